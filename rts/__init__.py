@@ -1,0 +1,32 @@
+"""rts: differentiable surface rendering by rasterize-then-splat.
+
+Find where camera rays meet a surface with any ordinary renderer; evaluate the surface there, shade it and splat it;
+differentiate only that.
+"""
+
+from rts.camera import Camera
+from rts.errors import EngineError, InputError, PluginError, RtsError
+from rts.protocols import Fragments, GBuffer, Part, Proxy, Sampled, Samples
+from rts.registry import plugin, plugins
+from rts.rendering import render, render_samples, sample
+from rts.sampling import TriangleSampler
+
+__all__ = [
+    "Camera",
+    "EngineError",
+    "Fragments",
+    "GBuffer",
+    "InputError",
+    "Part",
+    "PluginError",
+    "Proxy",
+    "RtsError",
+    "Sampled",
+    "Samples",
+    "TriangleSampler",
+    "plugin",
+    "plugins",
+    "render",
+    "render_samples",
+    "sample",
+]

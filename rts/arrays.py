@@ -1,0 +1,164 @@
+"""Trees of arrays, and the engine that owns them."""
+
+from __future__ import annotations
+
+import functools
+import sys
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace
+
+from rts.errors import EngineError
+from rts.protocols import STATIC_FIELDS, Array, Engine, Tree, join_record, split_record
+
+CONSTANT_TYPES = (np.ndarray, np.generic, bool, int, float)
+
+
+def leaves(tree: Tree) -> Iterator[Any]:
+    """The leaves of nested dicts, lists, tuples and records, in a fixed order; None has none."""
+    if tree is None:
+        return
+    if isinstance(tree, Mapping):
+        for key in sorted(tree):
+            yield from leaves(tree[key])
+    elif isinstance(tree, (list, tuple)):
+        for item in tree:
+            yield from leaves(item)
+    elif type(tree) in STATIC_FIELDS:
+        yield from leaves(split_record(tree)[0])
+    else:
+        yield tree
+
+
+def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
+    """The same tree with `fn` applied to each leaf, visited in the order of `leaves`."""
+    if tree is None:
+        return None
+    if isinstance(tree, Mapping):
+        return {key: map_leaves(fn, tree[key]) for key in sorted(tree)}
+    if isinstance(tree, (list, tuple)):
+        items = [map_leaves(fn, item) for item in tree]
+        return type(tree)(*items) if hasattr(tree, "_fields") else type(tree)(items)
+    if type(tree) in STATIC_FIELDS:
+        arrays, static = split_record(tree)
+        return join_record(type(tree), map_leaves(fn, arrays), static)
+    return fn(tree)
+
+
+def is_constant(tree: Tree) -> bool:
+    """Whether every leaf is NumPy or a Python number: never differentiated."""
+    return all(isinstance(x, CONSTANT_TYPES) for x in leaves(tree))
+
+
+@functools.cache
+def _engine(name: str) -> Engine:
+    from rts.registry import plugin
+
+    return plugin("rts.engines", name)()
+
+
+def _owner(x: Any) -> Engine:
+    from rts.registry import plugins
+
+    for name in plugins("rts.engines"):
+        if name != "numpy" and name in sys.modules and _engine(name).owns(x):
+            return _engine(name)
+    raise EngineError(
+        f"an array of type {type(x).__module__}.{type(x).__qualname__} belongs to no engine; "
+        f"expected NumPy, {', '.join(n for n in plugins('rts.engines') if n != 'numpy')}"
+    )
+
+
+_OWNERS: dict[type, Engine] = {}
+
+
+def engine_of(*trees: Tree) -> Engine:
+    """The engine of the arrays in these trees; NumPy arrays and Python numbers are constants beside any.
+
+    Raises:
+        EngineError: arrays of two engines, or of an unknown type.
+    """
+    found: dict[str, Engine] = {}
+    for x in leaves(trees):
+        if isinstance(x, CONSTANT_TYPES):
+            continue
+        engine = _OWNERS.get(type(x)) or _OWNERS.setdefault(type(x), _owner(x))
+        found[engine.name] = engine
+    if len(found) > 1:
+        raise EngineError(
+            f"arrays of {' and '.join(sorted(found))} met in one call; convert one side "
+            f"(NumPy arrays may stand beside either, as constants)"
+        )
+    return next(iter(found.values())) if found else _engine("numpy")
+
+
+def exemplar(*trees: Tree) -> Array | None:
+    """The floating array of an engine other than NumPy that sets dtype and device for constants, or None."""
+    for x in leaves(trees):
+        if not isinstance(x, CONSTANT_TYPES) and namespace(x).isdtype(x.dtype, "real floating"):
+            return x
+    return None
+
+
+def namespace(*arrays: Array) -> Any:
+    """The array-API namespace of these arrays (`array_api_compat`)."""
+    return array_namespace(*arrays)
+
+
+def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:
+    """The same tree with every NumPy array and number as a constant of the engine."""
+    return map_leaves(lambda x: engine.constant(x, like) if isinstance(x, CONSTANT_TYPES) else x, tree)
+
+
+def promote(*values: Any) -> tuple[Any, list[Array]]:
+    """Arguments of one call, numbers and lists included, as floating arrays of one engine, and their namespace.
+
+    Where all are NumPy or numbers the result is float64.
+    """
+    values_ = [np.asarray(v, dtype=np.float64) if isinstance(v, (list, tuple)) and is_constant(v) else v for v in values]
+    engine = engine_of(values_)
+    if any(isinstance(v, (list, tuple)) for v in values_):
+        # A list of traced scalars, such as an eye built of parameters.
+        like = exemplar(values_)
+        values_ = [
+            namespace(like).stack([engine.constant(x, like) if is_constant(x) else x for x in v])
+            if isinstance(v, (list, tuple))
+            else v
+            for v in values_
+        ]
+    like = exemplar(values_)
+    arrays = [
+        v if not isinstance(v, CONSTANT_TYPES) else engine.constant(np.asarray(v, dtype=np.float64), like)
+        for v in values_
+    ]
+    return namespace(*arrays), arrays
+
+
+def fingerprint(tree: Tree) -> tuple:
+    """A key that changes when the bytes of host arrays do; optimisers change arrays in place, so identity would not."""
+    arrays = [np.ascontiguousarray(x) for x in leaves(tree)]
+    return tuple((x.shape, x.dtype.str, zlib.crc32(x.view(np.uint8).reshape(-1))) for x in arrays)
+
+
+def unit(x: Array, axis: int = -1) -> Array:
+    """Vectors scaled to length one; a zero vector stays zero, with zero derivative."""
+    xp = namespace(x)
+    square = xp.sum(x * x, axis=axis, keepdims=True)
+    safe = xp.where(square > 0, square, xp.ones_like(square))
+    return x / xp.sqrt(safe)
+
+
+# Elementwise, since matrix units of some devices round float32 products to fewer bits.
+
+
+def matmul(a: Array, b: Array) -> Array:
+    """Product of two small matrices in full precision."""
+    return namespace(a, b).sum(a[:, :, None] * b[None, :, :], axis=1)
+
+
+def affine(row: Array, points: Array) -> Array:
+    """One coordinate (N,) of an affine map of points (N, 3): `row` is (4,), its last entry the offset."""
+    return points[..., 0] * row[0] + points[..., 1] * row[1] + points[..., 2] * row[2] + row[3]

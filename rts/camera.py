@@ -1,0 +1,426 @@
+"""Cameras, and the conventions of space that hold everywhere.
+
+- The world is right-handed. `view` maps world to camera space; the camera looks along −z with +y up and +x right, as in
+  OpenGL. `projection` maps camera space to OpenGL clip space: NDC x right, y up, z from −1 (near) to 1 (far).
+- Image row 0 is on top; the centre of pixel (x, y) is (x + 0.5, y + 0.5). `size` is (height, width) everywhere.
+- Depth is linear: the distance along the camera's axis, −z in camera space.
+
+Matrices act on column vectors. Every constructor is differentiable in its arguments: give torch or jax arrays, and the
+camera's matrices are of that kind; give numbers or NumPy arrays, and they are float64 NumPy.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.arrays import affine, is_constant, matmul, namespace, promote, unit
+from rts.errors import InputError
+from rts.protocols import Array, Rays
+
+NEAR_OVER_DISTANCE = 1e-2
+FAR_OVER_DISTANCE = 1e2
+
+
+def _matrix(xp: Any, rows: list[list[Any]], like: Array) -> Array:
+    """A matrix of array scalars and numbers."""
+    zero = xp.zeros_like(like)
+    return xp.stack([xp.stack([zero + entry for entry in row]) for row in rows])
+
+
+def _flipped(matrix: Array, row_signs: tuple[float, ...]) -> Array:
+    """The matrix with its rows multiplied by signs."""
+    xp = namespace(matrix)
+    return xp.stack([matrix[i, :] * s for i, s in enumerate(row_signs)])
+
+
+def _affine(linear: Array, translation: Array) -> Array:
+    """(4, 4) from a (3, 3) linear map and a (3,) translation."""
+    xp = namespace(linear)
+    last = xp.zeros_like(translation)
+    bottom = xp.concat([last, xp.ones_like(translation[:1])])
+    return xp.concat([xp.concat([linear, translation[:, None]], axis=1), bottom[None, :]], axis=0)
+
+
+def _check_range(near: Any, far: Any, *, positive: bool) -> None:
+    if not is_constant((near, far)):
+        return
+    if not (math.isfinite(near) and math.isfinite(far) and near < far):
+        raise InputError(f"near is {near} and far is {far}; expected finite numbers with near < far")
+    if positive and near <= 0:
+        raise InputError(f"near is {near}; a perspective camera needs near > 0")
+
+
+def perspective(
+    fov_y: Any, aspect: Any = 1.0, near: Any = 0.1, far: Any = 100.0, principal_point: Any = (0.0, 0.0)
+) -> Array:
+    """(4, 4) perspective projection.
+
+    Args:
+        fov_y: vertical field of view, degrees.
+        aspect: width over height.
+        near: depth of the near plane, positive.
+        far: depth of the far plane.
+        principal_point: (2,) where the axis meets the image, NDC; (0, 0) is the middle.
+    """
+    _check_range(near, far, positive=True)
+    if is_constant(fov_y) and not 0 < fov_y < 180:
+        raise InputError(f"fov_y is {fov_y}; expected degrees between 0 and 180")
+    xp, (fov, aspect, near, far, point) = promote(fov_y, aspect, near, far, principal_point)
+    scale = 1 / xp.tan(fov * (math.pi / 360))
+    depth = far - near
+    return _matrix(
+        xp,
+        [
+            [scale / aspect, 0, -point[0], 0],
+            [0, scale, -point[1], 0],
+            [0, 0, -(far + near) / depth, -2 * far * near / depth],
+            [0, 0, -1, 0],
+        ],
+        fov,
+    )
+
+
+def orthographic(
+    height: Any, aspect: Any = 1.0, near: Any = 0.1, far: Any = 100.0, principal_point: Any = (0.0, 0.0)
+) -> Array:
+    """(4, 4) orthographic projection.
+
+    Args:
+        height: of the image, world units.
+        aspect: width over height.
+        near: depth of the near plane; may be negative.
+        far: depth of the far plane.
+        principal_point: (2,) where the axis meets the image, NDC.
+    """
+    _check_range(near, far, positive=False)
+    if is_constant(height) and not (math.isfinite(height) and height > 0):
+        raise InputError(f"height is {height}; expected a positive number of world units")
+    xp, (height, aspect, near, far, point) = promote(height, aspect, near, far, principal_point)
+    scale, depth = 2 / height, far - near
+    return _matrix(
+        xp,
+        [
+            [scale / aspect, 0, 0, point[0]],
+            [0, scale, 0, point[1]],
+            [0, 0, -2 / depth, -(far + near) / depth],
+            [0, 0, 0, 1],
+        ],
+        height,
+    )
+
+
+def look_at(eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0)) -> Array:
+    """(4, 4) view matrix of a camera at `eye` (3,) that faces `target` (3,), world space.
+
+    Raises:
+        InputError: eye and target coincide, or the direction of view is parallel to `up`.
+    """
+    if is_constant((eye, target, up)):
+        eye_, target_, up_ = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
+        if any(v.shape != (3,) for v in (eye_, target_, up_)):
+            raise InputError(f"eye, target and up have shapes {eye_.shape}, {target_.shape}, {up_.shape}; expected (3,)")
+        if not np.linalg.norm(np.cross(target_ - eye_, up_)) > 1e-12 * np.linalg.norm(target_ - eye_) * np.linalg.norm(up_):
+            raise InputError(
+                f"a camera at {eye_.tolist()} that looks at {target_.tolist()} has no upright with up = {up_.tolist()}; "
+                f"move the eye or give another up"
+            )
+    xp, (eye, target, up) = promote(eye, target, up)
+    back = unit(eye - target)
+    right = unit(xp.linalg.cross(up, back))
+    linear = xp.stack([right, xp.linalg.cross(back, right), back])
+    return _affine(linear, -matmul(linear, eye[:, None])[:, 0])
+
+
+class Camera(NamedTuple):
+    """A camera: two matrices.
+
+    Attributes:
+        view: (4, 4) camera-from-world.
+        projection: (4, 4) OpenGL clip space from camera space.
+    """
+
+    view: Array
+    projection: Array
+
+    # ---------------------------------------------------------------------------------------- constructors
+
+    @classmethod
+    def look_at(
+        cls,
+        eye: Any,
+        target: Any,
+        up: Any = (0.0, 1.0, 0.0),
+        *,
+        fov_y: Any = 45.0,
+        aspect: Any = 1.0,
+        near: Any = None,
+        far: Any = None,
+        principal_point: Any = (0.0, 0.0),
+    ) -> Camera:
+        """A perspective camera at `eye` that faces `target`.
+
+        Args:
+            eye: (3,) world.
+            target: (3,) world.
+            up: (3,) direction that is up in the image.
+            fov_y: vertical field of view, degrees.
+            aspect: width over height.
+            near: near plane; default 1/100 of the distance to the target.
+            far: far plane; default 100 times the distance to the target.
+            principal_point: (2,) NDC of the axis.
+        """
+        view = look_at(eye, target, up)
+        if near is None or far is None:
+            xp, (eye, target) = promote(eye, target)
+            distance = xp.sqrt(xp.sum((eye - target) ** 2))
+            near = NEAR_OVER_DISTANCE * distance if near is None else near
+            far = FAR_OVER_DISTANCE * distance if far is None else far
+        return cls(*_alike(view, perspective(fov_y, aspect, near, far, principal_point)))
+
+    @classmethod
+    def orthographic(
+        cls,
+        eye: Any,
+        target: Any,
+        up: Any = (0.0, 1.0, 0.0),
+        *,
+        height: Any,
+        aspect: Any = 1.0,
+        near: Any = 0.0,
+        far: Any = 100.0,
+        principal_point: Any = (0.0, 0.0),
+    ) -> Camera:
+        """An orthographic camera; `height` of the image in world units, the rest as in `look_at`."""
+        view = look_at(eye, target, up)
+        return cls(*_alike(view, orthographic(height, aspect, near, far, principal_point)))
+
+    @classmethod
+    def from_opencv(
+        cls,
+        K: Any,
+        R: Any,
+        t: Any,
+        size: tuple[int, int],
+        *,
+        near: Any = 0.01,
+        far: Any = 1000.0,
+        pixel_center: float = 0.0,
+    ) -> Camera:
+        """From OpenCV's x = K (R X + t): camera axes x right, y down, z forward.
+
+        Args:
+            K: (3, 3) intrinsics, pixels; skew is kept.
+            R: (3, 3) rotation, camera-from-world.
+            t: (3,) translation, or (3, 1).
+            size: (height, width).
+            near: near plane.
+            far: far plane.
+            pixel_center: where K puts the centre of the first pixel: 0 in OpenCV, 0.5 in COLMAP and most data sets
+                whose principal point is exactly (width / 2, height / 2).
+        """
+        _check_range(near, far, positive=True)
+        xp, (K, R, t, near, far) = promote(K, R, t, near, far)
+        if tuple(K.shape) != (3, 3) or tuple(R.shape) != (3, 3):
+            raise InputError(f"K has shape {tuple(K.shape)} and R {tuple(R.shape)}; expected (3, 3) both")
+        height, width = size
+        view = _flipped(_affine(R, xp.reshape(t, (3,))), (1, -1, -1, 1))
+        cx, cy = K[0, 2] + (0.5 - pixel_center), K[1, 2] + (0.5 - pixel_center)
+        depth = far - near
+        projection = _matrix(
+            xp,
+            [
+                [2 * K[0, 0] / width, -2 * K[0, 1] / width, 1 - 2 * cx / width, 0],
+                [0, 2 * K[1, 1] / height, 2 * cy / height - 1, 0],
+                [0, 0, -(far + near) / depth, -2 * far * near / depth],
+                [0, 0, -1, 0],
+            ],
+            cx,
+        )
+        return cls(view, projection)
+
+    @classmethod
+    def from_opengl(cls, modelview: Any, projection: Any) -> Camera:
+        """From OpenGL's matrices, which are ours."""
+        _, (view, projection) = promote(modelview, projection)
+        return cls(view, projection)
+
+    @classmethod
+    def from_nvdiffrast(cls, modelview: Any, projection: Any, *, top_down: bool = False) -> Camera:
+        """From the matrices whose product feeds `nvdiffrast`.
+
+        nvdiffrast's row 0 is NDC y = −1, the bottom; with plain OpenGL matrices its image is ours upside down, and the
+        matrices are ours unchanged.
+
+        Args:
+            modelview: (4, 4).
+            projection: (4, 4).
+            top_down: the projection has its y negated, so that nvdiffrast's row 0 is the top already.
+        """
+        _, (view, projection) = promote(modelview, projection)
+        return cls(view, _flipped(projection, (1, -1, 1, 1)) if top_down else projection)
+
+    @classmethod
+    def from_pytorch3d(
+        cls,
+        R: Any,
+        T: Any,
+        *,
+        focal_length: Any,
+        principal_point: Any = (0.0, 0.0),
+        size: tuple[int, int],
+        near: Any = 0.01,
+        far: Any = 1000.0,
+    ) -> Camera:
+        """From PyTorch3D's `PerspectiveCameras` in NDC: X_camera = X R + T (row vectors), x left, y up, z forward.
+
+        Args:
+            R: (3, 3), acting on row vectors.
+            T: (3,).
+            focal_length: number or (2,), NDC; 1 / tan(fov / 2) of a `FoVPerspectiveCameras`.
+            principal_point: (2,) NDC, x left and y up; the shorter side of the image spans [−1, 1].
+            size: (height, width).
+            near: near plane.
+            far: far plane.
+        """
+        _check_range(near, far, positive=True)
+        xp, (R, T, focal, point, near, far) = promote(R, T, focal_length, principal_point, near, far)
+        height, width = size
+        sx, sy = min(size) / width, min(size) / height
+        focal = focal + xp.zeros_like(point)
+        view = _flipped(_affine(xp.linalg.matrix_transpose(R), T), (-1, 1, -1, 1))
+        depth = far - near
+        projection = _matrix(
+            xp,
+            [
+                [focal[0] * sx, 0, point[0] * sx, 0],
+                [0, focal[1] * sy, -point[1] * sy, 0],
+                [0, 0, -(far + near) / depth, -2 * far * near / depth],
+                [0, 0, -1, 0],
+            ],
+            far,
+        )
+        return cls(view, projection)
+
+    @classmethod
+    def from_blender(
+        cls, camera_to_world: Any, size: tuple[int, int], *, focal: Any, near: Any = 0.01, far: Any = 1000.0
+    ) -> Camera:
+        """From the camera-to-world matrix of Blender and of NeRF's data sets, whose camera axes are ours.
+
+        Args:
+            camera_to_world: (4, 4) or (3, 4).
+            size: (height, width).
+            focal: focal length, pixels: 0.5 width / tan(0.5 camera_angle_x).
+            near: near plane.
+            far: far plane.
+        """
+        xp, (c2w, focal) = promote(camera_to_world, focal)
+        c2w = _affine(c2w[:3, :3], c2w[:3, 3])
+        fov_y = xp.atan(size[0] / (2 * focal)) * (360 / math.pi)
+        fov_y = fov_y if not is_constant(fov_y) else float(fov_y)
+        return cls(*_alike(xp.linalg.inv(c2w), perspective(fov_y, size[1] / size[0], near, far)))
+
+    # ------------------------------------------------------------------------------------------ converters
+
+    def to_opencv(self, size: tuple[int, int], *, pixel_center: float = 0.0) -> tuple[Array, Array, Array]:
+        """(K, R, t) of a perspective camera; the inverse of `from_opencv`."""
+        xp, p = namespace(self.projection), self.projection
+        height, width = size
+        scale = -1 / p[3, 2]
+        shift = pixel_center - 0.5
+        K = _matrix(
+            xp,
+            [
+                [p[0, 0] * scale * width / 2, -p[0, 1] * scale * width / 2, (1 - p[0, 2] * scale) * width / 2 + shift],
+                [0, p[1, 1] * scale * height / 2, (1 + p[1, 2] * scale) * height / 2 + shift],
+                [0, 0, 1],
+            ],
+            scale,
+        )
+        view = _flipped(self.view, (1, -1, -1, 1))
+        return K, view[:3, :3], view[:3, 3]
+
+    def to_opengl(self) -> tuple[Array, Array]:
+        """(modelview, projection), which are ours."""
+        return self.view, self.projection
+
+    def to_nvdiffrast(self, *, top_down: bool = False) -> tuple[Array, Array]:
+        """(modelview, projection); with `top_down`, row 0 of nvdiffrast's image is the top, as here."""
+        return self.view, _flipped(self.projection, (1, -1, 1, 1)) if top_down else self.projection
+
+    def to_pytorch3d(self, size: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
+        """(R, T, focal_length (2,), principal_point (2,)); the inverse of `from_pytorch3d`."""
+        xp, p = namespace(self.projection), self.projection
+        sx, sy, scale = min(size) / size[1], min(size) / size[0], -1 / p[3, 2]
+        view = _flipped(self.view, (-1, 1, -1, 1))
+        focal = xp.stack([p[0, 0] / sx, p[1, 1] / sy]) * scale
+        return xp.linalg.matrix_transpose(view[:3, :3]), view[:3, 3], focal, xp.stack([p[0, 2] / sx, -p[1, 2] / sy]) * scale
+
+    def to_blender(self, size: tuple[int, int]) -> tuple[Array, Array]:
+        """(camera-to-world (4, 4), focal length in pixels)."""
+        return namespace(self.view).linalg.inv(self.view), self.projection[1, 1] * size[0] / 2
+
+    # ----------------------------------------------------------------------------------------------- use
+
+    def within(self, transform: Array | None) -> Camera:
+        """The same camera in the local space of a part with this world-from-local transform."""
+        return self if transform is None else self._replace(view=matmul(self.view, transform))
+
+    def with_apron(self, size: tuple[int, int], apron: int) -> Camera:
+        """The camera of the image with `apron` more pixels on every side."""
+        height, width = size
+        signs = (width / (width + 2 * apron), height / (height + 2 * apron), 1, 1)
+        return self._replace(projection=_flipped(self.projection, signs))
+
+    def project(self, points: Array, size: tuple[int, int]) -> Array:
+        """Pixel x, pixel y and linear depth of world points.
+
+        Args:
+            points: (N, 3) world.
+            size: (height, width).
+
+        Returns:
+            (N, 3). Points on the plane of the camera's centre have no image; they give finite values.
+        """
+        xp = namespace(points)
+        height, width = size
+        rows = matmul(self.projection, self.view)
+        w = affine(rows[3, :], points)
+        safe = xp.where(w * w > 0, w, xp.ones_like(w))
+        x, y = affine(rows[0, :], points) / safe, affine(rows[1, :], points) / safe
+        return xp.stack([(x + 1) * (width / 2), (1 - y) * (height / 2), -affine(self.view[2, :], points)], axis=-1)
+
+    def toward(self, points: Array) -> Array:
+        """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""
+        xp = namespace(points)
+        at = xp.stack([affine(self.view[i, :], points) for i in range(3)], axis=-1) * self.projection[3, 2]
+        r = self.view[:3, :3]
+        axis = self.projection[3, 3] * r[2, :]
+        return at[..., 0:1] * r[0, :] + at[..., 1:2] * r[1, :] + at[..., 2:3] * r[2, :] + axis
+
+    def rays(self, size: tuple[int, int]) -> Rays:
+        """Rays (H, W, 3) through the pixel centres of a NumPy camera, world space, float64."""
+        height, width = size
+        view, projection = np.asarray(self.view, np.float64), np.asarray(self.projection, np.float64)
+        x = (np.arange(width) + 0.5) * 2 / width - 1
+        y = 1 - (np.arange(height) + 0.5) * 2 / height
+        ndc = np.stack([*np.broadcast_arrays(x[None, :], y[:, None])], axis=-1)
+        # A point at depth z has clip (a − z b): solve the two rows x = X w, y = Y w for the camera-space x and y.
+        p = projection
+        a = p[:2, :2] - ndc[..., :, None] * p[3, :2]
+        constant = ndc * p[3, 3] - p[:2, 3]
+        slope = p[:2, 2] - ndc * p[3, 2]
+        start, step = (np.linalg.solve(a, b[..., None])[..., 0] for b in (constant, slope))
+        zero, one = np.zeros((height, width, 1)), np.ones((height, width, 1))
+        inverse = np.linalg.inv(view)
+        origins = np.concatenate([start, zero], -1) @ inverse[:3, :3].T + inverse[:3, 3]
+        return Rays(origins, np.concatenate([step, -one], -1) @ inverse[:3, :3].T)
+
+
+def _alike(view: Array, projection: Array) -> tuple[Array, Array]:
+    """Both matrices in the engine and dtype of the one that is not constant."""
+    _, (view, projection) = promote(view, projection)
+    return view, projection

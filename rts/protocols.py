@@ -1,0 +1,352 @@
+"""Every record and protocol that crosses a wall between the core and the plugins.
+
+Shapes use these letters: N packed samples, K layers front to back, H × W pixels (row 0 on top), V vertices,
+T triangles, I integers and P reals a sample, C channels. Conventions of space are in `rts.camera`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from rts.errors import InputError
+
+Array = Any
+"""An array of NumPy, torch or jax."""
+
+Tree = Any
+"""Arrays in nested dicts, lists, tuples and records."""
+
+STATIC_FIELDS: dict[type, tuple[str, ...]] = {}
+"""The records that are pytrees, each with the names of its fields that are not arrays (engines register them)."""
+
+
+def record(*, static: tuple[str, ...] = ()) -> Callable[[type], type]:
+    """Make a class a frozen dataclass that every engine knows as a pytree.
+
+    Args:
+        static: the fields that are not arrays; jax compares them to decide whether to compile anew.
+    """
+
+    def decorate(cls: type) -> type:
+        cls = dataclass(frozen=True, eq=False)(cls)
+        STATIC_FIELDS[cls] = static
+        return cls
+
+    return decorate
+
+
+def split_record(value: Any) -> tuple[tuple[Tree, ...], tuple[Any, ...]]:
+    """A record's array fields and its static fields, each in order of declaration."""
+    static = STATIC_FIELDS[type(value)]
+    names = [f.name for f in fields(value)]
+    arrays = tuple(getattr(value, n) for n in names if n not in static)
+    return arrays, tuple(getattr(value, n) for n in names if n in static)
+
+
+def join_record(cls: type, arrays: tuple[Tree, ...], static: tuple[Any, ...]) -> Any:
+    """The inverse of `split_record`; runs no check, since frameworks put placeholders into the fields."""
+    value, a, s = object.__new__(cls), iter(arrays), iter(static)
+    for f in fields(cls):
+        object.__setattr__(value, f.name, next(s if f.name in STATIC_FIELDS[cls] else a))
+    return value
+
+
+# --------------------------------------------------------------------------------------------- what passes
+
+
+class ArraySpec(NamedTuple):
+    """What a host function returns: the shape and dtype of one array.
+
+    Attributes:
+        shape: the shape, or the largest one where `packed`.
+        dtype: a NumPy dtype.
+        packed: the first axis counts samples and may come back shorter; an engine that needs fixed shapes pads it
+            with zeros.
+    """
+
+    shape: tuple[int, ...]
+    dtype: Any
+    packed: bool = False
+
+
+@record(static=("surface", "shader", "cull"))
+class Part:
+    """One object of a scene.
+
+    Attributes:
+        surface: the topology, a `Surface`; immutable.
+        theta: nested dict of every number of the part: vertices or control points, texture, lights, weights.
+        shader: a `Shader`, the name of a registered one, or any function with the same signature.
+        transform: (4, 4) world-from-local affine map, differentiable, or None for the identity.
+        cull: "none", or "back" to ignore triangles seen from behind. Never inferred.
+    """
+
+    surface: Surface
+    theta: Mapping[str, Tree]
+    shader: Shader | str = "silhouette"
+    transform: Array | None = None
+    cull: str = "none"
+
+    def __post_init__(self):
+        if self.cull not in ("none", "back"):
+            raise InputError(f'cull is {self.cull!r}; expected "none" or "back"')
+        if not isinstance(self.theta, Mapping):
+            raise InputError(f"theta is a {type(self.theta).__name__}; expected a dict of arrays")
+
+    def replace(self, **changes: Any) -> Part:
+        """A copy with some fields changed."""
+        return replace(self, **changes)
+
+
+class Proxy(NamedTuple):
+    """Triangles that stand for a surface while it is sampled. Host arrays.
+
+    Attributes:
+        vertices: (V, 3) float32, local space.
+        faces: (T, 3) int32.
+        ids: (T, I) int32, handed on to the samples of the triangle; None means `faces`.
+        corner_params: (T, 3, P) float32, interpolated with the barycentrics; None means the barycentrics themselves.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    ids: np.ndarray | None = None
+    corner_params: np.ndarray | None = None
+
+
+class Fragments(NamedTuple):
+    """What a triangle sampler finds. Host arrays.
+
+    Attributes:
+        triangle_ids: (K, H, W) int32 front to back, −1 where a pixel has no such layer.
+        barycentrics: (K, H, W, 2) float32, the weights of the triangle's first two corners, perspective-correct.
+        depth: (K, H, W) float32, linear distance along the camera's axis; 0 where empty.
+    """
+
+    triangle_ids: np.ndarray
+    barycentrics: np.ndarray
+    depth: np.ndarray
+
+
+class Rays(NamedTuple):
+    """Rays through pixel centres: the point at camera depth z is `origins + z * directions`.
+
+    Attributes:
+        origins: (..., 3), on the plane of the camera's centre.
+        directions: (..., 3), scaled to advance one unit of depth.
+    """
+
+    origins: Array
+    directions: Array
+
+
+@record(static=("centered",))
+class Samples:
+    """Where the rays of one part meet its surface: the paper's U, packed.
+
+    Attributes:
+        ids: (N, I) int32.
+        params: (N, P) float32.
+        row: (K, H, W) int32, the sample in each cell, or −1.
+        depth: (K, H, W) float32, linear camera depth; 0 where `row` is −1.
+        overflow: () int32, samples that did not fit into the capacity and were dropped, deepest layers first.
+        tables: further arrays of the surface, filled by its `refine`.
+        gbuffer: the evaluated G-buffer where the surface's θ is constant, else None.
+        centered: whether the samples reproject to the centres of their pixels.
+    """
+
+    ids: Array
+    params: Array
+    row: Array
+    depth: Array
+    overflow: Array
+    tables: Mapping[str, Array] = field(default_factory=dict)
+    gbuffer: Mapping[str, Array] | None = None
+    centered: bool = True
+
+
+@record()
+class Sampled:
+    """A whole scene, sampled: what `rts.sample` returns and `rts.render_samples` takes.
+
+    The grid has an apron of one cell around the image, so that what lies just outside can splat into it:
+    here H and W are the image's plus two.
+
+    Attributes:
+        samples: one `Samples` a part.
+        part: (K, H, W) int32, the part seen in each cell, or −1.
+        row: (K, H, W) int32, the sample in each cell, counted over all parts in order, or −1.
+        depth: (K, H, W) float32, linear camera depth; 0 where empty.
+        overflow: () int32, samples dropped for want of capacity. Should be 0.
+    """
+
+    samples: tuple[Samples, ...]
+    part: Array
+    row: Array
+    depth: Array
+    overflow: Array
+
+
+class GBuffer(dict):
+    """Attributes of the samples by name, each (N, C); "position" (N, 3) is required.
+
+    An attribute may be deferred: it is computed when first read, so a shader pays for what it reads.
+    Built-in surfaces use the names position, normal, uv and color, and any others that the user adds.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self._deferred: dict[str, Callable[[], Array]] = {}
+
+    def defer(self, name: str, compute: Callable[[], Array]) -> None:
+        """Add an attribute that `compute()` gives when it is first read."""
+        self._deferred[name] = compute
+
+    def __missing__(self, name: str) -> Array:
+        if name not in self._deferred:
+            raise InputError(
+                f"the shader reads {name!r}, but the surface provides {', '.join(map(repr, self))}; "
+                f"add the attribute to the part's theta or choose another shader"
+            )
+        self[name] = self._deferred.pop(name)()
+        return self[name]
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or name in self._deferred
+
+    def __iter__(self) -> Iterator[str]:
+        yield from [*super().__iter__(), *self._deferred]
+
+
+# ------------------------------------------------------------------------------------------------ protocols
+
+
+class Surface(Protocol):
+    """A kind of surface: holds topology, takes θ.
+
+    Optional members, looked up by name:
+        check(theta): raise an InputError if shapes or dtypes are wrong; values may be traced.
+        reads(theta) -> tuple of the θ entries that `evaluate` needs; default all of them.
+        refine(inputs, samples, rays) -> Samples: on the host, polish or replace ids and params.
+        table_specs(rows) -> dict of ArraySpec: the `Samples.tables` that `refine` fills, for at most `rows` samples.
+    """
+
+    sample_widths: tuple[int, int]
+    """(I, P) of the samples, after `refine`."""
+
+    def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
+        """Points of the surface: differentiable, written over the array namespace of θ; local space."""
+        ...
+
+    def proxy_inputs(self, theta: Mapping[str, Tree]) -> Tree:
+        """The arrays that `proxy` needs; computed on the device, then moved to the host."""
+        ...
+
+    def proxy(self, inputs: Tree, camera: Any, size: tuple[int, int]) -> Proxy:
+        """Triangles for these inputs, on the host; tessellation may depend on the view."""
+        ...
+
+
+class Sampler(Protocol):
+    """Finds where rays meet one part; the step without derivative."""
+
+    def sample(
+        self, part: Part, camera: Any, size: tuple[int, int], layers: int, *, capacity: int | None = None
+    ) -> Samples:
+        """The `layers` nearest samples of every pixel.
+
+        Args:
+            part: the part; its `transform` is already in the camera.
+            camera: the camera, in the part's local space.
+            size: (height, width).
+            layers: K.
+            capacity: number of packed rows to allot, or None for as many as there are.
+        """
+        ...
+
+
+class Shader(Protocol):
+    """Colours samples. Any function with the call signature will do.
+
+    Optional attributes: `opaque` (bool, default False) promises alpha = 1; `reads` (tuple of str) names the
+    G-buffer entries it needs besides position, default all of them.
+    """
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
+        """(N, 4) premultiplied linear RGBA from the part's θ and its G-buffer in world space."""
+        ...
+
+
+class Splatter(Protocol):
+    """Turns shaded samples into an image that has derivatives at occlusion boundaries."""
+
+    def splat(self, positions: Array, rgba: Array, row: Array) -> Array:
+        """Splat packed samples.
+
+        Args:
+            positions: (N, 3) pixel x, pixel y, linear depth.
+            rgba: (N, 4) premultiplied.
+            row: (K, H, W) int32, the sample of each cell front to back, or −1.
+
+        Returns:
+            (H, W, 4) premultiplied RGBA.
+        """
+        ...
+
+
+class Engine(Protocol):
+    """An array framework. Chosen by the type of the arrays, never a global setting.
+
+    The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the
+    user has imported that module.
+    """
+
+    name: str
+
+    def owns(self, x: Any) -> bool:
+        """Whether this is an array of the framework, traced ones included."""
+        ...
+
+    def constant(self, value: Any, like: Array | None = None) -> Array:
+        """An array with no derivative on the device of `like`; floats take the dtype of `like`."""
+        ...
+
+    def call_host(self, fn: Callable, specs: tuple[ArraySpec, ...], *args: Array) -> tuple[Array, ...]:
+        """Call `fn` on NumPy copies of `args`; the results carry no derivative and live where `args` do."""
+        ...
+
+    def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> Array:
+        """(count, C) sums of the rows of `values` (M, C) that share a segment (M,)."""
+        ...
+
+    def to_numpy(self, x: Array) -> np.ndarray:
+        """The value on the host; not for traced arrays."""
+        ...
+
+    def block(self, x: Tree) -> Tree:
+        """Wait until the arrays are computed."""
+        ...
+
+    def value_and_grad(self, f: Callable) -> Callable:
+        """`f(tree) -> scalar` to `tree -> (value, gradient tree)`."""
+        ...
+
+    def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[Array, Array]:
+        """The value of `f` and its derivative along `tangent`."""
+        ...
+
+    def jacobian(self, f: Callable) -> Callable:
+        """`f(vector) -> array` to `vector -> (value, forward-mode Jacobian)`."""
+        ...
+
+    def jit(self, f: Callable) -> Callable:
+        """Compile where the framework can, else return `f`."""
+        ...
+
+    def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
+        """A step function `(parameters, gradient) -> parameters` with its own state; "adam" or "sgd"."""
+        ...

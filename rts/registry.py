@@ -1,0 +1,139 @@
+"""Plugins by (group, name), found through the entry points of installed distributions.
+
+Groups: rts.surfaces, rts.samplers, rts.shaders, rts.splatters, rts.engines. The library's own plugins are
+registered in its `pyproject.toml` in the same way as anyone's. Only the plugin asked for is imported.
+"""
+
+from __future__ import annotations
+
+import difflib
+import functools
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, NamedTuple
+
+from rts.errors import InputError, PluginError
+
+GROUPS = ("rts.surfaces", "rts.samplers", "rts.shaders", "rts.splatters", "rts.engines")
+
+
+class PluginInfo(NamedTuple):
+    """One line of `rts plugins`.
+
+    Attributes:
+        group: the entry-point group.
+        name: the plugin's name.
+        distribution: name and version of the distribution that brings it.
+        error: why it does not load, or None.
+    """
+
+    group: str
+    name: str
+    distribution: str
+    error: str | None
+
+
+@functools.cache
+def _entries(group: str) -> dict[str, list[EntryPoint]]:
+    found: dict[str, list[EntryPoint]] = {}
+    for entry in entry_points(group=group):
+        found.setdefault(entry.name, []).append(entry)
+    return found
+
+
+def _group(group: str) -> str:
+    full = group if group.startswith("rts.") else f"rts.{group}"
+    if full not in GROUPS:
+        raise InputError(f"no plugin group {group!r}; expected one of {', '.join(GROUPS)}{_suggest(full, GROUPS)}")
+    return full
+
+
+def _suggest(name: str, names: Any) -> str:
+    close = difflib.get_close_matches(name, list(names), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _distribution(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown distribution"
+
+
+def plugins(group: str) -> list[str]:
+    """The names registered in a group, such as "rts.samplers" (or "samplers"), sorted."""
+    return sorted(_entries(_group(group)))
+
+
+def _entry(group: str, name: str) -> EntryPoint:
+    if name not in _entries(group):
+        _entries.cache_clear()  # A distribution may have been installed since the last look.
+    found = _entries(group).get(name)
+    kind = group.removeprefix("rts.").removesuffix("s")
+    if not found:
+        names = plugins(group)
+        hint = "" if names else "; is the distribution installed (pip install .)?"
+        raise InputError(f"no {kind} named {name!r}; there are {', '.join(names)}{_suggest(name, names)}{hint}")
+    if len(found) > 1:
+        raise PluginError(
+            f"the {kind} {name!r} is claimed by {' and '.join(sorted(map(_distribution, found)))}; uninstall one of them"
+        )
+    return found[0]
+
+
+def plugin(group: str, name: str) -> Any:
+    """Load one plugin: what its entry point names, usually a class.
+
+    Args:
+        group: such as "rts.samplers" (or "samplers").
+        name: such as "raster".
+
+    Raises:
+        InputError: no such group or name.
+        PluginError: two distributions claim the name, or it cannot be imported.
+    """
+    group = _group(group)
+    entry = _entry(group, name)
+    kind = group.removeprefix("rts.").removesuffix("s")
+    try:
+        return entry.load()
+    except ModuleNotFoundError as error:
+        extras = entry.dist.metadata.get_all("Provides-Extra") or [] if entry.dist else []
+        if name in extras:
+            command = f"pip install '{entry.dist.name}[{name}]'"
+            raise PluginError(f"the {kind} {name!r} needs the package {error.name!r}: {command}") from error
+        raise PluginError(
+            f"the {kind} {name!r} of {_distribution(entry)} needs the module {error.name!r}, which is not installed"
+        ) from error
+    except PluginError:
+        raise
+    except Exception as error:
+        raise PluginError(
+            f"the {kind} {name!r} of {_distribution(entry)} fails to import: {type(error).__name__}: {error}"
+        ) from error
+
+
+@functools.cache
+def _default(group: str, name: str) -> Any:
+    found = plugin(group, name)
+    return found() if isinstance(found, type) else found
+
+
+def instance(group: str, chosen: Any) -> Any:
+    """A usable plugin from a name, a class or a ready object.
+
+    A name gives one shared instance with default settings; a class is instantiated; anything else is returned.
+    """
+    if isinstance(chosen, str):
+        return _default(group, chosen)
+    return chosen() if isinstance(chosen, type) else chosen
+
+
+def survey() -> list[PluginInfo]:
+    """Every registered plugin, each tried, in order of group and name."""
+    found = []
+    for group in GROUPS:
+        for name, entries in sorted(_entries(group).items()):
+            try:
+                plugin(group, name)
+                error = None
+            except PluginError as problem:
+                error = str(problem)
+            found.append(PluginInfo(group, name, " and ".join(map(_distribution, entries)), error))
+    return found

@@ -1,0 +1,193 @@
+"""The step without derivative: from surfaces to packed samples, on the host."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rts.arrays import engine_of, is_constant, leaves, map_leaves, namespace
+from rts.camera import Camera
+from rts.errors import InputError
+from rts.protocols import ArraySpec, Fragments, Part, Proxy, Rays, Sampled, Samples
+
+
+class TriangleSampler(abc.ABC):
+    """Base class of samplers that know only triangles: `sample` for any surface that gives a proxy.
+
+    A sampler implements `rasterize`, and `prepare` where something is worth building once for a proxy.
+    """
+
+    def prepare(self, proxy: Proxy) -> Any:
+        """What `rasterize` needs of the proxy: an acceleration structure, device buffers. Default the proxy itself."""
+        return proxy
+
+    @abc.abstractmethod
+    def rasterize(
+        self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str
+    ) -> Fragments:
+        """The `layers` nearest triangles of every pixel, at its centre, between the near and the far plane.
+
+        Args:
+            prepared: what `prepare` gave.
+            camera: NumPy float64 matrices; world is the proxy's local space.
+            size: (height, width).
+            layers: K.
+            cull: "none", or "back": ignore triangles whose normal (counter-clockwise winding) faces away.
+        """
+
+    def sample(
+        self, part: Part, camera: Camera, size: tuple[int, int], layers: int, *, capacity: int | None = None
+    ) -> Samples:
+        """See `rts.protocols.Sampler`. One call to the host does everything."""
+        surface, theta = part.surface, part.theta
+        engine = engine_of(theta, camera)
+        inputs = surface.proxy_inputs(theta)
+        reads = surface.reads(theta) if hasattr(surface, "reads") else tuple(theta)
+        host_theta = {name: theta[name] for name in reads}
+        if engine.name == "numpy" or not is_constant(host_theta):
+            host_theta = None
+
+        rows = layers * size[0] * size[1] if capacity is None else capacity
+        table_specs = surface.table_specs(rows) if hasattr(surface, "table_specs") else {}
+        gbuffer_specs = _gbuffer_specs(part, host_theta, rows, packed=capacity is None)
+        specs = (
+            ArraySpec((rows, surface.sample_widths[0]), np.int32, packed=capacity is None),
+            ArraySpec((rows, surface.sample_widths[1]), np.float32, packed=capacity is None),
+            ArraySpec((layers, *size), np.int32),
+            ArraySpec((layers, *size), np.float32),
+            ArraySpec((), np.int32),
+            *table_specs.values(),
+            *gbuffer_specs.values(),
+        )
+
+        def host(view: np.ndarray, projection: np.ndarray, *host_leaves: np.ndarray) -> tuple[np.ndarray, ...]:
+            it = iter(host_leaves)
+            host_inputs = map_leaves(lambda _: next(it), inputs)
+            host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
+            check_camera(host_camera)
+            proxy = surface.proxy(host_inputs, host_camera, size)
+            check_proxy(proxy, surface)
+            fragments = self.rasterize(self.prepare(proxy), host_camera, size, layers, part.cull)
+            samples = lift(fragments, proxy, capacity)
+            if hasattr(surface, "refine"):
+                samples = surface.refine(host_inputs, samples, _sample_rays(samples, host_camera, size))
+            gbuffer = surface.evaluate(host_theta, samples) if host_theta is not None else {}
+            return (
+                samples.ids,
+                samples.params,
+                samples.row,
+                samples.depth,
+                samples.overflow,
+                *(np.asarray(samples.tables[name], spec.dtype) for name, spec in table_specs.items()),
+                *(np.asarray(gbuffer[name], spec.dtype) for name, spec in gbuffer_specs.items()),
+            )
+
+        results = engine.call_host(host, specs, camera.view, camera.projection, *leaves(inputs))
+        tables = results[5 : 5 + len(table_specs)]
+        gbuffer = results[5 + len(table_specs) :]
+        return Samples(
+            *results[:5],
+            tables=dict(zip(table_specs, tables, strict=True)),
+            gbuffer=dict(zip(gbuffer_specs, gbuffer, strict=True)) if host_theta is not None else None,
+            centered=getattr(surface, "centered", True),
+        )
+
+
+def _gbuffer_specs(part: Part, host_theta: Mapping | None, rows: int, packed: bool) -> dict[str, ArraySpec]:
+    """The attributes to evaluate on the host for a surface that is constant: those its shader reads."""
+    if host_theta is None:
+        return {}
+    i, p = part.surface.sample_widths
+    none = np.full((1, 1, 1), -1, np.int32)
+    one = Samples(np.zeros((1, i), np.int32), np.zeros((1, p), np.float32), none, none, np.int32(0))
+    gbuffer = part.surface.evaluate(host_theta, one)
+    names = getattr(part.shader, "reads", None)
+    names = list(gbuffer) if names is None else ["position", *(n for n in names if n in gbuffer)]
+    return {n: ArraySpec((rows, *gbuffer[n].shape[1:]), np.float32, packed) for n in dict.fromkeys(names)}
+
+
+def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None) -> Samples:
+    """Packed samples from fragments: the triangle's ids, and its corner parameters interpolated.
+
+    Samples are numbered layer by layer, each in rows and columns of the image. There is always at least one row, so
+    that what follows stays connected to θ; a row that no cell refers to has no effect.
+    """
+    ids_table = proxy.faces if proxy.ids is None else proxy.ids
+    covered = np.flatnonzero(fragments.triangle_ids.reshape(-1) >= 0)
+    overflow = 0
+    if capacity is not None:
+        overflow = max(0, len(covered) - capacity)
+        covered = covered[:capacity]
+    count = len(covered)
+    rows = max(1, count) if capacity is None else capacity
+    row = np.full(fragments.triangle_ids.size, -1, np.int32)
+    row[covered] = np.arange(count, dtype=np.int32)
+
+    triangles = fragments.triangle_ids.reshape(-1)[covered]
+    barycentrics = fragments.barycentrics.reshape(-1, 2)[covered]
+    if proxy.corner_params is None:
+        found = barycentrics
+    else:
+        a, b, c = np.moveaxis(proxy.corner_params[triangles], 1, 0)
+        found = c + barycentrics[:, :1] * (a - c) + barycentrics[:, 1:] * (b - c)
+    ids = np.zeros((rows, ids_table.shape[1]), np.int32)
+    params = np.zeros((rows, found.shape[1]), np.float32)
+    np.take(ids_table, triangles, axis=0, out=ids[:count])
+    params[:count] = found
+    row = row.reshape(fragments.triangle_ids.shape)
+    return Samples(ids, params, row, np.where(row >= 0, fragments.depth, 0), np.asarray(overflow, np.int32))
+
+
+def _sample_rays(samples: Samples, camera: Camera, size: tuple[int, int]) -> Rays:
+    """The ray of each packed sample (N, 3); samples that no cell refers to get the first pixel's."""
+    rays = camera.rays(size)
+    pixel = np.zeros(len(samples.ids), np.int64)
+    flat = samples.row.reshape(-1)
+    cells = np.flatnonzero(flat >= 0)
+    pixel[flat[cells]] = cells % (size[0] * size[1])
+    return Rays(rays.origins.reshape(-1, 3)[pixel], rays.directions.reshape(-1, 3)[pixel])
+
+
+def merge(samples: Sequence[Samples], layers: int) -> Sampled:
+    """Interleave the layers of several parts by depth and keep the nearest; equal depths go to the earlier part."""
+    xp = namespace(samples[0].row)
+    overflow = samples[0].overflow
+    for s in samples[1:]:
+        overflow = overflow + s.overflow
+    if len(samples) == 1:
+        only = samples[0]
+        return Sampled(tuple(samples), xp.minimum(only.row, xp.zeros_like(only.row)), only.row, only.depth, overflow)
+    offsets = np.cumsum([0, *(s.ids.shape[0] for s in samples)])
+    row = xp.concat([xp.where(s.row >= 0, s.row + int(o), s.row) for s, o in zip(samples, offsets, strict=False)])
+    part = xp.concat([xp.where(s.row >= 0, i, s.row) for i, s in enumerate(samples)])
+    depth = xp.concat([s.depth for s in samples])
+    last = xp.max(depth) + 1
+    order = xp.argsort(xp.where(row >= 0, depth, last), axis=0, stable=True)[:layers]
+    row, part, depth = (xp.take_along_axis(x, order, axis=0) for x in (row, part, depth))
+    return Sampled(tuple(samples), part, row, depth, overflow)
+
+
+def check_camera(camera: Camera) -> None:
+    """Refuse host matrices that are not finite or not invertible."""
+    for name, matrix in zip(("view", "projection"), camera, strict=True):
+        if not np.isfinite(matrix).all():
+            raise InputError(f"the camera's {name} matrix holds NaN or infinity; check how it was made")
+        singular_values = np.linalg.svd(matrix, compute_uv=False)
+        if not singular_values[-1] > 1e-14 * singular_values[0]:
+            raise InputError(
+                f"the camera's {name} matrix is singular (times the part's transform, for view); it has no inverse"
+            )
+
+
+def check_proxy(proxy: Proxy, surface: Any) -> None:
+    """Refuse vertices that are NaN or infinite."""
+    vertices = proxy.vertices
+    if not (np.isfinite(vertices.min()) and np.isfinite(vertices.max())):
+        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+        raise InputError(
+            f"{len(bad)} of the {len(vertices)} vertices of {surface!r} are NaN or infinite, the first is vertex "
+            f"{bad[0]}; check the input, or lower the step size if an optimisation led here"
+        )

@@ -1,0 +1,276 @@
+"""The built-in shaders: from θ and the G-buffer in world space to premultiplied linear RGBA.
+
+A shader is any function `shader(theta, gbuffer, camera) -> (N, 4)`. What it reads of θ is differentiable:
+
+    "color" (3,) or (4,)             factor on the base colour
+    "texture" (h, w, C)              row 0 on top, C = 1, 3 or 4; sampled at gbuffer["uv"], whose v points up
+    "light"                          dict of "direction" (3,) or (L, 3) towards the light, world space; "color" (3,) or
+                                     (L, 3); "ambient" (3,). Default: one white light from above the camera's left
+                                     shoulder and an ambient 0.2.
+    "specular" (3,), "shininess" ()  of `blinn_phong`
+    "depth_range" (2,)               of `depth`: what is black and what is white; default the near and far planes
+
+The base colour is the texture where θ has one and the surface has uv, else the G-buffer's "color", else white.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from rts.arrays import namespace, unit
+from rts.camera import Camera
+from rts.errors import InputError
+from rts.protocols import Array, GBuffer, Tree
+
+WRAPS = ("repeat", "mirror", "clamp")
+DEFAULT_AMBIENT, DEFAULT_DIFFUSE = 0.2, 0.8
+DEFAULT_LIGHT = (-0.3, 0.5, 0.81)  # In camera space.
+DEFAULT_SPECULAR, DEFAULT_SHININESS = 0.3, 32.0
+
+
+@dataclass(frozen=True)
+class Silhouette:
+    """White where there is a surface."""
+
+    opaque = True
+    reads = ()
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+        """See `rts.protocols.Shader`."""
+        position = gbuffer["position"]
+        return _opaque(namespace(position).ones_like(position))
+
+
+@dataclass(frozen=True)
+class Normals:
+    """World-space unit normals, mapped from [−1, 1] to [0, 1]."""
+
+    opaque = True
+    reads = ("normal",)
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+        """See `rts.protocols.Shader`."""
+        return _opaque(unit(gbuffer["normal"]) * 0.5 + 0.5)
+
+
+@dataclass(frozen=True)
+class Depth:
+    """Linear depth, from 0 at the near plane (or θ["depth_range"][0]) to 1 at the far plane."""
+
+    opaque = True
+    reads = ()
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+        """See `rts.protocols.Shader`."""
+        position = gbuffer["position"]
+        xp = namespace(position)
+        depth = camera.project(position, (1, 1))[:, 2]
+        if "depth_range" in theta:
+            near, far = theta["depth_range"][0], theta["depth_range"][1]
+        else:
+            p = camera.projection
+            # Clip z = ±w at the planes: p22 z + p23 = ∓(p32 z + p33), z = −depth.
+            near = (p[2, 3] + p[3, 3]) / (p[2, 2] + p[3, 2])
+            far = (p[2, 3] - p[3, 3]) / (p[2, 2] - p[3, 2])
+        grey = xp.clip((depth - near) / (far - near), 0.0, 1.0)
+        return _opaque(xp.stack([grey, grey, grey], axis=-1))
+
+
+@dataclass(frozen=True)
+class Unlit:
+    """The base colour.
+
+    Attributes:
+        wrap: of the texture, "repeat", "mirror" or "clamp".
+        opaque: ignore the alpha of texture and colours.
+    """
+
+    wrap: str = "repeat"
+    opaque: bool = True
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """G-buffer entries."""
+        return ("color", "uv")
+
+    def __post_init__(self):
+        if self.wrap not in WRAPS:
+            raise InputError(f"wrap is {self.wrap!r}; expected one of {', '.join(WRAPS)}")
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+        """See `rts.protocols.Shader`."""
+        color, alpha = self.base_color(theta, gbuffer)
+        return self.premultiplied(color, alpha)
+
+    def base_color(self, theta: Mapping[str, Tree], gbuffer: GBuffer) -> tuple[Array, Array]:
+        """Colour (N, 3), not premultiplied, and alpha (N, 1)."""
+        position = gbuffer["position"]
+        xp = namespace(position)
+        if "texture" in theta and "uv" in gbuffer:
+            base = sample_texture(theta["texture"], gbuffer["uv"], self.wrap)
+        elif "color" in gbuffer:
+            base = gbuffer["color"]
+        else:
+            base = xp.ones_like(position)
+        one = xp.ones_like(position[:, :1])
+        color = base if base.shape[1] >= 3 else base[:, :1] * xp.ones_like(position)
+        color, alpha = color[:, :3], color[:, 3:4] if base.shape[1] == 4 else one
+        if "color" in theta:
+            factor = theta["color"]
+            color = color * factor[:3]
+            alpha = alpha * factor[3] if factor.shape[0] == 4 else alpha
+        return color, alpha
+
+    def premultiplied(self, color: Array, alpha: Array) -> Array:
+        """(N, 4) of colour (N, 3) and alpha (N, 1), the latter ignored by an opaque shader."""
+        return _opaque(color) if self.opaque else namespace(color).concat([color * alpha, alpha], axis=1)
+
+
+@dataclass(frozen=True)
+class Textured(Unlit):
+    """The base colour, which must come from a texture."""
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """G-buffer entries."""
+        return ("uv",)
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+        """See `rts.protocols.Shader`."""
+        if "texture" not in theta:
+            raise InputError(f"the textured shader needs theta['texture'] (h, w, C); theta has {sorted(theta)}")
+        gbuffer["uv"]  # Its absence is an error here, not a reason for white.
+        return super().__call__(theta, gbuffer, camera)
+
+
+@dataclass(frozen=True)
+class Lambert(Unlit):
+    """Diffuse shading, two-sided: normals are turned towards the viewer."""
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """G-buffer entries."""
+        return ("normal", "color", "uv")
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+        """See `rts.protocols.Shader`."""
+        color, alpha = self.base_color(theta, gbuffer)
+        normal, _ = facing_normals(gbuffer, camera)
+        xp = namespace(color)
+        light = _light(theta, camera)
+        shade = light["ambient"] + xp.zeros_like(color)
+        for direction, brightness in zip(*_each(light), strict=True):
+            shade = shade + _positive(_dot(normal, direction)) * brightness
+        return self.premultiplied(xp.clip(color * shade, 0.0, 1.0), alpha)
+
+
+@dataclass(frozen=True)
+class BlinnPhong(Unlit):
+    """Diffuse shading with highlights (Blinn 1977), two-sided."""
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """G-buffer entries."""
+        return ("normal", "color", "uv")
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+        """See `rts.protocols.Shader`."""
+        color, alpha = self.base_color(theta, gbuffer)
+        normal, toward = facing_normals(gbuffer, camera)
+        xp = namespace(color)
+        light = _light(theta, camera)
+        specular = theta.get("specular", DEFAULT_SPECULAR)
+        shininess = theta.get("shininess", DEFAULT_SHININESS)
+        shade, highlight = light["ambient"] + xp.zeros_like(color), xp.zeros_like(color)
+        for direction, brightness in zip(*_each(light), strict=True):
+            cosine = _dot(normal, direction)
+            shade = shade + _positive(cosine) * brightness
+            # A power of zero has an infinite derivative for exponents below one, and a NaN one in its exponent.
+            half = xp.clip(_dot(normal, unit(direction + toward)), 1e-6, 1.0)
+            highlight = highlight + xp.where(cosine > 0, half**shininess, xp.zeros_like(half)) * brightness
+        return self.premultiplied(xp.clip(color * shade + specular * highlight, 0.0, 1.0), alpha)
+
+
+def facing_normals(gbuffer: GBuffer, camera: Camera) -> tuple[Array, Array]:
+    """Unit normals (N, 3) turned to the viewer's side, and unit vectors (N, 3) towards the viewer; world space."""
+    normal, toward = unit(gbuffer["normal"]), unit(camera.toward(gbuffer["position"]))
+    xp = namespace(normal)
+    return xp.where(_dot(normal, toward) < 0, -normal, normal), toward
+
+
+def sample_texture(texture: Array, uv: Array, wrap: str = "repeat") -> Array:
+    """Bilinear texture lookup, differentiable in both.
+
+    Args:
+        texture: (h, w, C), row 0 on top; texel (i, j) has its centre at u = (j + 0.5) / w, v = 1 − (i + 0.5) / h.
+        uv: (N, 2), u to the right and v up; (0, 0) is the lower left corner of the image.
+        wrap: "repeat", "mirror" or "clamp" outside [0, 1].
+
+    Returns:
+        (N, C).
+    """
+    xp = namespace(texture, uv)
+    if len(texture.shape) != 3 or texture.shape[2] not in (1, 3, 4):
+        raise InputError(f"the texture has shape {tuple(texture.shape)}; expected (h, w, C) with C = 1, 3 or 4")
+    height, width, channels = texture.shape
+    flat = xp.reshape(texture, (height * width, channels))
+    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
+    x0, y0 = xp.floor(x), xp.floor(y)
+    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
+
+    def texel(dx: int, dy: int) -> Array:
+        index = _wrapped(y0 + dy, height, wrap) * width + _wrapped(x0 + dx, width, wrap)
+        return xp.take(flat, index, axis=0)
+
+    top = texel(0, 0) + fx * (texel(1, 0) - texel(0, 0))
+    bottom = texel(0, 1) + fx * (texel(1, 1) - texel(0, 1))
+    return top + fy * (bottom - top)
+
+
+def _wrapped(index: Array, count: int, wrap: str) -> Array:
+    """Whole-numbered floats as indices in [0, count)."""
+    xp = namespace(index)
+    if wrap == "repeat":
+        index = index - xp.floor(index / count) * count
+    elif wrap == "mirror":
+        index = index - xp.floor(index / (2 * count)) * (2 * count)
+        index = xp.where(index >= count, 2 * count - 1 - index, index)
+    return xp.astype(xp.clip(index, 0, count - 1), xp.int32)
+
+
+def _light(theta: Mapping[str, Tree], camera: Camera) -> dict[str, Array]:
+    given = dict(theta.get("light", {}))
+    r = camera.view[:3, :3]
+    if "direction" not in given:
+        given["direction"] = sum(c * r[i, :] for i, c in enumerate(DEFAULT_LIGHT))
+    xp = namespace(given["direction"])
+    one = xp.ones_like(given["direction"][..., :3])
+    given.setdefault("color", DEFAULT_DIFFUSE * one)
+    given.setdefault("ambient", DEFAULT_AMBIENT)
+    return given
+
+
+def _each(light: dict[str, Array]) -> tuple[list[Array], list[Array]]:
+    """Unit directions and colours (3,) of each light."""
+    xp = namespace(light["direction"])
+    directions = xp.reshape(unit(light["direction"]), (-1, 3))
+    colors = xp.reshape(light["color"], (-1, 3))
+    if colors.shape[0] not in (1, directions.shape[0]):
+        raise InputError(f"theta['light'] has {directions.shape[0]} directions but {colors.shape[0]} colors")
+    count = directions.shape[0]
+    return [directions[i, :] for i in range(count)], [colors[min(i, colors.shape[0] - 1), :] for i in range(count)]
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return namespace(a).sum(a * b, axis=-1, keepdims=True)
+
+
+def _positive(x: Array) -> Array:
+    xp = namespace(x)
+    return xp.where(x > 0, x, xp.zeros_like(x))
+
+
+def _opaque(color: Array) -> Array:
+    xp = namespace(color)
+    return xp.concat([color, xp.ones_like(color[:, :1])], axis=1)

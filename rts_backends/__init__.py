@@ -1,0 +1,1 @@
+"""Samplers and engines that come with the library, one plugin a file."""

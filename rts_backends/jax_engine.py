@@ -1,0 +1,122 @@
+"""jax: eager, `jit`, and every transform, on any device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from rts.protocols import STATIC_FIELDS, ArraySpec, Tree, join_record, split_record
+
+for _cls in STATIC_FIELDS:
+    jax.tree_util.register_pytree_node(
+        _cls, split_record, lambda static, arrays, cls=_cls: join_record(cls, tuple(arrays), static)
+    )
+
+
+def bucket(rows: int) -> int:
+    """The next number of the form 2ⁿ or 3·2ⁿ, at least 64: few sizes, so that eager operations stay compiled."""
+    size = 64
+    while size < rows:
+        size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
+    return size
+
+
+def _pad(x: np.ndarray, rows: int) -> np.ndarray:
+    return np.concatenate([x, np.zeros((rows - x.shape[0], *x.shape[1:]), x.dtype)])
+
+
+class JaxEngine:
+    """Engine of jax arrays."""
+
+    name = "jax"
+
+    def owns(self, x: Any) -> bool:
+        """Whether `x` is a jax array or a tracer."""
+        return isinstance(x, jax.Array)
+
+    def constant(self, value: Any, like: jax.Array | None = None) -> jax.Array:
+        """`value` as a jax array, floats in the dtype of `like`."""
+        array = np.asarray(value)
+        if np.issubdtype(array.dtype, np.floating):
+            array = array.astype(np.float32 if like is None else like.dtype)
+        elif array.dtype == np.int64:
+            array = array.astype(np.int32)
+        return jnp.asarray(array)
+
+    def call_host(self, fn: Callable, specs: tuple[ArraySpec, ...], *args: Any) -> tuple[jax.Array, ...]:
+        """Call `fn`; packed rows are padded to a bucket where values are known, to the largest shape under a trace."""
+        # Under grad and jvp this yields the plain value; only jit and vmap leave a tracer.
+        args = tuple(jax.lax.stop_gradient(a) if isinstance(a, jax.Array) else a for a in args)
+        if not any(isinstance(a, jax.core.Tracer) for a in args):
+            results = fn(*map(np.asarray, args))
+            return tuple(
+                jnp.asarray(_pad(r, bucket(r.shape[0])) if spec.packed else r)
+                for r, spec in zip(results, specs, strict=True)
+            )
+
+        def padded(*host_args: Any) -> tuple[np.ndarray, ...]:
+            results = fn(*map(np.asarray, host_args))
+            return tuple(
+                (_pad(r, spec.shape[0]) if spec.packed else np.asarray(r)).astype(spec.dtype)
+                for r, spec in zip(results, specs, strict=True)
+            )
+
+        shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
+        return tuple(jax.pure_callback(padded, shapes, *args, vmap_method="sequential"))
+
+    def segment_sum(self, values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:
+        """Sums of the rows of `values` that share a segment."""
+        return jax.ops.segment_sum(values, jnp.asarray(segments), num_segments=count)
+
+    def to_numpy(self, x: jax.Array) -> np.ndarray:
+        """The value on the host."""
+        return np.asarray(x)
+
+    def block(self, x: Tree) -> Tree:
+        """Wait for the arrays."""
+        return jax.block_until_ready(x)
+
+    def value_and_grad(self, f: Callable) -> Callable:
+        """`jax.value_and_grad`."""
+        return jax.value_and_grad(f)
+
+    def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[jax.Array, jax.Array]:
+        """`jax.jvp`."""
+        return jax.jvp(f, (primal,), (tangent,))
+
+    def jacobian(self, f: Callable) -> Callable:
+        """By forward-mode autodiff, all columns in one vectorised pass."""
+        jacobian = jax.jacfwd(lambda v: (lambda r: (r, r))(f(v)), has_aux=True)
+
+        def call(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
+            matrix, value = jacobian(vector)
+            return value, matrix
+
+        return call
+
+    def jit(self, f: Callable) -> Callable:
+        """`jax.jit`."""
+        return jax.jit(f)
+
+    def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
+        """optax's `adam` or `sgd`."""
+        import optax
+
+        transform = {"adam": optax.adam, "sgd": optax.sgd}[name](learning_rate)
+        state = transform.init(parameters)
+
+        @jax.jit
+        def update(parameters: Tree, gradient: Tree, state: Any) -> tuple[Tree, Any]:
+            updates, state = transform.update(gradient, state)
+            return optax.apply_updates(parameters, updates), state
+
+        def step(parameters: Tree, gradient: Tree) -> Tree:
+            nonlocal state
+            parameters, state = update(parameters, gradient, state)
+            return parameters
+
+        return step

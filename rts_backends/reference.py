@@ -1,0 +1,134 @@
+"""The yardstick of the other samplers: float64 NumPy, every triangle against every pixel of its bounding box."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.protocols import Fragments, Proxy
+from rts.sampling import TriangleSampler
+
+CANDIDATES_AT_ONCE = 1 << 20
+
+
+class Reference(TriangleSampler):
+    """Slow and obvious.
+
+    A pixel's ray meets a triangle where Σ bᵢ (xᵢ − X wᵢ, yᵢ − Y wᵢ) = 0 with Σ bᵢ = 1 and bᵢ ≥ 0: (x, y, w) are the
+    corners in clip space and (X, Y) the pixel's centre in NDC. So with gᵢ = (xᵢ − X wᵢ, yᵢ − Y wᵢ), the b are in the
+    ratio g₁ × g₂ : g₂ × g₀ : g₀ × g₁. This needs no division by w, hence no clipping.
+    """
+
+    def rasterize(
+        self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str
+    ) -> Fragments:
+        """See `TriangleSampler.rasterize`."""
+        height, width = size
+        homogeneous = np.concatenate([prepared.vertices.astype(np.float64), np.ones((len(prepared.vertices), 1))], 1)
+        in_camera = homogeneous @ camera.view.T
+        clip = in_camera @ camera.projection.T
+        corners, depth = clip[prepared.faces], -in_camera[prepared.faces, 2]
+
+        first, last, kept = _pixel_boxes(corners, size)
+        if cull == "back":
+            kept &= _faces_viewer(in_camera[prepared.faces], camera)
+        found = []
+        counts = np.where(kept, (last - first + 1).clip(0).prod(axis=1), 0)
+        for chunk in _chunks(counts):
+            triangle = np.repeat(chunk, counts[chunk])
+            within = np.arange(len(triangle)) - np.repeat(np.cumsum(counts[chunk]) - counts[chunk], counts[chunk])
+            columns = (last - first + 1)[triangle, 0]
+            x, y = first[triangle, 0] + within % columns, first[triangle, 1] + within // columns
+            found.append(_hits(triangle, x, y, corners, depth, size))
+        return _nearest(*map(np.concatenate, zip(*found, strict=True)), size, layers) if found else _empty(size, layers)
+
+
+def _chunks(counts: np.ndarray) -> list[np.ndarray]:
+    """Indices of non-zero counts, split where the running total passes a multiple of the limit."""
+    indices = np.flatnonzero(counts)
+    if not len(indices):
+        return []
+    breaks = np.flatnonzero(np.diff(np.cumsum(counts[indices]) // CANDIDATES_AT_ONCE)) + 1
+    return np.split(indices, breaks)
+
+
+def _pixel_boxes(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """First and last pixel (x, y) that each triangle may cover, and whether it may cover any."""
+    height, width = size
+    w = corners[..., 3]
+    whole = (w > 0).all(axis=1)
+    safe = np.where(w > 0, w, 1.0)
+    with np.errstate(over="ignore"):
+        x, y = (corners[..., 0] / safe + 1) * width / 2, (1 - corners[..., 1] / safe) * height / 2
+    pixels = np.stack([x, y], -1).clip(-1, [width + 1, height + 1])
+    limits = np.array([width - 1, height - 1])
+    first = np.where(whole[:, None], np.floor(pixels.min(axis=1) - 0.5), 0).astype(np.int64).clip(0, limits + 1)
+    last = np.where(whole[:, None], np.ceil(pixels.max(axis=1) - 0.5), limits).astype(np.int64).clip(-1, limits)
+    inside_near, inside_far = (corners[..., 2] >= -w).any(axis=1), (corners[..., 2] <= w).any(axis=1)
+    return first, last, inside_near & inside_far & (w > 0).any(axis=1)
+
+
+def _faces_viewer(corners: np.ndarray, camera: Camera) -> np.ndarray:
+    """Whether each triangle's outward normal points to the viewer's side; corners in homogeneous camera space."""
+    a, b, c = corners[:, 0, :3], corners[:, 1, :3], corners[:, 2, :3]
+    toward = a * camera.projection[3, 2] + [0, 0, camera.projection[3, 3]]
+    outward = np.cross(b - a, c - a) * np.sign(np.linalg.det(camera.view[:3, :3]))
+    return (outward * toward).sum(axis=1) > 0
+
+
+def _hits(triangle, x, y, corners, depth, size):
+    """Triangle, pixel, barycentrics and depth of the candidates that are hits."""
+    height, width = size
+    ndc_x, ndc_y = (x + 0.5) * 2 / width - 1, 1 - (y + 0.5) * 2 / height
+    c = corners[triangle]
+    gx, gy = c[..., 0] - ndc_x[:, None] * c[..., 3], c[..., 1] - ndc_y[:, None] * c[..., 3]
+    edges = np.stack([_cross(gx[:, i], gy[:, i], gx[:, j], gy[:, j]) for i, j in ((1, 2), (2, 0), (0, 1))], -1)
+    total = edges.sum(axis=1)
+    sign = np.sign(total)
+    # Derivatives of each edge function along x and down y decide ties: top and left edges own their pixels.
+    slope_x, slope_down = _edge_slopes(c)
+    owned = np.where(slope_x * sign[:, None] != 0, slope_x * sign[:, None] > 0, slope_down * sign[:, None] > 0)
+    oriented = edges * sign[:, None]
+    hit = ((oriented > 0) | ((oriented == 0) & owned)).all(axis=1) & (total != 0)
+    triangle, x, y, c = triangle[hit], x[hit], y[hit], c[hit]
+    b = edges[hit] / total[hit, None]
+    near, far = (b * (c[..., 2] + c[..., 3])).sum(1) >= 0, (b * (c[..., 3] - c[..., 2])).sum(1) >= 0
+    # Σ bᵢ wᵢ > 0 tells a point before the viewer from one behind that projects to the same pixel.
+    seen = near & far & ((b * c[..., 3]).sum(1) > 0)
+    z = (b * depth[triangle]).sum(axis=1)
+    return triangle[seen], (y * width + x)[seen], b[seen, :2], z[seen]
+
+
+def _cross(ax, ay, bx, by):
+    return ax * by - ay * bx
+
+
+def _edge_slopes(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Derivative of gᵢ × gⱼ along +x of NDC, and along −y, for the three edges."""
+    pairs = ((1, 2), (2, 0), (0, 1))
+    along_x = [c[:, i, 1] * c[:, j, 3] - c[:, i, 3] * c[:, j, 1] for i, j in pairs]
+    down = [c[:, i, 0] * c[:, j, 3] - c[:, i, 3] * c[:, j, 0] for i, j in pairs]
+    return np.stack(along_x, -1), np.stack(down, -1)
+
+
+def _nearest(triangle, pixel, barycentrics, depth, size, layers) -> Fragments:
+    """The first `layers` hits of each pixel by depth, then by triangle."""
+    order = np.lexsort((triangle, depth, pixel))
+    triangle, pixel, barycentrics, depth = triangle[order], pixel[order], barycentrics[order], depth[order]
+    starts = np.flatnonzero(np.diff(pixel, prepend=-1))
+    layer = np.arange(len(pixel)) - np.repeat(starts, np.diff(starts, append=len(pixel)))
+    keep = layer < layers
+    fragments = _empty(size, layers)
+    at = layer[keep], *np.divmod(pixel[keep], size[1])
+    fragments.triangle_ids[at] = triangle[keep]
+    fragments.barycentrics[at] = barycentrics[keep]
+    fragments.depth[at] = depth[keep]
+    return fragments
+
+
+def _empty(size: tuple[int, int], layers: int) -> Fragments:
+    return Fragments(
+        np.full((layers, *size), -1, np.int32),
+        np.zeros((layers, *size, 2), np.float32),
+        np.zeros((layers, *size), np.float32),
+    )

@@ -1,0 +1,154 @@
+"""torch: eager autograd, `torch.func` transforms and `torch.compile`, on any device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch.utils import _pytree
+
+from rts.arrays import leaves, map_leaves
+from rts.protocols import STATIC_FIELDS, ArraySpec, Tree, join_record, split_record
+
+for _cls in STATIC_FIELDS:
+    _pytree.register_pytree_node(
+        _cls,
+        lambda value: ((parts := split_record(value))[0], parts[1]),
+        lambda arrays, static, cls=_cls: join_record(cls, tuple(arrays), static),
+        serialized_type_name=f"rts.{_cls.__name__}",
+    )
+
+
+def _tensor(value: Any, device: torch.device | None = None) -> torch.Tensor:
+    array = np.ascontiguousarray(value)
+    if not array.flags.writeable:
+        array = array.copy()  # torch warns of read-only memory, since it cannot mark a tensor so.
+    return torch.from_numpy(array).reshape(np.shape(value)).to(device)
+
+
+class _HostCall(torch.autograd.Function):
+    """A host function without derivative, transparent to every torch transform."""
+
+    @staticmethod
+    def forward(fn, specs, *args):
+        device = next((a.device for a in args if isinstance(a, torch.Tensor)), None)
+        results = fn(*(a.detach().cpu().numpy() if isinstance(a, torch.Tensor) else a for a in args))
+        return tuple(_tensor(r, device) for r in results)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.mark_non_differentiable(*output)
+        ctx.counts = len(inputs), len(output)
+
+    @staticmethod
+    def backward(ctx, *_):
+        return (None,) * ctx.counts[0]
+
+    @staticmethod
+    def jvp(ctx, *_):
+        return (None,) * ctx.counts[1]
+
+    @staticmethod
+    def vmap(info, in_dims, fn, specs, *args):
+        def select(b):
+            return [a if d is None else a.select(d, b) for a, d in zip(args, in_dims[2:], strict=True)]
+
+        items = [_HostCall.apply(fn, specs, *select(b)) for b in range(info.batch_size)]
+        outputs = []
+        for spec, values in zip(specs, zip(*items, strict=True), strict=True):
+            if spec.packed:
+                rows = max(v.shape[0] for v in values)
+                values = [torch.cat([v, v.new_zeros((rows - v.shape[0], *v.shape[1:]))]) for v in values]
+            outputs.append(torch.stack(tuple(values)))
+        return tuple(outputs), (0,) * len(outputs)
+
+
+class TorchEngine:
+    """Engine of torch tensors."""
+
+    name = "torch"
+
+    def owns(self, x: Any) -> bool:
+        """Whether `x` is a tensor."""
+        return isinstance(x, torch.Tensor)
+
+    def constant(self, value: Any, like: torch.Tensor | None = None) -> torch.Tensor:
+        """`value` on the device of `like`, floats in its dtype."""
+        tensor = _tensor(value, None if like is None else like.device)
+        return tensor.to(torch.float32 if like is None else like.dtype) if tensor.is_floating_point() else tensor
+
+    def call_host(self, fn: Callable, specs: tuple[ArraySpec, ...], *args: Any) -> tuple[torch.Tensor, ...]:
+        """Call `fn` on NumPy views or copies of `args`; under vmap once an item, packed rows padded alike."""
+        if torch.compiler.is_compiling():
+            return torch.compiler.disable(_HostCall.apply)(fn, specs, *args)
+        return _HostCall.apply(fn, specs, *args)
+
+    def segment_sum(self, values: torch.Tensor, segments: np.ndarray, count: int) -> torch.Tensor:
+        """Sums of the rows of `values` that share a segment."""
+        index = _tensor(segments, values.device)
+        return torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device).index_add(0, index, values)
+
+    def to_numpy(self, x: torch.Tensor) -> np.ndarray:
+        """The value on the host."""
+        return x.detach().cpu().numpy()
+
+    def block(self, x: Tree) -> Tree:
+        """Wait for the devices that hold the tensors."""
+        for device in {leaf.device for leaf in leaves(x) if isinstance(leaf, torch.Tensor)}:
+            if device.type == "cuda":
+                torch.cuda.synchronize(device)
+        return x
+
+    def value_and_grad(self, f: Callable) -> Callable:
+        """By autograd on detached leaves; entries that `f` does not use get a zero gradient."""
+
+        def call(tree: Tree) -> tuple[torch.Tensor, Tree]:
+            variables: list[torch.Tensor] = []
+
+            def variable(x: torch.Tensor) -> torch.Tensor:
+                variables.append(x.detach().requires_grad_(True))
+                return variables[-1]
+
+            value = f(map_leaves(variable, tree))
+            if value.requires_grad:
+                gradients = torch.autograd.grad(value, variables, materialize_grads=True)
+            else:
+                gradients = [torch.zeros_like(v) for v in variables]
+            it = iter(gradients)
+            return value.detach(), map_leaves(lambda _: next(it), tree)
+
+        return call
+
+    def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[torch.Tensor, torch.Tensor]:
+        """By forward-mode autodiff."""
+        return torch.func.jvp(f, (primal,), (tangent,))
+
+    def jacobian(self, f: Callable) -> Callable:
+        """By forward-mode autodiff, all columns in one vectorised pass."""
+        jacobian = torch.func.jacfwd(lambda v: (lambda r: (r, r))(f(v)), has_aux=True)
+
+        def call(vector: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            matrix, value = jacobian(vector.detach())
+            return value, matrix
+
+        return call
+
+    def jit(self, f: Callable) -> Callable:
+        """`f` itself: eager torch is what the rest of the engine is made for."""
+        return f
+
+    def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
+        """`torch.optim.Adam` or `torch.optim.SGD` on private copies of the parameters."""
+        variables = [p.detach().clone() for p in leaves(parameters)]
+        optimizer = {"adam": torch.optim.Adam, "sgd": torch.optim.SGD}[name](variables, lr=learning_rate)
+
+        def step(_: Tree, gradient: Tree) -> Tree:
+            for variable, g in zip(variables, leaves(gradient), strict=True):
+                variable.grad = g
+            optimizer.step()
+            copies = iter([v.clone() for v in variables])
+            return map_leaves(lambda _: next(copies), parameters)
+
+        return step

@@ -1,0 +1,1 @@
+"""Surfaces that come with the library, one a file."""

@@ -1,0 +1,129 @@
+"""Triangle meshes: positions and any attributes, interpolated with barycentrics (paper §3.1.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from rts.arrays import engine_of, fingerprint, is_constant, namespace, unit
+from rts.errors import InputError
+from rts.protocols import Array, GBuffer, Proxy, Samples, Tree
+
+G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
+VERTEX_ATTRIBUTES = ("normals", "colors", "uv")
+
+
+class Mesh:
+    """A triangle mesh.
+
+    θ["vertices"] (V, 3) are the positions. Attributes are further entries of θ, each (A, C): "normals", "colors" and
+    "uv" are known and have one row a vertex (A = V); others, and tables of their own such as the split seams of a uv
+    map, are declared by `indices`. In the G-buffer "normals" becomes "normal" and "colors" becomes "color". Where θ has
+    no normals, smooth ones are computed from the positions, differentiably, if the shader reads them.
+
+    Args:
+        faces: (T, 3) integers into θ["vertices"].
+        indices: attribute name → (T, 3) integers into θ[name], or None for one row a vertex.
+    """
+
+    def __init__(self, faces: Any, indices: Mapping[str, Any] | None = None):
+        self.faces = _index_table("faces", faces)
+        self._tables = [self.faces]
+        self._columns = dict.fromkeys(VERTEX_ATTRIBUTES, 0)
+        for name, table in (indices or {}).items():
+            self._columns[name] = 0
+            if table is not None:
+                table = _index_table(f"indices[{name!r}]", table)
+                if table.shape != self.faces.shape:
+                    raise InputError(f"indices[{name!r}] has shape {table.shape}; expected {self.faces.shape} as faces")
+                if not np.array_equal(table, self.faces):
+                    self._columns[name] = 3 * len(self._tables)
+                    self._tables.append(table)
+        self._ids = self.faces if len(self._tables) == 1 else np.concatenate(self._tables, axis=1)
+        self._extents = [int(t.max()) + 1 for t in self._tables]
+        self.sample_widths = (self._ids.shape[1], 2)
+        self._normals: tuple[tuple, np.ndarray] | None = None
+
+    def __repr__(self) -> str:
+        return f"Mesh({len(self.faces)} faces)"
+
+    def check(self, theta: Mapping[str, Tree]) -> None:
+        """Shapes and dtypes of θ."""
+        for name in ("vertices", *self._attributes(theta)):
+            if name not in theta:
+                raise InputError(f"theta of a mesh has no {name!r}; it has {sorted(theta)}")
+            value, rows = theta[name], self._extents[self._columns.get(name, 0) // 3]
+            shape = tuple(getattr(value, "shape", ()))
+            width = 3 if name in ("vertices", "normals") else shape[1] if len(shape) == 2 else "C"
+            if len(shape) != 2 or shape[1] != width:
+                raise InputError(f"theta[{name!r}] of a mesh has shape {shape}; expected (rows, {width})")
+            if not namespace(value).isdtype(value.dtype, "real floating"):
+                raise InputError(f"theta[{name!r}] of a mesh has dtype {value.dtype}; expected a floating one")
+            if shape[0] < rows:
+                raise InputError(
+                    f"theta[{name!r}] of a mesh has {shape[0]} rows, but its faces refer to row {rows - 1}; "
+                    f"check the indices (they count from 0)"
+                )
+
+    def _attributes(self, theta: Mapping[str, Tree]) -> list[str]:
+        return [name for name in self._columns if name in theta or name not in VERTEX_ATTRIBUTES]
+
+    def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
+        """The entries of θ that `evaluate` needs."""
+        return ("vertices", *self._attributes(theta))
+
+    def proxy_inputs(self, theta: Mapping[str, Tree]) -> Array:
+        """The vertices."""
+        return theta["vertices"]
+
+    def proxy(self, inputs: np.ndarray, camera: Any, size: tuple[int, int]) -> Proxy:
+        """The mesh itself."""
+        return Proxy(np.ascontiguousarray(inputs, dtype=np.float32), self.faces, self._ids)
+
+    def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
+        """Interpolated positions and attributes; see the class for their names."""
+        gbuffer = GBuffer(position=self._interpolate(theta["vertices"], samples, 0))
+        for name in self._attributes(theta):
+            interpolate = partial(self._interpolate, theta[name], samples, self._columns[name])
+            gbuffer.defer(G_BUFFER_NAMES.get(name, name), interpolate)
+        if "normals" not in theta:
+            gbuffer.defer("normal", lambda: self._interpolate(self.vertex_normals(theta["vertices"]), samples, 0))
+        return gbuffer
+
+    def _interpolate(self, rows: Array, samples: Samples, column: int) -> Array:
+        xp = namespace(rows, samples.ids)
+        a, b, c = (xp.take(rows, samples.ids[:, column + i], axis=0) for i in range(3))
+        return c + samples.params[:, 0:1] * (a - c) + samples.params[:, 1:2] * (b - c)
+
+    def vertex_normals(self, vertices: Array) -> Array:
+        """(V, 3) unit normals, the area-weighted mean of the faces around each vertex; zero where there is none."""
+        if not is_constant(vertices):
+            return self._vertex_normals(vertices)
+        key = fingerprint(vertices)
+        if self._normals is None or self._normals[0] != key:
+            self._normals = (key, self._vertex_normals(vertices))
+        return self._normals[1]
+
+    def _vertex_normals(self, vertices: Array) -> Array:
+        xp, engine = namespace(vertices), engine_of(vertices)
+        faces = engine.constant(self.faces, vertices)
+        a, b, c = (xp.take(vertices, faces[:, i], axis=0) for i in range(3))
+        face_normals = xp.linalg.cross(b - a, c - a)
+        segments = self.faces.T.reshape(-1)
+        return unit(engine.segment_sum(xp.concat([face_normals] * 3), segments, vertices.shape[0]))
+
+
+def _index_table(name: str, table: Any) -> np.ndarray:
+    array = np.asarray(table)
+    if array.ndim != 2 or array.shape[1] != 3 or not len(array):
+        raise InputError(f"{name} has shape {array.shape}; expected (T, 3) with at least one triangle")
+    if not np.issubdtype(array.dtype, np.integer):
+        raise InputError(f"{name} has dtype {array.dtype}; expected integers")
+    if array.min() < 0:
+        raise InputError(f"{name} holds the index {array.min()}; indices count from 0")
+    if array.max() >= 2**31:
+        raise InputError(f"{name} holds the index {array.max()}; expected less than 2**31")
+    return np.ascontiguousarray(array, dtype=np.int32)
