@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import sys
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
-from array_api_compat import array_namespace
 
 from rts.errors import EngineError
 from rts.protocols import STATIC_FIELDS, Array, Engine, Tree, join_record, split_record
@@ -53,11 +51,17 @@ def is_constant(tree: Tree) -> bool:
     return all(isinstance(x, CONSTANT_TYPES) for x in leaves(tree))
 
 
-@functools.cache
+# Plain dictionaries rather than functools caches: torch.compile looks through the latter, and warns.
+_ENGINES: dict[str, Engine] = {}
+_OWNERS: dict[type, Engine] = {}
+
+
 def _engine(name: str) -> Engine:
     from rts.registry import plugin
 
-    return plugin("rts.engines", name)()
+    if name not in _ENGINES:
+        _ENGINES[name] = plugin("rts.engines", name)()
+    return _ENGINES[name]
 
 
 def _owner(x: Any) -> Engine:
@@ -72,9 +76,6 @@ def _owner(x: Any) -> Engine:
     )
 
 
-_OWNERS: dict[type, Engine] = {}
-
-
 def engine_of(*trees: Tree) -> Engine:
     """The engine of the arrays in these trees; NumPy arrays and Python numbers are constants beside any.
 
@@ -85,7 +86,9 @@ def engine_of(*trees: Tree) -> Engine:
     for x in leaves(trees):
         if isinstance(x, CONSTANT_TYPES):
             continue
-        engine = _OWNERS.get(type(x)) or _OWNERS.setdefault(type(x), _owner(x))
+        if type(x) not in _OWNERS:
+            _OWNERS[type(x)] = _owner(x)
+        engine = _OWNERS[type(x)]
         found[engine.name] = engine
     if len(found) > 1:
         raise EngineError(
@@ -104,8 +107,8 @@ def exemplar(*trees: Tree) -> Array | None:
 
 
 def namespace(*arrays: Array) -> Any:
-    """The array-API namespace of these arrays (`array_api_compat`)."""
-    return array_namespace(*arrays)
+    """The array-API namespace of these arrays."""
+    return engine_of(*arrays).namespace
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:

@@ -25,9 +25,10 @@ FAR_OVER_DISTANCE = 1e2
 
 
 def _matrix(xp: Any, rows: list[list[Any]], like: Array) -> Array:
-    """A matrix of array scalars and numbers."""
+    """A matrix of array scalars and numbers, in the dtype of `like`."""
     zero = xp.zeros_like(like)
-    return xp.stack([xp.stack([zero + entry for entry in row]) for row in rows])
+    # Forward-mode torch widens products of a number and a scalar tensor; hence the cast.
+    return xp.astype(xp.stack([xp.stack([zero + entry for entry in row]) for row in rows]), like.dtype)
 
 
 def _flipped(matrix: Array, row_signs: tuple[float, ...]) -> Array:

@@ -306,6 +306,8 @@ class Engine(Protocol):
     """
 
     name: str
+    namespace: Any
+    """The array-API namespace of its arrays."""
 
     def owns(self, x: Any) -> bool:
         """Whether this is an array of the framework, traced ones included."""

@@ -7,7 +7,6 @@ registered in its `pyproject.toml` in the same way as anyone's. Only the plugin 
 from __future__ import annotations
 
 import difflib
-import functools
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, NamedTuple
 
@@ -32,12 +31,17 @@ class PluginInfo(NamedTuple):
     error: str | None
 
 
-@functools.cache
+_found: dict[str, dict[str, list[EntryPoint]]] = {}
+_defaults: dict[tuple[str, str], Any] = {}
+
+
 def _entries(group: str) -> dict[str, list[EntryPoint]]:
-    found: dict[str, list[EntryPoint]] = {}
-    for entry in entry_points(group=group):
-        found.setdefault(entry.name, []).append(entry)
-    return found
+    if group not in _found:
+        names: dict[str, list[EntryPoint]] = {}
+        for entry in entry_points(group=group):
+            names.setdefault(entry.name, []).append(entry)
+        _found[group] = names
+    return _found[group]
 
 
 def _group(group: str) -> str:
@@ -63,7 +67,7 @@ def plugins(group: str) -> list[str]:
 
 def _entry(group: str, name: str) -> EntryPoint:
     if name not in _entries(group):
-        _entries.cache_clear()  # A distribution may have been installed since the last look.
+        _found.clear()  # A distribution may have been installed since the last look.
     found = _entries(group).get(name)
     kind = group.removeprefix("rts.").removesuffix("s")
     if not found:
@@ -109,19 +113,15 @@ def plugin(group: str, name: str) -> Any:
         ) from error
 
 
-@functools.cache
-def _default(group: str, name: str) -> Any:
-    found = plugin(group, name)
-    return found() if isinstance(found, type) else found
-
-
 def instance(group: str, chosen: Any) -> Any:
     """A usable plugin from a name, a class or a ready object.
 
     A name gives one shared instance with default settings; a class is instantiated; anything else is returned.
     """
     if isinstance(chosen, str):
-        return _default(group, chosen)
+        if (group, chosen) not in _defaults:
+            _defaults[group, chosen] = instance(group, plugin(group, chosen))
+        return _defaults[group, chosen]
     return chosen() if isinstance(chosen, type) else chosen
 
 

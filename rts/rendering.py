@@ -22,6 +22,16 @@ APRON = 1
 BYTES_PER_CELL = 200
 """Rough memory of one cell of one layer through sampling, shading and splatting without gradients."""
 
+def _memory() -> float:
+    """Physical memory in bytes, or infinity where the system does not tell."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return math.inf
+
+
+MEMORY = _memory()
+
 AUTO = {"rts.samplers": "raster", "rts.splatters": "multi"}
 
 
@@ -231,18 +241,10 @@ def _check_size(size: Any, layers: Any, capacity: Any) -> tuple[int, int]:
         raise InputError(f"layers is {layers!r}; expected an integer of at least 1")
     if capacity is not None and (not isinstance(capacity, (int, np.integer)) or capacity < 1):
         raise InputError(f"capacity is {capacity!r}; expected an integer of at least 1, or None")
-    needed, available = height * width * layers * BYTES_PER_CELL, _memory()
-    if needed > available:
+    needed = height * width * layers * BYTES_PER_CELL
+    if needed > MEMORY:
         raise InputError(
             f"{height} x {width} pixels with {layers} layers need about {needed / 2**30:.3g} GiB, and this machine has "
-            f"{available / 2**30:.3g} GiB; choose a smaller size or fewer layers"
+            f"{MEMORY / 2**30:.3g} GiB; choose a smaller size or fewer layers"
         )
     return height, width
-
-
-def _memory() -> float:
-    """Physical memory in bytes, or infinity where the system does not tell."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return math.inf

@@ -33,6 +33,7 @@ class JaxEngine:
     """Engine of jax arrays."""
 
     name = "jax"
+    namespace = jnp
 
     def owns(self, x: Any) -> bool:
         """Whether `x` is a jax array or a tracer."""

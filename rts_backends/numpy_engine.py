@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from array_api_compat import numpy as array_api
 
 from rts.errors import EngineError
 from rts.protocols import Array, ArraySpec, Tree
@@ -19,6 +20,7 @@ class NumpyEngine:
     """Engine of plain NumPy arrays."""
 
     name = "numpy"
+    namespace = array_api
     value_and_grad = staticmethod(_forward_only)
     jvp = staticmethod(_forward_only)
     jacobian = staticmethod(_forward_only)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from array_api_compat import torch as array_api
 from torch.utils import _pytree
 
 from rts.arrays import leaves, map_leaves
@@ -69,6 +70,7 @@ class TorchEngine:
     """Engine of torch tensors."""
 
     name = "torch"
+    namespace = array_api
 
     def owns(self, x: Any) -> bool:
         """Whether `x` is a tensor."""
