@@ -6,6 +6,7 @@ differentiate only that.
 
 from rts.camera import Camera
 from rts.errors import EngineError, InputError, PluginError, RtsError
+from rts.fitting import Fit, fit, rigid
 from rts.protocols import Fragments, GBuffer, Part, Proxy, Sampled, Samples
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples, sample
@@ -14,6 +15,7 @@ from rts.sampling import TriangleSampler
 __all__ = [
     "Camera",
     "EngineError",
+    "Fit",
     "Fragments",
     "GBuffer",
     "InputError",
@@ -24,9 +26,11 @@ __all__ = [
     "Sampled",
     "Samples",
     "TriangleSampler",
+    "fit",
     "plugin",
     "plugins",
     "render",
     "render_samples",
+    "rigid",
     "sample",
 ]

@@ -37,7 +37,7 @@ def _flipped(matrix: Array, row_signs: tuple[float, ...]) -> Array:
     return xp.stack([matrix[i, :] * s for i, s in enumerate(row_signs)])
 
 
-def _affine(linear: Array, translation: Array) -> Array:
+def affine_matrix(linear: Array, translation: Array) -> Array:
     """(4, 4) from a (3, 3) linear map and a (3,) translation."""
     xp = namespace(linear)
     last = xp.zeros_like(translation)
@@ -132,7 +132,7 @@ def look_at(eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0)) -> Array:
     back = unit(eye - target)
     right = unit(xp.linalg.cross(up, back))
     linear = xp.stack([right, xp.linalg.cross(back, right), back])
-    return _affine(linear, -matmul(linear, eye[:, None])[:, 0])
+    return affine_matrix(linear, -matmul(linear, eye[:, None])[:, 0])
 
 
 class Camera(NamedTuple):
@@ -227,7 +227,7 @@ class Camera(NamedTuple):
         if tuple(K.shape) != (3, 3) or tuple(R.shape) != (3, 3):
             raise InputError(f"K has shape {tuple(K.shape)} and R {tuple(R.shape)}; expected (3, 3) both")
         height, width = size
-        view = _flipped(_affine(R, xp.reshape(t, (3,))), (1, -1, -1, 1))
+        view = _flipped(affine_matrix(R, xp.reshape(t, (3,))), (1, -1, -1, 1))
         cx, cy = K[0, 2] + (0.5 - pixel_center), K[1, 2] + (0.5 - pixel_center)
         depth = far - near
         projection = _matrix(
@@ -291,7 +291,7 @@ class Camera(NamedTuple):
         height, width = size
         sx, sy = min(size) / width, min(size) / height
         focal = focal + xp.zeros_like(point)
-        view = _flipped(_affine(xp.linalg.matrix_transpose(R), T), (-1, 1, -1, 1))
+        view = _flipped(affine_matrix(xp.linalg.matrix_transpose(R), T), (-1, 1, -1, 1))
         depth = far - near
         projection = _matrix(
             xp,
@@ -319,7 +319,7 @@ class Camera(NamedTuple):
             far: far plane.
         """
         xp, (c2w, focal) = promote(camera_to_world, focal)
-        c2w = _affine(c2w[:3, :3], c2w[:3, 3])
+        c2w = affine_matrix(c2w[:3, :3], c2w[:3, 3])
         fov_y = xp.atan(size[0] / (2 * focal)) * (360 / math.pi)
         fov_y = fov_y if not is_constant(fov_y) else float(fov_y)
         return cls(*_alike(xp.linalg.inv(c2w), perspective(fov_y, size[1] / size[0], near, far)))
@@ -368,7 +368,10 @@ class Camera(NamedTuple):
 
     def within(self, transform: Array | None) -> Camera:
         """The same camera in the local space of a part with this world-from-local transform."""
-        return self if transform is None else self._replace(view=matmul(self.view, transform))
+        if transform is None:
+            return self
+        _, (view, transform) = promote(self.view, transform)
+        return self._replace(view=matmul(view, transform))
 
     def with_apron(self, size: tuple[int, int], apron: int) -> Camera:
         """The camera of the image with `apron` more pixels on every side."""
