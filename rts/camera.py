@@ -54,6 +54,14 @@ def _check_range(near: Any, far: Any, *, positive: bool) -> None:
         raise InputError(f"near is {near}; a perspective camera needs near > 0")
 
 
+def _check_shapes(given: dict[str, tuple[Array, tuple[tuple[int, ...], ...]]]) -> None:
+    """Refuse arrays whose shape is none of those expected."""
+    for name, (array, expected) in given.items():
+        if tuple(array.shape) not in expected:
+            shapes = " or ".join(map(str, expected))
+            raise InputError(f"{name} has shape {tuple(array.shape)}; expected {shapes}")
+
+
 def perspective(
     fov_y: Any, aspect: Any = 1.0, near: Any = 0.1, far: Any = 100.0, principal_point: Any = (0.0, 0.0)
 ) -> Array:
@@ -121,14 +129,14 @@ def look_at(eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0)) -> Array:
     """
     if is_constant((eye, target, up)):
         eye_, target_, up_ = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
-        if any(v.shape != (3,) for v in (eye_, target_, up_)):
-            raise InputError(f"eye, target and up have shapes {eye_.shape}, {target_.shape}, {up_.shape}; expected (3,)")
+        _check_shapes({"eye": (eye_, ((3,),)), "target": (target_, ((3,),)), "up": (up_, ((3,),))})
         if not np.linalg.norm(np.cross(target_ - eye_, up_)) > 1e-12 * np.linalg.norm(target_ - eye_) * np.linalg.norm(up_):
             raise InputError(
                 f"a camera at {eye_.tolist()} that looks at {target_.tolist()} has no upright with up = {up_.tolist()}; "
                 f"move the eye or give another up"
             )
     xp, (eye, target, up) = promote(eye, target, up)
+    _check_shapes({"eye": (eye, ((3,),)), "target": (target, ((3,),)), "up": (up, ((3,),))})
     back = unit(eye - target)
     right = unit(xp.linalg.cross(up, back))
     linear = xp.stack([right, xp.linalg.cross(back, right), back])
@@ -224,8 +232,7 @@ class Camera(NamedTuple):
         """
         _check_range(near, far, positive=True)
         xp, (K, R, t, near, far) = promote(K, R, t, near, far)
-        if tuple(K.shape) != (3, 3) or tuple(R.shape) != (3, 3):
-            raise InputError(f"K has shape {tuple(K.shape)} and R {tuple(R.shape)}; expected (3, 3) both")
+        _check_shapes({"K": (K, ((3, 3),)), "R": (R, ((3, 3),)), "t": (t, ((3,), (3, 1)))})
         height, width = size
         view = _flipped(affine_matrix(R, xp.reshape(t, (3,))), (1, -1, -1, 1))
         cx, cy = K[0, 2] + (0.5 - pixel_center), K[1, 2] + (0.5 - pixel_center)
@@ -246,6 +253,7 @@ class Camera(NamedTuple):
     def from_opengl(cls, modelview: Any, projection: Any) -> Camera:
         """From OpenGL's matrices, which are ours."""
         _, (view, projection) = promote(modelview, projection)
+        _check_shapes({"modelview": (view, ((4, 4),)), "projection": (projection, ((4, 4),))})
         return cls(view, projection)
 
     @classmethod
@@ -260,7 +268,7 @@ class Camera(NamedTuple):
             projection: (4, 4).
             top_down: the projection has its y negated, so that nvdiffrast's row 0 is the top already.
         """
-        _, (view, projection) = promote(modelview, projection)
+        view, projection = cls.from_opengl(modelview, projection)
         return cls(view, _flipped(projection, (1, -1, 1, 1)) if top_down else projection)
 
     @classmethod
@@ -288,6 +296,7 @@ class Camera(NamedTuple):
         """
         _check_range(near, far, positive=True)
         xp, (R, T, focal, point, near, far) = promote(R, T, focal_length, principal_point, near, far)
+        _check_shapes({"R": (R, ((3, 3),)), "T": (T, ((3,),))})
         height, width = size
         sx, sy = min(size) / width, min(size) / height
         focal = focal + xp.zeros_like(point)
@@ -319,6 +328,7 @@ class Camera(NamedTuple):
             far: far plane.
         """
         xp, (c2w, focal) = promote(camera_to_world, focal)
+        _check_shapes({"camera_to_world": (c2w, ((4, 4), (3, 4)))})
         c2w = affine_matrix(c2w[:3, :3], c2w[:3, 3])
         fov_y = xp.atan(size[0] / (2 * focal)) * (360 / math.pi)
         fov_y = fov_y if not is_constant(fov_y) else float(fov_y)

@@ -1,0 +1,481 @@
+"""Cameras: conventions of space, converters from other libraries, derivatives of the constructors."""
+
+import numpy as np
+import pytest
+from helpers import DIFFERENTIABLE, arrays, derivative, finite_difference, gradient, moved, rigid, rotation
+
+from rts import Camera, InputError
+from rts.camera import look_at, orthographic, perspective
+
+SIZE = (40, 60)
+QUARTER_TURN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+SKEWED_K = np.array([[50.0, 2.0, 31.0], [0.0, 45.0, 22.0], [0.0, 0.0, 1.0]])
+
+
+def pixel(camera, point, size=SIZE):
+    """Pixel x, y and depth of one world point."""
+    return camera.project(np.array([point], np.float64), size)[0]
+
+
+CAMERAS = {
+    "perspective": Camera.look_at((1.0, 2.0, 5.0), (0.2, -0.3, 0.1), fov_y=50.0, aspect=1.5),
+    "off-centre": Camera.look_at((1.0, 2.0, 5.0), (0.0, 0.0, 0.0), aspect=1.5, principal_point=(0.3, -0.2)),
+    "orthographic": Camera.orthographic((1.0, 2.0, 5.0), (0.0, 0.0, 0.0), height=3.0, aspect=1.5),
+    "orthographic off-centre": Camera.orthographic(
+        (1.0, 2.0, 5.0), (0.0, 0.0, 0.0), height=3.0, aspect=1.5, principal_point=(0.3, -0.2)
+    ),
+    "skewed": Camera.from_opencv(SKEWED_K, rotation((1, 2, 3), 40), (0.1, 0.2, 6.0), SIZE),
+}
+
+
+# --------------------------------------------------------------------------------------------- conventions
+
+
+def test_perspective_pixel_of_a_point_is_the_written_out_number():
+    # At depth 5 a field of view of 90° shows y from −5 to 5: 4 pixels a unit.
+    camera = Camera.look_at((0, 0, 5), (0, 0, 0), fov_y=90, aspect=1.5)
+    np.testing.assert_allclose(pixel(camera, (1, 2, 0)), (30 + 4, 20 - 8, 5), atol=1e-12)
+
+
+def test_orthographic_pixel_of_a_point_is_the_written_out_number():
+    # 8 units high, 40 pixels high: 5 pixels a unit at any depth.
+    camera = Camera.orthographic((0, 0, 5), (0, 0, 0), height=8, aspect=1.5)
+    np.testing.assert_allclose(pixel(camera, (1, 2, 0)), (30 + 5, 20 - 10, 5), atol=1e-12)
+    np.testing.assert_allclose(pixel(camera, (1, 2, -7)), (30 + 5, 20 - 10, 12), atol=1e-12)
+
+
+@pytest.mark.parametrize("make", [Camera.look_at, lambda *a: Camera.orthographic(*a, height=2.0)])
+def test_the_target_is_in_the_middle_at_its_distance(make):
+    eye, target = np.array([3.0, -1.0, 2.0]), np.array([0.5, 0.25, -4.0])
+    np.testing.assert_allclose(
+        pixel(make(eye, target), target), (30, 20, np.linalg.norm(eye - target)), atol=1e-12
+    )
+
+
+def test_up_is_towards_row_zero_and_right_towards_larger_columns():
+    eye, target, up = np.array([3.0, -1.0, 2.0]), np.array([0.5, 0.25, -4.0]), np.array([0.2, 1.0, 0.1])
+    camera = Camera.look_at(eye, target, up)
+    right = np.cross(target - eye, up)
+    assert pixel(camera, target + 0.1 * up)[1] < 20 - 0.1
+    assert pixel(camera, target + 0.1 * up)[0] == pytest.approx(30, abs=1e-9)
+    assert pixel(camera, target + 0.1 * right)[0] > 30 + 0.1
+    assert pixel(camera, target + 0.1 * right)[1] == pytest.approx(20, abs=1e-9)
+
+
+def test_the_view_is_a_rotation_that_puts_the_eye_at_the_origin_and_looks_along_minus_z():
+    eye, target = np.array([3.0, -1.0, 2.0]), np.array([0.5, 0.25, -4.0])
+    view = look_at(eye, target, (0.2, 1.0, 0.1))
+    np.testing.assert_allclose(view[:3, :3] @ view[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(view[:3, :3]) == pytest.approx(1)
+    np.testing.assert_allclose(moved(view, eye), 0, atol=1e-12)
+    np.testing.assert_allclose(moved(view, target), (0, 0, -np.linalg.norm(eye - target)), atol=1e-12)
+    np.testing.assert_array_equal(view[3], (0, 0, 0, 1))
+
+
+@pytest.mark.parametrize("make", [Camera.look_at, lambda *a, **k: Camera.orthographic(*a, height=2.0, **k)])
+def test_the_principal_point_is_where_the_axis_meets_the_image(make):
+    camera = make((0, 0, 5), (0, 0, 0), principal_point=(0.2, -0.1))
+    np.testing.assert_allclose(pixel(camera, (0, 0, 0)), (1.2 * 30, 1.1 * 20, 5), atol=1e-12)
+
+
+@pytest.mark.parametrize("make", [perspective, orthographic])
+def test_near_and_far_planes_are_at_clip_minus_one_and_one(make):
+    for depth, expected in ((0.5, -1), (20.0, 1)):
+        clip = make(40.0, 1.5, 0.5, 20.0) @ (0, 0, -depth, 1)
+        assert clip[2] / clip[3] == pytest.approx(expected)
+
+
+def test_near_and_far_default_to_a_hundredth_and_a_hundred_times_the_distance():
+    camera = Camera.look_at((0, 0, 5), (0, 0, 0))
+    np.testing.assert_allclose(camera.projection, perspective(45.0, 1.0, 0.05, 500.0))
+
+
+def test_the_first_pixel_centre_is_at_one_half():
+    camera = Camera.orthographic((0, 0, 5), (0, 0, 0), height=40, aspect=1.5)
+    np.testing.assert_allclose(pixel(camera, (-29.5, 19.5, 0)), (0.5, 0.5, 5), atol=1e-12)
+
+
+def test_points_on_the_plane_of_the_camera_project_to_finite_values_with_depth_zero():
+    x, y, depth = pixel(Camera.look_at((0, 0, 5), (0, 0, 0)), (1, 2, 5))
+    assert np.isfinite((x, y)).all() and depth == 0
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize("depth", [0.7, 13.0])
+def test_rays_reproject_to_pixel_centres_at_their_depth(camera, depth):
+    rays = camera.rays(SIZE)
+    found = camera.project((rays.origins + depth * rays.directions).reshape(-1, 3), SIZE).reshape(*SIZE, 3)
+    rows, columns = np.indices(SIZE)
+    np.testing.assert_allclose(found[..., 0], columns + 0.5, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found[..., 1], rows + 0.5, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found[..., 2], depth, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["perspective", "orthographic"])
+def test_rays_start_on_the_plane_of_the_eye(name):
+    origins = CAMERAS[name].rays(SIZE).origins.reshape(-1, 3)
+    toward_target = np.array([0.2, -0.3, 0.1] if name == "perspective" else [0.0, 0.0, 0.0]) - (1.0, 2.0, 5.0)
+    np.testing.assert_allclose((origins - (1.0, 2.0, 5.0)) @ toward_target, 0, atol=1e-9)
+    if name == "perspective":
+        np.testing.assert_allclose(origins, np.broadcast_to((1.0, 2.0, 5.0), origins.shape), atol=1e-9)
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_an_apron_shifts_pixels_by_its_width_and_changes_nothing_else(camera):
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    found = camera.with_apron(SIZE, 3).project(points, (SIZE[0] + 6, SIZE[1] + 6))
+    np.testing.assert_allclose(found, camera.project(points, SIZE) + (3, 3, 0), atol=1e-9)
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_within_a_transform_sees_local_points_where_the_camera_sees_the_moved_ones(camera):
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    transform = rigid((1, 2, 3), 50, (0.3, 0.2, -0.1)) @ np.diag([2.0, 0.5, -1.0, 1.0])
+    found = camera.within(transform).project(points, SIZE)
+    np.testing.assert_allclose(found, camera.project(moved(transform, points), SIZE), atol=1e-9)
+    assert camera.within(None) is camera
+
+
+def test_toward_points_to_the_eye_in_perspective_and_along_the_axis_in_orthographic():
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    eye = np.array([1.0, 2.0, 5.0])
+    np.testing.assert_allclose(CAMERAS["perspective"].toward(points), eye - points, atol=1e-9)
+    parallel = CAMERAS["orthographic"].toward(points)
+    np.testing.assert_allclose(np.cross(parallel, eye), 0, atol=1e-9)
+    assert (parallel @ eye > 0).all()
+
+
+# ---------------------------------------------------------------------------------------------- converters
+
+
+@pytest.mark.parametrize("pixel_center, expected", [(0.0, (44.5, 33.75, 4)), (0.5, (44.0, 33.25, 4))])
+def test_opencv_point_lands_half_a_pixel_beyond_its_u_v(pixel_center, expected):
+    # R X + t = (3, 2, −1) + t = (1, 1, 4); u = (50 · 1 + 2 · 1) / 4 + 31 = 44, v = 45 / 4 + 22 = 33.25, where
+    # OpenCV has the centre of the first pixel at (0, 0) and we at (0.5, 0.5).
+    camera = Camera.from_opencv(SKEWED_K, QUARTER_TURN, (-2, -1, 5), SIZE, pixel_center=pixel_center)
+    np.testing.assert_allclose(pixel(camera, (1, 2, 3)), expected, atol=1e-12)
+
+
+def test_opencv_looks_along_plus_z_with_y_down():
+    camera = Camera.from_opencv(np.array([[50.0, 0, 30], [0, 50, 20], [0, 0, 1]]), np.eye(3), (0, 0, 0), SIZE)
+    x, y, depth = pixel(camera, (0.1, 0.2, 1.0))
+    assert x > 30 and y > 20 and depth == 1
+
+
+def test_opencv_translation_may_be_a_column():
+    row = Camera.from_opencv(SKEWED_K, QUARTER_TURN, (-2, -1, 5), SIZE)
+    column = Camera.from_opencv(SKEWED_K, QUARTER_TURN, np.array([[-2], [-1], [5]]), SIZE)
+    np.testing.assert_array_equal(row.view, column.view)
+
+
+def test_opengl_window_point_is_ours_counted_from_the_top():
+    # glFrustum(−1, 2, −1, 1.5, 1, 10), eye space (0.5, 0.25, −2): NDC x = (2/3 · 0.5 − 1/3 · 2) / 2 = −1/6
+    # and y = (0.8 · 0.25 − 0.2 · 2) / 2 = −0.1; window (5/6 · 30, 0.9 · 20) = (25, 18) from the lower left.
+    frustum = np.array([[2 / 3, 0, 1 / 3, 0], [0, 0.8, 0.2, 0], [0, 0, -11 / 9, -20 / 9], [0, 0, -1, 0]])
+    modelview = np.eye(4)
+    modelview[:3, 3] = (0.5, 0.25, -1.0)
+    camera = Camera.from_opengl(modelview, frustum)
+    np.testing.assert_allclose(pixel(camera, (0, 0, -1)), (25, 40 - 18, 2), atol=1e-12)
+
+
+def test_nvdiffrast_sample_position_is_ours_with_rows_reversed():
+    # nvdiffrast samples column i, row j at NDC ((2 i + 1) / w − 1, (2 j + 1) / h − 1), row 0 at NDC y = −1.
+    # Clip (0.75, −0.3, ·, 3): column coordinate 1.25 · 30 = 37.5, row coordinate 0.9 · 20 = 18 from the bottom.
+    projection = np.array([[1.5, 0, 0, 0], [0, 0.6, 0, 0], [0, 0, -11 / 9, -20 / 9], [0, 0, -1, 0]])
+    point = (0.5, -0.5, -3.0)
+    np.testing.assert_allclose(
+        pixel(Camera.from_nvdiffrast(np.eye(4), projection), point), (37.5, 22, 3), atol=1e-12
+    )
+    # Negating y puts nvdiffrast's row 0 on top: its row coordinate, 22, is then ours.
+    flipped = np.diag([1.0, -1, 1, 1]) @ projection
+    camera = Camera.from_nvdiffrast(np.eye(4), flipped, top_down=True)
+    np.testing.assert_allclose(pixel(camera, point), (37.5, 22, 3), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "size, expected", [((40, 60), (13, 14, 4)), ((60, 40), (3, 24, 4)), ((40, 40), (3, 14, 4))]
+)
+def test_pytorch3d_ndc_spans_the_shorter_side_with_x_left_and_y_up(size, expected):
+    # X R + T = (−3, 2, 1) + T = (1, 1, 4); NDC x = 3 / 4 + 0.1 = 0.85, y = 2 / 4 − 0.2 = 0.3; the shorter
+    # side, 40 pixels, is 2 long, and the pixel is (w / 2 − 20 · 0.85, h / 2 − 20 · 0.3).
+    camera = Camera.from_pytorch3d(
+        QUARTER_TURN, (4, -1, 3), focal_length=(3, 2), principal_point=(0.1, -0.2), size=size
+    )
+    np.testing.assert_allclose(pixel(camera, (1, 2, 3), size), expected, atol=1e-12)
+
+
+def test_pytorch3d_focal_length_may_be_one_number_and_is_the_cotangent_of_half_the_field_of_view():
+    R = np.diag([-1.0, 1.0, -1.0])
+    camera = Camera.from_pytorch3d(
+        R, (0, 0, 0), focal_length=1 / np.tan(np.radians(25)), size=SIZE, near=0.1, far=9
+    )
+    np.testing.assert_allclose(camera.projection, perspective(50, 1.5, 0.1, 9), atol=1e-12)
+    np.testing.assert_allclose(camera.view, np.eye(4), atol=1e-12)
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_blender_camera_looks_along_its_minus_z_with_focal_in_pixels(rows):
+    # Camera space (0.4, 0.2, −2): pixel (30 + 50 · 0.4 / 2, 20 − 50 · 0.2 / 2).
+    camera_to_world = np.eye(4)
+    camera_to_world[:3, :3], camera_to_world[:3, 3] = QUARTER_TURN, (1, 2, 3)
+    # QUARTER_TURN (0.4, 0.2, −2) + (1, 2, 3)
+    world = (-1.0, 2.2, 2.6)
+    camera = Camera.from_blender(camera_to_world[:rows], SIZE, focal=50.0)
+    np.testing.assert_allclose(pixel(camera, world), (40, 15, 2), atol=1e-12)
+
+
+def test_the_converters_agree_on_one_camera():
+    camera = Camera.look_at((1, 2, 5), (0, 0, 0), aspect=1.5, near=0.05, far=500)
+    limits = {"near": 0.05, "far": 500}
+    R, T, focal, point = camera.to_pytorch3d(SIZE)
+    camera_to_world, pixels = camera.to_blender(SIZE)
+    others = {
+        "opencv": Camera.from_opencv(*camera.to_opencv(SIZE), SIZE, **limits),
+        "opencv, centre at 0.5": Camera.from_opencv(
+            *camera.to_opencv(SIZE, pixel_center=0.5), SIZE, pixel_center=0.5, **limits
+        ),
+        "opengl": Camera.from_opengl(*camera.to_opengl()),
+        "nvdiffrast": Camera.from_nvdiffrast(*camera.to_nvdiffrast()),
+        "nvdiffrast, top down": Camera.from_nvdiffrast(*camera.to_nvdiffrast(top_down=True), top_down=True),
+        "pytorch3d": Camera.from_pytorch3d(
+            R, T, focal_length=focal, principal_point=point, size=SIZE, **limits
+        ),
+        "blender": Camera.from_blender(camera_to_world, SIZE, focal=pixels, **limits),
+    }
+    for name, other in others.items():
+        for ours, theirs in zip(camera, other, strict=True):
+            np.testing.assert_allclose(theirs, ours, atol=1e-12, err_msg=name)
+
+
+def test_opencv_round_trip_keeps_skew_and_principal_point():
+    R, t = rotation((1, 2, 3), 40), np.array([0.1, 0.2, 6.0])
+    for center in (0.0, 0.5):
+        camera = Camera.from_opencv(SKEWED_K, R, t, SIZE, pixel_center=center)
+        for found, given in zip(camera.to_opencv(SIZE, pixel_center=center), (SKEWED_K, R, t), strict=True):
+            np.testing.assert_allclose(found, given, atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [(40, 60), (60, 40)])
+def test_pytorch3d_round_trip(size):
+    given = (rotation((1, 2, 3), 40), np.array([0.1, 0.2, 6.0]), np.array([3.0, 2.0]), np.array([0.1, -0.2]))
+    camera = Camera.from_pytorch3d(
+        given[0], given[1], focal_length=given[2], principal_point=given[3], size=size
+    )
+    for found, expected in zip(camera.to_pytorch3d(size), given, strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+# --------------------------------------------------------------------------------------------- derivatives
+
+CONSTRUCTORS = {
+    "look_at": (
+        lambda a: Camera.look_at(
+            a["eye"],
+            a["target"],
+            a["up"],
+            fov_y=a["fov_y"],
+            aspect=a["aspect"],
+            near=a["near"],
+            far=a["far"],
+            principal_point=a["point"],
+        ),
+        {
+            "eye": (1.0, 2.0, 5.0),
+            "target": (0.1, 0.2, 0.3),
+            "up": (0.1, 1.0, 0.2),
+            "fov_y": 50.0,
+            "aspect": 1.5,
+            "near": 0.5,
+            "far": 9.0,
+            "point": (0.1, 0.2),
+        },
+    ),
+    "look_at, default planes": (
+        lambda a: Camera.look_at(a["eye"], a["target"]),
+        {"eye": (1.0, 2.0, 5.0), "target": (0.1, 0.2, 0.3)},
+    ),
+    "orthographic": (
+        lambda a: Camera.orthographic(
+            a["eye"],
+            a["target"],
+            a["up"],
+            height=a["height"],
+            aspect=a["aspect"],
+            near=a["near"],
+            far=a["far"],
+            principal_point=a["point"],
+        ),
+        {
+            "eye": (1.0, 2.0, 5.0),
+            "target": (0.1, 0.2, 0.3),
+            "up": (0.1, 1.0, 0.2),
+            "height": 3.0,
+            "aspect": 1.5,
+            "near": 0.5,
+            "far": 9.0,
+            "point": (0.1, 0.2),
+        },
+    ),
+    "from_opencv": (
+        lambda a: Camera.from_opencv(a["K"], a["R"], a["t"], SIZE, near=a["near"], far=a["far"]),
+        {"K": SKEWED_K, "R": rotation((1, 2, 3), 40), "t": (0.1, 0.2, 6.0), "near": 0.5, "far": 9.0},
+    ),
+    "from_opengl": (
+        lambda a: Camera.from_opengl(a["modelview"], a["projection"]),
+        {"modelview": rigid((1, 2, 3), 40, (0.1, 0.2, 6.0)), "projection": perspective(50.0, 1.5, 0.5, 9.0)},
+    ),
+    "from_nvdiffrast": (
+        lambda a: Camera.from_nvdiffrast(a["modelview"], a["projection"], top_down=True),
+        {"modelview": rigid((1, 2, 3), 40, (0.1, 0.2, 6.0)), "projection": perspective(50.0, 1.5, 0.5, 9.0)},
+    ),
+    "from_pytorch3d": (
+        lambda a: Camera.from_pytorch3d(
+            a["R"],
+            a["T"],
+            focal_length=a["focal"],
+            principal_point=a["point"],
+            size=SIZE,
+            near=a["near"],
+            far=a["far"],
+        ),
+        {
+            "R": rotation((1, 2, 3), 40),
+            "T": (0.1, 0.2, 6.0),
+            "focal": (3.0, 2.0),
+            "point": (0.1, -0.2),
+            "near": 0.5,
+            "far": 9.0,
+        },
+    ),
+    "from_blender": (
+        lambda a: Camera.from_blender(
+            a["camera_to_world"], SIZE, focal=a["focal"], near=a["near"], far=a["far"]
+        ),
+        {"camera_to_world": rigid((1, 2, 3), 40, (0.1, 0.2, 6.0)), "focal": 50.0, "near": 0.5, "far": 9.0},
+    ),
+}
+VIEW_WEIGHTS, PROJECTION_WEIGHTS = np.random.default_rng(0).normal(size=(2, 4, 4))
+
+
+def weighted_sum(make, target, dtype=np.float64):
+    """A scalar function of a constructor's arguments that depends on all 32 numbers of the camera."""
+    weights = arrays(target, (VIEW_WEIGHTS, PROJECTION_WEIGHTS), dtype)
+
+    def f(arguments):
+        return sum((w * m).sum() for w, m in zip(weights, make(arguments), strict=True))
+
+    return f
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize("name", CONSTRUCTORS)
+def test_constructor_gradient_and_jvp_in_all_arguments_are_the_finite_difference(name, target):
+    make, arguments = CONSTRUCTORS[name]
+    arguments = {key: np.array(value, np.float64) for key, value in arguments.items()}
+    expected = finite_difference(weighted_sum(make, "numpy"), arguments)
+    dtype, tolerance = (np.float32, 2e-3) if target == "jax" else (np.float64, 1e-6)
+    f, given = weighted_sum(make, target, dtype), arrays(target, arguments, dtype)
+    found = gradient(target, f, given)
+    for key in arguments:
+        np.testing.assert_allclose(found[key], expected[key], rtol=tolerance, atol=tolerance, err_msg=key)
+    rng = np.random.default_rng(1)
+    direction = {key: rng.normal(size=value.shape) for key, value in arguments.items()}
+    _, along = derivative(target, f, given, arrays(target, direction, dtype))
+    product = sum(np.sum(expected[key] * direction[key]) for key in arguments)
+    assert along == pytest.approx(product, rel=tolerance, abs=tolerance)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize("name, argument", [(n, a) for n in CONSTRUCTORS for a in CONSTRUCTORS[n][1]])
+def test_each_argument_alone_may_be_differentiable_beside_plain_numbers(name, argument, target):
+    make, arguments = CONSTRUCTORS[name]
+    camera = make(arguments | {argument: arrays(target, np.array(arguments[argument]))})
+    plain = make(arguments)
+    for found, expected in zip(camera, plain, strict=True):
+        assert type(found) is type(arrays(target, np.zeros(1)))
+        np.testing.assert_allclose(np.asarray(found), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_an_eye_listed_as_traced_scalars_is_differentiable():
+    torch = pytest.importorskip("torch")
+    x = torch.tensor(1.0, requires_grad=True)
+    camera = Camera.look_at((x, 2.0, 5.0), (0.0, 0.0, 0.0))
+    x_of_camera = -(camera.view[:3, :3].T @ camera.view[:3, 3])[0]
+    (slope,) = torch.autograd.grad(x_of_camera, x)
+    assert slope == pytest.approx(1, abs=1e-5)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_project_gradient_in_points_is_the_finite_difference(target):
+    points = np.random.default_rng(0).normal(size=(3, 3))
+    weights = np.random.default_rng(1).normal(size=(3, 3))
+    camera = CAMERAS["skewed"]
+    expected = finite_difference(lambda p: (camera.project(p, SIZE) * weights).sum(), points)
+    there, w = arrays(target, camera), arrays(target, weights)
+    found = gradient(target, lambda p: (there.project(p, SIZE) * w).sum(), arrays(target, points))
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_project_gradient_is_finite_on_the_plane_of_the_camera(target):
+    camera = arrays(target, Camera.look_at((0, 0, 5), (0, 0, 0)))
+    found = gradient(
+        target, lambda p: camera.project(p, SIZE).sum(), arrays(target, np.array([[1.0, 2.0, 5.0]]))
+    )
+    assert np.isfinite(found).all()
+
+
+# -------------------------------------------------------------------------------------------------- errors
+
+
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda: perspective(45, 1, 2.0, 1.0), ("near", "2.0", "far")),
+        (lambda: perspective(45, 1, 1.0, 1.0), ("near < far",)),
+        (lambda: perspective(45, 1, 0.0, 1.0), ("near > 0",)),
+        (lambda: perspective(45, 1, -1.0, 1.0), ("near > 0",)),
+        (lambda: perspective(45, 1, 0.1, float("inf")), ("finite",)),
+        (lambda: perspective(45, 1, float("nan"), 1.0), ("finite",)),
+        (lambda: perspective(0), ("fov_y", "degrees")),
+        (lambda: perspective(180), ("fov_y", "180")),
+        (lambda: perspective(-30), ("fov_y", "-30")),
+        (lambda: orthographic(0), ("height", "positive")),
+        (lambda: orthographic(2, 1, 3.0, 2.0), ("near", "far")),
+        (lambda: look_at((1, 2, 3), (1, 2, 3)), ("upright", "[1.0, 2.0, 3.0]")),
+        (lambda: look_at((0, 5, 0), (0, 0, 0)), ("upright", "up")),
+        (lambda: look_at((0, 5, 0), (0, 0, 1), (0, 0, 0)), ("upright",)),
+        (lambda: look_at((0, 5), (0, 0, 0)), ("eye has shape (2,)", "expected (3,)")),
+        (lambda: look_at((0, float("nan"), 1), (0, 0, 0)), ("upright",)),
+        (lambda: Camera.look_at((0, 0, 5), (0, 0, 0), near=3, far=1), ("near < far",)),
+        (lambda: Camera.orthographic((0, 0, 5), (0, 0, 0), height=-1), ("height",)),
+        (
+            lambda: Camera.from_opencv(np.eye(4), np.eye(3), np.zeros(3), SIZE),
+            ("K has shape (4, 4)", "(3, 3)"),
+        ),
+        (
+            lambda: Camera.from_opencv(np.eye(3), np.eye(4), np.zeros(3), SIZE),
+            ("R has shape (4, 4)", "(3, 3)"),
+        ),
+        (lambda: Camera.from_opencv(np.eye(3), np.eye(3), np.zeros(4), SIZE), ("t has shape (4,)", "(3,)")),
+        (lambda: Camera.from_opencv(np.eye(3), np.eye(3), np.zeros(3), SIZE, near=2, far=1), ("near < far",)),
+        (
+            lambda: Camera.from_pytorch3d(np.eye(4), np.zeros(3), focal_length=1.0, size=SIZE),
+            ("R has shape (4, 4)", "(3, 3)"),
+        ),
+        (
+            lambda: Camera.from_pytorch3d(np.eye(3), np.zeros(2), focal_length=1.0, size=SIZE),
+            ("T has shape (2,)", "(3,)"),
+        ),
+        (lambda: Camera.from_blender(np.eye(3), SIZE, focal=50.0), ("camera_to_world", "(3, 3)", "(4, 4)")),
+        (lambda: Camera.from_opengl(np.eye(3), np.eye(4)), ("modelview", "(3, 3)", "(4, 4)")),
+        (lambda: Camera.from_nvdiffrast(np.eye(4), np.eye(3)), ("projection", "(3, 3)", "(4, 4)")),
+    ],
+)
+def test_bad_camera_is_an_input_error_that_says_what_was_given(call, words):
+    with pytest.raises(InputError) as error:
+        call()
+    message = str(error.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message
