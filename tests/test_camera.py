@@ -180,7 +180,7 @@ def test_opengl_window_point_is_ours_counted_from_the_top():
 
 def test_nvdiffrast_sample_position_is_ours_with_rows_reversed():
     # nvdiffrast samples column i, row j at NDC ((2 i + 1) / w − 1, (2 j + 1) / h − 1), row 0 at NDC y = −1.
-    # Clip (0.75, −0.3, ·, 3): column coordinate 1.25 · 30 = 37.5, row coordinate 0.9 · 20 = 18 from the bottom.
+    # Clip (0.75, −0.3, ·, 3): column coordinate 1.25 · 30 = 37.5, row coordinate 0.9 · 20 = 18, from below.
     projection = np.array([[1.5, 0, 0, 0], [0, 0.6, 0, 0], [0, 0, -11 / 9, -20 / 9], [0, 0, -1, 0]])
     point = (0.5, -0.5, -3.0)
     np.testing.assert_allclose(

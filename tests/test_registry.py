@@ -1,0 +1,308 @@
+"""Plugins by name: what is found, what is loaded, and what the errors say."""
+
+import ast
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rts
+from rts import registry
+
+HEAVY = (
+    "torch",
+    "jax",
+    "numba",
+    "embreex",
+    "moderngl",
+    "trimesh",
+    "scipy",
+    "PIL",
+    "imageio",
+    "matplotlib",
+    "optax",
+)
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Install a small distribution in a folder of its own, uninstalled after the test."""
+    monkeypatch.setattr(registry, "_found", {})
+    monkeypatch.setattr(registry, "_defaults", {})
+    modules_before = set(sys.modules)
+
+    def call(name, entry_points, modules, extras=(), version="1.2"):
+        root = tmp_path / name
+        info = root / f"{name}-{version}.dist-info"
+        info.mkdir(parents=True)
+        provides = "".join(f"Provides-Extra: {extra}\n" for extra in extras)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n{provides}")
+        groups = "".join(
+            f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in entries.items())
+            for group, entries in entry_points.items()
+        )
+        (info / "entry_points.txt").write_text(groups)
+        for module, source in modules.items():
+            (root / f"{module}.py").write_text(source)
+        monkeypatch.syspath_prepend(str(root))
+
+    yield call
+    for module in set(sys.modules) - modules_before:
+        if str(tmp_path) in str(getattr(sys.modules[module], "__file__", "")):
+            del sys.modules[module]
+
+
+def modules_after(code):
+    """Names of the modules that a fresh interpreter has loaded after some code."""
+    script = f"import json, sys\n{code}\nprint(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return set(json.loads(done.stdout))
+
+
+# ------------------------------------------------------------------------------------------- what is found
+
+
+@pytest.mark.parametrize(
+    "group, names",
+    [
+        ("rts.engines", ("jax", "numpy", "torch")),
+        ("rts.surfaces", ("mesh",)),
+        ("rts.samplers", ("raster", "reference")),
+        ("rts.shaders", ("blinn_phong", "depth", "lambert", "normals", "silhouette", "textured", "unlit")),
+        ("rts.splatters", ("multi", "none", "single")),
+    ],
+)
+def test_built_in_plugins_are_registered_and_listed_in_order(group, names):
+    found = rts.plugins(group)
+    assert set(names) <= set(found)
+    assert found == sorted(found)
+    assert rts.plugins(group.removeprefix("rts.")) == found
+
+
+def test_a_name_gives_what_its_entry_point_names():
+    from rts.splatting import Multi
+
+    assert rts.plugin("rts.splatters", "multi") is Multi
+    assert rts.plugin("splatters", "multi") is Multi
+
+
+def test_a_name_gives_one_shared_instance_a_class_a_new_one_an_object_itself():
+    from rts.splatting import Multi
+
+    shared = registry.instance("rts.splatters", "multi")
+    assert isinstance(shared, Multi) and registry.instance("rts.splatters", "multi") is shared
+    made = registry.instance("rts.splatters", Multi)
+    assert isinstance(made, Multi) and made is not shared
+    ready = Multi(sigma=0.4)
+    assert registry.instance("rts.splatters", ready) is ready
+
+
+def test_a_plugin_of_another_distribution_is_used_by_its_name(install):
+    source = (
+        "class White:\n"
+        "    def splat(self, positions, rgba, row):\n"
+        "        return 0 * row[0][..., None] + rgba[:1] * 0 + 0.25\n"
+    )
+    install("flat", {"rts.splatters": {"flat": "flat_plugin:White"}}, {"flat_plugin": source})
+    vertices = np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0)], np.float32)
+    mesh = rts.plugin("surfaces", "mesh")([(0, 1, 2)])
+    camera = rts.Camera.look_at((0, 0, 3), (0, 0, 0))
+    image = rts.render(rts.Part(mesh, {"vertices": vertices}), camera, (4, 5), splatter="flat")
+    np.testing.assert_array_equal(image, np.full((4, 5, 4), 0.25))
+
+
+def test_a_distribution_installed_after_the_first_look_is_found(install):
+    assert "late" not in rts.plugins("splatters")
+    install("late", {"rts.splatters": {"late": "late_plugin:Late"}}, {"late_plugin": "class Late: pass"})
+    assert rts.plugin("splatters", "late").__name__ == "Late"
+    assert "late" in rts.plugins("splatters")
+
+
+def test_a_survey_names_the_distribution_and_why_a_plugin_does_not_load(install):
+    install(
+        "mixed",
+        {"rts.splatters": {"good": "mixed_good:Good", "bad": "mixed_bad:Bad"}},
+        {"mixed_good": "class Good: pass", "mixed_bad": "raise RuntimeError('no display')"},
+        version="3.4",
+    )
+    lines = {info.name: info for info in registry.survey() if info.group == "rts.splatters"}
+    assert lines["good"].error is None and lines["good"].distribution == "mixed 3.4"
+    assert "no display" in lines["bad"].error
+    assert lines["multi"].error is None and lines["multi"].distribution.startswith("rts ")
+
+
+# ------------------------------------------------------------------------------------------ what is loaded
+
+
+def test_importing_the_library_loads_no_framework_and_no_plugin():
+    loaded = modules_after("import rts")
+    assert not loaded & {*HEAVY, "rts_backends", "rts_surfaces"}
+    assert "rts.rendering" in loaded
+
+
+def test_only_the_plugin_asked_for_is_imported():
+    loaded = modules_after("import rts; rts.plugin('samplers', 'reference'); rts.plugin('surfaces', 'mesh')")
+    assert {"rts_backends.reference", "rts_surfaces.mesh"} <= loaded
+    assert {m for m in loaded if m.startswith(("rts_backends.", "rts_surfaces."))} == {
+        "rts_backends.reference",
+        "rts_surfaces.mesh",
+    }
+    assert not loaded & set(HEAVY)
+
+
+def test_listing_names_imports_no_plugin():
+    loaded = modules_after("import rts; [rts.plugins(g) for g in rts.registry.GROUPS]")
+    assert not {m for m in loaded if m.startswith(("rts_backends", "rts_surfaces"))}
+
+
+def test_rendering_numpy_arrays_loads_neither_torch_nor_jax():
+    loaded = modules_after(
+        "import numpy as np, rts\n"
+        "mesh = rts.plugin('surfaces', 'mesh')([(0, 1, 2)])\n"
+        "part = rts.Part(mesh, {'vertices': np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0)], np.float32)})\n"
+        "image = rts.render(part, rts.Camera.look_at((0, 0, 3), (0, 0, 0)), (4, 5), sampler='reference')\n"
+        "assert image[2, 2, 3] == 1"
+    )
+    assert not loaded & set(HEAVY)
+
+
+def test_the_core_never_imports_a_plugin_package():
+    files = sorted(Path(rts.__file__).parent.rglob("*.py"))
+    assert len(files) > 5
+    for file in files:
+        for node in ast.walk(ast.parse(file.read_text())):
+            names = []
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            for name in names:
+                assert name.split(".")[0] not in ("rts_backends", "rts_surfaces"), f"{file.name}: {name}"
+
+
+# -------------------------------------------------------------------------------------- what errors say
+
+
+def one_line(error):
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def test_a_misspelt_name_lists_the_names_and_suggests_one():
+    with pytest.raises(rts.InputError) as error:
+        rts.plugin("rts.samplers", "rastr")
+    message = one_line(error)
+    assert "no sampler named 'rastr'" in message and "reference" in message
+    assert "did you mean 'raster'?" in message
+
+
+def test_a_name_like_no_other_gets_no_suggestion():
+    with pytest.raises(rts.InputError) as error:
+        rts.plugin("rts.samplers", "qqqqqq")
+    assert "raster" in one_line(error) and "did you mean" not in one_line(error)
+
+
+def test_a_misspelt_group_lists_the_groups_and_suggests_one():
+    with pytest.raises(rts.InputError) as error:
+        rts.plugins("sampler")
+    message = one_line(error)
+    assert "no plugin group 'sampler'" in message and "rts.splatters" in message
+    assert "did you mean 'rts.samplers'?" in message
+
+
+def test_a_name_claimed_by_two_distributions_is_refused_naming_both(install):
+    for name in ("first", "second"):
+        install(
+            name, {"rts.splatters": {"same": f"{name}_plugin:Same"}}, {f"{name}_plugin": "class Same: pass"}
+        )
+    with pytest.raises(rts.PluginError) as error:
+        rts.plugin("splatters", "same")
+    assert "'same' is claimed by first 1.2 and second 1.2" in one_line(error)
+    assert rts.plugin("splatters", "multi").__name__ == "Multi"
+
+
+def test_a_name_of_ours_claimed_by_another_distribution_is_refused(install):
+    install(
+        "rival", {"rts.splatters": {"multi": "rival_plugin:Rival"}}, {"rival_plugin": "class Rival: pass"}
+    )
+    with pytest.raises(rts.PluginError, match="claimed by .*rival 1.2"):
+        rts.plugin("splatters", "multi")
+
+
+def test_a_missing_package_of_an_extra_names_the_pip_command(install):
+    install(
+        "needy",
+        {"rts.samplers": {"rays": "needy_plugin:Rays"}},
+        {"needy_plugin": "import a_package_that_is_absent"},
+        extras=("rays",),
+    )
+    with pytest.raises(rts.PluginError) as error:
+        rts.plugin("samplers", "rays")
+    message = one_line(error)
+    assert "'a_package_that_is_absent'" in message and "pip install 'needy[rays]'" in message
+    assert isinstance(error.value.__cause__, ModuleNotFoundError)
+
+
+def test_a_missing_package_without_an_extra_names_the_module_and_the_distribution(install):
+    install(
+        "needy",
+        {"rts.samplers": {"rays": "needy_plugin:Rays"}},
+        {"needy_plugin": "import a_package_that_is_absent"},
+    )
+    with pytest.raises(rts.PluginError) as error:
+        rts.plugin("samplers", "rays")
+    message = one_line(error)
+    assert "needy 1.2" in message and "'a_package_that_is_absent'" in message and "pip install" not in message
+
+
+@pytest.mark.parametrize("name, package", [("torch", "torch"), ("jax", "jax")])
+def test_an_engine_whose_framework_is_absent_names_our_extra(name, package):
+    code = (
+        f"import sys\nsys.modules[{package!r}] = None\nimport rts\n"
+        f"try:\n    rts.plugin('engines', {name!r})\n"
+        f"except rts.PluginError as error:\n    print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert f"needs the package '{package}': pip install 'rts[{name}]'" in done.stdout
+
+
+@pytest.mark.parametrize(
+    "source, words",
+    [
+        ("raise RuntimeError('driver too old')", ("RuntimeError", "driver too old")),
+        ("raise ImportError('libGL.so.1: cannot open shared object file')", ("ImportError", "libGL.so.1")),
+        ("def broken(:", ("SyntaxError",)),
+        ("class Other: pass", ("AttributeError", "Broken")),
+    ],
+    ids=["raises", "import error", "syntax", "no such attribute"],
+)
+def test_any_other_failure_to_import_shows_its_cause(install, source, words):
+    install("faulty", {"rts.samplers": {"broken": "faulty_plugin:Broken"}}, {"faulty_plugin": source})
+    with pytest.raises(rts.PluginError) as error:
+        rts.plugin("samplers", "broken")
+    message = str(error.value)
+    for word in ("'broken'", "faulty 1.2", "fails to import", *words):
+        assert word in message
+    assert error.value.__cause__ is not None
+
+
+def test_a_plugin_that_explains_itself_is_heard(install):
+    source = "from rts import PluginError\nraise PluginError('install libosd-dev, then reinstall')"
+    install("polite", {"rts.surfaces": {"polite": "polite_plugin:Polite"}}, {"polite_plugin": source})
+    with pytest.raises(rts.PluginError) as error:
+        rts.plugin("surfaces", "polite")
+    assert one_line(error) == "install libosd-dev, then reinstall"
+
+
+def test_a_broken_plugin_does_not_break_the_others(install):
+    install(
+        "faulty",
+        {"rts.samplers": {"broken": "faulty_plugin:Broken"}},
+        {"faulty_plugin": "raise OSError('x')"},
+    )
+    assert "broken" in rts.plugins("samplers")
+    assert rts.plugin("samplers", "reference").__name__ == "Reference"
