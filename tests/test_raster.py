@@ -1,0 +1,361 @@
+"""The rasterizer and the reference sampler: against ray casting, each other, and on watertight grids."""
+
+import numpy as np
+import pytest
+from helpers import box, icosphere, quad, rotation, soup
+
+import rts
+from rts import Camera, Proxy
+from rts.camera import orthographic, perspective
+
+numba = pytest.importorskip("numba")
+
+SIZE = (24, 30)
+NEAR, FAR = 0.5, 9.0
+SAMPLERS = ("raster", "reference")
+
+
+def rasterize(name, vertices, faces, camera, size=SIZE, layers=1, cull="none"):
+    sampler = rts.plugin("samplers", name)()
+    camera = Camera(*(np.asarray(m, np.float64) for m in camera))
+    return sampler.rasterize(sampler.prepare(Proxy(vertices, faces)), camera, size, layers, cull)
+
+
+def cast(vertices, faces, camera, size, layers, cull, near=NEAR, far=FAR):
+    """Fragments by intersecting every pixel's ray with every triangle (Möller and Trumbore 1997)."""
+    a, b, c = np.moveaxis(vertices[faces].astype(np.float64), 1, 0)
+    rays = camera.rays(size)
+    origins, directions = (x.reshape(-1, 1, 3) for x in rays)
+    p = np.cross(directions, c - a)
+    determinant = (p * (b - a)).sum(-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        v = (p * (origins - a)).sum(-1) / determinant
+        q = np.cross(origins - a, b - a)
+        w = (q * directions).sum(-1) / determinant
+        depth = (q * (c - a)).sum(-1) / determinant
+        hit = (v > 0) & (w > 0) & (v + w < 1) & (depth >= near) & (depth <= far)
+    if cull == "back":
+        hit &= (np.cross(b - a, c - a) * directions).sum(-1) < 0
+    depth = np.where(hit, depth, np.inf)
+    order = np.argsort(depth, axis=1, kind="stable")[:, :layers]
+    found = np.isfinite(np.take_along_axis(depth, order, axis=1))
+
+    def layered(x):
+        x = np.where(found, np.take_along_axis(x, order, axis=1), 0)
+        return np.moveaxis(x.reshape(*size, -1), -1, 0)
+
+    triangles = np.moveaxis(np.where(found, order, -1).reshape(*size, -1), -1, 0)
+    return triangles, np.stack([layered(1 - v - w), layered(v)], -1), layered(depth)
+
+
+def triangles(kind, seed=0):
+    """A soup of one kind, around the origin."""
+    rng = np.random.default_rng(seed)
+    if kind == "tiny":
+        return soup(400, seed, size=0.03)
+    vertices, faces = soup(50, seed, size=30.0 if kind == "huge" else 0.7)
+    corners = vertices.reshape(-1, 3, 3)
+    if kind == "slivers":
+        between = rng.uniform(0.2, 0.8, (50, 1)).astype(np.float32)
+        corners[:, 2] = corners[:, 0] * between + corners[:, 1] * (1 - between)
+        corners[:, 2] += rng.normal(0, 0.02, (50, 3))
+    if kind == "degenerate":
+        corners[::3, 1] = corners[::3, 0]
+        corners[1::6] = corners[1::6, :1]
+    return vertices, faces
+
+
+KINDS = ("interpenetrating", "slivers", "tiny", "degenerate", "huge")
+
+VIEW = Camera.look_at((1, 2, 3), (0, 0, 0)).view
+LENS = perspective(50.0, 1.25, NEAR, FAR)
+CAMERAS = {
+    "perspective": Camera(VIEW, LENS),
+    "orthographic": Camera(VIEW, orthographic(3.0, 1.25, NEAR, FAR)),
+    "inside": Camera.look_at((0.1, 0.2, 0.3), (1, 2, -1), aspect=1.25, near=NEAR, far=FAR),
+    "orthographic inside": Camera.orthographic(
+        (0.1, 0.2, 0.3), (1, 2, -1), height=3.0, aspect=1.25, near=NEAR, far=FAR
+    ),
+    "between close planes": Camera(VIEW, perspective(50.0, 1.25, 3.5, 4.0)),
+    "skewed": Camera.from_opencv(
+        np.array([[30.0, 4, 17], [0, 25, 10], [0, 0, 1]]),
+        rotation((1, 2, 3), 40),
+        (0.1, 0.2, 4),
+        SIZE,
+        near=NEAR,
+        far=FAR,
+    ),
+    "upside down": Camera(VIEW, np.diag([1.0, -1, 1, 1]) @ LENS),
+    "half turn": Camera(VIEW, np.diag([-1.0, -1, 1, 1]) @ LENS),
+    "mirrored": Camera(np.diag([-1.0, 1, 1, 1]) @ VIEW, LENS),
+    "mirrored and upside down": Camera(np.diag([-1.0, 1, 1, 1]) @ VIEW, np.diag([1.0, -1, 1, 1]) @ LENS),
+    "orthographic upside down": Camera(VIEW, np.diag([1.0, -1, 1, 1]) @ orthographic(3.0, 1.25, NEAR, FAR)),
+    "seen through a stretched part": Camera(VIEW @ np.diag([-2.0, 0.7, 1.3, 1]), LENS),
+}
+
+
+# ---------------------------------------------------------------------------------------- against ray casting
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_fragments_are_the_nearest_hits_of_each_ray(sampler, kind, camera):
+    near, far = (3.5, 4.0) if camera is CAMERAS["between close planes"] else (NEAR, FAR)
+    vertices, faces = triangles(kind)
+    total = 0
+    for layers, cull in ((1, "none"), (2, "back"), (4, "none")):
+        found = rasterize(sampler, vertices, faces, camera, SIZE, layers, cull)
+        ids, barycentrics, depth = cast(vertices, faces, camera, SIZE, layers, cull, near, far)
+        np.testing.assert_array_equal(found.triangle_ids, ids)
+        np.testing.assert_allclose(found.barycentrics, barycentrics, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(found.depth, depth, rtol=1e-6)
+        total += (ids >= 0).sum()
+    assert total > 5
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_raster_finds_what_the_reference_finds_among_thousands(camera):
+    parts = [triangles(kind, seed) for seed in (1, 2) for kind in KINDS] + [soup(2000, 3, size=0.2)]
+    offsets = np.cumsum([0, *(len(v) for v, _ in parts)])
+    vertices = np.concatenate([v for v, _ in parts])
+    faces = np.concatenate([f + o for (_, f), o in zip(parts, offsets, strict=False)]).astype(np.int32)
+    for layers in (1, 2, 4):
+        for cull in ("none", "back"):
+            found = rasterize("raster", vertices, faces, camera, SIZE, layers, cull)
+            expected = rasterize("reference", vertices, faces, camera, SIZE, layers, cull)
+            np.testing.assert_array_equal(found.triangle_ids, expected.triangle_ids)
+            np.testing.assert_allclose(found.barycentrics, expected.barycentrics, rtol=1e-6, atol=1e-6)
+            np.testing.assert_allclose(found.depth, expected.depth, rtol=1e-6)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_samples_reproject_to_their_pixel_centres_at_their_depth(sampler):
+    vertices, faces = icosphere(2)
+    camera = CAMERAS["perspective"]
+    found = rasterize(sampler, vertices, faces, camera, SIZE, 2)
+    k, y, x = np.nonzero(found.triangle_ids >= 0)
+    b = found.barycentrics[k, y, x].astype(np.float64)
+    weights = np.concatenate([b, 1 - b.sum(axis=1, keepdims=True)], axis=1)
+    points = (vertices[faces[found.triangle_ids[k, y, x]]] * weights[..., None]).sum(axis=1)
+    projected = camera.project(points, SIZE)
+    np.testing.assert_allclose(projected[:, 0], x + 0.5, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(projected[:, 1], y + 0.5, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(projected[:, 2], found.depth[k, y, x], rtol=1e-6)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_layers_come_front_to_back_and_empty_ones_last(sampler):
+    vertices, faces = soup(200, size=0.5)
+    found = rasterize(sampler, vertices, faces, CAMERAS["perspective"], SIZE, 4)
+    covered = found.triangle_ids >= 0
+    assert covered[3].any() and not covered.all()
+    assert (covered[:-1] | ~covered[1:]).all()
+    assert (found.depth[:-1] <= found.depth[1:])[covered[1:]].all()
+    np.testing.assert_array_equal(found.depth[~covered], 0)
+    np.testing.assert_array_equal(found.barycentrics[~covered], 0)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_fewer_layers_are_the_first_of_more(sampler):
+    vertices, faces = soup(100, size=0.5)
+    few = rasterize(sampler, vertices, faces, CAMERAS["perspective"], SIZE, 2)
+    many = rasterize(sampler, vertices, faces, CAMERAS["perspective"], SIZE, 5)
+    for found, expected in zip(few, many, strict=True):
+        np.testing.assert_array_equal(found, expected[:2])
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_of_triangles_at_one_depth_the_first_is_in_front(sampler):
+    vertices, faces = quad(-9, 9, -9, 9)
+    faces = np.concatenate([faces, faces, faces])
+    found = rasterize(sampler, vertices, faces, Camera.look_at((0, 0, 3), (0, 0, 0)), SIZE, 3)
+    np.testing.assert_array_equal(found.triangle_ids[1], found.triangle_ids[0] + 2)
+    np.testing.assert_array_equal(found.triangle_ids[2], found.triangle_ids[0] + 4)
+
+
+# ------------------------------------------------------------------------------------------- shared edges
+
+PIXELS = Camera.orthographic((16, -16, 50), (16, -16, 0), height=32, near=1, far=100)
+"""Looks at 32 × 32 pixels of which (x, y) has its corners at world (x, −y), (x + 1, −y − 1)."""
+
+
+def grid(corner, step, count, depth=None):
+    """A grid of count² cells of two triangles each, from `corner` to the right and downwards."""
+    rows, columns = np.indices((count + 1, count + 1))
+    z = np.zeros_like(rows) if depth is None else depth
+    vertices = np.stack([corner + step * columns, -(corner + step * rows), z], -1).reshape(-1, 3)
+    index = np.arange((count + 1) ** 2).reshape(count + 1, count + 1)
+    a, b, c, d = (i.ravel() for i in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    odd = (np.indices((count, count)).sum(axis=0) % 2).ravel()[:, None]
+    first = np.where(odd, np.stack([a, b, c], -1), np.stack([a, b, d], -1))
+    second = np.where(odd, np.stack([a, c, d], -1), np.stack([b, c, d], -1))
+    return vertices.astype(np.float32), np.concatenate([first, second]).astype(np.int32)
+
+
+@pytest.mark.parametrize("flip", [False, True], ids=["upright", "y-flipped"])
+@pytest.mark.parametrize("corner, step", [(-0.5, 1.0), (-0.5, 0.5), (-1.0, 1.0), (-1.5, 3.0), (-0.25, 0.75)])
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_a_grid_through_pixel_centres_covers_each_pixel_once(sampler, corner, step, flip):
+    vertices, faces = grid(corner, step, int(np.ceil(34 / step)))
+    camera = PIXELS._replace(projection=np.diag([1.0, -1, 1, 1]) @ PIXELS.projection) if flip else PIXELS
+    found = rasterize(sampler, vertices, faces, camera, (32, 32), 2)
+    assert (found.triangle_ids[0] >= 0).all()
+    assert (found.triangle_ids[1] == -1).all()
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_a_fan_around_a_pixel_centre_covers_each_pixel_once(sampler):
+    count = 48
+    # Rim vertices on whole pixels far outside, so that many edges run exactly through pixel centres.
+    angles = 2 * np.pi * np.arange(count) / count
+    rim = np.round(64 * np.stack([np.cos(angles), np.sin(angles)], -1)) + (16.5, -16.5)
+    vertices = np.concatenate([[(16.5, -16.5)], rim])
+    vertices = np.concatenate([vertices, np.zeros((len(vertices), 1))], axis=1).astype(np.float32)
+    around = np.arange(count)
+    faces = np.stack([np.zeros(count, int), 1 + around, 1 + (around + 1) % count], -1).astype(np.int32)
+    for order in (faces, faces[:, ::-1].copy(), np.roll(faces, 1, axis=1)):
+        found = rasterize(sampler, vertices, order, PIXELS, (32, 32), 2)
+        assert (found.triangle_ids[0] >= 0).all()
+        assert (found.triangle_ids[1] == -1).all()
+
+
+@pytest.mark.parametrize("camera", ["orthographic", "perspective"])
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_a_rough_sheet_has_neither_holes_nor_double_hits(sampler, camera):
+    depth = np.random.default_rng(0).uniform(-0.4, 0.4, (35, 35))
+    vertices, faces = grid(-1.0, 1.0, 34, depth)
+    # From afar and with a long lens no cell hides another.
+    lens = Camera.look_at((16, -16, 400), (16, -16, 0), fov_y=4.5, near=300, far=500)
+    found = rasterize(sampler, vertices, faces, PIXELS if camera == "orthographic" else lens, (32, 32), 2)
+    assert (found.triangle_ids[0] >= 0).all()
+    assert (found.triangle_ids[1] == -1).all()
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_a_quad_owns_the_pixel_centres_of_its_top_and_left_edges_only(sampler):
+    vertices, faces = quad(4.5, 8.5, -10.5, -5.5)
+    found = rasterize(sampler, vertices, faces, PIXELS, (32, 32))
+    expected = np.zeros((32, 32), bool)
+    expected[5:10, 4:8] = True
+    np.testing.assert_array_equal(found.triangle_ids[0] >= 0, expected)
+
+
+# ----------------------------------------------------------------------------------------------- the rest
+
+
+def test_the_result_does_not_depend_on_the_number_of_threads():
+    vertices, faces = soup(30000, size=0.1)
+    camera = CAMERAS["perspective"]
+    before = numba.get_num_threads()
+    try:
+        results = []
+        for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
+            numba.set_num_threads(threads)
+            results.append(rasterize("raster", vertices, faces, camera, (96, 120), 3))
+    finally:
+        numba.set_num_threads(before)
+    for one, two in zip(*results, strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_inside_a_closed_box_only_back_faces_are_seen_and_none_when_culled(sampler):
+    vertices, faces = box(2.0)
+    camera = Camera.look_at((0.3, 0.2, 0.1), (1, 0.5, 0.2), fov_y=80, near=0.1, far=10)
+    found = rasterize(sampler, vertices, faces, camera, SIZE, 2)
+    assert (found.triangle_ids[0] >= 0).all() and (found.triangle_ids[1] == -1).all()
+    assert (rasterize(sampler, vertices, faces, camera, SIZE, 2, "back").triangle_ids == -1).all()
+    inside_out = faces[:, ::-1].copy()
+    found = rasterize(sampler, vertices, inside_out, camera, SIZE, 2, "back")
+    assert (found.triangle_ids[0] >= 0).all()
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_outside_a_closed_box_culling_leaves_the_front_layer(sampler):
+    vertices, faces = box()
+    camera = CAMERAS["perspective"]
+    both = rasterize(sampler, vertices, faces, camera, SIZE, 2)
+    front = rasterize(sampler, vertices, faces, camera, SIZE, 2, "back")
+    np.testing.assert_array_equal(both.triangle_ids[0] >= 0, both.triangle_ids[1] >= 0)
+    np.testing.assert_array_equal(front.triangle_ids[0], both.triangle_ids[0])
+    assert (front.triangle_ids[1] == -1).all() and (front.triangle_ids[0] >= 0).sum() > 50
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_a_triangle_across_the_near_plane_is_cut_there(sampler):
+    # A floor one unit below the eye: at depth z it is seen at tan(angle) = 1 / z, from the near plane on.
+    vertices, faces = quad(-100, 100, -100, 100)
+    vertices = vertices[:, [0, 2, 1]] - np.float32([0, 1, 0])
+    camera = Camera(np.eye(4), perspective(90.0, 1.0, 2.0, 50.0))
+    found = rasterize(sampler, vertices, faces, camera, (64, 64))
+    slope = (np.arange(64) + 0.5) / 32 - 1
+    with np.errstate(divide="ignore"):
+        depth = np.where((slope > 0) & (1 / slope >= 2.0) & (1 / slope <= 50.0), 1 / slope, 0)
+    np.testing.assert_allclose(found.depth[0], np.broadcast_to(depth[:, None], (64, 64)), rtol=1e-5)
+    assert 10 < (depth > 0).sum() < 32
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_what_lies_behind_the_camera_or_beyond_the_far_plane_is_not_seen(sampler):
+    camera = Camera(np.eye(4), perspective(90.0, 1.0, 0.5, 10.0))
+    for z in (1.0, 3.0, -0.4, -10.1):
+        found = rasterize(sampler, *quad(-50, 50, -50, 50, z), camera)
+        assert (found.triangle_ids == -1).all()
+    for z in (-0.6, -9.9):
+        assert (rasterize(sampler, *quad(-50, 50, -50, 50, z), camera).triangle_ids >= 0).all()
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_a_mesh_far_from_the_origin_is_sampled_as_well_as_near_it(sampler):
+    vertices, faces = icosphere(2)
+    vertices = np.round(vertices * 512) / 512  # So that float32 holds them exactly at 10 000 too.
+    offset = np.array([1e4, -1e4, 1e4])
+    near = rasterize(
+        sampler, vertices.astype(np.float32), faces, Camera.look_at((1, 2, 3), (0, 0, 0)), SIZE, 2
+    )
+    far = rasterize(
+        sampler,
+        (vertices + offset).astype(np.float32),
+        faces,
+        Camera.look_at(offset + (1, 2, 3), offset),
+        SIZE,
+        2,
+    )
+    np.testing.assert_array_equal(far.triangle_ids, near.triangle_ids)
+    np.testing.assert_allclose(far.barycentrics, near.barycentrics, atol=1e-5)
+    np.testing.assert_allclose(far.depth, near.depth, rtol=1e-6)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_triangles_without_area_are_never_hit(sampler):
+    vertices = np.array([(-1, -1, 0), (1, 1, 0), (0, 0, 0), (-1, 0, 0), (1, 0, 0)], np.float32)
+    faces = np.array([(0, 1, 2), (0, 0, 1), (2, 2, 2), (3, 4, 3), (3, 2, 4)], np.int32)
+    found = rasterize(sampler, vertices, faces, Camera.look_at((0, 0, 3), (0, 0, 0)), (33, 33), 2)
+    assert (found.triangle_ids == -1).all()
+
+
+def test_the_rasterizer_drops_triangles_with_nan_and_keeps_the_others():
+    vertices, faces = quad(-9, 9, -9, 9)
+    vertices[3] = np.nan
+    found = rasterize("raster", vertices, faces, Camera.look_at((0, 0, 3), (0, 0, 0)), (16, 16), 2)
+    assert set(np.unique(found.triangle_ids)) == {-1, 0}
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_render_refuses_vertices_that_are_not_finite_and_names_the_first(sampler, bad):
+    vertices, faces = icosphere(0)
+    vertices[7, 1] = bad
+    part = rts.Part(rts.plugin("surfaces", "mesh")(faces), {"vertices": vertices})
+    with pytest.raises(rts.InputError) as error:
+        rts.render(part, CAMERAS["perspective"], SIZE, sampler=sampler)
+    assert "1 of the 12 vertices" in str(error.value) and "vertex 7" in str(error.value)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 50), (50, 1), (7, 9), (8, 8), (17, 3)])
+def test_any_size_of_image_is_filled(size):
+    vertices, faces = quad(-900, 900, -900, 900)
+    found = rasterize("raster", vertices, faces, Camera.look_at((0, 0, 3), (0, 0, 0)), size, 2)
+    assert found.triangle_ids.shape == (2, *size)
+    assert (found.triangle_ids[0] >= 0).all() and (found.triangle_ids[1] == -1).all()
