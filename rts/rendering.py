@@ -207,7 +207,7 @@ def _choose(group: str, chosen: Any) -> Any:
 
 def _resolve(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Part], Camera]:
     """Checked parts with their shaders looked up."""
-    parts = [parts] if isinstance(parts, Part) else list(parts)
+    parts = list(parts) if isinstance(parts, Sequence) else [parts]
     if not parts or not all(isinstance(p, Part) for p in parts):
         kinds = ", ".join(type(p).__name__ for p in parts) or "nothing"
         raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
@@ -233,7 +233,7 @@ def _check_size(size: Any, layers: Any, capacity: Any) -> tuple[int, int]:
     try:
         height, width = (int(s) for s in size)
         whole = (height, width) == tuple(size)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         whole = False
     if not whole or height <= 0 or width <= 0:
         raise InputError(f"size is {size!r}; expected (height, width), two positive integers")

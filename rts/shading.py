@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from rts.arrays import namespace, unit
 from rts.camera import Camera
@@ -25,6 +26,7 @@ from rts.protocols import Array, GBuffer, Tree
 
 WRAPS = ("repeat", "mirror", "clamp")
 DEFAULT_AMBIENT, DEFAULT_DIFFUSE = 0.2, 0.8
+LIGHT_ENTRIES = ("direction", "color", "ambient")
 DEFAULT_LIGHT = (-0.3, 0.5, 0.81)  # In camera space.
 DEFAULT_SPECULAR, DEFAULT_SHININESS = 0.3, 32.0
 
@@ -118,6 +120,7 @@ class Unlit:
         color, alpha = color[:, :3], color[:, 3:4] if base.shape[1] == 4 else one
         if "color" in theta:
             factor = theta["color"]
+            _check_shape("['color']", factor, "(3,) or (4,)", _shape(factor) in ((3,), (4,)))
             color = color * factor[:3]
             alpha = alpha * factor[3] if factor.shape[0] == 4 else alpha
         return color, alpha
@@ -211,7 +214,7 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat") -> Array:
         (N, C).
     """
     xp = namespace(texture, uv)
-    if len(texture.shape) != 3 or texture.shape[2] not in (1, 3, 4):
+    if len(texture.shape) != 3 or texture.shape[2] not in (1, 3, 4) or 0 in texture.shape:
         raise InputError(f"the texture has shape {tuple(texture.shape)}; expected (h, w, C) with C = 1, 3 or 4")
     height, width, channels = texture.shape
     flat = xp.reshape(texture, (height * width, channels))
@@ -240,7 +243,16 @@ def _wrapped(index: Array, count: int, wrap: str) -> Array:
 
 
 def _light(theta: Mapping[str, Tree], camera: Camera) -> dict[str, Array]:
-    given = dict(theta.get("light", {}))
+    given = theta.get("light", {})
+    if not isinstance(given, Mapping):
+        raise InputError(f"theta['light'] is a {type(given).__name__}; expected a dict of {', '.join(LIGHT_ENTRIES)}")
+    for name, value in given.items():
+        if name not in LIGHT_ENTRIES:
+            raise InputError(f"theta['light'] has an entry {name!r}; expected {', '.join(LIGHT_ENTRIES)}")
+        if name != "ambient":
+            shape = _shape(value)
+            _check_shape(f"['light'][{name!r}]", value, "(3,) or (L, 3)", len(shape) in (1, 2) and shape[-1] == 3)
+    given = dict(given)
     r = camera.view[:3, :3]
     if "direction" not in given:
         given["direction"] = sum(c * r[i, :] for i, c in enumerate(DEFAULT_LIGHT))
@@ -249,6 +261,17 @@ def _light(theta: Mapping[str, Tree], camera: Camera) -> dict[str, Array]:
     given.setdefault("color", DEFAULT_DIFFUSE * one)
     given.setdefault("ambient", DEFAULT_AMBIENT)
     return given
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    return tuple(getattr(value, "shape", ()))
+
+
+def _check_shape(entry: str, value: Any, expected: str, ok: bool) -> None:
+    """Refuse what is not an array of the expected shape."""
+    if not ok:
+        given = f"has shape {_shape(value)}" if hasattr(value, "shape") else f"is a {type(value).__name__}"
+        raise InputError(f"theta{entry} {given}; expected an array of shape {expected}")
 
 
 def _each(light: dict[str, Array]) -> tuple[list[Array], list[Array]]:

@@ -14,6 +14,7 @@ from rts.protocols import Array, GBuffer, Proxy, Samples, Tree
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv")
+WIDTHS = {"vertices": (3,), "normals": (3,), "uv": (2,), "colors": (1, 3, 4)}
 
 
 class Mesh:
@@ -56,10 +57,12 @@ class Mesh:
             if name not in theta:
                 raise InputError(f"theta of a mesh has no {name!r}; it has {sorted(theta)}")
             value, rows = theta[name], self._extents[self._columns.get(name, 0) // 3]
-            shape = tuple(getattr(value, "shape", ()))
-            width = 3 if name in ("vertices", "normals") else shape[1] if len(shape) == 2 else "C"
-            if len(shape) != 2 or shape[1] != width:
-                raise InputError(f"theta[{name!r}] of a mesh has shape {shape}; expected (rows, {width})")
+            if not hasattr(value, "shape"):
+                raise InputError(f"theta[{name!r}] of a mesh is a {type(value).__name__}; expected an array")
+            shape, widths = tuple(value.shape), WIDTHS.get(name)
+            if len(shape) != 2 or (widths and shape[1] not in widths):
+                expected = " or ".join(map(str, widths or "C"))
+                raise InputError(f"theta[{name!r}] of a mesh has shape {shape}; expected (rows, {expected})")
             if not namespace(value).isdtype(value.dtype, "real floating"):
                 raise InputError(f"theta[{name!r}] of a mesh has dtype {value.dtype}; expected a floating one")
             if shape[0] < rows:

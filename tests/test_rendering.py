@@ -1,0 +1,826 @@
+"""Rendering from end to end, the mesh, the shaders, and what bad input is told."""
+
+import math
+
+import numpy as np
+import pytest
+from helpers import (
+    ALL,
+    DIFFERENTIABLE,
+    TORCH,
+    arrays,
+    box,
+    gradient,
+    icosphere,
+    moved,
+    quad,
+    rigid,
+    soup,
+    to_numpy,
+)
+
+import rts
+from rts import Camera, GBuffer, Part
+from rts.shading import BlinnPhong, Depth, Lambert, Normals, Silhouette, Textured, Unlit, sample_texture
+
+Mesh = rts.plugin("surfaces", "mesh")
+SIZE = (20, 24)
+CAMERA = Camera.look_at((1, 1.5, 4), (0, 0, 0), fov_y=40, aspect=1.2)
+FRONT = Camera.orthographic((0, 0, 5), (0, 0, 0), height=4, aspect=1.2, near=1, far=9)
+
+
+def mesh_part(mesh, **options):
+    vertices, faces = mesh
+    theta = {"vertices": vertices, **options.pop("theta", {})}
+    return Part(Mesh(faces, options.pop("indices", None)), theta, **options)
+
+
+def show(parts, camera=CAMERA, size=SIZE, **options):
+    return to_numpy(rts.render(parts, camera, size, **options))
+
+
+# ------------------------------------------------------------------------------------------ the whole of it
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_render_is_sample_then_render_samples(target):
+    part, camera = arrays(target, (mesh_part(icosphere(1), shader="lambert"), CAMERA))
+    image = show(part, camera, layers=3, background=(0.1, 0.2, 0.3))
+    sampled = rts.sample(part, camera, SIZE, layers=3)
+    found = rts.render_samples(sampled, part, camera, background=(0.1, 0.2, 0.3))
+    np.testing.assert_array_equal(to_numpy(found), image)
+    assert image.shape == (*SIZE, 4) and image.dtype == np.float32
+    assert sampled.row.shape == (3, SIZE[0] + 2, SIZE[1] + 2) and int(sampled.overflow) == 0
+
+
+@pytest.mark.parametrize("splatter", ["none", "single", "multi"])
+def test_a_part_at_plus_x_plus_y_appears_upper_right(splatter):
+    part = mesh_part(quad(0.4, 1.6, 0.4, 1.6))
+    alpha = show(part, FRONT, (20, 24), splatter=splatter)[..., 3]
+    rows, columns = np.nonzero(alpha > 0.5)
+    # 5 pixels a unit: x from 12 + 2 to 12 + 8, y from 10 − 8 to 10 − 2.
+    assert (rows.min(), rows.max(), columns.min(), columns.max()) == (2, 7, 14, 19)
+
+
+def test_a_surface_beyond_the_image_keeps_the_rim_bright():
+    image = show(mesh_part(quad(-9, 9, -9, 9)), FRONT)
+    np.testing.assert_allclose(image, 1, atol=1e-6)
+
+
+def test_the_nearer_part_hides_the_farther_one_whatever_their_order():
+    near = mesh_part(quad(-9, 9, -9, 9, 1.0), shader="unlit", theta={"color": np.array([1.0, 0, 0])})
+    far = mesh_part(quad(-9, 9, -9, 9, 0.0), shader="unlit", theta={"color": np.array([0.0, 1, 0])})
+    for parts in ([near, far], [far, near]):
+        np.testing.assert_allclose(show(parts, FRONT), np.broadcast_to([1, 0, 0, 1], (*SIZE, 4)), atol=1e-6)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_parts_merged_by_depth_are_the_image_of_one_merged_mesh(target):
+    rng = np.random.default_rng(0)
+    meshes = [box(0.8), soup(12, 1), icosphere(1, 0.9, (0.3, 0.2, 0.4))]
+    colors = [rng.random((len(v), 3)) for v, _ in meshes]
+    parts = [mesh_part(m, shader="unlit", theta={"colors": c}) for m, c in zip(meshes, colors, strict=True)]
+    offsets = np.cumsum([0, *(len(v) for v, _ in meshes)])
+    merged = (
+        np.concatenate([v for v, _ in meshes]),
+        np.concatenate([f + o for (_, f), o in zip(meshes, offsets, strict=False)]),
+    )
+    one = mesh_part(merged, shader="unlit", theta={"colors": np.concatenate(colors)})
+    for layers in (1, 3):
+        parts_, one_, camera = arrays(target, (parts, one, CAMERA))
+        sampled, expected = (
+            rts.sample(parts_, camera, SIZE, layers=layers),
+            rts.sample(one_, camera, SIZE, layers=layers),
+        )
+        np.testing.assert_array_equal(to_numpy(sampled.depth), to_numpy(expected.depth))
+        seen = np.unique(to_numpy(sampled.part))
+        assert {0, 1, 2} <= set(seen)
+        np.testing.assert_allclose(
+            show(parts_, camera, layers=layers), show(one_, camera, layers=layers), rtol=0, atol=1e-5
+        )
+
+
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize("shader", ["unlit", "normals", "lambert"])
+def test_a_rigid_transform_is_like_moving_the_vertices(target, shader):
+    transform = rigid((1, 2, 3), 40, (0.3, -0.2, 0.5))
+    vertices, faces = box(0.8)
+    colors = {"colors": np.random.default_rng(0).random((8, 3))}
+    still = mesh_part((vertices, faces), shader=shader, theta=colors, transform=transform)
+    there = mesh_part((moved(transform, vertices), faces), shader=shader, theta=colors)
+    still, there, camera = arrays(target, (still, there, CAMERA))
+    np.testing.assert_allclose(show(still, camera), show(there, camera), rtol=0, atol=2e-5)
+
+
+def test_normals_under_a_stretch_are_those_of_the_ellipsoid():
+    vertices, faces = icosphere(3)
+    transform = np.diag([1.5, 0.75, 1.0, 1.0])
+    part = mesh_part((vertices, faces), theta={"normals": vertices}, transform=transform, shader="normals")
+    image = show(part, splatter="none")
+    sampled = rts.sample(part, CAMERA, SIZE)
+    row = sampled.row[0, 1:-1, 1:-1]
+    points = moved(transform, part.surface.evaluate(part.theta, sampled.samples[0])["position"])[row]
+    expected = points / np.array([1.5, 0.75, 1.0]) ** 2
+    expected /= np.linalg.norm(expected, axis=-1, keepdims=True)
+    inside = row >= 0
+    assert inside.sum() > 100
+    np.testing.assert_allclose(image[inside][:, :3] * 2 - 1, expected[inside], atol=0.02)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_a_mirroring_transform_keeps_the_outside_outside(target):
+    vertices, faces = icosphere(2, 1.0, (0.5, 0, 0))
+    mirror = np.diag([-1.0, 1, 1, 1])
+    outward = {"normals": vertices - np.float32((0.5, 0, 0))}
+    mirrored = mesh_part((vertices, faces), theta=outward, transform=mirror, shader="normals", cull="back")
+    there = mesh_part(
+        (moved(mirror, vertices), faces[:, ::-1]),
+        theta={"normals": moved(mirror, outward["normals"])},
+        shader="normals",
+        cull="back",
+    )
+    mirrored, there, camera = arrays(target, (mirrored, there, CAMERA))
+    image = show(mirrored, camera)
+    np.testing.assert_allclose(image, show(there, camera), rtol=0, atol=2e-5)
+    assert image[..., 3].sum() > 50
+
+
+def test_culling_hides_the_inside_and_nothing_else():
+    vertices, faces = icosphere(2)
+    outside = mesh_part((vertices, faces), cull="back")
+    inside_out = mesh_part((vertices, faces[:, ::-1]), cull="back")
+    front = rts.sample(outside, CAMERA, SIZE)
+    back = rts.sample(inside_out, CAMERA, SIZE)
+    both = rts.sample(mesh_part((vertices, faces)), CAMERA, SIZE)
+    np.testing.assert_array_equal(front.depth[0], both.depth[0])
+    np.testing.assert_array_equal(back.depth[0], both.depth[1])
+    assert (front.row[1] == -1).all() and (back.row[1] == -1).all() and (back.row[0] >= 0).any()
+
+
+# ------------------------------------------------------------------------------------------- degenerate views
+
+FLAT = np.array([(-1, -1, 0), (1, 1, 0), (0, 0, 0)], np.float32), np.array([(0, 1, 2), (0, 0, 1)], np.int32)
+VIEWS = {
+    "beside the view": (icosphere(1, 1.0, (50, 0, 0)), CAMERA, True),
+    "behind the camera": (icosphere(1, 1.0, (2, 3, 8)), CAMERA, True),
+    "zero area": (FLAT, CAMERA, True),
+    "across the near plane": (icosphere(2, 1.0, (1, 1.5, 4)), CAMERA, False),
+    "zero area among others": (
+        (np.concatenate([FLAT[0], icosphere(1)[0]]), np.concatenate([FLAT[1], icosphere(1)[1] + 3])),
+        CAMERA,
+        False,
+    ),
+    "a vertex at the eye": (
+        (np.array([(1, 1.5, 4), (1, 0, 0), (-1, 0, 0)], np.float32), np.array([(0, 1, 2)])),
+        CAMERA,
+        True,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_degenerate_views_give_finite_images_and_gradients(name, target):
+    mesh, camera, nothing = VIEWS[name]
+    part = mesh_part(mesh, shader="lambert")
+    given = arrays(target, {"vertices": mesh[0], "camera": camera, "transform": np.eye(4)})
+
+    def f(tree):
+        moving = part.replace(theta={"vertices": tree["vertices"]}, transform=tree["transform"])
+        return rts.render(moving, tree["camera"], (12, 14))
+
+    image = to_numpy(f(given))
+    assert np.isfinite(image).all()
+    assert (image == 0).all() if nothing else image[..., 3].sum() > 1
+    found = gradient(target, lambda tree: (f(tree) ** 2).sum(), given)
+    for leaf in (found["vertices"], found["transform"], *found["camera"]):
+        assert np.isfinite(leaf).all()
+        assert not nothing or (leaf == 0).all()
+    assert nothing or np.abs(found["vertices"]).max() > 0
+
+
+# ------------------------------------------------------------------------------------------------- background
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_backgrounds_show_through_what_is_not_covered(target):
+    part, camera = arrays(
+        target, (mesh_part(icosphere(1), shader="unlit", theta={"color": np.array([0.9, 0.5, 0.1])}), CAMERA)
+    )
+    bare = show(part, camera)
+    rng = np.random.default_rng(0)
+    for shape in ((3,), (4,), (*SIZE, 3), (*SIZE, 4)):
+        background = rng.random(shape)
+        if shape[-1] == 4:
+            background[..., :3] *= background[..., 3:]
+        full = (
+            background if shape[-1] == 4 else np.concatenate([background, np.ones((*shape[:-1], 1))], axis=-1)
+        )
+        expected = bare + (1 - bare[..., 3:]) * full
+        for given in (background, arrays(target, background)):
+            np.testing.assert_allclose(show(part, camera, background=given), expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(
+        show(part, camera, background=(0, 0, 1)), bare + (1 - bare[..., 3:]) * (0, 0, 1, 1), rtol=0, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_the_background_is_differentiable(target):
+    part, camera = arrays(target, (mesh_part(quad(0, 9, -9, 9)), FRONT))
+    found = gradient(
+        target,
+        lambda b: rts.render(part, camera, SIZE, splatter="none", background=b)[..., 0].sum(),
+        arrays(target, np.array([0.2, 0.3, 0.4])),
+    )
+    np.testing.assert_allclose(found, (SIZE[0] * SIZE[1] / 2, 0, 0), atol=1e-3)
+
+
+# ------------------------------------------------------------------------------------------------------- mesh
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_smooth_normals_of_a_sphere_are_its_radii(target):
+    vertices, faces = icosphere(3, 2.0)
+    normals = to_numpy(Mesh(faces).vertex_normals(arrays(target, vertices)))
+    np.testing.assert_allclose(normals, vertices / 2, atol=0.01)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
+
+
+def test_smooth_normals_of_a_flat_sheet_and_of_a_lone_vertex():
+    vertices, faces = quad()
+    vertices = np.concatenate([vertices, [(5, 5, 5)]]).astype(np.float32)
+    normals = Mesh(faces).vertex_normals(vertices)
+    np.testing.assert_array_equal(normals, [(0, 0, 1)] * 4 + [(0, 0, 0)])
+
+
+def test_smooth_normals_follow_vertices_that_change_in_place():
+    vertices, faces = quad()
+    mesh = Mesh(faces)
+    mesh.vertex_normals(vertices)
+    vertices[:] = vertices[:, [2, 1, 0]]
+    np.testing.assert_allclose(mesh.vertex_normals(vertices), [(-1, 0, 0)] * 4)
+
+
+def test_given_normals_take_the_place_of_smooth_ones():
+    tilted = np.broadcast_to(np.float32((0.6, 0, 0.8)), (4, 3))
+    image = show(mesh_part(quad(-9, 9, -9, 9), shader="normals", theta={"normals": tilted}), FRONT)
+    np.testing.assert_allclose(image[..., :3], np.broadcast_to((0.8, 0.5, 0.9), (*SIZE, 3)), atol=1e-6)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_vertex_attributes_are_interpolated_linearly_in_space(target):
+    # A sheet that recedes: colour is the world coordinate, so each pixel shows where its ray meets the sheet.
+    vertices = np.array([(-2, -2, -3), (2, -2, 1), (2, 2, 1), (-2, 2, -3)], np.float32)
+    colors = np.clip((vertices + (2, 2, 3)) / 4, 0, 1)
+    part, camera = arrays(
+        target, (mesh_part((vertices, quad()[1]), shader="unlit", theta={"colors": colors}), CAMERA)
+    )
+    image = show(part, camera, splatter="none")
+    rays = CAMERA.rays(SIZE)
+    # The sheet is z = x − 1.
+    depth = (rays.origins[..., 0] - 1 - rays.origins[..., 2]) / (
+        rays.directions[..., 2] - rays.directions[..., 0]
+    )
+    points = rays.origins + depth[..., None] * rays.directions
+    inside = image[..., 3] == 1
+    assert inside.sum() > 100
+    np.testing.assert_allclose(image[inside][:, :3], (points[inside] + (2, 2, 3)) / 4, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_attributes_of_corners_are_read_through_their_own_indices(target):
+    vertices, faces = quad(-9, 9, -9, 9)
+    # One colour for each triangle; uv of the second triangle differ at the shared vertices.
+    part = mesh_part(
+        (vertices, faces),
+        indices={"colors": [(0, 0, 0), (1, 1, 1)], "heat": [(2, 2, 2), (0, 0, 0)], "uv": None},
+        theta={
+            "colors": np.array([(1.0, 0, 0), (0, 1.0, 0)]),
+            "heat": np.array([(0.25,), (0.5,), (0.75,)]),
+            "uv": np.zeros((4, 2)),
+        },
+        shader=heat_in_blue,
+    )
+    part, camera = arrays(target, (part, FRONT))
+    image = show(part, camera, (20, 20), splatter="none")
+    # FRONT stretches; the diagonal runs from the lower left to the upper right, triangle 0 is below it.
+    np.testing.assert_allclose(image[15, 15], (1, 0, 0.75, 1), atol=1e-6)
+    np.testing.assert_allclose(image[5, 5], (0, 1, 0.25, 1), atol=1e-6)
+
+
+def heat_in_blue(theta, gbuffer, camera):
+    xp = rts.arrays.namespace(gbuffer["position"])
+    color = gbuffer["color"]
+    one = xp.ones_like(color[:, :1])
+    return xp.concat([color[:, :2], gbuffer["heat"], one], axis=1)
+
+
+def test_attributes_of_vertices_need_no_indices_but_their_name():
+    part = mesh_part(
+        quad(-9, 9, -9, 9),
+        indices={"heat": None},
+        theta={"heat": np.full((4, 1), 0.5), "colors": np.zeros((4, 3))},
+        shader=heat_in_blue,
+    )
+    np.testing.assert_allclose(show(part, FRONT)[9, 9], (0, 0, 0.5, 1), atol=1e-6)
+
+
+class CountingMesh(Mesh):
+    def __init__(self, faces):
+        super().__init__(faces)
+        self.asked = 0
+
+    def _vertex_normals(self, vertices):
+        self.asked += 1
+        return super()._vertex_normals(vertices)
+
+
+@pytest.mark.parametrize(
+    "pose_only", [False, True], ids=["all differentiable", "only the transform differentiable"]
+)
+@pytest.mark.parametrize("target", ALL)
+def test_normals_are_computed_only_for_a_shader_that_reads_them(target, pose_only):
+    vertices, faces = icosphere(1)
+    theta = {"vertices": vertices if pose_only else arrays(target, vertices)}
+    transform, camera = arrays(target, (np.eye(4), CAMERA))
+    for shader, asked in (("silhouette", 0), ("unlit", 0), ("depth", 0), ("lambert", 1)):
+        mesh = CountingMesh(faces)
+        rts.render(Part(mesh, theta, shader, transform), camera, SIZE)
+        assert (mesh.asked > 0) == asked, shader
+
+
+def test_a_deferred_attribute_is_computed_once_when_first_read():
+    calls = []
+    gbuffer = GBuffer(position=np.zeros((2, 3)))
+    gbuffer.defer("normal", lambda: calls.append(1) or np.ones((2, 3)))
+    assert "normal" in gbuffer and list(gbuffer) == ["position", "normal"] and calls == []
+    np.testing.assert_array_equal(gbuffer["normal"], gbuffer["normal"])
+    assert calls == [1]
+    with pytest.raises(rts.InputError, match="reads 'uv'.*'position', 'normal'"):
+        gbuffer["uv"]
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_a_function_is_a_shader_and_its_theta_is_differentiable(target):
+    def tinted(theta, gbuffer, camera):
+        xp = rts.arrays.namespace(gbuffer["position"])
+        one = xp.ones_like(gbuffer["position"])
+        return xp.concat([one * theta["tint"] ** 2, one[:, :1]], axis=1)
+
+    mesh, camera = quad(-9, 9, -9, 9), arrays(target, FRONT)
+    part = mesh_part(mesh, shader=tinted)
+    found = gradient(
+        target,
+        lambda tint: rts.render(part.replace(theta={**part.theta, "tint": tint}), camera, SIZE)[..., 1].sum(),
+        arrays(target, np.array([0.1, 0.2, 0.3])),
+    )
+    np.testing.assert_allclose(found, (0, 2 * 0.2 * SIZE[0] * SIZE[1], 0), rtol=1e-5)
+
+
+# ---------------------------------------------------------------------------------------------------- texture
+
+TEXTURE = np.random.default_rng(0).random((3, 4, 3))
+
+
+def texel(i, j):
+    """(u, v) of the centre of texel row i, column j."""
+    return (j + 0.5) / 4, 1 - (i + 0.5) / 3
+
+
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
+def test_texel_centres_are_exact_and_v_points_up(target, wrap):
+    uv = np.array([texel(i, j) for i in range(3) for j in range(4)])
+    found = to_numpy(sample_texture(*arrays(target, (TEXTURE, uv)), wrap))
+    np.testing.assert_allclose(found.reshape(3, 4, 3), TEXTURE, atol=1e-6)
+
+
+def test_between_texels_lookup_is_bilinear():
+    uv = np.array([np.add(texel(1, 2), texel(1, 3)), np.add(texel(0, 1), texel(1, 1))]) / 2
+    quarter = np.array(texel(0, 0)) * 0.75 * 0.5 + np.array(texel(0, 1)) * 0.25 * 0.5
+    quarter += np.array(texel(1, 0)) * 0.75 * 0.5 + np.array(texel(1, 1)) * 0.25 * 0.5
+    found = sample_texture(TEXTURE, np.concatenate([uv, [quarter]]))
+    t = TEXTURE
+    np.testing.assert_allclose(found[0], (t[1, 2] + t[1, 3]) / 2)
+    np.testing.assert_allclose(found[1], (t[0, 1] + t[1, 1]) / 2)
+    np.testing.assert_allclose(found[2], 0.375 * (t[0, 0] + t[1, 0]) + 0.125 * (t[0, 1] + t[1, 1]))
+
+
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize(
+    "wrap, column",
+    [
+        ("repeat", [2, 3, 0, 1, 2, 3, 0, 1, 2, 3]),
+        ("mirror", [1, 0, 0, 1, 2, 3, 3, 2, 1, 0]),
+        ("clamp", [0, 0, 0, 1, 2, 3, 3, 3, 3, 3]),
+    ],
+)
+def test_wrap_modes_outside_the_unit_square(target, wrap, column):
+    # Columns −2 … 7 of a texture of four, and one whole turn farther out where that is the same.
+    uv = np.array([texel(1, j) for j in range(-2, 8)])
+    texture, there = arrays(target, (TEXTURE, uv))
+    np.testing.assert_allclose(to_numpy(sample_texture(texture, there, wrap)), TEXTURE[1, column], atol=1e-6)
+    # The same in v, on the transposed texture; rows count downwards, v upwards.
+    flipped = np.array([((1 + 0.5) / 3, 1 - (i + 0.5) / 4) for i in range(-2, 8)])
+    texture, there = arrays(target, (TEXTURE.transpose(1, 0, 2), flipped))
+    np.testing.assert_allclose(to_numpy(sample_texture(texture, there, wrap)), TEXTURE[1, column], atol=1e-6)
+    period = {"repeat": 3, "mirror": 2}.get(wrap)
+    if period:
+        texture, there = arrays(target, (TEXTURE, uv - 2 * period))
+        np.testing.assert_allclose(
+            to_numpy(sample_texture(texture, there, wrap)), TEXTURE[1, column], atol=1e-5
+        )
+
+
+def test_repeat_blends_the_two_ends_and_clamp_does_not():
+    uv = np.array([(0.0, texel(1, 0)[1])])
+    ends = (TEXTURE[1, 0] + TEXTURE[1, 3]) / 2
+    np.testing.assert_allclose(sample_texture(TEXTURE, uv, "repeat")[0], ends)
+    np.testing.assert_allclose(sample_texture(TEXTURE, uv, "clamp")[0], TEXTURE[1, 0])
+    np.testing.assert_allclose(sample_texture(TEXTURE, uv, "mirror")[0], TEXTURE[1, 0])
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_texture_gradients_are_the_bilinear_weights_and_slopes(target):
+    uv = np.array([np.add(texel(1, 2), texel(1, 3))]) / 2
+    given = arrays(target, {"texture": TEXTURE, "uv": uv})
+    found = gradient(target, lambda t: sample_texture(t["texture"], t["uv"])[..., 0].sum(), given)
+    expected = np.zeros_like(TEXTURE)
+    expected[1, 2:, 0] = 0.5
+    np.testing.assert_allclose(found["texture"], expected, atol=1e-5)
+    np.testing.assert_allclose(found["uv"][0, 0], 4 * (TEXTURE[1, 3, 0] - TEXTURE[1, 2, 0]), rtol=1e-4)
+
+
+@pytest.mark.parametrize("channels, expected", [(1, (0.2, 0.2, 0.2, 1)), (3, (0.2, 0.4, 0.6, 1))])
+def test_textures_of_one_and_three_channels(channels, expected):
+    texture = np.ones((2, 2, channels)) * np.array([0.2, 0.4, 0.6])[:channels]
+    theta = {"texture": texture, "uv": np.zeros((4, 2))}
+    image = show(mesh_part(quad(-9, 9, -9, 9), theta=theta, shader="textured"), FRONT)
+    np.testing.assert_allclose(image[9, 9], expected, atol=1e-6)
+
+
+def test_a_textured_quad_is_its_texture_upright():
+    texture = np.random.default_rng(0).random((20, 24, 3))
+    uv = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+    part = mesh_part(quad(-2.4, 2.4, -2, 2), theta={"texture": texture, "uv": uv}, shader="textured")
+    np.testing.assert_allclose(show(part, FRONT, (20, 24), splatter="none")[..., :3], texture, atol=1e-4)
+
+
+# ---------------------------------------------------------------------------------------------------- shaders
+
+
+def shade(shader, normal=(0, 0, 1), position=(0, 0, 0), camera=FRONT, **theta):
+    gbuffer = GBuffer(position=np.array([position], np.float64), normal=np.array([normal], np.float64))
+    arrays_ = {k: v if isinstance(v, dict) else np.asarray(v, np.float64) for k, v in theta.items()}
+    return shader(arrays_, gbuffer, camera)[0]
+
+
+def light(degrees=0.0, ambient=0.1, color=(0.5, 0.6, 0.7)):
+    """From the direction of +z turned towards +y."""
+    a = math.radians(degrees)
+    direction = 3.0 * np.array([0, math.sin(a), math.cos(a)])
+    return {"direction": direction, "color": np.array(color), "ambient": np.full(3, ambient)}
+
+
+@pytest.mark.parametrize("degrees", [0, 30, 60])
+def test_lambert_is_ambient_plus_diffuse_times_the_cosine(degrees):
+    found = shade(Lambert(), light=light(degrees), color=(0.8, 0.4, 0.2))
+    expected = np.array([0.8, 0.4, 0.2]) * (0.1 + math.cos(math.radians(degrees)) * np.array([0.5, 0.6, 0.7]))
+    np.testing.assert_allclose(found, [*expected, 1], atol=1e-12)
+
+
+def test_lambert_is_two_sided_and_dark_where_light_comes_from_behind():
+    np.testing.assert_allclose(shade(Lambert(), (0, 0, -2), light=light()), shade(Lambert(), light=light()))
+    np.testing.assert_allclose(shade(Lambert(), light=light(180))[:3], 0.1)
+
+
+def test_lambert_adds_several_lights_and_saturates_at_one():
+    both = {
+        "direction": np.array([(0, 0, 1), (0, 3.0, 0), (0, 0.6, 0.8)]),
+        "color": np.array([(0.1, 0, 0), (9, 9, 9), (0, 2, 0.5)]),
+        "ambient": np.zeros(3),
+    }
+    np.testing.assert_allclose(shade(Lambert(), light=both), (0.1, 1.0, 0.4, 1), atol=1e-12)
+
+
+def test_the_default_light_is_fixed_to_the_camera():
+    cosine = 0.81 / math.sqrt(0.3**2 + 0.5**2 + 0.81**2)
+    np.testing.assert_allclose(shade(Lambert())[:3], 0.2 + 0.8 * cosine)
+    turn = rigid((1, 2, 3), 70, (0.1, 0.2, 0.3))
+    turned = FRONT.within(np.linalg.inv(turn))
+    position, normal = moved(turn, np.array([(0.0, 0, 0)]))[0], turn[:3, :3] @ (0, 0.6, 0.8)
+    np.testing.assert_allclose(shade(Lambert(), normal, position, turned), shade(Lambert(), (0, 0.6, 0.8)))
+
+
+def test_blinn_phong_is_brightest_where_the_normal_halves_light_and_view():
+    lit = {
+        "light": light(60, 0.0, (1, 1, 1)),
+        "color": (0, 0, 0),
+        "specular": (0.9, 0.5, 0.1),
+        "shininess": 20.0,
+    }
+
+    def highlight(degrees):
+        a = math.radians(degrees)
+        return shade(BlinnPhong(), (0, math.sin(a), math.cos(a)), **lit)[:3]
+
+    np.testing.assert_allclose(highlight(30), (0.9, 0.5, 0.1), atol=1e-9)
+    for off in (10, 25):
+        expected = np.array([0.9, 0.5, 0.1]) * math.cos(math.radians(off)) ** 20
+        np.testing.assert_allclose(highlight(30 + off), expected, atol=1e-9)
+        np.testing.assert_allclose(highlight(30 - off), expected, atol=1e-9)
+
+
+def test_blinn_phong_without_specular_is_lambert():
+    for degrees in (0, 40, 130):
+        found = shade(BlinnPhong(), light=light(degrees), specular=(0, 0, 0))
+        np.testing.assert_allclose(found, shade(Lambert(), light=light(degrees)))
+
+
+@pytest.mark.parametrize("shininess", [0.0, 0.5, 1.0, 32.0])
+@pytest.mark.parametrize("degrees", [0, 89.999, 90, 120, 180])
+@pytest.mark.parametrize("target", TORCH)
+def test_blinn_phong_gradients_are_finite_at_grazing_light(target, degrees, shininess):
+    camera = arrays(target, FRONT)
+    given = arrays(
+        target,
+        {
+            "light": light(degrees),
+            "specular": np.full(3, 0.5),
+            "shininess": np.array(shininess),
+            "n": np.eye(3),
+        },
+    )
+
+    def f(tree):
+        gbuffer = GBuffer(position=0 * tree["n"], normal=tree["n"])
+        return BlinnPhong()({k: v for k, v in tree.items() if k != "n"}, gbuffer, camera).sum()
+
+    found = gradient(target, f, given)
+    for leaf in (*found["light"].values(), found["specular"], found["shininess"], found["n"]):
+        assert np.isfinite(leaf).all()
+
+
+@pytest.mark.parametrize("camera", [FRONT, Camera.look_at((0, 0, 5), (0, 0, 0), near=1, far=9)])
+def test_depth_is_linear_from_the_near_plane_to_the_far_plane(camera):
+    for z, expected in ((4, 0), (2, 0.25), (0, 0.5), (-4, 1), (-9, 1)):
+        found = shade(Depth(), position=(0.3, -0.2, z), camera=camera)
+        np.testing.assert_allclose(found, (expected, expected, expected, 1), atol=1e-9)
+
+
+def test_depth_range_sets_black_and_white():
+    np.testing.assert_allclose(shade(Depth(), position=(0, 0, 0), depth_range=(4, 8))[:3], 0.25)
+    np.testing.assert_allclose(shade(Depth(), position=(0, 0, 2), depth_range=(4, 8))[:3], 0)
+
+
+def test_normals_map_to_colours_about_one_half():
+    np.testing.assert_allclose(shade(Normals(), (0, 3, 0)), (0.5, 1, 0.5, 1))
+    np.testing.assert_allclose(shade(Normals(), (-0.6, 0, 0.8)), (0.2, 0.5, 0.9, 1))
+
+
+def test_silhouette_is_white():
+    np.testing.assert_array_equal(shade(Silhouette()), (1, 1, 1, 1))
+
+
+def test_unlit_multiplies_base_colour_and_factor_and_premultiplies_where_not_opaque():
+    position = np.zeros((1, 3))
+    gbuffer = GBuffer(position=position, color=np.array([[0.5, 0.6, 0.8, 0.5]]))
+    theta = {"color": np.array([0.5, 1.0, 0.25, 0.4])}
+    np.testing.assert_allclose(Unlit()(theta, gbuffer, FRONT)[0], (0.25, 0.6, 0.2, 1))
+    np.testing.assert_allclose(Unlit(opaque=False)(theta, gbuffer, FRONT)[0], (0.05, 0.12, 0.04, 0.2))
+    np.testing.assert_allclose(Unlit()({}, GBuffer(position=position), FRONT)[0], 1)
+
+
+def test_base_colour_is_the_texture_before_the_vertex_colours():
+    gbuffer = GBuffer(position=np.zeros((1, 3)), color=np.full((1, 3), 0.3), uv=np.full((1, 2), 0.5))
+    theta = {"texture": np.full((1, 1, 3), 0.7)}
+    np.testing.assert_allclose(Unlit()(theta, gbuffer, FRONT)[0, :3], 0.7)
+    np.testing.assert_allclose(Unlit()({}, gbuffer, FRONT)[0, :3], 0.3)
+
+
+# ----------------------------------------------------------------------------------------------------- errors
+
+BOX = box()
+PART = mesh_part(BOX, shader="unlit")
+UV = np.zeros((8, 2))
+
+
+def with_theta(shader="unlit", **theta):
+    return mesh_part(BOX, shader=shader, theta=theta)
+
+
+def two_lights():
+    return {"direction": np.eye(3)[:2], "color": np.eye(3)}
+
+
+BAD = {
+    "zero height": (lambda: rts.render(PART, CAMERA, (0, 5)), ("size", "(0, 5)", "positive integers")),
+    "negative width": (lambda: rts.render(PART, CAMERA, (5, -1)), ("size", "-1", "positive integers")),
+    "fractional size": (lambda: rts.render(PART, CAMERA, (2.5, 3)), ("size", "2.5", "integers")),
+    "one number as size": (lambda: rts.render(PART, CAMERA, 64), ("size", "64", "(height, width)")),
+    "three numbers as size": (lambda: rts.render(PART, CAMERA, (6, 6, 3)), ("size", "(height, width)")),
+    "nan size": (lambda: rts.render(PART, CAMERA, (math.nan, 3)), ("size", "nan")),
+    "infinite size": (lambda: rts.render(PART, CAMERA, (math.inf, 3)), ("size", "inf")),
+    "words as size": (lambda: rts.render(PART, CAMERA, "ab"), ("size", "'ab'")),
+    "absurd size": (lambda: rts.render(PART, CAMERA, (10**6, 10**6)), ("GiB", "smaller size")),
+    "no layers": (lambda: rts.render(PART, CAMERA, SIZE, layers=0), ("layers", "0", "at least 1")),
+    "fractional layers": (lambda: rts.render(PART, CAMERA, SIZE, layers=1.5), ("layers", "1.5", "integer")),
+    "no capacity": (lambda: rts.render(PART, CAMERA, SIZE, capacity=0), ("capacity", "0", "at least 1")),
+    "fractional capacity": (lambda: rts.render(PART, CAMERA, SIZE, capacity=9.5), ("capacity", "9.5")),
+    "no parts": (lambda: rts.render([], CAMERA, SIZE), ("parts", "nothing", "rts.Part")),
+    "a mesh for a part": (lambda: rts.render(PART.surface, CAMERA, SIZE), ("parts", "Mesh", "rts.Part")),
+    "a mesh among parts": (lambda: rts.render([PART, PART.surface], CAMERA, SIZE), ("Mesh", "rts.Part")),
+    "a matrix for a camera": (lambda: rts.render(PART, np.eye(4), SIZE), ("camera", "ndarray", "rts.Camera")),
+    "camera and size swapped": (lambda: rts.render(PART, SIZE, CAMERA), ("camera is a tuple", "rts.Camera")),
+    "view (3, 4)": (
+        lambda: rts.render(PART, CAMERA._replace(view=np.eye(4)[:3]), SIZE),
+        ("camera's view", "(3, 4)", "(4, 4)"),
+    ),
+    "projection a list": (
+        lambda: rts.render(PART, CAMERA._replace(projection=np.eye(4).tolist()), SIZE),
+        ("camera's projection", "(4, 4)"),
+    ),
+    "singular view": (
+        lambda: rts.render(PART, CAMERA._replace(view=np.zeros((4, 4))), SIZE),
+        ("view", "singular"),
+    ),
+    "singular projection": (
+        lambda: rts.render(PART, CAMERA._replace(projection=np.diag([1.0, 0, 1, 1])), SIZE),
+        ("projection", "singular"),
+    ),
+    "nan in the view": (
+        lambda: rts.render(PART, CAMERA._replace(view=np.full((4, 4), np.nan)), SIZE),
+        ("view", "NaN"),
+    ),
+    "transform (3, 3)": (
+        lambda: rts.render([PART, PART.replace(transform=np.eye(3))], CAMERA, SIZE),
+        ("transform of part 1", "(3, 3)", "(4, 4)"),
+    ),
+    "singular transform": (
+        lambda: rts.render(PART.replace(transform=np.diag([1.0, 1, 0, 1])), CAMERA, SIZE),
+        ("transform", "singular"),
+    ),
+    "unknown sampler": (
+        lambda: rts.render(PART, CAMERA, SIZE, sampler="rasta"),
+        ("sampler", "mean 'raster'"),
+    ),
+    "unknown splatter": (
+        lambda: rts.render(PART, CAMERA, SIZE, splatter="mutli"),
+        ("splatter", "mean 'multi'"),
+    ),
+    "unknown shader": (
+        lambda: rts.render(PART.replace(shader="lambart"), CAMERA, SIZE),
+        ("shader", "mean 'lambert'"),
+    ),
+    "cull typo": (lambda: PART.replace(cull="backs"), ("cull", "'backs'", '"back"')),
+    "theta not a dict": (lambda: Part(PART.surface, BOX[0]), ("theta", "ndarray", "dict")),
+    "no vertices": (
+        lambda: rts.render(Part(PART.surface, {"points": BOX[0]}), CAMERA, SIZE),
+        ("'vertices'",),
+    ),
+    "flat vertices": (
+        lambda: rts.render(with_theta(vertices=BOX[0][:, :2]), CAMERA, SIZE),
+        ("(8, 2)", "(rows, 3)"),
+    ),
+    "vertices in one row": (
+        lambda: rts.render(with_theta(vertices=BOX[0].ravel()), CAMERA, SIZE),
+        ("(24,)",),
+    ),
+    "whole vertices": (
+        lambda: rts.render(with_theta(vertices=BOX[0].astype(int)), CAMERA, SIZE),
+        ("vertices", "int64", "floating"),
+    ),
+    "vertices in a list": (
+        lambda: rts.render(with_theta(vertices=BOX[0].tolist()), CAMERA, SIZE),
+        ("vertices", "list", "array"),
+    ),
+    "faces out of range": (
+        lambda: rts.render(with_theta(vertices=BOX[0][:7]), CAMERA, SIZE),
+        ("7 rows", "refer to row 7", "count from 0"),
+    ),
+    "negative faces": (lambda: Mesh([(0, 1, -1)]), ("faces", "-1", "count from 0")),
+    "fractional faces": (lambda: Mesh([(0.0, 1.0, 2.0)]), ("faces", "float64", "integers")),
+    "quads": (lambda: Mesh([(0, 1, 2, 3)]), ("faces", "(1, 4)", "(T, 3)")),
+    "no faces": (lambda: Mesh(np.zeros((0, 3), int)), ("faces", "(0, 3)", "at least one")),
+    "faces beyond int32": (lambda: Mesh([(0, 1, 2**40)]), ("faces", str(2**40), "2**31")),
+    "uv indices of another length": (
+        lambda: Mesh(BOX[1], {"uv": [(0, 1, 2)]}),
+        ("indices['uv']", "(1, 3)", "(12, 3)"),
+    ),
+    "uv rows missing": (
+        lambda: rts.render(with_theta(uv=UV[:5], texture=np.ones((2, 2, 3))), CAMERA, SIZE),
+        ("theta['uv']", "5 rows", "row 7"),
+    ),
+    "uv of one column": (
+        lambda: rts.render(with_theta("textured", uv=UV[:, :1], texture=np.ones((2, 2, 3))), CAMERA, SIZE),
+        ("theta['uv']", "(8, 1)", "(rows, 2)"),
+    ),
+    "an attribute declared and not given": (
+        lambda: rts.render(mesh_part(BOX, indices={"heat": None}), CAMERA, SIZE),
+        ("'heat'",),
+    ),
+    "normals of two columns": (
+        lambda: rts.render(with_theta(normals=np.ones((8, 2))), CAMERA, SIZE),
+        ("theta['normals']", "(8, 2)", "(rows, 3)"),
+    ),
+    "colours of two columns": (
+        lambda: rts.render(with_theta(colors=np.ones((8, 2))), CAMERA, SIZE),
+        ("theta['colors']", "(8, 2)", "(rows, 1 or 3 or 4)"),
+    ),
+    "colour factor of two": (
+        lambda: rts.render(with_theta(color=np.ones(2)), CAMERA, SIZE),
+        ("theta['color']", "(2,)", "(3,) or (4,)"),
+    ),
+    "colour factor a tuple": (
+        lambda: rts.render(with_theta(color=(1.0, 0.0, 0.0)), CAMERA, SIZE),
+        ("theta['color']", "tuple", "array", "(3,) or (4,)"),
+    ),
+    "colour factor a number": (
+        lambda: rts.render(with_theta(color=np.array(0.5)), CAMERA, SIZE),
+        ("theta['color']", "()", "(3,) or (4,)"),
+    ),
+    "textured without a texture": (
+        lambda: rts.render(with_theta("textured", uv=UV), CAMERA, SIZE),
+        ("texture",),
+    ),
+    "textured without uv": (
+        lambda: rts.render(with_theta("textured", texture=np.ones((2, 2, 3))), CAMERA, SIZE),
+        ("uv",),
+    ),
+    "texture of two channels": (
+        lambda: rts.render(with_theta("textured", uv=UV, texture=np.ones((2, 2, 2))), CAMERA, SIZE),
+        ("texture", "(2, 2, 2)", "(h, w, C)"),
+    ),
+    "texture without pixels": (
+        lambda: rts.render(with_theta("textured", uv=UV, texture=np.ones((0, 2, 3))), CAMERA, SIZE),
+        ("texture", "(0, 2, 3)"),
+    ),
+    "wrap typo": (lambda: Textured(wrap="reapeat"), ("wrap", "'reapeat'", "mirror")),
+    "two directions, three colours": (
+        lambda: rts.render(with_theta("lambert", light=two_lights()), CAMERA, SIZE),
+        ("2 directions", "3 colors"),
+    ),
+    "a light's direction of two": (
+        lambda: rts.render(with_theta("lambert", light={"direction": np.ones(2)}), CAMERA, SIZE),
+        ("light", "direction", "(2,)", "(3,)"),
+    ),
+    "a light's colour a list": (
+        lambda: rts.render(with_theta("lambert", light={"color": [1.0, 1.0, 1.0]}), CAMERA, SIZE),
+        ("theta['light']['color']", "list", "array"),
+    ),
+    "a light that is no dict": (
+        lambda: rts.render(with_theta("lambert", light=np.ones(3)), CAMERA, SIZE),
+        ("light", "ndarray", "dict"),
+    ),
+    "a light's entry misspelt": (
+        lambda: rts.render(with_theta("lambert", light={"dirction": np.ones(3)}), CAMERA, SIZE),
+        ("light", "'dirction'", "direction"),
+    ),
+    "background of two": (
+        lambda: rts.render(PART, CAMERA, SIZE, background=(0, 1)),
+        ("background", "(2,)", "(4,)"),
+    ),
+    "background of another size": (
+        lambda: rts.render(PART, CAMERA, SIZE, background=np.ones((5, 6, 3))),
+        ("background", "(5, 6, 3)", "(20, 24, 3)"),
+    ),
+    "shader of three channels": (
+        lambda: rts.render(PART.replace(shader=lambda t, g, c: g["position"]), CAMERA, SIZE),
+        ("shader", "3)", "4)"),
+    ),
+    "samples of other parts": (
+        lambda: rts.render_samples(rts.sample(PART, CAMERA, SIZE), [PART, PART], CAMERA),
+        ("2 parts", "samples of 1"),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_an_input_error_of_one_line_that_says_what_was_given(name):
+    call, words = BAD[name]
+    with pytest.raises(rts.InputError) as error:
+        call()
+    message = str(error.value)
+    assert "\n" not in message
+    for word in words:
+        assert word in message, message
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_bad_values_in_tensors_are_input_errors_too(target):
+    part, camera = arrays(target, (PART, CAMERA))
+    with pytest.raises(rts.InputError, match="view matrix is singular"):
+        rts.render(part, camera._replace(view=camera.view * 0), SIZE)
+    with pytest.raises(rts.InputError, match=r"shape \(8, 2\)"):
+        rts.render(part.replace(theta={"vertices": part.theta["vertices"][:, :2]}), camera, SIZE)
+    with pytest.raises(rts.InputError, match="NaN or infinite"):
+        rts.render(part.replace(theta={"vertices": part.theta["vertices"] * math.nan}), camera, SIZE)
+    with pytest.raises(rts.InputError, match="int32; expected a floating one"):
+        rts.render(part.replace(theta={"vertices": arrays(target, BOX[0].astype(np.int32))}), camera, SIZE)
+
+
+def test_every_error_is_an_error_of_the_library_and_of_its_python_kind():
+    assert issubclass(rts.InputError, (rts.RtsError, ValueError))
+    assert issubclass(rts.InputError, ValueError) and issubclass(rts.InputError, rts.RtsError)
+    assert issubclass(rts.EngineError, TypeError) and issubclass(rts.EngineError, rts.RtsError)
+    assert issubclass(rts.PluginError, ImportError) and issubclass(rts.PluginError, rts.RtsError)
