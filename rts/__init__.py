@@ -11,6 +11,7 @@ from rts.protocols import Fragments, GBuffer, Part, Proxy, Sampled, Samples
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples, sample
 from rts.sampling import TriangleSampler
+from rts.scenes import load, load_image, save_animation, save_image
 
 __all__ = [
     "Camera",
@@ -27,10 +28,14 @@ __all__ = [
     "Samples",
     "TriangleSampler",
     "fit",
+    "load",
+    "load_image",
     "plugin",
     "plugins",
     "render",
     "render_samples",
     "rigid",
     "sample",
+    "save_animation",
+    "save_image",
 ]

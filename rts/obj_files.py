@@ -1,0 +1,247 @@
+"""Reading Wavefront OBJ files and their MTL materials."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.errors import InputError
+from rts.model_files import Piece, inside, read_texture
+
+# Options of a map statement, such as "-s 2 2 1 -clamp on"; the rest is the file's name, spaces and all.
+_VALUE = r"(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?[\d.][-+.\deE]*)"
+_MAP_OPTIONS = re.compile(rf"^(?:-[a-z]+\s+(?:{_VALUE}\s+)*)+", re.IGNORECASE)
+_MAPS = ("map_", "bump", "disp", "decal", "refl", "norm")
+
+
+class Material(NamedTuple):
+    """What is used of an MTL material.
+
+    Attributes:
+        color: (3,) Kd, sRGB, or (4,) where d or Tr make it translucent; None where there is no Kd.
+        texture: file of map_Kd, or None. It replaces Kd.
+    """
+
+    color: np.ndarray | None = None
+    texture: Path | None = None
+
+
+class _Lines:
+    """The statements of an OBJ file, by kind, each with its line number."""
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.rows: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}
+        self.numbers: dict[str, list[int]] = {"v": [], "vt": [], "vn": []}
+        self.faces: list[tuple[int, str, int]] = []
+        self.libraries: list[str] = []
+        self.materials: dict[str | None, int] = {}
+
+    def read(self) -> _Lines:
+        """Sort the lines of the file."""
+        text = (
+            self.path.read_bytes()
+            .decode("utf-8", errors="replace")
+            .replace("\\\r\n", " ")
+            .replace("\\\n", " ")
+        )
+        material = self.materials.setdefault(None, 0)
+        for number, line in enumerate(text.splitlines(), start=1):
+            key, _, rest = line.partition("#")[0].replace("\t", " ").strip().partition(" ")
+            if key in self.rows:
+                self.rows[key].append(rest)
+                self.numbers[key].append(number)
+            elif key == "f":
+                self.faces.append((number, self._absolute(rest, number) if "-" in rest else rest, material))
+            elif key == "usemtl":
+                material = self.materials.setdefault(rest.strip(), len(self.materials))
+            elif key == "mtllib":
+                # The whole line: names may hold spaces and, however unwisely, "#".
+                self.libraries.append(line.strip()[len("mtllib") :].strip())
+        return self
+
+    def fail(self, number: int, what: str) -> InputError:
+        """The error of a line."""
+        return InputError(
+            f"{self.path}, line {number}: {what}; the file may be cut short or damaged: export it again"
+        )
+
+    def _absolute(self, rest: str, number: int) -> str:
+        """A face whose negative indices, which count back from the latest row, are made positive."""
+        counts = [len(self.rows[k]) for k in ("v", "vt", "vn")]
+        corners = []
+        for corner in rest.split():
+            parts = corner.split("/")
+            for i, part in enumerate(parts[:3]):
+                if part.startswith("-"):
+                    index = counts[i] + 1 + self.integer(part, number)
+                    if index < 1:
+                        raise self.fail(
+                            number, f"the index {part} counts back further than the {counts[i]} rows so far"
+                        )
+                    parts[i] = str(index)
+            corners.append("/".join(parts))
+        return " ".join(corners)
+
+    def integer(self, token: str, number: int) -> int:
+        """A whole number of line `number`."""
+        try:
+            return int(token)
+        except ValueError:
+            raise self.fail(number, f"{token!r} is no index") from None
+
+    def array(self, key: str, least: int, widths: tuple[int, ...]) -> np.ndarray:
+        """The rows of one kind: the widest of `widths` that every row has, at least `least` columns."""
+        split = [row.split() for row in self.rows[key]]
+        if not split:
+            return np.zeros((0, least))
+        shortest = min(range(len(split)), key=lambda i: len(split[i]))
+        if len(split[shortest]) < least:
+            raise self.fail(
+                self.numbers[key][shortest], f"{key!r} has {len(split[shortest])} numbers; expected {least}"
+            )
+        width = max(w for w in widths if w <= len(split[shortest]))
+        try:
+            return np.array([[float(x) for x in row[:width]] for row in split])
+        except ValueError:
+            for number, row in zip(self.numbers[key], split, strict=True):
+                if not all(_is_number(x) for x in row[:width]):
+                    raise self.fail(number, f"{' '.join(row)!r} are not numbers") from None
+            raise
+
+    def triangles(self, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Zero-based indices of position, uv and normal (T, 3 corners, 3), and the material (T,).
+
+        An index that is not given is −1. Polygons become fans.
+        """
+        corners: list[tuple[int, ...]] = []
+        materials: list[int] = []
+        known: dict[str, tuple[int, ...]] = {}
+        for number, rest, material in self.faces:
+            tokens = rest.split()
+            if len(tokens) < 3:
+                raise self.fail(number, f"a face has {len(tokens)} corners; expected at least 3")
+            polygon = []
+            for token in tokens:
+                if token not in known:
+                    known[token] = self._corner(token, number, counts)
+                polygon.append(known[token])
+            for second, third in zip(polygon[1:], polygon[2:], strict=False):
+                corners += (polygon[0], second, third)
+                materials.append(material)
+        return np.array(corners, np.int64).reshape(-1, 3, 3), np.array(materials, np.int64)
+
+    def _corner(self, token: str, number: int, counts: tuple[int, int, int]) -> tuple[int, ...]:
+        indices = []
+        for part, count, name in zip(
+            [*token.split("/"), "", ""][:3],
+            counts,
+            ("vertices", "texture coordinates", "normals"),
+            strict=True,
+        ):
+            index = self.integer(part, number) if part or name == "vertices" else 0
+            if part and not 1 <= index <= count:
+                raise self.fail(
+                    number, f"a face refers to number {part} of {count} {name} (indices count from 1)"
+                )
+            indices.append(index - 1)
+        return tuple(indices)
+
+
+def read_obj(path: Path) -> list[Piece]:
+    """One piece a material, in order of first use. See `rts.model_files.read_pieces`."""
+    lines = _Lines(path).read()
+    materials = _materials(lines)
+    used = {material for _, _, material in lines.faces}
+    textures = {
+        name: read_texture(materials[name].texture, path)
+        for name, index in lines.materials.items()
+        if index in used and name in materials and materials[name].texture is not None
+    }
+    v, vt, vn = lines.array("v", 3, (3, 6)), lines.array("vt", 1, (1, 2)), lines.array("vn", 3, (3,))
+    if not lines.faces:
+        what = f"{len(v)} vertices but no faces" if len(v) else "neither vertices nor faces"
+        raise InputError(f"{path} holds {what}; expected a mesh with triangles or polygons")
+    if vt.shape[1] == 1:
+        vt = np.concatenate([vt, np.zeros_like(vt)], axis=1)
+    corners, owner = lines.triangles((len(v), len(vt), len(vn)))
+    pieces = []
+    for name, index in lines.materials.items():
+        if index not in used:
+            continue
+        faces, uv, normals = np.moveaxis(corners[owner == index], 2, 0)
+        attributes: dict[str, Any] = {}
+        if (uv >= 0).all():
+            attributes["uv"] = (vt, uv)
+        if (normals >= 0).all():
+            attributes["normals"] = (vn, normals)
+        if v.shape[1] == 6:
+            attributes["colors"] = (v[:, 3:] / (255 if v[:, 3:].max() > 1 else 1), faces)
+        material = materials.get(name, Material())
+        pieces.append(Piece(v[:, :3], faces, attributes, textures.get(name), material.color))
+    return pieces
+
+
+def _materials(lines: _Lines) -> dict[str | None, Material]:
+    """The materials of all libraries by name."""
+    found: dict[str | None, Material] = {}
+    for name in lines.libraries:
+        library = inside(lines.path.parent, name, lines.path)
+        if library.is_file():
+            found.update(_read_mtl(library, lines.path.parent))
+        else:
+            warnings.warn(
+                f"{lines.path} names the material library {name!r}, but there is no file {library}; it is "
+                "loaded without materials",
+                stacklevel=2,
+            )
+    return found
+
+
+def _read_mtl(library: Path, folder: Path) -> dict[str, Material]:
+    found: dict[str, dict[str, Any]] = {}
+    current: dict[str, Any] = {}
+
+    def numbers(rest: str) -> list[float]:
+        try:
+            return [float(x) for x in rest.split()]
+        except ValueError:
+            return []  # "Kd spectral file.rfl" and the like.
+
+    for line in library.read_bytes().decode("utf-8", errors="replace").splitlines():
+        key, _, rest = line.replace("\t", " ").strip().partition(" ")
+        key, rest = key.lower(), rest.strip()
+        if key == "newmtl":
+            current = found.setdefault(rest, {})
+        elif key == "kd" and len(numbers(rest)) in (1, 3):
+            current["color"] = np.resize(numbers(rest), 3)
+        elif key == "d" and len(numbers(rest)) == 1:
+            current["alpha"] = numbers(rest)[0]
+        elif key == "tr" and len(numbers(rest)) == 1:
+            current.setdefault("alpha", 1 - numbers(rest)[0])
+        elif key.startswith(_MAPS) and rest:
+            file = inside(folder, _MAP_OPTIONS.sub("", rest), library)
+            if key == "map_kd":
+                current["texture"] = file
+    return {name: _material(values) for name, values in found.items()}
+
+
+def _material(values: dict[str, Any]) -> Material:
+    color, alpha = values.get("color"), values.get("alpha", 1.0)
+    if "texture" in values:
+        color = None if alpha >= 1 else np.ones(3)
+    if alpha < 1:
+        color = np.append(np.ones(3) if color is None else color, max(alpha, 0.0))
+    return Material(color, values.get("texture"))
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
