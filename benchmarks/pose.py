@@ -54,7 +54,9 @@ def arrays(engine: str, x: np.ndarray):
     return jnp.asarray(x, jnp.float32)
 
 
-def run(part: rts.Part, view: rts.Camera, target: np.ndarray, seed: int, method: str, engine: str, splatter: str) -> dict:
+def run(
+    part: rts.Part, view: rts.Camera, target: np.ndarray, seed: int, method: str, engine: str, splatter: str
+) -> dict:
     """One fit."""
     goal = arrays(engine, target)
 
@@ -100,7 +102,10 @@ def main() -> None:
     args.output.mkdir(parents=True, exist_ok=True)
     surface = rts.plugin("rts.surfaces", "mesh")
     results = defaultdict(list)
-    print(f"{'mesh':10} view method  succeeded  failures (local minimum / ambiguous)  median steps  s   ms/step", flush=True)
+    print(
+        f"{'mesh':10} view method  succeeded  failures (local minimum / ambiguous)  median steps  s   ms/step",
+        flush=True,
+    )
     for name in args.meshes:
         vertices, faces = mesh(name)
         part = rts.Part(surface(faces), {"vertices": vertices.astype(np.float32)}, "silhouette")

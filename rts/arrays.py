@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from rts.errors import EngineError
-from rts.protocols import STATIC_FIELDS, Array, Engine, Tree, join_record, split_record
+from rts.protocols import Array, Engine, Tree
+from rts.records import STATIC_FIELDS, join_record, split_record
 
 CONSTANT_TYPES = (np.ndarray, np.generic, bool, int, float)
 
@@ -121,7 +122,9 @@ def promote(*values: Any) -> tuple[Any, list[Array]]:
 
     Where all are NumPy or numbers the result is float64.
     """
-    values_ = [np.asarray(v, dtype=np.float64) if isinstance(v, (list, tuple)) and is_constant(v) else v for v in values]
+    values_ = [
+        np.asarray(v, dtype=np.float64) if isinstance(v, (list, tuple)) and is_constant(v) else v for v in values
+    ]
     engine = engine_of(values_)
     if any(isinstance(v, (list, tuple)) for v in values_):
         # A list of traced scalars, such as an eye built of parameters.

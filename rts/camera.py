@@ -16,131 +16,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import affine, is_constant, matmul, namespace, promote, unit
-from rts.errors import InputError
+from rts.arrays import affine, is_constant, matmul, namespace, promote
 from rts.protocols import Array, Rays
+from rts.transforms import (
+    affine_matrix,
+    check_range,
+    check_shapes,
+    look_at,
+    matrix_of,
+    orthographic,
+    perspective,
+    scaled_rows,
+)
 
 NEAR_OVER_DISTANCE = 1e-2
 FAR_OVER_DISTANCE = 1e2
-
-
-def _matrix(xp: Any, rows: list[list[Any]], like: Array) -> Array:
-    """A matrix of array scalars and numbers, in the dtype of `like`."""
-    zero = xp.zeros_like(like)
-    # Forward-mode torch widens products of a number and a scalar tensor; hence the cast.
-    return xp.astype(xp.stack([xp.stack([zero + entry for entry in row]) for row in rows]), like.dtype)
-
-
-def _flipped(matrix: Array, row_signs: tuple[float, ...]) -> Array:
-    """The matrix with its rows multiplied by signs."""
-    xp = namespace(matrix)
-    return xp.stack([matrix[i, :] * s for i, s in enumerate(row_signs)])
-
-
-def affine_matrix(linear: Array, translation: Array) -> Array:
-    """(4, 4) from a (3, 3) linear map and a (3,) translation."""
-    xp = namespace(linear)
-    last = xp.zeros_like(translation)
-    bottom = xp.concat([last, xp.ones_like(translation[:1])])
-    return xp.concat([xp.concat([linear, translation[:, None]], axis=1), bottom[None, :]], axis=0)
-
-
-def _check_range(near: Any, far: Any, *, positive: bool) -> None:
-    if not is_constant((near, far)):
-        return
-    if not (math.isfinite(near) and math.isfinite(far) and near < far):
-        raise InputError(f"near is {near} and far is {far}; expected finite numbers with near < far")
-    if positive and near <= 0:
-        raise InputError(f"near is {near}; a perspective camera needs near > 0")
-
-
-def _check_shapes(given: dict[str, tuple[Array, tuple[tuple[int, ...], ...]]]) -> None:
-    """Refuse arrays whose shape is none of those expected."""
-    for name, (array, expected) in given.items():
-        if tuple(array.shape) not in expected:
-            shapes = " or ".join(map(str, expected))
-            raise InputError(f"{name} has shape {tuple(array.shape)}; expected {shapes}")
-
-
-def perspective(
-    fov_y: Any, aspect: Any = 1.0, near: Any = 0.1, far: Any = 100.0, principal_point: Any = (0.0, 0.0)
-) -> Array:
-    """(4, 4) perspective projection.
-
-    Args:
-        fov_y: vertical field of view, degrees.
-        aspect: width over height.
-        near: depth of the near plane, positive.
-        far: depth of the far plane.
-        principal_point: (2,) where the axis meets the image, NDC; (0, 0) is the middle.
-    """
-    _check_range(near, far, positive=True)
-    if is_constant(fov_y) and not 0 < fov_y < 180:
-        raise InputError(f"fov_y is {fov_y}; expected degrees between 0 and 180")
-    xp, (fov, aspect, near, far, point) = promote(fov_y, aspect, near, far, principal_point)
-    scale = 1 / xp.tan(fov * (math.pi / 360))
-    depth = far - near
-    return _matrix(
-        xp,
-        [
-            [scale / aspect, 0, -point[0], 0],
-            [0, scale, -point[1], 0],
-            [0, 0, -(far + near) / depth, -2 * far * near / depth],
-            [0, 0, -1, 0],
-        ],
-        fov,
-    )
-
-
-def orthographic(
-    height: Any, aspect: Any = 1.0, near: Any = 0.1, far: Any = 100.0, principal_point: Any = (0.0, 0.0)
-) -> Array:
-    """(4, 4) orthographic projection.
-
-    Args:
-        height: of the image, world units.
-        aspect: width over height.
-        near: depth of the near plane; may be negative.
-        far: depth of the far plane.
-        principal_point: (2,) where the axis meets the image, NDC.
-    """
-    _check_range(near, far, positive=False)
-    if is_constant(height) and not (math.isfinite(height) and height > 0):
-        raise InputError(f"height is {height}; expected a positive number of world units")
-    xp, (height, aspect, near, far, point) = promote(height, aspect, near, far, principal_point)
-    scale, depth = 2 / height, far - near
-    return _matrix(
-        xp,
-        [
-            [scale / aspect, 0, 0, point[0]],
-            [0, scale, 0, point[1]],
-            [0, 0, -2 / depth, -(far + near) / depth],
-            [0, 0, 0, 1],
-        ],
-        height,
-    )
-
-
-def look_at(eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0)) -> Array:
-    """(4, 4) view matrix of a camera at `eye` (3,) that faces `target` (3,), world space.
-
-    Raises:
-        InputError: eye and target coincide, or the direction of view is parallel to `up`.
-    """
-    if is_constant((eye, target, up)):
-        eye_, target_, up_ = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
-        _check_shapes({"eye": (eye_, ((3,),)), "target": (target_, ((3,),)), "up": (up_, ((3,),))})
-        if not np.linalg.norm(np.cross(target_ - eye_, up_)) > 1e-12 * np.linalg.norm(target_ - eye_) * np.linalg.norm(up_):
-            raise InputError(
-                f"a camera at {eye_.tolist()} that looks at {target_.tolist()} has no upright with up = {up_.tolist()}; "
-                f"move the eye or give another up"
-            )
-    xp, (eye, target, up) = promote(eye, target, up)
-    _check_shapes({"eye": (eye, ((3,),)), "target": (target, ((3,),)), "up": (up, ((3,),))})
-    back = unit(eye - target)
-    right = unit(xp.linalg.cross(up, back))
-    linear = xp.stack([right, xp.linalg.cross(back, right), back])
-    return affine_matrix(linear, -matmul(linear, eye[:, None])[:, 0])
 
 
 class Camera(NamedTuple):
@@ -230,14 +120,14 @@ class Camera(NamedTuple):
             pixel_center: where K puts the centre of the first pixel: 0 in OpenCV, 0.5 in COLMAP and most data sets
                 whose principal point is exactly (width / 2, height / 2).
         """
-        _check_range(near, far, positive=True)
+        check_range(near, far, positive=True)
         xp, (K, R, t, near, far) = promote(K, R, t, near, far)
-        _check_shapes({"K": (K, ((3, 3),)), "R": (R, ((3, 3),)), "t": (t, ((3,), (3, 1)))})
+        check_shapes({"K": (K, ((3, 3),)), "R": (R, ((3, 3),)), "t": (t, ((3,), (3, 1)))})
         height, width = size
-        view = _flipped(affine_matrix(R, xp.reshape(t, (3,))), (1, -1, -1, 1))
+        view = scaled_rows(affine_matrix(R, xp.reshape(t, (3,))), (1, -1, -1, 1))
         cx, cy = K[0, 2] + (0.5 - pixel_center), K[1, 2] + (0.5 - pixel_center)
         depth = far - near
-        projection = _matrix(
+        projection = matrix_of(
             xp,
             [
                 [2 * K[0, 0] / width, -2 * K[0, 1] / width, 1 - 2 * cx / width, 0],
@@ -253,7 +143,7 @@ class Camera(NamedTuple):
     def from_opengl(cls, modelview: Any, projection: Any) -> Camera:
         """From OpenGL's matrices, which are ours."""
         _, (view, projection) = promote(modelview, projection)
-        _check_shapes({"modelview": (view, ((4, 4),)), "projection": (projection, ((4, 4),))})
+        check_shapes({"modelview": (view, ((4, 4),)), "projection": (projection, ((4, 4),))})
         return cls(view, projection)
 
     @classmethod
@@ -269,7 +159,7 @@ class Camera(NamedTuple):
             top_down: the projection has its y negated, so that nvdiffrast's row 0 is the top already.
         """
         view, projection = cls.from_opengl(modelview, projection)
-        return cls(view, _flipped(projection, (1, -1, 1, 1)) if top_down else projection)
+        return cls(view, scaled_rows(projection, (1, -1, 1, 1)) if top_down else projection)
 
     @classmethod
     def from_pytorch3d(
@@ -294,15 +184,15 @@ class Camera(NamedTuple):
             near: near plane.
             far: far plane.
         """
-        _check_range(near, far, positive=True)
+        check_range(near, far, positive=True)
         xp, (R, T, focal, point, near, far) = promote(R, T, focal_length, principal_point, near, far)
-        _check_shapes({"R": (R, ((3, 3),)), "T": (T, ((3,),))})
+        check_shapes({"R": (R, ((3, 3),)), "T": (T, ((3,),))})
         height, width = size
         sx, sy = min(size) / width, min(size) / height
         focal = focal + xp.zeros_like(point)
-        view = _flipped(affine_matrix(xp.linalg.matrix_transpose(R), T), (-1, 1, -1, 1))
+        view = scaled_rows(affine_matrix(xp.linalg.matrix_transpose(R), T), (-1, 1, -1, 1))
         depth = far - near
-        projection = _matrix(
+        projection = matrix_of(
             xp,
             [
                 [focal[0] * sx, 0, point[0] * sx, 0],
@@ -328,7 +218,7 @@ class Camera(NamedTuple):
             far: far plane.
         """
         xp, (c2w, focal) = promote(camera_to_world, focal)
-        _check_shapes({"camera_to_world": (c2w, ((4, 4), (3, 4)))})
+        check_shapes({"camera_to_world": (c2w, ((4, 4), (3, 4)))})
         c2w = affine_matrix(c2w[:3, :3], c2w[:3, 3])
         fov_y = xp.atan(size[0] / (2 * focal)) * (360 / math.pi)
         fov_y = fov_y if not is_constant(fov_y) else float(fov_y)
@@ -342,16 +232,20 @@ class Camera(NamedTuple):
         height, width = size
         scale = -1 / p[3, 2]
         shift = pixel_center - 0.5
-        K = _matrix(
+        K = matrix_of(
             xp,
             [
-                [p[0, 0] * scale * width / 2, -p[0, 1] * scale * width / 2, (1 - p[0, 2] * scale) * width / 2 + shift],
+                [
+                    p[0, 0] * scale * width / 2,
+                    -p[0, 1] * scale * width / 2,
+                    (1 - p[0, 2] * scale) * width / 2 + shift,
+                ],
                 [0, p[1, 1] * scale * height / 2, (1 + p[1, 2] * scale) * height / 2 + shift],
                 [0, 0, 1],
             ],
             scale,
         )
-        view = _flipped(self.view, (1, -1, -1, 1))
+        view = scaled_rows(self.view, (1, -1, -1, 1))
         return K, view[:3, :3], view[:3, 3]
 
     def to_opengl(self) -> tuple[Array, Array]:
@@ -360,15 +254,20 @@ class Camera(NamedTuple):
 
     def to_nvdiffrast(self, *, top_down: bool = False) -> tuple[Array, Array]:
         """(modelview, projection); with `top_down`, row 0 of nvdiffrast's image is the top, as here."""
-        return self.view, _flipped(self.projection, (1, -1, 1, 1)) if top_down else self.projection
+        return self.view, scaled_rows(self.projection, (1, -1, 1, 1)) if top_down else self.projection
 
     def to_pytorch3d(self, size: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
         """(R, T, focal_length (2,), principal_point (2,)); the inverse of `from_pytorch3d`."""
         xp, p = namespace(self.projection), self.projection
         sx, sy, scale = min(size) / size[1], min(size) / size[0], -1 / p[3, 2]
-        view = _flipped(self.view, (-1, 1, -1, 1))
+        view = scaled_rows(self.view, (-1, 1, -1, 1))
         focal = xp.stack([p[0, 0] / sx, p[1, 1] / sy]) * scale
-        return xp.linalg.matrix_transpose(view[:3, :3]), view[:3, 3], focal, xp.stack([p[0, 2] / sx, -p[1, 2] / sy]) * scale
+        return (
+            xp.linalg.matrix_transpose(view[:3, :3]),
+            view[:3, 3],
+            focal,
+            xp.stack([p[0, 2] / sx, -p[1, 2] / sy]) * scale,
+        )
 
     def to_blender(self, size: tuple[int, int]) -> tuple[Array, Array]:
         """(camera-to-world (4, 4), focal length in pixels)."""
@@ -387,7 +286,7 @@ class Camera(NamedTuple):
         """The camera of the image with `apron` more pixels on every side."""
         height, width = size
         signs = (width / (width + 2 * apron), height / (height + 2 * apron), 1, 1)
-        return self._replace(projection=_flipped(self.projection, signs))
+        return self._replace(projection=scaled_rows(self.projection, signs))
 
     def project(self, points: Array, size: tuple[int, int]) -> Array:
         """Pixel x, pixel y and linear depth of world points.

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import engine_of, is_constant, leaves, map_leaves, namespace, promote
-from rts.camera import affine_matrix
+from rts.arrays import engine_of, is_constant, leaves, map_leaves, namespace
 from rts.errors import InputError
 from rts.protocols import Array, Engine, Tree
 
@@ -247,7 +246,12 @@ def _progress(wanted: bool | None, steps: int, method: str, run: _Run) -> Iterat
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[status]}")
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[status]}"),
+    )
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task, start = bar.add_task(method, total=steps, status=""), time.perf_counter()
 
@@ -257,36 +261,3 @@ def _progress(wanted: bool | None, steps: int, method: str, run: _Run) -> Iterat
 
         run.show = show
         yield
-
-
-def rigid(pose: Array, center: Any = (0.0, 0.0, 0.0)) -> Array:
-    """World-from-local transform of a rigid pose; differentiable everywhere, at zero rotation too.
-
-    Args:
-        pose: (6,) rotation vector (axis times angle, radians) about `center`, then translation.
-        center: (3,) local space.
-
-    Returns:
-        (4, 4), usable as `Part.transform`.
-    """
-    if tuple(getattr(pose, "shape", ())) != (6,):
-        raise InputError(f"pose has shape {tuple(getattr(pose, 'shape', ()))}; expected (6,): rotation vector, translation")
-    xp, (pose, center) = promote(pose, center)
-    x, y, z = pose[0], pose[1], pose[2]
-    square = x * x + y * y + z * z
-    # Below a tenth of a radian the series is exact to rounding; the square root is kept away from zero, where its
-    # derivative is infinite.
-    small = square < 1e-2
-    angle = xp.sqrt(xp.where(small, xp.ones_like(square), square))
-    a = xp.where(small, 1 - square / 6 * (1 - square / 20 * (1 - square / 42)), xp.sin(angle) / angle)
-    b = xp.where(small, 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56)), (1 - xp.cos(angle)) / angle**2)
-    one = xp.ones_like(square)
-    rotation = xp.stack(
-        [
-            xp.stack([one - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y]),
-            xp.stack([b * x * y + a * z, one - b * (x * x + z * z), b * y * z - a * x]),
-            xp.stack([b * x * z - a * y, b * y * z + a * x, one - b * (x * x + y * y)]),
-        ]
-    )
-    moved = center + pose[3:] - xp.sum(rotation * center, axis=1)
-    return affine_matrix(rotation, moved)

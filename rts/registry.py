@@ -76,7 +76,8 @@ def _entry(group: str, name: str) -> EntryPoint:
         raise InputError(f"no {kind} named {name!r}; there are {', '.join(names)}{_suggest(name, names)}{hint}")
     if len(found) > 1:
         raise PluginError(
-            f"the {kind} {name!r} is claimed by {' and '.join(sorted(map(_distribution, found)))}; uninstall one of them"
+            f"the {kind} {name!r} is claimed by {' and '.join(sorted(map(_distribution, found)))}; "
+            f"uninstall one of them"
         )
     return found[0]
 

@@ -22,6 +22,7 @@ APRON = 1
 BYTES_PER_CELL = 200
 """Rough memory of one cell of one layer through sampling, shading and splatting without gradients."""
 
+
 def _memory() -> float:
     """Physical memory in bytes, or infinity where the system does not tell."""
     try:
@@ -88,6 +89,10 @@ def sample(
     parts, camera = _resolve(parts, camera)
     height, width = _check_size(size, layers, capacity)
     chosen = _choose("rts.samplers", sampler)
+    engine = engine_of(parts, camera)
+    if engine.name != "numpy":
+        # Every part is then sampled by the one engine, and by the very matrices that samples are projected with.
+        camera = constants(camera, engine, exemplar(parts, camera))
     grid = height + 2 * APRON, width + 2 * APRON
     wide = camera.with_apron((height, width), APRON)
     samples = [chosen.sample(p, wide.within(p.transform), grid, layers, capacity=capacity) for p in parts]
@@ -116,7 +121,9 @@ def render_samples(
     """
     parts, camera = _resolve(parts, camera)
     if len(parts) != len(sampled.samples):
-        raise InputError(f"{len(parts)} parts were given for the samples of {len(sampled.samples)}; pass the same parts")
+        raise InputError(
+            f"{len(parts)} parts were given for the samples of {len(sampled.samples)}; pass the same parts"
+        )
     splatter = _choose("rts.splatters", splatter)
     engine = engine_of(parts, camera, sampled)
     like = exemplar(parts, camera, sampled)
@@ -179,7 +186,8 @@ def _move_normals(transform: Array, normals: Array) -> Array:
     xp = namespace(transform)
     a, b, c = (transform[:3, i] for i in range(3))
     cofactors = [xp.linalg.cross(b, c), xp.linalg.cross(c, a), xp.linalg.cross(a, b)]
-    outside = xp.sign(xp.sum(a * cofactors[0]))
+    volume = xp.sum(a * cofactors[0])
+    outside = xp.where(volume < 0, -xp.ones_like(volume), xp.ones_like(volume))
     return sum(normals[:, i : i + 1] * (cofactors[i] * outside) for i in range(3))
 
 

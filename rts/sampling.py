@@ -25,9 +25,7 @@ class TriangleSampler(abc.ABC):
         return proxy
 
     @abc.abstractmethod
-    def rasterize(
-        self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str
-    ) -> Fragments:
+    def rasterize(self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """The `layers` nearest triangles of every pixel, at its centre, between the near and the far plane.
 
         Args:

@@ -71,7 +71,7 @@ class Kernel(abc.ABC):
         """`splat` of at least one sample."""
 
     def weights(self, position: Array) -> tuple[dict[int, Array], dict[int, Array]]:
-        """Weights of the cells (h, w, ·) whose first is cell (−1, −1): by target offset u, and by v; w = x[u] · y[v]."""
+        """Weights of cells (h, w, ·), the first being cell (−1, −1): by target offset u, and by v; w = x[u] · y[v]."""
         xp = namespace(position)
         height, width = position.shape[:2]
         constant = engine_of(position).constant
@@ -110,9 +110,9 @@ class Multi(Kernel):
     """Three accumulation buffers (paper §3.3.2): in front of the target, at its surface, and behind it.
 
     Layers of the source p and the target q are paired on linear depth z: with A_l = |z_p[l] − z_q[0]| and
-    B_l = |z_q[l] − z_p[0]|, s = −argmin B where min B < min A, else argmin A. Layer l of p is in front where l < s, at the
-    surface where l = s, behind where l > s. The B test catches a source whose front layer continues a hidden layer of
-    the target. Back faces of a closed surface pair with what lies behind them: cull them (`Part.cull`).
+    B_l = |z_q[l] − z_p[0]|, s = −argmin B where min B < min A, else argmin A. Layer l of p is in front where l < s, at
+    the surface where l = s, behind where l > s. The B test catches a source whose front layer continues a hidden layer
+    of the target. Back faces of a closed surface pair with what lies behind them: cull them (`Part.cull`).
     """
 
     def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
@@ -147,7 +147,8 @@ def check_splats(positions: Array, rgba: Array, row: Array) -> None:
     ok = len(shapes[0]) == 2 and shapes[0][1] == 3 and shapes[1] == (shapes[0][0], 4) and len(shapes[2]) == 3
     if not ok or shapes[2][0] < 1:
         raise InputError(
-            f"positions, rgba and row have shapes {shapes[0]}, {shapes[1]}, {shapes[2]}; expected (N, 3), (N, 4), (K, H, W)"
+            f"positions, rgba and row have shapes {shapes[0]}, {shapes[1]}, {shapes[2]}; "
+            f"expected (N, 3), (N, 4), (K, H, W)"
         )
 
 
@@ -198,7 +199,7 @@ def _depths(position: list[Array], cells: Array) -> list[Array]:
 
 
 def _pairing(source: list[Array], target: list[Array], xp: Any) -> Array:
-    """s of each target for one of its sources."""
+    """S of each target for one of its sources."""
     a, best_a = _first_minimum([xp.abs(z - target[0]) for z in source], xp)
     b, best_b = _first_minimum([xp.abs(z - source[0]) for z in target], xp)
     return xp.where(best_b < best_a, -b, a)

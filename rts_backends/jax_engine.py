@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from rts.protocols import STATIC_FIELDS, ArraySpec, Tree, join_record, split_record
+from rts.protocols import ArraySpec, Tree
+from rts.records import STATIC_FIELDS, join_record, split_record
 
 for _cls in STATIC_FIELDS:
     jax.tree_util.register_pytree_node(
@@ -104,7 +105,7 @@ class JaxEngine:
         return jax.jit(f)
 
     def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
-        """optax's `adam` or `sgd`."""
+        """Optax's `adam` or `sgd`."""
         import optax
 
         transform = {"adam": optax.adam, "sgd": optax.sgd}[name](learning_rate)

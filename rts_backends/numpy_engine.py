@@ -41,7 +41,9 @@ class NumpyEngine:
 
     def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> np.ndarray:
         """Sums of the rows of `values` that share a segment."""
-        return np.stack([np.bincount(segments, weights=v, minlength=count) for v in values.T], axis=-1).astype(values.dtype)
+        return np.stack([np.bincount(segments, weights=v, minlength=count) for v in values.T], axis=-1).astype(
+            values.dtype
+        )
 
     def to_numpy(self, x: Array) -> np.ndarray:
         """`x` itself."""

@@ -29,13 +29,13 @@ _one_at_a_time = threading.Lock()  # numba's default threading layer must not be
 class Raster(TriangleSampler):
     """K-buffer rasterization with a top-left fill rule; ties in depth go to the lower triangle index."""
 
-    def rasterize(
-        self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str
-    ) -> Fragments:
+    def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         height, width = size
         # Straight to homogeneous pixels: (X, Y, w) with the pixel at (X / w, Y / w), and clip z.
-        to_pixels = np.array([[width / 2, 0, 0, width / 2], [0, -height / 2, 0, height / 2], [0, 0, 1, 0], [0, 0, 0, 1]])
+        to_pixels = np.array(
+            [[width / 2, 0, 0, width / 2], [0, -height / 2, 0, height / 2], [0, 0, 1, 0], [0, 0, 0, 1]]
+        )
         matrix = to_pixels @ camera.projection @ camera.view
         p = camera.projection
         # A y-flip of the projection, or a mirroring view, reverses the winding on screen.
@@ -74,9 +74,7 @@ def _transform(vertices, matrix, corners, flags):
 
 @numba.njit(cache=True, inline="always")
 def _determinant(a, b, c):
-    return (
-        a[0] * (b[1] * c[3] - b[3] * c[1]) - a[1] * (b[0] * c[3] - b[3] * c[0]) + a[3] * (b[0] * c[1] - b[1] * c[0])
-    )
+    return a[0] * (b[1] * c[3] - b[3] * c[1]) - a[1] * (b[0] * c[3] - b[3] * c[0]) + a[3] * (b[0] * c[1] - b[1] * c[0])
 
 
 @numba.njit(parallel=True, cache=True, nogil=True)

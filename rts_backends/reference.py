@@ -19,9 +19,7 @@ class Reference(TriangleSampler):
     ratio g₁ × g₂ : g₂ × g₀ : g₀ × g₁. This needs no division by w, hence no clipping.
     """
 
-    def rasterize(
-        self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str
-    ) -> Fragments:
+    def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         height, width = size
         homogeneous = np.concatenate([prepared.vertices.astype(np.float64), np.ones((len(prepared.vertices), 1))], 1)

@@ -11,7 +11,8 @@ from array_api_compat import torch as array_api
 from torch.utils import _pytree
 
 from rts.arrays import leaves, map_leaves
-from rts.protocols import STATIC_FIELDS, ArraySpec, Tree, join_record, split_record
+from rts.protocols import ArraySpec, Tree
+from rts.records import STATIC_FIELDS, join_record, split_record
 
 for _cls in STATIC_FIELDS:
     _pytree.register_pytree_node(
@@ -90,7 +91,9 @@ class TorchEngine:
     def segment_sum(self, values: torch.Tensor, segments: np.ndarray, count: int) -> torch.Tensor:
         """Sums of the rows of `values` that share a segment."""
         index = _tensor(segments, values.device)
-        return torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device).index_add(0, index, values)
+        return torch.zeros((count, values.shape[1]), dtype=values.dtype, device=values.device).index_add(
+            0, index, values
+        )
 
     def to_numpy(self, x: torch.Tensor) -> np.ndarray:
         """The value on the host."""

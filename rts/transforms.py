@@ -1,0 +1,169 @@
+"""(4, 4) matrices, differentiable in their arguments: views, projections, rigid poses.
+
+Conventions of space are in `rts.camera`. Arguments may be torch or jax arrays, NumPy arrays or numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from rts.arrays import is_constant, matmul, namespace, promote, unit
+from rts.errors import InputError
+from rts.protocols import Array
+
+
+def matrix_of(xp: Any, rows: list[list[Any]], like: Array) -> Array:
+    """A matrix of array scalars and numbers, in the dtype of `like`."""
+    zero = xp.zeros_like(like)
+    # Forward-mode torch widens products of a number and a scalar tensor; hence the cast.
+    return xp.astype(xp.stack([xp.stack([zero + entry for entry in row]) for row in rows]), like.dtype)
+
+
+def scaled_rows(matrix: Array, row_signs: tuple[float, ...]) -> Array:
+    """The matrix with its rows multiplied by signs."""
+    xp = namespace(matrix)
+    return xp.stack([matrix[i, :] * s for i, s in enumerate(row_signs)])
+
+
+def affine_matrix(linear: Array, translation: Array) -> Array:
+    """(4, 4) from a (3, 3) linear map and a (3,) translation."""
+    xp = namespace(linear)
+    last = xp.zeros_like(translation)
+    bottom = xp.concat([last, xp.ones_like(translation[:1])])
+    return xp.concat([xp.concat([linear, translation[:, None]], axis=1), bottom[None, :]], axis=0)
+
+
+def check_range(near: Any, far: Any, *, positive: bool) -> None:
+    """Refuse planes in the wrong order, where their values are known."""
+    if not is_constant((near, far)):
+        return
+    if not (math.isfinite(near) and math.isfinite(far) and near < far):
+        raise InputError(f"near is {near} and far is {far}; expected finite numbers with near < far")
+    if positive and near <= 0:
+        raise InputError(f"near is {near}; a perspective camera needs near > 0")
+
+
+def check_shapes(given: dict[str, tuple[Array, tuple[tuple[int, ...], ...]]]) -> None:
+    """Refuse arrays whose shape is none of those expected."""
+    for name, (array, expected) in given.items():
+        if tuple(array.shape) not in expected:
+            shapes = " or ".join(map(str, expected))
+            raise InputError(f"{name} has shape {tuple(array.shape)}; expected {shapes}")
+
+
+def perspective(
+    fov_y: Any, aspect: Any = 1.0, near: Any = 0.1, far: Any = 100.0, principal_point: Any = (0.0, 0.0)
+) -> Array:
+    """(4, 4) perspective projection.
+
+    Args:
+        fov_y: vertical field of view, degrees.
+        aspect: width over height.
+        near: depth of the near plane, positive.
+        far: depth of the far plane.
+        principal_point: (2,) where the axis meets the image, NDC; (0, 0) is the middle.
+    """
+    check_range(near, far, positive=True)
+    if is_constant(fov_y) and not 0 < fov_y < 180:
+        raise InputError(f"fov_y is {fov_y}; expected degrees between 0 and 180")
+    xp, (fov, aspect, near, far, point) = promote(fov_y, aspect, near, far, principal_point)
+    scale = 1 / xp.tan(fov * (math.pi / 360))
+    depth = far - near
+    return matrix_of(
+        xp,
+        [
+            [scale / aspect, 0, -point[0], 0],
+            [0, scale, -point[1], 0],
+            [0, 0, -(far + near) / depth, -2 * far * near / depth],
+            [0, 0, -1, 0],
+        ],
+        fov,
+    )
+
+
+def orthographic(
+    height: Any, aspect: Any = 1.0, near: Any = 0.1, far: Any = 100.0, principal_point: Any = (0.0, 0.0)
+) -> Array:
+    """(4, 4) orthographic projection.
+
+    Args:
+        height: of the image, world units.
+        aspect: width over height.
+        near: depth of the near plane; may be negative.
+        far: depth of the far plane.
+        principal_point: (2,) where the axis meets the image, NDC.
+    """
+    check_range(near, far, positive=False)
+    if is_constant(height) and not (math.isfinite(height) and height > 0):
+        raise InputError(f"height is {height}; expected a positive number of world units")
+    xp, (height, aspect, near, far, point) = promote(height, aspect, near, far, principal_point)
+    scale, depth = 2 / height, far - near
+    return matrix_of(
+        xp,
+        [
+            [scale / aspect, 0, 0, point[0]],
+            [0, scale, 0, point[1]],
+            [0, 0, -2 / depth, -(far + near) / depth],
+            [0, 0, 0, 1],
+        ],
+        height,
+    )
+
+
+def look_at(eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0)) -> Array:
+    """(4, 4) view matrix of a camera at `eye` (3,) that faces `target` (3,), world space.
+
+    Raises:
+        InputError: eye and target coincide, or the direction of view is parallel to `up`.
+    """
+    xp, (eye, target, up) = promote(eye, target, up)
+    check_shapes({"eye": (eye, ((3,),)), "target": (target, ((3,),)), "up": (up, ((3,),))})
+    if is_constant((eye, target, up)):
+        sideways = np.linalg.norm(np.cross(target - eye, up))
+        if not sideways > 1e-12 * np.linalg.norm(target - eye) * np.linalg.norm(up):
+            raise InputError(
+                f"a camera at {eye.tolist()} that looks at {target.tolist()} has no upright with up = {up.tolist()}; "
+                f"move the eye or give another up"
+            )
+    back = unit(eye - target)
+    right = unit(xp.linalg.cross(up, back))
+    linear = xp.stack([right, xp.linalg.cross(back, right), back])
+    return affine_matrix(linear, -matmul(linear, eye[:, None])[:, 0])
+
+
+def rigid(pose: Array, center: Any = (0.0, 0.0, 0.0)) -> Array:
+    """World-from-local transform of a rigid pose; differentiable everywhere, at zero rotation too.
+
+    Args:
+        pose: (6,) rotation vector (axis times angle, radians) about `center`, then translation.
+        center: (3,) local space.
+
+    Returns:
+        (4, 4), usable as `Part.transform`.
+    """
+    if tuple(getattr(pose, "shape", ())) != (6,):
+        raise InputError(
+            f"pose has shape {tuple(getattr(pose, 'shape', ()))}; expected (6,): rotation vector, translation"
+        )
+    xp, (pose, center) = promote(pose, center)
+    x, y, z = pose[0], pose[1], pose[2]
+    square = x * x + y * y + z * z
+    # Below a tenth of a radian the series is exact to rounding; the square root is kept away from zero, where its
+    # derivative is infinite.
+    small = square < 1e-2
+    angle = xp.sqrt(xp.where(small, xp.ones_like(square), square))
+    a = xp.where(small, 1 - square / 6 * (1 - square / 20 * (1 - square / 42)), xp.sin(angle) / angle)
+    b = xp.where(small, 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56)), (1 - xp.cos(angle)) / angle**2)
+    one = xp.ones_like(square)
+    rotation = xp.stack(
+        [
+            xp.stack([one - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y]),
+            xp.stack([b * x * y + a * z, one - b * (x * x + z * z), b * y * z - a * x]),
+            xp.stack([b * x * z - a * y, b * y * z + a * x, one - b * (x * x + y * y)]),
+        ]
+    )
+    moved = center + pose[3:] - xp.sum(rotation * center, axis=1)
+    return affine_matrix(rotation, moved)
