@@ -1,0 +1,538 @@
+"""The engines: every transform of torch and jax gives the plain derivative, and all give the same numbers."""
+
+import functools
+
+import numpy as np
+import pytest
+from helpers import (
+    ALL,
+    DIFFERENTIABLE,
+    TORCH,
+    arrays,
+    derivative,
+    finite_difference,
+    gradient,
+    icosphere,
+    relative_error,
+    rigid,
+    to_numpy,
+)
+
+import rts
+from rts import Camera, Part
+from rts.arrays import leaves, map_leaves
+
+Mesh = rts.plugin("surfaces", "mesh")
+SIZE = (24, 32)
+VERTICES, FACES = icosphere(1)
+MESH = Mesh(FACES)
+EYES = np.array([(1.0, 1.5, 4.0), (-1.5, 1.0, 3.5), (0.5, -2.0, 3.0)])
+SCENE = {
+    "vertices": VERTICES.astype(np.float64),
+    "colors": np.random.default_rng(0).uniform(0.2, 0.9, (len(VERTICES), 3)),
+    "transform": rigid((1, 2, 3), 30, (0.1, -0.2, 0.3)),
+    "eye": EYES[0],
+}
+SIMPLE = {"splatter": "single", "layers": 1}
+"""For what would be slow to compile otherwise."""
+
+DIRECTION = {key: np.random.default_rng(1).normal(size=value.shape) for key, value in SCENE.items()}
+WEIGHTS = np.random.default_rng(2).normal(size=(*SIZE, 4))
+
+
+def camera_at(eye):
+    return Camera.look_at(eye, (0.0, 0.0, 0.0), fov_y=40, aspect=SIZE[1] / SIZE[0], near=0.5, far=20)
+
+
+def part_of(scene):
+    theta = {"vertices": scene["vertices"], "colors": scene["colors"]}
+    return Part(MESH, theta, "lambert", scene["transform"])
+
+
+def image_of(scene, **options):
+    return rts.render(part_of(scene), camera_at(scene["eye"]), SIZE, **options)
+
+
+def loss_of(target, dtype=np.float32):
+    """A scalar function of the scene; `DIRECTION` and `SCENE` are its plain arguments."""
+    weights = arrays(target, WEIGHTS, dtype)
+    return lambda scene, **options: (image_of(scene, **options) * weights).sum()
+
+
+def with_eye(scene, eye):
+    return {**scene, "eye": eye}
+
+
+@functools.cache
+def plain_gradient(target):
+    """The gradient of the loss by reverse mode, each entry on the host: what every other way must equal."""
+    return gradient(target, loss_of(target), arrays(target, SCENE))
+
+
+@functools.cache
+def plain_image(target):
+    return to_numpy(image_of(arrays(target, SCENE)))
+
+
+def assert_trees_close(found, expected, tolerance=1e-4):
+    for one, other in zip(leaves(found), leaves(expected), strict=True):
+        assert relative_error(one, other) < tolerance
+
+
+# ------------------------------------------------------------------------------------------ across engines
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_the_image_is_that_of_numpy(target):
+    np.testing.assert_allclose(plain_image(target), plain_image("numpy"), rtol=0, atol=1e-5)
+    assert plain_image(target)[..., 3].sum() > 150
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_gradient_and_jvp_are_those_of_torch(target):
+    assert_trees_close(plain_gradient(target), plain_gradient(TORCH[0]))
+    along = [derivative(t, image_of, arrays(t, SCENE), arrays(t, DIRECTION)) for t in dict.fromkeys((target, TORCH[0]))]
+    for image, slope in along:
+        np.testing.assert_allclose(image, plain_image("numpy"), rtol=0, atol=1e-5)
+        assert relative_error(slope, along[-1][1]) < 1e-4
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_jvp_and_vjp_are_transposes(target):
+    _, slope = derivative(target, image_of, arrays(target, SCENE), arrays(target, DIRECTION))
+    forward = np.sum(slope.astype(np.float64) * WEIGHTS)
+    reverse = sum(np.sum(plain_gradient(target)[key] * DIRECTION[key]) for key in SCENE)
+    assert forward == pytest.approx(reverse, rel=1e-4)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_the_derivative_of_render_is_that_at_frozen_samples(target):
+    scene = arrays(target, SCENE)
+    sampled = rts.sample(part_of(scene), camera_at(scene["eye"]), SIZE)
+    weights = arrays(target, WEIGHTS)
+    found = gradient(
+        target,
+        lambda s: (rts.render_samples(sampled, part_of(s), camera_at(s["eye"])) * weights).sum(),
+        scene,
+    )
+    assert_trees_close(found, plain_gradient(target), 1e-6)
+
+
+@pytest.mark.parametrize("target", TORCH)
+def test_in_double_precision_the_gradient_at_frozen_samples_is_the_finite_difference(target):
+    scene = arrays(target, SCENE, np.float64)
+    sampled = rts.sample(part_of(scene), camera_at(scene["eye"]), SIZE)
+    weights = arrays(target, WEIGHTS, np.float64)
+
+    def f(s):
+        image = rts.render_samples(sampled, part_of(s), camera_at(s["eye"]))
+        assert str(image.dtype) == "torch.float64"
+        return (image * weights).sum()
+
+    found = gradient(target, f, scene)
+    for key in ("transform", "eye"):
+        by_differences = finite_difference(
+            lambda x, key=key: f({**scene, key: arrays(target, x, np.float64)}).item(), SCENE[key]
+        )
+        np.testing.assert_allclose(found[key], by_differences, rtol=1e-5, atol=1e-5 * np.abs(by_differences).max())
+
+
+@pytest.mark.parametrize("target", TORCH)
+def test_gradcheck_passes_in_all_arguments_at_frozen_samples(target):
+    torch = pytest.importorskip("torch")
+    vertices, faces = icosphere(0)
+    mesh, size = Mesh(faces), (6, 7)
+    theta = {"vertices": vertices, "color": np.array([0.7, 0.6, 0.5])}
+    given = arrays(target, {"theta": theta, "transform": SCENE["transform"], "eye": EYES[0]}, np.float64)
+
+    def parts(tree):
+        return Part(mesh, tree["theta"], "blinn_phong", tree["transform"])
+
+    sampled = rts.sample(parts(given), camera_at(given["eye"]), size)
+
+    def f(*flat):
+        it = iter(flat)
+        tree = map_leaves(lambda _: next(it), given)
+        return rts.render_samples(sampled, parts(tree), camera_at(tree["eye"]))
+
+    inputs = [x.requires_grad_(True) for x in leaves(given)]
+    assert torch.autograd.gradcheck(f, inputs, atol=1e-5, check_forward_ad=True)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_float64_numpy_beside_float32_arrays_stays_float32(target):
+    scene = {**SCENE, "vertices": arrays(target, SCENE["vertices"])}
+    image = image_of(scene)
+    assert str(image.dtype).endswith("float32")
+    np.testing.assert_allclose(to_numpy(image), plain_image("numpy"), rtol=0, atol=1e-5)
+
+
+# ---------------------------------------------------------------------------------------- what is constant
+
+
+@pytest.mark.parametrize("kept", SCENE)
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_numpy_entries_are_constants_and_the_rest_keeps_image_and_gradient(target, kept):
+    moving = {key: value for key, value in SCENE.items() if key == kept}
+    weights = arrays(target, WEIGHTS)
+
+    def f(tree):
+        return (image_of({**SCENE, **tree}) * weights).sum()
+
+    given = arrays(target, moving)
+    np.testing.assert_allclose(to_numpy(image_of({**SCENE, **given})), plain_image("numpy"), rtol=0, atol=1e-5)
+    assert relative_error(gradient(target, f, given)[kept], plain_gradient(target)[kept]) < 1e-4
+
+
+@pytest.mark.parametrize("target", TORCH)
+def test_a_scene_of_numpy_with_a_torch_background_has_no_other_gradient(target):
+    torch = pytest.importorskip("torch")
+    image = image_of({**SCENE, "eye": arrays(target, SCENE["eye"])})
+    assert isinstance(image, torch.Tensor) and not image.requires_grad
+    assert isinstance(image_of(SCENE), np.ndarray)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_where_only_the_pose_is_differentiable_the_mesh_is_evaluated_on_the_host(target):
+    scene = {**SCENE, "transform": arrays(target, SCENE["transform"])}
+    samples = rts.sample(part_of(scene), camera_at(SCENE["eye"]), SIZE).samples[0]
+    assert set(samples.gbuffer) == {"position", "normal", "color"}
+    assert type(samples.gbuffer["position"]) is type(scene["transform"])
+    full = arrays(target, SCENE)
+    assert rts.sample(part_of(full), camera_at(full["eye"]), SIZE).samples[0].gbuffer is None
+
+
+def test_torch_and_jax_in_one_scene_are_refused_by_name():
+    pytest.importorskip("torch")
+    pytest.importorskip("jax")
+    scene = arrays("torch-cpu", SCENE)
+    for key in ("vertices", "colors", "transform"):
+        mixed = {**scene, key: arrays("jax", SCENE[key])}
+        with pytest.raises(rts.EngineError, match="jax and torch.*convert one side"):
+            image_of(mixed)
+    with pytest.raises(TypeError, match="jax and torch"):
+        rts.render(part_of(scene), camera_at(arrays("jax", SCENE["eye"])), SIZE)
+    sampled = rts.sample(part_of(scene), camera_at(scene["eye"]), SIZE)
+    jax_scene = arrays("jax", SCENE)
+    with pytest.raises(rts.EngineError, match="jax and torch"):
+        rts.render_samples(sampled, part_of(jax_scene), camera_at(jax_scene["eye"]))
+
+
+def test_arrays_of_no_engine_are_refused_by_type():
+    class Strange:
+        shape = (4, 4)
+
+    with pytest.raises(rts.EngineError, match="Strange belongs to no engine; expected NumPy, jax, torch"):
+        rts.render(part_of({**SCENE, "transform": Strange()}), camera_at(SCENE["eye"]), SIZE)
+
+
+def test_numpy_has_no_derivatives_and_says_what_to_pass():
+    engine = rts.plugin("engines", "numpy")()
+    with pytest.raises(rts.EngineError, match="torch or jax"):
+        engine.value_and_grad(lambda x: x)
+
+
+# ------------------------------------------------------------------------------------- torch's transforms
+
+
+@pytest.fixture(params=TORCH)
+def on_torch(request):
+    return pytest.importorskip("torch"), request.param
+
+
+def test_torch_func_grad_and_vjp_are_autograd(on_torch):
+    torch, target = on_torch
+    scene = arrays(target, SCENE)
+    found = torch.func.grad(loss_of(target))(scene)
+    assert_trees_close(to_numpy(found), plain_gradient(target), 1e-5)
+    image, pull = torch.func.vjp(image_of, scene)
+    np.testing.assert_array_equal(to_numpy(image), plain_image(target))
+    assert_trees_close(to_numpy(pull(arrays(target, WEIGHTS))[0]), plain_gradient(target), 1e-5)
+
+
+def test_torch_jacfwd_and_jacrev_are_a_loop_of_jvps(on_torch):
+    torch, target = on_torch
+    scene = arrays(target, SCENE)
+
+    def f(eye):
+        return image_of(with_eye(scene, eye))[8:16, 10:20]
+
+    columns = [torch.func.jvp(f, (scene["eye"],), (e,))[1] for e in torch.eye(3, device=scene["eye"].device)]
+    expected = to_numpy(torch.stack(columns, dim=-1))
+    assert relative_error(to_numpy(torch.func.jacfwd(f)(scene["eye"])), expected) < 1e-4
+    assert relative_error(to_numpy(torch.func.jacrev(f)(scene["eye"])), expected) < 1e-4
+
+
+def test_torch_hessian_is_the_finite_difference_of_the_gradient_at_frozen_samples(on_torch):
+    torch, target = on_torch
+    scene, loss = arrays(target, SCENE, np.float64), loss_of(target, np.float64)
+    weights = arrays(target, WEIGHTS, np.float64)
+    sampled = rts.sample(part_of(scene), camera_at(scene["eye"]), SIZE)
+
+    def frozen(eye):
+        return (rts.render_samples(sampled, part_of(scene), camera_at(eye)) * weights).sum()
+
+    step = 1e-5
+    columns = []
+    for e in step * torch.eye(3, dtype=torch.float64, device=scene["eye"].device):
+        above, below = (torch.func.grad(frozen)(scene["eye"] + d) for d in (e, -e))
+        columns.append((above - below) / (2 * step))
+    expected = to_numpy(torch.stack(columns))
+    found = to_numpy(torch.func.hessian(lambda eye: loss(with_eye(scene, eye)))(scene["eye"]))
+    assert relative_error(found, expected) < 1e-5
+    np.testing.assert_allclose(found, found.T, rtol=1e-6, atol=1e-6 * np.abs(found).max())
+
+
+def test_torch_vmap_over_cameras_is_a_loop_for_images_and_gradients(on_torch):
+    torch, target = on_torch
+    scene, eyes, loss = arrays(target, SCENE), arrays(target, EYES), loss_of(target)
+    images = torch.func.vmap(lambda eye: image_of(with_eye(scene, eye)))(eyes)
+    assert images.shape == (3, *SIZE, 4)
+    gradients = torch.func.vmap(torch.func.grad(lambda eye: loss(with_eye(scene, eye))))(eyes)
+    for eye, image, slope in zip(eyes, images, gradients, strict=True):
+        expected = with_eye(scene, eye)
+        np.testing.assert_allclose(to_numpy(image), to_numpy(image_of(expected)), rtol=0, atol=1e-6)
+        assert relative_error(to_numpy(slope), gradient(target, loss, expected)["eye"]) < 1e-4
+
+
+def test_torch_vmap_over_poses_of_a_constant_mesh_is_a_loop(on_torch):
+    torch, target = on_torch
+    poses = arrays(target, np.stack([rigid((0, 1, 0), a, (0.1, 0, 0)) for a in (0, 40, 80)]))
+    images = torch.func.vmap(lambda pose: image_of({**SCENE, "transform": pose}))(poses)
+    for pose, image in zip(poses, images, strict=True):
+        np.testing.assert_allclose(to_numpy(image), to_numpy(image_of({**SCENE, "transform": pose})), rtol=0, atol=1e-6)
+
+
+# torch itself reads .grad of intermediate tensors where it cuts a graph in two.
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf:UserWarning")
+def test_torch_compile_keeps_value_and_gradient(on_torch):
+    torch, target = on_torch
+    scene, loss = arrays(target, SCENE), functools.partial(loss_of(target), **SIMPLE)
+    compiled = torch.compile(loss, backend="aot_eager")
+    assert compiled(scene).item() == pytest.approx(loss(scene).item(), rel=1e-4)
+    assert_trees_close(gradient(target, compiled, scene), gradient(target, loss, scene))
+
+
+def test_torch_updates_in_place_are_seen(on_torch):
+    torch, target = on_torch
+    scene = arrays(target, SCENE)
+    image_of(scene)
+    with torch.no_grad():
+        scene["vertices"].mul_(0.5)
+    smaller = arrays(target, {**SCENE, "vertices": 0.5 * SCENE["vertices"]})
+    np.testing.assert_array_equal(to_numpy(image_of(scene)), to_numpy(image_of(smaller)))
+
+
+def test_torch_records_are_arguments_of_its_transforms(on_torch):
+    torch, target = on_torch
+    scene, loss_weights = arrays(target, SCENE), arrays(target, WEIGHTS)
+    part, camera = part_of(scene), camera_at(scene["eye"])
+
+    def f(part, camera):
+        return (rts.render(part, camera, SIZE) * loss_weights).sum()
+
+    by_part, by_camera = torch.func.grad(f, argnums=(0, 1))(part, camera)
+    assert isinstance(by_part, Part) and isinstance(by_camera, Camera) and by_part.shader == "lambert"
+    assert relative_error(to_numpy(by_part.transform), plain_gradient(target)["transform"]) < 1e-5
+    assert relative_error(to_numpy(by_part.theta["vertices"]), plain_gradient(target)["vertices"]) < 1e-5
+
+    sampled = rts.sample(part, camera, SIZE)
+    frozen = torch.func.grad(lambda s, p: (rts.render_samples(s, p, camera) * loss_weights).sum(), argnums=1)(
+        sampled, part
+    )
+    assert relative_error(to_numpy(frozen.transform), plain_gradient(target)["transform"]) < 1e-5
+
+    cameras = Camera(*(torch.stack(m) for m in zip(*map(camera_at, arrays(target, EYES)), strict=True)))
+    images = torch.func.vmap(lambda camera: rts.render(part, camera, SIZE))(cameras)
+    np.testing.assert_allclose(to_numpy(images[0]), plain_image(target), rtol=0, atol=1e-6)
+
+
+# --------------------------------------------------------------------------------------- jax's transforms
+
+
+@pytest.fixture(scope="module")
+def jax():
+    return pytest.importorskip("jax")
+
+
+@pytest.fixture(scope="module")
+def scene_of_jax(jax):
+    return arrays("jax", SCENE)
+
+
+def test_jax_jit_keeps_image_and_gradient(jax, scene_of_jax):
+    loss = loss_of("jax")
+
+    @jax.jit
+    def compiled(scene):
+        return image_of(scene), *jax.value_and_grad(loss)(scene)
+
+    image, value, found = compiled(scene_of_jax)
+    np.testing.assert_allclose(np.asarray(image), plain_image("jax"), rtol=0, atol=1e-5)
+    assert float(value) == pytest.approx(float(np.sum(plain_image("jax") * WEIGHTS)), rel=1e-4)
+    assert_trees_close(to_numpy(found), plain_gradient("jax"))
+
+
+def test_jax_jit_with_enough_capacity_keeps_the_image_and_counts_no_overflow(jax, scene_of_jax):
+    part, camera = part_of(scene_of_jax), camera_at(scene_of_jax["eye"])
+    covered = int((rts.sample(part, camera, SIZE).row >= 0).sum())
+    sampled = jax.jit(lambda p, c: rts.sample(p, c, SIZE, capacity=covered))(part, camera)
+    assert int(sampled.overflow) == 0 and sampled.samples[0].ids.shape[0] == covered
+    image = rts.render_samples(sampled, part, camera)
+    np.testing.assert_allclose(np.asarray(image), plain_image("jax"), rtol=0, atol=1e-6)
+
+
+def test_jax_jit_with_too_little_capacity_drops_the_deepest_layers_and_counts_them(jax, scene_of_jax):
+    part, camera = part_of(scene_of_jax), camera_at(scene_of_jax["eye"])
+    whole = np.asarray(rts.sample(part, camera, SIZE).row) >= 0
+    capacity = int(whole[0].sum()) + 5
+    sampled = jax.jit(lambda p, c: rts.sample(p, c, SIZE, capacity=capacity))(part, camera)
+    kept = np.asarray(sampled.row) >= 0
+    assert int(sampled.overflow) == whole.sum() - capacity > 0
+    np.testing.assert_array_equal(kept[0], whole[0])
+    assert kept[1].sum() == 5 and (whole[1] | ~kept[1]).all()
+
+
+def test_jax_vjp_is_the_gradient(jax, scene_of_jax):
+    image, pull = jax.vjp(image_of, scene_of_jax)
+    np.testing.assert_allclose(np.asarray(image), plain_image("jax"), rtol=0, atol=1e-6)
+    (found,) = pull(arrays("jax", WEIGHTS))
+    assert_trees_close(to_numpy(found), plain_gradient("jax"))
+
+
+def test_jax_jacfwd_and_jacrev_are_a_loop_of_jvps(jax, scene_of_jax):
+    def f(eye):
+        return image_of(with_eye(scene_of_jax, eye), **SIMPLE)[12:14, 14:17]
+
+    eye = scene_of_jax["eye"]
+    along = jax.jit(lambda e: jax.jvp(f, (eye,), (e,))[1])
+    columns = [np.asarray(along(e)) for e in arrays("jax", np.eye(3))]
+    expected = np.stack(columns, axis=-1)
+    assert relative_error(np.asarray(jax.jit(jax.jacfwd(f))(eye)), expected) < 1e-4
+    assert relative_error(np.asarray(jax.jit(jax.jacrev(f))(eye)), expected) < 1e-4
+
+
+def test_jax_hessian_is_that_of_torch(jax, scene_of_jax):
+    torch = pytest.importorskip("torch")
+    eye = scene_of_jax["eye"]
+    found = jax.jit(jax.hessian(lambda e: loss_of("jax")(with_eye(scene_of_jax, e), **SIMPLE)))(eye)
+    scene = arrays("torch-cpu", SCENE)
+    loss = loss_of("torch-cpu")
+    expected = torch.func.hessian(lambda e: loss(with_eye(scene, e), **SIMPLE))(scene["eye"])
+    assert relative_error(np.asarray(found), to_numpy(expected)) < 1e-3
+
+
+def test_jax_vmap_over_cameras_is_a_loop_for_images(jax, scene_of_jax):
+    images = jax.vmap(lambda eye: image_of(with_eye(scene_of_jax, eye), **SIMPLE))(arrays("jax", EYES))
+    for eye, image in zip(EYES, images, strict=True):
+        expected = image_of(with_eye(SCENE, eye), **SIMPLE)
+        np.testing.assert_allclose(np.asarray(image), expected, rtol=0, atol=1e-5)
+
+
+def test_jax_vmap_and_jit_over_cameras_are_a_loop_for_gradients(jax, scene_of_jax):
+    weights = arrays("jax", WEIGHTS)
+    slope = jax.value_and_grad(lambda eye: (image_of(with_eye(scene_of_jax, eye)) * weights).sum())
+    values, gradients = jax.jit(jax.vmap(slope))(arrays("jax", EYES))
+    for i, eye in enumerate(arrays("jax", EYES)):
+        value, expected = slope(eye)
+        assert float(values[i]) == pytest.approx(float(value), rel=1e-4)
+        assert relative_error(np.asarray(gradients[i]), np.asarray(expected)) < 1e-4
+
+
+def test_jax_records_are_arguments_of_jit_and_grad(jax, scene_of_jax):
+    part, camera = part_of(scene_of_jax), camera_at(scene_of_jax["eye"])
+    weights = arrays("jax", WEIGHTS)
+    found = jax.grad(lambda p: (rts.render(p, camera, SIZE) * weights).sum())(part)
+    assert isinstance(found, Part) and found.surface is MESH and found.shader == "lambert"
+    assert relative_error(np.asarray(found.transform), plain_gradient("jax")["transform"]) < 1e-4
+    traces = []
+
+    @jax.jit
+    def f(part, camera):
+        traces.append(1)
+        return rts.render(part, camera, SIZE, **SIMPLE)
+
+    image = f(part, camera)
+    np.testing.assert_allclose(np.asarray(image), image_of(SCENE, **SIMPLE), rtol=0, atol=1e-5)
+    f(part.replace(transform=arrays("jax", np.eye(4))), camera)
+    assert len(traces) == 1
+    unlit = f(part.replace(shader="unlit"), camera)
+    assert len(traces) == 2
+    assert np.abs(np.asarray(unlit - image)).max() > 0.01
+
+
+def test_jax_samples_taken_outside_jit_are_rendered_inside(jax, scene_of_jax):
+    part, camera = part_of(scene_of_jax), camera_at(scene_of_jax["eye"])
+    sampled = rts.sample(part, camera, SIZE)
+    inside = jax.jit(rts.render_samples)(sampled, [part], camera)
+    np.testing.assert_allclose(np.asarray(inside), plain_image("jax"), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_records_survive_being_taken_apart_and_put_together(target):
+    part = part_of(arrays(target, SCENE)).replace(cull="back")
+    sampled = rts.sample(part, camera_at(arrays(target, SCENE["eye"])), SIZE)
+
+    def again_from_leaves(record):
+        if target == "jax":
+            flat, structure = pytest.importorskip("jax").tree.flatten(record)
+            return structure.unflatten(flat)
+        from torch.utils import _pytree
+
+        return _pytree.tree_unflatten(*_pytree.tree_flatten(record))
+
+    for record in (part, part.replace(transform=None), sampled):
+        again = again_from_leaves(record)
+        assert type(again) is type(record)
+        assert all(x is y for x, y in zip(leaves(again), leaves(record), strict=True))
+    assert again.samples[0].centered is True
+    again = again_from_leaves(part)
+    assert (again.surface, again.shader, again.cull) == (MESH, "lambert", "back")
+
+
+COMPILED = []
+
+
+@pytest.fixture(scope="module")
+def compilations(jax):
+    """A list that grows by one with each compilation of jax."""
+
+    def heard(event, duration, **_):
+        if event == "/jax/core/compile/backend_compile_duration":
+            COMPILED.append(duration)
+
+    jax.monitoring.register_event_duration_secs_listener(heard)
+    x = jax.numpy.ones(7919)
+    before = len(COMPILED)
+    jax.jit(lambda x: x * 2.7182)(x)
+    assert len(COMPILED) == before + 1, "the listener does not hear compilations"
+    return COMPILED
+
+
+def test_eager_jax_compiles_only_at_the_first_pose_of_each_bucket(jax, compilations):
+    part = Part(MESH, {"vertices": VERTICES}, "unlit")
+    camera = camera_at(EYES[0])
+    counts, buckets = set(), []
+    for i in range(50):
+        pose = arrays("jax", rigid((0, 1, 0), 7 * i, (0, 0, 0.02 * i)))
+        moving = part.replace(transform=pose)
+        before = len(compilations)
+        sampled = rts.sample(moving, camera, SIZE)
+        jax.grad(lambda t, s=sampled: rts.render_samples(s, part.replace(transform=t), camera).sum())(pose)
+        rows = sampled.samples[0].ids.shape[0]
+        assert len(compilations) == before or rows not in buckets, f"pose {i} compiled again for {rows} rows"
+        counts.add(int((sampled.row >= 0).sum()))
+        buckets.append(rows)
+    assert len(counts) > 20 and 2 <= len(set(buckets)) <= 4
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_rows_are_exact_or_padded_to_a_bucket(target):
+    part, camera = arrays(target, (part_of(SCENE), camera_at(SCENE["eye"])))
+    sampled = rts.sample(part, camera, SIZE)
+    rows, covered = sampled.samples[0].ids.shape[0], int((sampled.row >= 0).sum())
+    if target == "jax":
+        powers = {2**n for n in range(6, 16)} | {3 * 2**n for n in range(5, 15)}
+        assert rows == min(p for p in powers if p >= covered)
+    else:
+        assert rows == covered
