@@ -6,12 +6,13 @@ differentiate only that.
 
 from rts.camera import Camera
 from rts.errors import EngineError, InputError, PluginError, RtsError
-from rts.fitting import Fit, fit, rigid
+from rts.fitting import Fit, fit
 from rts.protocols import Fragments, GBuffer, Part, Proxy, Sampled, Samples
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples, sample
 from rts.sampling import TriangleSampler
 from rts.scenes import load, load_image, save_animation, save_image
+from rts.transforms import rigid
 
 __all__ = [
     "Camera",

@@ -107,9 +107,7 @@ def read_image(path: Path) -> np.ndarray:
         with Image.open(path) as image:
             return pixels(image)
     except Exception as error:  # Pillow's decoders raise many kinds, SyntaxError and struct.error among them.
-        raise InputError(
-            f"{path} cannot be read as an image ({error}); export it again, as PNG for example"
-        ) from error
+        raise InputError(f"{path} cannot be read as an image ({error}); export it again, as PNG for example") from error
 
 
 def pixels(image: Any) -> np.ndarray:
@@ -137,9 +135,7 @@ class _Folder:
             if not target.is_file():
                 target = inside(self.path.parent, unquote(name.strip()), self.path)
             if not target.is_file():
-                raise InputError(
-                    f"{self.path} refers to {name!r}, but there is no file {target}; put it there"
-                )
+                raise InputError(f"{self.path} refers to {name!r}, but there is no file {target}; put it there")
             return target.read_bytes()
         except InputError as problem:
             self.problem = self.problem or problem
@@ -161,9 +157,7 @@ def _read_with_trimesh(path: Path, extension: str) -> list[Piece]:
     folder = _Folder(path)
     try:
         if extension == "gltf":
-            json.loads(
-                path.read_bytes()
-            )  # Of a damaged file trimesh only says that it found no "model.gltf".
+            json.loads(path.read_bytes())  # Of a damaged file trimesh only says that it found no "model.gltf".
         with open(path, "rb") as file:
             scene = trimesh.load(file, file_type=extension, resolver=folder, force="scene", process=False)
         pieces = _pieces(scene, trimesh.Trimesh, extension in LINEAR_COLORS)
@@ -238,9 +232,7 @@ def _check(path: Path, piece: Piece) -> None:
     for name, (rows, table) in tables.items():
         if table.min() < 0 or table.max() >= len(rows):
             bad = table.max() if table.max() >= len(rows) else table.min()
-            raise InputError(
-                f"{path}: a face refers to row {bad} of {name}, which has {len(rows)}; repair the file"
-            )
+            raise InputError(f"{path}: a face refers to row {bad} of {name}, which has {len(rows)}; repair the file")
         with np.errstate(over="ignore"):
             wrong = np.flatnonzero(~np.isfinite(np.asarray(rows, np.float32)).all(axis=1))
         if len(wrong):

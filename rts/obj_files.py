@@ -43,12 +43,7 @@ class _Lines:
 
     def read(self) -> _Lines:
         """Sort the lines of the file."""
-        text = (
-            self.path.read_bytes()
-            .decode("utf-8", errors="replace")
-            .replace("\\\r\n", " ")
-            .replace("\\\n", " ")
-        )
+        text = self.path.read_bytes().decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
         material = self.materials.setdefault(None, 0)
         for number, line in enumerate(text.splitlines(), start=1):
             key, _, rest = line.partition("#")[0].replace("\t", " ").strip().partition(" ")
@@ -66,9 +61,7 @@ class _Lines:
 
     def fail(self, number: int, what: str) -> InputError:
         """The error of a line."""
-        return InputError(
-            f"{self.path}, line {number}: {what}; the file may be cut short or damaged: export it again"
-        )
+        return InputError(f"{self.path}, line {number}: {what}; the file may be cut short or damaged: export it again")
 
     def _absolute(self, rest: str, number: int) -> str:
         """A face whose negative indices, which count back from the latest row, are made positive."""
@@ -145,9 +138,7 @@ class _Lines:
         ):
             index = self.integer(part, number) if part or name == "vertices" else 0
             if part and not 1 <= index <= count:
-                raise self.fail(
-                    number, f"a face refers to number {part} of {count} {name} (indices count from 1)"
-                )
+                raise self.fail(number, f"a face refers to number {part} of {count} {name} (indices count from 1)")
             indices.append(index - 1)
         return tuple(indices)
 

@@ -71,8 +71,7 @@ def _part(piece: Piece) -> Part:
     if piece.color is not None and (piece.color < 1).any():
         theta["color"] = piece.color[: 3 if (piece.color[3:] >= 1).all() else 4].astype(np.float32)
     translucent = any(
-        name in theta and theta[name].shape[-1] == 4
-        for name in ("color", "texture" if textured else "colors")
+        name in theta and theta[name].shape[-1] == 4 for name in ("color", "texture" if textured else "colors")
     )
     return Part(
         registry.plugin("rts.surfaces", "mesh")(faces, indices),
@@ -112,8 +111,7 @@ def _merged(path: Path, pieces: list[Piece]) -> Piece:
     for piece in pieces[1:]:
         if not (piece.texture is first is None or np.array_equal(piece.texture, first)):
             raise InputError(
-                f"{path} has {len(pieces)} parts with different textures, which cannot be merged; load it "
-                "without merge"
+                f"{path} has {len(pieces)} parts with different textures, which cannot be merged; load it without merge"
             )
     tables: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {}
     for piece in pieces:
@@ -203,9 +201,7 @@ def save_animation(path: Any, frames: Iterable[Array], fps: float = 20.0) -> Non
     path = as_path(path)
     kind = path.suffix.lower()
     if kind not in (".gif", ".png", ".mp4"):
-        raise InputError(
-            f"the animation is to be called {path.name!r}; expected a name ending in .gif, .png or .mp4"
-        )
+        raise InputError(f"the animation is to be called {path.name!r}; expected a name ending in .gif, .png or .mp4")
     if not (np.isfinite(fps) and fps > 0):
         raise InputError(f"fps is {fps}; expected a positive number of frames a second")
     pictures = [_bytes(_on_white(_host(frame))) for frame in frames]
@@ -228,9 +224,7 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
     try:
         import imageio_ffmpeg  # noqa: F401
     except ModuleNotFoundError:
-        raise PluginError(
-            "mp4 needs the package imageio-ffmpeg: pip install imageio-ffmpeg; or write a .gif"
-        ) from None
+        raise PluginError("mp4 needs the package imageio-ffmpeg: pip install imageio-ffmpeg; or write a .gif") from None
     # The usual pixel format of mp4 halves the resolution of colour: sides must be even.
     even = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in pictures]
     even = [np.pad(p, ((0, p.shape[0] % 2), (0, p.shape[1] % 2), (0, 0)), mode="edge") for p in even]
@@ -243,16 +237,12 @@ def _host(image: Array) -> np.ndarray:
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[..., 0]
     if array.ndim not in (2, 3) or array.size == 0 or (array.ndim == 3 and array.shape[2] not in (3, 4)):
-        raise InputError(
-            f"the image has shape {array.shape}; expected (H, W, 4), (H, W, 3), (H, W, 1) or (H, W)"
-        )
+        raise InputError(f"the image has shape {array.shape}; expected (H, W, 4), (H, W, 3), (H, W, 1) or (H, W)")
     if not np.issubdtype(array.dtype, np.floating):
         raise InputError(f"the image has dtype {array.dtype}; expected linear floats in [0, 1]")
     wrong = array.size - int(np.isfinite(array).sum())
     if wrong:
-        raise InputError(
-            f"{wrong} of the image's {array.size} values are NaN or infinite; check what made it"
-        )
+        raise InputError(f"{wrong} of the image's {array.size} values are NaN or infinite; check what made it")
     return array
 
 
@@ -274,9 +264,7 @@ def _on_white(image: np.ndarray) -> np.ndarray:
 
 def encode_srgb(linear: np.ndarray) -> np.ndarray:
     """The sRGB curve."""
-    return np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055
-    )
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 def decode_srgb(encoded: np.ndarray) -> np.ndarray:

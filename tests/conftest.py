@@ -3,6 +3,9 @@ from pathlib import Path
 
 import pytest
 
+# Idle threads of OpenMP otherwise spin, which on a busy machine makes small renders many times slower.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
 ROOT = Path(__file__).resolve().parent.parent
 
 

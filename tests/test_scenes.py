@@ -43,9 +43,7 @@ def front_view(parts, size=(64, 64)):
 
 
 def corners(image):
-    return [
-        tuple(np.round(image[y, x, :3]).astype(int) * 255) for y, x in ((8, 8), (8, 56), (56, 8), (56, 56))
-    ]
+    return [tuple(np.round(image[y, x, :3]).astype(int) * 255) for y, x in ((8, 8), (8, 56), (56, 8), (56, 56))]
 
 
 def message(error):
@@ -116,9 +114,7 @@ def test_a_split_mesh_of_another_format_is_welded_too(tmp_path):
 
 def test_vertices_keep_the_order_of_the_file_and_unused_ones_are_dropped(tmp_path):
     [part] = rts.load(write(tmp_path / "m.obj", "v 9 9 9\nv 2 0 0\nv 1 0 0\nv 0 1 0\nf 4 3 2\n"))
-    np.testing.assert_array_equal(
-        part.theta["vertices"], np.array([[2, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
-    )
+    np.testing.assert_array_equal(part.theta["vertices"], np.array([[2, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32))
     np.testing.assert_array_equal(part.surface.faces, [[2, 1, 0]])
 
 
@@ -299,9 +295,7 @@ def test_missing_textures_and_libraries(tmp_path):
     assert "uv" in part.theta
 
 
-@pytest.mark.parametrize(
-    "name", ["../secret.png", "sub/../../secret.png", "{absolute}", "C:\\secret.png", "link.png"]
-)
+@pytest.mark.parametrize("name", ["../secret.png", "sub/../../secret.png", "{absolute}", "C:\\secret.png", "link.png"])
 @pytest.mark.parametrize("line", ["map_Kd {}", "map_Ks {}", "bump -bm 1 {}"])
 def test_files_outside_the_folder_are_refused(tmp_path, name, line):
     secret = quadrants(tmp_path / "secret.png")
@@ -351,9 +345,7 @@ def test_different_textures_cannot_be_merged(tmp_path):
 def test_the_srgb_curve_is_exact():
     codes = np.arange(256) / 255
     np.testing.assert_allclose(encode_srgb(decode_srgb(codes[:, None]))[:, 0], codes, atol=1e-12)
-    np.testing.assert_allclose(
-        decode_srgb(np.array([0.04045, 0.5, 1.0])), [0.04045 / 12.92, 0.21404114, 1], atol=1e-7
-    )
+    np.testing.assert_allclose(decode_srgb(np.array([0.04045, 0.5, 1.0])), [0.04045 / 12.92, 0.21404114, 1], atol=1e-7)
 
 
 def test_pictures_survive_a_round_trip(tmp_path):
@@ -388,9 +380,7 @@ def test_pictures_of_jax(tmp_path):
 
 def test_grey_pictures_of_16_bits(tmp_path):
     Image.fromarray(np.full((2, 2), 32768, np.uint16)).save(tmp_path / "a.png")
-    np.testing.assert_allclose(
-        rts.load_image(tmp_path / "a.png")[0, 0], [0.21405, 0.21405, 0.21405, 1], atol=1e-4
-    )
+    np.testing.assert_allclose(rts.load_image(tmp_path / "a.png")[0, 0], [0.21405, 0.21405, 0.21405, 1], atol=1e-4)
 
 
 @pytest.mark.parametrize(

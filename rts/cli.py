@@ -1,0 +1,262 @@
+"""The command line: `rts plugins`, `rts render`, `rts fit-pose`, `rts demo`."""
+
+from __future__ import annotations
+
+import os
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from typer.core import TyperGroup
+
+from rts import registry
+from rts.arrays import map_leaves
+from rts.errors import RtsError
+from rts.protocols import Part
+
+EXAMPLES = """
+Examples:
+
+    rts demo
+
+    rts render bunny.obj -o bunny.png --size 480x640 --camera 30,20 --shader normals
+
+    rts fit-pose bunny.obj photo.png -o found
+"""
+
+
+class _Group(TyperGroup):
+    """Commands whose expected errors are one line on standard error, without a traceback."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (RtsError, OSError) as error:
+            if ctx.params.get("debug"):
+                raise
+            typer.echo(f"rts: {error}", err=True)
+            raise typer.Exit(1) from error
+
+
+app = typer.Typer(
+    cls=_Group,
+    help="Differentiable surface rendering by rasterize-then-splat.\n" + EXAMPLES,
+    rich_markup_mode="markdown",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def main() -> None:
+    """The entry point `rts`."""
+    # Idle threads of OpenMP, which torch and numba both use, would spin and take the processor from others.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    app()
+
+
+def _say(text: str) -> None:
+    Console(soft_wrap=True, highlight=False).print(text)
+
+
+def _say_written(files: list[Path]) -> None:
+    for file in files:
+        _say(f"  {escape(str(file))}")
+
+
+# ------------------------------------------------------------------------------------------------- options
+
+
+def _size(text: str) -> tuple[int, int]:
+    """(height, width) of "256" or "480x640"."""
+    parts = text.lower().split("x")
+    if len(parts) not in (1, 2) or not all(p.strip().isdecimal() and int(p) > 0 for p in parts):
+        raise typer.BadParameter(f"{text!r} is no size; expected a number of pixels, or HEIGHTxWIDTH such as 480x640")
+    return int(parts[0]), int(parts[-1])
+
+
+def _view(text: str) -> tuple[float, ...]:
+    """Azimuth, elevation and perhaps distance."""
+    try:
+        numbers = tuple(float(x) for x in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) not in (2, 3):
+        raise typer.BadParameter(f'{text!r} is no camera; expected "azimuth,elevation" or "azimuth,elevation,distance"')
+    return numbers
+
+
+def _background(text: str) -> tuple[float, ...] | None:
+    """A linear colour, or None for transparent."""
+    from PIL import ImageColor
+
+    from rts.scenes import decode_srgb
+
+    if text == "none":
+        return None
+    try:
+        return tuple(decode_srgb(np.array(ImageColor.getrgb(text)[:3]) / 255))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is no colour; expected a name, #rrggbb, or none") from None
+
+
+Camera_ = Annotated[
+    str,
+    typer.Option(
+        "--camera",
+        help="Azimuth,elevation[,distance] about the middle of the object: degrees, and world units. "
+        "Without a distance the whole object is in view.",
+    ),
+]
+Fov = Annotated[float, typer.Option(help="Vertical field of view in degrees.")]
+Up = Annotated[str, typer.Option(help="The axis that is upright: y or z.")]
+Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"rts {version('rts')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _global(
+    debug: Debug = False,
+    show_version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+# ------------------------------------------------------------------------------------------------ commands
+
+
+@app.command()
+def plugins() -> None:
+    """List every plugin: engines, surfaces, samplers, shaders and splatters, and whether each one loads."""
+    table = Table("group", "name", "from", "state")
+    for group, name, distribution, error in registry.survey():
+        state = "[green]ready[/]" if error is None else f"[red]{escape(error)}[/]"
+        table.add_row(group.removeprefix("rts."), name, distribution, state)
+    Console().print(table)
+
+
+@app.command(epilog="Example: rts render bunny.obj -o bunny.png --size 480x640 --camera 30,20 --cull back")
+def render(
+    model: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, GLB, glTF, OFF, …", show_default=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("out.png"),
+    size: Annotated[str, typer.Option(help="Pixels: 256, or HEIGHTxWIDTH.")] = "256",
+    camera: Camera_ = "30,20",
+    fov: Fov = 40.0,
+    up: Up = "y",
+    sampler: Annotated[str, typer.Option(help="Name of a sampler, see `rts plugins`.")] = "auto",
+    engine: Annotated[str, typer.Option(help="numpy, torch or jax.")] = "numpy",
+    layers: Annotated[int, typer.Option(help="Surface layers kept at each pixel.")] = 2,
+    shader: Annotated[str, typer.Option(help="Name of a shader; auto is the model's own.")] = "auto",
+    splatter: Annotated[str, typer.Option(help="Name of a splatter: multi, single or none.")] = "auto",
+    background: Annotated[str, typer.Option(help="A colour's name, #rrggbb, or none: transparent.")] = "none",
+    cull: Annotated[str, typer.Option(help="none, or back to leave out triangles seen from behind.")] = "none",
+) -> None:
+    """Render a model to a picture."""
+    import rts
+    from rts.framing import bounds_of, orbit
+
+    shape, view, color = _size(size), _view(camera), _background(background)
+    chosen = registry.plugin("rts.engines", engine)()
+    parts = rts.load(model)
+    bounds = bounds_of(parts)
+    seen = orbit(bounds, shape, *view, fov=fov, up=up)
+    distance = float(np.linalg.norm(np.linalg.inv(seen.view)[:3, 3] - bounds.center))
+    extent = np.array([max(distance - bounds.radius, 0), distance + bounds.radius], np.float32)
+
+    def prepared(part: Part) -> Part:
+        theta = {**part.theta, "depth_range": extent} if shader == "depth" else part.theta
+        return part.replace(
+            theta=map_leaves(chosen.constant, theta),
+            cull=cull,
+            shader=part.shader if shader == "auto" else shader,
+        )
+
+    start = time.perf_counter()
+    image = rts.render(
+        [prepared(p) for p in parts],
+        seen,
+        shape,
+        sampler=sampler,
+        splatter=splatter,
+        layers=layers,
+        background=color,
+    )
+    seconds = time.perf_counter() - start
+    rts.save_image(output, image)
+    triangles = sum(len(p.surface.faces) for p in parts)
+    _say(f"{triangles} triangles, {shape[0]} x {shape[1]} pixels, {seconds * 1e3:.0f} ms; wrote {escape(str(output))}")
+
+
+@app.command(
+    "fit-pose",
+    epilog="Example: rts render teapot.obj -o target.png --camera 45,30 && rts fit-pose teapot.obj target.png -o found",
+)
+def fit_pose(
+    model: Annotated[Path, typer.Argument(help="The model, seen by the camera in roughly the right pose.")],
+    target: Annotated[
+        Path,
+        typer.Argument(help="The picture: its alpha is the silhouette, or its brightness where it is opaque."),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("pose"),
+    engine: Annotated[str, typer.Option(help="torch or jax; auto is whichever is installed.")] = "auto",
+    method: Annotated[str, typer.Option(help="lm (Levenberg–Marquardt), adam or sgd.")] = "lm",
+    steps: Annotated[int | None, typer.Option(help="At most so many at each of the resolutions.")] = None,
+    camera: Camera_ = "30,20",
+    fov: Fov = 40.0,
+    up: Up = "y",
+) -> None:
+    """Find the turn and shift of a model that make its silhouette match a picture's.
+
+    Writes pose.json (axis-angle, translation, 4x4 matrix, loss, iterations, seconds), before.png, after.png,
+    target.png, animation.gif and convergence.png.
+    """
+    import rts
+    from rts import pose
+    from rts.framing import bounds_of, orbit
+
+    view = _view(camera)
+    parts = rts.load(model)
+    mask = pose.silhouette_of(rts.load_image(target))
+    bounds = bounds_of(parts)
+    seen = orbit(bounds, mask.shape, *view, fov=fov, up=up)
+    chosen = None if engine == "auto" else engine
+    found = pose.fit_pose(parts, mask, seen, bounds, engine=chosen, method=method, steps=steps)
+    files = pose.write_report(output, found, parts, seen, mask)
+    _say(
+        f"loss {found.history[0]:.3g} → {found.loss:.3g} in {len(found.history)} steps, "
+        f"{found.seconds:.1f} s ({found.reason}); wrote"
+    )
+    _say_written(files)
+    _say_skipped_plot(files)
+
+
+@app.command(epilog="Example: rts demo -o out && open out/summary.md")
+def demo(
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("out"),
+    engine: Annotated[str, typer.Option(help="torch or jax; auto is whichever is installed.")] = "auto",
+) -> None:
+    """Recover the pose of a knot from its silhouette: no input needed, pictures and a summary written."""
+    from rts.demo import run
+
+    found, files = run(output, None if engine == "auto" else engine)
+    _say(f"pose found in {len(found.history)} steps, {found.seconds:.1f} s; wrote")
+    _say_written(files)
+    _say_skipped_plot(files)
+
+
+def _say_skipped_plot(files: list[Path]) -> None:
+    if not any(f.name == "convergence.png" for f in files):
+        _say("no convergence.png, which needs matplotlib: pip install 'rts\\[bench]'")

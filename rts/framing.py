@@ -1,0 +1,85 @@
+"""Where a scene is, and a camera that sees all of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.errors import InputError
+from rts.protocols import Part
+
+MARGIN = 1.05
+"""Radius of what the default view shows, over the radius of the object."""
+
+
+class Bounds(NamedTuple):
+    """A sphere around a scene, world space.
+
+    Attributes:
+        center: (3,) middle of the bounding box.
+        radius: largest distance of a vertex from it.
+    """
+
+    center: np.ndarray
+    radius: float
+
+
+def bounds_of(parts: Sequence[Part]) -> Bounds:
+    """The bounding sphere of parts whose θ["vertices"] and transforms are NumPy arrays."""
+    points = []
+    for part in parts:
+        vertices = np.asarray(part.theta["vertices"], np.float64)
+        m = part.transform
+        points.append(vertices if m is None else vertices @ m[:3, :3].T + m[:3, 3])
+    everything = np.concatenate(points)
+    center = (everything.min(axis=0) + everything.max(axis=0)) / 2
+    radius = float(np.linalg.norm(everything - center, axis=1).max())
+    if radius == 0:
+        raise InputError("all vertices of the model are in one point; expected an object with an extent")
+    return Bounds(center, radius)
+
+
+def orbit(
+    bounds: Bounds,
+    size: tuple[int, int],
+    azimuth: float,
+    elevation: float,
+    distance: float | None = None,
+    fov: float = 40.0,
+    up: str = "y",
+) -> Camera:
+    """A camera on a sphere around an object, looking at its centre.
+
+    Args:
+        bounds: the object.
+        size: (height, width) of the image.
+        azimuth: degrees about the upright axis; 0 looks from +z (from −y where z is up), 90 from +x.
+        elevation: degrees above the horizon, −90 to 90.
+        distance: from the centre; default so that the whole object is seen.
+        fov: vertical field of view, degrees.
+        up: "y" or "z", the axis that is upright.
+    """
+    if up not in ("y", "z"):
+        raise InputError(f'up is {up!r}; expected "y" or "z"')
+    if not 0 < fov < 180:
+        raise InputError(f"fov is {fov}; expected degrees between 0 and 180")
+    if not (math.isfinite(azimuth) and -90 <= elevation <= 90):
+        raise InputError(f"azimuth is {azimuth} and elevation {elevation}; expected degrees, the second from -90 to 90")
+    aspect = size[1] / size[0]
+    if distance is None:
+        narrower = math.atan(math.tan(math.radians(fov / 2)) * min(aspect, 1.0))
+        distance = MARGIN * bounds.radius / math.sin(narrower)
+    if not (math.isfinite(distance) and distance > 0):
+        raise InputError(f"the camera's distance is {distance}; expected a positive number")
+    a, e = math.radians(azimuth), math.radians(elevation)
+    back = np.array([math.cos(e) * math.sin(a), math.sin(e), math.cos(e) * math.cos(a)])
+    # Perpendicular to `back` at every elevation, the poles included.
+    upright = np.array([-math.sin(e) * math.sin(a), math.cos(e), -math.sin(e) * math.cos(a)])
+    if up == "z":
+        back, upright = (np.array([v[0], -v[2], v[1]]) for v in (back, upright))
+    eye = bounds.center + distance * back
+    return Camera.look_at(eye, bounds.center, upright, fov_y=fov, aspect=aspect, far=100 * (distance + bounds.radius))

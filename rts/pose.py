@@ -1,0 +1,253 @@
+"""The rigid pose of a model from one silhouette, and a report of how it was found."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts import registry
+from rts.arrays import matmul
+from rts.camera import Camera
+from rts.errors import InputError, PluginError
+from rts.fitting import fit
+from rts.framing import Bounds
+from rts.protocols import Array, Part
+from rts.rendering import render
+from rts.scenes import save_animation, save_image
+from rts.transforms import rigid
+
+LARGEST_SIDE = 256
+"""Pixels of the longer side of the image that is fitted."""
+
+COARSEST_SIDE = 24
+"""The pyramid starts at least here: an edge pulls over one pixel only, so coarse pixels reach further."""
+
+PICTURE_SIDE, FRAMES = 512, 48
+PAPER, MARKED = (0.86, 0.87, 0.9), (0.95, 0.32, 0.05)
+
+
+class PoseFit(NamedTuple):
+    """A recovered pose.
+
+    Attributes:
+        rotation: (3,) axis times angle, radians, about `center`.
+        translation: (3,) world units.
+        center: (3,) world.
+        matrix: (4, 4), world from the model as loaded.
+        trail: the best matrix so far, at each step.
+        history: the loss at each step: mean square of the difference of silhouettes, at that step's
+            resolution.
+        loss: the lowest loss at full resolution.
+        reason: why it stopped.
+        seconds: wall time.
+    """
+
+    rotation: np.ndarray
+    translation: np.ndarray
+    center: np.ndarray
+    matrix: np.ndarray
+    trail: list[np.ndarray]
+    history: list[float]
+    loss: float
+    reason: str
+    seconds: float
+
+
+def available_engine() -> str:
+    """The name of an engine with derivatives that is installed, torch before jax."""
+    for name in ("torch", "jax"):
+        if importlib.util.find_spec(name) is not None:
+            return name
+    raise PluginError("fitting needs torch or jax: pip install 'rts[torch]' (or 'rts[jax]')")
+
+
+def silhouette_of(image: np.ndarray) -> np.ndarray:
+    """(H, W) float32 in [0, 1] of a picture (H, W, 4): its alpha, or its luminance where it is opaque.
+
+    Raises:
+        InputError: nothing, or everything, is inside.
+    """
+    alpha = image[..., 3]
+    mask = alpha if (alpha < 1).any() else image[..., :3] @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+    if not mask.max() > 0.5 or not mask.min() < 0.5:
+        raise InputError(
+            f"the target's silhouette lies between {mask.min():.2g} and {mask.max():.2g}; expected a picture "
+            f"with a transparent background, or a bright object on a dark one"
+        )
+    return np.ascontiguousarray(mask, np.float32)
+
+
+def shrunk(mask: np.ndarray, largest: int) -> np.ndarray:
+    """(h, w) box-filtered so that the longer side is at most `largest`."""
+    from PIL import Image
+
+    scale = min(1.0, largest / max(mask.shape))
+    height, width = (max(1, round(s * scale)) for s in mask.shape)
+    return np.asarray(Image.fromarray(mask).resize((width, height), Image.Resampling.BOX))
+
+
+def fit_pose(
+    parts: Sequence[Part],
+    target: np.ndarray,
+    camera: Camera,
+    bounds: Bounds,
+    *,
+    engine: str | None = None,
+    method: str = "lm",
+    steps: int | None = None,
+    progress: bool | None = None,
+) -> PoseFit:
+    """Turn and move a model until its silhouette is the target's, from coarse pixels to fine ones.
+
+    Args:
+        parts: the model, NumPy arrays; its pose as loaded is the start.
+        target: (H, W) silhouette.
+        camera: the camera of the target.
+        bounds: of the model; translations are fitted in units of its radius, so that they weigh like radians.
+        engine: "torch" or "jax"; default whichever is installed.
+        method: of `rts.fit`.
+        steps: at most so many at each resolution; default that of `rts.fit`.
+        progress: see `rts.fit`.
+    """
+    name = engine or available_engine()
+    chosen = registry.plugin("rts.engines", name)()
+    if name == "numpy":
+        raise InputError("engine is 'numpy', which has no derivatives; expected torch or jax")
+    pose = chosen.constant(np.zeros(6, np.float32))
+    weights = np.repeat([1.0, bounds.radius], 3)
+    trail: list[np.ndarray] = []
+    levels: list[list[float]] = []
+    seconds = 0.0
+    for mask in _pyramid(target):
+        goal = chosen.constant(mask)
+        levels.append([])
+
+        def residuals(p: Array, mask: np.ndarray = mask, goal: Array = goal) -> Array:
+            transform = rigid(p * chosen.constant(weights, p), bounds.center)
+            image = render(posed(parts, transform, "silhouette"), camera, mask.shape, layers=1, splatter="single")
+            return image[..., 3] - goal
+
+        def note(step: int, p: Array, loss: float) -> None:
+            # Levenberg–Marquardt reports rejected trials too: those repeat the last pose.
+            best = step == 0 or loss < min(levels[-1])
+            trail.append(_matrix(chosen.to_numpy(p) * weights, bounds) if best else trail[-1])
+            levels[-1].append(loss)
+
+        result = fit(residuals, pose, method=method, steps=steps, callback=note, progress=progress)
+        pose = result.parameters
+        seconds += result.seconds
+    found = chosen.to_numpy(pose).astype(np.float64) * weights
+    matrix = _matrix(found, bounds)
+    trail.append(matrix)
+    history = sum(levels, [])
+    return PoseFit(found[:3], found[3:], bounds.center, matrix, trail, history, result.loss, result.reason, seconds)
+
+
+def _pyramid(target: np.ndarray) -> list[np.ndarray]:
+    """The target from coarse to fine, each twice the one before."""
+    sides = [min(LARGEST_SIDE, max(target.shape))]
+    while sides[0] >= 2 * COARSEST_SIDE:
+        sides.insert(0, sides[0] // 2)
+    return [shrunk(target, side) for side in sides]
+
+
+def _matrix(pose: np.ndarray, bounds: Bounds) -> np.ndarray:
+    return np.asarray(rigid(np.asarray(pose, np.float64), bounds.center))
+
+
+def posed(parts: Sequence[Part], transform: Array, shader: Any = None) -> list[Part]:
+    """The parts moved by a transform of the world, perhaps with another shader."""
+    return [
+        part.replace(
+            transform=transform if part.transform is None else matmul(transform, part.transform),
+            shader=shader or part.shader,
+        )
+        for part in parts
+    ]
+
+
+# -------------------------------------------------------------------------------------------------- report
+
+
+def write_report(
+    folder: Path,
+    found: PoseFit,
+    parts: Sequence[Part],
+    camera: Camera,
+    target: np.ndarray,
+    scenery: Sequence[Part] = (),
+) -> list[Path]:
+    """Write pose.json, pictures of the pose before and after, the target, an animation and the convergence.
+
+    The last, convergence.png, is only written where matplotlib is installed.
+
+    Args:
+        folder: where to; made if need be.
+        found: what `fit_pose` gave.
+        parts: the model.
+        camera: the camera of the target.
+        target: (H, W) silhouette.
+        scenery: parts that stand still, for the pictures.
+
+    Returns:
+        The files written.
+    """
+    numbers = {
+        "axis_angle": found.rotation.tolist(),
+        "translation": found.translation.tolist(),
+        "center": found.center.tolist(),
+        "matrix": found.matrix.tolist(),
+        "loss": found.loss,
+        "iterations": len(found.history),
+        "seconds": found.seconds,
+        "reason": found.reason,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "pose.json").write_text(json.dumps(numbers, indent=2) + "\n")
+    large, small = shrunk(target, PICTURE_SIDE), shrunk(target, LARGEST_SIDE)
+
+    def picture(matrix: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        return _outlined(posed(parts, matrix), scenery, camera, mask)
+
+    save_image(folder / "before.png", picture(np.eye(4), large))
+    save_image(folder / "after.png", picture(found.matrix, large))
+    save_image(folder / "target.png", large)
+    moved = [found.trail[0]] + [
+        b for a, b in zip(found.trail, found.trail[1:], strict=False) if np.abs(b - a).max() > 1e-4
+    ]
+    chosen = moved[:: -(-len(moved) // FRAMES)]
+    frames = [picture(m, small) for m in [chosen[0]] * 4 + chosen + [found.matrix] * 10]
+    save_animation(folder / "animation.gif", frames, fps=8)
+    names = ["pose.json", "before.png", "after.png", "target.png", "animation.gif"]
+    return [folder / name for name in names] + _plot(folder / "convergence.png", found.history)
+
+
+def _outlined(parts: Sequence[Part], scenery: Sequence[Part], camera: Camera, mask: np.ndarray) -> np.ndarray:
+    """The model in the scene, the outline of the target drawn over it."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    paper = np.asarray(PAPER) + 0.6 * mask[..., None] * (np.asarray(MARKED) - PAPER)
+    image = render([*parts, *scenery], camera, mask.shape, background=paper)[..., :3]
+    inside = (mask > 0.5).astype(np.float64)
+    edge = (maximum_filter(inside, 3) - minimum_filter(inside, 3))[..., None]
+    return image + 0.85 * edge * (np.asarray(MARKED) - image)
+
+
+def _plot(path: Path, history: list[float]) -> list[Path]:
+    """The loss over the steps; nothing where matplotlib is not installed."""
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError:
+        return []
+    figure = Figure(figsize=(6, 3.5), layout="constrained")
+    axes = figure.subplots()
+    axes.semilogy(np.maximum(history, 1e-12), ".-", color="#c2410c", linewidth=1, markersize=4)
+    axes.set(xlabel="step", ylabel="mean square difference", title="Silhouette, from coarse pixels to fine")
+    axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=120)
+    return [path]

@@ -1,0 +1,309 @@
+import json
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from typer.testing import CliRunner
+
+import rts
+from rts import cli, demo, pose
+from rts.errors import InputError, PluginError
+from rts.framing import Bounds, bounds_of, orbit
+
+
+def run(*arguments):
+    return CliRunner().invoke(cli.app, [str(a) for a in arguments])
+
+
+def succeed(*arguments):
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    return " ".join(result.output.split())
+
+
+def fail(*arguments, code=1):
+    result = run(*arguments)
+    assert result.exit_code == code, result.output
+    assert "Traceback" not in result.output
+    if code == 1:
+        assert result.stdout == ""
+        assert result.stderr.startswith("rts: ") and result.stderr.count("\n") == 1
+    return re.sub(r"[│\s]+", " ", result.stderr)
+
+
+@pytest.fixture
+def model(tmp_path):
+    """A crooked block: no turn maps it to itself."""
+    path = tmp_path / "model.ply"
+    block = trimesh.creation.box((2, 1.2, 0.8))
+    block.vertices *= 1 + np.random.default_rng(3).uniform(-0.3, 0.3, block.vertices.shape)
+    block.export(path)
+    return path
+
+
+# ------------------------------------------------------------------------------------------------- program
+
+
+def test_help_shows_examples_for_every_command():
+    assert "rts fit-pose bunny.obj photo.png -o found" in succeed("--help")
+    for command in ("render", "fit-pose", "demo"):
+        assert f"Example: rts {command}" in succeed(command, "--help").replace("rts render teapot.obj", "rts fit-pose")
+    assert "engines, surfaces, samplers" in succeed("plugins", "--help")
+
+
+def test_version():
+    assert re.fullmatch(r"rts \d+\.\d+.*", succeed("--version"))
+
+
+def test_the_installed_program_reports_an_error_in_one_line_and_the_traceback_on_request():
+    def program(*arguments):
+        code = "import sys; from rts.cli import main; sys.argv[0] = 'rts'; main()"
+        return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
+
+    short = program("render", "gone.obj")
+    assert short.returncode == 1 and short.stdout == ""
+    assert short.stderr.startswith("rts: no file gone.obj; check the path") and short.stderr.count("\n") == 1
+    long = program("--debug", "render", "gone.obj")
+    assert long.returncode == 1
+    assert "Traceback" in long.stderr and "InputError: no file gone.obj" in long.stderr
+
+
+def test_plugins_lists_each_plugin_and_why_one_does_not_load(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    output = succeed("plugins")
+    for name in (
+        n for group in ("engines", "surfaces", "samplers", "shaders", "splatters") for n in rts.plugins(group)
+    ):
+        assert f"│ {name} │" in output
+    broken = [rts.registry.PluginInfo("rts.samplers", "odd", "odd 1.0", "needs [odd]: pip install odd")]
+    monkeypatch.setattr(rts.registry, "survey", lambda: broken)
+    assert "│ samplers │ odd │ odd 1.0 │ needs [odd]: pip install odd │" in succeed("plugins")
+
+
+# -------------------------------------------------------------------------------------------------- render
+
+
+def test_render_frames_the_whole_object(model, tmp_path):
+    output = succeed("render", model, "-o", tmp_path / "new" / "a.png", "--size", "48x80")
+    assert "12 triangles, 48 x 80 pixels" in output and "a.png" in output
+    alpha = rts.load_image(tmp_path / "new" / "a.png")[..., 3]
+    assert alpha.shape == (48, 80)
+    assert alpha.max() == 1
+    assert max(alpha[0].max(), alpha[-1].max(), alpha[:, 0].max(), alpha[:, -1].max()) == 0
+
+
+@pytest.mark.parametrize("engine", ["torch", "jax"])
+def test_engines_render_the_same(model, tmp_path, engine):
+    pytest.importorskip(engine)
+    common = ["--size", 32, "--layers", 1, "--splatter", "single", "--shader", "normals", "--sampler", "raster"]
+    succeed("render", model, "-o", tmp_path / "a.png", *common)
+    succeed("render", model, "-o", tmp_path / "b.png", *common, "--engine", engine)
+    np.testing.assert_allclose(rts.load_image(tmp_path / "a.png"), rts.load_image(tmp_path / "b.png"), atol=0.01)
+
+
+def test_render_options_reach_the_picture(model, tmp_path):
+    def picture(*options):
+        succeed("render", model, "-o", tmp_path / "a.png", "--size", 32, *options)
+        return rts.load_image(tmp_path / "a.png")
+
+    plain = picture()
+    assert np.abs(picture("--camera=-60,20") - plain).max() > 0.1
+    assert np.abs(picture("--up", "z") - plain).max() > 0.1
+    assert picture("--camera", "30,20,20")[..., 3].sum() < plain[..., 3].sum() / 2
+    assert picture("--fov", "60", "--camera", "30,20,4")[..., 3].sum() < picture("--camera", "30,20,4")[..., 3].sum()
+    np.testing.assert_allclose(picture("--background", "#ff8000")[0, 0], [1, 0.2158605, 0, 1], atol=1e-5)
+    # A camera amid the object sees the inside of its far walls, unless those are culled.
+    amid = "--camera", "30,20,0.01"
+    assert picture(*amid)[..., 3].mean() == 1
+    assert picture(*amid, "--cull", "back")[..., 3].mean() == 0
+
+
+def test_the_depth_shader_covers_the_range_of_the_object(model, tmp_path):
+    succeed("render", model, "-o", tmp_path / "a.png", "--shader", "depth", "--size", 64, "--splatter", "none")
+    image = rts.load_image(tmp_path / "a.png")
+    depth = image[image[..., 3] == 1][:, 0]
+    assert 0.05 < depth.min() < 0.6 and depth.min() + 0.1 < depth.max() < 0.95
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--size", "0"], "'0' is no size"),
+        (["--size", "4x5x6"], "'4x5x6' is no size"),
+        (["--camera", "north"], "'north' is no camera"),
+        (["--camera", "1"], "'1' is no camera"),
+        (["--background", "blurple"], "'blurple' is no colour"),
+        (["--layers", "two"], "Invalid value for '--layers'"),
+        (["--colour"], "No such option"),
+    ],
+)
+def test_wrong_usage_exits_with_2(model, options, expected):
+    assert expected in fail("render", model, *options, code=2)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--camera", "0,91"], "elevation 91.0"),
+        (["--camera", "0,0,-1"], "distance is -1.0"),
+        (["--fov", "180"], "fov is 180.0"),
+        (["--up", "x"], "up is 'x'"),
+        (["--layers", "0"], "layers is 0"),
+        (["--cull", "front"], "cull is 'front'"),
+        (["--shader", "lambart"], "did you mean 'lambert'"),
+        (["--shader", "textured"], "needs theta['texture']"),
+        (["--sampler", "rastar"], "did you mean 'raster'"),
+        (["--splatter", "malti"], "did you mean 'multi'"),
+        (["--engine", "tensorflow"], "no engine named 'tensorflow'"),
+        (["-o", "a.jpg"], "ending in .png"),
+    ],
+)
+def test_wrong_values_exit_with_1(model, options, expected):
+    assert expected in fail("render", model, "--size", 16, *options)
+
+
+def test_unreadable_and_unwritable_files(model, tmp_path):
+    assert "no file" in fail("render", tmp_path / "gone.obj")
+    assert "is a folder" in fail("render", tmp_path)
+    (tmp_path / "file").write_text("")
+    assert "file" in fail("render", model, "--size", 16, "-o", tmp_path / "file" / "a.png")
+
+
+# ---------------------------------------------------------------------------------------------------- pose
+
+
+def test_fit_pose_finds_the_turn_of_a_rendered_target(model, tmp_path):
+    pytest.importorskip("torch")
+    succeed("render", model, "-o", tmp_path / "target.png", "--size", 96, "--camera", "42,14", "--splatter", "single")
+    output = succeed("fit-pose", model, tmp_path / "target.png", "-o", tmp_path / "found", "--engine", "torch")
+    assert "pose.json" in output and "animation.gif" in output
+    names = {p.name for p in (tmp_path / "found").iterdir()}
+    assert {"pose.json", "before.png", "after.png", "target.png", "animation.gif"} <= names
+    found = json.loads((tmp_path / "found" / "pose.json").read_text())
+    assert found["loss"] < 2e-3 and found["iterations"] > 3 and found["seconds"] > 0
+    bounds = bounds_of(rts.load(model))
+    views = [orbit(bounds, (96, 96), *v).view for v in ((30, 20), (42, 14))]
+    np.testing.assert_allclose(np.array(found["matrix"]), np.linalg.inv(views[0]) @ views[1], atol=0.03)
+    rigid = rts.rigid(np.array(found["axis_angle"] + found["translation"]), found["center"])
+    np.testing.assert_allclose(rigid, found["matrix"], atol=1e-6)
+    with Image.open(tmp_path / "found" / "animation.gif") as file:
+        assert file.n_frames > 3
+
+
+def test_fit_pose_with_adam_lowers_the_loss(model, tmp_path):
+    pytest.importorskip("torch")
+    white_on_black = "--shader", "silhouette", "--background", "black"
+    succeed("render", model, "-o", tmp_path / "t.png", "--size", 48, "--camera", "36,20", *white_on_black)
+    arguments = model, tmp_path / "t.png", "-o", tmp_path / "o", "--method", "adam", "--steps", 30
+    output = succeed("fit-pose", *arguments)
+    before, after = (float(x) for x in re.search(r"loss (\S+) → (\S+) in 60 steps", output).groups())
+    assert after < before / 4
+
+
+def test_fit_pose_says_which_extra_draws_the_plot(model, tmp_path, monkeypatch):
+    pytest.importorskip("torch")
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    succeed("render", model, "-o", tmp_path / "t.png", "--size", 32)
+    output = succeed("fit-pose", model, tmp_path / "t.png", "-o", tmp_path / "o", "--steps", 1)
+    assert "pip install 'rts[bench]'" in output
+    assert not (tmp_path / "o" / "convergence.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--method", "newton"], "method is 'newton'"),
+        (["--engine", "numpy"], "'numpy', which has no derivatives"),
+        (["--engine", "torsh"], "did you mean 'torch'"),
+    ],
+)
+def test_fit_pose_refuses(model, tmp_path, options, expected):
+    succeed("render", model, "-o", tmp_path / "t.png", "--size", 32)
+    assert expected in fail("fit-pose", model, tmp_path / "t.png", *options)
+
+
+def test_targets_without_a_silhouette_are_refused(model, tmp_path):
+    rts.save_image(tmp_path / "t.png", np.zeros((8, 8)))
+    assert "the target's silhouette lies between 0 and 0" in fail("fit-pose", model, tmp_path / "t.png")
+    assert "no picture" in fail("fit-pose", model, tmp_path / "gone.png")
+    assert "cannot be read as an image" in fail("fit-pose", model, model)
+
+
+def test_the_silhouette_is_the_alpha_or_else_the_brightness():
+    image = np.zeros((2, 2, 4), np.float32)
+    image[0, 0] = 0.7
+    image[0, 1, 3] = 1
+    np.testing.assert_allclose(pose.silhouette_of(image), [[0.7, 1], [0, 0]], rtol=1e-6)
+    image[..., 3] = 1
+    np.testing.assert_allclose(pose.silhouette_of(image), [[0.7, 0], [0, 0]], rtol=1e-6)
+
+
+def test_shrinking_is_a_box_filter():
+    mask = np.arange(32, dtype=np.float32).reshape(4, 8)
+    np.testing.assert_allclose(pose.shrunk(mask, 4), mask.reshape(2, 2, 4, 2).mean(axis=(1, 3)))
+    assert pose.shrunk(mask, 100) is not None and pose.shrunk(mask, 100).shape == (4, 8)
+
+
+def test_without_torch_and_jax_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(PluginError, match=r"pip install 'rts\[torch\]'"):
+        pose.available_engine()
+
+
+# ---------------------------------------------------------------------------------------------------- demo
+
+
+def test_demo_recovers_the_pose_and_writes_its_report(tmp_path):
+    pytest.importorskip("torch")
+    output = succeed("demo", "-o", tmp_path / "out", "--engine", "torch")
+    for name in ("before.png", "after.png", "animation.gif", "pose.json", "summary.json", "summary.md"):
+        assert (tmp_path / "out" / name).stat().st_size > 100
+        assert name in output
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["rotation_error_degrees"]["start"] > 20
+    assert summary["rotation_error_degrees"]["end"] < 0.5
+    assert summary["translation_error_over_radius"]["end"] < 0.02
+    assert "![after](after.png)" in (tmp_path / "out" / "summary.md").read_text()
+
+
+def test_the_knot_is_closed_and_wound_outwards():
+    part = demo.knot(rings=60, sides=8)
+    solid = trimesh.Trimesh(part.theta["vertices"], part.surface.faces, process=False)
+    assert solid.is_watertight and solid.volume > 0
+
+
+# ------------------------------------------------------------------------------------------------- framing
+
+
+def test_orbit_looks_from_where_it_says():
+    bounds = Bounds(np.array([1.0, 2.0, 3.0]), 1.0)
+
+    def eye(*view, **options):
+        return np.linalg.inv(orbit(bounds, (10, 10), *view, **options).view)[:3, 3] - bounds.center
+
+    np.testing.assert_allclose(eye(0, 0, 5.0), [0, 0, 5], atol=1e-12)
+    np.testing.assert_allclose(eye(90, 0, 5.0), [5, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(eye(0, 90, 5.0), [0, 5, 0], atol=1e-12)
+    np.testing.assert_allclose(eye(0, 0, 5.0, up="z"), [0, -5, 0], atol=1e-12)
+    np.testing.assert_allclose(eye(90, -90, 5.0, up="z"), [0, 0, -5], atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [(100, 100), (50, 100), (100, 50)])
+def test_the_default_distance_shows_the_whole_sphere(size):
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    part = rts.Part(rts.plugin("surfaces", "mesh")(sphere.faces), {"vertices": np.asarray(sphere.vertices)})
+    pixels = orbit(bounds_of([part]), size, 30, 20).project(np.asarray(sphere.vertices), size)
+    extent = np.abs(pixels[:, :2] - [size[1] / 2, size[0] / 2]).max(axis=0)
+    assert min(size) / 2 * 0.9 < extent.max() < min(size) / 2
+
+
+def test_bounds_follow_transforms_and_refuse_a_point():
+    mesh = rts.plugin("surfaces", "mesh")([[0, 1, 2]])
+    part = rts.Part(mesh, {"vertices": np.eye(3)}, transform=np.diag([2.0, 2, 2, 1]))
+    np.testing.assert_allclose(bounds_of([part]).center, [1, 1, 1])
+    with pytest.raises(InputError, match="in one point"):
+        bounds_of([part.replace(theta={"vertices": np.zeros((3, 3))})])
