@@ -154,12 +154,12 @@ def _read_with_trimesh(path: Path, extension: str) -> list[Piece]:
             f"{path} has the extension {path.suffix!r}, which is not known; expected obj, ply, stl, glb, "
             f"gltf, off or another of trimesh's: {others}"
         )
-    folder = _Folder(path)
+    folder: Any = _Folder(path)
     try:
         if extension == "gltf":
             json.loads(path.read_bytes())  # Of a damaged file trimesh only says that it found no "model.gltf".
         with open(path, "rb") as file:
-            scene = trimesh.load(file, file_type=extension, resolver=folder, force="scene", process=False)
+            scene: Any = trimesh.load(file, file_type=extension, resolver=folder, force="scene", process=False)
         pieces = _pieces(scene, trimesh.Trimesh, extension in LINEAR_COLORS)
     except InputError:
         raise

@@ -149,9 +149,9 @@ def read_obj(path: Path) -> list[Piece]:
     materials = _materials(lines)
     used = {material for _, _, material in lines.faces}
     textures = {
-        name: read_texture(materials[name].texture, path)
+        name: read_texture(file, path)
         for name, index in lines.materials.items()
-        if index in used and name in materials and materials[name].texture is not None
+        if index in used and (file := materials.get(name, Material()).texture) is not None
     }
     v, vt, vn = lines.array("v", 3, (3, 6)), lines.array("vt", 1, (1, 2)), lines.array("vn", 3, (3,))
     if not lines.faces:

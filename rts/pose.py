@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -122,15 +122,9 @@ def fit_pose(
     weights = np.repeat([1.0, bounds.radius], 3)
     trail: list[np.ndarray] = []
     levels: list[list[float]] = []
-    seconds = 0.0
+    seconds, result = 0.0, None
     for mask in _pyramid(target):
-        goal = chosen.constant(mask)
         levels.append([])
-
-        def residuals(p: Array, mask: np.ndarray = mask, goal: Array = goal) -> Array:
-            transform = rigid(p * chosen.constant(weights, p), bounds.center)
-            image = render(posed(parts, transform, "silhouette"), camera, mask.shape, layers=1, splatter="single")
-            return image[..., 3] - goal
 
         def note(step: int, p: Array, loss: float) -> None:
             # Levenberg–Marquardt reports rejected trials too: those repeat the last pose.
@@ -138,14 +132,35 @@ def fit_pose(
             trail.append(_matrix(chosen.to_numpy(p) * weights, bounds) if best else trail[-1])
             levels[-1].append(loss)
 
-        result = fit(residuals, pose, method=method, steps=steps, callback=note, progress=progress)
+        result = fit(
+            _residuals(parts, camera, mask, bounds, weights, chosen),
+            pose,
+            method=method,
+            steps=steps,
+            callback=note,
+            progress=progress,
+        )
         pose = result.parameters
         seconds += result.seconds
+    assert result is not None  # A pyramid has at least one level.
     found = chosen.to_numpy(pose).astype(np.float64) * weights
     matrix = _matrix(found, bounds)
     trail.append(matrix)
     history = sum(levels, [])
     return PoseFit(found[:3], found[3:], bounds.center, matrix, trail, history, result.loss, result.reason, seconds)
+
+
+def _residuals(
+    parts: Sequence[Part], camera: Camera, mask: np.ndarray, bounds: Bounds, weights: np.ndarray, engine: Any
+) -> Callable[[Array], Array]:
+    goal = engine.constant(mask)
+
+    def residuals(pose: Array) -> Array:
+        transform = rigid(pose * engine.constant(weights, pose), bounds.center)
+        silhouettes = posed(parts, transform, "silhouette")
+        return render(silhouettes, camera, mask.shape, layers=1, splatter="single")[..., 3] - goal
+
+    return residuals
 
 
 def _pyramid(target: np.ndarray) -> list[np.ndarray]:
@@ -197,18 +212,8 @@ def write_report(
     Returns:
         The files written.
     """
-    numbers = {
-        "axis_angle": found.rotation.tolist(),
-        "translation": found.translation.tolist(),
-        "center": found.center.tolist(),
-        "matrix": found.matrix.tolist(),
-        "loss": found.loss,
-        "iterations": len(found.history),
-        "seconds": found.seconds,
-        "reason": found.reason,
-    }
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "pose.json").write_text(json.dumps(numbers, indent=2) + "\n")
+    (folder / "pose.json").write_text(json.dumps(_numbers(found), indent=2) + "\n")
     large, small = shrunk(target, PICTURE_SIDE), shrunk(target, LARGEST_SIDE)
 
     def picture(matrix: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -225,6 +230,19 @@ def write_report(
     save_animation(folder / "animation.gif", frames, fps=8)
     names = ["pose.json", "before.png", "after.png", "target.png", "animation.gif"]
     return [folder / name for name in names] + _plot(folder / "convergence.png", found.history)
+
+
+def _numbers(found: PoseFit) -> dict[str, Any]:
+    return {
+        "axis_angle": found.rotation.tolist(),
+        "translation": found.translation.tolist(),
+        "center": found.center.tolist(),
+        "matrix": found.matrix.tolist(),
+        "loss": found.loss,
+        "iterations": len(found.history),
+        "seconds": found.seconds,
+        "reason": found.reason,
+    }
 
 
 def _outlined(parts: Sequence[Part], scenery: Sequence[Part], camera: Camera, mask: np.ndarray) -> np.ndarray:

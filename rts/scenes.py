@@ -66,7 +66,7 @@ def _part(piece: Piece) -> Part:
     if theta.get("colors", np.zeros((0, 0))).shape[1] == 4 and (theta["colors"][:, 3] >= 1).all():
         theta["colors"] = np.ascontiguousarray(theta["colors"][:, :3])
     textured = piece.texture is not None and "uv" in theta
-    if textured:
+    if piece.texture is not None and textured:
         theta["texture"] = piece.texture.astype(np.float32)
     if piece.color is not None and (piece.color < 1).any():
         theta["color"] = piece.color[: 3 if (piece.color[3:] >= 1).all() else 4].astype(np.float32)
@@ -109,7 +109,8 @@ def _merged(path: Path, pieces: list[Piece]) -> Piece:
     """All pieces as one, transforms applied, material colours moved to the vertices."""
     first = pieces[0].texture
     for piece in pieces[1:]:
-        if not (piece.texture is first is None or np.array_equal(piece.texture, first)):
+        other = piece.texture
+        if not (other is None if first is None else other is not None and np.array_equal(other, first)):
             raise InputError(
                 f"{path} has {len(pieces)} parts with different textures, which cannot be merged; load it without merge"
             )
@@ -222,13 +223,13 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
     import imageio.v2 as imageio
 
     try:
-        import imageio_ffmpeg  # noqa: F401
+        import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
         raise PluginError("mp4 needs the package imageio-ffmpeg: pip install imageio-ffmpeg; or write a .gif") from None
     # The usual pixel format of mp4 halves the resolution of colour: sides must be even.
-    even = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in pictures]
+    even: list[Any] = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in pictures]
     even = [np.pad(p, ((0, p.shape[0] % 2), (0, p.shape[1] % 2), (0, 0)), mode="edge") for p in even]
-    imageio.mimwrite(path, even, fps=fps, macro_block_size=2)
+    imageio.mimwrite(path, even, fps=fps, macro_block_size=2)  # pyright: ignore[reportCallIssue]
 
 
 def _host(image: Array) -> np.ndarray:
