@@ -109,9 +109,7 @@ def relative_error(found, expected):
 def icosphere(subdivisions=2, radius=1.0, center=(0.0, 0.0, 0.0)):
     """Vertices (V, 3) float32 and faces (T, 3) of a sphere, counter-clockwise seen from outside."""
     golden = (1 + 5**0.5) / 2
-    vertices = [
-        v for a in (-1.0, 1.0) for b in (-golden, golden) for v in ((a, b, 0.0), (0.0, a, b), (b, 0.0, a))
-    ]
+    vertices = [v for a in (-1.0, 1.0) for b in (-golden, golden) for v in ((a, b, 0.0), (0.0, a, b), (b, 0.0, a))]
     vertices = np.array(vertices)
     edge = 2.0
     faces = []

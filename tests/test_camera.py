@@ -47,9 +47,7 @@ def test_orthographic_pixel_of_a_point_is_the_written_out_number():
 @pytest.mark.parametrize("make", [Camera.look_at, lambda *a: Camera.orthographic(*a, height=2.0)])
 def test_the_target_is_in_the_middle_at_its_distance(make):
     eye, target = np.array([3.0, -1.0, 2.0]), np.array([0.5, 0.25, -4.0])
-    np.testing.assert_allclose(
-        pixel(make(eye, target), target), (30, 20, np.linalg.norm(eye - target)), atol=1e-12
-    )
+    np.testing.assert_allclose(pixel(make(eye, target), target), (30, 20, np.linalg.norm(eye - target)), atol=1e-12)
 
 
 def test_up_is_towards_row_zero_and_right_towards_larger_columns():
@@ -183,18 +181,14 @@ def test_nvdiffrast_sample_position_is_ours_with_rows_reversed():
     # Clip (0.75, −0.3, ·, 3): column coordinate 1.25 · 30 = 37.5, row coordinate 0.9 · 20 = 18, from below.
     projection = np.array([[1.5, 0, 0, 0], [0, 0.6, 0, 0], [0, 0, -11 / 9, -20 / 9], [0, 0, -1, 0]])
     point = (0.5, -0.5, -3.0)
-    np.testing.assert_allclose(
-        pixel(Camera.from_nvdiffrast(np.eye(4), projection), point), (37.5, 22, 3), atol=1e-12
-    )
+    np.testing.assert_allclose(pixel(Camera.from_nvdiffrast(np.eye(4), projection), point), (37.5, 22, 3), atol=1e-12)
     # Negating y puts nvdiffrast's row 0 on top: its row coordinate, 22, is then ours.
     flipped = np.diag([1.0, -1, 1, 1]) @ projection
     camera = Camera.from_nvdiffrast(np.eye(4), flipped, top_down=True)
     np.testing.assert_allclose(pixel(camera, point), (37.5, 22, 3), atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "size, expected", [((40, 60), (13, 14, 4)), ((60, 40), (3, 24, 4)), ((40, 40), (3, 14, 4))]
-)
+@pytest.mark.parametrize("size, expected", [((40, 60), (13, 14, 4)), ((60, 40), (3, 24, 4)), ((40, 40), (3, 14, 4))])
 def test_pytorch3d_ndc_spans_the_shorter_side_with_x_left_and_y_up(size, expected):
     # X R + T = (−3, 2, 1) + T = (1, 1, 4); NDC x = 3 / 4 + 0.1 = 0.85, y = 2 / 4 − 0.2 = 0.3; the shorter
     # side, 40 pixels, is 2 long, and the pixel is (w / 2 − 20 · 0.85, h / 2 − 20 · 0.3).
@@ -206,9 +200,7 @@ def test_pytorch3d_ndc_spans_the_shorter_side_with_x_left_and_y_up(size, expecte
 
 def test_pytorch3d_focal_length_may_be_one_number_and_is_the_cotangent_of_half_the_field_of_view():
     R = np.diag([-1.0, 1.0, -1.0])
-    camera = Camera.from_pytorch3d(
-        R, (0, 0, 0), focal_length=1 / np.tan(np.radians(25)), size=SIZE, near=0.1, far=9
-    )
+    camera = Camera.from_pytorch3d(R, (0, 0, 0), focal_length=1 / np.tan(np.radians(25)), size=SIZE, near=0.1, far=9)
     np.testing.assert_allclose(camera.projection, perspective(50, 1.5, 0.1, 9), atol=1e-12)
     np.testing.assert_allclose(camera.view, np.eye(4), atol=1e-12)
 
@@ -237,9 +229,7 @@ def test_the_converters_agree_on_one_camera():
         "opengl": Camera.from_opengl(*camera.to_opengl()),
         "nvdiffrast": Camera.from_nvdiffrast(*camera.to_nvdiffrast()),
         "nvdiffrast, top down": Camera.from_nvdiffrast(*camera.to_nvdiffrast(top_down=True), top_down=True),
-        "pytorch3d": Camera.from_pytorch3d(
-            R, T, focal_length=focal, principal_point=point, size=SIZE, **limits
-        ),
+        "pytorch3d": Camera.from_pytorch3d(R, T, focal_length=focal, principal_point=point, size=SIZE, **limits),
         "blender": Camera.from_blender(camera_to_world, SIZE, focal=pixels, **limits),
     }
     for name, other in others.items():
@@ -258,9 +248,7 @@ def test_opencv_round_trip_keeps_skew_and_principal_point():
 @pytest.mark.parametrize("size", [(40, 60), (60, 40)])
 def test_pytorch3d_round_trip(size):
     given = (rotation((1, 2, 3), 40), np.array([0.1, 0.2, 6.0]), np.array([3.0, 2.0]), np.array([0.1, -0.2]))
-    camera = Camera.from_pytorch3d(
-        given[0], given[1], focal_length=given[2], principal_point=given[3], size=size
-    )
+    camera = Camera.from_pytorch3d(given[0], given[1], focal_length=given[2], principal_point=given[3], size=size)
     for found, expected in zip(camera.to_pytorch3d(size), given, strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-12)
 
@@ -348,9 +336,7 @@ CONSTRUCTORS = {
         },
     ),
     "from_blender": (
-        lambda a: Camera.from_blender(
-            a["camera_to_world"], SIZE, focal=a["focal"], near=a["near"], far=a["far"]
-        ),
+        lambda a: Camera.from_blender(a["camera_to_world"], SIZE, focal=a["focal"], near=a["near"], far=a["far"]),
         {"camera_to_world": rigid((1, 2, 3), 40, (0.1, 0.2, 6.0)), "focal": 50.0, "near": 0.5, "far": 9.0},
     ),
 }
@@ -419,9 +405,7 @@ def test_project_gradient_in_points_is_the_finite_difference(target):
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_project_gradient_is_finite_on_the_plane_of_the_camera(target):
     camera = arrays(target, Camera.look_at((0, 0, 5), (0, 0, 0)))
-    found = gradient(
-        target, lambda p: camera.project(p, SIZE).sum(), arrays(target, np.array([[1.0, 2.0, 5.0]]))
-    )
+    found = gradient(target, lambda p: camera.project(p, SIZE).sum(), arrays(target, np.array([[1.0, 2.0, 5.0]])))
     assert np.isfinite(found).all()
 
 

@@ -311,9 +311,7 @@ def test_a_mesh_far_from_the_origin_is_sampled_as_well_as_near_it(sampler):
     vertices, faces = icosphere(2)
     vertices = np.round(vertices * 512) / 512  # So that float32 holds them exactly at 10 000 too.
     offset = np.array([1e4, -1e4, 1e4])
-    near = rasterize(
-        sampler, vertices.astype(np.float32), faces, Camera.look_at((1, 2, 3), (0, 0, 0)), SIZE, 2
-    )
+    near = rasterize(sampler, vertices.astype(np.float32), faces, Camera.look_at((1, 2, 3), (0, 0, 0)), SIZE, 2)
     far = rasterize(
         sampler,
         (vertices + offset).astype(np.float32),

@@ -216,9 +216,7 @@ def test_a_misspelt_group_lists_the_groups_and_suggests_one():
 
 def test_a_name_claimed_by_two_distributions_is_refused_naming_both(install):
     for name in ("first", "second"):
-        install(
-            name, {"rts.splatters": {"same": f"{name}_plugin:Same"}}, {f"{name}_plugin": "class Same: pass"}
-        )
+        install(name, {"rts.splatters": {"same": f"{name}_plugin:Same"}}, {f"{name}_plugin": "class Same: pass"})
     with pytest.raises(rts.PluginError) as error:
         rts.plugin("splatters", "same")
     assert "'same' is claimed by first 1.2 and second 1.2" in one_line(error)
@@ -226,9 +224,7 @@ def test_a_name_claimed_by_two_distributions_is_refused_naming_both(install):
 
 
 def test_a_name_of_ours_claimed_by_another_distribution_is_refused(install):
-    install(
-        "rival", {"rts.splatters": {"multi": "rival_plugin:Rival"}}, {"rival_plugin": "class Rival: pass"}
-    )
+    install("rival", {"rts.splatters": {"multi": "rival_plugin:Rival"}}, {"rival_plugin": "class Rival: pass"})
     with pytest.raises(rts.PluginError, match="claimed by .*rival 1.2"):
         rts.plugin("splatters", "multi")
 

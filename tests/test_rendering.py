@@ -213,9 +213,7 @@ def test_backgrounds_show_through_what_is_not_covered(target):
         background = rng.random(shape)
         if shape[-1] == 4:
             background[..., :3] *= background[..., 3:]
-        full = (
-            background if shape[-1] == 4 else np.concatenate([background, np.ones((*shape[:-1], 1))], axis=-1)
-        )
+        full = background if shape[-1] == 4 else np.concatenate([background, np.ones((*shape[:-1], 1))], axis=-1)
         expected = bare + (1 - bare[..., 3:]) * full
         for given in (background, arrays(target, background)):
             np.testing.assert_allclose(show(part, camera, background=given), expected, rtol=0, atol=1e-6)
@@ -272,15 +270,11 @@ def test_vertex_attributes_are_interpolated_linearly_in_space(target):
     # A sheet that recedes: colour is the world coordinate, so each pixel shows where its ray meets the sheet.
     vertices = np.array([(-2, -2, -3), (2, -2, 1), (2, 2, 1), (-2, 2, -3)], np.float32)
     colors = np.clip((vertices + (2, 2, 3)) / 4, 0, 1)
-    part, camera = arrays(
-        target, (mesh_part((vertices, quad()[1]), shader="unlit", theta={"colors": colors}), CAMERA)
-    )
+    part, camera = arrays(target, (mesh_part((vertices, quad()[1]), shader="unlit", theta={"colors": colors}), CAMERA))
     image = show(part, camera, splatter="none")
     rays = CAMERA.rays(SIZE)
     # The sheet is z = x − 1.
-    depth = (rays.origins[..., 0] - 1 - rays.origins[..., 2]) / (
-        rays.directions[..., 2] - rays.directions[..., 0]
-    )
+    depth = (rays.origins[..., 0] - 1 - rays.origins[..., 2]) / (rays.directions[..., 2] - rays.directions[..., 0])
     points = rays.origins + depth[..., None] * rays.directions
     inside = image[..., 3] == 1
     assert inside.sum() > 100
@@ -335,9 +329,7 @@ class CountingMesh(Mesh):
         return super()._vertex_normals(vertices)
 
 
-@pytest.mark.parametrize(
-    "pose_only", [False, True], ids=["all differentiable", "only the transform differentiable"]
-)
+@pytest.mark.parametrize("pose_only", [False, True], ids=["all differentiable", "only the transform differentiable"])
 @pytest.mark.parametrize("target", ALL)
 def test_normals_are_computed_only_for_a_shader_that_reads_them(target, pose_only):
     vertices, faces = icosphere(1)
@@ -427,9 +419,7 @@ def test_wrap_modes_outside_the_unit_square(target, wrap, column):
     period = {"repeat": 3, "mirror": 2}.get(wrap)
     if period:
         texture, there = arrays(target, (TEXTURE, uv - 2 * period))
-        np.testing.assert_allclose(
-            to_numpy(sample_texture(texture, there, wrap)), TEXTURE[1, column], atol=1e-5
-        )
+        np.testing.assert_allclose(to_numpy(sample_texture(texture, there, wrap)), TEXTURE[1, column], atol=1e-5)
 
 
 def test_repeat_blends_the_two_ends_and_clamp_does_not():

@@ -26,9 +26,7 @@ KERNELS = {"single": Single, "multi": Multi}
 def dense(height, width, layers=1, depth=5.0):
     """Positions (N, 3) at the pixel centres, and row (K, H, W), of a grid whose first layer is full."""
     rows, columns = np.indices((height, width))
-    positions = np.stack([columns + 0.5, rows + 0.5, np.full_like(rows, depth, np.float64)], -1).reshape(
-        -1, 3
-    )
+    positions = np.stack([columns + 0.5, rows + 0.5, np.full_like(rows, depth, np.float64)], -1).reshape(-1, 3)
     row = np.full((layers, height, width), -1, np.int32)
     row[0] = np.arange(height * width).reshape(height, width)
     return positions, row
@@ -126,9 +124,7 @@ def test_single_is_multi_with_one_layer(target):
 
 def test_single_ignores_the_hidden_layers():
     positions, rgba, row = random_scene(3)
-    np.testing.assert_array_equal(
-        Single().splat(positions, rgba, row), Single().splat(positions, rgba, row[:1])
-    )
+    np.testing.assert_array_equal(Single().splat(positions, rgba, row), Single().splat(positions, rgba, row[:1]))
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
@@ -189,14 +185,10 @@ def test_the_edge_derivative_follows_sigma_and_epsilon(sigma, epsilon):
     row[0, :, 8:] = -1
     _, slope = along_x(TORCH[0], Single(sigma, epsilon), positions, white(positions), row)
     e = math.exp(-1 / (2 * sigma**2))
-    assert slope[3, 5:11, 3].sum() == pytest.approx(
-        2 * (1 + epsilon) * e / (sigma**2 * (1 + 2 * e)), abs=1e-4
-    )
+    assert slope[3, 5:11, 3].sum() == pytest.approx(2 * (1 + epsilon) * e / (sigma**2 * (1 + 2 * e)), abs=1e-4)
 
 
-@pytest.mark.parametrize(
-    "target, sigma", [*((t, 0.5) for t in DIFFERENTIABLE), (TORCH[0], 0.4), (TORCH[0], 0.7)]
-)
+@pytest.mark.parametrize("target, sigma", [*((t, 0.5) for t in DIFFERENTIABLE), (TORCH[0], 0.4), (TORCH[0], 0.7)])
 @pytest.mark.parametrize("name", KERNELS)
 def test_a_translating_ramp_is_felt_at_the_first_moment_of_the_kernel(name, target, sigma):
     positions, row = dense(7, 16)
@@ -272,9 +264,7 @@ def test_no_covered_cell_gives_zero_gradients(name, target):
     splatter = rts.plugin("splatters", name)()
     given = {"positions": np.ones((1, 3)), "rgba": np.ones((1, 4))}
     row = arrays(target, np.full((2, 3, 5), -1, np.int32))
-    found = gradient(
-        target, lambda t: splatter.splat(t["positions"], t["rgba"], row).sum(), arrays(target, given)
-    )
+    found = gradient(target, lambda t: splatter.splat(t["positions"], t["rgba"], row).sum(), arrays(target, given))
     np.testing.assert_array_equal(found["positions"], 0)
     np.testing.assert_array_equal(found["rgba"], 0)
 
