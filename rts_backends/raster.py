@@ -9,21 +9,18 @@ so the result does not depend on the number of threads.
 
 from __future__ import annotations
 
-import threading
-
 import numba
 import numpy as np
 
 from rts.camera import Camera
 from rts.protocols import Fragments, Proxy
 from rts.sampling import TriangleSampler
+from rts_backends.threads import parallel
 
 BAND_ROWS = 8
 CHUNK = 1 << 14
 BOX_SLACK = 1e-6
 NEAR, FAR = 1, 2
-
-_one_at_a_time = threading.Lock()  # numba's default threading layer must not be entered by two threads.
 
 
 class Raster(TriangleSampler):
@@ -46,24 +43,23 @@ class Raster(TriangleSampler):
             np.empty((layers, height, width, 2), np.float32),
             np.empty((layers, height, width), np.float32),
         )
-        with _one_at_a_time:
-            corners = np.empty((len(prepared.vertices), 4))
-            flags = np.empty(len(prepared.vertices), np.uint8)
-            _transform(prepared.vertices, matrix, corners, flags)
-            chunks = -(-len(prepared.faces) // CHUNK)
-            kept = np.empty(len(prepared.faces), np.int32)
-            boxes = np.empty((len(prepared.faces), 4), np.int16 if max(size) < 2**15 else np.int32)
-            counts = np.zeros(chunks, np.int64)
-            _set_up(prepared.faces, corners, flags, height, width, facing, kept, boxes, counts)
-            view_depth = -camera.view[2]
-            _draw(prepared.faces, prepared.vertices, corners, flags, kept, boxes, counts, view_depth, *fragments)
+        vertices, faces = prepared.vertices, prepared.faces
+        corners, flags = np.empty((len(vertices), 4)), np.empty(len(vertices), np.uint8)
+        parallel(_transform, len(vertices), vertices, matrix, corners, flags)
+        kept = np.empty(len(faces), np.int32)
+        boxes = np.empty((len(faces), 4), np.int16 if max(size) < 2**15 else np.int32)
+        counts = np.zeros(-(-len(faces) // CHUNK), np.int64)
+        parallel(_set_up, len(counts), faces, corners, flags, height, width, facing, kept, boxes, counts)
+        bands = -(-height // BAND_ROWS)
+        scene = faces, vertices, corners, flags, kept, boxes, counts, -camera.view[2]
+        parallel(_draw, bands, *scene, *fragments)
         return fragments
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
-def _transform(vertices, matrix, corners, flags):
+@numba.njit(cache=True, nogil=True)
+def _transform(start, stop, vertices, matrix, corners, flags):
     """Homogeneous pixel coordinates (V, 4) = X, Y, clip z, w, and which of the two planes each vertex violates."""
-    for v in numba.prange(len(vertices)):
+    for v in range(start, stop):
         x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
         for i in range(4):
             corners[v, i] = matrix[i, 0] * x + matrix[i, 1] * y + matrix[i, 2] * z + matrix[i, 3]
@@ -72,15 +68,10 @@ def _transform(vertices, matrix, corners, flags):
         flags[v] = (0 if depth >= -w and w > 0 else NEAR) | (0 if depth <= w else FAR)
 
 
-@numba.njit(cache=True, inline="always")
-def _determinant(a, b, c):
-    return a[0] * (b[1] * c[3] - b[3] * c[1]) - a[1] * (b[0] * c[3] - b[3] * c[0]) + a[3] * (b[0] * c[1] - b[1] * c[0])
-
-
-@numba.njit(parallel=True, cache=True, nogil=True)
-def _set_up(faces, corners, flags, height, width, facing, kept, boxes, counts):
+@numba.njit(cache=True, nogil=True)
+def _set_up(first, last, faces, corners, flags, height, width, facing, kept, boxes, counts):
     """List, chunk by chunk, the triangles that may cover a pixel centre, with their pixel boxes."""
-    for chunk in numba.prange(len(counts)):
+    for chunk in range(first, last):
         start, stop = chunk * CHUNK, min(len(faces), (chunk + 1) * CHUNK)
         found = start
         for t in range(start, stop):
@@ -88,13 +79,12 @@ def _set_up(faces, corners, flags, height, width, facing, kept, boxes, counts):
             fa, fb, fc = flags[ia], flags[ib], flags[ic]
             if fa & fb & fc:
                 continue
-            a, b, c = corners[ia], corners[ib], corners[ic]
             if (fa | fb | fc) & NEAR:
-                x0, x1, y0, y1 = _clipped_box(a, b, c, width, height)
+                x0, x1, y0, y1 = _clipped_box(corners, ia, ib, ic, width, height)
             else:
-                ra, rb, rc = 1 / a[3], 1 / b[3], 1 / c[3]
-                xa, xb, xc = a[0] * ra, b[0] * rb, c[0] * rc
-                ya, yb, yc = a[1] * ra, b[1] * rb, c[1] * rc
+                ra, rb, rc = 1 / corners[ia, 3], 1 / corners[ib, 3], 1 / corners[ic, 3]
+                xa, xb, xc = corners[ia, 0] * ra, corners[ib, 0] * rb, corners[ic, 0] * rc
+                ya, yb, yc = corners[ia, 1] * ra, corners[ib, 1] * rb, corners[ic, 1] * rc
                 x0, x1 = min(xa, xb, xc), max(xa, xb, xc)
                 y0, y1 = min(ya, yb, yc), max(ya, yb, yc)
             # Pixel centres at i + 0.5; clamp before rounding, since a far point overflows an integer.
@@ -105,7 +95,7 @@ def _set_up(faces, corners, flags, height, width, facing, kept, boxes, counts):
             i0, j0, i1, j1 = max(i0, 0), max(j0, 0), min(i1, width - 1), min(j1, height - 1)
             if i0 > i1 or j0 > j1:
                 continue
-            area = _determinant(a, b, c)
+            area = determinant(corners, ia, ib, ic)
             if not (area * facing > 0 or (facing == 0 and area != 0)):
                 continue
             kept[found] = t
@@ -115,48 +105,49 @@ def _set_up(faces, corners, flags, height, width, facing, kept, boxes, counts):
 
 
 @numba.njit(cache=True)
-def _clipped_box(a, b, c, width, height):
+def _clipped_box(corners, ia, ib, ic, width, height):
     """The pixel box (x0, x1, y0, y1) of the part of a triangle before the near plane."""
     x0, x1, y0, y1 = np.inf, -np.inf, np.inf, -np.inf
-    for p, q in ((a, b), (b, c), (c, a)):
-        dp, dq = p[2] + p[3], q[2] + q[3]
+    for i, j in ((ia, ib), (ib, ic), (ic, ia)):
+        here, there = corners[i, 2] + corners[i, 3], corners[j, 2] + corners[j, 3]
         for end in range(2):
-            if end == 0:
-                if dp < 0:
-                    continue
-                x, y, w = p[0], p[1], p[3]
-            else:
-                if (dp < 0) == (dq < 0):
-                    continue
-                s = dp / (dp - dq)
-                x, y, w = p[0] + s * (q[0] - p[0]), p[1] + s * (q[1] - p[1]), p[3] + s * (q[3] - p[3])
+            if (end == 0 and here < 0) or (end == 1 and (here < 0) == (there < 0)):
+                continue
+            s = 0.0 if end == 0 else here / (here - there)
+            x = corners[i, 0] + s * (corners[j, 0] - corners[i, 0])
+            y = corners[i, 1] + s * (corners[j, 1] - corners[i, 1])
+            w = corners[i, 3] + s * (corners[j, 3] - corners[i, 3])
             if not w > 0:
                 return 0.0, np.float64(width), 0.0, np.float64(height)
             x0, x1, y0, y1 = min(x0, x / w), max(x1, x / w), min(y0, y / w), max(y1, y / w)
     return x0, x1, y0, y1
 
 
-@numba.njit(cache=True, inline="always")
-def _edges(a, b, c):
-    """Coefficients of the three edge functions, made symmetric: swapping two corners negates them exactly."""
-    return (
-        b[1] * c[3] - b[3] * c[1],
-        b[3] * c[0] - b[0] * c[3],
-        b[0] * c[1] - b[1] * c[0],
-        c[1] * a[3] - c[3] * a[1],
-        c[3] * a[0] - c[0] * a[3],
-        c[0] * a[1] - c[1] * a[0],
-        a[1] * b[3] - a[3] * b[1],
-        a[3] * b[0] - a[0] * b[3],
-        a[0] * b[1] - a[1] * b[0],
-    )
+@numba.njit(cache=True)
+def determinant(corners, ia, ib, ic):
+    """Of the three corners (X, Y, w): twice the signed area on screen, times the three w."""
+    ax, ay, aw = corners[ia, 0], corners[ia, 1], corners[ia, 3]
+    bx, by, bw = corners[ib, 0], corners[ib, 1], corners[ib, 3]
+    cx, cy, cw = corners[ic, 0], corners[ic, 1], corners[ic, 3]
+    return ax * (by * cw - bw * cy) - ay * (bx * cw - bw * cx) + aw * (bx * cy - by * cx)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
-def _draw(faces, vertices, corners, flags, kept, boxes, counts, view_depth, triangle_ids, barycentrics, depths):
+@numba.njit(cache=True)
+def edge(corners, i, j):
+    """Coefficients (x, y, 1) of the edge function of two corners; swapping them negates it exactly."""
+    ax, ay, aw = corners[i, 0], corners[i, 1], corners[i, 3]
+    bx, by, bw = corners[j, 0], corners[j, 1], corners[j, 3]
+    return ay * bw - aw * by, aw * bx - ax * bw, ax * by - ay * bx
+
+
+@numba.njit(cache=True, nogil=True)
+def _draw(
+    first, last, faces, vertices, corners, flags, kept, boxes, counts, view_depth, triangle_ids, barycentrics, depths
+):
     """Fill the three fragment arrays, band by band."""
     layers, height, width = triangle_ids.shape
-    for band in numba.prange((height + BAND_ROWS - 1) // BAND_ROWS):
+    d0, d1, d2, d3 = view_depth[0], view_depth[1], view_depth[2], view_depth[3]
+    for band in range(first, last):
         top, bottom = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS) - 1
         nearest = np.full(((bottom - top + 1) * width, layers), np.inf)
         ids = np.full(((bottom - top + 1) * width, layers), -1, np.int32)
@@ -167,18 +158,19 @@ def _draw(faces, vertices, corners, flags, kept, boxes, counts, view_depth, tria
                     continue
                 t = kept[at]
                 ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
-                a, b, c = corners[ia], corners[ib], corners[ic]
-                xa, ya, wa, xb, yb, wb, xc, yc, wc = _edges(a, b, c)
-                if _determinant(a, b, c) < 0:
+                xa, ya, wa = edge(corners, ib, ic)
+                xb, yb, wb = edge(corners, ic, ia)
+                xc, yc, wc = edge(corners, ia, ib)
+                if determinant(corners, ia, ib, ic) < 0:
                     xa, ya, wa, xb, yb, wb, xc, yc, wc = -xa, -ya, -wa, -xb, -yb, -wb, -xc, -yc, -wc
                 # Top and left edges own the pixels exactly on them (y points down).
                 own_a = xa > 0 or (xa == 0 and ya > 0)
                 own_b = xb > 0 or (xb == 0 and yb > 0)
                 own_c = xc > 0 or (xc == 0 and yc > 0)
                 clip = flags[ia] | flags[ib] | flags[ic]
-                za = _depth(view_depth, vertices[ia])
-                zb = _depth(view_depth, vertices[ib])
-                zc = _depth(view_depth, vertices[ic])
+                za = d0 * vertices[ia, 0] + d1 * vertices[ia, 1] + d2 * vertices[ia, 2] + d3
+                zb = d0 * vertices[ib, 0] + d1 * vertices[ib, 1] + d2 * vertices[ib, 2] + d3
+                zc = d0 * vertices[ic, 0] + d1 * vertices[ic, 1] + d2 * vertices[ic, 2] + d3
                 for j in range(j0, j1 + 1):
                     y = j + 0.5
                     ra, rb, rc = ya * y + wa, yb * y + wb, yc * y + wc
@@ -190,13 +182,8 @@ def _draw(faces, vertices, corners, flags, kept, boxes, counts, view_depth, tria
                         if (ea == 0 and not own_a) or (eb == 0 and not own_b) or (ec == 0 and not own_c):
                             continue
                         total = ea + eb + ec
-                        if not total > 0:
+                        if not total > 0 or (clip and _clipped(corners, ia, ib, ic, ea, eb, ec)):
                             continue
-                        if clip:
-                            if ea * (a[2] + a[3]) + eb * (b[2] + b[3]) + ec * (c[2] + c[3]) < 0:
-                                continue
-                            if ea * (a[3] - a[2]) + eb * (b[3] - b[2]) + ec * (c[3] - c[2]) < 0:
-                                continue
                         z = (ea * za + eb * zb + ec * zc) / total
                         pixel = (j - top) * width + i
                         if not z < nearest[pixel, layers - 1]:
@@ -213,21 +200,28 @@ def _draw(faces, vertices, corners, flags, kept, boxes, counts, view_depth, tria
             for k in range(layers):
                 t = ids[pixel, k]
                 triangle_ids[k, j, i] = t
-                barycentrics[k, j, i, 0] = 0
-                barycentrics[k, j, i, 1] = 0
-                depths[k, j, i] = 0
                 if t < 0:
+                    barycentrics[k, j, i, 0] = barycentrics[k, j, i, 1] = depths[k, j, i] = 0
                     continue
-                a, b, c = corners[faces[t, 0]], corners[faces[t, 1]], corners[faces[t, 2]]
-                xa, ya, wa, xb, yb, wb, xc, yc, wc = _edges(a, b, c)
-                x, y = i + 0.5, j + 0.5
-                ea, eb, ec = xa * x + (ya * y + wa), xb * x + (yb * y + wb), xc * x + (yc * y + wc)
-                total = ea + eb + ec
-                barycentrics[k, j, i, 0] = ea / total
-                barycentrics[k, j, i, 1] = eb / total
+                barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = weights(corners, faces, t, i + 0.5, j + 0.5)
                 depths[k, j, i] = nearest[pixel, k]
 
 
-@numba.njit(cache=True, inline="always")
-def _depth(row, vertex):
-    return row[0] * vertex[0] + row[1] * vertex[1] + row[2] * vertex[2] + row[3]
+@numba.njit(cache=True)
+def _clipped(corners, ia, ib, ic, ea, eb, ec):
+    """Whether the point with barycentrics in the ratio ea : eb : ec lies outside the near or the far plane."""
+    near = ea * (corners[ia, 2] + corners[ia, 3]) + eb * (corners[ib, 2] + corners[ib, 3])
+    far = ea * (corners[ia, 3] - corners[ia, 2]) + eb * (corners[ib, 3] - corners[ib, 2])
+    return near + ec * (corners[ic, 2] + corners[ic, 3]) < 0 or far + ec * (corners[ic, 3] - corners[ic, 2]) < 0
+
+
+@numba.njit(cache=True)
+def weights(corners, faces, t, x, y):
+    """Perspective-correct barycentrics of the first two corners of a triangle at a pixel position."""
+    ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
+    xa, ya, wa = edge(corners, ib, ic)
+    xb, yb, wb = edge(corners, ic, ia)
+    xc, yc, wc = edge(corners, ia, ib)
+    ea, eb, ec = xa * x + (ya * y + wa), xb * x + (yb * y + wb), xc * x + (yc * y + wc)
+    total = ea + eb + ec
+    return ea / total, eb / total

@@ -1,0 +1,42 @@
+"""Compiled loops on all cores.
+
+A pool of plain Python threads runs kernels that release the interpreter lock. numba's own parallel loops are not used:
+their OpenMP threads spin against torch's for milliseconds after every loop, and its other layers must not be entered
+by two threads at once.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+TASKS_PER_THREAD = 4
+"""More tasks than threads, so that one that gets the heavy rows does not keep the others waiting."""
+
+_pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
+
+
+def thread_count() -> int:
+    """Threads to use: the variable RTS_NUM_THREADS, or the cores this process may run on."""
+    wanted = os.environ.get("RTS_NUM_THREADS", "")
+    if wanted.isdigit() and int(wanted) > 0:
+        return int(wanted)
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def parallel(kernel: Callable, count: int, *args: Any) -> None:
+    """Call `kernel(start, stop, *args)` so that the ranges cover [0, count); the kernel must release the lock."""
+    threads = thread_count()
+    tasks = min(count, threads * TASKS_PER_THREAD)
+    if threads == 1 or tasks <= 1:
+        kernel(0, count, *args)
+        return
+    key = os.getpid(), threads  # A forked child has none of its parent's threads.
+    if key not in _pools:
+        _pools[key] = ThreadPoolExecutor(threads, thread_name_prefix="rts")
+    bounds = [count * i // tasks for i in range(tasks + 1)]
+    futures = [_pools[key].submit(kernel, a, b, *args) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    for future in futures:
+        future.result()
