@@ -14,7 +14,7 @@ from scenes import DATA
 
 import rts
 from rts.errors import InputError
-from rts.framing import bounds_of, orbit, with_depth_range
+from rts.framing import bounds_of, orbit
 
 MODELS = {
     "bunny": "meshes/bunny.obj",
@@ -23,7 +23,8 @@ MODELS = {
     "nefertiti": "meshes/nefertiti.obj",
     "airplane": "ycb_airplane/textured.obj",
 }
-VIEWS = {"spot": (150, 15), "nefertiti": (0, -80)}
+VIEWS = {"spot": (150, 15), "nefertiti": (30, 5), "airplane": (150, 30)}
+Z_UP = ("nefertiti", "airplane")
 SIZE = (256, 256)
 SPOT_TEXTURE = "spot_texture.png"
 
@@ -34,8 +35,7 @@ def load(name: str) -> list[rts.Part]:
         # Its files do not name the texture, which lies beside them.
         texture = rts.load_image(DATA / "meshes" / "spot" / SPOT_TEXTURE)[..., :3]
         parts = [p.replace(theta={**p.theta, "texture": texture}, shader="textured") for p in parts]
-    if name == "nefertiti":
-        # z is up in this file.
+    if name in Z_UP:
         upright = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
         parts = [p.replace(transform=upright) for p in parts]
     return parts
@@ -54,7 +54,9 @@ def main() -> None:
         for shader in rts.plugins("rts.shaders"):
             shaded = [p.replace(shader=shader) for p in parts]
             if shader == "depth":
-                shaded = with_depth_range(shaded, camera)
+                distance = np.linalg.norm(np.linalg.inv(camera.view)[:3, 3] - bounds.center)
+                extent = np.array([distance - bounds.radius, distance + bounds.radius])
+                shaded = [p.replace(theta={**p.theta, "depth_range": extent}) for p in shaded]
             try:
                 image = rts.render(shaded, camera, SIZE, background=(0.08, 0.08, 0.1))
             except InputError as error:  # A mesh without texture has no textured picture.

@@ -47,6 +47,17 @@ def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
     return fn(tree)
 
 
+def from_numbers(tree: Tree) -> Tree:
+    """The same tree with every list or tuple that holds only numbers, nested or not, as a float32 array."""
+    if isinstance(tree, Mapping):
+        return {key: from_numbers(value) for key, value in tree.items()}
+    if isinstance(tree, (list, tuple)) and not hasattr(tree, "_fields"):
+        if tree and all(isinstance(x, (bool, int, float)) for x in leaves(tree)):
+            return np.asarray(tree, np.float32)
+        return type(tree)(from_numbers(x) for x in tree)
+    return tree
+
+
 def is_constant(tree: Tree) -> bool:
     """Whether every leaf is NumPy or a Python number: never differentiated."""
     return all(isinstance(x, CONSTANT_TYPES) for x in leaves(tree))

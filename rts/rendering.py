@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rts import registry
-from rts.arrays import affine, constants, engine_of, exemplar, is_constant, namespace
+from rts.arrays import affine, constants, engine_of, exemplar, from_numbers, is_constant, namespace
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.protocols import Array, GBuffer, Part, Sampled, Samples
@@ -214,13 +214,15 @@ def _choose(group: str, chosen: Any) -> Any:
 
 
 def _resolve(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Part], Camera]:
-    """Checked parts with their shaders looked up."""
+    """Checked parts, with their shaders looked up and plain numbers made arrays."""
     parts = list(parts) if isinstance(parts, Sequence) else [parts]
     if not parts or not all(isinstance(p, Part) for p in parts):
         kinds = ", ".join(type(p).__name__ for p in parts) or "nothing"
         raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
     if not isinstance(camera, Camera):
         raise InputError(f"camera is a {type(camera).__name__}; expected an rts.Camera")
+    camera = Camera(*from_numbers(tuple(camera)))
+    parts = [p.replace(theta=from_numbers(p.theta), transform=from_numbers(p.transform)) for p in parts]
     for name, matrix in zip(camera._fields, camera, strict=True):
         _check_matrix(f"the camera's {name}", matrix)
     engine_of(parts, camera)

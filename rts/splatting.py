@@ -48,7 +48,8 @@ class Kernel(abc.ABC):
     """What the splatters share: a Gaussian over 3 × 3 cells.
 
     Attributes:
-        sigma: standard deviation, pixels.
+        sigma: standard deviation, pixels. Below 0.45 little of the kernel reaches the neighbouring cells, and most of
+            the derivative at edges is lost.
         epsilon: excess of the weights' sum over one, so that the interior is always normalised.
     """
 
