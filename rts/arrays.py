@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import zlib
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -152,12 +151,6 @@ def promote(*values: Any) -> tuple[Any, list[Array]]:
         for v in values_
     ]
     return namespace(*arrays), arrays
-
-
-def fingerprint(tree: Tree) -> tuple:
-    """A key that changes when the bytes of host arrays do; optimisers change arrays in place, so identity would not."""
-    arrays = [np.ascontiguousarray(x) for x in leaves(tree)]
-    return tuple((x.shape, x.dtype.str, zlib.crc32(x.view(np.uint8).reshape(-1))) for x in arrays)
 
 
 def unit(x: Array, axis: int = -1) -> Array:

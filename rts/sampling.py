@@ -3,22 +3,34 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Self
 
 import numpy as np
 
 from rts.arrays import engine_of, is_constant, leaves, map_leaves, namespace
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.protocols import ArraySpec, Fragments, Part, Proxy, Rays, Sampled, Samples
+from rts.preparing import Entry, Keeper, fingerprint
+from rts.protocols import ArraySpec, Fragments, Part, Proxy, Rays, Sampled, Samples, Tree
 
 
 class TriangleSampler(abc.ABC):
     """Base class of samplers that know only triangles: `sample` for any surface that gives a proxy.
 
-    A sampler implements `rasterize`, and `prepare` where something is worth building once for a proxy.
+    A sampler implements `rasterize`; also `prepare`, where something is worth building once for a proxy, and
+    `update(prepared, proxy) -> prepared`, where that can follow moved vertices more cheaply. What was prepared is kept
+    (`rts.preparing`) until the proxy's inputs change.
     """
+
+    update: Callable[[Any, Proxy], Any] | None = None
+    _keeper: Keeper
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Give every instance a keeper, whatever `__init__` a subclass has."""
+        self = super().__new__(cls)
+        self._keeper = Keeper()
+        return self
 
     def prepare(self, proxy: Proxy) -> Any:
         """What `rasterize` needs of the proxy: an acceleration structure, device buffers. Default the proxy itself."""
@@ -36,24 +48,56 @@ class TriangleSampler(abc.ABC):
             cull: "none", or "back": ignore triangles whose normal (counter-clockwise winding) faces away.
         """
 
+    def entry(self, surface: Any, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
+        """The surface's proxy for host inputs, checked, and what this sampler prepares of it; kept where it pays."""
+
+        def make() -> Proxy:
+            proxy = surface.proxy(inputs, camera, size)
+            check_proxy(proxy, surface)
+            return proxy
+
+        if type(self).prepare is TriangleSampler.prepare and getattr(surface, "proxy_is_cheap", False):
+            proxy = make()
+            return Entry(proxy, self.prepare(proxy))
+        beside = surface.proxy_key(inputs, camera, size) if hasattr(surface, "proxy_key") else None
+        key = (fingerprint(inputs), beside)
+        return self._keeper.get(surface, key, make, self.prepare, self.update)
+
     def sample(
-        self, part: Part, camera: Camera, size: tuple[int, int], layers: int, *, capacity: int | None = None
+        self,
+        part: Part,
+        camera: Camera,
+        size: tuple[int, int],
+        layers: int,
+        *,
+        capacity: int | None = None,
+        entry: Entry | None = None,
     ) -> Samples:
-        """See `rts.protocols.Sampler`. One call to the host does everything."""
+        """See `rts.protocols.Sampler`. One call to the host does everything.
+
+        Args:
+            part: see there.
+            camera: see there.
+            size: see there.
+            layers: see there.
+            capacity: see there.
+            entry: to be used without a look at the surface's inputs; see `rts.prepare`.
+        """
         surface, theta = part.surface, part.theta
         engine = engine_of(theta, camera)
-        inputs = surface.proxy_inputs(theta)
+        inputs = surface.proxy_inputs(theta) if entry is None or hasattr(surface, "refine") else None
         reads = surface.reads(theta) if hasattr(surface, "reads") else tuple(theta)
         host_theta = {name: theta[name] for name in reads}
         if engine.name == "numpy" or not is_constant(host_theta):
             host_theta = None
 
         rows = layers * size[0] * size[1] if capacity is None else capacity
+        packed = capacity is None
         table_specs = surface.table_specs(rows) if hasattr(surface, "table_specs") else {}
-        gbuffer_specs = _gbuffer_specs(part, host_theta, rows, packed=capacity is None)
+        gbuffer_specs = _gbuffer_specs(part, host_theta, rows, packed)
         specs = (
-            ArraySpec((rows, surface.sample_widths[0]), np.int32, packed=capacity is None),
-            ArraySpec((rows, surface.sample_widths[1]), np.float32, packed=capacity is None),
+            ArraySpec((rows, surface.sample_widths[0]), np.int32, packed),
+            ArraySpec((rows, surface.sample_widths[1]), np.float32, packed),
             ArraySpec((layers, *size), np.int32),
             ArraySpec((layers, *size), np.float32),
             ArraySpec((), np.int32),
@@ -66,10 +110,10 @@ class TriangleSampler(abc.ABC):
             host_inputs = map_leaves(lambda _: next(it), inputs)
             host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
             check_camera(host_camera)
-            proxy = surface.proxy(host_inputs, host_camera, size)
-            check_proxy(proxy, surface)
-            fragments = self.rasterize(self.prepare(proxy), host_camera, size, layers, part.cull)
-            samples = lift(fragments, proxy, capacity)
+            with self._keeper.lock:
+                found = entry or self.entry(surface, host_inputs, host_camera, size)
+                fragments = self.rasterize(found.prepared, host_camera, size, layers, part.cull)
+            samples = lift(fragments, found.proxy, capacity)
             if hasattr(surface, "refine"):
                 samples = surface.refine(host_inputs, samples, _sample_rays(samples, host_camera, size))
             gbuffer = surface.evaluate(host_theta, samples) if host_theta is not None else {}

@@ -1,7 +1,7 @@
 """Rasterizer for the CPU: K nearest triangles a pixel in one pass, on all cores (numba).
 
-Triangles are rasterized in homogeneous coordinates (`rts_backends.triangles`), in float64. The image is cut into bands of
-rows; each band is drawn by one thread, its triangles in order of their index, so the result does not depend on the
+Triangles are rasterized in homogeneous coordinates (`rts_backends.triangles`), in float64. The image is cut into bands
+of rows; each band is drawn by one thread, its triangles in order of their index, so the result does not depend on the
 number of threads.
 """
 

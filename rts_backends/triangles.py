@@ -4,8 +4,9 @@ A corner is (X, Y, clip z, w), at the pixel (X / w, Y / w). The edge function of
 (X, Y, w) (Olano and Greer, *Triangle scan conversion using 2D homogeneous coordinates*, 1997): no triangle needs
 clipping, and two triangles that share an edge evaluate exactly opposite numbers on it. All of it is float64.
 
-These helpers are not cached on disk, only the kernels that call them are: a helper loaded from the cache is not inlined,
-which costs a factor of three. After a change here, touch the files of the kernels, whose caches go by their own dates.
+These helpers are not cached on disk, only the kernels that call them are: a helper loaded from the cache is not
+inlined, which costs a factor of three. After a change here, touch the files of the kernels, whose caches go by their
+own dates.
 """
 
 from __future__ import annotations

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import engine_of, fingerprint, is_constant, namespace, unit
+from rts.arrays import engine_of, is_constant, namespace, unit
 from rts.errors import InputError
+from rts.preparing import fingerprint
 from rts.protocols import Array, GBuffer, Proxy, Samples, Tree
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
@@ -29,6 +30,8 @@ class Mesh:
         faces: (T, 3) integers into θ["vertices"].
         indices: attribute name → (T, 3) integers into θ[name], or None for one row a vertex.
     """
+
+    proxy_is_cheap = True
 
     def __init__(self, faces: Any, indices: Mapping[str, Any] | None = None):
         self.faces = _index_table("faces", faces)

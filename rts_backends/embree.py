@@ -1,0 +1,99 @@
+"""Ray casting with Embree 4: the structure of a static mesh is built once, and only rays move.
+
+Embree's library is called directly, on shared buffers and from compiled loops on all cores; where it cannot be found,
+the public interface of the package embreex serves, slower and to the same end.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.protocols import Fragments, Proxy
+from rts.sampling import TriangleSampler
+from rts_backends import embree_library
+from rts_backends.embree_kernels import TILE, cast, facing, keep_nearest_address, pixel_matrix
+from rts_backends.threads import parallel
+
+REFITS = 32
+"""After so many refits in a row the structure is built anew, since moved triangles loosen its boxes."""
+
+
+class Structure:
+    """A proxy and Embree's structure over it, the vertices moved and scaled to the unit sphere."""
+
+    def __init__(self, proxy: Proxy):
+        self.proxy = proxy
+        self._unit = np.zeros((len(proxy.vertices) + 1, 3), np.float32)
+        self._place()
+        self.scene = embree_library.Scene(self._unit, proxy.faces)
+        self.refits = 0
+
+    def _place(self) -> None:
+        vertices = self.proxy.vertices
+        low, high = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
+        center, radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-30)
+        self.sphere = np.array([*center, radius])
+        np.divide(vertices - center, radius, out=self._unit[:-1], casting="same_kind")
+
+    def move(self, proxy: Proxy) -> None:
+        """Follow other vertices of the same faces."""
+        self.proxy = proxy
+        self._place()
+        self.refits = (self.refits + 1) % REFITS
+        self.scene.move(rebuild=self.refits == 0)
+
+
+class Embree(TriangleSampler):
+    """K nearest hits a pixel by an intersection filter, decided in float64 as the rasterizer decides."""
+
+    def prepare(self, proxy: Proxy) -> Structure:
+        """Build the acceleration structure."""
+        return Structure(proxy)
+
+    def update(self, prepared: Structure, proxy: Proxy) -> Structure:
+        """Refit it to moved vertices."""
+        prepared.move(proxy)
+        return prepared
+
+    def rasterize(
+        self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str
+    ) -> Fragments:
+        """See `TriangleSampler.rasterize`."""
+        height, width = size
+        fragments = Fragments(
+            np.empty((layers, height, width), np.int32),
+            np.empty((layers, height, width, 2), np.float32),
+            np.empty((layers, height, width), np.float32),
+        )
+        parallel(
+            cast,
+            -(-height // TILE) * -(-width // TILE),
+            prepared.scene.intersect,
+            keep_nearest_address(),
+            prepared.scene.handle,
+            pixel_matrix(camera, size),
+            -camera.view[2],
+            np.concatenate([camera.projection, np.linalg.inv(camera.view)]),
+            prepared.sphere,
+            _planes(camera.projection),
+            facing(camera, cull),
+            prepared.proxy.vertices,
+            prepared.proxy.faces,
+            *fragments,
+        )
+        return fragments
+
+
+def _planes(p: np.ndarray) -> np.ndarray:
+    """(4,) depths: nothing is seen before the first or beyond the second, and all between the other two.
+
+    Planes that are not straight on have no one depth: then everything is left to the exact test.
+    """
+    if p[2, 0] or p[2, 1] or p[3, 0] or p[3, 1]:
+        return np.array([-np.inf, np.inf, np.inf, -np.inf])
+    # Clip z = ∓w, with z = −depth.
+    sums, differences = p[2] + p[3], p[2] - p[3]
+    with np.errstate(divide="ignore"):
+        near, far = sorted((sums[3] / sums[2], differences[3] / differences[2]))
+    return np.array([near, far, near, far])

@@ -1,0 +1,312 @@
+"""Rays through pixel centres, K nearest hits each, by compiled code that calls Embree.
+
+Embree finds candidates in float32 and hands each to our intersection filter. A hit well inside its triangle, and at a
+depth of its own, is believed. Any other is decided in float64 by the edge functions of `rts_backends.triangles`,
+exactly as the rasterizer decides: so an edge between triangles is hit once, and coplanar layers keep their order. A
+candidate that the exact test puts just beyond an edge stays only if no neighbour across that edge turns up.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.extending import intrinsic
+
+from rts_backends.triangles import clipped, depth_of, determinant, edge_values, facing, pixel_matrix, to_corner
+
+__all__ = ["cast", "facing", "keep_nearest_address", "pixel_matrix"]
+
+TILE = 8
+ACCEPT, REJECT = -1, 0
+COHERENT, INVOKE_FILTER = 1 << 16, 1 << 1
+SLACK = 1e-5
+"""Of the object's size: depths closer than this are compared in float64."""
+MARGIN = 1e-3
+"""Barycentrics, and cosines, further than this from zero are believed as Embree gives them."""
+
+REACH = 1.01
+"""Square of the radius of the sphere that rays start on, in units of the object's."""
+
+BEYOND, EXACT, BELIEVED = range(3)
+"""How sure a hit is: just beyond an edge; inside, with an exact depth; inside, with Embree's depth."""
+
+# Per ray: K, hits so far, pixel x, y, sign of determinants to keep, depth slack, depth where the ray starts, and the
+# depths between which no plane clips.
+LAYERS, COUNT, PIXEL_X, PIXEL_Y, KEEP, DEPTH_SLACK, START, NEAREST, FARTHEST = range(9)
+HEADER = 9
+
+
+@intrinsic
+def _call(typing_context, function, a, b, c):
+    """Call a C function of three pointers that returns nothing, all given as integers."""
+    signature = types.void(types.intp, types.intp, types.intp, types.intp)
+
+    def generate(context, builder, signature, arguments):
+        pointer = ir.IntType(8).as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [pointer] * 3).as_pointer()
+        target, *values = arguments
+        builder.call(builder.inttoptr(target, kind), [builder.inttoptr(v, pointer) for v in values])
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic
+def _pointer(typing_context, address):
+    """An integer as a pointer."""
+
+    def generate(context, builder, signature, arguments):
+        return builder.inttoptr(arguments[0], ir.IntType(8).as_pointer())
+
+    return types.voidptr(types.intp), generate
+
+
+@numba.njit
+def _touch(vertices, faces, s, t):
+    """Whether two triangles have a corner in one place."""
+    for i in range(3):
+        for j in range(3):
+            p, q = faces[s, i], faces[t, j]
+            if p == q or (
+                vertices[p, 0] == vertices[q, 0]
+                and vertices[p, 1] == vertices[q, 1]
+                and vertices[p, 2] == vertices[q, 2]
+            ):
+                return True
+    return False
+
+
+@numba.njit
+def _decide(t, state, work, vertices, faces):
+    """Whether a triangle is hit (BEYOND, EXACT or −1 for no), and the exact depth; see `cast` for `work`."""
+    matrix, row, corners = work[:4], work[4], work[5:]
+    ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
+    to_corner(matrix, vertices, ia, corners, 0)
+    to_corner(matrix, vertices, ib, corners, 1)
+    to_corner(matrix, vertices, ic, corners, 2)
+    area = determinant(corners, 0, 1, 2)
+    if not (area * state[KEEP] > 0 or (state[KEEP] == 0 and area != 0)):
+        return -1, 0.0
+    ea, eb, ec, inside = edge_values(corners, 0, 1, 2, state[PIXEL_X], state[PIXEL_Y])
+    total = ea + eb + ec
+    if not total > 0 or clipped(corners, 0, 1, 2, ea, eb, ec):
+        return -1, 0.0
+    za, zb, zc = depth_of(row, vertices, ia), depth_of(row, vertices, ib), depth_of(row, vertices, ic)
+    return EXACT if inside else BEYOND, (ea * za + eb * zb + ec * zc) / total
+
+
+@numba.njit
+def _insert(t, z, kind, state, depths, ids, kinds, work, vertices, faces):
+    """Put a hit in its place among the nearest; True if it is one of them."""
+    slack, slots = state[DEPTH_SLACK], len(ids)
+    if kind == BELIEVED:
+        for i in range(int(state[COUNT])):
+            if abs(depths[i] - z) <= slack:
+                kind, z = _decide(t, state, work, vertices, faces)
+                break
+    if kind == -1:
+        return False
+    count, i = int(state[COUNT]), 0
+    while i < count:
+        if ids[i] == t:
+            return False
+        if abs(depths[i] - z) <= slack:
+            if kinds[i] == BELIEVED:
+                kinds[i], depths[i] = _decide(ids[i], state, work, vertices, faces)
+            drop = kinds[i] == -1
+            if not drop and (kind == BEYOND or kinds[i] == BEYOND) and _touch(vertices, faces, ids[i], t):
+                if kind == BEYOND:
+                    return False
+                drop = True
+            if drop:
+                for k in range(i, count - 1):
+                    depths[k], ids[k], kinds[k] = depths[k + 1], ids[k + 1], kinds[k + 1]
+                count -= 1
+                continue
+        i += 1
+    at = count
+    while at > 0 and (z < depths[at - 1] or (z == depths[at - 1] and t < ids[at - 1])):
+        at -= 1
+    state[COUNT] = count
+    if at >= slots:
+        return False
+    for k in range(min(count, slots - 1), at, -1):
+        depths[k], ids[k], kinds[k] = depths[k - 1], ids[k - 1], kinds[k - 1]
+    depths[at], ids[at], kinds[at] = z, t, kind
+    state[COUNT] = min(count + 1, slots)
+    return True
+
+
+@numba.cfunc(types.void(types.CPointer(types.intp)), cache=True)
+def _keep_nearest(arguments):
+    """Embree's intersection filter; fields: valid, user, context, ray, hit."""
+    fields = numba.carray(arguments, 5)
+    valid = numba.carray(_pointer(fields[0]), 1, types.int32)
+    ray = numba.carray(_pointer(fields[3]), 9, types.float32)
+    hit = numba.carray(_pointer(fields[4]), 5, types.float32)
+    t = numba.carray(_pointer(fields[4]), 7, types.int32)[5]
+    # Ours, behind the 16 bytes of Embree's own query context: addresses and counts.
+    context = numba.carray(_pointer(fields[2]), 12, types.intp)
+    slots = context[3]
+    state = numba.carray(_pointer(context[2]), HEADER, types.float64)
+    depths = numba.carray(_pointer(context[4]), slots, types.float64)
+    ids = numba.carray(_pointer(context[5]), slots, types.int32)
+    kinds = numba.carray(_pointer(context[6]), slots, types.int8)
+    vertices = numba.carray(_pointer(context[7]), (context[8], 3), types.float32)
+    faces = numba.carray(_pointer(context[9]), (context[10], 3), types.int32)
+    work = numba.carray(_pointer(context[11]), (8, 4), types.float64)
+
+    valid[0] = REJECT
+    u, v, z = hit[3], hit[4], state[START] + ray[8]
+    kind = BELIEVED
+    if not (u > MARGIN and v > MARGIN and u + v < 1 - MARGIN and state[NEAREST] < z < state[FARTHEST]):
+        kind, z = _decide(t, state, work, vertices, faces)
+    elif state[KEEP] != 0:
+        along = hit[0] * ray[4] + hit[1] * ray[5] + hit[2] * ray[6]
+        normal = hit[0] * hit[0] + hit[1] * hit[1] + hit[2] * hit[2]
+        step = ray[4] * ray[4] + ray[5] * ray[5] + ray[6] * ray[6]
+        if along * along < MARGIN * MARGIN * normal * step:
+            kind, z = _decide(t, state, work, vertices, faces)
+        elif along > 0:
+            return
+    if kind == -1 or not _insert(t, z, kind, state, depths, ids, kinds, work, vertices, faces):
+        return
+    # Nothing beyond the K-th hit matters: an accepted hit ends the ray there. A hit beyond an edge may yet be
+    # replaced by its neighbour, so one slot more is filled before the ray ends.
+    layers, count = int(state[LAYERS]), int(state[COUNT])
+    last = layers
+    if count >= layers:
+        last = layers - 1
+        for k in range(layers):
+            if kinds[k] == BEYOND:
+                last = layers
+    if last < count:
+        valid[0] = ACCEPT
+        ray[8] = depths[last] - state[START] + state[DEPTH_SLACK]
+
+
+def keep_nearest_address() -> int:
+    """Address of the intersection filter."""
+    return _keep_nearest.address
+
+
+@numba.njit(cache=True, nogil=True)
+def cast(
+    first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep, vertices, faces,
+    triangle_ids, barycentrics, depths_out,
+):  # fmt: skip
+    """Fill the fragment arrays for tiles of pixels.
+
+    Args:
+        first: first tile.
+        last: past the last tile.
+        intersect: address of rtcIntersect1.
+        filter_address: address of the intersection filter.
+        scene: Embree's handle.
+        matrix: (4, 4) to homogeneous pixels.
+        row: (4,) of linear depth.
+        ray_space: (8, 4): the camera's projection, and the inverse of its view.
+        object_sphere: (4,) centre and radius; the scene is the object moved and scaled to the unit sphere.
+        planes: (4,) depths outside of which near or far plane clips, and between which neither does.
+        keep: sign of the determinants to keep, or 0.
+        vertices: (V, 3) of the proxy.
+        faces: (T, 3).
+        triangle_ids: (K, H, W) to fill.
+        barycentrics: (K, H, W, 2) to fill.
+        depths_out: (K, H, W) to fill.
+    """
+    layers, height, width = triangle_ids.shape
+    slots = layers + 1
+    across = (width + TILE - 1) // TILE
+    state, depths = np.empty(HEADER), np.empty(slots)
+    ids, kinds = np.empty(slots, np.int32), np.empty(slots, np.int8)
+    work = np.empty((8, 4))
+    work[:4], work[4] = matrix, row
+    corners = work[5:]
+    ray, options = np.zeros(32, np.float32), np.zeros(4, np.intp)
+    ray_bits, option_bits = ray.view(np.int32), options.view(np.int32)
+    context = np.zeros(12, np.intp)
+    context.view(np.int32)[:4] = -1
+    context[2], context[3], context[4] = state.ctypes.data, slots, depths.ctypes.data
+    context[5], context[6] = ids.ctypes.data, kinds.ctypes.data
+    context[7], context[8] = vertices.ctypes.data, len(vertices)
+    context[9], context[10], context[11] = faces.ctypes.data, len(faces), work.ctypes.data
+    option_bits[0], option_bits[1] = COHERENT | INVOKE_FILTER, -1
+    options[1], options[2] = context.ctypes.data, filter_address
+    # Rays are read as 16-byte vectors.
+    shift = (-ray.ctypes.data % 16) // 4
+    ray, ray_bits = ray[shift : shift + 24], ray_bits[shift : shift + 24]
+    radius = object_sphere[3]
+    slack = SLACK * radius
+    state[LAYERS], state[KEEP], state[DEPTH_SLACK] = layers, keep, slack
+    state[NEAREST], state[FARTHEST] = planes[2] + slack, planes[3] - slack
+    for tile in range(first, last):
+        top, left = tile // across * TILE, tile % across * TILE
+        for j in range(top, min(height, top + TILE)):
+            for i in range(left, min(width, left + TILE)):
+                state[COUNT], state[PIXEL_X], state[PIXEL_Y] = 0, i + 0.5, j + 0.5
+                x, y = (i + 0.5) * 2 / width - 1, 1 - (j + 0.5) * 2 / height
+                if _aim(ray_space, object_sphere, planes, x, y, ray, state):
+                    ray_bits[9], ray_bits[10], ray_bits[11] = -1, 0, 0
+                    ray_bits[17], ray_bits[18], ray_bits[19] = -1, -1, -1
+                    _call(intersect, scene, ray.ctypes.data, options.ctypes.data)
+                count = int(state[COUNT])
+                for k in range(layers):
+                    triangle_ids[k, j, i] = ids[k] if k < count else -1
+        # In a loop of its own, where the processor overlaps the waits for memory of several hits.
+        for k in range(layers):
+            for j in range(top, min(height, top + TILE)):
+                for i in range(left, min(width, left + TILE)):
+                    t = triangle_ids[k, j, i]
+                    if t < 0:
+                        barycentrics[k, j, i, 0] = barycentrics[k, j, i, 1] = depths_out[k, j, i] = 0
+                        continue
+                    ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
+                    to_corner(matrix, vertices, ia, corners, 0)
+                    to_corner(matrix, vertices, ib, corners, 1)
+                    to_corner(matrix, vertices, ic, corners, 2)
+                    ea, eb, ec, _ = edge_values(corners, 0, 1, 2, i + 0.5, j + 0.5)
+                    a, b = ea / (ea + eb + ec), eb / (ea + eb + ec)
+                    za, zb, zc = depth_of(row, vertices, ia), depth_of(row, vertices, ib), depth_of(row, vertices, ic)
+                    barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = a, b
+                    depths_out[k, j, i] = a * za + b * zb + ec / (ea + eb + ec) * zc
+
+
+@numba.njit
+def _aim(space, sphere, planes, x, y, ray, state):
+    """Write the ray through an NDC position, from where it meets the object's sphere; False if it misses.
+
+    Starting there, and in units of the object, float32 is fine enough however far off the camera or the origin.
+    """
+    # See Camera.rays: the camera-space point at depth z is (start + z step, −z). Rows 0–3 are the projection, 4–6
+    # those of the inverse view. (No slices here: each would cost an atomic count of references.)
+    a, b = space[0, 0] - x * space[3, 0], space[0, 1] - x * space[3, 1]
+    c, d = space[1, 0] - y * space[3, 0], space[1, 1] - y * space[3, 1]
+    scale = 1 / (a * d - b * c)
+    u, v = x * space[3, 3] - space[0, 3], y * space[3, 3] - space[1, 3]
+    sx, sy = scale * (d * u - b * v), scale * (a * v - c * u)
+    u, v = space[0, 2] - x * space[3, 2], space[1, 2] - y * space[3, 2]
+    tx, ty = scale * (d * u - b * v), scale * (a * v - c * u)
+    unit = 1 / sphere[3]
+    ox = (space[4, 0] * sx + space[4, 1] * sy + space[4, 3] - sphere[0]) * unit
+    oy = (space[5, 0] * sx + space[5, 1] * sy + space[5, 3] - sphere[1]) * unit
+    oz = (space[6, 0] * sx + space[6, 1] * sy + space[6, 3] - sphere[2]) * unit
+    dx = (space[4, 0] * tx + space[4, 1] * ty - space[4, 2]) * unit
+    dy = (space[5, 0] * tx + space[5, 1] * ty - space[5, 2]) * unit
+    dz = (space[6, 0] * tx + space[6, 1] * ty - space[6, 2]) * unit
+    square = 1 / (dx * dx + dy * dy + dz * dz)
+    middle = -(ox * dx + oy * dy + oz * dz) * square
+    discriminant = middle * middle - (ox * ox + oy * oy + oz * oz - REACH) * square
+    if not discriminant > 0:
+        return False
+    half, slack = np.sqrt(discriminant), state[DEPTH_SLACK]
+    start, stop = max(middle - half, planes[0] - slack), min(middle + half, planes[1] + slack)
+    if not start < stop:
+        return False
+    ray[0], ray[1], ray[2], ray[3] = ox + start * dx, oy + start * dy, oz + start * dz, 0
+    ray[4], ray[5], ray[6], ray[7] = dx, dy, dz, 0
+    ray[8] = stop - start
+    state[START] = start
+    return True
