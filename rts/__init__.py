@@ -5,8 +5,10 @@ differentiate only that.
 """
 
 from rts.camera import Camera
+from rts.choosing import explain
 from rts.errors import EngineError, InputError, PluginError, RtsError
 from rts.fitting import Fit, fit
+from rts.preparing import prepare
 from rts.protocols import Fragments, GBuffer, Part, Proxy, Sampled, Samples
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples, sample
@@ -28,11 +30,13 @@ __all__ = [
     "Sampled",
     "Samples",
     "TriangleSampler",
+    "explain",
     "fit",
     "load",
     "load_image",
     "plugin",
     "plugins",
+    "prepare",
     "render",
     "render_samples",
     "rigid",

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.errors import EngineError
+from rts.errors import EngineError, InputError
 from rts.protocols import Array, Engine, Tree
 from rts.records import STATIC_FIELDS, join_record, split_record
 
@@ -52,7 +52,10 @@ def from_numbers(tree: Tree) -> Tree:
         return {key: from_numbers(value) for key, value in tree.items()}
     if isinstance(tree, (list, tuple)) and not hasattr(tree, "_fields"):
         if tree and all(isinstance(x, (bool, int, float)) for x in leaves(tree)):
-            return np.asarray(tree, np.float32)
+            try:
+                return np.asarray(tree, np.float32)
+            except ValueError:
+                raise InputError(f"a list of numbers has rows of different lengths: {str(tree)[:60]}") from None
         return type(tree)(from_numbers(x) for x in tree)
     return tree
 
@@ -110,11 +113,15 @@ def engine_of(*trees: Tree) -> Engine:
 
 
 def exemplar(*trees: Tree) -> Array | None:
-    """The floating array of an engine other than NumPy that sets dtype and device for constants, or None."""
+    """The widest floating array of an engine other than NumPy, which sets dtype and device for constants, or None."""
+    widest, bits = None, 0
     for x in leaves(trees):
-        if not isinstance(x, CONSTANT_TYPES) and namespace(x).isdtype(x.dtype, "real floating"):
-            return x
-    return None
+        if isinstance(x, CONSTANT_TYPES) or not namespace(x).isdtype(x.dtype, "real floating"):
+            continue
+        own = namespace(x).finfo(x.dtype).bits
+        if own > bits:
+            widest, bits = x, own
+    return widest
 
 
 def namespace(*arrays: Array) -> Any:

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import engine_of, is_constant, leaves, map_leaves, namespace
+from rts.arrays import engine_of, is_constant, leaves, map_leaves
 from rts.errors import InputError
+from rts.fit_runs import Astray, Report, Run, progress_bar, require
+from rts.least_squares import levenberg_marquardt, mean_square
 from rts.protocols import Array, Engine, Tree
 
 STEPS = {"adam": 200, "sgd": 200, "lm": 50}
 LEARNING_RATES = {"adam": 1e-2, "sgd": 1e-1}
-FIRST_DAMPING = 1e-3
-LARGEST_DAMPING = 1e12
-
-Report = Callable[[int, Tree, float], Any]
 
 
 class Fit(NamedTuple):
@@ -29,8 +26,8 @@ class Fit(NamedTuple):
     Attributes:
         parameters: those with the lowest loss met.
         loss: their loss.
-        history: the loss of each step, before its update; for Levenberg–Marquardt after each trial, accepted or not.
-        steps: number of steps made.
+        history: the loss at the start and after each update; for Levenberg–Marquardt of each trial, accepted or not.
+        steps: number of losses computed, the one at the start included.
         reason: why it stopped.
         seconds: wall time, compilation included.
     """
@@ -41,11 +38,6 @@ class Fit(NamedTuple):
     steps: int
     reason: str
     seconds: float
-
-
-def mean_square(residuals: Array) -> Array:
-    """The default loss."""
-    return namespace(residuals).mean(residuals * residuals)
 
 
 def fit(
@@ -64,13 +56,16 @@ def fit(
 ) -> Fit:
     """Find parameters that make residuals small.
 
+    Where parameters go astray on the way, so that a loss or derivative is not finite or `residuals` raises an
+    InputError, the fit stops, says so in its `reason`, and returns the best parameters met before.
+
     Args:
         residuals: parameters → array of any shape, such as an image difference.
         parameters: a torch or jax array, or nested dicts and lists of them; where to start.
         method: "adam" or "sgd" (torch.optim or optax, on the gradient of the loss), or "lm": Levenberg–Marquardt on the
             sum of squares, by the forward-mode Jacobian, for up to some hundred unknowns.
         loss: reduces residuals to a scalar, for Adam and SGD; Levenberg–Marquardt always takes the mean square.
-        steps: at most so many; default 200, for "lm" 50.
+        steps: at most so many losses are computed, the first at the start; default 200, for "lm" 50.
         learning_rate: of Adam (default 0.01) and SGD (default 0.1).
         tolerance: stop when the loss has not fallen by this fraction in `patience` steps ("lm": in an accepted step).
         patience: see `tolerance`.
@@ -79,185 +74,125 @@ def fit(
         jit: compile with jax (no effect on torch). Turn off if `residuals` cannot be traced.
 
     Raises:
-        InputError: unknown method, parameters that cannot be differentiated, or a loss that is not finite at the start.
+        InputError: an argument of the wrong kind, or a loss or derivative that is not finite at the start.
     """
-    if method not in STEPS:
-        raise InputError(f"method is {method!r}; expected one of {', '.join(STEPS)}")
-    steps = STEPS[method] if steps is None else steps
-    if steps < 1:
-        raise InputError(f"steps is {steps}; expected at least 1")
-    if not any(True for _ in leaves(parameters)) or any(is_constant(x) for x in leaves(parameters)):
-        raise InputError("parameters holds NumPy arrays, numbers or nothing; expected torch or jax arrays to optimise")
-    engine = engine_of(parameters)
+    _check_method(method, loss, steps, learning_rate)
+    _check_limits(tolerance, patience)
+    engine = _checked_engine(parameters)
+    # Private copies: neither the caller's later changes nor the graph that made them may reach the result.
+    parameters = map_leaves(lambda x: engine.constant(np.array(engine.to_numpy(x)), x), parameters)
     start = time.perf_counter()
-    run = _Run(steps, callback, tolerance, patience)
-    with _progress(progress, steps, method, run):
-        if method == "lm":
-            _levenberg_marquardt(residuals, parameters, engine, run, jit)
-        else:
-            rate = LEARNING_RATES[method] if learning_rate is None else learning_rate
-            _descend(lambda p: loss(residuals(p)), parameters, engine, method, rate, run, jit)
+    run = Run(int(steps or STEPS[method]), callback, tolerance, patience)
+    with progress_bar(progress, run.steps, method, run):
+        try:
+            if method == "lm":
+                levenberg_marquardt(_checked(residuals, engine), parameters, engine, run, jit)
+            else:
+                rate = LEARNING_RATES[method] if learning_rate is None else float(learning_rate)
+                objective = _objective(_checked(residuals, engine), loss, engine)
+                _descend(objective, parameters, engine, method, rate, run, jit)
+        except Astray as stop:
+            run.stop(str(stop))
     return Fit(run.best, run.best_loss, run.history, len(run.history), run.reason, time.perf_counter() - start)
 
 
-class _Run:
-    """What a fit keeps as it goes: history, best parameters, and whether to stop."""
-
-    def __init__(self, steps: int, callback: Report | None, tolerance: float, patience: int):
-        self.steps, self.callback, self.tolerance, self.patience = steps, callback, tolerance, patience
-        self.history: list[float] = []
-        self.best: Tree = None
-        self.best_loss = math.inf
-        self.reason = f"all {steps} steps made"
-        self.show: Callable[[float], None] = lambda loss: None
-        self._last_gain, self._reference = 0, math.inf
-
-    def record(self, parameters: Tree, loss: float) -> bool:
-        """Note one step; True to go on."""
-        if not self.history and not math.isfinite(loss):
-            raise InputError(f"the loss is {loss} at the start; check the parameters and the target for NaN")
-        self.history.append(loss)
-        self.show(loss)
-        if loss < self.best_loss:
-            self.best, self.best_loss = parameters, loss
-        if loss < self._reference * (1 - self.tolerance):
-            self._reference, self._last_gain = loss, len(self.history)
-        if self.callback is not None and self.callback(len(self.history) - 1, parameters, loss):
-            return self.stop("the callback asked to")
-        return len(self.history) < self.steps
-
-    def stalled(self) -> bool:
-        """Whether patience is over."""
-        return len(self.history) - self._last_gain >= self.patience
-
-    def stop(self, reason: str) -> bool:
-        """Say why; always False."""
-        self.reason = reason
-        return False
-
-
 def _descend(
-    objective: Callable, parameters: Tree, engine: Engine, method: str, rate: float, run: _Run, jit: bool
+    objective: Callable, parameters: Tree, engine: Engine, method: str, rate: float, run: Run, jit: bool
 ) -> None:
     """Adam or SGD."""
-    step = engine.optimizer(method, rate, parameters)
+    xp = engine.namespace
     value_and_grad = engine.value_and_grad(objective)
-    value_and_grad = engine.jit(value_and_grad) if jit else value_and_grad
+
+    def evaluate(p: Tree) -> tuple[Array, Tree, list[Array]]:
+        value, gradient = value_and_grad(p)
+        return value, gradient, [xp.all(xp.isfinite(g)) for g in leaves(gradient)]
+
+    evaluate = engine.jit(evaluate) if jit else evaluate
+    step = engine.optimizer(method, rate, parameters)
     while True:
-        value, gradient = value_and_grad(parameters)
+        start = not run.history
+        value, gradient, finite = run.attempt(engine, evaluate, parameters)
+        require(math.isfinite(value), f"the loss is {float(value)}", start)
         if not run.record(parameters, float(value)):
             return
-        if not math.isfinite(run.history[-1]):
-            run.stop(f"the loss became {run.history[-1]}; a lower learning rate may help")
-            return
+        require(all(map(bool, finite)), "the gradient is not finite", start)
         if run.stalled():
             run.stop(f"no gain in {run.patience} steps")
             return
         parameters = step(parameters, gradient)
 
 
-def _levenberg_marquardt(residuals: Callable, parameters: Tree, engine: Engine, run: _Run, jit: bool) -> None:
-    """Normal equations with Marquardt's scaling and Nielsen's control of the damping (Madsen et al. 2004)."""
-    from scipy.linalg import LinAlgError, solve
-
-    vector, unflatten = _flatten(parameters)
-    xp = namespace(vector)
-
-    def flat(v: Array) -> Array:
-        return xp.reshape(residuals(unflatten(v)), (-1,))
-
-    def normal_equations(v: Array) -> tuple[Array, Array, Array]:
-        r, jacobian = engine.jacobian(flat)(v)
-        transposed = xp.matrix_transpose(jacobian)
-        return xp.mean(r * r), transposed @ jacobian / r.shape[0], transposed @ r / r.shape[0]
-
-    def mean_residual(v: Array) -> Array:
-        r = flat(v)
-        return xp.mean(r * r)
-
-    if jit:
-        normal_equations, mean_residual = engine.jit(normal_equations), engine.jit(mean_residual)
-
-    def solved_at(v: Array) -> tuple[float, np.ndarray, np.ndarray]:
-        value, *equations = normal_equations(v)
-        return float(value), *(engine.to_numpy(x).astype(np.float64) for x in equations)
-
-    value, matrix, gradient = solved_at(vector)
-    damping, growth = FIRST_DAMPING, 2.0
-    going = run.record(unflatten(vector), value)
-    while going:
-        scale = np.diag(matrix).clip(1e-12 * max(np.trace(matrix), 1e-300))
-        if np.abs(gradient).max() == 0:
-            run.stop("the gradient is zero")
-            return
-        try:
-            delta = -solve(matrix + damping * np.diag(scale), gradient, assume_a="pos")
-        except LinAlgError:
-            damping, growth = damping * growth, growth * 2
-            continue
-        trial = vector + engine.constant(delta, vector)
-        trial_value = float(mean_residual(trial))
-        going = run.record(unflatten(trial), trial_value)
-        gain = value - trial_value
-        if gain > 0:
-            small = gain <= run.tolerance * value
-            predicted = delta @ (damping * scale * delta - gradient)
-            vector = trial
-            value, matrix, gradient = solved_at(vector)
-            if small:
-                run.stop(f"the last step gained less than {run.tolerance:g} of the loss")
-                return
-            ratio = gain / max(predicted, 1e-300)
-            damping *= max(1 / 3, 1 - (2 * ratio - 1) ** 3)
-            growth = 2.0
-        else:
-            damping, growth = damping * growth, growth * 2
-            if damping > LARGEST_DAMPING:
-                run.stop("no step lowers the loss")
-                return
+# -------------------------------------------------------------------------------------------------- checks
 
 
-def _flatten(parameters: Tree) -> tuple[Array, Callable[[Array], Tree]]:
-    """All leaves as one vector, and the way back."""
-    arrays = list(leaves(parameters))
-    xp = namespace(*arrays)
-
-    def unflatten(vector: Array) -> Tree:
-        at = 0
-
-        def take(x: Array) -> Array:
-            nonlocal at
-            count = math.prod(x.shape)
-            piece = xp.reshape(vector[at : at + count], tuple(x.shape))
-            at += count
-            return piece
-
-        return map_leaves(take, parameters)
-
-    return xp.concat([xp.reshape(x, (-1,)) for x in arrays]), unflatten
+def _check_method(method: str, loss: Callable, steps: int | None, learning_rate: float | None) -> None:
+    if method not in STEPS:
+        raise InputError(f"method is {method!r}; expected one of {', '.join(STEPS)}")
+    if method == "lm" and loss is not mean_square:
+        raise InputError('method "lm" minimises the mean square and takes no other loss; use "adam", or leave out loss')
+    if steps is not None:
+        _check_count("steps", steps)
+    if learning_rate is not None and not (_is_real(learning_rate) and 0 < learning_rate < math.inf):
+        raise InputError(f"learning_rate is {learning_rate!r}; expected a positive number")
 
 
-@contextlib.contextmanager
-def _progress(wanted: bool | None, steps: int, method: str, run: _Run) -> Iterator[None]:
-    """A progress bar on standard error."""
-    if wanted is False or (wanted is None and not sys.stderr.isatty()):
-        yield
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+def _check_limits(tolerance: float, patience: int) -> None:
+    if not (_is_real(tolerance) and tolerance >= 0):
+        raise InputError(f"tolerance is {tolerance!r}; expected a number, at least 0")
+    _check_count("patience", patience)
 
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[status]}"),
+
+def _check_count(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+        raise InputError(f"{name} is {value!r}; expected a whole number, at least 1")
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+def _checked_engine(parameters: Tree) -> Engine:
+    """The engine of the parameters, which must be differentiable arrays."""
+    if not any(True for _ in leaves(parameters)) or any(is_constant(x) for x in leaves(parameters)):
+        raise InputError("parameters holds NumPy arrays, numbers or nothing; expected torch or jax arrays to optimise")
+    engine = engine_of(parameters)
+    for x in leaves(parameters):
+        if not engine.namespace.isdtype(x.dtype, "real floating"):
+            raise InputError(f"parameters holds an array of dtype {x.dtype}; expected a floating one to optimise")
+    return engine
+
+
+def _checked(residuals: Callable[[Tree], Array], engine: Engine) -> Callable[[Tree], Array]:
+    """The same function, whose result is known to be a floating array of the engine."""
+
+    def call(parameters: Tree) -> Array:
+        result = residuals(parameters)
+        if not engine.owns(result):
+            raise InputError(f"residuals gave {_kind(result)}; expected one {engine.name} array, as the parameters are")
+        if not engine.namespace.isdtype(result.dtype, "real floating") or 0 in result.shape:
+            raise InputError(
+                f"residuals gave an array of shape {tuple(result.shape)} and dtype {result.dtype}; "
+                f"expected floats, and at least one"
+            )
+        return result
+
+    return call
+
+
+def _objective(residuals: Callable, loss: Callable, engine: Engine) -> Callable[[Tree], Array]:
+    """The loss of parameters, known to be a scalar."""
+
+    def call(parameters: Tree) -> Array:
+        value = loss(residuals(parameters))
+        if not engine.owns(value) or value.shape != ():
+            what = f"an array of shape {tuple(value.shape)}" if engine.owns(value) else _kind(value)
+            raise InputError(f"loss gave {what}; expected a {engine.name} scalar, of shape ()")
+        return value
+
+    return call
+
+
+def _kind(value: Any) -> str:
+    return (
+        "None" if value is None else f"a {type(value).__module__}.{type(value).__qualname__}".replace("builtins.", "")
     )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task, start = bar.add_task(method, total=steps, status=""), time.perf_counter()
-
-        def show(loss: float) -> None:
-            pace = (time.perf_counter() - start) / len(run.history) * 1e3
-            bar.update(task, advance=1, status=f"loss {loss:.3e}  {pace:.1f} ms/iteration")
-
-        run.show = show
-        yield

@@ -1,83 +1,80 @@
-"""What samplers build for a surface, kept between calls: structures over triangles, buffers on a device.
-
-Optimisers change arrays in place, so identity proves nothing: what is kept goes by a fingerprint of the bytes that the
-proxy was made of.
-"""
+"""`rts.prepare`: a scene's triangles handed to a sampler once, for loops that want no check of them at all."""
 
 from __future__ import annotations
 
-import threading
-import weakref
-from collections import OrderedDict
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
-import numpy as np
-
-from rts.arrays import leaves
-from rts.protocols import Proxy, Tree
-
-KEPT = 2
-"""Entries a surface and sampler: the newest, and the one before it, which is moved when a third is asked for."""
-
-
-class Entry(NamedTuple):
-    """A proxy, and what a sampler built over it."""
-
-    proxy: Proxy
-    prepared: Any
+from rts import registry
+from rts.arrays import engine_of, map_leaves
+from rts.camera import Camera
+from rts.checks import check_plugin, check_scene
+from rts.choosing import Auto, choose
+from rts.errors import InputError
+from rts.keeping import Entry
+from rts.protocols import Part
+from rts.sampling import TriangleSampler
 
 
-class Keeper:
-    """The entries of one sampler: bounded in number, released with their surfaces.
+class PreparedParts:
+    """Parts with what their samplers have built; `render` and `sample` take it in place of parts.
 
-    A sampler's calls go through its keeper's `lock`, since an entry may be moved in place.
+    Attributes:
+        parts: the parts.
+        samplers: the sampler of each.
+        entries: what the sampler has built of each, or None where it builds nothing.
     """
 
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        self._entries: weakref.WeakKeyDictionary[Any, OrderedDict] = weakref.WeakKeyDictionary()
+    def __init__(self, parts: Sequence[Part], samplers: Sequence[Any], entries: Sequence[Entry | None]):
+        self.parts, self.samplers, self.entries = tuple(parts), tuple(samplers), tuple(entries)
 
-    def get(
-        self, surface: Any, key: tuple, make: Callable[[], Proxy], prepare: Callable, update: Callable | None
-    ) -> Entry:
-        """The entry of a surface under a key; made, or moved from an older one with the same faces, if need be.
-
-        Args:
-            surface: the surface; entries are dropped when it is.
-            key: what the proxy depends on.
-            make: gives the proxy.
-            prepare: proxy → what the sampler needs.
-            update: (prepared, proxy with the same faces) → the same moved, or None.
-        """
-        entries = self._entries.setdefault(surface, OrderedDict())
-        if key in entries:
-            entries.move_to_end(key)
-            return entries[key]
-        # A copy, since the arrays given may be changed in place, or lent for the length of one call only.
-        proxy = make()
-        proxy = proxy._replace(vertices=proxy.vertices.copy())
-        old = entries.popitem(last=False)[1] if len(entries) >= KEPT else None
-        if old is not None and update is not None and _same_faces(old.proxy, proxy):
-            entries[key] = Entry(proxy, update(old.prepared, proxy))
-        else:
-            entries[key] = Entry(proxy, prepare(proxy))
-        return entries[key]
+    def replace(self, index: int = 0, **changes: Any) -> PreparedParts:
+        """The same with some fields of one part changed, such as its `transform`; the triangles are not looked at."""
+        if "surface" in changes:
+            raise InputError("a prepared part keeps its surface; call rts.prepare for another one")
+        parts = list(self.parts)
+        parts[index] = parts[index].replace(**changes)
+        return PreparedParts(parts, self.samplers, self.entries)
 
 
-def _same_faces(a: Proxy, b: Proxy) -> bool:
-    same_count = len(a.vertices) == len(b.vertices)
-    return same_count and (a.faces is b.faces or np.array_equal(a.faces, b.faces))
+def prepare(
+    parts: Part | Sequence[Part],
+    sampler: Any = "auto",
+    *,
+    camera: Camera | None = None,
+    size: tuple[int, int] | None = None,
+) -> PreparedParts:
+    """Build what a sampler needs of each part, once.
+
+    Args:
+        parts: one part or several, with values that are known (not traced).
+        sampler: as in `rts.render`; "auto" takes the triangles for static.
+        camera: needed for surfaces whose triangles depend on the view.
+        size: (height, width), needed likewise.
+
+    Returns:
+        A handle. Later changes to vertices are not seen; `replace` changes transforms, shaders and the rest of θ.
+    """
+    identity = Camera.look_at((0, 0, 1), (0, 0, 0))
+    checked, _ = check_scene(parts, identity if camera is None else camera)
+    chosen = check_plugin("rts.samplers", sampler, "sample")
+    samplers, entries = [], []
+    for part in checked:
+        own = chosen
+        if isinstance(chosen, Auto):
+            own = registry.instance("rts.samplers", choose(part, static=True).sampler)
+        samplers.append(own)
+        entries.append(_entry(part, own, camera, size) if isinstance(own, TriangleSampler) else None)
+    return PreparedParts(checked, samplers, entries)
 
 
-def fingerprint(tree: Tree) -> tuple:
-    """A key that changes when the bytes of host arrays do; a million vertices take half a millisecond."""
-    return tuple(_fingerprint(np.ascontiguousarray(x)) for x in leaves(tree))
-
-
-def _fingerprint(x: np.ndarray) -> tuple:
-    from rts.checksum import checksum
-
-    data = x.reshape(-1).view(np.uint8)
-    whole = len(data) // 8 * 8
-    return x.shape, x.dtype.str, int(checksum(data[:whole].view(np.uint64))), bytes(data[whole:])
+def _entry(part: Part, sampler: TriangleSampler, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
+    surface = part.surface
+    if hasattr(surface, "proxy_key") and (camera is None or size is None):
+        raise InputError(f"the triangles of {surface!r} depend on the view; give camera and size")
+    inputs = surface.proxy_inputs(part.theta)
+    inputs = map_leaves(engine_of(inputs).to_numpy, inputs)
+    if camera is not None:
+        within = camera.within(part.transform)
+        camera = Camera(*(engine_of(m).to_numpy(m) for m in within))
+    return sampler.build(surface, inputs, camera, size)

@@ -110,7 +110,7 @@ class Rays(NamedTuple):
     directions: Array
 
 
-@record(static=("centered",))
+@record(static=("asked", "centered"))
 class Samples:
     """Where the rays of one part meet its surface: the paper's U, packed.
 
@@ -122,6 +122,7 @@ class Samples:
         overflow: () int32, samples that did not fit into the capacity and were dropped, deepest layers first.
         tables: further arrays of the surface, filled by its `refine`.
         gbuffer: the evaluated G-buffer where the surface's θ is constant, else None.
+        asked: the entries that were asked for when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their pixels.
     """
 
@@ -132,6 +133,7 @@ class Samples:
     overflow: Array
     tables: Mapping[str, Array] = field(default_factory=dict)
     gbuffer: Mapping[str, Array] | None = None
+    asked: tuple[str, ...] | None = None
     centered: bool = True
 
 
@@ -197,8 +199,8 @@ class Surface(Protocol):
     Optional members, looked up by name:
         check(theta): raise an InputError if shapes or dtypes are wrong; values may be traced.
         reads(theta) -> tuple of the θ entries that `evaluate` needs; default all of them.
-        proxy_key(inputs, camera, size) -> hashable: what besides the bytes of the inputs makes a proxy stale; without it
-            the proxy may not depend on camera and size.
+        proxy_key(inputs, camera, size) -> hashable: what besides the bytes of the inputs makes a proxy stale; without
+            it the proxy may not depend on camera and size.
         proxy_is_cheap (bool): making the proxy costs no more than looking whether its inputs have changed.
         refine(inputs, samples, rays) -> Samples: on the host, polish or replace ids and params.
         table_specs(rows) -> dict of ArraySpec: the `Samples.tables` that `refine` fills, for at most `rows` samples.

@@ -8,10 +8,10 @@ from typing import Any, Self
 
 import numpy as np
 
-from rts.arrays import engine_of, is_constant, leaves, map_leaves, namespace
+from rts.arrays import engine_of, exemplar, is_constant, leaves, map_leaves, namespace
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.preparing import Entry, Keeper, fingerprint
+from rts.keeping import Entry, Keeper, fingerprint, same_faces
 from rts.protocols import ArraySpec, Fragments, Part, Proxy, Rays, Sampled, Samples, Tree
 
 
@@ -20,7 +20,7 @@ class TriangleSampler(abc.ABC):
 
     A sampler implements `rasterize`; also `prepare`, where something is worth building once for a proxy, and
     `update(prepared, proxy) -> prepared`, where that can follow moved vertices more cheaply. What was prepared is kept
-    (`rts.preparing`) until the proxy's inputs change.
+    (`rts.keeping`) until the proxy's inputs change.
     """
 
     update: Callable[[Any, Proxy], Any] | None = None
@@ -48,20 +48,31 @@ class TriangleSampler(abc.ABC):
             cull: "none", or "back": ignore triangles whose normal (counter-clockwise winding) faces away.
         """
 
-    def entry(self, surface: Any, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
-        """The surface's proxy for host inputs, checked, and what this sampler prepares of it; kept where it pays."""
+    def build(self, surface: Any, inputs: Tree, camera: Any, size: Any) -> Entry:
+        """A copy of the surface's proxy for host inputs, checked, and what this sampler prepares of it."""
+        proxy = _checked_proxy(surface, inputs, camera, size)
+        # A copy, since the arrays given may be changed in place, or lent for the length of one call only.
+        proxy = proxy._replace(vertices=proxy.vertices.copy())
+        return Entry(proxy, self.prepare(proxy))
 
-        def make() -> Proxy:
-            proxy = surface.proxy(inputs, camera, size)
-            check_proxy(proxy, surface)
-            return proxy
-
+    def _entry(self, surface: Any, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
+        """The same, kept from call to call where that pays."""
         if type(self).prepare is TriangleSampler.prepare and getattr(surface, "proxy_is_cheap", False):
-            proxy = make()
+            proxy = _checked_proxy(surface, inputs, camera, size)
             return Entry(proxy, self.prepare(proxy))
         beside = surface.proxy_key(inputs, camera, size) if hasattr(surface, "proxy_key") else None
+
+        def follow(old: Entry) -> Entry | None:
+            if self.update is None:
+                return None
+            proxy = _checked_proxy(surface, inputs, camera, size)
+            if not same_faces(old.proxy, proxy):
+                return None
+            proxy = proxy._replace(vertices=proxy.vertices.copy())
+            return Entry(proxy, self.update(old.prepared, proxy))
+
         key = (fingerprint(inputs), beside)
-        return self._keeper.get(surface, key, make, self.prepare, self.update)
+        return self._keeper.get(surface, key, lambda: self.build(surface, inputs, camera, size), follow)
 
     def sample(
         self,
@@ -94,7 +105,9 @@ class TriangleSampler(abc.ABC):
         rows = layers * size[0] * size[1] if capacity is None else capacity
         packed = capacity is None
         table_specs = surface.table_specs(rows) if hasattr(surface, "table_specs") else {}
-        gbuffer_specs = _gbuffer_specs(part, host_theta, rows, packed)
+        like = exemplar(theta, camera)
+        real = np.float64 if like is not None and namespace(like).finfo(like.dtype).bits == 64 else np.float32
+        gbuffer_specs = _gbuffer_specs(part, host_theta, ArraySpec((rows,), real, packed))
         specs = (
             ArraySpec((rows, surface.sample_widths[0]), np.int32, packed),
             ArraySpec((rows, surface.sample_widths[1]), np.float32, packed),
@@ -111,7 +124,7 @@ class TriangleSampler(abc.ABC):
             host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
             check_camera(host_camera)
             with self._keeper.lock:
-                found = entry or self.entry(surface, host_inputs, host_camera, size)
+                found = entry or self._entry(surface, host_inputs, host_camera, size)
                 fragments = self.rasterize(found.prepared, host_camera, size, layers, part.cull)
             samples = lift(fragments, found.proxy, capacity)
             if hasattr(surface, "refine"):
@@ -134,11 +147,18 @@ class TriangleSampler(abc.ABC):
             *results[:5],
             tables=dict(zip(table_specs, tables, strict=True)),
             gbuffer=dict(zip(gbuffer_specs, gbuffer, strict=True)) if host_theta is not None else None,
+            asked=getattr(part.shader, "reads", None),
             centered=getattr(surface, "centered", True),
         )
 
 
-def _gbuffer_specs(part: Part, host_theta: Mapping | None, rows: int, packed: bool) -> dict[str, ArraySpec]:
+def _checked_proxy(surface: Any, inputs: Tree, camera: Any, size: Any) -> Proxy:
+    proxy = surface.proxy(inputs, camera, size)
+    check_proxy(proxy, surface)
+    return proxy
+
+
+def _gbuffer_specs(part: Part, host_theta: Mapping | None, row_spec: ArraySpec) -> dict[str, ArraySpec]:
     """The attributes to evaluate on the host for a surface that is constant: those its shader reads."""
     if host_theta is None:
         return {}
@@ -148,7 +168,7 @@ def _gbuffer_specs(part: Part, host_theta: Mapping | None, rows: int, packed: bo
     gbuffer = part.surface.evaluate(host_theta, one)
     names = getattr(part.shader, "reads", None)
     names = list(gbuffer) if names is None else ["position", *(n for n in names if n in gbuffer)]
-    return {n: ArraySpec((rows, *gbuffer[n].shape[1:]), np.float32, packed) for n in dict.fromkeys(names)}
+    return {n: row_spec._replace(shape=row_spec.shape + gbuffer[n].shape[1:]) for n in dict.fromkeys(names)}
 
 
 def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None) -> Samples:
@@ -201,7 +221,7 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         overflow = overflow + s.overflow
     if len(samples) == 1:
         only = samples[0]
-        return Sampled(tuple(samples), xp.minimum(only.row, xp.zeros_like(only.row)), only.row, only.depth, overflow)
+        return Sampled(tuple(samples), xp.where(only.row >= 0, 0, -1), only.row, only.depth, overflow)
     offsets = np.cumsum([0, *(s.ids.shape[0] for s in samples)])
     row = xp.concat([xp.where(s.row >= 0, s.row + int(o), s.row) for s, o in zip(samples, offsets, strict=False)])
     part = xp.concat([xp.where(s.row >= 0, i, s.row) for i, s in enumerate(samples)])
@@ -213,15 +233,23 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
 
 
 def check_camera(camera: Camera) -> None:
-    """Refuse host matrices that are not finite or not invertible."""
+    """Refuse host matrices that are not finite, not invertible, or a view that is not affine."""
     for name, matrix in zip(("view", "projection"), camera, strict=True):
         if not np.isfinite(matrix).all():
             raise InputError(f"the camera's {name} matrix holds NaN or infinity; check how it was made")
+    # Far from the origin, or at scales far from one, a matrix is none the worse: rows are compared at their own scale.
+    scale = np.linalg.norm(camera.projection, axis=1, keepdims=True)
+    for name, matrix in (("view", camera.view[:3, :3]), ("projection", camera.projection / np.where(scale, scale, 1))):
         singular_values = np.linalg.svd(matrix, compute_uv=False)
-        if not singular_values[-1] > 1e-14 * singular_values[0]:
+        if not singular_values[-1] > 1e-12 * singular_values[0]:
             raise InputError(
                 f"the camera's {name} matrix is singular (times the part's transform, for view); it has no inverse"
             )
+    if not np.array_equal(camera.view[3], [0, 0, 0, 1]):
+        raise InputError(
+            f"the last row of the camera's view times the part's transform is {camera.view[3].tolist()}; "
+            f"expected 0, 0, 0, 1"
+        )
 
 
 def check_proxy(proxy: Proxy, surface: Any) -> None:

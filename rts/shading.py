@@ -234,6 +234,7 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat") -> Array:
 def _wrapped(index: Array, count: int, wrap: str) -> Array:
     """Whole-numbered floats as indices in [0, count)."""
     xp = namespace(index)
+    index = xp.where(index == index, index, 0.0)  # NaN has no texel; as an index it would be out of range.
     if wrap == "repeat":
         index = index - xp.floor(index / count) * count
     elif wrap == "mirror":

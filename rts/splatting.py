@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import engine_of, namespace
+from rts.arrays import constants, engine_of, exemplar, from_numbers, namespace
 from rts.errors import InputError
 from rts.protocols import Array
 
@@ -32,14 +32,15 @@ class Plain:
 
     def splat(self, positions: Array, rgba: Array, row: Array) -> Array:
         """See `rts.protocols.Splatter`."""
-        check_splats(positions, rgba, row)
-        xp = namespace(rgba, row)
+        positions, rgba, row = check_splats(positions, rgba, row)
         if rgba.shape[0] == 0:
             return _nothing(rgba, row)
-        image = None
+        xp = namespace(rgba)
+        # Nothing, but it keeps the image connected to the positions, whose derivative it is to say is zero.
+        image = 0 * xp.sum(positions)
         for k in reversed(range(row.shape[0])):
             layer = xp.where((row[k] >= 0)[..., None], _unpack(rgba, row[k]), 0.0)
-            image = layer if image is None else _over(layer, image)
+            image = _over(layer, image)
         return image
 
 
@@ -64,7 +65,7 @@ class Kernel(abc.ABC):
 
     def splat(self, positions: Array, rgba: Array, row: Array) -> Array:
         """See `rts.protocols.Splatter`."""
-        check_splats(positions, rgba, row)
+        positions, rgba, row = check_splats(positions, rgba, row)
         return _nothing(rgba, row) if rgba.shape[0] == 0 else self.accumulate(positions, rgba, row)
 
     @abc.abstractmethod
@@ -142,15 +143,21 @@ class Multi(Kernel):
         return _over(front, _over(surface, behind))
 
 
-def check_splats(positions: Array, rgba: Array, row: Array) -> None:
-    """Refuse arrays of the wrong shape."""
-    shapes = [tuple(x.shape) for x in (positions, rgba, row)]
+def check_splats(positions: Array, rgba: Array, row: Array) -> tuple[Array, Array, Array]:
+    """The three as arrays of one engine; wrong shapes and dtypes are refused."""
+    given = tuple(from_numbers(x) for x in (positions, rgba))
+    row = np.asarray(row, np.int32) if isinstance(row, (list, tuple)) else row
+    shapes = [tuple(getattr(x, "shape", ())) for x in (*given, row)]
     ok = len(shapes[0]) == 2 and shapes[0][1] == 3 and shapes[1] == (shapes[0][0], 4) and len(shapes[2]) == 3
     if not ok or shapes[2][0] < 1:
         raise InputError(
             f"positions, rgba and row have shapes {shapes[0]}, {shapes[1]}, {shapes[2]}; "
             f"expected (N, 3), (N, 4), (K, H, W)"
         )
+    if not namespace(row).isdtype(row.dtype, "signed integer"):
+        raise InputError(f"row has dtype {row.dtype}; expected signed integers, -1 where a cell is empty")
+    positions, rgba, row = constants((*given, row), engine_of(given, row), exemplar(given))
+    return positions, rgba, row
 
 
 def _nothing(rgba: Array, row: Array) -> Array:

@@ -134,7 +134,7 @@ def look_at(eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0)) -> Array:
     return affine_matrix(linear, -matmul(linear, eye[:, None])[:, 0])
 
 
-def rigid(pose: Array, center: Any = (0.0, 0.0, 0.0)) -> Array:
+def rigid(pose: Any, center: Any = (0.0, 0.0, 0.0)) -> Array:
     """World-from-local transform of a rigid pose; differentiable everywhere, at zero rotation too.
 
     Args:
@@ -144,10 +144,11 @@ def rigid(pose: Array, center: Any = (0.0, 0.0, 0.0)) -> Array:
     Returns:
         (4, 4), usable as `Part.transform`.
     """
-    if tuple(getattr(pose, "shape", ())) != (6,):
-        raise InputError(
-            f"pose has shape {tuple(getattr(pose, 'shape', ()))}; expected (6,): rotation vector, translation"
-        )
+    if isinstance(pose, (list, tuple)) and is_constant(pose):
+        pose = np.asarray(pose, np.float64)
+    shape = tuple(getattr(pose, "shape", ()))
+    if shape != (6,):
+        raise InputError(f"pose has shape {shape}; expected (6,): rotation vector, translation")
     xp, (pose, center) = promote(pose, center)
     x, y, z = pose[0], pose[1], pose[2]
     square = x * x + y * y + z * z

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from rts.errors import RtsError
 from rts.protocols import ArraySpec, Tree
 from rts.records import STATIC_FIELDS, join_record, split_record
 
@@ -35,6 +36,7 @@ class JaxEngine:
 
     name = "jax"
     namespace = jnp
+    _error: RtsError | None = None
 
     def owns(self, x: Any) -> bool:
         """Whether `x` is a jax array or a tracer."""
@@ -44,7 +46,7 @@ class JaxEngine:
         """`value` as a jax array, floats in the dtype of `like`."""
         array = np.asarray(value)
         if np.issubdtype(array.dtype, np.floating):
-            array = array.astype(np.float32 if like is None else like.dtype)
+            array = array.astype(np.float64 if like is not None and like.dtype == np.float64 else np.float32)
         elif array.dtype == np.int64:
             array = array.astype(np.int32)
         return jnp.asarray(array)
@@ -61,7 +63,11 @@ class JaxEngine:
             )
 
         def padded(*host_args: Any) -> tuple[np.ndarray, ...]:
-            results = fn(*map(np.asarray, host_args))
+            try:
+                results = fn(*map(np.asarray, host_args))
+            except RtsError as error:
+                self._error = error
+                raise
             return tuple(
                 (_pad(r, spec.shape[0]) if spec.packed else np.asarray(r)).astype(spec.dtype)
                 for r, spec in zip(results, specs, strict=True)
@@ -69,6 +75,11 @@ class JaxEngine:
 
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
         return tuple(jax.pure_callback(padded, shapes, *args, vmap_method="sequential"))
+
+    def take_error(self) -> RtsError | None:
+        """The error that the latest failed host call under a trace raised, which jax replaces by one of its own; once."""
+        error, self._error = self._error, None
+        return error
 
     def segment_sum(self, values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:
         """Sums of the rows of `values` that share a segment."""

@@ -30,13 +30,19 @@ def _tensor(value: Any, device: torch.device | None = None) -> torch.Tensor:
     return torch.from_numpy(array).reshape(np.shape(value)).to(device)
 
 
+def _to_host(x: torch.Tensor) -> np.ndarray:
+    """The value as NumPy; half precision, of which NumPy knows only one kind, as float32."""
+    x = x.detach().cpu()
+    return (x.float() if x.dtype in (torch.bfloat16, torch.float16) else x).numpy()
+
+
 class _HostCall(torch.autograd.Function):
     """A host function without derivative, transparent to every torch transform."""
 
     @staticmethod
     def forward(fn, specs, *args):
         device = next((a.device for a in args if isinstance(a, torch.Tensor)), None)
-        results = fn(*(a.detach().cpu().numpy() if isinstance(a, torch.Tensor) else a for a in args))
+        results = fn(*(_to_host(a) if isinstance(a, torch.Tensor) else a for a in args))
         return tuple(_tensor(r, device) for r in results)
 
     @staticmethod
@@ -80,7 +86,9 @@ class TorchEngine:
     def constant(self, value: Any, like: torch.Tensor | None = None) -> torch.Tensor:
         """`value` on the device of `like`, floats in its dtype."""
         tensor = _tensor(value, None if like is None else like.device)
-        return tensor.to(torch.float32 if like is None else like.dtype) if tensor.is_floating_point() else tensor
+        if not tensor.is_floating_point():
+            return tensor
+        return tensor.to(torch.float64 if like is not None and like.dtype == torch.float64 else torch.float32)
 
     def call_host(self, fn: Callable, specs: tuple[ArraySpec, ...], *args: Any) -> tuple[torch.Tensor, ...]:
         """Call `fn` on NumPy views or copies of `args`; under vmap once an item, packed rows padded alike."""
@@ -97,7 +105,7 @@ class TorchEngine:
 
     def to_numpy(self, x: torch.Tensor) -> np.ndarray:
         """The value on the host."""
-        return x.detach().cpu().numpy()
+        return _to_host(x)
 
     def block(self, x: Tree) -> Tree:
         """Wait for the devices that hold the tensors."""

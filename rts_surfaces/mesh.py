@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.arrays import engine_of, is_constant, namespace, unit
 from rts.errors import InputError
-from rts.preparing import fingerprint
+from rts.keeping import fingerprint
 from rts.protocols import Array, GBuffer, Proxy, Samples, Tree
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}

@@ -1,0 +1,137 @@
+"""What is refused before any work starts."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rts import registry
+from rts.arrays import engine_of, from_numbers, is_constant, leaves, namespace
+from rts.camera import Camera
+from rts.errors import InputError
+from rts.protocols import Array, Part
+
+BYTES_PER_CELL = {"forward": 200, "gradient": 700}
+"""Rough memory of one cell of one layer through sampling, shading and splatting, measured with the splatter `multi`."""
+
+
+def _memory() -> float:
+    """Physical memory in bytes, or infinity where the system does not tell."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return math.inf
+
+
+MEMORY = _memory()
+
+
+def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Part], Camera]:
+    """Checked parts, with their shaders looked up and plain numbers made arrays."""
+    parts = list(parts) if isinstance(parts, Sequence) else [parts]
+    if not parts or not all(isinstance(p, Part) for p in parts):
+        kinds = ", ".join(type(p).__name__ for p in parts) or "nothing"
+        raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
+    if not isinstance(camera, Camera):
+        raise InputError(f"camera is a {type(camera).__name__}; expected an rts.Camera")
+    camera = Camera(*from_numbers(tuple(camera)))
+    for name, matrix in zip(camera._fields, camera, strict=True):
+        check_matrix(f"the camera's {name}", matrix)
+    checked = [_check_part(index, part) for index, part in enumerate(parts)]
+    engine_of(checked, camera)
+    return checked, camera
+
+
+def _check_part(index: int, part: Part) -> Part:
+    strange = [key for key in part.theta if not isinstance(key, str)]
+    if strange:
+        raise InputError(f"theta of part {index} has the key {strange[0]!r}; expected names")
+    if not hasattr(part.surface, "evaluate") or isinstance(part.surface, type):
+        raise InputError(f"the surface of part {index} is {part.surface!r}; expected an object such as a mesh")
+    part = part.replace(theta=from_numbers(part.theta), transform=from_numbers(part.transform))
+    shader = registry.instance("rts.shaders", part.shader)
+    if not callable(shader):
+        raise InputError(f"the shader of part {index} is {shader!r}; expected a name or a function")
+    if part.transform is not None:
+        check_matrix(f"the transform of part {index}", part.transform)
+    if hasattr(part.surface, "check"):
+        part.surface.check(part.theta)
+    return part.replace(shader=shader)
+
+
+def check_plugin(group: str, chosen: Any, method: str) -> Any:
+    """A usable plugin from a name, a class or an object, which must have a method."""
+    found = registry.instance(group, chosen)
+    if not hasattr(found, method):
+        kind = group.removeprefix("rts.").removesuffix("s")
+        raise InputError(f"the {kind} is {found!r}; expected a name or an object with a method {method!r}")
+    return found
+
+
+def check_matrix(name: str, matrix: Any) -> None:
+    """Refuse what is not (4, 4)."""
+    if tuple(getattr(matrix, "shape", ())) != (4, 4):
+        raise InputError(f"{name} has shape {tuple(getattr(matrix, 'shape', ()))}; expected a (4, 4) array")
+
+
+def check_size(size: Any, layers: Any, capacity: Any, *, gradient: bool) -> tuple[int, int]:
+    """(height, width) as integers, refused where they make no image or one too large for this machine."""
+    try:
+        height, width = (int(s) for s in size)
+        whole = (height, width) == tuple(size)
+    except (TypeError, ValueError, OverflowError):
+        whole = False
+    if not whole or height <= 0 or width <= 0:
+        raise InputError(f"size is {size!r}; expected (height, width), two positive integers")
+    if not _is_count(layers):
+        raise InputError(f"layers is {layers!r}; expected an integer of at least 1")
+    if capacity is not None and not _is_count(capacity):
+        raise InputError(f"capacity is {capacity!r}; expected an integer of at least 1, or None")
+    needed = height * width * layers * BYTES_PER_CELL["gradient" if gradient else "forward"]
+    if needed > MEMORY:
+        raise InputError(
+            f"{height} x {width} pixels with {layers} layers need about {needed / 2**30:.3g} GiB, and this machine has "
+            f"{MEMORY / 2**30:.3g} GiB; choose a smaller size or fewer layers"
+        )
+    return height, width
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 1
+
+
+def check_background(background: Any, size: tuple[int, int]) -> Array | None:
+    """The background as an array, refused where it fits no image of this size."""
+    if background is None:
+        return None
+    background = from_numbers(background)
+    shape = tuple(getattr(background, "shape", ()))
+    if shape not in ((3,), (4,), (*size, 3), (*size, 4)):
+        given = f"has shape {shape}" if hasattr(background, "shape") else f"is {background!r}"
+        height, width = size
+        raise InputError(f"background {given}; expected (3,), (4,), ({height}, {width}, 3) or ({height}, {width}, 4)")
+    check_floating("background", background)
+    return background
+
+
+def check_floating(name: str, value: Array) -> None:
+    """Refuse integers, which would be taken for 0 to 255 by the one and for 0 to 1 by the other."""
+    if not namespace(value).isdtype(value.dtype, "real floating"):
+        raise InputError(f"{name} has dtype {value.dtype}; expected floating numbers")
+
+
+def check_shaded(rgba: Any, count: int, shader: Any) -> None:
+    """Refuse what a shader should not have returned."""
+    shape = tuple(getattr(rgba, "shape", ()))
+    if shape != (count, 4):
+        given = f"shape {shape}" if hasattr(rgba, "shape") else f"a {type(rgba).__name__}"
+        raise InputError(f"the shader {shader!r} returned {given}; expected ({count}, 4)")
+
+
+def differentiable(*trees: Any) -> bool:
+    """Whether any array could carry a derivative."""
+    return any(not is_constant(x) for x in leaves(trees))

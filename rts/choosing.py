@@ -1,0 +1,67 @@
+"""`sampler="auto"`: which sampler a part needs, and why."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, NamedTuple
+
+from rts import registry
+from rts.arrays import engine_of, is_constant
+from rts.camera import Camera
+from rts.errors import PluginError
+from rts.protocols import Part, Samples
+
+STATIC_FACES = 400_000
+"""From so many triangles on, rays at a structure that is kept are faster than drawing all (benchmarks/samplers.py)."""
+
+_log = logging.getLogger("rts")
+
+
+class Choice(NamedTuple):
+    """A sampler, by name, and the reason for it."""
+
+    sampler: str
+    reason: str
+
+
+def choose(part: Part, *, static: bool) -> Choice:
+    """The sampler for a part whose triangles stay the same from call to call (`static`), or may not."""
+    surface = part.surface
+    if not hasattr(surface, "proxy"):
+        return Choice("rays", f"{surface!r} intersects rays itself and has no triangles")
+    faces = len(getattr(surface, "faces", ()))
+    if not static:
+        return Choice("raster", "triangles that may change each call are drawn at once, with nothing to build")
+    if faces < STATIC_FACES:
+        return Choice("raster", f"{faces} triangles are drawn faster than rays find them (below {STATIC_FACES})")
+    try:
+        registry.plugin("rts.samplers", "embree")
+    except PluginError as error:
+        return Choice("raster", f"{faces} static triangles would suit embree, but {error}")
+    return Choice("embree", f"{faces} triangles stay the same: their structure is built once, and only rays move")
+
+
+def is_static(part: Part, camera: Camera) -> bool:
+    """Whether something is differentiated, but not what the surface reads: so calls repeat, and triangles stay."""
+    reads = part.surface.reads(part.theta) if hasattr(part.surface, "reads") else tuple(part.theta)
+    constant = is_constant({name: part.theta[name] for name in reads})
+    return constant and engine_of(part, camera).name != "numpy"
+
+
+def explain(parts: Part | list[Part] | tuple[Part, ...], camera: Camera) -> list[Choice]:
+    """What `sampler="auto"` takes for each part of a scene, and why."""
+    parts = [parts] if isinstance(parts, Part) else list(parts)
+    return [choose(part, static=is_static(part, camera)) for part in parts]
+
+
+class Auto:
+    """The sampler that suits each part."""
+
+    def sample(
+        self, part: Part, camera: Camera, size: tuple[int, int], layers: int, *, capacity: int | None = None
+    ) -> Samples:
+        """See `rts.protocols.Sampler`."""
+        choice = choose(part, static=is_static(part, camera))
+        _log.debug("%s for %r: %s", choice.sampler, part.surface, choice.reason)
+        sampler: Any = registry.instance("rts.samplers", choice.sampler)
+        return sampler.sample(part, camera, size, layers, capacity=capacity)

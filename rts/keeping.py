@@ -1,0 +1,81 @@
+"""What samplers build for a surface, kept between calls: structures over triangles, buffers on a device.
+
+Optimisers change arrays in place, so identity proves nothing: what is kept goes by a fingerprint of the bytes that the
+proxy was made of.
+"""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.arrays import leaves
+from rts.protocols import Proxy, Tree
+
+KEPT = 2
+"""Entries a surface and sampler: the newest, and the one before it, which is moved when a third is asked for."""
+
+
+class Entry(NamedTuple):
+    """A proxy, and what a sampler built over it."""
+
+    proxy: Proxy
+    prepared: Any
+
+
+class Keeper:
+    """The entries of one sampler: bounded in number, released with their surfaces.
+
+    A sampler's calls go through its keeper's `lock`, since an entry may be moved in place.
+    """
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+        self._entries: weakref.WeakKeyDictionary[Any, OrderedDict] = weakref.WeakKeyDictionary()
+
+    def get(
+        self,
+        surface: Any,
+        key: tuple,
+        build: Callable[[], Entry],
+        follow: Callable[[Entry], Entry | None],
+    ) -> Entry:
+        """The entry of a surface under a key.
+
+        Args:
+            surface: the surface; entries are dropped when it is.
+            key: what the proxy depends on.
+            build: makes the entry.
+            follow: makes it of an older one, in place, or gives None where it cannot.
+        """
+        entries = self._entries.setdefault(surface, OrderedDict())
+        if key in entries:
+            entries.move_to_end(key)
+            return entries[key]
+        old = entries.popitem(last=False)[1] if len(entries) >= KEPT else None
+        entries[key] = (follow(old) if old is not None else None) or build()
+        return entries[key]
+
+
+def same_faces(a: Proxy, b: Proxy) -> bool:
+    """Whether two proxies differ in the places of their vertices only."""
+    same_count = len(a.vertices) == len(b.vertices)
+    return same_count and (a.faces is b.faces or np.array_equal(a.faces, b.faces))
+
+
+def fingerprint(tree: Tree) -> tuple:
+    """A key that changes when the bytes of host arrays do; a million vertices take half a millisecond."""
+    return tuple(_fingerprint(np.ascontiguousarray(x)) for x in leaves(tree))
+
+
+def _fingerprint(x: np.ndarray) -> tuple:
+    from rts.checksum import checksum
+
+    data = x.reshape(-1).view(np.uint8)
+    whole = len(data) // 8 * 8
+    return x.shape, x.dtype.str, int(checksum(data[:whole].view(np.uint64))), bytes(data[whole:])

@@ -1,0 +1,111 @@
+"""Levenberg–Marquardt on the mean square of residuals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from rts.arrays import leaves, map_leaves, namespace
+from rts.fit_runs import Run, require
+from rts.protocols import Array, Engine, Tree
+
+FIRST_DAMPING = 1e-3
+LARGEST_DAMPING = 1e12
+
+
+def mean_square(residuals: Array) -> Array:
+    """The default loss."""
+    return namespace(residuals).mean(residuals * residuals)
+
+
+def levenberg_marquardt(residuals: Callable, parameters: Tree, engine: Engine, run: Run, jit: bool) -> None:
+    """Normal equations with Marquardt's scaling and Nielsen's control of the damping (Madsen et al. 2004)."""
+    vector, unflatten = _flatten(parameters)
+    linearize, loss_at = _least_squares(lambda v: residuals(unflatten(v)), engine, run, jit)
+    value, matrix, gradient = linearize(vector)
+    going = run.record(unflatten(vector), value)
+    damping, growth = FIRST_DAMPING, 2.0
+    while going:
+        if not gradient.any():
+            run.stop("the gradient is zero")
+            return
+        delta, predicted, damping = _damped_step(matrix, gradient, damping)
+        trial = vector + engine.constant(delta, vector)
+        trial_value = loss_at(trial)
+        if not run.record(unflatten(trial), trial_value):
+            return
+        gain = value - trial_value
+        if not gain > 0:  # Trials that are not finite, too.
+            damping, growth = damping * growth, growth * 2
+            going = damping <= LARGEST_DAMPING or run.stop("no step lowers the loss")
+        elif gain <= run.tolerance * value:
+            going = run.stop(f"the last step gained less than {run.tolerance:g} of the loss")
+        else:
+            ratio = gain / max(predicted, gain)
+            damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
+            vector = trial
+            value, matrix, gradient = linearize(vector)
+
+
+def _least_squares(residuals: Callable, engine: Engine, run: Run, jit: bool) -> tuple[Callable, Callable]:
+    """Functions of a vector: mean square with normal equations JᵀJ and Jᵀr on the host, and mean square alone."""
+    xp = engine.namespace
+
+    def flat(v: Array) -> Array:
+        return xp.reshape(residuals(v), (-1,))
+
+    def equations(v: Array) -> tuple[Array, Array, Array]:
+        r, jacobian = engine.jacobian(flat)(v)
+        transposed = xp.matrix_transpose(jacobian)
+        return xp.mean(r * r), transposed @ jacobian / r.shape[0], transposed @ r / r.shape[0]
+
+    def loss(v: Array) -> Array:
+        return mean_square(flat(v))
+
+    if jit:
+        equations, loss = engine.jit(equations), engine.jit(loss)
+
+    def linearize(v: Array) -> tuple[float, np.ndarray, np.ndarray]:
+        value, *rest = run.attempt(engine, equations, v)
+        matrix, gradient = (engine.to_numpy(x).astype(np.float64) for x in rest)
+        require(math.isfinite(value), f"the loss is {float(value)}", not run.history)
+        require(bool(np.isfinite(matrix).all()), "the Jacobian is not finite", not run.history)
+        return float(value), matrix, gradient
+
+    return linearize, lambda v: float(run.attempt(engine, loss, v))
+
+
+def _damped_step(matrix: np.ndarray, gradient: np.ndarray, damping: float) -> tuple[np.ndarray, float, float]:
+    """The step, the gain that the linear model predicts of it, and the damping that it took."""
+    from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+    scale = np.sqrt(np.diag(matrix).clip(1e-12 * np.trace(matrix)))
+    scaled, downhill = matrix / scale[:, None] / scale, -gradient / scale
+    while True:
+        try:
+            step = cho_solve(cho_factor(scaled + damping * np.eye(len(scale))), downhill)
+            return step / scale, float(step @ (damping * step + downhill)), damping
+        except LinAlgError:  # Rounding left the matrix with a negative eigenvalue.
+            damping *= 10
+
+
+def _flatten(parameters: Tree) -> tuple[Array, Callable[[Array], Tree]]:
+    """All leaves as one vector, and the way back."""
+    arrays = list(leaves(parameters))
+    xp = namespace(*arrays)
+
+    def unflatten(vector: Array) -> Tree:
+        at = 0
+
+        def take(x: Array) -> Array:
+            nonlocal at
+            count = math.prod(x.shape)
+            piece = xp.reshape(vector[at : at + count], tuple(x.shape))
+            at += count
+            return xp.astype(piece, x.dtype, copy=False)
+
+        return map_leaves(take, parameters)
+
+    return xp.concat([xp.reshape(x, (-1,)) for x in arrays]), unflatten
