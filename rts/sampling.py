@@ -237,9 +237,12 @@ def check_camera(camera: Camera) -> None:
     for name, matrix in zip(("view", "projection"), camera, strict=True):
         if not np.isfinite(matrix).all():
             raise InputError(f"the camera's {name} matrix holds NaN or infinity; check how it was made")
-    # Far from the origin, or at scales far from one, a matrix is none the worse: rows are compared at their own scale.
-    scale = np.linalg.norm(camera.projection, axis=1, keepdims=True)
-    for name, matrix in (("view", camera.view[:3, :3]), ("projection", camera.projection / np.where(scale, scale, 1))):
+    # Far from the origin, or at lengths far from one, a matrix is none the worse: its rows and columns are scaled alike.
+    projection = camera.projection
+    for axis in (1, 0):
+        length = np.linalg.norm(projection, axis=axis, keepdims=True)
+        projection = projection / np.where(length > 0, length, 1)
+    for name, matrix in (("view", camera.view[:3, :3]), ("projection", projection)):
         singular_values = np.linalg.svd(matrix, compute_uv=False)
         if not singular_values[-1] > 1e-12 * singular_values[0]:
             raise InputError(

@@ -808,3 +808,68 @@ def test_plain_lists_of_numbers_are_arrays():
     np.testing.assert_allclose(
         rts.render(PART.replace(theta=lists, shader="lambert"), camera, SIZE), expected, atol=1e-6
     )
+
+
+# ------------------------------------------------------------------------- what one call leaves to the next
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_samples_taken_for_one_shader_serve_another(target):
+    identity = arrays(target, np.eye(4))
+    part = Part(Mesh(BOX[1]), {"vertices": BOX[0], "colors": BOX[0] * 0.5 + 0.5}, "silhouette", identity)
+    sampled = rts.sample(part, CAMERA, SIZE)
+    for shader in ("unlit", "lambert"):
+        other = part.replace(shader=shader)
+        image = rts.render_samples(sampled, other, CAMERA)
+        np.testing.assert_allclose(to_numpy(image), to_numpy(rts.render(other, CAMERA, SIZE)), atol=1e-6)
+
+
+def test_a_half_precision_entry_does_not_round_the_rest():
+    torch = pytest.importorskip("torch")
+    part = Part(Mesh(BOX[1]), {"vertices": BOX[0].astype(np.float32), "color": np.ones(3, np.float32)}, "unlit")
+    expected = rts.render(part, CAMERA, SIZE)
+    half = part.replace(theta={**part.theta, "color": torch.ones(3, dtype=torch.float16)})
+    np.testing.assert_allclose(to_numpy(rts.render(half, CAMERA, SIZE)), expected, atol=2e-5)
+    brain = part.replace(theta={"vertices": torch.tensor(BOX[0]).bfloat16(), "color": np.ones(3)})
+    assert np.isfinite(to_numpy(rts.render(brain, CAMERA, SIZE).float())).all()
+
+
+def test_a_float64_pose_over_constant_vertices_is_rendered_in_float64():
+    torch = pytest.importorskip("torch")
+    part = Part(Mesh(BOX[1]), {"vertices": BOX[0]}, "silhouette", torch.eye(4, dtype=torch.float64))
+    assert rts.render(part, CAMERA, SIZE).dtype == torch.float64
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_plain_rasterization_has_a_gradient_of_zero(target):
+    weights = arrays(target, np.random.default_rng(0).random((*SIZE, 4)))
+
+    def loss(vertices):
+        return (rts.render(Part(Mesh(BOX[1]), {"vertices": vertices}), CAMERA, SIZE, splatter="none") * weights).sum()
+
+    found = gradient(target, loss, arrays(target, BOX[0]))
+    assert found.shape == BOX[0].shape and (found == 0).all()
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_the_background_may_be_what_is_differentiated(target):
+    def loss(background):
+        return rts.render(PART, CAMERA, SIZE, background=background).sum()
+
+    found = gradient(target, loss, arrays(target, np.array([0.1, 0.2, 0.3])))
+    alpha = rts.render(PART, CAMERA, SIZE)[..., 3]
+    np.testing.assert_allclose(found, np.full(3, (1 - alpha).sum()), rtol=1e-4)
+
+
+def test_a_scene_far_away_or_huge_is_no_singular_camera():
+    for scale in (1e-20, 1e8):
+        camera = Camera.look_at(np.array([0.1, 0.3, 3]) * scale, (0, 0, 0), fov_y=40)
+        image = rts.render(Part(Mesh(BOX[1]), {"vertices": BOX[0] * scale}), camera, SIZE)
+        assert image[..., 3].sum() > 10
+
+
+def test_a_projective_transform_is_refused():
+    projective = np.eye(4)
+    projective[3] = [0, 0, 0.5, 1]
+    with pytest.raises(rts.InputError, match="last row"):
+        rts.render(PART.replace(transform=projective), CAMERA, SIZE)
