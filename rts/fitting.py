@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 from numbers import Integral, Real
 from typing import Any, NamedTuple
 
@@ -80,7 +81,7 @@ def fit(
     _check_limits(tolerance, patience)
     engine = _checked_engine(parameters)
     # Private copies: neither the caller's later changes nor the graph that made them may reach the result.
-    parameters = map_leaves(lambda x: engine.constant(np.array(engine.to_numpy(x)), x), parameters)
+    parameters = map_leaves(partial(_copied, engine), parameters)
     start = time.perf_counter()
     run = Run(int(steps or STEPS[method]), callback, tolerance, patience)
     with progress_bar(progress, run.steps, method, run):
@@ -94,6 +95,10 @@ def fit(
         except Astray as stop:
             run.stop(str(stop))
     return Fit(run.best, run.best_loss, run.history, len(run.history), run.reason, time.perf_counter() - start)
+
+
+def _copied(engine: Engine, x: Array) -> Array:
+    return engine.namespace.astype(engine.constant(np.array(engine.to_numpy(x)), x), x.dtype, copy=False)
 
 
 def _descend(

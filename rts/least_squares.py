@@ -28,7 +28,7 @@ def levenberg_marquardt(residuals: Callable, parameters: Tree, engine: Engine, r
     going = run.record(unflatten(vector), value)
     damping, growth = FIRST_DAMPING, 2.0
     while going:
-        if not gradient.any():
+        if not (gradient.any() and matrix.any()):
             run.stop("the gradient is zero")
             return
         delta, predicted, damping = _damped_step(matrix, gradient, damping)

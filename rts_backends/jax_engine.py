@@ -77,7 +77,7 @@ class JaxEngine:
         return tuple(jax.pure_callback(padded, shapes, *args, vmap_method="sequential"))
 
     def take_error(self) -> RtsError | None:
-        """The error that the latest failed host call under a trace raised, which jax replaces by one of its own; once."""
+        """What the latest host call under a trace raised, once; jax replaces it by an error of its own."""
         error, self._error = self._error, None
         return error
 

@@ -1,0 +1,558 @@
+import math
+
+import numpy as np
+import pytest
+from helpers import DIFFERENTIABLE, arrays, box, derivative, finite_difference, gradient, rotation, to_numpy
+from scipy.spatial.transform import Rotation
+
+import rts
+from rts.errors import EngineError, InputError, PluginError
+from rts.least_squares import LARGEST_DAMPING, _damped_step
+
+targets = pytest.mark.parametrize("target", DIFFERENTIABLE)
+
+MATRIX = np.random.default_rng(5).normal(size=(9, 3))
+SOLUTION = np.array([1.0, -2.0, 0.5])
+
+
+def line(target):
+    """Residuals of linear least squares that vanish at SOLUTION, and where to start."""
+    matrix, goal = arrays(target, MATRIX), arrays(target, MATRIX @ SOLUTION)
+    return lambda p: matrix @ p - goal, arrays(target, np.zeros(3))
+
+
+def rosenbrock(p):
+    """Its two residuals, by the arithmetic that every engine has."""
+    return p[:1] * 0 + 1 - p[:1], 10 * (p[1:] - p[:1] ** 2)
+
+
+def joined(target, pieces):
+    return pytest.importorskip("jax").numpy.concatenate(pieces) if target == "jax" else _torch().cat(pieces)
+
+
+def _torch():
+    return pytest.importorskip("torch")
+
+
+# ------------------------------------------------------------------------------------------------ solutions
+
+
+@targets
+def test_lm_solves_linear_least_squares_in_a_few_steps(target):
+    residuals, start = line(target)
+    fit = rts.fit(residuals, start, method="lm", progress=False)
+    np.testing.assert_allclose(to_numpy(fit.parameters), SOLUTION, atol=1e-6)
+    assert fit.history[4] < 1e-9 * fit.history[0]
+
+
+@targets
+def test_lm_solves_an_overdetermined_system_to_its_normal_equations(target):
+    goal = np.random.default_rng(1).normal(size=9)
+    matrix, there = arrays(target, MATRIX), arrays(target, goal)
+    fit = rts.fit(lambda p: matrix @ p - there, arrays(target, np.ones(3)), method="lm", tolerance=1e-9)
+    np.testing.assert_allclose(to_numpy(fit.parameters), np.linalg.lstsq(MATRIX, goal)[0], atol=1e-4)
+
+
+@targets
+def test_lm_goes_through_the_valley_of_rosenbrock(target):
+    start = arrays(target, np.array([-1.2, 1.0]))
+    fit = rts.fit(lambda p: joined(target, rosenbrock(p)), start, method="lm", steps=100, tolerance=0)
+    np.testing.assert_allclose(to_numpy(fit.parameters), [1, 1], atol=1e-4)
+    assert fit.steps < 60
+    assert any(after > before for before, after in zip(fit.history, fit.history[1:], strict=False)), "no trial rejected"
+
+
+@targets
+def test_lm_ignores_parameters_that_change_nothing_and_differences_of_scale(target):
+    scales = arrays(target, np.array([1e-4, 1e3, 0.0]))
+    start = arrays(target, np.array([0.0, 0.0, 7.0]))
+    goal = arrays(target, np.array([1.0, 1.0, 0.0]))
+    fit = rts.fit(lambda p: p * scales - goal, start, method="lm", tolerance=0)
+    np.testing.assert_allclose(to_numpy(fit.parameters), [1e4, 1e-3, 7], rtol=1e-4)
+
+
+@targets
+@pytest.mark.parametrize(("method", "options"), [("adam", {"learning_rate": 0.1}), ("sgd", {"learning_rate": 0.4})])
+def test_descent_finds_the_minimum_of_a_quadratic(target, method, options):
+    residuals, start = line(target)
+    fit = rts.fit(residuals, start, method=method, steps=600, **options)
+    np.testing.assert_allclose(to_numpy(fit.parameters), SOLUTION, atol=2e-3)
+
+
+@targets
+def test_sgd_makes_the_step_of_the_book(target):
+    seen = []
+    start = arrays(target, np.array([1.0, -3.0]))
+    rts.fit(lambda p: p, start, method="sgd", steps=3, learning_rate=0.1, callback=lambda k, p, v: seen.append(p))
+    # The gradient of the mean square of two numbers is the numbers.
+    np.testing.assert_allclose([to_numpy(p) for p in seen], [[1, -3], [0.9, -2.7], [0.81, -2.43]], rtol=1e-6)
+
+
+@targets
+@pytest.mark.parametrize("method", ["adam", "sgd", "lm"])
+def test_parameters_may_be_nested(target, method):
+    start = arrays(target, {"b": [np.zeros((2, 2)), np.array(1.0)], "a": (np.full(3, 2.0),)})
+
+    def residuals(p):
+        (first,), (second, third) = p["a"], p["b"]
+        return joined(target, [(first - 1) * third, second.reshape(4) + 2])
+
+    fit = rts.fit(residuals, start, method=method, steps=400, learning_rate=0.3 if method != "lm" else None)
+    assert fit.loss < 1e-5
+    assert set(fit.parameters) == {"a", "b"}
+    assert isinstance(fit.parameters["a"], tuple) and isinstance(fit.parameters["b"], list)
+    assert tuple(fit.parameters["b"][1].shape) == ()
+    np.testing.assert_allclose(to_numpy(fit.parameters["b"][0]), np.full((2, 2), -2), atol=1e-2)
+
+
+@targets
+def test_a_loss_of_ones_own(target):
+    start = arrays(target, np.array([3.0]))
+    goal = arrays(target, np.array([[0.0], [0.1], [10.0]]))
+    fit = rts.fit(lambda p: p - goal, start, loss=lambda r: abs(r).sum(), steps=300, learning_rate=0.05)
+    np.testing.assert_allclose(to_numpy(fit.parameters), [0.1], atol=0.05)  # The median.
+
+
+def test_lm_keeps_float64_and_mixed_dtypes():
+    torch = _torch()
+    start = {"a": torch.zeros(2, dtype=torch.float64), "b": torch.zeros(1)}
+    fit = rts.fit(lambda p: torch.cat([p["a"] - 1, p["b"] - 2]), start, method="lm")
+    assert fit.parameters["a"].dtype == torch.float64 and fit.parameters["b"].dtype == torch.float32
+
+
+@pytest.mark.parametrize("method", ["adam", "lm"])
+def test_the_start_is_neither_changed_nor_followed(method):
+    torch = _torch()
+    start = torch.ones(2, requires_grad=True)
+    fit = rts.fit(lambda p: p * p + 1, start * 2, method=method, steps=1)
+    assert not fit.parameters.requires_grad
+    with torch.no_grad():
+        start += 5
+    np.testing.assert_array_equal(fit.parameters, [2, 2])
+    rts.fit(lambda p: p, start, method=method, steps=3)
+    np.testing.assert_array_equal(start.detach(), [6, 6])
+
+
+# -------------------------------------------------------------------------------------------------- stopping
+
+
+@targets
+@pytest.mark.parametrize("method", ["adam", "sgd", "lm"])
+def test_steps_history_and_best(target, method):
+    calls = []
+    residuals, start = line(target)
+    options = {} if method == "lm" else {"learning_rate": 0.2}
+    fit = rts.fit(residuals, start, method=method, steps=3, callback=lambda *a: calls.append(a), **options)
+    assert fit.steps == len(fit.history) == 3
+    assert fit.reason == "all 3 steps made"
+    assert [step for step, _, _ in calls] == [0, 1, 2]
+    assert [loss for _, _, loss in calls] == fit.history
+    assert fit.history[0] == pytest.approx(np.mean((MATRIX @ SOLUTION) ** 2), rel=1e-5)
+    np.testing.assert_array_equal(to_numpy(calls[0][1]), np.zeros(3))
+    best = int(np.argmin(fit.history))
+    assert fit.loss == fit.history[best]
+    np.testing.assert_array_equal(to_numpy(fit.parameters), to_numpy(calls[best][1]))
+    assert fit.seconds > 0
+
+
+@targets
+def test_the_best_is_kept_when_descent_overshoots(target):
+    start = arrays(target, np.array([1.0]))
+    fit = rts.fit(lambda p: p, start, method="sgd", steps=5, learning_rate=1.5)  # p, −2p, 4p, …
+    np.testing.assert_allclose(fit.history, [1, 4, 16, 64, 256])
+    assert fit.loss == 1
+    np.testing.assert_array_equal(to_numpy(fit.parameters), [1])
+
+
+@targets
+@pytest.mark.parametrize("method", ["adam", "sgd", "lm"])
+@pytest.mark.parametrize("last", [0, 2])
+def test_a_callback_stops_and_its_reason_stays(target, method, last):
+    residuals, start = line(target)
+    # The tolerance would stop Levenberg–Marquardt in the same step.
+    options = {"tolerance": 10.0} if method == "lm" and last == 0 else {}
+    fit = rts.fit(residuals, start, method=method, callback=lambda step, p, loss: step == last, **options)
+    assert fit.reason == "the callback asked to"
+    assert fit.steps == last + 1
+
+
+def test_an_error_of_the_callback_is_its_own():
+    def report(step, parameters, loss):
+        if step == 2:
+            raise InputError("cannot write")
+
+    for method in ("adam", "lm"):
+        with pytest.raises(InputError, match="cannot write"):
+            rts.fit(lambda p: p**3 - 1, _torch().ones(1) * 3, method=method, callback=report)
+
+
+def test_no_jacobian_is_made_that_nobody_uses():
+    torch = _torch()
+    traced = []
+
+    def residuals(p):
+        traced.append(torch._C._functorch.is_functorch_wrapped_tensor(p))
+        return torch.stack([p[0] - 1, 10 * (p[1] - p[0] ** 2)])
+
+    start = torch.tensor([0.9, 0.9])
+    rts.fit(residuals, start, method="lm", steps=1)
+    assert traced == [True]
+    for options in (
+        {"steps": 2},
+        {"tolerance": 1.0},
+        {"callback": lambda step, p, loss: step == 1},
+    ):
+        traced.clear()
+        fit = rts.fit(residuals, start, method="lm", **options)
+        assert traced == [True, False] and fit.steps == 2
+
+
+@targets
+def test_patience(target):
+    start = arrays(target, np.array([1.0]))
+    flat = rts.fit(lambda p: p * 0 + 1, start, steps=100, patience=7)
+    assert (flat.steps, flat.reason) == (8, "no gain in 7 steps")
+    # Two steps gain less than a fifth.
+    slow = rts.fit(lambda p: p, start, method="sgd", learning_rate=0.02, steps=100, patience=2, tolerance=0.3)
+    assert slow.steps == 3
+    assert rts.fit(lambda p: p, start, method="sgd", learning_rate=0.02, steps=100, patience=2).steps == 100
+
+
+@targets
+def test_patience_with_a_negative_loss(target):
+    start = arrays(target, np.array([1.0]))
+    fit = rts.fit(lambda p: p * 0, start, loss=lambda r: r.sum() - 1, steps=100, patience=5)
+    assert fit.steps == 6
+
+
+@targets
+def test_lm_stops_where_steps_gain_little_or_nothing_can(target):
+    residuals, start = line(target)
+    assert "gained less than 0.5" in rts.fit(lambda p: residuals(p) ** 2 + 1, start, method="lm", tolerance=0.5).reason
+    assert rts.fit(lambda p: p * 0 + 1, start, method="lm").reason == "the gradient is zero"
+    # Away from the start the loss only rises, whatever the derivative says.
+    walled = rts.fit(lambda p: p + 1000 * (p != 0) + 1, start, method="lm")
+    assert walled.reason == "no step lowers the loss"
+    assert walled.loss == 1
+    np.testing.assert_array_equal(to_numpy(walled.parameters), np.zeros(3))
+
+
+def test_damping_grows_where_the_matrix_is_not_definite():
+    step, predicted, damping = _damped_step(np.array([[1.0, 1.5], [1.5, 1.0]]), np.array([1.0, 0.0]), 1e-3)
+    assert 0.5 < damping < LARGEST_DAMPING
+    assert step[0] < 0 and predicted > 0
+
+
+# ----------------------------------------------------------------------------------------------- going astray
+
+
+@targets
+def test_descent_that_diverges_keeps_the_best(target):
+    start = arrays(target, np.array([2.0]))
+    fit = rts.fit(lambda p: p**4 - 1, start, method="sgd", learning_rate=0.1)
+    assert "the loss is" in fit.reason and "too far" in fit.reason
+    assert all(map(math.isfinite, fit.history)) and fit.loss == min(fit.history) == fit.history[0]
+    np.testing.assert_array_equal(to_numpy(fit.parameters), [2])
+
+
+@targets
+def test_lm_shuns_trials_that_are_not_finite(target):
+    # The first trials overshoot to below zero, where a power is NaN.
+    start = arrays(target, np.array([4.0]))
+    fit = rts.fit(lambda p: p**0.1 - 0.5, start, method="lm", steps=100, tolerance=0)
+    assert any(map(math.isnan, fit.history))
+    np.testing.assert_allclose(to_numpy(fit.parameters), [0.5**10], rtol=1e-3)
+
+
+@targets
+@pytest.mark.parametrize("method", ["adam", "lm"])
+def test_what_is_not_finite_at_the_start_is_an_error(target, method):
+    start = arrays(target, np.array([0.0]))
+    with pytest.raises(InputError, match="the loss is nan at the start"):
+        rts.fit(lambda p: p + math.nan, start, method=method)
+    what = "Jacobian" if method == "lm" else "gradient"
+    with pytest.raises(InputError, match=f"the {what} is not finite at the start"):
+        rts.fit(lambda p: p**0.5 + 1, start, method=method)
+
+
+@targets
+@pytest.mark.parametrize("method", ["sgd", "lm"])
+def test_a_derivative_that_is_not_finite_later_stops(target, method):
+    # Below a half the root of zero has no derivative.
+    start = arrays(target, np.array([1.0]))
+    fit = rts.fit(lambda p: p + (abs(p - 0.5) + (p - 0.5)) ** 0.5, start, method=method)
+    assert fit.reason.startswith(f"the {'Jacobian' if method == 'lm' else 'gradient'} is not finite; ")
+    assert fit.loss == fit.history[-1] < 0.25
+    assert abs(to_numpy(fit.parameters)[0]) < 0.5
+
+
+def host(target, fn, x):
+    """A host function of the library in a trace or out of it, as samplers are."""
+    from rts.arrays import engine_of
+    from rts.protocols import ArraySpec
+
+    return engine_of(x).call_host(fn, (ArraySpec((1,), np.float32),), x)[0]
+
+
+@targets
+@pytest.mark.parametrize("jit", [True, False])
+@pytest.mark.parametrize("method", ["sgd", "lm"])
+def test_an_input_error_later_stops_and_at_the_start_is_raised(target, jit, method):
+    def refuse(x):
+        if abs(float(x[0])) < 0.7:
+            raise InputError("the vertices went away")
+        return (np.zeros(1, np.float32),)
+
+    def residuals(p):
+        return p * p + host(target, refuse, p)
+
+    fit = rts.fit(
+        residuals,
+        arrays(target, np.array([2.0])),
+        method=method,
+        learning_rate=0.01 if method == "sgd" else None,
+        jit=jit,
+    )
+    assert fit.reason == "the vertices went away"
+    assert fit.steps >= 2 and fit.loss == min(fit.history) < fit.history[0]
+    assert 0.7 <= to_numpy(fit.parameters)[0] < 2
+    with pytest.raises(InputError, match="^the vertices went away"):
+        rts.fit(residuals, arrays(target, np.array([0.5])), method=method, jit=jit)
+
+
+@targets
+def test_other_errors_are_never_kept_quiet(target):
+    def residuals(error):
+        def fail(x):
+            if float(x[0]) < 1:
+                raise error
+            return (np.zeros(1, np.float32),)
+
+        return lambda p: p + host(target, fail, p)
+
+    start = arrays(target, np.array([2.0]))
+    with pytest.raises(PluginError, match="no driver"):
+        rts.fit(residuals(PluginError("no driver")), start, method="sgd", learning_rate=0.3)
+    with pytest.raises(Exception, match="a bug") as caught:
+        rts.fit(residuals(ZeroDivisionError("a bug")), start, method="sgd", learning_rate=0.3)
+    assert not isinstance(caught.value, rts.RtsError)
+
+
+def test_an_older_error_is_not_taken_for_a_new_one():
+    jax = pytest.importorskip("jax")
+
+    def refuse(x):
+        raise InputError("old")
+
+    with pytest.raises(jax.errors.JaxRuntimeError, match="old"):
+        jax.block_until_ready(jax.jit(lambda x: host("jax", refuse, x))(jax.numpy.ones(1)))
+    with pytest.raises(ZeroDivisionError):
+        rts.fit(lambda p: 1 / 0, jax.numpy.ones(1))
+
+
+# -------------------------------------------------------------------------------------------------- arguments
+
+
+@targets
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"method": "newton"}, "method is 'newton'; expected one of adam, sgd, lm"),
+        ({"steps": 0}, "steps is 0; expected a whole number"),
+        ({"steps": True}, "steps is True"),
+        ({"steps": 2.5}, "steps is 2.5"),
+        ({"learning_rate": 0}, "learning_rate is 0; expected a positive number"),
+        ({"learning_rate": -1.0}, "learning_rate is -1.0"),
+        ({"learning_rate": math.inf}, "learning_rate is inf"),
+        ({"learning_rate": math.nan}, "learning_rate is nan"),
+        ({"learning_rate": "fast"}, "learning_rate is 'fast'"),
+        ({"tolerance": -1e-3}, "tolerance is -0.001"),
+        ({"tolerance": math.nan}, "tolerance is nan"),
+        ({"tolerance": None}, "tolerance is None"),
+        ({"patience": 0}, "patience is 0"),
+        ({"method": "lm", "loss": lambda r: r.sum()}, "takes no other loss"),
+        ({"loss": lambda r: r}, r"loss gave an array of shape \(3,\); expected a \w+ scalar"),
+        ({"loss": lambda r: 1.0}, "loss gave a float; expected"),
+        ({"loss": lambda r: None}, "loss gave None"),
+    ],
+)
+def test_wrong_options(target, options, expected):
+    with pytest.raises(InputError, match=expected) as error:
+        rts.fit(lambda p: p, arrays(target, np.ones(3)), **options)
+    assert "\n" not in str(error.value)
+
+
+@targets
+@pytest.mark.parametrize("method", ["adam", "lm"])
+@pytest.mark.parametrize(
+    ("result", "expected"),
+    [
+        (lambda p: None, "residuals gave None; expected one"),
+        (lambda p: [p, p], "residuals gave a list"),
+        (lambda p: 1.0, "residuals gave a float"),
+        (lambda p: np.ones(3), "residuals gave a numpy.ndarray"),
+        (lambda p: p > 0, "dtype .*bool; expected floats"),
+        (lambda p: p[:0], r"shape \(0,\)"),
+    ],
+)
+def test_residuals_that_are_none(target, method, result, expected):
+    with pytest.raises(InputError, match=expected) as error:
+        rts.fit(result, arrays(target, np.ones(3)), method=method)
+    assert "\n" not in str(error.value)
+
+
+def test_residuals_of_another_engine():
+    torch, jax = _torch(), pytest.importorskip("jax")
+    with pytest.raises(InputError, match="expected one torch array"):
+        rts.fit(lambda p: jax.numpy.ones(2), torch.ones(2))
+    with pytest.raises(InputError, match="residuals gave a torch.Tensor; expected one jax array"):
+        rts.fit(lambda p: torch.ones(2), jax.numpy.ones(2))
+
+
+@targets
+def test_parameters_that_cannot_be_optimised(target):
+    for wrong in (np.ones(3), 1.0, [], {}, None, {"a": arrays(target, np.ones(3)), "b": np.ones(2)}):
+        with pytest.raises(InputError, match="expected torch or jax arrays"):
+            rts.fit(lambda p: p, wrong)
+    with pytest.raises(InputError, match="dtype .*int"):
+        rts.fit(lambda p: p, {"a": arrays(target, np.ones(3, np.int32))})
+    with pytest.raises(EngineError, match="belongs to no engine"):
+        rts.fit(lambda p: p, "pose")
+
+
+def test_the_progress_bar(capsys):
+    rts.fit(lambda p: p, _torch().ones(2), steps=3, progress=True)
+    assert "loss" in (shown := capsys.readouterr().err) and "ms/iteration" in shown and "3/3" in shown
+    rts.fit(lambda p: p, _torch().ones(2), steps=3)
+    assert capsys.readouterr().err == ""
+
+
+# ----------------------------------------------------------------------------------------------- rigid poses
+
+
+def test_rigid_equals_scipy_on_both_sides_of_the_threshold():
+    rng = np.random.default_rng(0)
+    axes = rng.normal(size=(60, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    angles = [0.0, 1e-9, 1e-4, 0.05, 0.0999999, 0.1, 0.1000001, 0.2, 1.0, 3.0, math.pi, 2 * math.pi, 7.0]
+    for axis, angle in zip(axes, [*angles, *rng.uniform(0, 0.3, 47)], strict=True):
+        vector = axis * angle
+        matrix = rts.rigid(np.array([*vector, 1.0, 2.0, 3.0]))
+        np.testing.assert_allclose(matrix[:3, :3], Rotation.from_rotvec(vector).as_matrix(), atol=1e-12)
+        np.testing.assert_allclose(matrix[:, 3], [1, 2, 3, 1], atol=1e-15)
+
+
+@targets
+def test_rigid_in_float32(target):
+    for angle in (0.0, 0.0999, 0.1001, 2.0):
+        vector = np.array([0.6, 0.0, 0.8]) * angle
+        matrix = to_numpy(rts.rigid(arrays(target, np.array([*vector, 0, 0, 0]))))
+        np.testing.assert_allclose(matrix[:3, :3], Rotation.from_rotvec(vector).as_matrix(), atol=1e-6)
+
+
+@targets
+def test_rigid_is_the_identity_at_zero_with_its_derivatives(target):
+    zero = arrays(target, np.zeros(6))
+    np.testing.assert_array_equal(to_numpy(rts.rigid(zero)), np.eye(4))
+    point = arrays(target, np.array([0.3, -0.7, 0.5, 1.0]))
+    weights = arrays(target, np.array([1.0, 2.0, -1.0, 0.0]))
+
+    def f(pose):
+        return (rts.rigid(pose) @ point) @ weights
+
+    # d(R p)/dω at zero is the cross product.
+    expected = [*np.cross(to_numpy(point)[:3], to_numpy(weights)[:3]), *to_numpy(weights)[:3]]
+    np.testing.assert_allclose(gradient(target, f, zero), expected, atol=1e-6)
+    p, w = to_numpy(point)[:3].astype(float), to_numpy(weights)[:3].astype(float)
+    # R p = p + ω × p + ω × (ω × p) / 2 + …: the Hessian is (w pᵀ + p wᵀ) / 2 − (w · p) I.
+    hessian = np.zeros((6, 6))
+    hessian[:3, :3] = (np.outer(w, p) + np.outer(p, w)) / 2 - (w @ p) * np.eye(3)
+    func = pytest.importorskip("jax") if target == "jax" else _torch().func
+    np.testing.assert_allclose(to_numpy(func.hessian(f)(zero)), hessian, atol=1e-5)
+
+
+def test_the_derivative_of_rigid_at_an_angle():
+    torch = _torch()
+    weights = np.random.default_rng(2).normal(size=(4, 4))
+    for angle in (0.03, 0.1, 0.5):
+        pose = np.array([0.6 * angle, 0, 0.8 * angle, 0.1, 0.2, 0.3])
+        tensor = torch.tensor(pose)
+
+        def f(p):
+            return (rts.rigid(p, (0.5, 0, 1)) * torch.as_tensor(weights)).sum()
+
+        numeric = finite_difference(lambda p: np.sum(rts.rigid(p, (0.5, 0, 1)) * weights), pose)
+        np.testing.assert_allclose(gradient("torch-cpu", f, tensor), numeric, atol=1e-8)
+        tangent = np.arange(6.0)
+        _, slope = derivative("torch-cpu", f, tensor, torch.tensor(tangent))
+        assert float(slope) == pytest.approx(numeric @ tangent, abs=1e-7)
+
+
+def test_rigid_turns_about_the_centre_and_takes_lists():
+    center = np.array([1.0, -2.0, 0.5])
+    matrix = rts.rigid([0, 0, 0.7, 0.1, 0.2, 0.3], center)
+    np.testing.assert_allclose(matrix @ [*center, 1], [1.1, -1.8, 0.8, 1], atol=1e-12)
+    np.testing.assert_allclose(matrix[:3, :3], rotation((0, 0, 1), np.degrees(0.7)), atol=1e-12)
+    np.testing.assert_array_equal(matrix, rts.rigid(np.array([0, 0, 0.7, 0.1, 0.2, 0.3]), center))
+    for wrong in ([0, 0, 0], np.zeros((6, 1)), 3.0, None):
+        with pytest.raises(InputError, match=r"expected \(6,\)"):
+            rts.rigid(wrong)
+
+
+# ---------------------------------------------------------------------------------------------- silhouettes
+
+SIZE = (40, 40)
+POSE = np.array([0.12, -0.18, 0.1, 0.06, -0.05, 0.08], np.float32)
+
+
+def block():
+    """A crooked box: no turn maps it to itself."""
+    vertices, faces = box(0.5)
+    vertices = vertices * np.array([1.5, 0.9, 0.6], np.float32)
+    vertices *= 1 + np.random.default_rng(3).uniform(-0.2, 0.2, vertices.shape).astype(np.float32)
+    return rts.Part(rts.plugin("surfaces", "mesh")(faces), {"vertices": vertices})
+
+
+def silhouette_residuals(target, splatter):
+    camera = rts.Camera.look_at((0.9, 0.8, 2.2), (0, 0, 0), fov_y=40)
+    part = block()
+
+    def silhouette(pose):
+        moved = part.replace(transform=rts.rigid(pose))
+        return rts.render(moved, camera, SIZE, layers=1, splatter=splatter)[..., 3]
+
+    goal = arrays(target, silhouette(POSE.astype(np.float64)))
+    return lambda pose: silhouette(pose) - goal
+
+
+@pytest.mark.parametrize(
+    ("target", "method", "options"),
+    [
+        ("torch-cpu", "lm", {}),
+        ("torch-cpu", "adam", {"steps": 250, "learning_rate": 0.01}),
+        ("jax", "lm", {}),
+    ],
+)
+def test_a_pose_is_recovered_from_a_silhouette(target, method, options):
+    residuals, start = silhouette_residuals(target, "single"), arrays(target, np.zeros(6))
+    fit = rts.fit(residuals, start, method=method, **options)
+    assert fit.loss < fit.history[0] / 50
+    np.testing.assert_allclose(to_numpy(fit.parameters), POSE, atol=0.03)
+
+
+@pytest.mark.parametrize("method", ["lm", "adam"])
+def test_plain_rasterization_moves_nothing(method):
+    residuals, start = silhouette_residuals("torch-cpu", "none"), arrays("torch-cpu", np.zeros(6))
+    fit = rts.fit(residuals, start, method=method, steps=60)
+    np.testing.assert_array_equal(fit.parameters, start)
+    assert fit.loss == fit.history[0]
+    assert fit.reason == ("the gradient is zero" if method == "lm" else "no gain in 50 steps")
+
+
+@targets
+def test_vertices_that_become_nan_stop_the_fit(target):
+    residuals = silhouette_residuals(target, "single")
+    start = arrays(target, np.zeros(6))
+    fit = rts.fit(lambda pose: residuals(pose / (pose == 0)), start, method="sgd", steps=4)
+    assert "NaN" in fit.reason and fit.steps == 1
+    np.testing.assert_array_equal(to_numpy(fit.parameters), np.zeros(6))
