@@ -9,7 +9,7 @@ from rts.choosing import explain
 from rts.errors import EngineError, InputError, PluginError, RtsError
 from rts.fitting import Fit, fit
 from rts.preparing import prepare
-from rts.protocols import Fragments, GBuffer, Part, Proxy, Sampled, Samples
+from rts.protocols import Fragments, GBuffer, Part, Proxy, RayHits, Sampled, Samples
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples, sample
 from rts.sampling import TriangleSampler
@@ -26,6 +26,7 @@ __all__ = [
     "Part",
     "PluginError",
     "Proxy",
+    "RayHits",
     "RtsError",
     "Sampled",
     "Samples",

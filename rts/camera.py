@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import affine, is_constant, matmul, namespace, promote
+from rts.arrays import affine, engine_of, is_constant, matmul, namespace, promote
 from rts.protocols import Array, Rays
 from rts.transforms import (
     affine_matrix,
@@ -315,22 +315,28 @@ class Camera(NamedTuple):
         return at[..., 0:1] * r[0, :] + at[..., 1:2] * r[1, :] + at[..., 2:3] * r[2, :] + axis
 
     def rays(self, size: tuple[int, int]) -> Rays:
-        """Rays (H, W, 3) through the pixel centres of a NumPy camera, world space, float64."""
+        """Rays (H, W, 3) through the pixel centres, world space; differentiable."""
+        xp, (view, p) = promote(self.view, self.projection)
+        engine = engine_of(view)
         height, width = size
-        view, projection = np.asarray(self.view, np.float64), np.asarray(self.projection, np.float64)
-        x = (np.arange(width) + 0.5) * 2 / width - 1
-        y = 1 - (np.arange(height) + 0.5) * 2 / height
-        ndc = np.stack([*np.broadcast_arrays(x[None, :], y[:, None])], axis=-1)
-        # A point at depth z has clip (a − z b): solve the two rows x = X w, y = Y w for the camera-space x and y.
-        p = projection
-        a = p[:2, :2] - ndc[..., :, None] * p[3, :2]
-        constant = ndc * p[3, 3] - p[:2, 3]
-        slope = p[:2, 2] - ndc * p[3, 2]
-        start, step = (np.linalg.solve(a, b[..., None])[..., 0] for b in (constant, slope))
-        zero, one = np.zeros((height, width, 1)), np.ones((height, width, 1))
-        inverse = np.linalg.inv(view)
-        origins = np.concatenate([start, zero], -1) @ inverse[:3, :3].T + inverse[:3, 3]
-        return Rays(origins, np.concatenate([step, -one], -1) @ inverse[:3, :3].T)
+        x = engine.constant((np.arange(width) + 0.5) * 2 / width - 1, view)[None, :]
+        y = engine.constant(1 - (np.arange(height) + 0.5) * 2 / height, view)[:, None]
+        # A camera-space point (X, Y, −z) is seen at NDC (x, y) where two linear equations hold; Cramer's rule solves
+        # them for (X, Y) = start + z step.
+        a, b = p[0, 0] - x * p[3, 0], p[0, 1] - x * p[3, 1]
+        c, d = p[1, 0] - y * p[3, 0], p[1, 1] - y * p[3, 1]
+        determinant = a * d - b * c
+
+        def solved(u: Array, v: Array, z: float) -> Array:
+            right, up = (d * u - b * v) / determinant, (a * v - c * u) / determinant
+            return xp.stack([right, up, z * xp.ones_like(right)], axis=-1)
+
+        start = solved(x * p[3, 3] - p[0, 3], y * p[3, 3] - p[1, 3], 0.0)
+        step = solved(p[0, 2] - x * p[3, 2], p[1, 2] - y * p[3, 2], -1.0)
+        inverse = xp.linalg.inv(view)
+        linear = xp.concat([inverse[:3, :3], xp.zeros_like(inverse[:3, :1])], axis=1)
+        origins = xp.stack([affine(inverse[i, :], start) for i in range(3)], axis=-1)
+        return Rays(origins, xp.stack([affine(linear[i, :], step) for i in range(3)], axis=-1))
 
 
 def _alike(view: Array, projection: Array) -> tuple[Array, Array]:

@@ -110,6 +110,22 @@ class Rays(NamedTuple):
     directions: Array
 
 
+class RayHits(NamedTuple):
+    """Where R rays meet a surface that intersects them itself, nearest first, K for each.
+
+    Attributes:
+        hit: (K, R) bool, whether there is such a hit; those of a ray come first.
+        distance: (K, R) the hit is at `origin + distance * direction`; any finite number where there is none.
+        params: (K, R, P) what `evaluate` finds in `Samples.params`; finite where there is no hit, too.
+        ids: (K, R, I) int32, or None for I = 0.
+    """
+
+    hit: Array
+    distance: Array
+    params: Array
+    ids: Array | None = None
+
+
 @record(static=("asked", "centered"))
 class Samples:
     """Where the rays of one part meet its surface: the paper's U, packed.
@@ -222,6 +238,28 @@ class Surface(Protocol):
         ...
 
 
+class RaySurface(Protocol):
+    """A surface without triangles, for the sampler `rays`. The optional members of `Surface` apply, as far as they go."""
+
+    sample_widths: tuple[int, int]
+    """(I, P) of the samples."""
+
+    def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
+        """See `Surface.evaluate`."""
+        ...
+
+    def intersect(self, theta: Mapping[str, Tree], origins: Array, directions: Array, layers: int) -> RayHits:
+        """The `layers` nearest hits of each ray at distances of at least 0; on the device, perhaps traced.
+
+        Args:
+            theta: θ without derivatives.
+            origins: (R, 3), local space.
+            directions: (R, 3), not of unit length; distances are in units of them.
+            layers: K.
+        """
+        ...
+
+
 class Sampler(Protocol):
     """Finds where rays meet one part; the step without derivative."""
 
@@ -290,6 +328,10 @@ class Engine(Protocol):
 
     def call_host(self, fn: Callable, specs: tuple[ArraySpec, ...], *args: Array) -> tuple[Array, ...]:
         """Call `fn` on NumPy copies of `args`; the results carry no derivative and live where `args` do."""
+        ...
+
+    def stop_gradient(self, x: Array) -> Array:
+        """The same values without derivatives."""
         ...
 
     def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> Array:

@@ -237,7 +237,7 @@ def check_camera(camera: Camera) -> None:
     for name, matrix in zip(("view", "projection"), camera, strict=True):
         if not np.isfinite(matrix).all():
             raise InputError(f"the camera's {name} matrix holds NaN or infinity; check how it was made")
-    # Far from the origin, or at lengths far from one, a matrix is none the worse: its rows and columns are scaled alike.
+    # Far from the origin, or at lengths far from one, a matrix is none the worse: so rows and columns are scaled.
     projection = camera.projection
     for axis in (1, 0):
         length = np.linalg.norm(projection, axis=axis, keepdims=True)

@@ -81,6 +81,10 @@ class JaxEngine:
         error, self._error = self._error, None
         return error
 
+    def stop_gradient(self, x: jax.Array) -> jax.Array:
+        """`jax.lax.stop_gradient`."""
+        return jax.lax.stop_gradient(x)
+
     def segment_sum(self, values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:
         """Sums of the rows of `values` that share a segment."""
         return jax.ops.segment_sum(values, jnp.asarray(segments), num_segments=count)

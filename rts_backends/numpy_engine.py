@@ -39,6 +39,10 @@ class NumpyEngine:
         """Call `fn`: everything is on the host already."""
         return fn(*args)
 
+    def stop_gradient(self, x: Array) -> Array:
+        """`x` itself."""
+        return x
+
     def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> np.ndarray:
         """Sums of the rows of `values` that share a segment."""
         return np.stack([np.bincount(segments, weights=v, minlength=count) for v in values.T], axis=-1).astype(

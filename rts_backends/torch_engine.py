@@ -96,6 +96,10 @@ class TorchEngine:
             return torch.compiler.disable(_HostCall.apply)(fn, specs, *args)
         return _HostCall.apply(fn, specs, *args)
 
+    def stop_gradient(self, x: torch.Tensor) -> torch.Tensor:
+        """`x` detached."""
+        return x.detach()
+
     def segment_sum(self, values: torch.Tensor, segments: np.ndarray, count: int) -> torch.Tensor:
         """Sums of the rows of `values` that share a segment."""
         index = _tensor(segments, values.device)

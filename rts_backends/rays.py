@@ -1,0 +1,61 @@
+"""For surfaces that intersect rays themselves: no triangles at all."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.arrays import constants, engine_of, exemplar, map_leaves, namespace
+from rts.camera import Camera
+from rts.errors import InputError
+from rts.protocols import ArraySpec, Part, Samples
+
+
+class Rays:
+    """Casts a ray through every pixel's centre, on the device, so that a traced function may hold the surface."""
+
+    def sample(
+        self, part: Part, camera: Camera, size: tuple[int, int], layers: int, *, capacity: int | None = None
+    ) -> Samples:
+        """See `rts.protocols.Sampler`."""
+        surface = part.surface
+        if not hasattr(surface, "intersect"):
+            raise InputError(f"{surface!r} does not intersect rays itself; use a sampler of triangles, such as 'raster'")
+        if part.cull != "none":
+            raise InputError(f"cull is {part.cull!r}, but the sampler 'rays' has no triangles to cull; expected 'none'")
+        engine, like = engine_of(part.theta, camera), exemplar(part.theta, camera)
+        theta = map_leaves(engine.stop_gradient, constants(part.theta, engine, like))
+        camera = map_leaves(engine.stop_gradient, constants(camera, engine, like))
+        xp = namespace(camera.view)
+
+        p = camera.projection
+        # Clip z = ∓w at the planes, with z = −depth.
+        near, far = (p[2, 3] + p[3, 3]) / (p[2, 2] + p[3, 2]), (p[2, 3] - p[3, 3]) / (p[2, 2] - p[3, 2])
+        rays = camera.rays(size)
+        directions = xp.reshape(rays.directions, (-1, 3))
+        origins = xp.reshape(rays.origins, (-1, 3)) + near * directions
+        hits = surface.intersect(theta, origins, directions, layers)
+        depth = near + hits.distance
+        hit = xp.reshape(hits.hit & (hits.distance >= 0) & (depth <= far), (layers, *size))
+
+        cells = layers * size[0] * size[1]
+        rows = cells if capacity is None else capacity
+
+        def pack(hit: np.ndarray) -> tuple[np.ndarray, ...]:
+            found = np.flatnonzero(hit)
+            row = np.full(cells, -1, np.int32)
+            row[found[:rows]] = np.arange(min(rows, len(found)), dtype=np.int32)
+            index = np.zeros(max(1, len(found)) if capacity is None else rows, np.int32)
+            index[: len(found)] = found[: len(index)]
+            return index, row.reshape(hit.shape), np.asarray(max(0, len(found) - rows), np.int32)
+
+        packed = ArraySpec((rows,), np.int32, packed=capacity is None)
+        specs = packed, ArraySpec((layers, *size), np.int32), ArraySpec((), np.int32)
+        index, row, overflow = engine.call_host(pack, specs, hit)
+        width_i, width_p = surface.sample_widths
+        params = xp.take(xp.reshape(hits.params, (cells, width_p)), index, axis=0)
+        if hits.ids is None:
+            ids = xp.zeros_like(params[:, :0], dtype=xp.int32)
+        else:
+            ids = xp.take(xp.reshape(hits.ids, (cells, width_i)), index, axis=0)
+        depth = xp.where(row >= 0, xp.reshape(depth, (layers, *size)), 0.0)
+        return Samples(ids, params, row, depth, overflow)
