@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -31,24 +33,52 @@ Examples:
 """
 
 
+# The base of BadParameter is click's UsageError, under whatever name typer has click.
+UsageError: Any = typer.BadParameter.__base__
+
+
 class _Group(TyperGroup):
     """Commands whose expected errors are one line on standard error, without a traceback."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Let --debug stand anywhere; without arguments, show the help."""
+        end = args.index("--") if "--" in args else len(args)
+        if "--debug" in args[:end]:
+            args = ["--debug", *(a for a in args[:end] if a != "--debug"), *args[end:]]
+        with _one_line(ctx):
+            return super().parse_args(ctx, args or ["--help"])
+
     def invoke(self, ctx: Any) -> Any:
-        try:
+        with _one_line(ctx):
             return super().invoke(ctx)
-        except (RtsError, OSError) as error:
-            if ctx.params.get("debug"):
-                raise
-            typer.echo(f"rts: {error}", err=True)
-            raise typer.Exit(1) from error
+
+
+@contextlib.contextmanager
+def _one_line(ctx: Any) -> Iterator[None]:
+    """Turn errors into a line on standard error and an exit code: 2 for wrong usage, else 1."""
+    try:
+        yield
+    except UsageError as error:
+        command = error.ctx.info_name if error.ctx is not None and error.ctx.parent else ctx.invoked_subcommand
+        help_ = " ".join(filter(None, ("rts", command, "--help")))
+        _fail(error, f"{error.format_message().rstrip('.')}; try '{help_}'", 2)
+    except BrokenPipeError:  # The reader of our output has gone; click knows what to do.
+        raise
+    except (RtsError, OSError) as error:
+        if ctx.params.get("debug"):
+            raise
+        _fail(error, str(error), 1)
+
+
+def _fail(error: Exception, message: str, code: int) -> None:
+    typer.echo(f"rts: {' '.join(message.split())}", err=True)
+    raise typer.Exit(code) from error
 
 
 app = typer.Typer(
     cls=_Group,
     help="Differentiable surface rendering by rasterize-then-splat.\n" + EXAMPLES,
     rich_markup_mode="markdown",
-    no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
@@ -116,7 +146,7 @@ Camera_ = Annotated[
 ]
 Fov = Annotated[float, typer.Option(help="Vertical field of view in degrees.")]
 Up = Annotated[str, typer.Option(help="The axis that is upright: y or z.")]
-Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error; may stand anywhere.")]
 
 
 def _show_version(wanted: bool) -> None:
@@ -167,8 +197,10 @@ def render(
     """Render a model to a picture."""
     import rts
     from rts.framing import bounds_of, orbit
+    from rts.scenes import output_file
 
     shape, view, color = _size(size), _view(camera), _background(background)
+    output_file(output, "picture", (".png",))
     chosen = registry.plugin("rts.engines", engine)()
     parts = rts.load(model)
     bounds = bounds_of(parts)
@@ -196,13 +228,14 @@ def render(
     )
     seconds = time.perf_counter() - start
     rts.save_image(output, image)
-    triangles = sum(len(p.surface.faces) for p in parts)
-    _say(f"{triangles} triangles, {shape[0]} x {shape[1]} pixels, {seconds * 1e3:.0f} ms; wrote {escape(str(output))}")
+    what = repr(parts[0].surface) if len(parts) == 1 else f"{len(parts)} parts"
+    _say(escape(f"{what}, {shape[0]} x {shape[1]} pixels, {seconds * 1e3:.0f} ms; wrote {output}"))
 
 
 @app.command(
     "fit-pose",
-    epilog="Example: rts render teapot.obj -o target.png --camera 45,30 && rts fit-pose teapot.obj target.png -o found",
+    epilog="Example: rts render bunny.obj -o mask.png --shader silhouette --splatter single --layers 1 "
+    "--camera 45,30 && rts fit-pose bunny.obj mask.png -o found",
 )
 def fit_pose(
     model: Annotated[Path, typer.Argument(help="The model, seen by the camera in roughly the right pose.")],
@@ -226,8 +259,10 @@ def fit_pose(
     import rts
     from rts import pose
     from rts.framing import bounds_of, orbit
+    from rts.scenes import output_folder
 
     view = _view(camera)
+    output_folder(output)
     parts = rts.load(model)
     mask = pose.silhouette_of(rts.load_image(target))
     bounds = bounds_of(parts)
@@ -250,7 +285,9 @@ def demo(
 ) -> None:
     """Recover the pose of a knot from its silhouette: no input needed, pictures and a summary written."""
     from rts.demo import run
+    from rts.scenes import output_folder
 
+    output_folder(output)
     found, files = run(output, None if engine == "auto" else engine)
     _say(f"pose found in {len(found.history)} steps, {found.seconds:.1f} s; wrote")
     _say_written(files)

@@ -59,7 +59,8 @@ def run(folder: Path, engine: str | None = None, progress: bool | None = None) -
     floor = ground(float(bounds.center[1] - 1.02 * bounds.radius))
     camera = orbit(bounds._replace(radius=1.25 * bounds.radius), SIZE, 28, 24)
     true = np.asarray(rigid(np.array([*TRUE_ROTATION, *TRUE_TRANSLATION]), bounds.center))
-    target = silhouette_of(render(posed(model, true, "silhouette"), camera, SIZE))
+    # One layer, splatted as the fit does: two would widen the outline, as the knot's back faces are not culled.
+    target = silhouette_of(render(posed(model, true, "silhouette"), camera, SIZE, splatter="single", layers=1))
     found = fit_pose(model, target, camera, bounds, engine=engine, progress=progress)
     files = write_report(folder, found, model, camera, target, scenery=[floor])
     errors = {

@@ -153,6 +153,31 @@ def _in_scene(piece: Piece) -> Piece:
 # ------------------------------------------------------------------------------------------------ pictures
 
 
+def output_file(path: Any, what: str, extensions: tuple[str, ...]) -> Path:
+    """The path of a file to write.
+
+    Raises:
+        InputError: another extension, a folder of that name, or a file where a folder ought to be.
+    """
+    path = as_path(path)
+    if path.suffix.lower() not in extensions:
+        expected = " or ".join(filter(None, (", ".join(extensions[:-1]), extensions[-1])))
+        raise InputError(f"the {what} is to be called {path.name!r}; expected a name ending in {expected}")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; expected the name of a file to write")
+    output_folder(path.parent)
+    return path
+
+
+def output_folder(path: Any) -> Path:
+    """The path of a folder to write into, which need not exist; an InputError where it cannot be made."""
+    path = as_path(path)
+    existing = next((p for p in (path, *path.parents) if p.exists()), path)
+    if existing.exists() and not existing.is_dir():
+        raise InputError(f"{existing} is a file; expected a folder to write into")
+    return path
+
+
 def save_image(path: Any, image: Array) -> None:
     """Write a PNG.
 
@@ -162,13 +187,11 @@ def save_image(path: Any, image: Array) -> None:
             clipped.
 
     Raises:
-        InputError: another shape, integers, NaN or infinity, or another extension.
+        InputError: another shape, integers, NaN or infinity, another extension, or a path that cannot be.
     """
     from PIL import Image
 
-    path = as_path(path)
-    if path.suffix.lower() != ".png":
-        raise InputError(f"the picture is to be called {path.name!r}; expected a name ending in .png")
+    path = output_file(path, "picture", (".png",))
     encoded = _bytes(image)
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(encoded).save(path)
@@ -194,15 +217,13 @@ def save_animation(path: Any, frames: Iterable[Array], fps: float = 20.0) -> Non
         fps: frames a second.
 
     Raises:
-        InputError: no frames, a wrong or changing shape, NaN or infinity, or another extension.
+        InputError: no frames, a wrong or changing shape, NaN or infinity, another extension, or a path that cannot be.
         PluginError: .mp4 without imageio-ffmpeg.
     """
     from PIL import Image
 
-    path = as_path(path)
+    path = output_file(path, "animation", (".gif", ".png", ".mp4"))
     kind = path.suffix.lower()
-    if kind not in (".gif", ".png", ".mp4"):
-        raise InputError(f"the animation is to be called {path.name!r}; expected a name ending in .gif, .png or .mp4")
     if not (np.isfinite(fps) and fps > 0):
         raise InputError(f"fps is {fps}; expected a positive number of frames a second")
     pictures = [_bytes(_on_white(_host(frame))) for frame in frames]
