@@ -19,7 +19,9 @@ class Rays:
         """See `rts.protocols.Sampler`."""
         surface = part.surface
         if not hasattr(surface, "intersect"):
-            raise InputError(f"{surface!r} does not intersect rays itself; use a sampler of triangles, such as 'raster'")
+            raise InputError(
+                f"{surface!r} does not intersect rays itself; use a sampler of triangles, such as 'raster'"
+            )
         if part.cull != "none":
             raise InputError(f"cull is {part.cull!r}, but the sampler 'rays' has no triangles to cull; expected 'none'")
         engine, like = engine_of(part.theta, camera), exemplar(part.theta, camera)

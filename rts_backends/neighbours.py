@@ -1,0 +1,101 @@
+"""Hits of a rasterizer that snaps vertices, settled exactly: each goes to the triangle that truly covers the pixel."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
+
+WALK = 16
+"""Steps from triangle to triangle at most."""
+
+
+@numba.njit(cache=True, nogil=True)
+def corner_lists(faces, count):
+    """For each of `count` vertices the triangles around it: offsets (V + 1,) into members (3 T,)."""
+    offsets = np.zeros(count + 1, np.int32)
+    for t in range(len(faces)):
+        for c in range(3):
+            offsets[faces[t, c] + 1] += 1
+    for v in range(count):
+        offsets[v + 1] += offsets[v]
+    members, filled = np.empty(3 * len(faces), np.int32), offsets[:-1].copy()
+    for t in range(len(faces)):
+        for c in range(3):
+            v = faces[t, c]
+            members[filled[v]] = t
+            filled[v] += 1
+    return offsets, members
+
+
+@numba.njit
+def _look(t, x, y, matrix, row, keep, vertices, faces, corners):
+    """Whether a triangle covers a pixel exactly, its least barycentric there, its depth, two barycentrics."""
+    ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
+    to_corner(matrix, vertices, ia, corners, 0)
+    to_corner(matrix, vertices, ib, corners, 1)
+    to_corner(matrix, vertices, ic, corners, 2)
+    area = determinant(corners, 0, 1, 2)
+    if not (area * keep > 0 or (keep == 0 and area != 0)):
+        return False, -np.inf, 0.0, 0.0, 0.0
+    ea, eb, ec, inside = edge_values(corners, 0, 1, 2, x, y)
+    total = ea + eb + ec
+    if not total > 0 or clipped(corners, 0, 1, 2, ea, eb, ec):
+        return False, -np.inf, 0.0, 0.0, 0.0
+    za, zb, zc = depth_of(row, vertices, ia), depth_of(row, vertices, ib), depth_of(row, vertices, ic)
+    z = (ea * za + eb * zb + ec * zc) / total
+    return inside, min(ea, eb, ec) / total, z, ea / total, eb / total
+
+
+@numba.njit(cache=True, nogil=True)
+def settle(
+    first, last, matrix, row, keep, vertices, faces, offsets, members, triangle_ids, barycentrics, depths
+):  # fmt: skip
+    """Settle the hits of some rows of pixels: fill barycentrics and depths, correct ids, drop what covers nothing."""
+    layers, _, width = triangle_ids.shape
+    corners = np.empty((3, 4))
+    found, found_z, found_b = np.empty(layers, np.int32), np.empty(layers), np.empty((layers, 2))
+    for j in range(first, last):
+        y = j + 0.5
+        for i in range(width):
+            x, count = i + 0.5, 0
+            for k in range(layers):
+                t = triangle_ids[k, j, i]
+                if t < 0:
+                    break
+                inside, least, z, a, b = _look(t, x, y, matrix, row, keep, vertices, faces, corners)
+                for _ in range(WALK):
+                    if inside:
+                        break
+                    # The best of the triangles around this one; none better means that the surface ends here.
+                    best, best_least, best_z, best_a, best_b, best_inside = t, least, z, a, b, False
+                    for c in range(3):
+                        v = faces[t, c]
+                        for at in range(offsets[v], offsets[v + 1]):
+                            s = members[at]
+                            inside_s, least_s, z_s, a_s, b_s = _look(
+                                s, x, y, matrix, row, keep, vertices, faces, corners
+                            )
+                            if (inside_s and not best_inside) or (inside_s == best_inside and least_s > best_least):
+                                best, best_least, best_z = s, least_s, z_s
+                                best_a, best_b, best_inside = a_s, b_s, inside_s
+                    if best == t:
+                        break
+                    t, least, z, a, b, inside = best, best_least, best_z, best_a, best_b, best_inside
+                known = not inside
+                for n in range(count):
+                    known = known or found[n] == t
+                if known:
+                    continue
+                at = count
+                while at > 0 and (z < found_z[at - 1] or (z == found_z[at - 1] and t < found[at - 1])):
+                    found[at], found_z[at], found_b[at] = found[at - 1], found_z[at - 1], found_b[at - 1]
+                    at -= 1
+                found[at], found_z[at], found_b[at, 0], found_b[at, 1] = t, z, a, b
+                count += 1
+            for k in range(layers):
+                triangle_ids[k, j, i] = found[k] if k < count else -1
+                depths[k, j, i] = found_z[k] if k < count else 0
+                barycentrics[k, j, i, 0] = found_b[k, 0] if k < count else 0
+                barycentrics[k, j, i, 1] = found_b[k, 1] if k < count else 0

@@ -1,0 +1,197 @@
+"""Depth peeling with OpenGL ≥ 3.3, headless.
+
+Each pass draws the triangles beyond those of the pass before and keeps the nearest, into an integer target: the triangle
+and its quantised depth. The order (depth, triangle) is total, so coplanar triangles peel one by one. Hardware snaps
+vertices to fractions of a pixel; so each hit is then decided in float64 by the edge functions of
+`rts_backends.triangles`, and passed on to the neighbour that truly covers the pixel's centre.
+"""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any
+
+import moderngl
+import numpy as np
+
+from rts.camera import Camera
+from rts.protocols import Fragments, Proxy
+from rts.sampling import TriangleSampler
+from rts_backends.neighbours import corner_lists, settle
+from rts_backends.opengl_worker import Worker
+from rts_backends.threads import parallel
+from rts_backends.triangles import facing, pixel_matrix
+
+TARGETS = 4
+"""Framebuffers kept, one a size."""
+
+DEPTH_STEPS = 2**22
+"""Quantised depths; the 24 bits of a depth buffer hold each exactly."""
+
+VERTEX = """
+#version 330
+uniform mat4 clip_from_unit;
+in vec3 position;
+void main() { gl_Position = clip_from_unit * vec4(position, 1.0); }
+"""
+FRAGMENT = f"""
+#version 330
+uniform isampler2D last;
+uniform bool peeling;
+out ivec2 found;
+void main() {{
+    int depth = int(gl_FragCoord.z * {DEPTH_STEPS}.0);
+    if (peeling) {{
+        ivec2 before = texelFetch(last, ivec2(gl_FragCoord.xy), 0).xy;
+        if (before.x < 0 || depth < before.y || (depth == before.y && gl_PrimitiveID <= before.x)) discard;
+    }}
+    found = ivec2(gl_PrimitiveID, depth);
+    gl_FragDepth = (float(depth) + 0.5) / {DEPTH_STEPS}.0;
+}}
+"""
+EMPTY_VERTEX = """
+#version 330
+void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 1.0, 1.0); }
+"""
+EMPTY_FRAGMENT = """
+#version 330
+out ivec2 found;
+void main() { found = ivec2(-1, 0); }
+"""
+
+
+class Buffers:
+    """A proxy on the device, its vertices moved and scaled to the unit sphere. Released when garbage-collected."""
+
+    def __init__(self, worker: Worker, proxy: Proxy):
+        self.proxy = proxy
+        low, high = proxy.vertices.min(axis=0).astype(np.float64), proxy.vertices.max(axis=0).astype(np.float64)
+        self.center, self.radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-30)
+        unit = ((proxy.vertices - self.center) / self.radius).astype(np.float32)
+        self.corners = corner_lists(proxy.faces, len(proxy.vertices))
+        self.array, buffers = worker.call(_upload, unit, proxy.faces)
+        weakref.finalize(self, worker.later, _release, [self.array, *buffers])
+
+
+class OpenGL(TriangleSampler):
+    """Depth peeling on whatever device the system's EGL offers; Mesa's llvmpipe where there is none."""
+
+    def __init__(self) -> None:
+        self._worker = Worker()
+
+    def prepare(self, proxy: Proxy) -> Buffers:
+        """Move the triangles to the device."""
+        return Buffers(self._worker, proxy)
+
+    def rasterize(self, prepared: Buffers, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
+        """See `TriangleSampler.rasterize`."""
+        height, width = size
+        keep = facing(camera, cull)
+        clip = _tight(camera.projection, camera.view, prepared) @ camera.view
+        # Read from below, the image has its top row first.
+        clip = np.diag([1.0, -1.0, 1.0, 1.0]) @ clip
+        denormalize = np.diag([prepared.radius] * 3 + [1.0])
+        denormalize[:3, 3] = prepared.center
+        triangle_ids = self._worker.call(_peel, prepared.array, clip @ denormalize, size, layers, keep)
+        fragments = Fragments(
+            np.ascontiguousarray(triangle_ids),
+            np.empty((layers, height, width, 2), np.float32),
+            np.empty((layers, height, width), np.float32),
+        )
+        proxy = prepared.proxy
+        scene = pixel_matrix(camera, size), -camera.view[2], keep, proxy.vertices, proxy.faces, *prepared.corners
+        parallel(settle, height, *scene, *fragments)
+        return fragments
+
+
+def _tight(projection: np.ndarray, view: np.ndarray, prepared: Buffers) -> np.ndarray:
+    """The projection with its planes drawn close around the object, so that depth is quantised finely."""
+    p = projection.copy()
+    if p[2, 0] or p[2, 1] or p[3, 0] or p[3, 1]:
+        return p
+    # Clip z = ∓w at the planes, with z = −depth.
+    near, far = (p[2, 3] + p[3, 3]) / (p[2, 2] + p[3, 2]), (p[2, 3] - p[3, 3]) / (p[2, 2] - p[3, 2])
+    middle = -(view[2, :3] @ prepared.center + view[2, 3])
+    reach = 1.01 * prepared.radius * np.linalg.norm(view[2, :3])
+    near, far = max(near, middle - reach), min(far, middle + reach)
+    if not near < far:
+        return projection
+    # Row 2 so that z = −w at depth near and z = w at depth far.
+    w_near, w_far = p[3, 3] - p[3, 2] * near, p[3, 3] - p[3, 2] * far
+    p[2, 2] = -(w_far + w_near) / (far - near)
+    p[2, 3] = -w_near + p[2, 2] * near
+    return p
+
+
+# --------------------------------------------------------------------------------- on the worker's thread
+
+
+def _programs(context: moderngl.Context) -> dict[str, Any]:
+    """Programs and framebuffers of a context, made once."""
+    if context.extra is None:
+        peel = context.program(vertex_shader=VERTEX, fragment_shader=FRAGMENT)
+        empty = context.program(vertex_shader=EMPTY_VERTEX, fragment_shader=EMPTY_FRAGMENT)
+        context.extra = {
+            "peel": peel,
+            "empty": context.vertex_array(empty, []),
+            "query": context.query(samples=True),
+            "targets": {},
+        }
+    return context.extra
+
+
+def _upload(context: moderngl.Context, vertices: np.ndarray, faces: np.ndarray) -> tuple[Any, list[Any]]:
+    program = _programs(context)["peel"]
+    vertex_buffer, index_buffer = context.buffer(vertices.tobytes()), context.buffer(faces.tobytes())
+    array = context.vertex_array(program, [(vertex_buffer, "3f", "position")], index_buffer, index_element_size=4)
+    return array, [vertex_buffer, index_buffer]
+
+
+def _release(context: moderngl.Context, objects: list[Any]) -> None:
+    for item in objects:
+        item.release()
+
+
+def _targets(context: moderngl.Context, size: tuple[int, int]) -> list[tuple[Any, Any]]:
+    """Two framebuffers of a size, each with its texture, to read one while the other is drawn."""
+    kept = _programs(context)["targets"]
+    if size not in kept:
+        while len(kept) >= TARGETS:
+            for framebuffer, texture, depth in kept.pop(next(iter(kept))):
+                _release(context, [framebuffer, texture, depth])
+        pairs = []
+        for _ in range(2):
+            texture, depth = context.texture(size[::-1], 2, dtype="i4"), context.depth_renderbuffer(size[::-1])
+            pairs.append((context.framebuffer([texture], depth), texture, depth))
+        kept[size] = pairs
+    kept[size] = kept.pop(size)  # The least recently used is first.
+    return [(framebuffer, texture) for framebuffer, texture, _ in kept[size]]
+
+
+def _peel(
+    context: moderngl.Context, array: Any, clip: np.ndarray, size: tuple[int, int], layers: int, keep: float
+) -> np.ndarray:
+    """(K, H, W) triangle ids, as the hardware has them."""
+    parts = _programs(context)
+    program, query = parts["peel"], parts["query"]
+    targets = _targets(context, size)
+    ids = np.full((layers, *size), -1, np.int32)
+    program["clip_from_unit"].write(clip.T.astype(np.float32).tobytes())
+    context.front_face = "ccw" if keep >= 0 else "cw"
+    for k in range(layers):
+        framebuffer, texture = targets[k % 2]
+        framebuffer.use()
+        framebuffer.clear(depth=1.0)
+        # Clearing sets integers to no known value; a triangle over everything does.
+        context.enable_only(moderngl.NOTHING)
+        parts["empty"].render(moderngl.TRIANGLES, vertices=3)
+        context.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if keep else moderngl.NOTHING))
+        targets[(k + 1) % 2][1].use(0)
+        program["peeling"].value = k > 0
+        with query:
+            array.render(moderngl.TRIANGLES)
+        if query.samples == 0:
+            break
+        found = np.frombuffer(framebuffer.read(components=2, dtype="i4"), np.int32)
+        ids[k] = found.reshape(*size, 2)[..., 0]
+    return ids
