@@ -164,9 +164,14 @@ def _read_with_trimesh(path: Path, extension: str) -> list[Piece]:
     except InputError:
         raise
     except Exception as error:
+        kind, again = extension.upper(), "the file may be cut short or of another format: export it again"
+        if isinstance(error, ModuleNotFoundError) and isinstance(error.__context__, UnicodeDecodeError):
+            # What is no sound binary file trimesh takes for text, and would guess its encoding with another package.
+            raise InputError(
+                f"{path} is not a valid {kind} file, neither as binary nor as text; {again}"
+            ) from error.__context__
         raise folder.problem or InputError(
-            f"{path} cannot be read as {extension.upper()} ({type(error).__name__}: {error}); the file may "
-            f"be cut short or of another format: export it again"
+            f"{path} cannot be read as {kind} ({type(error).__name__}: {error}); {again}"
         ) from error
     if folder.problem:
         raise folder.problem

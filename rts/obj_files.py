@@ -43,7 +43,7 @@ class _Lines:
 
     def read(self) -> _Lines:
         """Sort the lines of the file."""
-        text = self.path.read_bytes().decode("utf-8", errors="replace").replace("\\\r\n", " ").replace("\\\n", " ")
+        text = _text(self.path).replace("\\\r\n", " ").replace("\\\n", " ")
         material = self.materials.setdefault(None, 0)
         for number, line in enumerate(text.splitlines(), start=1):
             key, _, rest = line.partition("#")[0].replace("\t", " ").strip().partition(" ")
@@ -160,6 +160,8 @@ def read_obj(path: Path) -> list[Piece]:
     if vt.shape[1] == 1:
         vt = np.concatenate([vt, np.zeros_like(vt)], axis=1)
     corners, owner = lines.triangles((len(v), len(vt), len(vn)))
+    # Of one identity in all pieces, so that merging need not repeat them.
+    vertices = v[:, :3]
     pieces = []
     for name, index in lines.materials.items():
         if index not in used:
@@ -173,7 +175,7 @@ def read_obj(path: Path) -> list[Piece]:
         if v.shape[1] == 6:
             attributes["colors"] = (v[:, 3:] / (255 if v[:, 3:].max() > 1 else 1), faces)
         material = materials.get(name, Material())
-        pieces.append(Piece(v[:, :3], faces, attributes, textures.get(name), material.color))
+        pieces.append(Piece(vertices, faces, attributes, textures.get(name), material.color))
     return pieces
 
 
@@ -196,29 +198,39 @@ def _materials(lines: _Lines) -> dict[str | None, Material]:
 def _read_mtl(library: Path, folder: Path) -> dict[str, Material]:
     found: dict[str, dict[str, Any]] = {}
     current: dict[str, Any] = {}
-
-    def numbers(rest: str) -> list[float]:
-        try:
-            return [float(x) for x in rest.split()]
-        except ValueError:
-            return []  # "Kd spectral file.rfl" and the like.
-
-    for line in library.read_bytes().decode("utf-8", errors="replace").splitlines():
+    for number, line in enumerate(_text(library).splitlines(), start=1):
         key, _, rest = line.replace("\t", " ").strip().partition(" ")
         key, rest = key.lower(), rest.strip()
+        values = _numbers(library, number, rest) if key in ("kd", "d", "tr") else []
         if key == "newmtl":
             current = found.setdefault(rest, {})
-        elif key == "kd" and len(numbers(rest)) in (1, 3):
-            current["color"] = np.resize(numbers(rest), 3)
-        elif key == "d" and len(numbers(rest)) == 1:
-            current["alpha"] = numbers(rest)[0]
-        elif key == "tr" and len(numbers(rest)) == 1:
-            current.setdefault("alpha", 1 - numbers(rest)[0])
+        elif key == "kd" and len(values) in (1, 3):
+            current["color"] = np.resize(values, 3)
+        elif key == "d" and len(values) == 1:
+            current["alpha"] = values[0]
+        elif key == "tr" and len(values) == 1:
+            current.setdefault("alpha", 1 - values[0])
         elif key.startswith(_MAPS) and rest:
             file = inside(folder, _MAP_OPTIONS.sub("", rest), library)
             if key == "map_kd":
                 current["texture"] = file
     return {name: _material(values) for name, values in found.items()}
+
+
+def _numbers(library: Path, number: int, text: str) -> list[float]:
+    """The numbers of a line; none where it is of another kind, such as "Kd spectral file.rfl"."""
+    try:
+        values = [float(x) for x in text.split()]
+    except ValueError:
+        return []
+    if not np.isfinite(values).all():
+        raise InputError(f"{library}, line {number}: {text!r} is not finite; expected numbers from 0 to 1")
+    return values
+
+
+def _text(path: Path) -> str:
+    """The text of a file, without the mark of its encoding that some editors put first."""
+    return path.read_bytes().decode("utf-8-sig", errors="replace")
 
 
 def _material(values: dict[str, Any]) -> Material:

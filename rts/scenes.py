@@ -20,7 +20,7 @@ from rts.protocols import Array, Part
 from rts.shading import Lambert, Textured
 
 
-def load(path: Any, *, merge: bool = False) -> list[Part]:
+def load(path: Any, *, merge: bool = False, weld: bool = True) -> list[Part]:
     """The parts of a model file: OBJ with MTL and textures, PLY, STL, GLB, glTF, OFF, what trimesh reads.
 
     There is one part for each mesh of the scene, for each material of an OBJ. θ holds NumPy float32 arrays:
@@ -31,9 +31,14 @@ def load(path: Any, *, merge: bool = False) -> list[Part]:
     from θ, and smooth ones are computed that do. Polygons are cut into triangles. The shader is `textured`
     where there are uv and a texture, else `lambert`.
 
+    So the number of vertices may be less than the file's. For data of your own, one row for each vertex of the
+    file, load with `weld=False`.
+
     Args:
         path: the file. It may refer to files in its own folder only.
         merge: join everything into one part, in the coordinates of the scene. Refused where textures differ.
+        weld: leave out vertices without faces, and weld those that coincide; False keeps the vertices of the file,
+            their number and order. (All parts of an OBJ share one table of vertices; each then holds all of it.)
 
     Raises:
         InputError: the file is missing, damaged, of unknown kind, empty, or refers to what is missing or
@@ -41,7 +46,7 @@ def load(path: Any, *, merge: bool = False) -> list[Part]:
     """
     path = as_path(path)
     pieces = [_linear(piece) for piece in read_pieces(path)]
-    return [_part(piece) for piece in ([_merged(path, pieces)] if merge and len(pieces) > 1 else pieces)]
+    return [_part(piece, weld) for piece in ([_merged(path, pieces)] if merge and len(pieces) > 1 else pieces)]
 
 
 def _linear(piece: Piece) -> Piece:
@@ -56,10 +61,12 @@ def _linear(piece: Piece) -> Piece:
     return piece._replace(attributes=attributes, color=color, texture=texture)
 
 
-def _part(piece: Piece) -> Part:
-    rows, faces = _used(piece.vertices, piece.faces)
-    vertices, weld = _welded(rows.astype(np.float32))
-    faces = weld[faces]
+def _part(piece: Piece, weld: bool) -> Part:
+    vertices, faces = piece.vertices.astype(np.float32), piece.faces
+    if weld:
+        rows, faces = _used(vertices, faces)
+        vertices, place = _welded(rows)
+        faces = place[faces]
     theta, indices = {"vertices": vertices}, {}
     for name, (rows, table) in piece.attributes.items():
         theta[name], indices[name] = _settled(rows.astype(np.float32), table, faces, len(vertices))
@@ -100,6 +107,8 @@ def _settled(
     rows: np.ndarray, table: np.ndarray, faces: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """One row a vertex (and no table) where the faces around each vertex agree, else rows and their table."""
+    if len(rows) == count and np.array_equal(table, faces):
+        return rows, None
     by_vertex = np.zeros((count, rows.shape[1]), rows.dtype)
     by_vertex[faces] = rows[table]
     return (by_vertex, None) if np.array_equal(by_vertex[faces], rows[table]) else _used(rows, table)
@@ -122,6 +131,9 @@ def _merged(path: Path, pieces: list[Piece]) -> Piece:
     whole = {}
     for name, pairs in tables.items():
         if len(pairs) == len(pieces):  # What only some of them have is dropped.
+            if all(rows is pairs[0][0] for rows, _ in pairs):
+                whole[name] = pairs[0][0], np.concatenate([table for _, table in pairs])
+                continue
             offsets = np.cumsum([0, *(len(rows) for rows, _ in pairs)])
             rows = np.concatenate([rows for rows, _ in pairs])
             whole[name] = rows, np.concatenate([t + o for (_, t), o in zip(pairs, offsets, strict=False)])

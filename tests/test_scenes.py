@@ -91,6 +91,42 @@ def test_texture_names_may_have_backslashes(tmp_path):
     assert "texture" in rts.load(path)[0].theta
 
 
+def test_files_may_start_with_a_mark_of_their_encoding(tmp_path):
+    for name, text in {
+        "m.mtl": "newmtl m\nKd 1 0 0\n",
+        "m.obj": f"v 0 0 9\n{QUAD}mtllib m.mtl\nusemtl m\nf 1 2 3\n",
+    }.items():
+        (tmp_path / name).write_text(text, encoding="utf-8-sig")
+    [part] = rts.load(tmp_path / "m.obj")
+    np.testing.assert_array_equal(part.theta["vertices"][0], [0, 0, 9])
+    np.testing.assert_array_equal(part.theta["color"], [1, 0, 0])
+
+
+def test_without_welding_the_vertices_are_those_of_the_file(tmp_path):
+    rows = "v 9 9 9 0 0 1\n" + "".join(
+        f"v {x} {y} 0 1 0 0\n" for x, y in [(0, 0), (1, 0), (1, 1), (1, 0), (1, 1), (2, 0)]
+    )
+    path = write(tmp_path / "m.obj", rows + QUAD_UV + "usemtl a\nf 2/1 3/2 4/3\nusemtl b\nf 5/4 7/1 6/3\n")
+    expected = [[9, 9, 9], [0, 0, 0], [1, 0, 0], [1, 1, 0], [1, 0, 0], [1, 1, 0], [2, 0, 0]]
+    a, b = rts.load(path, weld=False)
+    for part, face in ((a, [1, 2, 3]), (b, [4, 6, 5])):
+        np.testing.assert_array_equal(part.theta["vertices"], expected)
+        np.testing.assert_array_equal(part.surface.faces, [face])
+        np.testing.assert_array_equal(part.theta["colors"], [[0, 0, 1]] + [[1, 0, 0]] * 6)
+    [whole] = rts.load(path, merge=True, weld=False)
+    np.testing.assert_array_equal(whole.theta["vertices"], expected)
+    np.testing.assert_array_equal(whole.surface.faces, [[1, 2, 3], [4, 6, 5]])
+    assert len(rts.load(path, merge=True)[0].theta["vertices"]) == 4
+    view = front_view(rts.load(path, merge=True)[0])
+    np.testing.assert_allclose(front_view(whole), view)
+    np.testing.assert_allclose(front_view([a, b]), view)
+
+
+def test_without_welding_an_stl_has_three_vertices_a_face(tmp_path):
+    trimesh.creation.box().export(tmp_path / "m.stl")
+    assert rts.load(tmp_path / "m.stl", weld=False)[0].theta["vertices"].shape == (36, 3)
+
+
 def test_seams_are_welded_and_uv_keep_their_own_table(tmp_path):
     text = QUAD + "v 1 0 0\nv 1 1 0\nv 2 0 0\n" + QUAD_UV + "vt 0.5 0.5\n"
     [part] = rts.load(write(tmp_path / "m.obj", text + "f 1/1 2/2 3/3\nf 5/5 7/1 6/3\n"))
@@ -262,8 +298,19 @@ def test_truncated_binary_files(tmp_path, kind):
     whole = tmp_path / f"m.{kind}"
     trimesh.creation.icosphere(subdivisions=1).export(whole)
     whole.write_bytes(whole.read_bytes()[:-300])
-    with pytest.raises(InputError, match=f"cannot be read as {kind.upper()}"):
+    with pytest.raises(InputError, match=f"(cannot be read as|is not a valid) {kind.upper()}"):
         rts.load(whole)
+
+
+@pytest.mark.parametrize("kind", ["stl", "off", "xyz"])
+def test_bytes_where_text_ought_to_be(tmp_path, kind, monkeypatch):
+    monkeypatch.setitem(sys.modules, "charset_normalizer", None)
+    path = tmp_path / f"m.{kind}"
+    path.write_bytes(bytes(range(128, 256)) * 3)
+    with pytest.raises(InputError, match=f"m.{kind} is not a valid {kind.upper()} file.*export it again") as error:
+        rts.load(path)
+    assert "charset" not in message(error)
+    assert isinstance(error.value.__cause__, UnicodeDecodeError)
 
 
 def test_point_clouds_are_refused(tmp_path):
@@ -279,6 +326,13 @@ def test_indices_out_of_range_in_a_ply(tmp_path):
         rts.load(write(tmp_path / "m.ply", header + "0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n"))
     with pytest.raises(InputError, match="1 of 3 rows of vertices are NaN"):
         rts.load(write(tmp_path / "n.ply", header + "0 0 0\nnan 0 0\n0 1 0\n3 0 1 2\n"))
+
+
+@pytest.mark.parametrize("line", ["Kd nan 0 0", "Kd 0 0 inf", "d nan", "Tr -inf"])
+def test_materials_that_are_not_finite_are_refused_with_their_line(tmp_path, line):
+    write(tmp_path / "m.mtl", f"newmtl m\n\n{line}\n")
+    with pytest.raises(InputError, match="m.mtl, line 3: '.*' is not finite"):
+        rts.load(write(tmp_path / "m.obj", "mtllib m.mtl\n" + QUAD + "usemtl m\nf 1 2 3\n"))
 
 
 def test_missing_textures_and_libraries(tmp_path):
@@ -405,6 +459,15 @@ def test_what_is_no_picture_is_refused(tmp_path, image, expected):
 def test_bad_names_of_pictures(tmp_path):
     with pytest.raises(InputError, match="ending in .png"):
         rts.save_image(tmp_path / "a.jpg", np.zeros((2, 2)))
+    (tmp_path / "folder.png").mkdir()
+    with pytest.raises(InputError, match="folder.png is a folder"):
+        rts.save_image(tmp_path / "folder.png", np.zeros((2, 2)))
+    write(tmp_path / "file", "")
+    for name in ("file/a.png", "file/deeper/a.png"):
+        with pytest.raises(InputError, match="file is a file; expected a folder"):
+            rts.save_image(tmp_path / name, np.zeros((2, 2)))
+        with pytest.raises(InputError, match="file is a file; expected a folder"):
+            rts.save_animation(tmp_path / name, [np.zeros((2, 2))])
     with pytest.raises(InputError, match="no picture"):
         rts.load_image(tmp_path / "gone.png")
     with pytest.raises(InputError, match="cannot be read as an image"):
