@@ -11,7 +11,7 @@ import numpy as np
 from rts.camera import Camera
 from rts.protocols import Fragments, Proxy
 from rts.sampling import TriangleSampler
-from rts_backends import embree_library
+from rts_backends import embree_library, embree_public
 from rts_backends.embree_kernels import TILE, cast, facing, keep_nearest_address, pixel_matrix
 from rts_backends.threads import parallel
 
@@ -26,7 +26,8 @@ class Structure:
         self.proxy = proxy
         self._unit = np.zeros((len(proxy.vertices) + 1, 3), np.float32)
         self._place()
-        self.scene = embree_library.Scene(self._unit, proxy.faces)
+        library = embree_library if embree_library.load() else embree_public
+        self.scene = library.Scene(self._unit, proxy.faces)
         self.refits = 0
 
     def _place(self) -> None:
@@ -60,6 +61,9 @@ class Embree(TriangleSampler):
         self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str
     ) -> Fragments:
         """See `TriangleSampler.rasterize`."""
+        scene, planes = prepared.scene, _planes(camera.projection)
+        if isinstance(scene, embree_public.Scene):
+            return scene.cast(prepared.proxy, prepared.sphere, planes, camera, size, layers, cull)
         height, width = size
         fragments = Fragments(
             np.empty((layers, height, width), np.int32),
@@ -69,14 +73,14 @@ class Embree(TriangleSampler):
         parallel(
             cast,
             -(-height // TILE) * -(-width // TILE),
-            prepared.scene.intersect,
+            scene.intersect,
             keep_nearest_address(),
-            prepared.scene.handle,
+            scene.handle,
             pixel_matrix(camera, size),
             -camera.view[2],
             np.concatenate([camera.projection, np.linalg.inv(camera.view)]),
             prepared.sphere,
-            _planes(camera.projection),
+            planes,
             facing(camera, cull),
             prepared.proxy.vertices,
             prepared.proxy.faces,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import ctypes.util
+import functools
 import glob
 import sys
 import threading
@@ -52,6 +53,7 @@ _device: int | None = None
 _first_use = threading.Lock()
 
 
+@functools.cache
 def find() -> str | None:
     """Path or name of Embree 4's shared library, or None."""
     package = Path(embreex.__file__).parent

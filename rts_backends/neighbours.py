@@ -30,7 +30,7 @@ def corner_lists(faces, count):
 
 
 @numba.njit
-def _look(t, x, y, matrix, row, keep, vertices, faces, corners):
+def look(t, x, y, matrix, row, keep, vertices, faces, corners):
     """Whether a triangle covers a pixel exactly, its least barycentric there, its depth, two barycentrics."""
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
     to_corner(matrix, vertices, ia, corners, 0)
@@ -64,7 +64,7 @@ def settle(
                 t = triangle_ids[k, j, i]
                 if t < 0:
                     break
-                inside, least, z, a, b = _look(t, x, y, matrix, row, keep, vertices, faces, corners)
+                inside, least, z, a, b = look(t, x, y, matrix, row, keep, vertices, faces, corners)
                 for _ in range(WALK):
                     if inside:
                         break
@@ -74,7 +74,7 @@ def settle(
                         v = faces[t, c]
                         for at in range(offsets[v], offsets[v + 1]):
                             s = members[at]
-                            inside_s, least_s, z_s, a_s, b_s = _look(
+                            inside_s, least_s, z_s, a_s, b_s = look(
                                 s, x, y, matrix, row, keep, vertices, faces, corners
                             )
                             if (inside_s and not best_inside) or (inside_s == best_inside and least_s > best_least):

@@ -1,0 +1,139 @@
+"""The public interface of the package embreex, where Embree's library cannot be found.
+
+It gives the first hit of a ray, on one core. So rays are cast again, each from just beyond its last hit, until every
+pixel has its layers. Each hit is decided in float64 as the rasterizer decides, along with all triangles around its
+corners: so edges are hit once, and layers that share a vertex keep their order however close they are. Others closer
+than `STEP` may get lost.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from rts.camera import Camera
+from rts.protocols import Fragments, Proxy
+from rts_backends.neighbours import corner_lists, look
+from rts_backends.threads import parallel
+from rts_backends.triangles import facing, pixel_matrix
+
+STEP = 4e-6
+"""Of the object's size: how far beyond a hit the next ray starts; float32 resolves about a tenth of it."""
+REACH = 1.01
+"""Square of the radius of the sphere that rays start on, in units of the object's."""
+
+
+class Scene:
+    """Stands in for `rts_backends.embree_library.Scene`.
+
+    Args:
+        vertices: (V + 1, 3) float32 within the unit sphere; the last row is padding.
+        faces: (T, 3) int32.
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray):
+        self._vertices, self._faces = vertices, faces
+        self.corners = corner_lists(faces, len(vertices) - 1)
+        self.move(rebuild=True)
+
+    def move(self, *, rebuild: bool) -> None:
+        """Follow vertices that have changed in place; always by building anew, since embreex cannot refit."""
+        self.handle = EmbreeScene(robust=True)
+        TriangleMesh(self.handle, self._vertices[:-1], self._faces)
+
+    def cast(
+        self,
+        proxy: Proxy,
+        sphere: np.ndarray,
+        planes: np.ndarray,
+        camera: Camera,
+        size: tuple[int, int],
+        layers: int,
+        cull: str,
+    ) -> Fragments:
+        """The K nearest hits a pixel.
+
+        Args:
+            proxy: the object.
+            sphere: (4,) its centre and radius; the scene is the object moved and scaled to the unit sphere.
+            planes: depths; nothing is seen before the first or beyond the second.
+            camera: see `TriangleSampler.rasterize`.
+            size: likewise.
+            layers: likewise.
+            cull: likewise.
+        """
+        rays = camera.rays(size)
+        origins = (rays.origins.reshape(-1, 3) - sphere[:3]) / sphere[3]
+        directions = rays.directions.reshape(-1, 3) / sphere[3]
+        length = np.linalg.norm(directions, axis=1)
+        middle = -(origins * directions).sum(axis=1) / length**2
+        square = middle**2 - ((origins**2).sum(axis=1) - REACH) / length**2
+        half = np.sqrt(square.clip(0))
+        reach = np.maximum(middle - half, planes[0] - STEP * sphere[3])
+        stop = np.minimum(middle + half, planes[1] + STEP * sphere[3])
+
+        count = size[0] * size[1]
+        ids, found = np.full((count, layers), -1, np.int32), np.zeros((count, layers, 3))
+        last, step = np.full(count, -1, np.int32), np.empty(count)
+        scene = pixel_matrix(camera, size), -camera.view[2], facing(camera, cull), proxy.vertices, proxy.faces
+        live = np.flatnonzero((square > 0) & (reach < stop))
+        while len(live):
+            starts = origins[live] + reach[live, None] * directions[live]
+            ways = directions[live] / length[live, None]
+            hits = self.handle.run(starts.astype(np.float32), ways.astype(np.float32), query="INTERSECT", output=True)
+            hit = hits["primID"] >= 0
+            live = live[hit]
+            depth = reach[live] + hits["tfar"][hit] / length[live]
+            args = live, hits["primID"][hit], size[1], *scene, *self.corners, ids, found
+            parallel(_take, len(live), *args)
+            again = last[live] == hits["primID"][hit]
+            last[live] = hits["primID"][hit]
+            step[live] = np.where(again, 2 * step[live], STEP / length[live])
+            reach[live] = np.maximum(depth, reach[live]) + step[live]
+            full = (ids[live, -1] >= 0) & (found[live, -1, 0] <= reach[live])
+            live = live[~full & (reach[live] < stop[live])]
+
+        def layered(x: np.ndarray, dtype: type) -> np.ndarray:
+            return np.ascontiguousarray(np.moveaxis(x, 1, 0).reshape(layers, *size, *x.shape[2:]), dtype)
+
+        return Fragments(
+            layered(ids, np.int32), layered(found[..., 1:], np.float32), layered(found[..., 0], np.float32)
+        )
+
+
+@numba.njit(cache=True, nogil=True)
+def _take(
+    first, last, pixels, triangles, width, matrix, row, keep, vertices, faces, offsets, members, ids, found
+):  # fmt: skip
+    """Put the hit of each pixel, and those of all triangles around its corners, among the pixel's nearest."""
+    layers = ids.shape[1]
+    corners = np.empty((3, 4))
+    for n in range(first, last):
+        pixel = pixels[n]
+        x, y = pixel % width + 0.5, pixel // width + 0.5
+        for c in range(3):
+            v = faces[triangles[n], c]
+            for m in range(offsets[v], offsets[v + 1]):
+                t = members[m]
+                inside, _, z, a, b = look(t, x, y, matrix, row, keep, vertices, faces, corners)
+                known = not inside
+                for k in range(layers):
+                    known = known or ids[pixel, k] == t
+                if known:
+                    continue
+                at = layers
+                while at > 0 and (
+                    ids[pixel, at - 1] < 0
+                    or z < found[pixel, at - 1, 0]
+                    or (z == found[pixel, at - 1, 0] and t < ids[pixel, at - 1])
+                ):
+                    at -= 1
+                for k in range(layers - 1, at, -1):
+                    ids[pixel, k] = ids[pixel, k - 1]
+                    for i in range(3):
+                        found[pixel, k, i] = found[pixel, k - 1, i]
+                if at < layers:
+                    ids[pixel, at] = t
+                    found[pixel, at, 0], found[pixel, at, 1], found[pixel, at, 2] = z, a, b
