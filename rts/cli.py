@@ -197,7 +197,7 @@ def render(
     """Render a model to a picture."""
     import rts
     from rts.framing import bounds_of, orbit
-    from rts.scenes import output_file
+    from rts.paths import output_file
 
     shape, view, color = _size(size), _view(camera), _background(background)
     output_file(output, "picture", (".png",))
@@ -259,7 +259,7 @@ def fit_pose(
     import rts
     from rts import pose
     from rts.framing import bounds_of, orbit
-    from rts.scenes import output_folder
+    from rts.paths import output_folder
 
     view = _view(camera)
     output_folder(output)
@@ -285,7 +285,7 @@ def demo(
 ) -> None:
     """Recover the pose of a knot from its silhouette: no input needed, pictures and a summary written."""
     from rts.demo import run
-    from rts.scenes import output_folder
+    from rts.paths import output_folder
 
     output_folder(output)
     found, files = run(output, None if engine == "auto" else engine)

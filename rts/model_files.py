@@ -9,7 +9,6 @@ of the disk.
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
 from urllib.parse import unquote
@@ -247,11 +246,3 @@ def _check(path: Path, piece: Piece) -> None:
             )
     if piece.transform is not None and not np.isfinite(piece.transform).all():
         raise InputError(f"{path}: a transform of its scene holds NaN or infinity; repair the file")
-
-
-def as_path(path: Any) -> Path:
-    """A path from a string or path object."""
-    try:
-        return Path(os.fspath(path))
-    except TypeError:
-        raise InputError(f"the path is a {type(path).__name__}; expected a string or pathlib.Path") from None

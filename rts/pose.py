@@ -16,7 +16,7 @@ from rts.camera import Camera
 from rts.errors import InputError, PluginError
 from rts.fitting import fit
 from rts.framing import Bounds
-from rts.protocols import Array, Part
+from rts.protocols import Array, Engine, Part
 from rts.rendering import render
 from rts.scenes import save_animation, save_image
 from rts.transforms import rigid
@@ -114,10 +114,7 @@ def fit_pose(
         steps: at most so many at each resolution; default that of `rts.fit`.
         progress: see `rts.fit`.
     """
-    name = engine or available_engine()
-    chosen = registry.plugin("rts.engines", name)()
-    if name == "numpy":
-        raise InputError("engine is 'numpy', which has no derivatives; expected torch or jax")
+    chosen = _engine(engine or available_engine())
     pose = chosen.constant(np.zeros(6, np.float32))
     weights = np.repeat([1.0, bounds.radius], 3)
     trail: list[np.ndarray] = []
@@ -150,8 +147,15 @@ def fit_pose(
     return PoseFit(found[:3], found[3:], bounds.center, matrix, trail, history, result.loss, result.reason, seconds)
 
 
+def _engine(name: str) -> Engine:
+    """The engine of this name, which must have derivatives."""
+    if name == "numpy":
+        raise InputError("engine is 'numpy', which has no derivatives; expected torch or jax")
+    return registry.plugin("rts.engines", name)()
+
+
 def _residuals(
-    parts: Sequence[Part], camera: Camera, mask: np.ndarray, bounds: Bounds, weights: np.ndarray, engine: Any
+    parts: Sequence[Part], camera: Camera, mask: np.ndarray, bounds: Bounds, weights: np.ndarray, engine: Engine
 ) -> Callable[[Array], Array]:
     goal = engine.constant(mask)
 

@@ -15,7 +15,8 @@ import numpy as np
 from rts import registry
 from rts.arrays import engine_of
 from rts.errors import InputError, PluginError
-from rts.model_files import Piece, as_path, read_image, read_pieces
+from rts.model_files import Piece, read_image, read_pieces
+from rts.paths import as_path, output_file
 from rts.protocols import Array, Part
 from rts.shading import Lambert, Textured
 
@@ -163,31 +164,6 @@ def _in_scene(piece: Piece) -> Piece:
 
 
 # ------------------------------------------------------------------------------------------------ pictures
-
-
-def output_file(path: Any, what: str, extensions: tuple[str, ...]) -> Path:
-    """The path of a file to write.
-
-    Raises:
-        InputError: another extension, a folder of that name, or a file where a folder ought to be.
-    """
-    path = as_path(path)
-    if path.suffix.lower() not in extensions:
-        expected = " or ".join(filter(None, (", ".join(extensions[:-1]), extensions[-1])))
-        raise InputError(f"the {what} is to be called {path.name!r}; expected a name ending in {expected}")
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; expected the name of a file to write")
-    output_folder(path.parent)
-    return path
-
-
-def output_folder(path: Any) -> Path:
-    """The path of a folder to write into, which need not exist; an InputError where it cannot be made."""
-    path = as_path(path)
-    existing = next((p for p in (path, *path.parents) if p.exists()), path)
-    if existing.exists() and not existing.is_dir():
-        raise InputError(f"{existing} is a file; expected a folder to write into")
-    return path
 
 
 def save_image(path: Any, image: Array) -> None:

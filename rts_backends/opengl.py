@@ -1,8 +1,8 @@
 """Depth peeling with OpenGL ≥ 3.3, headless.
 
-Each pass draws the triangles beyond those of the pass before and keeps the nearest, into an integer target: the triangle
-and its quantised depth. The order (depth, triangle) is total, so coplanar triangles peel one by one. Hardware snaps
-vertices to fractions of a pixel; so each hit is then decided in float64 by the edge functions of
+Each pass draws the triangles beyond those of the pass before and keeps the nearest, into an integer target: the
+triangle and its quantised depth. The order (depth, triangle) is total, so coplanar triangles peel one by one. Hardware
+snaps vertices to fractions of a pixel; so each hit is then decided in float64 by the edge functions of
 `rts_backends.triangles`, and passed on to the neighbour that truly covers the pixel's centre.
 """
 

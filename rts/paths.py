@@ -1,0 +1,42 @@
+"""Paths that callers give, checked before any work is done for them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from rts.errors import InputError
+
+
+def as_path(path: Any) -> Path:
+    """A path from a string or path object."""
+    try:
+        return Path(os.fspath(path))
+    except TypeError:
+        raise InputError(f"the path is a {type(path).__name__}; expected a string or pathlib.Path") from None
+
+
+def output_file(path: Any, what: str, extensions: tuple[str, ...]) -> Path:
+    """The path of a file to write.
+
+    Raises:
+        InputError: another extension, a folder of that name, or a file where a folder ought to be.
+    """
+    path = as_path(path)
+    if path.suffix.lower() not in extensions:
+        expected = " or ".join(filter(None, (", ".join(extensions[:-1]), extensions[-1])))
+        raise InputError(f"the {what} is to be called {path.name!r}; expected a name ending in {expected}")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; expected the name of a file to write")
+    output_folder(path.parent)
+    return path
+
+
+def output_folder(path: Any) -> Path:
+    """The path of a folder to write into, which need not exist; an InputError where it cannot be made."""
+    path = as_path(path)
+    existing = next((p for p in (path, *path.parents) if p.exists()), path)
+    if existing.exists() and not existing.is_dir():
+        raise InputError(f"{existing} is a file; expected a folder to write into")
+    return path
