@@ -1,6 +1,6 @@
 """Real meshes under every shader, one sheet a mesh, to be looked at.
 
-    python benchmarks/contact_sheets.py -o out/sheets
+python benchmarks/contact_sheets.py -o out/sheets
 """
 
 from __future__ import annotations
