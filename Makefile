@@ -3,11 +3,11 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-INSTALL := $(BIN)/python -m pip install --quiet -c constraints.txt
+INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt
 SOURCES := pyproject.toml constraints.txt
 
 # What tests need of the system, by Debian's names; installed where this is root or may use sudo.
-SYSTEM_PACKAGES := python3-venv
+SYSTEM_PACKAGES := python3-venv libegl1 libgl1-mesa-dri
 SUDO := $(shell if [ "$$(id -u)" = 0 ]; then echo env; elif sudo -n true 2>/dev/null; then echo sudo; fi)
 
 .PHONY: demo test lint clean system
@@ -27,7 +27,8 @@ system:
 	if ! command -v dpkg >/dev/null; then \
 		echo "not a Debian system: install the equivalents of $(SYSTEM_PACKAGES) if tests are skipped"; \
 	elif [ -n "$$missing" ] && [ -n "$(SUDO)" ]; then \
-		$(SUDO) apt-get update -qq && $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq $$missing >/dev/null; \
+		{ $(SUDO) apt-get update -qq && $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq $$missing >/dev/null; } \
+			|| echo "could not install $$missing: tests that need them are skipped"; \
 	elif [ -n "$$missing" ]; then \
 		echo "not root and no sudo: tests that need these Debian packages are skipped: $$missing"; \
 	fi
