@@ -50,7 +50,9 @@ class Raster(TriangleSampler):
             np.empty((layers, height, width, 2), np.float32),
             np.empty((layers, height, width), np.float32),
         )
-        parallel(_draw, -(-height // BAND_ROWS), boxes, kept, clips, numbers, planes, counts, *fragments)
+        bands = -(-height // BAND_ROWS)
+        offsets, items = _bands(bands, boxes, counts)
+        parallel(_draw, bands, offsets, items, boxes, kept, clips, numbers, planes, *fragments)
         return fragments
 
 
@@ -180,52 +182,69 @@ def _clipped_box(corners, width, height):
 
 
 @numba.njit(cache=True, nogil=True)
-def _draw(first, last, boxes, kept, clips, numbers, planes, counts, triangle_ids, barycentrics, depths):
+def _bands(count, boxes, counts):
+    """For each band of rows the listed triangles that touch it, in order: offsets (bands + 1,) into items."""
+    offsets = np.zeros(count + 1, np.int64)
+    for chunk in range(len(counts)):
+        for n in range(chunk * CHUNK, chunk * CHUNK + counts[chunk]):
+            for band in range(boxes[n, 2] // BAND_ROWS, boxes[n, 3] // BAND_ROWS + 1):
+                offsets[band + 1] += 1
+    for band in range(count):
+        offsets[band + 1] += offsets[band]
+    items, filled = np.empty(offsets[count], np.int32), offsets[:-1].copy()
+    for chunk in range(len(counts)):
+        for n in range(chunk * CHUNK, chunk * CHUNK + counts[chunk]):
+            for band in range(boxes[n, 2] // BAND_ROWS, boxes[n, 3] // BAND_ROWS + 1):
+                items[filled[band]] = n
+                filled[band] += 1
+    return offsets, items
+
+
+@numba.njit(cache=True, nogil=True)
+def _draw(first, last, offsets, items, boxes, kept, clips, numbers, planes, triangle_ids, barycentrics, depths):
     """Fill the three fragment arrays, band by band."""
     layers, height, width = triangle_ids.shape
     nearest = np.empty((BAND_ROWS * width, layers))
-    items = np.empty((BAND_ROWS * width, layers), np.int64)
+    winners = np.empty((BAND_ROWS * width, layers), np.int32)
     for band in range(first, last):
         top, bottom = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS) - 1
-        nearest[:], items[:] = np.inf, -1
-        for chunk in range(len(counts)):
-            for n in range(chunk * CHUNK, chunk * CHUNK + counts[chunk]):
-                j0, j1 = max(top, boxes[n, 2]), min(bottom, boxes[n, 3])
-                if j0 > j1:
-                    continue
-                xa, ya, wa = numbers[n, 0], numbers[n, 1], numbers[n, 2]
-                xb, yb, wb = numbers[n, 3], numbers[n, 4], numbers[n, 5]
-                xc, yc, wc = numbers[n, 6], numbers[n, 7], numbers[n, 8]
-                za, zb, zc = numbers[n, 9], numbers[n, 10], numbers[n, 11]
-                # Top and left edges own the pixels exactly on them (y points down).
-                own_a, own_b, own_c = owns(xa, ya), owns(xb, yb), owns(xc, yc)
-                for j in range(j0, j1 + 1):
-                    y = j + 0.5
-                    ra, rb, rc = ya * y + wa, yb * y + wb, yc * y + wc
-                    for i in range(boxes[n, 0], boxes[n, 1] + 1):
-                        x = i + 0.5
-                        ea, eb, ec = xa * x + ra, xb * x + rb, xc * x + rc
-                        if ea < 0 or eb < 0 or ec < 0:
-                            continue
-                        if (ea == 0 and not own_a) or (eb == 0 and not own_b) or (ec == 0 and not own_c):
-                            continue
-                        total = ea + eb + ec
-                        if not total > 0 or (clips[n] and _outside(planes, n, ea, eb, ec)):
-                            continue
-                        z = (ea * za + eb * zb + ec * zc) / total
-                        pixel = (j - top) * width + i
-                        if not z < nearest[pixel, layers - 1]:
-                            continue
-                        k = layers - 1
-                        while k > 0 and z < nearest[pixel, k - 1]:
-                            nearest[pixel, k], items[pixel, k] = nearest[pixel, k - 1], items[pixel, k - 1]
-                            k -= 1
-                        nearest[pixel, k], items[pixel, k] = z, n
+        nearest[:], winners[:] = np.inf, -1
+        for at in range(offsets[band], offsets[band + 1]):
+            n = items[at]
+            j0, j1 = max(top, boxes[n, 2]), min(bottom, boxes[n, 3])
+            xa, ya, wa = numbers[n, 0], numbers[n, 1], numbers[n, 2]
+            xb, yb, wb = numbers[n, 3], numbers[n, 4], numbers[n, 5]
+            xc, yc, wc = numbers[n, 6], numbers[n, 7], numbers[n, 8]
+            za, zb, zc = numbers[n, 9], numbers[n, 10], numbers[n, 11]
+            # Top and left edges own the pixels exactly on them (y points down).
+            own_a, own_b, own_c = owns(xa, ya), owns(xb, yb), owns(xc, yc)
+            for j in range(j0, j1 + 1):
+                y = j + 0.5
+                ra, rb, rc = ya * y + wa, yb * y + wb, yc * y + wc
+                for i in range(boxes[n, 0], boxes[n, 1] + 1):
+                    x = i + 0.5
+                    ea, eb, ec = xa * x + ra, xb * x + rb, xc * x + rc
+                    if ea < 0 or eb < 0 or ec < 0:
+                        continue
+                    if (ea == 0 and not own_a) or (eb == 0 and not own_b) or (ec == 0 and not own_c):
+                        continue
+                    total = ea + eb + ec
+                    if not total > 0 or (clips[n] and _outside(planes, n, ea, eb, ec)):
+                        continue
+                    z = (ea * za + eb * zb + ec * zc) / total
+                    pixel = (j - top) * width + i
+                    if not z < nearest[pixel, layers - 1]:
+                        continue
+                    k = layers - 1
+                    while k > 0 and z < nearest[pixel, k - 1]:
+                        nearest[pixel, k], winners[pixel, k] = nearest[pixel, k - 1], winners[pixel, k - 1]
+                        k -= 1
+                    nearest[pixel, k], winners[pixel, k] = z, n
         for pixel in range((bottom - top + 1) * width):
             i, j = pixel % width, top + pixel // width
             x, y = i + 0.5, j + 0.5
             for k in range(layers):
-                n = items[pixel, k]
+                n = winners[pixel, k]
                 if n < 0:
                     triangle_ids[k, j, i] = -1
                     barycentrics[k, j, i, 0] = barycentrics[k, j, i, 1] = depths[k, j, i] = 0
