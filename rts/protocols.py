@@ -6,13 +6,14 @@ T triangles, I integers and P reals a sample, C channels. Conventions of space a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import field, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from rts.errors import InputError
+from rts.gbuffer import GBuffer
 from rts.records import record
 
 Array = Any
@@ -175,37 +176,6 @@ class Sampled:
     overflow: Array
 
 
-class GBuffer(dict):
-    """Attributes of the samples by name, each (N, C); "position" (N, 3) is required.
-
-    An attribute may be deferred: it is computed when first read, so a shader pays for what it reads.
-    Built-in surfaces use the names position, normal, uv and color, and any others that the user adds.
-    """
-
-    def __init__(self, *args: Any, **kwargs: Any):
-        super().__init__(*args, **kwargs)
-        self._deferred: dict[str, Callable[[], Array]] = {}
-
-    def defer(self, name: str, compute: Callable[[], Array]) -> None:
-        """Add an attribute that `compute()` gives when it is first read."""
-        self._deferred[name] = compute
-
-    def __missing__(self, name: str) -> Array:
-        if name not in self._deferred:
-            raise InputError(
-                f"the shader reads {name!r}, but the surface provides {', '.join(map(repr, self))}; "
-                f"add the attribute to the part's theta or choose another shader"
-            )
-        self[name] = self._deferred.pop(name)()
-        return self[name]
-
-    def __contains__(self, name: object) -> bool:
-        return super().__contains__(name) or name in self._deferred
-
-    def __iter__(self) -> Iterator[str]:
-        yield from [*super().__iter__(), *self._deferred]
-
-
 # ------------------------------------------------------------------------------------------------ protocols
 
 
@@ -239,7 +209,7 @@ class Surface(Protocol):
 
 
 class RaySurface(Protocol):
-    """A surface without triangles, for the sampler `rays`. The optional members of `Surface` apply, as far as they go."""
+    """A surface without triangles, for the sampler `rays`. Optional members as of `Surface`, as far as they go."""
 
     sample_widths: tuple[int, int]
     """(I, P) of the samples."""
@@ -309,6 +279,9 @@ class Splatter(Protocol):
 
 class Engine(Protocol):
     """An array framework. Chosen by the type of the arrays, never a global setting.
+
+    Optional member: `take_error() -> RtsError | None`, the last error raised inside a host call, where the framework
+    wraps such errors in its own.
 
     The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the
     user has imported that module.

@@ -1,0 +1,39 @@
+"""The attributes of samples, some of them computed only when read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from rts.errors import InputError
+
+
+class GBuffer(dict):
+    """Attributes of the samples by name, each (N, C); "position" (N, 3) is required.
+
+    An attribute may be deferred: it is computed when first read, so a shader pays for what it reads.
+    Built-in surfaces use the names position, normal, uv and color, and any others that the user adds.
+    """
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        super().__init__(*args, **kwargs)
+        self._deferred: dict[str, Callable[[], Any]] = {}
+
+    def defer(self, name: str, compute: Callable[[], Any]) -> None:
+        """Add an attribute that `compute()` gives when it is first read."""
+        self._deferred[name] = compute
+
+    def __missing__(self, name: str) -> Any:
+        if name not in self._deferred:
+            raise InputError(
+                f"the shader reads {name!r}, but the surface provides {', '.join(map(repr, self))}; "
+                f"add the attribute to the part's theta or choose another shader"
+            )
+        self[name] = self._deferred.pop(name)()
+        return self[name]
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or name in self._deferred
+
+    def __iter__(self) -> Iterator[str]:
+        yield from [*super().__iter__(), *self._deferred]

@@ -1,0 +1,129 @@
+"""What stands between a surface and its samples: lifting, refinement, tables, capacity, merging."""
+
+import numpy as np
+import pytest
+from helpers import DIFFERENTIABLE, arrays, icosphere, to_numpy
+
+import rts
+from rts import Camera, Fragments, GBuffer, Part, Proxy, Samples
+from rts.arrays import namespace
+from rts.protocols import ArraySpec
+from rts.sampling import lift, merge
+
+CAMERA = Camera.look_at((0.3, 0.5, 4), (0, 0, 0), fov_y=40, near=1, far=10)
+SIZE = (20, 24)
+TRIANGLE_SAMPLERS = [s for s in ("raster", "reference", "embree", "opengl") if s in rts.plugins("samplers")]
+
+
+class Ball:
+    """A sphere of radius θ["radius"] (1,), tessellated coarsely and polished along the rays."""
+
+    sample_widths = (1, 3)
+
+    def __init__(self):
+        self.vertices, self.faces = icosphere(1)
+
+    def proxy_inputs(self, theta):
+        return theta["radius"]
+
+    def proxy(self, inputs, camera, size):
+        # Larger than the ball, so that every ray that meets the ball meets the proxy.
+        vertices = (1.2 * inputs[0] * self.vertices).astype(np.float32)
+        faces = self.faces.astype(np.int32)
+        ids = np.arange(len(faces), dtype=np.int32)[:, None]
+        return Proxy(vertices, faces, ids, vertices[faces])
+
+    def refine(self, inputs, samples, rays):
+        o, d = rays.origins, rays.directions
+        a, b, c = (d * d).sum(1), (o * d).sum(1), (o * o).sum(1) - inputs[0] ** 2
+        square = b * b - a * c
+        distance = (-b - np.sqrt(np.maximum(square, 0))) / a
+        point = (o + distance[:, None] * d) / inputs[0]
+        cells = samples.row.reshape(-1)
+        missed = (cells >= 0) & (square[cells] <= 0)
+        row = np.where(missed, -1, cells).reshape(samples.row.shape).astype(np.int32)
+        depth = np.where(row >= 0, distance[row], 0).astype(np.float32)
+        tables = {"squares": (point**2).astype(np.float32)}
+        return Samples(samples.ids, point.astype(np.float32), row, depth, samples.overflow, tables)
+
+    def table_specs(self, rows):
+        return {"squares": ArraySpec((rows, 3), np.float32, packed=True)}
+
+    def evaluate(self, theta, samples):
+        assert set(samples.tables) <= {"squares"}
+        return GBuffer(position=samples.params * theta["radius"])
+
+
+@pytest.mark.parametrize("sampler", TRIANGLE_SAMPLERS)
+def test_refined_samples_lie_on_the_true_surface_and_in_the_centres_of_their_pixels(sampler):
+    if sampler == "opengl":
+        pytest.importorskip("moderngl")
+    part = Part(Ball(), {"radius": np.array([0.9])})
+    samples = rts.plugin("samplers", sampler)().sample(part, CAMERA, SIZE, 1)
+    cells = np.argwhere(samples.row[0] >= 0)
+    assert len(cells) > 50
+    rows = samples.row[0][tuple(cells.T)]
+    positions = part.surface.evaluate(part.theta, samples)["position"][rows]
+    np.testing.assert_allclose(np.linalg.norm(positions, axis=1), 0.9, rtol=1e-6)
+    found = CAMERA.project(positions, SIZE)
+    np.testing.assert_allclose(found[:, :2], cells[:, ::-1] + 0.5, atol=1e-4)
+    np.testing.assert_allclose(found[:, 2], samples.depth[0][tuple(cells.T)], rtol=1e-5)
+    np.testing.assert_allclose(samples.tables["squares"][rows].sum(1), 1, rtol=1e-5)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_refinement_and_tables_work_on_every_engine(target):
+    reference = rts.render(Part(Ball(), {"radius": np.array([0.9], np.float32)}), CAMERA, SIZE, layers=1)
+    part = Part(Ball(), {"radius": arrays(target, np.array([0.9]))})
+    np.testing.assert_allclose(to_numpy(rts.render(part, CAMERA, SIZE, layers=1)), reference, atol=1e-5)
+    if target == "jax":
+        import jax
+
+        traced = jax.jit(lambda r: rts.render(Part(part.surface, {"radius": r}), CAMERA, SIZE, layers=1))
+        np.testing.assert_allclose(traced(part.theta["radius"]), reference, atol=1e-5)
+
+
+def test_lift_numbers_samples_layer_by_layer_and_interpolates_corner_parameters():
+    ids = np.array([[[0, -1], [1, 0]], [[1, -1], [-1, -1]]], np.int32)
+    barycentrics = np.tile(np.array([0.5, 0.25], np.float32), (2, 2, 2, 1))
+    depth = np.arange(8, dtype=np.float32).reshape(2, 2, 2)
+    faces = np.array([[0, 1, 2], [2, 1, 3]], np.int32)
+    corners = np.arange(18, dtype=np.float32).reshape(2, 3, 3)
+    samples = lift(Fragments(ids, barycentrics, depth), Proxy(np.zeros((4, 3)), faces, None, corners))
+    np.testing.assert_array_equal(samples.row, [[[0, -1], [1, 2]], [[3, -1], [-1, -1]]])
+    np.testing.assert_array_equal(samples.ids, faces[[0, 1, 0, 1]])
+    weights = np.array([0.5, 0.25, 0.25])
+    np.testing.assert_allclose(samples.params, np.einsum("c,ncp->np", weights, corners[[0, 1, 0, 1]]))
+    np.testing.assert_array_equal(samples.depth, np.where(ids >= 0, depth, 0))
+
+
+def test_lift_drops_the_deepest_layers_first_where_capacity_ends():
+    ids = np.zeros((2, 1, 3), np.int32)
+    fragments = Fragments(ids, np.zeros((2, 1, 3, 2), np.float32), np.ones((2, 1, 3), np.float32))
+    samples = lift(fragments, Proxy(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32)), capacity=4)
+    np.testing.assert_array_equal(samples.row, [[[0, 1, 2]], [[3, -1, -1]]])
+    assert samples.overflow == 2 and len(samples.ids) == 4
+
+
+def test_there_is_a_row_even_where_nothing_is_hit():
+    ids = np.full((1, 2, 2), -1, np.int32)
+    fragments = Fragments(ids, np.zeros((1, 2, 2, 2), np.float32), np.zeros((1, 2, 2), np.float32))
+    samples = lift(fragments, Proxy(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32)))
+    assert len(samples.ids) == 1 and (samples.row == -1).all()
+
+
+@pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
+def test_layers_of_several_parts_are_interleaved_by_depth_and_ties_go_to_the_earlier(target):
+    def samples(row, depth):
+        row, depth = np.array(row, np.int32).reshape(2, 1, 3), np.array(depth, np.float32).reshape(2, 1, 3)
+        fields = np.zeros((4, 1), np.int32), np.zeros((4, 2), np.float32), row, depth, np.int32(0)
+        return Samples(*fields) if target == "numpy" else Samples(*arrays(target, tuple(map(np.asarray, fields))))
+
+    first = samples([0, 1, -1, 2, -1, -1], [1, 5, 0, 3, 0, 0])
+    second = samples([0, 1, 2, 3, -1, -1], [2, 5, 7, 4, 0, 0])
+    merged = merge([first, second], 2)
+    np.testing.assert_array_equal(to_numpy(merged.row).reshape(2, 3), [[0, 1, 6], [4, 5, -1]])
+    np.testing.assert_array_equal(to_numpy(merged.part).reshape(2, 3), [[0, 0, 1], [1, 1, -1]])
+    depth = np.where(to_numpy(merged.row) >= 0, to_numpy(merged.depth), 0)
+    np.testing.assert_array_equal(depth.reshape(2, 3), [[1, 5, 7], [2, 5, 0]])
+    assert namespace(merged.row) is namespace(first.row)
