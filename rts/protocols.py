@@ -190,6 +190,8 @@ class Surface(Protocol):
         proxy_is_cheap (bool): making the proxy costs no more than looking whether its inputs have changed.
         refine(inputs, samples, rays) -> Samples: on the host, polish or replace ids and params.
         table_specs(rows) -> dict of ArraySpec: the `Samples.tables` that `refine` fills, for at most `rows` samples.
+        example() -> Part: of the class, not of an object: a small part with its shader and θ in NumPy, about the origin
+            and within two units of it. `rts plugins --matrix` and tests draw it.
     """
 
     sample_widths: tuple[int, int]

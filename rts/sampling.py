@@ -95,6 +95,10 @@ class TriangleSampler(abc.ABC):
             entry: to be used without a look at the surface's inputs; see `rts.prepare`.
         """
         surface, theta = part.surface, part.theta
+        if not hasattr(surface, "proxy"):
+            raise InputError(
+                f"{surface!r} has no triangles, which this sampler needs; use a sampler of such surfaces, such as 'rays'"
+            )
         engine = engine_of(theta, camera)
         inputs = surface.proxy_inputs(theta) if entry is None or hasattr(surface, "refine") else None
         reads = surface.reads(theta) if hasattr(surface, "reads") else tuple(theta)

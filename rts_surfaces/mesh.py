@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from rts.arrays import engine_of, is_constant, namespace, unit
 from rts.errors import InputError
 from rts.keeping import fingerprint
-from rts.protocols import Array, GBuffer, Proxy, Samples, Tree
+from rts.protocols import Array, GBuffer, Part, Proxy, Samples, Tree
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv")
@@ -53,6 +54,21 @@ class Mesh:
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.faces)} faces)"
+
+    @classmethod
+    def example(cls) -> Part:
+        """A coloured icosahedron."""
+        golden = (1 + 5**0.5) / 2
+        corners = [c for a in (-1, 1) for b in (-golden, golden) for c in ((a, b, 0), (0, a, b), (b, 0, a))]
+        directions = np.array(corners) / np.hypot(1, golden)
+        triples = np.array(list(combinations(range(12), 3)))
+        # Its faces are the triples of corners that are an edge apart; the farthest others are √2 or more away.
+        sides = np.linalg.norm(directions[triples] - directions[np.roll(triples, 1, axis=1)], axis=2)
+        faces = triples[(sides < 1.1).all(axis=1)]
+        inward = np.linalg.det(directions[faces]) < 0
+        faces[inward] = faces[inward][:, ::-1]
+        theta = {"vertices": directions.astype(np.float32), "colors": (0.5 + 0.5 * directions).astype(np.float32)}
+        return Part(cls(faces), theta, shader="lambert")
 
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Shapes and dtypes of θ."""

@@ -1,0 +1,252 @@
+"""What every sampler must do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rts import registry
+from rts.arrays import leaves
+from rts.camera import Camera
+from rts.gbuffer import GBuffer
+from rts.protocols import Part, Sampled
+from rts.testing import engines, scenes
+from rts.testing.conformance import Conformance, claim, no_error, refusal
+from rts.testing.engines import DIFFERENTIABLE, ENGINES, engine_named, joined, split
+from rts.testing.samples import claim_empty_where_empty, claim_ordered, claim_reprojected
+from rts.testing.unusual import claim_awkward_views_are_finite, claim_unseen_is_nothing
+
+DEEPER = 4
+"""Layers of the reference beyond those compared, which tell where a silhouette is."""
+
+
+class Elsewhere:
+    """A surface that no sampler can sample: it has neither triangles nor an intersection."""
+
+    sample_widths = (0, 2)
+
+    def __repr__(self) -> str:
+        return "Elsewhere()"
+
+    def evaluate(self, theta: Any, samples: Any) -> GBuffer:
+        """A point wherever it is asked for one."""
+        return GBuffer(position=theta["center"] + 0 * samples.params[:, :1])
+
+
+class SamplerConformance(Conformance):
+    """Checks of a sampler.
+
+    Override the fixture `sampler`: the name of one, or an object. For a sampler of surfaces that are not triangles,
+    override `parts`, too: a list of parts about the origin, within two units, whose θ holds NumPy arrays.
+    """
+
+    @pytest.fixture
+    def sampler(self) -> Any:
+        """Name or object of the sampler."""
+        raise NotImplementedError("override the fixture 'sampler' with the sampler, or its name")
+
+    @pytest.fixture
+    def parts(self) -> list[Part]:
+        """What it is to sample: triangles that are closed, culled, moved, and in a heap."""
+        turned = np.array([(0.8, 0, 0.6, 0.1), (0, 1.2, 0, -0.1), (-0.6, 0, 0.8, 0.2), (0, 0, 0, 1)], np.float32)
+        return [scenes.ball(), scenes.ball(cull="back", transform=turned), scenes.soup()]
+
+    # ---------------------------------------------------------------------------------------- geometry
+
+    def test_samples_lie_on_the_centres_of_their_pixels(self, sampler: Any, parts: list[Part]) -> None:
+        """Evaluated and projected, each sample is where its ray went, at its depth."""
+        for view, camera, part in _scenes(parts):
+            claim_reprojected(part, scenes.find(part, camera, sampler, layers=3), camera, view)
+
+    def test_it_agrees_with_the_reference(self, sampler: Any, parts: list[Part]) -> None:
+        """The same triangles inside, at most one in a hundred pixels different at silhouettes, depth to 1e-5."""
+        triangles = [p for p in parts if hasattr(p.surface, "proxy")]
+        if not triangles:
+            pytest.skip("no triangles to compare with the reference")
+        edges = different = 0
+        for view, camera, part in _scenes(triangles):
+            for layers in (1, 3):
+                found = scenes.find(part, camera, sampler, layers=layers)
+                more = claim_like_reference(found, part, camera, layers, view)
+                edges, different = edges + more[0], different + more[1]
+        claim(
+            different <= 0.01 * edges,
+            f"{different} of {edges} pixels at silhouettes differ from the reference; expected at most 1 %",
+        )
+
+    def test_layers_are_front_to_back(self, sampler: Any, parts: list[Part]) -> None:
+        """In every pixel, without gaps; and one layer is the first of three."""
+        for view, camera, part in _scenes(parts):
+            one, three = (scenes.find(part, camera, sampler, layers=k) for k in (1, 3))
+            claim_ordered(three, view)
+            first = np.asarray(three.depth)[:1]
+            claim(np.allclose(one.depth, first, rtol=1e-6), f"{view}: one layer is not the first of three")
+
+    def test_background_is_empty(self, sampler: Any, parts: list[Part]) -> None:
+        """Row −1 and depth 0 where nothing is seen, no row twice, and an image that is zero there."""
+        for view, camera, part in _scenes(parts):
+            sampled = scenes.find(part, camera, sampler)
+            claim_empty_where_empty(sampled, view)
+            image = scenes.render(part, camera, scenes.SIZE, sampler=sampler, splatter="none")
+            empty = np.asarray(sampled.row)[0, 1:-1, 1:-1] < 0
+            claim((image[empty] == 0).all(), f"{view}: the image is not zero where nothing is seen")
+
+    def test_samples_lie_between_the_near_and_the_far_plane(self, sampler: Any, parts: list[Part]) -> None:
+        """What is before the one or beyond the other is not seen."""
+        near, far = 3.4, 4.2
+        for part in parts:
+            sampled = scenes.find(part, scenes.NEAR, sampler, layers=3)
+            depth = np.asarray(sampled.depth)[np.asarray(sampled.row) >= 0]
+            claim(len(depth), "nothing is seen of a part that both planes cut")
+            ok = (depth >= near * (1 - 1e-5)) & (depth <= far * (1 + 1e-5))
+            claim(ok.all(), f"depths from {depth.min():.5g} to {depth.max():.5g}; the planes are at {near} and {far}")
+
+    # -------------------------------------------------------------------------------------- the contract
+
+    def test_two_calls_give_the_same(self, sampler: Any, parts: list[Part]) -> None:
+        """To the last bit, whatever was sampled between."""
+        for view, camera, part in _scenes(parts):
+            first = scenes.find(part, camera, sampler)
+            for other in parts:
+                values, join = split(other.theta)
+                scenes.find(other.replace(theta=join([0.9 * v for v in values])), scenes.AXES[2], sampler)
+            _claim_same(scenes.find(part, camera, sampler), first, view)
+
+    def test_it_sees_arrays_that_change_in_place(self, sampler: Any, parts: list[Part]) -> None:
+        """What is built is kept by the values, not by the identity of arrays."""
+        for part in parts:
+            values, join = split(part.theta)
+            changing = [v.copy() for v in values]
+            changed = part.replace(theta=join(changing))
+            scenes.find(changed, sampler=sampler)
+            for v in changing:
+                v *= 0.9
+            expected = scenes.find(part.replace(theta=join([v.copy() for v in changing])), sampler="auto")
+            found = scenes.find(changed, sampler=sampler)
+            same = np.allclose(np.sum(found.depth), np.sum(expected.depth), rtol=1e-2)
+            claim(same, "a change in place of the arrays of θ is not seen; keep what is built by their values")
+
+    def test_capacity_drops_the_deepest_layers_first(self, sampler: Any, parts: list[Part]) -> None:
+        """Exactly so many rows; what does not fit is counted."""
+        part = parts[0]
+        everything = np.asarray(scenes.find(part, sampler=sampler).row)
+        hits, front = (everything >= 0).sum(), (everything[0] >= 0).sum()
+        capacity = int((hits + front) // 2)
+        found = scenes.find(part, sampler=sampler, capacity=capacity)
+        samples, row = found.samples[0], np.asarray(found.row)
+        rows = len(samples.ids), len(samples.params)
+        claim(rows == (capacity, capacity), f"{rows} rows of ids and params; the capacity is {capacity}")
+        dropped = int(found.overflow)
+        claim(dropped == hits - capacity, f"overflow is {dropped}; {hits - capacity} were dropped")
+        claim((row >= 0).sum() == capacity, f"{(row >= 0).sum()} cells have samples; the capacity is {capacity}")
+        claim((row[0] >= 0).sum() == front, "samples of the front layer were dropped before those behind")
+
+    def test_what_it_cannot_sample_is_refused_in_one_line(self, sampler: Any) -> None:
+        """An `rts.InputError` that says what to do, for a surface with neither triangles nor an intersection."""
+        part = Part(Elsewhere(), {"center": np.zeros(3, np.float32)})
+        what = "a surface without triangles and intersection"
+        claim(refusal(lambda: scenes.find(part, sampler=sampler), what), f"{what} is accepted")
+
+    # ------------------------------------------------------------------------------------------- engines
+
+    @pytest.mark.parametrize("engine", ENGINES)
+    def test_every_engine_finds_the_same_samples(self, sampler: Any, parts: list[Part], engine: str) -> None:
+        """Also inside a compiled function."""
+        chosen = engine_named(engine)
+        for part in parts[:2]:
+            values, join = split(part.theta)
+            expected = scenes.frozen(part, sampler=sampler)
+
+            def sampled(x: list, part: Part = part, join: Any = join) -> Sampled:
+                theta = joined(chosen, join, x)
+                return scenes.find(part.replace(theta=theta), sampler=sampler, capacity=scenes.CAPACITY)
+
+            at = engines.on(chosen, values)
+            for how, f in (("", sampled), (", compiled", chosen.jit(sampled))):
+                with no_error(f"sampling in {engine}{how}"):
+                    found = engines.host(chosen, f(at))
+                claim(found.row.shape == expected.row.shape, f"in {engine}{how}, row has shape {found.row.shape}")
+                same = (found.row >= 0) == (expected.row >= 0)
+                same &= np.abs(found.depth - expected.depth) <= 1e-4 * expected.depth
+                claim(same.mean() >= 0.99, f"in {engine}{how}, {np.sum(~same)} of {same.size} cells are not NumPy's")
+
+    def test_engines_agree(self, sampler: Any, parts: list[Part]) -> None:
+        """On the image, its gradient, and its derivative along a direction, each at samples of its own."""
+        part = parts[0]
+        values, join = split(part.theta)
+
+        def image(x: list) -> Any:
+            return scenes.shown(part.replace(theta=join(x)), sampler=sampler)
+
+        engines.claim_engines_agree(image, values, image([engines.single(v) for v in values]), "the image")
+
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_samples_carry_no_derivative(self, sampler: Any, parts: list[Part], engine: str) -> None:
+        """Parameters and depth are constants, whatever they were computed from."""
+        chosen, (values, join) = engine_named(engine), split(parts[0].theta)
+        xp = chosen.namespace
+
+        def total(x: list) -> Any:
+            part = parts[0].replace(theta=joined(chosen, join, x))
+            samples = scenes.find(part, sampler=sampler, capacity=scenes.CAPACITY).samples[0]
+            return xp.sum(samples.params) + xp.sum(samples.depth)
+
+        gradient = engines.host(chosen, chosen.value_and_grad(total)(engines.on(chosen, values))[1])
+        claim(all((g == 0).all() for g in gradient), f"in {engine}, samples have a gradient in θ; stop it")
+
+    # ------------------------------------------------------------------------------------ unusual scenes
+
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_unseen_parts_give_nothing_and_no_gradient(self, sampler: Any, parts: list[Part], engine: str) -> None:
+        """Behind the camera or beside the image: an empty image and a gradient of zero."""
+        for part in parts[:1]:
+            claim_unseen_is_nothing(part, sampler, engine_named(engine))
+
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_awkward_views_are_finite(self, sampler: Any, parts: list[Part], engine: str) -> None:
+        """From inside, cut by the near plane, edge-on: a finite image and gradient."""
+        triangles = [scenes.flat()] if hasattr(parts[0].surface, "proxy") else []
+        for part in [parts[0], *triangles]:
+            claim_awkward_views_are_finite(part, sampler, engine_named(engine))
+
+
+def claim_like_reference(found: Sampled, part: Part, camera: Camera, layers: int, view: str) -> tuple[int, int]:
+    """Fail unless samples have the ids and depths of the reference, save at silhouettes; how many those are."""
+    reference = registry.instance("rts.samplers", "reference")
+    deep = scenes.find(part, camera, reference, layers=layers + DEEPER)
+    count = np.pad((np.asarray(deep.row) >= 0).sum(axis=0), 1, mode="edge")
+    height, width = scenes.GRID
+    around = np.stack([count[i : i + height, j : j + width] for i in range(3) for j in range(3)])
+    edge = (around != around[4]).any(axis=0)
+
+    expected = scenes.find(part, camera, reference, layers=layers)
+    ids, other = _ids(found), _ids(expected)
+    different = (ids != other).any(axis=(0, -1))
+    inside = different & ~edge
+    claim(
+        not inside.any(),
+        f"{view}, {layers} layers: {inside.sum()} of {(~edge).sum()} pixels inside have other triangles than the "
+        f"reference, the first at {tuple(np.argwhere(inside)[0]) if inside.any() else ()} of the grid",
+    )
+    depth, right = np.asarray(found.depth), np.asarray(expected.depth)
+    off = (np.abs(depth - right) > 1e-5 * right) & ~different
+    claim(not off.any(), f"{view}: the depth of {off.sum()} samples is not the reference's, by more than 1e-5 of it")
+    return int(edge.sum()), int((different & edge).sum())
+
+
+def _ids(sampled: Sampled) -> np.ndarray:
+    """(K, H, W, I) the ids in each cell, −1 where empty."""
+    row = np.asarray(sampled.row)
+    return np.where((row >= 0)[..., None], np.asarray(sampled.samples[0].ids)[row], -1)
+
+
+def _scenes(parts: list[Part]) -> list[tuple[str, Camera, Part]]:
+    return [(f"part {i}, {view}", c, p) for i, p in enumerate(parts) for view, c in scenes.VIEWS.items()]
+
+
+def _claim_same(found: Sampled, expected: Sampled, view: str) -> None:
+    pairs = zip(leaves(found), leaves(expected), strict=True)
+    same = all(np.array_equal(a, b) for a, b in pairs)
+    claim(same, f"{view}: the same call gives other samples after another one")

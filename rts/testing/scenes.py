@@ -1,0 +1,92 @@
+"""Cameras and parts that the kit looks at; everything lies about the origin, within two units of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rts import registry
+from rts.camera import Camera
+from rts.protocols import Array, Part, Sampled
+from rts.rendering import APRON, render, render_samples, sample
+from rts.testing.conformance import claim
+from rts.testing.engines import single
+
+# One size throughout: engines that compile do it once.
+SIZE = (14, 18)
+GRID = SIZE[0] + 2 * APRON, SIZE[1] + 2 * APRON
+LAYERS = 2
+CAPACITY = LAYERS * GRID[0] * GRID[1]
+
+
+def _rounded(camera: Camera) -> Camera:
+    """In float32, so that every engine sees the same one."""
+    return Camera(*map(single, camera))
+
+
+def _look(eye: tuple, at: tuple = (0, 0, 0), up: tuple = (0, 1, 0), **options: Any) -> Camera:
+    return _rounded(Camera.look_at(eye, at, up, fov_y=options.pop("fov_y", 45), aspect=18 / 14, **options))
+
+
+CAMERA = _look((0.9, 1.6, 3.2), principal_point=(0.1, -0.05))
+"""Perspective, with nothing symmetric that could hide a flip or a shift."""
+
+AWAY = _look((0, 0, 5), (0, 0, 9))
+BESIDE = _look((0, 0, 5), (40, 0, 5.5))
+NEAR = _look((0.9, 1.6, 3.2), near=3.4, far=4.2)
+"""Its near plane cuts through what is about the origin, and its far plane too."""
+
+INSIDE = _look((0.1, 0.05, 0.2), (0.6, 0.2, -1), near=0.05, far=20, fov_y=75)
+PARALLEL = _rounded(Camera.orthographic((1.1, 1.3, 3.1), (0, 0.1, 0), height=3.1, aspect=18 / 14, near=0.5, far=9))
+AXES = [_look(e, up=u) for e, u in (((4, 0, 0), (0, 1, 0)), ((0, 4, 0), (0, 0, 1)), ((0, 0, 4), (0, 1, 0)))]
+VIEWS = {"perspective": CAMERA, "orthographic": PARALLEL, "from inside": INSIDE, "cut by near and far plane": NEAR}
+UNSEEN = {"behind the camera": AWAY, "beside the image": BESIDE}
+
+
+def mesh(vertices: Any, faces: Any, **options: Any) -> Part:
+    """A mesh as a part."""
+    surface = registry.plugin("rts.surfaces", "mesh")(faces)
+    return Part(surface, {"vertices": np.asarray(vertices, np.float32)}, **options)
+
+
+def soup(count: int = 14, seed: int = 3) -> Part:
+    """Random triangles that pierce each other."""
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(-0.8, 0.8, (count, 1, 3)) + rng.normal(0, 0.6, (count, 3, 3))
+    return mesh(corners.reshape(-1, 3), np.arange(3 * count).reshape(-1, 3))
+
+
+def ball(**options: Any) -> Part:
+    """A closed surface of few, large triangles."""
+    return registry.plugin("rts.surfaces", "mesh").example().replace(shader="unlit", **options)
+
+
+def flat() -> Part:
+    """A square in the plane x = 0, which the camera on the z-axis sees edge-on."""
+    return mesh([(0, -1, -1), (0, 1, -1), (0, 1, 1), (0, -1, 1)], [(0, 1, 2), (0, 2, 3)])
+
+
+def find(part: Part, camera: Camera = CAMERA, sampler: Any = "auto", layers: int = LAYERS, **options: Any) -> Sampled:
+    """Sample a scene of NumPy arrays."""
+    return sample(part, camera, SIZE, sampler=sampler, layers=layers, **options)
+
+
+def frozen(part: Part, camera: Camera = CAMERA, sampler: Any = "auto") -> Sampled:
+    """Samples of NumPy arrays to evaluate at in any engine, always of the same number of rows."""
+    sampled = find(part, camera, sampler, capacity=CAPACITY)
+    claim(
+        (np.asarray(sampled.row) >= 0).sum() >= 20,
+        "the camera sees too little of the part: move it to the origin, at a size of about one",
+    )
+    return sampled
+
+
+def shown(part: Part, camera: Camera = CAMERA, sampler: Any = "auto") -> Array:
+    """An image, in the engine of the part; with the splatter that costs least and has derivatives everywhere."""
+    return render(part, camera, SIZE, sampler=sampler, splatter="single", layers=LAYERS, capacity=CAPACITY)
+
+
+def shown_at(sampled: Sampled, part: Part, camera: Camera = CAMERA) -> Array:
+    """The same at samples found before."""
+    return render_samples(sampled, part, camera, splatter="single")

@@ -1,0 +1,190 @@
+"""What every shader must do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rts import registry
+from rts.arrays import constants, engine_of, map_leaves
+from rts.gbuffer import GBuffer
+from rts.protocols import Engine, Tree
+from rts.testing import engines, scenes
+from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
+from rts.testing.engines import DIFFERENTIABLE, engine_named, names, split
+
+ROWS = 64
+STEP = 1e-6
+TOLERANCE = 1e-5
+
+
+class ShaderConformance(Conformance):
+    """Checks of a shader.
+
+    Override the fixture `shader`: its name, an object or a function; `theta` where it reads any of θ; and `gbuffer`
+    where it reads entries other than position, normal, uv and color.
+    """
+
+    @pytest.fixture
+    def shader(self) -> Any:
+        """Name or object of the shader."""
+        raise NotImplementedError("override the fixture 'shader' with the shader, or its name")
+
+    @pytest.fixture
+    def theta(self) -> Tree:
+        """The entries of θ that it reads; NumPy arrays."""
+        return {}
+
+    @pytest.fixture
+    def gbuffer(self) -> dict[str, np.ndarray]:
+        """Entries of the G-buffer, (64, C) float32 each, in world space about the origin."""
+        return random_gbuffer()
+
+    # ------------------------------------------------------------------------------------------- values
+
+    def test_it_gives_a_premultiplied_color_for_each_sample(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
+        """(N, 4) in the G-buffer's dtype, within [0, 1], no colour above alpha."""
+        rgba = _shaded(shader, theta, gbuffer)
+        claim(rgba.shape == (ROWS, 4), f"the shader returned {rgba.shape}; expected {(ROWS, 4)}")
+        claim(rgba.dtype == np.float32, f"the shader returned {rgba.dtype} for float32; expected float32")
+        low, high = rgba.min(), rgba.max()
+        claim(low >= -TOLERANCE and high <= 1 + TOLERANCE, f"colours run from {low:.3g} to {high:.3g}; expected 0 to 1")
+        above = (rgba[:, :3] - rgba[:, 3:]).max()
+        claim(above <= TOLERANCE, f"a colour exceeds its alpha by {above:.3g}; multiply colours by alpha")
+
+    def test_samples_are_shaded_one_by_one(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
+        """Their order, and what else is seen, change nothing."""
+        rgba = _shaded(shader, theta, gbuffer)
+        order = np.random.default_rng(1).permutation(ROWS)
+        found = _shaded(shader, theta, {name: value[order] for name, value in gbuffer.items()})
+        claim_close(found, rgba[order], TOLERANCE, "the colour of permuted samples")
+        half = _shaded(shader, theta, {name: value[: ROWS // 2] for name, value in gbuffer.items()})
+        claim_close(half, rgba[: ROWS // 2], TOLERANCE, "the colour of samples shaded without the others")
+
+    def test_opaque_is_true(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
+        """A shader that promises to be opaque has alpha 1, exactly."""
+        if not getattr(_instance(shader), "opaque", False):
+            pytest.skip("the shader does not promise to be opaque")
+        alpha = _shaded(shader, theta, gbuffer)[:, 3]
+        claim((alpha == 1).all(), f"the shader promises to be opaque; alpha is {alpha.min():.3g} somewhere")
+
+    def test_it_reads_what_it_says(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
+        """With only position and the entries that it names, it gives the same."""
+        reads = getattr(_instance(shader), "reads", None)
+        if reads is None:
+            pytest.skip("the shader does not say what it reads")
+        fewer = {name: value for name, value in gbuffer.items() if name in ("position", *reads)}
+        with no_error(f"shading with position, {', '.join(reads)} only, as `reads` says"):
+            found = _shaded(shader, theta, fewer)
+        claim_close(found, _shaded(shader, theta, gbuffer), 0, "the colour without what is not in `reads`")
+
+    # -------------------------------------------------------------------------------------- derivatives
+
+    def test_engines_agree(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
+        """On colours, their gradient, and their derivative along a direction, in θ and the G-buffer."""
+        values, join = split({"theta": theta, "gbuffer": gbuffer})
+
+        def f(x: list) -> Any:
+            return _call(shader, join(x), None)
+
+        expected = f([engines.single(v) for v in values])
+        engines.claim_engines_agree(f, values, expected, "the colour")
+
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_gradients_are_finite_differences(self, shader: Any, theta: Tree, gbuffer: dict, engine: str) -> None:
+        """In every entry of θ."""
+        chosen, (values, join) = engine_named(engine), split(theta)
+        values = [v.astype(np.float64) for v in values]
+        if not values:
+            pytest.skip("the shader is given no θ")
+        weights = np.random.default_rng(0).standard_normal((ROWS, 4))
+        wide = map_leaves(lambda x: np.asarray(x, np.float64), gbuffer)
+
+        def value(x: list) -> float:
+            return float(np.sum(_call(shader, {"theta": join(x), "gbuffer": wide}, None) * weights))
+
+        on_device = engines.on(chosen, (gbuffer, weights))
+
+        def product(x: list) -> Any:
+            rgba = _call(shader, {"theta": join(x), "gbuffer": on_device[0]}, chosen)
+            return chosen.namespace.sum(rgba * on_device[1])
+
+        gradient = engines.host(chosen, chosen.value_and_grad(product)(engines.on(chosen, values))[1])
+        for i, along in enumerate(engines.directions(values)):
+            ends = []
+            for step in (STEP, -STEP):
+                ends.append(value([v + step * along if i == j else v for j, v in enumerate(values)]))
+            what = f"the derivative of the colour in {names(theta)[i]}, in {engine},"
+            engines.claim_slope(gradient[i], along, (ends[0] - ends[1]) / (2 * STEP), what)
+
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_awkward_samples_have_finite_gradients(self, shader: Any, theta: Tree, gbuffer: dict, engine: str) -> None:
+        """Normals of zero, seen edge-on or from behind, uv far outside, black, positions at the camera."""
+        chosen = engine_named(engine)
+        values, join = split({"theta": theta, "gbuffer": awkward(gbuffer)})
+
+        def f(x: list) -> Any:
+            return _call(shader, join(x), chosen)
+
+        found = engines.derivatives(chosen, f, values, engines.directions(values), np.ones((ROWS, 4)))
+        claim_finite(found, f"in {engine}, the colour of awkward samples or its derivative")
+
+    # ------------------------------------------------------------------------------------------- errors
+
+    def test_what_is_missing_is_refused_in_one_line(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
+        """Without an entry of θ or of the G-buffer, it works, or raises an `rts.InputError` that says what to do."""
+        for name in theta:
+            fewer = {k: v for k, v in theta.items() if k != name}
+            refusal(lambda fewer=fewer: _shaded(shader, fewer, gbuffer), f"theta without {name!r}")
+        for name in sorted(set(gbuffer) - {"position"}):
+            without = {k: v for k, v in gbuffer.items() if k != name}
+            refusal(lambda without=without: _shaded(shader, theta, without), f"a G-buffer without {name!r}")
+
+
+def random_gbuffer() -> dict[str, np.ndarray]:
+    """What surfaces usually provide, at points about the origin."""
+    rng = np.random.default_rng(0)
+    normal = rng.standard_normal((ROWS, 3))
+    return {
+        "position": rng.uniform(-0.8, 0.8, (ROWS, 3)).astype(np.float32),
+        "normal": (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32),
+        "uv": rng.uniform(0.02, 0.98, (ROWS, 2)).astype(np.float32),
+        "color": rng.uniform(0, 1, (ROWS, 4)).astype(np.float32),
+    }
+
+
+def awkward(gbuffer: dict) -> dict:
+    """The same with rows on which careless arithmetic divides by zero."""
+    gbuffer = {name: value.copy() for name, value in gbuffer.items()}
+    eye = np.linalg.inv(scenes.CAMERA.view.astype(np.float64))[:3, 3]
+    gbuffer["position"][5] = eye
+    if "normal" in gbuffer:
+        toward = eye - gbuffer["position"]
+        gbuffer["normal"][:10] = 0
+        gbuffer["normal"][10:20] = np.cross(toward[10:20], [0.0, 1.0, 0.0])
+        gbuffer["normal"][20:25] = -toward[20:25]
+    if "uv" in gbuffer:
+        gbuffer["uv"][25:30] = [-1e4, 1e4]
+        gbuffer["uv"][30:32] = 1.0
+    for name, value in gbuffer.items():
+        if name not in ("position", "normal", "uv"):
+            value[35:40] = 0
+    return gbuffer
+
+
+def _instance(shader: Any) -> Any:
+    return registry.instance("rts.shaders", shader)
+
+
+def _call(shader: Any, inputs: dict, engine: Engine | None) -> Any:
+    """The colours for {"theta": …, "gbuffer": …}, constants made those of the engine."""
+    engine = engine or engine_of(inputs)
+    inputs, camera = constants((inputs, scenes.CAMERA), engine, None)
+    return _instance(shader)(inputs["theta"], GBuffer(inputs["gbuffer"]), camera)
+
+
+def _shaded(shader: Any, theta: Tree, gbuffer: dict) -> np.ndarray:
+    single = map_leaves(engines.single, theta)
+    return np.asarray(_call(shader, {"theta": single, "gbuffer": gbuffer}, None))

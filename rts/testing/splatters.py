@@ -1,0 +1,211 @@
+"""What every splatter must do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from rts import registry
+from rts.testing import engines
+from rts.testing.conformance import Conformance, claim, claim_close, no_error, refusal
+from rts.testing.engines import DIFFERENTIABLE, ENGINES, engine_named
+
+HEIGHT, WIDTH, LAYERS = 8, 9, 2
+CELLS = HEIGHT * WIDTH * LAYERS
+TOLERANCE = 1e-5
+
+
+class Splats(NamedTuple):
+    """The arguments of `splat`."""
+
+    positions: np.ndarray
+    rgba: np.ndarray
+    row: np.ndarray
+
+
+class SplatterConformance(Conformance):
+    """Checks of a splatter.
+
+    Override the fixture `splatter`: its name, or an object. Set `moves_edges = False` for one that deliberately has no
+    derivative where surfaces end.
+    """
+
+    moves_edges = True
+
+    @pytest.fixture
+    def splatter(self) -> Any:
+        """Name or object of the splatter."""
+        raise NotImplementedError("override the fixture 'splatter' with the splatter, or its name")
+
+    # ------------------------------------------------------------------------------------------- values
+
+    def test_a_constant_interior_stays(self, splatter: Any) -> None:
+        """Away from the image's border an opaque colour is reproduced, from one layer or two."""
+        color = np.array([0.2, 0.5, 0.9, 1.0], np.float32)
+        for layers in (1, 2):
+            splats = everywhere(layers)
+            image = _splat(splatter, splats._replace(rgba=np.broadcast_to(color, splats.rgba.shape)))
+            claim(image.shape == (HEIGHT, WIDTH, 4), f"the image is {image.shape}; expected {(HEIGHT, WIDTH, 4)}")
+            inside = np.broadcast_to(color, (HEIGHT - 2, WIDTH - 2, 4))
+            claim_close(image[1:-1, 1:-1], inside, TOLERANCE, f"a constant colour of {layers} layers")
+
+    def test_the_front_layer_hides_those_behind(self, splatter: Any) -> None:
+        """Where it is opaque and covers everything."""
+        splats = everywhere(LAYERS)
+        rgba = splats.rgba.copy()
+        rgba[splats.row[0].ravel()] = [1, 0, 0, 1]
+        rgba[splats.row[1].ravel()] = [0, 1, 0, 1]
+        image = _splat(splatter, splats._replace(rgba=rgba))[1:-1, 1:-1]
+        claim_close(image, np.broadcast_to([1, 0, 0, 1], image.shape), TOLERANCE, "the color of a covered surface")
+
+    def test_empty_cells_stay_empty(self, splatter: Any) -> None:
+        """An image of zeros where no cell, or none nearby, has a sample: row −1 is no sample."""
+        splats = everywhere(LAYERS)
+        image = _splat(splatter, splats._replace(row=np.full_like(splats.row, -1)))
+        claim((image == 0).all(), "an image without samples is not zero; row −1 means that there is none")
+        row = np.full_like(splats.row, -1)
+        row[:, 2, 3] = splats.row[:, 2, 3]
+        image = _splat(splatter, splats._replace(row=row))
+        far = np.ones((HEIGHT, WIDTH), bool)
+        far[1:4, 2:5] = False
+        claim((image[far] == 0).all(), "a sample reaches beyond the cells beside its own")
+        claim(image[2, 3, 3] > 0.5, "a sample does not show in its own cell")
+
+    def test_colors_stay_premultiplied(self, splatter: Any) -> None:
+        """0 ≤ colour ≤ alpha ≤ 1, of any layers."""
+        image = _splat(splatter, scattered())
+        low, alpha = image.min(), image[..., 3].max()
+        claim(low >= -TOLERANCE and alpha <= 1 + TOLERANCE, f"values from {low:.3g}, alpha to {alpha:.3g}")
+        above = (image[..., :3] - image[..., 3:]).max()
+        claim(above <= TOLERANCE, f"a colour exceeds its alpha by {above:.3g}")
+
+    def test_the_order_of_packed_rows_has_no_effect(self, splatter: Any) -> None:
+        """`row` says which sample is where."""
+        splats, order = scattered(), np.random.default_rng(2).permutation(CELLS)
+        row = np.where(splats.row >= 0, np.argsort(order)[splats.row], -1).astype(np.int32)
+        image = _splat(splatter, Splats(splats.positions[order], splats.rgba[order], row))
+        claim_close(image, _splat(splatter, splats), TOLERANCE, "the image of permuted rows")
+
+    def test_rows_of_no_cell_have_no_effect(self, splatter: Any) -> None:
+        """Padding, whatever its values."""
+        splats = scattered()
+        unused = np.setdiff1d(np.arange(CELLS), splats.row)
+        positions, rgba = splats.positions.copy(), splats.rgba.copy()
+        positions[unused], rgba[unused] = [3.5, 4.5, 1e4], 1.0
+        image = _splat(splatter, Splats(positions, rgba, splats.row))
+        claim_close(image, _splat(splatter, splats), TOLERANCE, "the image with other values in padded rows")
+
+    # -------------------------------------------------------------------------------------- derivatives
+
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_a_shape_that_moves_brightens_what_it_moves_into(self, splatter: Any, engine: str) -> None:
+        """The derivative of a square that moves to the right, and down, has the right sign at its edges."""
+        if not self.moves_edges:
+            pytest.skip("the splatter deliberately has no derivative at edges")
+        chosen, splats = engine_named(engine), square()
+        for axis, ahead, astern in ((0, (3, 6), (3, 2)), (1, (5, 4), (1, 4))):
+            along = np.zeros_like(splats.positions)
+            along[:, axis] = 1
+            change = _along(chosen, splatter, splats, along)[..., 3]
+            moving = f"in {engine}, moving {('to the right', 'down')[axis]}"
+            claim(change[ahead] > 0.05, f"{moving}, the cell ahead changes by {change[ahead]:.3g}")
+            claim(change[astern] < -0.05, f"{moving}, the cell left behind changes by {change[astern]:.3g}")
+
+    @pytest.mark.parametrize("engine", ENGINES)
+    def test_every_engine_gives_the_same_image(self, splatter: Any, engine: str) -> None:
+        """To 1e-5."""
+        chosen = engine_named(engine)
+        for splats in (everywhere(LAYERS), scattered()):
+            with no_error(f"splatting in {engine}"):
+                image = chosen.to_numpy(_instance(splatter).splat(*engines.on(chosen, splats)))
+            claim_close(image, _splat(splatter, splats), TOLERANCE, f"the image in {engine}")
+
+    def test_engines_agree(self, splatter: Any) -> None:
+        """On the image, its gradient, and its derivative along a direction; both modes are one derivative."""
+        splats = scattered()
+        f = _of_positions_and_colors(splatter, splats.row)
+        engines.claim_engines_agree(f, [*splats[:2]], np.asarray(f([*splats[:2]])), "the image")
+
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_rows_of_no_cell_have_no_gradient(self, splatter: Any, engine: str) -> None:
+        """Nor have any where nothing is seen; none is NaN."""
+        chosen, splats = engine_named(engine), scattered()
+        for row in (splats.row, np.full_like(splats.row, -1)):
+            f = _of_positions_and_colors(splatter, row)
+            weights = np.random.default_rng(0).standard_normal((HEIGHT, WIDTH, 4))
+            at, w = engines.on(chosen, ([*splats[:2]], weights))
+            _, gradient = chosen.value_and_grad(lambda x, f=f, w=w: chosen.namespace.sum(f(x) * w))(at)
+            unused = np.setdiff1d(np.arange(CELLS), row)
+            for what, g in zip(("positions", "colours"), engines.host(chosen, gradient), strict=True):
+                claim((g[unused] == 0).all(), f"in {engine}, the gradient of the {what} of padded rows is not zero")
+
+    # ------------------------------------------------------------------------------------------- errors
+
+    def test_wrong_shapes_are_refused_in_one_line(self, splatter: Any) -> None:
+        """An `rts.InputError` that says what was expected."""
+        splats = scattered()
+        wrong = {
+            "positions of two coordinates": splats._replace(positions=splats.positions[:, :2]),
+            "colours without alpha": splats._replace(rgba=splats.rgba[:, :3]),
+            "fewer colours than positions": splats._replace(rgba=splats.rgba[:-1]),
+            "row without layers": splats._replace(row=splats.row[0]),
+        }
+        for what, given in wrong.items():
+            claim(refusal(lambda given=given: _instance(splatter).splat(*given), what), f"{what} is accepted")
+
+
+# ------------------------------------------------------------------------------------------------ samples
+
+
+def everywhere(layers: int) -> Splats:
+    """A white sample at the centre of every cell, layer k at depth 2 + k."""
+    k, y, x = np.indices((layers, HEIGHT, WIDTH))
+    positions = np.stack([x + 0.5, y + 0.5, 2.0 + k], -1).reshape(-1, 3).astype(np.float32)
+    return Splats(positions, np.ones((len(positions), 4), np.float32), _numbered(layers))
+
+
+def scattered() -> Splats:
+    """Samples off the centres of some cells, of any colour and depth; a second layer only behind a first."""
+    rng = np.random.default_rng(5)
+    splats = everywhere(LAYERS)
+    off = rng.uniform(-0.2, 0.2, (CELLS, 3)) + np.linspace(0, 1, CELLS)[:, None] * [0, 0, 0.3]
+    alpha = rng.uniform(0.3, 1, (CELLS, 1))
+    rgba = np.concatenate([alpha * rng.random((CELLS, 3)), alpha], 1).astype(np.float32)
+    row = splats.row.copy()
+    row[0][rng.random((HEIGHT, WIDTH)) < 0.3] = -1
+    row[1][(rng.random((HEIGHT, WIDTH)) < 0.3) | (row[0] < 0)] = -1
+    return Splats((splats.positions + off).astype(np.float32), rgba, row)
+
+
+def square() -> Splats:
+    """A white square of one layer, from cell (2, 3) to (4, 5)."""
+    splats = everywhere(LAYERS)
+    row = np.full_like(splats.row, -1)
+    row[0, 2:5, 3:6] = splats.row[0, 2:5, 3:6]
+    return splats._replace(row=row)
+
+
+def _numbered(layers: int) -> np.ndarray:
+    return np.arange(layers * HEIGHT * WIDTH, dtype=np.int32).reshape(layers, HEIGHT, WIDTH)
+
+
+def _instance(splatter: Any) -> Any:
+    return registry.instance("rts.splatters", splatter)
+
+
+def _splat(splatter: Any, splats: Splats) -> np.ndarray:
+    return np.asarray(_instance(splatter).splat(*splats))
+
+
+def _of_positions_and_colors(splatter: Any, row: np.ndarray) -> Callable[[list], Any]:
+    return lambda x: _instance(splatter).splat(x[0], x[1], row)
+
+
+def _along(engine: Any, splatter: Any, splats: Splats, along: np.ndarray) -> np.ndarray:
+    """The image's derivative when positions move along a direction."""
+    rgba, row = engines.on(engine, splats[1:])
+    at, d = engines.on(engine, ([splats.positions], [along]))
+    return engine.to_numpy(engine.jvp(lambda x: _instance(splatter).splat(x[0], rgba, row), at, d)[1])

@@ -1,0 +1,234 @@
+"""What every surface must do."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rts.arrays import engine_of, map_leaves
+from rts.camera import Camera
+from rts.gbuffer import GBuffer
+from rts.protocols import Part, Proxy, Samples, Tree
+from rts.testing import engines, scenes
+from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
+from rts.testing.engines import DIFFERENTIABLE, claim_slope, engine_named, installed, joined, split
+from rts.testing.samples import claim_empty_where_empty, claim_ordered, claim_reprojected
+from rts.testing.unusual import claim_awkward_views_are_finite, claim_unseen_is_nothing
+
+STEP = 1e-5
+
+
+class SurfaceConformance(Conformance):
+    """Checks of a surface.
+
+    Override the fixture `part`: an `rts.Part` of it about the origin, within two units, whose θ holds NumPy arrays; and
+    `sampler` where "auto" is not to choose.
+    """
+
+    @pytest.fixture
+    def part(self) -> Part:
+        """The surface, its θ, and a shader."""
+        raise NotImplementedError("override the fixture 'part' with an rts.Part of your surface")
+
+    @pytest.fixture
+    def sampler(self) -> Any:
+        """Name or object of a sampler that can sample it."""
+        return "auto"
+
+    # ------------------------------------------------------------------------------------------ samples
+
+    def test_samples_lie_on_the_centres_of_their_pixels(self, part: Part, sampler: Any) -> None:
+        """Evaluated and projected, each sample is where its ray went, at its depth."""
+        for view, camera in scenes.VIEWS.items():
+            claim_reprojected(part, scenes.find(part, camera, sampler), camera, view)
+
+    def test_layers_are_front_to_back(self, part: Part, sampler: Any) -> None:
+        """In every pixel, and without gaps."""
+        for view, camera in scenes.VIEWS.items():
+            claim_ordered(scenes.find(part, camera, sampler), view)
+
+    def test_background_is_empty(self, part: Part, sampler: Any) -> None:
+        """Row −1 and depth 0 where nothing is seen, and no row twice."""
+        for view, camera in scenes.VIEWS.items():
+            claim_empty_where_empty(scenes.find(part, camera, sampler), view)
+
+    def test_two_renders_are_the_same(self, part: Part, sampler: Any) -> None:
+        """To the last bit, whatever was rendered between, and when arrays change in place."""
+        values, join = split(part.theta)
+        other = part.replace(theta=join([0.9 * v for v in values]))
+        first, different = (scenes.shown(p, sampler=sampler) for p in (part, other))
+        again = scenes.shown(part, sampler=sampler)
+        claim(np.array_equal(first, again), "the same part gives another image after another one was rendered")
+        changing = [v.copy() for v in values]
+        part = part.replace(theta=join(changing))
+        scenes.shown(part, sampler=sampler)
+        for v in changing:
+            v *= 0.9
+        same = np.array_equal(scenes.shown(part, sampler=sampler), different)
+        claim(same, "a change in place of the arrays of θ is not seen; keep nothing by an array's identity")
+        claim_reprojected(part, scenes.find(part, sampler=sampler), scenes.CAMERA, "after a change in place")
+
+    # ----------------------------------------------------------------------------------------- evaluate
+
+    def test_the_g_buffer_has_a_row_for_each_sample(self, part: Part, sampler: Any) -> None:
+        """(N, C) of finite numbers in θ's dtype, also where a sample is only padding: all zeros."""
+        samples = map_leaves(engines.single, scenes.find(part, sampler=sampler).samples[0])
+        widths, declared = (samples.ids.shape[1], samples.params.shape[1]), tuple(part.surface.sample_widths)
+        claim(widths == declared, f"samples have ids and params of widths {widths}; sample_widths says {declared}")
+        for kind, some in (("found", samples), ("padding", map_leaves(np.zeros_like, samples))):
+            with no_error(f"evaluate of {kind} samples"):
+                gbuffer = _evaluated(part, _single(part.theta), some)
+            claim("position" in gbuffer, f"the G-buffer has {sorted(gbuffer)}; 'position' is missing")
+            for name, value in gbuffer.items():
+                expected = len(some.ids), 3 if name in ("position", "normal") else value.shape[-1]
+                claim(value.shape == expected, f"{name!r} has shape {value.shape}; expected {expected}")
+                claim(value.dtype == np.float32, f"{name!r} is {value.dtype} where θ is float32; expected float32")
+                claim_finite(value, f"{name!r} of {kind} samples")
+
+    def test_triangles_have_their_corners_on_the_surface(self, part: Part) -> None:
+        """What `proxy` says of a corner evaluates to that corner, and normals face the triangles' outside."""
+        surface, proxy = part.surface, _proxy(part, scenes.CAMERA)
+        if hasattr(surface, "refine") and proxy.corner_params is None:
+            pytest.skip("refine replaces the parameters of the triangles")
+        corners = proxy.vertices[proxy.faces].astype(np.float64)
+        outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        for i in range(3):
+            gbuffer = _evaluated(part, part.theta, _at_corner(proxy, i))
+            off = 1e-5 * max(1, np.abs(proxy.vertices).max())
+            claim_close(gbuffer["position"], corners[:, i], off, f"the surface at corner {i} of its triangles")
+            inward = np.sum(gbuffer.get("normal", outward) * outward, axis=1) < 0
+            claim(inward.mean() < 0.05, f"{inward.mean():.0%} of the normals face the inside of the triangles")
+
+    def test_triangles_depend_on_the_view_only_with_a_key(self, part: Part) -> None:
+        """They are kept from view to view unless `proxy_key` says otherwise."""
+        if hasattr(part.surface, "proxy_key"):
+            pytest.skip("the surface has a proxy_key")
+        one, other = (_proxy(part, camera).vertices for camera in (scenes.CAMERA, scenes.AXES[0]))
+        claim(np.array_equal(one, other), "the triangles differ from camera to camera, but there is no proxy_key")
+
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_evaluate_can_be_compiled(self, part: Part, sampler: Any, engine: str) -> None:
+        """It looks at no value of θ, and uses nothing but the namespace of θ."""
+        chosen, (values, join) = engine_named(engine), split(part.theta)
+        sampled = scenes.frozen(part, sampler=sampler).samples[0]
+        samples = engines.on(chosen, sampled)
+        with no_error(f"evaluate compiled by {engine}"):
+            evaluate = chosen.jit(lambda x: part.surface.evaluate(joined(chosen, join, x), samples)["position"])
+            found = chosen.to_numpy(evaluate(engines.on(chosen, values)))
+        expected = _evaluated(part, _single(part.theta), sampled)["position"]
+        claim_close(found, expected, 1e-5, f"position compiled by {engine}")
+
+    # -------------------------------------------------------------------------------------- derivatives
+
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_gradients_at_frozen_samples_are_finite_differences(self, part: Part, sampler: Any, engine: str) -> None:
+        """Of every entry of the G-buffer, in every entry of θ."""
+        chosen, (values, join) = engine_named(engine), split(part.theta)
+        values = [v.astype(np.float64) for v in values]
+        sampled = scenes.frozen(part, sampler=sampler).samples[0]
+        samples, at = engines.on(chosen, sampled), engines.on(chosen, values)
+        rng = np.random.default_rng(0)
+        for name, value in _evaluated(part, part.theta, sampled).items():
+            weights = rng.standard_normal(value.shape) / np.sqrt(value.size)
+            on_device = chosen.constant(engines.single(weights))
+
+            def product(x: list, name: str = name, weights: Any = on_device) -> Any:
+                entry = part.surface.evaluate(joined(chosen, join, x), samples)[name]
+                return engine_of(entry).namespace.sum(entry * weights)
+
+            gradient = engines.host(chosen, chosen.value_and_grad(product)(at)[1])
+            for i, along in enumerate(engines.directions(values)):
+                ends = []
+                for step in (STEP, -STEP):
+                    moved = [v + step * along if i == j else v for j, v in enumerate(values)]
+                    ends.append(np.sum(_evaluated(part, join(moved), sampled)[name] * weights))
+                what = f"the derivative of {name!r} in {engines.names(part.theta)[i]}, in {engine},"
+                claim_slope(gradient[i], along, (ends[0] - ends[1]) / (2 * STEP), what)
+
+    def test_engines_agree(self, part: Part, sampler: Any) -> None:
+        """On the image, its gradient, and its derivative along a direction, at the same samples."""
+        values, join = split(part.theta)
+        sampled = scenes.frozen(part, sampler=sampler)
+
+        def image(x: list) -> Any:
+            return scenes.shown_at(sampled, part.replace(theta=join(x)))
+
+        engines.claim_engines_agree(image, values, image([engines.single(v) for v in values]), "the image")
+
+    def test_the_image_depends_on_the_surface(self, part: Part, sampler: Any) -> None:
+        """Its gradient is not zero at the outline, in at least one entry of θ."""
+        values, join = split(part.theta)
+        sampled = scenes.frozen(part.replace(shader="silhouette"), sampler=sampler)
+        weights = np.random.default_rng(0).random((*scenes.SIZE, 4))
+        for engine in installed():
+
+            def product(x: list, engine: Any = engine) -> Any:
+                image = scenes.shown_at(sampled, part.replace(theta=join(x), shader="silhouette"))
+                return engine.namespace.sum(image * engine.constant(engines.single(weights)))
+
+            gradient = engines.host(engine, engine.value_and_grad(product)(engines.on(engine, values))[1])
+            largest = max(np.abs(g).max(initial=0) for g in gradient)
+            claim(largest > 1e-6, f"in {engine.name} the silhouette has no gradient in θ; is something detached?")
+
+    # ------------------------------------------------------------------------------------ unusual input
+
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_unseen_it_gives_nothing_and_no_gradient(self, part: Part, sampler: Any, engine: str) -> None:
+        """Behind the camera or beside the image: an empty image and a gradient of zero."""
+        claim_unseen_is_nothing(part, sampler, engine_named(engine))
+
+    @pytest.mark.parametrize("engine", DIFFERENTIABLE)
+    def test_awkward_views_are_finite(self, part: Part, sampler: Any, engine: str) -> None:
+        """From inside, cut by the near plane, and along the axes: a finite image and gradient."""
+        claim_awkward_views_are_finite(part, sampler, engine_named(engine))
+
+    def test_wrong_theta_is_refused_in_one_line(self, part: Part, sampler: Any) -> None:
+        """An `rts.InputError` that says what to do, wherever an entry is missing or has a wrong shape."""
+        reads = part.surface.reads(part.theta) if hasattr(part.surface, "reads") else tuple(part.theta)
+        part = part.replace(shader="silhouette")
+
+        def refused(theta: Tree, what: str) -> str | None:
+            return refusal(lambda: scenes.shown(part.replace(theta=theta), sampler=sampler), what)
+
+        claim(not reads or refused({}, "an empty theta"), "an empty theta is accepted")
+        for name in reads:
+            refused({k: v for k, v in part.theta.items() if k != name}, f"theta without {name!r}")
+            wrong = map_leaves(lambda _: np.zeros((2, 1, 3, 1, 2), np.float32), part.theta[name])
+            what = f"theta[{name!r}] of shape (2, 1, 3, 1, 2)"
+            claim(refused({**part.theta, name: wrong}, what), f"{what} is accepted")
+
+
+def _single(theta: Tree) -> Tree:
+    return map_leaves(engines.single, theta)
+
+
+def _evaluated(part: Part, theta: Tree, samples: Samples) -> dict[str, np.ndarray]:
+    """Every entry of the G-buffer, deferred ones too."""
+    given = part.surface.evaluate(theta, samples)
+    gbuffer = given if isinstance(given, GBuffer) else GBuffer(given)
+    return {name: np.asarray(gbuffer[name]) for name in list(gbuffer)}
+
+
+def _proxy(part: Part, camera: Camera) -> Proxy:
+    """The surface's triangles, or a skip."""
+    surface = part.surface
+    if not hasattr(surface, "proxy"):
+        pytest.skip("the surface has no triangles")
+    inputs = map_leaves(np.asarray, surface.proxy_inputs(_single(part.theta)))
+    return surface.proxy(inputs, camera, scenes.SIZE)
+
+
+def _at_corner(proxy: Proxy, i: int) -> Samples:
+    """One sample a triangle, at its corner i."""
+    count = len(proxy.faces)
+    weights = np.broadcast_to(np.eye(3, 2, dtype=np.float32)[i], (count, 2))
+    row = np.arange(count, dtype=np.int32).reshape(1, 1, -1)
+    return Samples(
+        proxy.faces if proxy.ids is None else proxy.ids,
+        weights if proxy.corner_params is None else proxy.corner_params[:, i],
+        row,
+        np.ones_like(row, dtype=np.float32),
+        np.int32(0),
+    )

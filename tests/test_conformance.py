@@ -1,0 +1,659 @@
+"""The conformance kit on every built-in plugin; and for each check a broken plugin, to prove that it can fail."""
+
+import inspect
+import subprocess
+import sys
+from dataclasses import replace
+from importlib.metadata import entry_points
+
+import numpy as np
+import pytest
+from analytic import Ellipsoid
+
+import rts
+from rts import Fragments, GBuffer, InputError, Part, PluginError, RayHits
+from rts.arrays import engine_of, namespace
+from rts.registry import instance
+from rts.shading import Unlit
+from rts.splatting import Multi, Plain
+from rts.testing import (
+    SamplerConformance,
+    ShaderConformance,
+    SplatterConformance,
+    SurfaceConformance,
+    scenes,
+    shaders,
+    splatters,
+)
+
+Raster = rts.plugin("samplers", "raster")
+RASTER = Raster()
+Mesh = rts.plugin("surfaces", "mesh")
+
+
+class CheckedEllipsoid(Ellipsoid):
+    """With the error texts that the kit asks for."""
+
+    def check(self, theta):
+        for name in ("center", "radii"):
+            shape = getattr(theta.get(name), "shape", None)
+            if shape != (3,):
+                raise InputError(f"theta[{name!r}] of an ellipsoid has shape {shape}; expected (3,)")
+
+
+def ellipsoid(surface=None, shader="lambert"):
+    theta = {"center": np.array([0.1, -0.05, 0.1], np.float32), "radii": np.array([1.0, 0.7, 0.8], np.float32)}
+    return Part(surface or CheckedEllipsoid(), theta, shader)
+
+
+# ------------------------------------------------------------------------------------------ what is built in
+
+
+class TestMesh(SurfaceConformance):
+    @pytest.fixture
+    def part(self):
+        return Mesh.example()
+
+
+class TestEllipsoid(SurfaceConformance):
+    @pytest.fixture
+    def part(self):
+        return ellipsoid()
+
+    @pytest.fixture
+    def sampler(self):
+        return "rays"
+
+
+class TestRaster(SamplerConformance):
+    @pytest.fixture
+    def sampler(self):
+        return "raster"
+
+
+class TestReference(SamplerConformance):
+    @pytest.fixture
+    def sampler(self):
+        return "reference"
+
+
+class TestAuto(SamplerConformance):
+    @pytest.fixture
+    def sampler(self):
+        return "auto"
+
+
+class TestEmbree(SamplerConformance):
+    @pytest.fixture
+    def sampler(self):
+        try:
+            return instance("rts.samplers", "embree")
+        except PluginError as error:
+            pytest.skip(str(error))
+
+
+class TestOpenGL(SamplerConformance):
+    @pytest.fixture
+    def sampler(self):
+        try:
+            rts.sample(scenes.ball(), scenes.CAMERA, (2, 2), sampler="opengl")
+        except PluginError as error:
+            pytest.skip(str(error))
+        return "opengl"
+
+
+class TestRays(SamplerConformance):
+    @pytest.fixture
+    def sampler(self):
+        return "rays"
+
+    @pytest.fixture
+    def parts(self):
+        return [ellipsoid(), ellipsoid().replace(transform=np.diag([1, 1.2, 0.8, 1]).astype(np.float32))]
+
+
+class ShaderOfBuiltIn(ShaderConformance):
+    __test__ = False
+
+    @pytest.fixture
+    def theta(self):
+        return {"color": np.array([0.9, 0.8, 1.0], np.float32)}
+
+
+class TestSilhouette(ShaderOfBuiltIn):
+    @pytest.fixture
+    def shader(self):
+        return "silhouette"
+
+
+class TestNormals(ShaderOfBuiltIn):
+    @pytest.fixture
+    def shader(self):
+        return "normals"
+
+
+class TestDepth(ShaderOfBuiltIn):
+    @pytest.fixture
+    def shader(self):
+        return "depth"
+
+    @pytest.fixture
+    def theta(self):
+        return {"depth_range": np.array([1.5, 6.0], np.float32)}
+
+
+class TestUnlit(ShaderOfBuiltIn):
+    @pytest.fixture
+    def shader(self):
+        return "unlit"
+
+
+class TestTranslucent(ShaderOfBuiltIn):
+    @pytest.fixture
+    def shader(self):
+        return Unlit(opaque=False)
+
+
+class TestTextured(ShaderOfBuiltIn):
+    @pytest.fixture
+    def shader(self):
+        return "textured"
+
+    @pytest.fixture
+    def theta(self):
+        return {"texture": np.random.default_rng(0).random((3, 4, 3)).astype(np.float32)}
+
+
+class TestLambert(ShaderOfBuiltIn):
+    @pytest.fixture
+    def shader(self):
+        return "lambert"
+
+    @pytest.fixture
+    def theta(self):
+        light = {"direction": np.array([0.3, 0.6, 0.7], np.float32), "color": np.array([0.5, 0.6, 0.7], np.float32)}
+        return {"color": np.array([0.9, 0.8, 1.0], np.float32), "light": light}
+
+
+class TestBlinnPhong(TestLambert):
+    @pytest.fixture
+    def shader(self):
+        return "blinn_phong"
+
+
+class TestNone(SplatterConformance):
+    moves_edges = False
+
+    @pytest.fixture
+    def splatter(self):
+        return "none"
+
+
+class TestSingle(SplatterConformance):
+    @pytest.fixture
+    def splatter(self):
+        return "single"
+
+
+class TestMulti(SplatterConformance):
+    @pytest.fixture
+    def splatter(self):
+        return "multi"
+
+
+# ---------------------------------------------------------------------------------------------- broken plugins
+#
+# Each differs from a plugin that conforms in one respect.
+
+
+def stopped(x):
+    return engine_of(x).stop_gradient(x)
+
+
+def wrong_in_torch(x):
+    """A thousandth too much, in one engine."""
+    return x * 1.001 if engine_of(x).name == "torch" else x
+
+
+class OddRaster(Raster):
+    """A rasterizer whose fragments, or camera, are altered."""
+
+    def __init__(self, alter=lambda fragments, scene: fragments, camera=lambda camera, size: camera, cull=None):
+        self.alter, self.camera, self.cull = alter, camera, cull
+
+    def rasterize(self, prepared, camera, size, layers, cull):
+        seen = self.camera(camera, size)
+        fragments = super().rasterize(prepared, seen, size, layers, self.cull or cull)
+        return self.alter(fragments, (prepared, camera, size))
+
+
+class OddSampler:
+    """A sampler whose samples are altered."""
+
+    def __init__(self, alter):
+        self.alter = alter
+
+    def sample(self, part, camera, size, layers, *, capacity=None):
+        samples = RASTER.sample(part, camera, size, layers, capacity=capacity)
+        return self.alter(samples, part)
+
+
+def altered(**changes):
+    """A sampler with fields of its samples changed by functions of the samples."""
+    return OddSampler(lambda samples, part: replace(samples, **{k: f(samples) for k, f in changes.items()}))
+
+
+def next_triangle(fragments, scene):
+    ids, count = fragments.triangle_ids, len(scene[0].faces)
+    return fragments._replace(triangle_ids=np.where(ids >= 0, (ids + 1) % count, ids))
+
+
+def affine_barycentrics(fragments, scene):
+    """Interpolated in the image, as if there were no perspective."""
+    proxy, camera, size = scene
+    corners = proxy.faces[np.maximum(fragments.triangle_ids, 0)]
+    w = camera.project(proxy.vertices.astype(np.float64), size)[:, 2][corners]
+    b = np.concatenate([fragments.barycentrics, 1 - fragments.barycentrics.sum(-1, keepdims=True)], -1) * w
+    return fragments._replace(barycentrics=(b / b.sum(-1, keepdims=True))[..., :2].astype(np.float32))
+
+
+def half_a_pixel(camera, size):
+    shift = np.eye(4)
+    shift[0, 3] = 1 / size[1]
+    return camera._replace(projection=shift @ camera.projection)
+
+
+def wider_planes(camera, size):
+    projection = camera.projection.copy()
+    projection[2, 2:] = [-1.0001, -0.02] if projection[3, 2] else projection[2, 2:]
+    return camera._replace(projection=projection)
+
+
+def eroded(fragments, scene):
+    """Without the leftmost pixels of everything."""
+    ids = fragments.triangle_ids
+    left = np.pad(ids, ((0, 0), (0, 0), (1, 0)), constant_values=-1)[..., :-1]
+    return fragments._replace(triangle_ids=np.where(left[:1] >= 0, ids, -1))
+
+
+class Unsteady(OddRaster):
+    calls = 0
+
+    def rasterize(self, *scene):
+        self.calls += 1
+        fragments = super().rasterize(*scene)
+        return fragments._replace(barycentrics=fragments.barycentrics * np.float32(1 - 1e-6 * self.calls))
+
+
+class Forgetful(Raster):
+    """Keeps the first triangles of a surface for ever."""
+
+    def _entry(self, surface, inputs, camera, size):
+        if not hasattr(self, "kept"):
+            self.kept = {}
+        if surface not in self.kept:
+            self.kept[surface] = self.build(surface, inputs, camera, size)
+        return self.kept[surface]
+
+
+class Roomy:
+    """Takes no notice of the capacity."""
+
+    def sample(self, part, camera, size, layers, *, capacity=None):
+        return RASTER.sample(part, camera, size, layers)
+
+
+class DropsTheFront:
+    def sample(self, part, camera, size, layers, *, capacity=None):
+        whole = RASTER.sample(part, camera, size, layers)
+        first = max(0, len(whole.ids) - (capacity or len(whole.ids)))
+        row = np.where(whole.row >= first, whole.row - first, -1).astype(np.int32)
+        return replace(whole, ids=whole.ids[first:], params=whole.params[first:], row=row, overflow=np.int32(first))
+
+
+class Complains:
+    def __init__(self, error):
+        self.error = error
+
+    def sample(self, part, camera, size, layers, *, capacity=None):
+        raise self.error
+
+
+class AcceptsAnything:
+    def sample(self, part, camera, size, layers, *, capacity=None):
+        return RASTER.sample(scenes.ball(), camera, size, layers, capacity=capacity)
+
+
+def leaking(samples, part):
+    xp = namespace(part.theta["vertices"])
+    return replace(samples, params=samples.params + 1e-6 * xp.sum(part.theta["vertices"]))
+
+
+def covering(samples, part):
+    """Samples in every cell, whether something is there or not."""
+    return replace(samples, row=samples.row * 0, depth=samples.depth * 0 + 1)
+
+
+SAMPLERS = {
+    "samples_lie_on_the_centres_of_their_pixels": {
+        "rows upside down": OddRaster(lambda f, _: Fragments(*(x[:, ::-1] for x in f))),
+        "columns mirrored": OddRaster(lambda f, _: Fragments(*(x[:, :, ::-1] for x in f))),
+        "half a pixel": OddRaster(camera=half_a_pixel),
+        "ids off by one": OddRaster(next_triangle),
+        "barycentrics exchanged": OddRaster(lambda f, _: f._replace(barycentrics=f.barycentrics[..., ::-1])),
+        "no perspective": OddRaster(affine_barycentrics),
+        "depth of another scale": OddRaster(lambda f, _: f._replace(depth=f.depth * np.float32(1.1))),
+    },
+    "it_agrees_with_the_reference": {
+        "nothing culled": OddRaster(cull="none"),
+        "edges lost": OddRaster(eroded),
+        "depth": OddRaster(lambda f, _: f._replace(depth=f.depth * np.float32(1 + 4e-5))),
+    },
+    "layers_are_front_to_back": {
+        "reversed": OddRaster(lambda f, _: Fragments(*(np.ascontiguousarray(x[::-1]) for x in f))),
+        "K - 1": OddRaster(lambda f, _: Fragments(*(np.concatenate([x[1:], x[:1]]) for x in f))),
+    },
+    "background_is_empty": {
+        "depth": altered(depth=lambda s: np.where(s.row < 0, np.float32(9), s.depth)),
+        "row 0": altered(row=lambda s: np.maximum(s.row, 0)),
+        "shared rows": altered(row=lambda s: np.minimum(s.row, 5)),
+        "row -2": altered(row=lambda s: np.where(s.row < 0, -2, s.row)),
+    },
+    "samples_lie_between_the_near_and_the_far_plane": {"no planes": OddRaster(camera=wider_planes)},
+    "two_calls_give_the_same": {"a counter": Unsteady()},
+    "it_sees_arrays_that_change_in_place": {"kept for ever": Forgetful()},
+    "capacity_drops_the_deepest_layers_first": {
+        "ignored": Roomy(),
+        "front first": DropsTheFront(),
+        "not counted": altered(overflow=lambda s: 0 * s.overflow),
+    },
+    "what_it_cannot_sample_is_refused_in_one_line": {
+        "another error": Complains(AttributeError("no attribute 'proxy'")),
+        "two lines": Complains(InputError("wrong surface\ntry another")),
+        "no words": Complains(InputError("")),
+        "none": AcceptsAnything(),
+    },
+    "every_engine_finds_the_same_samples": {
+        "not in torch": altered(depth=lambda s: wrong_in_torch(s.depth)),
+        "not traceable": altered(depth=lambda s: np.asarray(s.depth) if engine_of(s.depth).name == "jax" else s.depth),
+    },
+    "engines_agree": {"not in torch": altered(params=lambda s: wrong_in_torch(s.params))},
+    "samples_carry_no_derivative": {"leaking": OddSampler(leaking)},
+    "unseen_parts_give_nothing_and_no_gradient": {"everywhere": OddSampler(covering)},
+    "awkward_views_are_finite": {"NaN": altered(params=lambda s: s.params / (s.depth[0, 0, 0] * 0))},
+}
+
+
+class OddMesh(Mesh):
+    """A mesh whose G-buffer is altered."""
+
+    def __init__(self, alter=lambda gbuffer, theta, samples: None):
+        super().__init__(Mesh.example().surface.faces)
+        self.alter = alter
+
+    def evaluate(self, theta, samples):
+        gbuffer = super().evaluate(theta, samples)
+        return self.alter(gbuffer, theta, samples) or gbuffer
+
+
+def with_entry(name, change):
+    """A mesh with an entry of its G-buffer changed."""
+
+    def alter(gbuffer, theta, samples):
+        gbuffer[name] = change(gbuffer[name], theta, samples)
+
+    return OddMesh(alter)
+
+
+class SwappedHits(Ellipsoid):
+    def intersect(self, theta, origins, directions, layers):
+        hits = super().intersect(theta, origins, directions, layers)
+        return RayHits(*(x[::-1] for x in hits[:3]))
+
+
+class Refined(OddMesh):
+    def refine(self, inputs, samples, rays):
+        return replace(samples, depth=np.full_like(samples.depth, 2))
+
+
+class Stale(OddMesh):
+    def proxy(self, inputs, camera, size):
+        if not hasattr(self, "kept"):
+            self.kept = super().proxy(inputs.copy(), camera, size)
+        return self.kept
+
+
+class Counting(OddMesh):
+    calls = 0
+
+    def evaluate(self, theta, samples):
+        self.calls += 1
+        gbuffer = super().evaluate(theta, samples)
+        gbuffer["position"] = gbuffer["position"] + 1e-4 * self.calls
+        return gbuffer
+
+
+class WrongWidths(OddMesh):
+    sample_widths = property(lambda self: (4, 2), lambda self, widths: None)
+
+
+class Inflated(OddMesh):
+    def proxy(self, inputs, camera, size):
+        return super().proxy(1.01 * inputs, camera, size)
+
+
+class ViewDependent(OddMesh):
+    def proxy(self, inputs, camera, size):
+        return super().proxy(inputs + 1e-3 * camera.view[0, 0], camera, size)
+
+
+class Unchecked(OddMesh):
+    def check(self, theta):
+        pass
+
+
+def looks_at_values(gbuffer, theta, samples):
+    if theta["vertices"][0, 0] > 100:
+        gbuffer["position"] = gbuffer["position"] + 1
+
+
+def over_nothing(x, theta, samples):
+    """Divided by what is zero in a row that only pads."""
+    total = samples.params[:, :1] + samples.params[:, 1:]
+    return x * (total / total)
+
+
+SURFACES = {
+    "samples_lie_on_the_centres_of_their_pixels": {
+        "moved": with_entry("position", lambda x, *_: x + 0.05),
+        "corners exchanged": with_entry(
+            "position", lambda x, t, s: OddMesh().evaluate(t, replace(s, params=s.params[:, ::-1]))["position"]
+        ),
+        "another depth": Refined(),
+    },
+    "layers_are_front_to_back": {"farthest first": SwappedHits()},
+    "background_is_empty": {"depth": Refined()},
+    "two_renders_are_the_same": {"a counter": Counting(), "kept for ever": Stale()},
+    "the_g_buffer_has_a_row_for_each_sample": {
+        "widths": WrongWidths(),
+        "no position": OddMesh(lambda g, t, s: GBuffer(normal=g["position"])),
+        "one row": with_entry("color", lambda x, *_: x[:1]),
+        "no columns": with_entry("color", lambda x, *_: x[:, 0]),
+        "float64": with_entry("color", lambda x, *_: x * np.float64(1)),
+        "padding": with_entry("color", over_nothing),
+    },
+    "triangles_have_their_corners_on_the_surface": {
+        "inflated": Inflated(),
+        "normals inward": with_entry("normal", lambda x, *_: -x),
+    },
+    "triangles_depend_on_the_view_only_with_a_key": {"no key": ViewDependent()},
+    "evaluate_can_be_compiled": {"looks at values": OddMesh(looks_at_values)},
+    "gradients_at_frozen_samples_are_finite_differences": {
+        "position detached": with_entry("position", lambda x, *_: stopped(x)),
+        "color detached": with_entry("color", lambda x, *_: stopped(x)),
+        "half detached": with_entry("normal", lambda x, *_: 0.5 * (x + stopped(x))),
+    },
+    "engines_agree": {"not in torch": with_entry("color", lambda x, *_: wrong_in_torch(x))},
+    "the_image_depends_on_the_surface": {"detached": with_entry("position", lambda x, *_: stopped(x))},
+    "unseen_it_gives_nothing_and_no_gradient": {"padding": with_entry("position", over_nothing)},
+    "awkward_views_are_finite": {"NaN": with_entry("color", lambda x, *_: x / (x - x))},
+    "wrong_theta_is_refused_in_one_line": {"no check": Unchecked()},
+}
+
+
+def shading(change=lambda rgba, theta, gbuffer: rgba, **promises):
+    """A shader whose colours are altered."""
+
+    def shader(theta, gbuffer, camera):
+        return change(Unlit(opaque=False)(theta, gbuffer, camera), theta, gbuffer)
+
+    for name, value in promises.items():
+        setattr(shader, name, value)
+    return shader
+
+
+def straight(rgba, *_):
+    return namespace(rgba).concat([rgba[:, :3] / rgba[:, 3:], rgba[:, 3:]], axis=1)
+
+
+def by_length(rgba, theta, gbuffer):
+    xp = namespace(rgba)
+    return rgba * xp.sqrt(xp.sum(gbuffer["normal"] ** 2, axis=1, keepdims=True))
+
+
+SHADERS = {
+    "it_gives_a_premultiplied_color_for_each_sample": {
+        "straight alpha": shading(straight),
+        "too bright": shading(lambda c, *_: 2 * c),
+        "negative": shading(lambda c, *_: c - 0.1),
+        "no alpha": shading(lambda c, *_: c[:, :3]),
+        "float64": shading(lambda c, *_: c.astype(np.float64)),
+    },
+    "samples_are_shaded_one_by_one": {
+        "all together": shading(lambda c, *_: c * namespace(c).mean(c)),
+        "by number": shading(lambda c, *_: c * (0.5 + np.arange(len(c), dtype=np.float32)[:, None] / 200)),
+    },
+    "opaque_is_true": {"translucent": shading(opaque=True)},
+    "it_reads_what_it_says": {
+        "color unsaid": shading(reads=("uv",)),
+        "normal unsaid": shading(by_length, reads=("color",)),
+    },
+    "engines_agree": {"not in torch": shading(lambda c, *_: wrong_in_torch(c))},
+    "gradients_are_finite_differences": {"detached": shading(lambda c, *_: stopped(c))},
+    "awkward_samples_have_finite_gradients": {"root of zero": shading(by_length)},
+    "what_is_missing_is_refused_in_one_line": {"KeyError": shading(lambda c, t, g: c * t["color"][0])},
+}
+
+
+class OddMulti(Multi):
+    """A splatter whose input or output is altered."""
+
+    def __init__(self, given=lambda p, c, r: (p, c, r), made=lambda image, p, c, r: image):
+        super().__init__()
+        object.__setattr__(self, "given", given)
+        object.__setattr__(self, "made", made)
+
+    def splat(self, positions, rgba, row):
+        image = super().splat(*self.given(positions, rgba, row))
+        return self.made(image, positions, rgba, row)
+
+
+class Careless(OddMulti):
+    def splat(self, positions, rgba, row):
+        positions[:, 2], rgba[:, 3], row.shape[2], positions[: len(rgba)] + rgba[:, :3]
+        return super().splat(positions, rgba, row)
+
+
+def from_centres(positions, rgba, row):
+    """Positions mirrored at the centres of their cells, for one sample a cell in order."""
+    centres = engine_of(positions).constant(splatters.everywhere(splatters.LAYERS).positions)
+    return 2 * centres - positions, rgba, row
+
+
+def all_rows(image, positions, rgba, row):
+    xp = namespace(image)
+    return image + 1e-3 * xp.mean(rgba)
+
+
+SPLATTERS = {
+    "a_constant_interior_stays": {"dimmed": OddMulti(made=lambda image, *_: 0.99 * image)},
+    "the_front_layer_hides_those_behind": {"back to front": OddMulti(lambda p, c, r: (p, c, r[::-1]))},
+    "empty_cells_stay_empty": {"last row": OddMulti(lambda p, c, r: (p, c, np.where(r < 0, len(c) - 1, r)))},
+    "colors_stay_premultiplied": {
+        "alpha halved": OddMulti(made=lambda image, *_: image * np.array([1, 1, 1, 0.5])),
+        "summed": OddMulti(made=lambda image, *_: 1.5 * image),
+    },
+    "the_order_of_packed_rows_has_no_effect": {
+        "by number": OddMulti(lambda p, c, r: (p, c * np.linspace(0, 1, len(c))[:, None], r))
+    },
+    "rows_of_no_cell_have_no_effect": {"all rows": OddMulti(made=all_rows)},
+    "a_shape_that_moves_brightens_what_it_moves_into": {"mirrored": OddMulti(from_centres), "none": Plain()},
+    "every_engine_gives_the_same_image": {"not in torch": OddMulti(made=lambda image, *_: wrong_in_torch(image))},
+    "engines_agree": {
+        "detached in torch": OddMulti(lambda p, c, r: (stopped(p) if engine_of(p).name == "torch" else p, c, r))
+    },
+    "rows_of_no_cell_have_no_gradient": {"all rows": OddMulti(made=all_rows)},
+    "wrong_shapes_are_refused_in_one_line": {"IndexError": Careless()},
+}
+
+LAMBERTIAN = {"color": np.array([0.9, 0.8, 1.0], np.float32)}
+
+
+def surface_part(surface):
+    return Mesh.example().replace(surface=surface) if isinstance(surface, Mesh) else ellipsoid(surface)
+
+
+KIT = {
+    SamplerConformance: (SAMPLERS, lambda sampler: {"sampler": sampler, "parts": [scenes.ball(), CULLED]}),
+    SurfaceConformance: (SURFACES, lambda surface: {"part": surface_part(surface), "sampler": "auto"}),
+    ShaderConformance: (
+        SHADERS,
+        lambda shader: {"shader": shader, "theta": LAMBERTIAN, "gbuffer": shaders.random_gbuffer()},
+    ),
+    SplatterConformance: (SPLATTERS, lambda splatter: {"splatter": splatter}),
+}
+CULLED = scenes.ball(cull="back")
+ENGINE = {"looks at values": "jax", "not traceable": "jax"}
+"""The engine to show it in; the others with torch."""
+
+BROKEN = [
+    pytest.param(kit, check, fixtures, plugin, ENGINE.get(name, "torch"), id=f"{kit.__name__}-{check}-{name}")
+    for kit, (checks, fixtures) in KIT.items()
+    for check, plugins in checks.items()
+    for name, plugin in plugins.items()
+]
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("kit, check, fixtures, plugin, engine", BROKEN)
+def test_a_broken_plugin_fails_the_check(kit, check, fixtures, plugin, engine):
+    pytest.importorskip("torch")
+    pytest.importorskip("jax")
+    method = getattr(kit(), f"test_{check}")
+    arguments = fixtures(plugin)
+    wanted = set(inspect.signature(method).parameters)
+    if "engine" in wanted:
+        arguments["engine"] = engine
+    with pytest.raises(AssertionError) as failure:
+        method(**{name: value for name, value in arguments.items() if name in wanted})
+    assert str(failure.value)
+
+
+@pytest.mark.parametrize("kit", KIT, ids=lambda kit: kit.__name__)
+def test_every_check_is_proved(kit):
+    checks = {name.removeprefix("test_") for name in dir(kit) if name.startswith("test_")}
+    assert set(KIT[kit][0]) == checks
+
+
+@pytest.mark.parametrize("kit", KIT, ids=lambda kit: kit.__name__)
+def test_only_subclasses_are_collected(kit):
+    assert not kit.__test__
+    assert type("TestMine", (kit,), {}).__test__
+
+
+def test_the_kit_is_loaded_by_nothing_but_its_own_import():
+    names = "('pytest', '_pytest', 'rts.testing')"
+    code = f"import sys, rts, rts.cli; print([m for m in sys.modules if m.startswith({names})])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+    assert not [e for e in entry_points(group="pytest11") if e.dist and e.dist.name == "rts"]
