@@ -42,8 +42,8 @@ $(VENV)/.demo: $(BIN)/python $(SOURCES)
 	$(INSTALL) -e '.[torch,bench]'
 	@touch $@
 
-$(VENV)/.test: $(BIN)/python $(SOURCES)
-	$(INSTALL) -e '.[all,test]'
+$(VENV)/.test: $(BIN)/python $(SOURCES) tests/plugin_example/pyproject.toml
+	$(INSTALL) -e '.[all,test]' -e ./tests/plugin_example
 	@touch $@ $(VENV)/.demo
 
 clean:

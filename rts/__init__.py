@@ -4,6 +4,7 @@ Find where camera rays meet a surface with any ordinary renderer; evaluate the s
 differentiate only that.
 """
 
+from rts.arrays import namespace
 from rts.camera import Camera
 from rts.choosing import explain
 from rts.errors import EngineError, InputError, PluginError, RtsError
@@ -35,6 +36,7 @@ __all__ = [
     "fit",
     "load",
     "load_image",
+    "namespace",
     "plugin",
     "plugins",
     "prepare",

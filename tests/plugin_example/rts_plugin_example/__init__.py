@@ -1,0 +1,1 @@
+"""A surface and a sampler for rts."""
