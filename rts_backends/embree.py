@@ -23,11 +23,11 @@ class Structure:
     """A proxy and Embree's structure over it, the vertices moved and scaled to the unit sphere."""
 
     def __init__(self, proxy: Proxy):
-        self.proxy = proxy
+        self.proxy = _packed(proxy)
         self._unit = np.zeros((len(proxy.vertices) + 1, 3), np.float32)
         self._place()
         library = embree_library if embree_library.load() else embree_public
-        self.scene = library.Scene(self._unit, proxy.faces)
+        self.scene = library.Scene(self._unit, self.proxy.faces)
         self.refits = 0
 
     def _place(self) -> None:
@@ -39,7 +39,7 @@ class Structure:
 
     def move(self, proxy: Proxy) -> None:
         """Follow other vertices of the same faces."""
-        self.proxy = proxy
+        self.proxy = _packed(proxy)
         self._place()
         self.refits = (self.refits + 1) % REFITS
         self.scene.move(rebuild=self.refits == 0)
@@ -87,6 +87,12 @@ class Embree(TriangleSampler):
             *fragments,
         )
         return fragments
+
+
+def _packed(proxy: Proxy) -> Proxy:
+    """The proxy in arrays as compiled code and Embree read them: row by row, without gaps."""
+    vertices = np.ascontiguousarray(proxy.vertices, np.float32)
+    return proxy._replace(vertices=vertices, faces=np.ascontiguousarray(proxy.faces, np.int32))
 
 
 def _planes(p: np.ndarray) -> np.ndarray:

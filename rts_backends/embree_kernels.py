@@ -26,6 +26,15 @@ SLACK = 1e-5
 MARGIN = 1e-3
 """Barycentrics, and cosines, further than this from zero are believed as Embree gives them."""
 
+BEYOND_AT_MOST = 0.01
+"""How far beyond an edge a hit may lie, in barycentrics: further than what float32 explains, it is noise."""
+
+NOISE = 1e-13
+"""Square of twice the area, in units of the object's size, from which on it is more than rounding in float32."""
+
+THIN = 1e-7
+"""Height of a triangle over its longest edge."""
+
 REACH = 1.01
 """Square of the radius of the sphere that rays start on, in units of the object's."""
 
@@ -79,6 +88,22 @@ def _touch(vertices, faces, s, t):
 
 
 @numba.njit
+def _edge(vertices, i, j):
+    x, y, z = np.float64(vertices[i, 0]), np.float64(vertices[i, 1]), np.float64(vertices[i, 2])
+    return vertices[j, 0] - x, vertices[j, 1] - y, vertices[j, 2] - z
+
+
+@numba.njit
+def _is_line(vertices, ia, ib, ic):
+    """Whether a triangle is so thin that float32 sees no area."""
+    ux, uy, uz = _edge(vertices, ia, ib)
+    vx, vy, vz = _edge(vertices, ia, ic)
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    longest = max(ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz)
+    return nx * nx + ny * ny + nz * nz <= (THIN * longest) ** 2
+
+
+@numba.njit
 def _decide(t, state, work, vertices, faces):
     """Whether a triangle is hit (BEYOND, EXACT or −1 for no), and the exact depth; see `cast` for `work`."""
     matrix, row, corners = work[:4], work[4], work[5:]
@@ -94,6 +119,8 @@ def _decide(t, state, work, vertices, faces):
     if not total > 0 or clipped(corners, 0, 1, 2, ea, eb, ec):
         return -1, 0.0
     za, zb, zc = depth_of(row, vertices, ia), depth_of(row, vertices, ib), depth_of(row, vertices, ic)
+    if not inside and (min(ea, eb, ec) < -BEYOND_AT_MOST * total or _is_line(vertices, ia, ib, ic)):
+        return -1, 0.0
     return EXACT if inside else BEYOND, (ea * za + eb * zb + ec * zc) / total
 
 
@@ -161,11 +188,12 @@ def _keep_nearest(arguments):
     valid[0] = REJECT
     u, v, z = hit[3], hit[4], state[START] + ray[8]
     kind = BELIEVED
-    if not (u > MARGIN and v > MARGIN and u + v < 1 - MARGIN and state[NEAREST] < z < state[FARTHEST]):
+    normal = hit[0] * hit[0] + hit[1] * hit[1] + hit[2] * hit[2]
+    believed = u > MARGIN and v > MARGIN and u + v < 1 - MARGIN and normal > NOISE
+    if not (believed and state[NEAREST] < z < state[FARTHEST]):
         kind, z = _decide(t, state, work, vertices, faces)
     elif state[KEEP] != 0:
         along = hit[0] * ray[4] + hit[1] * ray[5] + hit[2] * ray[6]
-        normal = hit[0] * hit[0] + hit[1] * hit[1] + hit[2] * hit[2]
         step = ray[4] * ray[4] + ray[5] * ray[5] + ray[6] * ray[6]
         if along * along < MARGIN * MARGIN * normal * step:
             kind, z = _decide(t, state, work, vertices, faces)
@@ -222,6 +250,8 @@ def cast(
     across = (width + TILE - 1) // TILE
     state, depths = np.empty(HEADER), np.empty(slots)
     ids, kinds = np.empty(slots, np.int32), np.empty(slots, np.int8)
+    near_faces = np.empty((layers * TILE * TILE, 3), np.int32)
+    near_vertices = np.empty((layers * TILE * TILE * 3, 3), np.float32)
     work = np.empty((8, 4))
     work[:4], work[4] = matrix, row
     corners = work[5:]
@@ -255,23 +285,42 @@ def cast(
                 count = int(state[COUNT])
                 for k in range(layers):
                     triangle_ids[k, j, i] = ids[k] if k < count else -1
-        # In a loop of its own, where the processor overlaps the waits for memory of several hits.
+        # Corners are gathered by loops of their own, so short that the processor overlaps their waits for memory.
+        count = 0
         for k in range(layers):
             for j in range(top, min(height, top + TILE)):
                 for i in range(left, min(width, left + TILE)):
-                    t = triangle_ids[k, j, i]
-                    if t < 0:
+                    if triangle_ids[k, j, i] >= 0:
+                        t = triangle_ids[k, j, i]
+                        near_faces[count, 0] = faces[t, 0]
+                        near_faces[count, 1] = faces[t, 1]
+                        near_faces[count, 2] = faces[t, 2]
+                        count += 1
+        for n in range(count):
+            for c in range(3):
+                v = near_faces[n, c]
+                near_vertices[3 * n + c, 0] = vertices[v, 0]
+                near_vertices[3 * n + c, 1] = vertices[v, 1]
+                near_vertices[3 * n + c, 2] = vertices[v, 2]
+        n = 0
+        for k in range(layers):
+            for j in range(top, min(height, top + TILE)):
+                for i in range(left, min(width, left + TILE)):
+                    if triangle_ids[k, j, i] < 0:
                         barycentrics[k, j, i, 0] = barycentrics[k, j, i, 1] = depths_out[k, j, i] = 0
                         continue
-                    ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
-                    to_corner(matrix, vertices, ia, corners, 0)
-                    to_corner(matrix, vertices, ib, corners, 1)
-                    to_corner(matrix, vertices, ic, corners, 2)
+                    to_corner(matrix, near_vertices, 3 * n, corners, 0)
+                    to_corner(matrix, near_vertices, 3 * n + 1, corners, 1)
+                    to_corner(matrix, near_vertices, 3 * n + 2, corners, 2)
                     ea, eb, ec, _ = edge_values(corners, 0, 1, 2, i + 0.5, j + 0.5)
-                    a, b = ea / (ea + eb + ec), eb / (ea + eb + ec)
-                    za, zb, zc = depth_of(row, vertices, ia), depth_of(row, vertices, ib), depth_of(row, vertices, ic)
+                    a, b, c = ea / (ea + eb + ec), eb / (ea + eb + ec), ec / (ea + eb + ec)
                     barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = a, b
-                    depths_out[k, j, i] = a * za + b * zb + ec / (ea + eb + ec) * zc
+                    depths_out[k, j, i] = (
+                        a * depth_of(row, near_vertices, 3 * n)
+                        + b * depth_of(row, near_vertices, 3 * n + 1)
+                        + c * depth_of(row, near_vertices, 3 * n + 2)
+                    )
+                    n += 1
 
 
 @numba.njit

@@ -77,6 +77,10 @@ def settle(
                             inside_s, least_s, z_s, a_s, b_s = look(
                                 s, x, y, matrix, row, keep, vertices, faces, corners
                             )
+                            # Those found already have hits of their own; so coplanar layers all stay.
+                            for n in range(count):
+                                if found[n] == s:
+                                    inside_s, least_s = False, -np.inf
                             if (inside_s and not best_inside) or (inside_s == best_inside and least_s > best_least):
                                 best, best_least, best_z = s, least_s, z_s
                                 best_a, best_b, best_inside = a_s, b_s, inside_s

@@ -64,7 +64,8 @@ class Buffers:
     """A proxy on the device, its vertices moved and scaled to the unit sphere. Released when garbage-collected."""
 
     def __init__(self, worker: Worker, proxy: Proxy):
-        self.proxy = proxy
+        faces = np.ascontiguousarray(proxy.faces, np.int32)
+        self.proxy = proxy = proxy._replace(vertices=np.ascontiguousarray(proxy.vertices, np.float32), faces=faces)
         low, high = proxy.vertices.min(axis=0).astype(np.float64), proxy.vertices.max(axis=0).astype(np.float64)
         self.center, self.radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-30)
         unit = ((proxy.vertices - self.center) / self.radius).astype(np.float32)
