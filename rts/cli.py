@@ -14,7 +14,6 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 from typer.core import TyperGroup
 
 from rts import registry
@@ -169,13 +168,13 @@ def _global(
 
 
 @app.command()
-def plugins() -> None:
+def plugins(
+    matrix: Annotated[bool, typer.Option("--matrix", help="Try each surface with each sampler and engine.")] = False,
+) -> None:
     """List every plugin: engines, surfaces, samplers, shaders and splatters, and whether each one loads."""
-    table = Table("group", "name", "from", "state")
-    for group, name, distribution, error in registry.survey():
-        state = "[green]ready[/]" if error is None else f"[red]{escape(error)}[/]"
-        table.add_row(group.removeprefix("rts."), name, distribution, state)
-    Console().print(table)
+    from rts.listing import matrix_table, plugin_table
+
+    Console().print(matrix_table() if matrix else plugin_table())
 
 
 @app.command(epilog="Example: rts render bunny.obj -o bunny.png --size 480x640 --camera 30,20 --cull back")

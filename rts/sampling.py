@@ -97,7 +97,7 @@ class TriangleSampler(abc.ABC):
         surface, theta = part.surface, part.theta
         if not hasattr(surface, "proxy"):
             raise InputError(
-                f"{surface!r} has no triangles, which this sampler needs; use a sampler of such surfaces, such as 'rays'"
+                f"{surface!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
             )
         engine = engine_of(theta, camera)
         inputs = surface.proxy_inputs(theta) if entry is None or hasattr(surface, "refine") else None

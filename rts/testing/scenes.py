@@ -6,18 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from rts import registry
+from rts import pairs, registry
 from rts.camera import Camera
+from rts.pairs import CAPACITY, LAYERS, SIZE
 from rts.protocols import Array, Part, Sampled
 from rts.rendering import APRON, render, render_samples, sample
 from rts.testing.conformance import claim
 from rts.testing.engines import single
 
-# One size throughout: engines that compile do it once.
-SIZE = (14, 18)
 GRID = SIZE[0] + 2 * APRON, SIZE[1] + 2 * APRON
-LAYERS = 2
-CAPACITY = LAYERS * GRID[0] * GRID[1]
 
 
 def _rounded(camera: Camera) -> Camera:
@@ -26,19 +23,19 @@ def _rounded(camera: Camera) -> Camera:
 
 
 def _look(eye: tuple, at: tuple = (0, 0, 0), up: tuple = (0, 1, 0), **options: Any) -> Camera:
-    return _rounded(Camera.look_at(eye, at, up, fov_y=options.pop("fov_y", 45), aspect=18 / 14, **options))
+    return _rounded(Camera.look_at(eye, at, up, fov_y=options.pop("fov_y", 45), aspect=SIZE[1] / SIZE[0], **options))
 
 
-CAMERA = _look((0.9, 1.6, 3.2), principal_point=(0.1, -0.05))
-"""Perspective, with nothing symmetric that could hide a flip or a shift."""
-
+CAMERA = _rounded(pairs.CAMERA)
 AWAY = _look((0, 0, 5), (0, 0, 9))
 BESIDE = _look((0, 0, 5), (40, 0, 5.5))
 NEAR = _look((0.9, 1.6, 3.2), near=3.4, far=4.2)
 """Its near plane cuts through what is about the origin, and its far plane too."""
 
 INSIDE = _look((0.1, 0.05, 0.2), (0.6, 0.2, -1), near=0.05, far=20, fov_y=75)
-PARALLEL = _rounded(Camera.orthographic((1.1, 1.3, 3.1), (0, 0.1, 0), height=3.1, aspect=18 / 14, near=0.5, far=9))
+PARALLEL = _rounded(
+    Camera.orthographic((1.1, 1.3, 3.1), (0, 0.1, 0), height=3.1, aspect=SIZE[1] / SIZE[0], near=0.5, far=9)
+)
 AXES = [_look(e, up=u) for e, u in (((4, 0, 0), (0, 1, 0)), ((0, 4, 0), (0, 0, 1)), ((0, 0, 4), (0, 1, 0)))]
 VIEWS = {"perspective": CAMERA, "orthographic": PARALLEL, "from inside": INSIDE, "cut by near and far plane": NEAR}
 UNSEEN = {"behind the camera": AWAY, "beside the image": BESIDE}

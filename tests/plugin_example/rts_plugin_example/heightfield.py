@@ -6,13 +6,13 @@ import numpy as np
 
 import rts
 
-SQUARES, NEWTON_STEPS = 5, 6  # Squares of two triangles along the side of a patch.
 
-
+@dataclasses.dataclass(frozen=True)
 class Heightfield:
     """θ["heights"] (R, C) are the control heights, rows along z and columns along x, at least four of each."""
 
     sample_widths = (0, 2)  # A sample has no integers; its parameters are u along x and v along z, counted in patches.
+    squares, newton_steps = 5, 6  # Squares of two triangles along the side of a patch.
 
     def check(self, theta):
         shape = tuple(getattr(theta.get("heights"), "shape", ()))
@@ -31,8 +31,8 @@ class Heightfield:
         return theta["heights"]
 
     def proxy(self, inputs, camera, size):
-        counts = [SQUARES * (n - 3) + 1 for n in inputs.shape]
-        params = np.indices(counts, np.float32)[::-1].reshape(2, -1).T / SQUARES
+        counts = [self.squares * (n - 3) + 1 for n in inputs.shape]
+        params = np.indices(counts, np.float32)[::-1].reshape(2, -1).T / self.squares
         vertices = self.evaluate({"heights": inputs}, rts.Samples(None, params, None, None, None))["position"]
         index = np.arange(len(params), dtype=np.int32).reshape(counts)
         a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]  # From above, counter-clockwise.
@@ -45,7 +45,7 @@ class Heightfield:
         start[samples.row[cells]] = samples.depth[cells]
         per_z, per_x = ((n - 3) / 2 for n in inputs.shape)
         depth, (dx, dy, dz) = start, rays.directions.T
-        for _ in range(NEWTON_STEPS):
+        for _ in range(self.newton_steps):
             x, y, z = (rays.origins + depth[:, None] * rays.directions).T
             u, v = (x + 1) * per_x, (z + 1) * per_z
             h, slope_u, slope_v = height(inputs.astype(np.float64), u, v)

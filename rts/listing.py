@@ -1,0 +1,28 @@
+"""The tables that `rts plugins` prints."""
+
+from __future__ import annotations
+
+from rich.markup import escape
+from rich.table import Table
+
+from rts import pairs, registry
+
+
+def plugin_table() -> Table:
+    """Every plugin, and whether it loads."""
+    table = Table("group", "name", "from", "state")
+    for group, name, distribution, error in registry.survey():
+        state = "[green]ready[/]" if error is None else f"[red]{escape(error)}[/]"
+        table.add_row(group.removeprefix("rts."), name, distribution, state)
+    return table
+
+
+def matrix_table() -> Table:
+    """Every surface with every sampler, tried in every engine."""
+    engines = registry.plugins("rts.engines")
+    table = Table("surface", "sampler", *engines, "why not")
+    for pair in pairs.pairs():
+        cells = ["[green]ok[/]" if pair.problems[e] is None else "[red]no[/]" for e in engines]
+        reasons = dict.fromkeys(p for p in pair.problems.values() if p is not None)
+        table.add_row(pair.surface, pair.sampler, *cells, escape("\n".join(reasons)))
+    return table

@@ -1,0 +1,115 @@
+"""Which surface goes with which sampler and engine: each tried on the example that the surface gives of itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts import registry
+from rts.arrays import constants, is_constant, leaves, map_leaves
+from rts.camera import Camera
+from rts.errors import RtsError
+from rts.protocols import Engine, Part
+from rts.rendering import APRON, render
+
+SIZE = (14, 18)
+CAMERA = Camera.look_at((0.9, 1.6, 3.2), (0, 0, 0), aspect=SIZE[1] / SIZE[0], principal_point=(0.1, -0.05))
+"""Sees an example, which lies about the origin and within two units of it; nothing is symmetric."""
+
+LAYERS = 2
+CAPACITY = LAYERS * (SIZE[0] + 2 * APRON) * (SIZE[1] + 2 * APRON)
+"""A row for every cell, so that engines that compile meet the same shapes again."""
+
+
+class Pair(NamedTuple):
+    """A surface and a sampler, by name.
+
+    Attributes:
+        surface: the surface.
+        sampler: the sampler; "" where the surface cannot be tried.
+        problems: for each engine why it does not work, or None.
+    """
+
+    surface: str
+    sampler: str
+    problems: dict[str, str | None]
+
+
+def example(surface: str) -> Part | None:
+    """The example of a registered surface, or None where it gives none."""
+    found = registry.plugin("rts.surfaces", surface)
+    return found.example() if hasattr(found, "example") else None
+
+
+def attempt(part: Part, sampler: Any, engine: str) -> np.ndarray:
+    """The image of an example, after its gradient in θ has been taken where the engine has derivatives.
+
+    Raises:
+        RtsError: the image shows nothing, or a value or derivative is not finite; or whatever rendering raises.
+    """
+    chosen = registry.plugin("rts.engines", engine)()
+    theta = constants(map_leaves(_single, part.theta), chosen, None)
+
+    def image(theta: Any) -> Any:
+        seen = part.replace(theta=theta)
+        return render(seen, CAMERA, SIZE, sampler=sampler, splatter="single", layers=LAYERS, capacity=CAPACITY)
+
+    found = np.asarray(chosen.to_numpy(image(theta)))
+    if not (np.isfinite(found).all() and found.any()):
+        raise RtsError("the image is empty or not finite; an example lies about the origin, within two units of it")
+    if not is_constant(theta):
+        _check_gradient(chosen, image, theta)
+    return found
+
+
+def _check_gradient(engine: Engine, image: Any, theta: Any) -> None:
+    """Refuse a gradient that is zero everywhere, or not finite."""
+    xp = engine.namespace
+    floating = [x for x in leaves(theta) if xp.isdtype(x.dtype, "real floating")]
+
+    def total(values: list) -> Any:
+        it = iter(values)
+        moved = map_leaves(lambda x: next(it) if xp.isdtype(x.dtype, "real floating") else x, theta)
+        return xp.sum(image(moved) ** 2)
+
+    gradient = [engine.to_numpy(g) for g in engine.value_and_grad(total)(floating)[1]]
+    if not all(np.isfinite(g).all() for g in gradient):
+        raise RtsError("the gradient in theta is not finite")
+    if not any(g.any() for g in gradient):
+        raise RtsError("the gradient in theta is zero everywhere")
+
+
+def _single(x: Any) -> np.ndarray:
+    x = np.asarray(x)
+    return x.astype(np.float32) if np.issubdtype(x.dtype, np.floating) else x
+
+
+def pairs() -> Iterator[Pair]:
+    """Every registered surface with every sampler, tried in every engine."""
+    engines = registry.plugins("rts.engines")
+    for surface in registry.plugins("rts.surfaces"):
+        part, problem = None, "no example"
+        try:
+            part = example(surface)
+        except Exception as error:
+            problem = _reason(error)
+        if part is None:
+            yield Pair(surface, "", dict.fromkeys(engines, problem))
+            continue
+        for sampler in registry.plugins("rts.samplers"):
+            yield Pair(surface, sampler, {engine: _problem(part, sampler, engine) for engine in engines})
+
+
+def _problem(part: Part, sampler: str, engine: str) -> str | None:
+    try:
+        attempt(part, sampler, engine)
+    except Exception as error:  # Of other people's plugins, too.
+        return _reason(error)
+    return None
+
+
+def _reason(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    return text if isinstance(error, RtsError) else f"{type(error).__name__}: {text}"

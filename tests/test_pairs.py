@@ -1,0 +1,94 @@
+"""Every surface with every sampler in every engine, on the example of each surface."""
+
+import numpy as np
+import pytest
+from analytic import Ellipsoid
+from typer.testing import CliRunner
+
+import rts
+from rts import pairs
+from rts.cli import app
+
+
+class OwnEllipsoid(Ellipsoid):
+    """A surface without triangles, as none is registered."""
+
+    @classmethod
+    def example(cls):
+        theta = {"center": np.array([0.1, 0.0, 0.1], np.float32), "radii": np.array([1.0, 0.7, 0.8], np.float32)}
+        return rts.Part(cls(), theta, shader="lambert")
+
+
+EXAMPLES = {name: pairs.example(name) for name in rts.plugins("surfaces")} | {"ellipsoid": OwnEllipsoid.example()}
+
+
+def works(surface, sampler):
+    """Whether a pair is meant to: all other samplers are of triangles."""
+    return sampler == "auto" or hasattr(surface, "intersect" if sampler == "rays" else "proxy")
+
+
+@pytest.mark.parametrize("engine", rts.plugins("engines"))
+@pytest.mark.parametrize("sampler", rts.plugins("samplers"))
+@pytest.mark.parametrize("surface", EXAMPLES)
+def test_a_pair_shows_the_surface_or_says_why_not(surface, sampler, engine):
+    part = EXAMPLES[surface]
+    if part is None:
+        pytest.skip("the surface gives no example")
+    if not works(part.surface, sampler):
+        with pytest.raises(rts.InputError, match=r"\A[^\n]*; use a sampler of [^\n]*\Z"):
+            pairs.attempt(part, sampler, engine)
+        return
+    try:
+        image = pairs.attempt(part, sampler, engine)
+    except rts.PluginError as error:
+        pytest.skip(str(error))
+    expected = pairs.attempt(part, "rays" if hasattr(part.surface, "intersect") else "reference", "numpy")
+    differing = (np.abs(image - expected) > 1e-4).any(axis=-1)
+    assert expected[..., 3].mean() > 0.1 and differing.mean() < 0.01
+
+
+def test_the_matrix_names_each_pair_and_why_one_does_not_work(monkeypatch):
+    class Bare:
+        """Without an example."""
+
+    class Broken(OwnEllipsoid):
+        def evaluate(self, theta, samples):
+            raise KeyError("lost")
+
+    found = {"mesh": rts.plugin("surfaces", "mesh"), "bare": Bare, "broken": Broken}
+    plugin, plugins = rts.registry.plugin, rts.registry.plugins
+    names = {"rts.engines": ["numpy"], "rts.samplers": ["raster", "rays"], "rts.surfaces": list(found)}
+    monkeypatch.setattr(rts.registry, "plugins", lambda group: names.get(group) or plugins(group))
+    monkeypatch.setattr(rts.registry, "plugin", lambda group, name: found.get(name) or plugin(group, name))
+    monkeypatch.setenv("COLUMNS", "300")
+    done = CliRunner().invoke(app, ["plugins", "--matrix"])
+    assert done.exit_code == 0
+    lines = [[cell.strip() for cell in line.split("│")[1:-1]] for line in done.output.splitlines() if "│" in line]
+    cells = {(surface, sampler): rest for surface, sampler, *rest in lines}
+    assert cells["mesh", "raster"] == ["ok", ""]
+    assert cells["mesh", "rays"][0] == "no" and "use a sampler of triangles" in cells["mesh", "rays"][1]
+    assert cells["bare", ""] == ["no", "no example"]
+    assert cells["broken", "rays"] == ["no", "KeyError: 'lost'"]
+    assert "has no triangles" in cells["broken", "raster"][1]
+
+
+@pytest.mark.parametrize(
+    "change, expected",
+    [
+        ({"center": np.full(3, 50, np.float32)}, "the image is empty"),
+        ({"detached": np.ones(3, np.float32)}, "gradient in theta is zero"),
+    ],
+)
+def test_an_example_that_shows_nothing_is_no_success(change, expected):
+    pytest.importorskip("torch")
+
+    class Detached(OwnEllipsoid):
+        def evaluate(self, theta, samples):
+            gbuffer = super().evaluate(theta, samples)
+            if "detached" not in theta:
+                return gbuffer
+            return rts.GBuffer(position=gbuffer["position"].detach(), normal=gbuffer["normal"].detach())
+
+    part = Detached.example()
+    with pytest.raises(rts.RtsError, match=expected):
+        pairs.attempt(part.replace(theta={**part.theta, **change}), "rays", "torch")
