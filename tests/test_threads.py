@@ -1,0 +1,226 @@
+"""Two threads at once with every sampler, and a thousand renders that leave nothing behind."""
+
+import gc
+import os
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from analytic import Ellipsoid
+from helpers import icosphere, soup
+
+import rts
+from rts import Camera, Part, PluginError
+
+Mesh = rts.plugin("surfaces", "mesh")
+CAMERA = Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=50, aspect=1.25)
+TRIANGLE_SAMPLERS = ("raster", "reference", "embree", "opengl")
+SAMPLERS = (*TRIANGLE_SAMPLERS, "rays")
+
+
+def made(name):
+    """A sampler, or the test is skipped where it cannot work."""
+    try:
+        sampler = rts.plugin("samplers", name)()
+        rts.sample(scene(name, 0), CAMERA, (4, 5), sampler=sampler)
+        return sampler
+    except PluginError as error:
+        pytest.skip(str(error))
+
+
+def scene(name, kind):
+    if name == "rays":
+        radii = [(1, 0.6, 0.8), (0.5, 1.1, 0.7)][kind]
+        return Part(Ellipsoid(), {"center": np.zeros(3, np.float32), "radii": np.float32(radii)}, "normals")
+    vertices, faces = icosphere(2) if kind == 0 else soup(120, size=0.4)
+    return Part(Mesh(faces), {"vertices": vertices}, "normals")
+
+
+@pytest.fixture(params=SAMPLERS)
+def name(request):
+    return request.param
+
+
+# ------------------------------------------------------------------------------------------------- threads
+
+
+def pictures(name, sampler, kind, count, size, moving):
+    """Renders of one scene from many poses, its vertices moved too if `moving`."""
+    part, found = scene(name, kind), []
+    for step in range(count):
+        part = part.replace(transform=rts.rigid(np.float32([0.1 * step, 0, 0, 0, 0.02 * kind, 0])))
+        if moving and name != "rays":
+            part.theta["vertices"][:, kind] *= np.float32(0.99)
+        found.append(rts.render(part, CAMERA, size, sampler=sampler, layers=2 + kind))
+    return found
+
+
+@pytest.mark.parametrize("moving", [False, True], ids=["poses", "vertices"])
+@pytest.mark.parametrize("shared", [True, False], ids=["one sampler", "two samplers"])
+def test_two_threads_render_what_one_does_after_the_other(name, shared, moving):
+    first = made(name)
+    samplers = (first, first if shared else made(name))
+    sizes = ((24, 30), (33, 20))
+    expected = [pictures(name, made(name), kind, 24, sizes[kind], moving) for kind in (0, 1)]
+    found, errors, start = [None, None], [], threading.Barrier(2)
+
+    def work(kind):
+        try:
+            start.wait(30)
+            found[kind] = pictures(name, samplers[kind], kind, 24, sizes[kind], moving)
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=work, args=(kind,)) for kind in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert not errors and not any(t.is_alive() for t in threads)
+    for kind in (0, 1):
+        np.testing.assert_array_equal(found[kind], expected[kind])
+
+
+def test_threads_may_share_a_part_and_a_handle(name):
+    sampler, part = made(name), scene(name, 1)
+    handle = rts.prepare(part, sampler)
+    moves = [rts.rigid(np.float32([0, 0.2 * i, 0, 0, 0, 0])) for i in range(12)]
+    expected = [rts.render(part.replace(transform=m), CAMERA, (20, 25), sampler=sampler) for m in moves]
+    found, errors = {}, []
+
+    def work(who, prepared):
+        try:
+            for i, move in enumerate(moves):
+                if prepared:
+                    found[who, i] = rts.render(handle.replace(transform=move), CAMERA, (20, 25))
+                else:
+                    found[who, i] = rts.render(part.replace(transform=move), CAMERA, (20, 25), sampler=sampler)
+        except BaseException as error:
+            errors.append(error)
+
+    threads = [threading.Thread(target=work, args=(who, who % 2 == 0)) for who in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(120)
+    assert not errors
+    for (_, i), image in found.items():
+        np.testing.assert_array_equal(image, expected[i])
+    assert len(found) == 36
+
+
+# --------------------------------------------------------------------------------------------------- leaks
+
+LIMIT = 20e6
+
+
+def resident():
+    """Bytes of memory that this process occupies."""
+    statm = Path("/proc/self/statm")
+    if not statm.exists():
+        pytest.skip("no /proc/self/statm on this system")
+    gc.collect()
+    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.parametrize("moving", [False, True], ids=["poses", "vertices"])
+def test_a_thousand_renders_leave_no_memory_behind(name, moving):
+    sampler, part = made(name), scene(name, 0)
+    original = {key: value.copy() for key, value in part.theta.items()}
+    angles = np.linspace(0, 3, 1000).astype(np.float32)
+
+    def render(angle):
+        if moving:
+            for key in original:
+                part.theta[key][:] = original[key] * (1 + 0.1 * angle)
+        rts.render(part.replace(transform=rts.rigid((0, float(angle), 0, 0, 0, 0))), CAMERA, (16, 16), sampler=sampler)
+
+    for angle in angles[:150]:
+        render(angle)
+    before = resident()
+    for angle in angles:
+        render(angle)
+    assert resident() - before < LIMIT
+
+
+@pytest.mark.parametrize("name", ["embree", "opengl"])
+def test_hundreds_of_meshes_leave_no_memory_behind(name):
+    # Each of 5120 triangles: without release, 300 of them would be seen.
+    sampler, (vertices, faces) = made(name), icosphere(4)
+
+    def render(count):
+        for _ in range(count):
+            part = Part(Mesh(faces), {"vertices": vertices}, "silhouette")
+            rts.render(part, CAMERA, (16, 16), sampler=sampler)
+
+    render(40)
+    before = resident()
+    render(300)
+    assert resident() - before < LIMIT
+
+
+class Counted:
+    """A context that counts the objects made of it and released."""
+
+    MADE = ("buffer", "vertex_array", "texture", "depth_renderbuffer", "framebuffer", "program", "query")
+
+    def __init__(self, context):
+        self._context, self.alive, self.most = context, [], 0
+
+    def __getattr__(self, attribute):
+        value = getattr(self._context, attribute)
+        if attribute not in self.MADE:
+            return value
+
+        def make(*args, **kwargs):
+            thing = value(*args, **kwargs)
+            self.alive.append(thing)
+            self.alive = [x for x in self.alive if type(x.mglo).__name__ != "InvalidObject"]
+            self.most = max(self.most, len(self.alive))
+            return thing
+
+        return make
+
+    def __setattr__(self, attribute, value):
+        if attribute in ("_context", "alive", "most"):
+            object.__setattr__(self, attribute, value)
+        else:
+            setattr(self._context, attribute, value)
+
+
+def test_a_thousand_renders_leave_no_opengl_object_behind(monkeypatch):
+    made("opengl")
+    from rts_backends import opengl_worker
+
+    create, contexts = opengl_worker._create, []
+
+    def counted():
+        contexts.append(Counted(create()))
+        return contexts[-1]
+
+    monkeypatch.setattr(opengl_worker, "_create", counted)
+    sampler = made("opengl")
+    parts, original = [scene("opengl", 0)], icosphere(2)[0]
+
+    def render(steps):
+        for step in steps:
+            parts[0].theta["vertices"][:] = original * np.float32(1 - 1e-4 * step)
+            rts.render(parts[0], CAMERA, (16, 16 + step % 9), sampler=sampler)
+
+    def alive():
+        gc.collect()
+        sampler._worker.call(lambda context: None)
+        (context,) = contexts
+        return sum(type(x.mglo).__name__ != "InvalidObject" for x in context.alive)
+
+    render(range(60))
+    before = alive()
+    render(range(60, 1060))
+    assert alive() == before
+    assert contexts[0].most <= before + 12
+    # Two meshes of three objects, four pairs of targets of three, programs and query.
+    assert before <= 2 * 3 + 4 * 2 * 3 + 4
+    parts.clear()
+    assert alive() <= before - 6
+    sampler._worker.close()
