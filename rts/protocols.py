@@ -133,7 +133,7 @@ class Samples:
 
     Attributes:
         ids: (N, I) int32.
-        params: (N, P) float32.
+        params: (N, P) float32; θ's own dtype where they were found on the device.
         row: (K, H, W) int32, the sample in each cell, or −1.
         depth: (K, H, W) float32, linear camera depth; 0 where `row` is −1.
         overflow: () int32, samples that did not fit into the capacity and were dropped, deepest layers first.

@@ -19,6 +19,7 @@ from rts_backends.triangles import depth_of, determinant, edge, facing, owns, pi
 
 BAND_ROWS = 8
 CHUNK = 1 << 14
+BLOCK = 64
 SLACK = 1e-2
 """Pixels, for the rounding of corners to float32."""
 
@@ -129,14 +130,27 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, keep, b
 def _set_up(first, last, vertices, faces, matrix, view_depth, keep, boxes, kept, clips, numbers, planes, counts):
     """Work out what drawing needs of the listed triangles; those of no area, or facing away, leave the list."""
     corners = np.empty((3, 4))
+    near_faces, near_vertices = np.empty((BLOCK, 3), np.int32), np.empty((3 * BLOCK, 3), np.float32)
     for chunk in range(first, last):
         start, found = chunk * CHUNK, chunk * CHUNK
         for n in range(start, start + counts[chunk]):
+            at = (n - start) % BLOCK
+            if at == 0:
+                # Corners are gathered by loops so short that the processor overlaps their waits for memory.
+                block = min(BLOCK, start + counts[chunk] - n)
+                for b in range(block):
+                    t = kept[n + b]
+                    near_faces[b, 0], near_faces[b, 1], near_faces[b, 2] = faces[t, 0], faces[t, 1], faces[t, 2]
+                for b in range(block):
+                    for c in range(3):
+                        v = near_faces[b, c]
+                        near_vertices[3 * b + c, 0] = vertices[v, 0]
+                        near_vertices[3 * b + c, 1] = vertices[v, 1]
+                        near_vertices[3 * b + c, 2] = vertices[v, 2]
             t = kept[n]
-            ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
-            to_corner(matrix, vertices, ia, corners, 0)
-            to_corner(matrix, vertices, ib, corners, 1)
-            to_corner(matrix, vertices, ic, corners, 2)
+            to_corner(matrix, near_vertices, 3 * at, corners, 0)
+            to_corner(matrix, near_vertices, 3 * at + 1, corners, 1)
+            to_corner(matrix, near_vertices, 3 * at + 2, corners, 2)
             area = determinant(corners, 0, 1, 2)
             if not (area * keep > 0 or (keep == 0 and area != 0)):
                 continue
@@ -147,9 +161,9 @@ def _set_up(first, last, vertices, faces, matrix, view_depth, keep, boxes, kept,
             numbers[found, 0], numbers[found, 1], numbers[found, 2] = sign * xa, sign * ya, sign * wa
             numbers[found, 3], numbers[found, 4], numbers[found, 5] = sign * xb, sign * yb, sign * wb
             numbers[found, 6], numbers[found, 7], numbers[found, 8] = sign * xc, sign * yc, sign * wc
-            numbers[found, 9] = depth_of(view_depth, vertices, ia)
-            numbers[found, 10] = depth_of(view_depth, vertices, ib)
-            numbers[found, 11] = depth_of(view_depth, vertices, ic)
+            numbers[found, 9] = depth_of(view_depth, near_vertices, 3 * at)
+            numbers[found, 10] = depth_of(view_depth, near_vertices, 3 * at + 1)
+            numbers[found, 11] = depth_of(view_depth, near_vertices, 3 * at + 2)
             if clips[n]:
                 for c in range(3):
                     planes[found, c] = corners[c, 3] + corners[c, 2]

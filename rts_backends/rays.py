@@ -8,6 +8,7 @@ from rts.arrays import constants, engine_of, exemplar, map_leaves, namespace
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.protocols import ArraySpec, Part, Samples
+from rts.sampling import check_camera
 
 
 class Rays:
@@ -42,7 +43,8 @@ class Rays:
         cells = layers * size[0] * size[1]
         rows = cells if capacity is None else capacity
 
-        def pack(hit: np.ndarray) -> tuple[np.ndarray, ...]:
+        def pack(hit: np.ndarray, *matrices: np.ndarray) -> tuple[np.ndarray, ...]:
+            check_camera(Camera(*(np.asarray(m, np.float64) for m in matrices)))
             found = np.flatnonzero(hit)
             row = np.full(cells, -1, np.int32)
             row[found[:rows]] = np.arange(min(rows, len(found)), dtype=np.int32)
@@ -52,7 +54,7 @@ class Rays:
 
         packed = ArraySpec((rows,), np.int32, packed=capacity is None)
         specs = packed, ArraySpec((layers, *size), np.int32), ArraySpec((), np.int32)
-        index, row, overflow = engine.call_host(pack, specs, hit)
+        index, row, overflow = engine.call_host(pack, specs, hit, camera.view, camera.projection)
         width_i, width_p = surface.sample_widths
         params = xp.take(xp.reshape(hits.params, (cells, width_p)), index, axis=0)
         if hits.ids is None:

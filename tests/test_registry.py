@@ -232,25 +232,25 @@ def test_a_name_of_ours_claimed_by_another_distribution_is_refused(install):
 def test_a_missing_package_of_an_extra_names_the_pip_command(install):
     install(
         "needy",
-        {"rts.samplers": {"rays": "needy_plugin:Rays"}},
+        {"rts.samplers": {"beams": "needy_plugin:Rays"}},
         {"needy_plugin": "import a_package_that_is_absent"},
-        extras=("rays",),
+        extras=("beams",),
     )
     with pytest.raises(rts.PluginError) as error:
-        rts.plugin("samplers", "rays")
+        rts.plugin("samplers", "beams")
     message = one_line(error)
-    assert "'a_package_that_is_absent'" in message and "pip install 'needy[rays]'" in message
+    assert "'a_package_that_is_absent'" in message and "pip install 'needy[beams]'" in message
     assert isinstance(error.value.__cause__, ModuleNotFoundError)
 
 
 def test_a_missing_package_without_an_extra_names_the_module_and_the_distribution(install):
     install(
         "needy",
-        {"rts.samplers": {"rays": "needy_plugin:Rays"}},
+        {"rts.samplers": {"beams": "needy_plugin:Rays"}},
         {"needy_plugin": "import a_package_that_is_absent"},
     )
     with pytest.raises(rts.PluginError) as error:
-        rts.plugin("samplers", "rays")
+        rts.plugin("samplers", "beams")
     message = one_line(error)
     assert "needy 1.2" in message and "'a_package_that_is_absent'" in message and "pip install" not in message
 
