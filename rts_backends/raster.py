@@ -254,22 +254,23 @@ def _draw(first, last, offsets, items, boxes, kept, clips, numbers, planes, tria
                         nearest[pixel, k], winners[pixel, k] = nearest[pixel, k - 1], winners[pixel, k - 1]
                         k -= 1
                     nearest[pixel, k], winners[pixel, k] = z, n
-        for pixel in range((bottom - top + 1) * width):
-            i, j = pixel % width, top + pixel // width
-            x, y = i + 0.5, j + 0.5
-            for k in range(layers):
-                n = winners[pixel, k]
-                if n < 0:
-                    triangle_ids[k, j, i] = -1
-                    barycentrics[k, j, i, 0] = barycentrics[k, j, i, 1] = depths[k, j, i] = 0
-                    continue
-                ea = numbers[n, 0] * x + (numbers[n, 1] * y + numbers[n, 2])
-                eb = numbers[n, 3] * x + (numbers[n, 4] * y + numbers[n, 5])
-                ec = numbers[n, 6] * x + (numbers[n, 7] * y + numbers[n, 8])
-                triangle_ids[k, j, i] = kept[n]
-                barycentrics[k, j, i, 0] = ea / (ea + eb + ec)
-                barycentrics[k, j, i, 1] = eb / (ea + eb + ec)
-                depths[k, j, i] = nearest[pixel, k]
+        for k in range(layers):
+            for j in range(top, bottom + 1):
+                y = j + 0.5
+                for i in range(width):
+                    n = winners[(j - top) * width + i, k]
+                    if n < 0:
+                        triangle_ids[k, j, i] = -1
+                        barycentrics[k, j, i, 0] = barycentrics[k, j, i, 1] = depths[k, j, i] = 0
+                        continue
+                    x = i + 0.5
+                    ea = numbers[n, 0] * x + (numbers[n, 1] * y + numbers[n, 2])
+                    eb = numbers[n, 3] * x + (numbers[n, 4] * y + numbers[n, 5])
+                    ec = numbers[n, 6] * x + (numbers[n, 7] * y + numbers[n, 8])
+                    scale = 1 / (ea + eb + ec)
+                    triangle_ids[k, j, i] = kept[n]
+                    barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = ea * scale, eb * scale
+                    depths[k, j, i] = nearest[(j - top) * width + i, k]
 
 
 @numba.njit
