@@ -2,7 +2,7 @@
 
 It gives the first hit of a ray, on one core. So rays are cast again, each from just beyond its last hit, until every
 pixel has its layers. Each hit is decided in float64 as the rasterizer decides, along with all triangles around its
-corners: so edges are hit once, and layers that share a vertex keep their order however close they are. Others closer
+corners: so edges are hit once, and layers that share a corner keep their order however close they are. Others closer
 than `STEP` may get lost.
 """
 
@@ -15,12 +15,12 @@ from embreex.rtcore_scene import EmbreeScene
 
 from rts.camera import Camera
 from rts.protocols import Fragments, Proxy
-from rts_backends.neighbours import corner_lists, look
+from rts_backends.neighbours import corner_lists, look, places
 from rts_backends.threads import parallel
 from rts_backends.triangles import facing, pixel_matrix
 
-STEP = 4e-6
-"""Of the object's size: how far beyond a hit the next ray starts; float32 resolves about a tenth of it."""
+STEP = 1e-6
+"""Of the object's size: how far beyond a hit the next ray starts; float32 resolves about a tenth."""
 REACH = 1.01
 """Square of the radius of the sphere that rays start on, in units of the object's."""
 
@@ -35,13 +35,15 @@ class Scene:
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
         self._vertices, self._faces = vertices, faces
-        self.corners = corner_lists(faces, len(vertices) - 1)
         self.move(rebuild=True)
 
     def move(self, *, rebuild: bool) -> None:
         """Follow vertices that have changed in place; always by building anew, since embreex cannot refit."""
+        vertices = self._vertices[:-1]
+        self._places = places(vertices, self._faces)
+        self._around = corner_lists(self._places, len(vertices))
         self.handle = EmbreeScene(robust=True)
-        TriangleMesh(self.handle, self._vertices[:-1], self._faces)
+        TriangleMesh(self.handle, vertices, self._faces)
 
     def cast(
         self,
@@ -86,7 +88,7 @@ class Scene:
             hit = hits["primID"] >= 0
             live = live[hit]
             depth = reach[live] + hits["tfar"][hit] / length[live]
-            args = live, hits["primID"][hit], size[1], *scene, *self.corners, ids, found
+            args = live, hits["primID"][hit], size[1], *scene, self._places, *self._around, ids, found
             parallel(_take, len(live), *args)
             again = last[live] == hits["primID"][hit]
             last[live] = hits["primID"][hit]
@@ -105,7 +107,7 @@ class Scene:
 
 @numba.njit(cache=True, nogil=True)
 def _take(
-    first, last, pixels, triangles, width, matrix, row, keep, vertices, faces, offsets, members, ids, found
+    first, last, pixels, triangles, width, matrix, row, keep, vertices, faces, around, offsets, members, ids, found
 ):  # fmt: skip
     """Put the hit of each pixel, and those of all triangles around its corners, among the pixel's nearest."""
     layers = ids.shape[1]
@@ -114,7 +116,7 @@ def _take(
         pixel = pixels[n]
         x, y = pixel % width + 0.5, pixel // width + 0.5
         for c in range(3):
-            v = faces[triangles[n], c]
+            v = around[triangles[n], c]
             for m in range(offsets[v], offsets[v + 1]):
                 t = members[m]
                 inside, _, z, a, b = look(t, x, y, matrix, row, keep, vertices, faces, corners)

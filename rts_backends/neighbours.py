@@ -29,6 +29,35 @@ def corner_lists(faces, count):
     return offsets, members
 
 
+@numba.njit(cache=True, nogil=True)
+def places(vertices, faces):
+    """(T, 3) faces in which corners at one place have one number, though they may be different vertices."""
+    size = 4
+    while size < 2 * len(vertices):
+        size *= 2
+    table, first = np.full(size, -1, np.int32), np.empty(len(vertices), np.int32)
+    bits = (vertices + np.float32(0)).view(np.uint32)  # So that −0 is 0.
+    for v in range(len(vertices)):
+        mixed = np.uint64(bits[v, 0]) * np.uint64(0x9E3779B185EBCA87)
+        mixed = (mixed ^ (mixed >> np.uint64(29)) ^ np.uint64(bits[v, 1])) * np.uint64(0xC2B2AE3D27D4EB4F)
+        mixed = (mixed ^ (mixed >> np.uint64(31)) ^ np.uint64(bits[v, 2])) * np.uint64(0x165667B19E3779F9)
+        slot = np.int64((mixed ^ (mixed >> np.uint64(32))) & np.uint64(size - 1))
+        while True:
+            w = table[slot]
+            if w < 0:
+                table[slot] = first[v] = v
+                break
+            if bits[w, 0] == bits[v, 0] and bits[w, 1] == bits[v, 1] and bits[w, 2] == bits[v, 2]:
+                first[v] = w
+                break
+            slot = (slot + 1) & (size - 1)
+    found = np.empty_like(faces)
+    for t in range(len(faces)):
+        for c in range(3):
+            found[t, c] = first[faces[t, c]]
+    return found
+
+
 @numba.njit
 def look(t, x, y, matrix, row, keep, vertices, faces, corners):
     """Whether a triangle covers a pixel exactly, its least barycentric there, its depth, two barycentrics."""
@@ -50,9 +79,12 @@ def look(t, x, y, matrix, row, keep, vertices, faces, corners):
 
 @numba.njit(cache=True, nogil=True)
 def settle(
-    first, last, matrix, row, keep, vertices, faces, offsets, members, triangle_ids, barycentrics, depths
+    first, last, matrix, row, keep, vertices, faces, around, offsets, members, triangle_ids, barycentrics, depths
 ):  # fmt: skip
-    """Settle the hits of some rows of pixels: fill barycentrics and depths, correct ids, drop what covers nothing."""
+    """Settle the hits of some rows of pixels: fill barycentrics and depths, correct ids, drop what covers nothing.
+
+    `around` are the faces by place, `offsets` and `members` their `corner_lists`.
+    """
     layers, _, width = triangle_ids.shape
     corners = np.empty((3, 4))
     found, found_z, found_b = np.empty(layers, np.int32), np.empty(layers), np.empty((layers, 2))
@@ -71,7 +103,7 @@ def settle(
                     # The best of the triangles around this one; none better means that the surface ends here.
                     best, best_least, best_z, best_a, best_b, best_inside = t, least, z, a, b, False
                     for c in range(3):
-                        v = faces[t, c]
+                        v = around[t, c]
                         for at in range(offsets[v], offsets[v + 1]):
                             s = members[at]
                             inside_s, least_s, z_s, a_s, b_s = look(

@@ -9,6 +9,7 @@ snaps vertices to fractions of a pixel; so each hit is then decided in float64 b
 from __future__ import annotations
 
 import weakref
+from collections.abc import Sequence
 from typing import Any
 
 import moderngl
@@ -17,7 +18,7 @@ import numpy as np
 from rts.camera import Camera
 from rts.protocols import Fragments, Proxy
 from rts.sampling import TriangleSampler
-from rts_backends.neighbours import corner_lists, settle
+from rts_backends.neighbours import corner_lists, places, settle
 from rts_backends.opengl_worker import Worker
 from rts_backends.threads import parallel
 from rts_backends.triangles import facing, pixel_matrix
@@ -60,6 +61,13 @@ void main() { found = ivec2(-1, 0); }
 """
 
 
+class Device:
+    """Objects of one context: of another one, after it was lost, they must not be touched."""
+
+    context: moderngl.Context | None = None
+    objects: tuple[Any, ...] = ()
+
+
 class Buffers:
     """A proxy on the device, its vertices moved and scaled to the unit sphere. Released when garbage-collected."""
 
@@ -68,10 +76,11 @@ class Buffers:
         self.proxy = proxy = proxy._replace(vertices=np.ascontiguousarray(proxy.vertices, np.float32), faces=faces)
         low, high = proxy.vertices.min(axis=0).astype(np.float64), proxy.vertices.max(axis=0).astype(np.float64)
         self.center, self.radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-30)
-        unit = ((proxy.vertices - self.center) / self.radius).astype(np.float32)
-        self.corners = corner_lists(proxy.faces, len(proxy.vertices))
-        self.array, buffers = worker.call(_upload, unit, proxy.faces)
-        weakref.finalize(self, worker.later, _release, [self.array, *buffers])
+        around = places(proxy.vertices, proxy.faces)
+        self.corners = around, *corner_lists(around, len(proxy.vertices))
+        self.device = Device()
+        weakref.finalize(self, worker.later, _forget, self.device)
+        worker.call(_upload, self)
 
 
 class OpenGL(TriangleSampler):
@@ -93,7 +102,7 @@ class OpenGL(TriangleSampler):
         clip = np.diag([1.0, -1.0, 1.0, 1.0]) @ clip
         denormalize = np.diag([prepared.radius] * 3 + [1.0])
         denormalize[:3, 3] = prepared.center
-        triangle_ids = self._worker.call(_peel, prepared.array, clip @ denormalize, size, layers, keep)
+        triangle_ids = self._worker.call(_peel, prepared, clip @ denormalize, size, layers, keep)
         fragments = Fragments(
             np.ascontiguousarray(triangle_ids),
             np.empty((layers, height, width, 2), np.float32),
@@ -141,14 +150,25 @@ def _programs(context: moderngl.Context) -> dict[str, Any]:
     return context.extra
 
 
-def _upload(context: moderngl.Context, vertices: np.ndarray, faces: np.ndarray) -> tuple[Any, list[Any]]:
-    program = _programs(context)["peel"]
-    vertex_buffer, index_buffer = context.buffer(vertices.tobytes()), context.buffer(faces.tobytes())
-    array = context.vertex_array(program, [(vertex_buffer, "3f", "position")], index_buffer, index_element_size=4)
-    return array, [vertex_buffer, index_buffer]
+def _upload(context: moderngl.Context, prepared: Buffers) -> Any:
+    """The vertex array of a proxy, made where this context has none."""
+    device = prepared.device
+    if device.context is not context:
+        program, proxy = _programs(context)["peel"], prepared.proxy
+        unit = ((proxy.vertices - prepared.center) / prepared.radius).astype(np.float32)
+        vertex_buffer, index_buffer = context.buffer(unit.tobytes()), context.buffer(proxy.faces.tobytes())
+        layout = [(vertex_buffer, "3f", "position")]
+        array = context.vertex_array(program, layout, index_buffer, index_element_size=4)
+        device.context, device.objects = context, (array, vertex_buffer, index_buffer)
+    return device.objects[0]
 
 
-def _release(context: moderngl.Context, objects: list[Any]) -> None:
+def _forget(context: moderngl.Context, device: Device) -> None:
+    if device.context is context:
+        _release(context, device.objects)
+
+
+def _release(context: moderngl.Context, objects: Sequence[Any]) -> None:
     for item in objects:
         item.release()
 
@@ -170,10 +190,10 @@ def _targets(context: moderngl.Context, size: tuple[int, int]) -> list[tuple[Any
 
 
 def _peel(
-    context: moderngl.Context, array: Any, clip: np.ndarray, size: tuple[int, int], layers: int, keep: float
+    context: moderngl.Context, prepared: Buffers, clip: np.ndarray, size: tuple[int, int], layers: int, keep: float
 ) -> np.ndarray:
     """(K, H, W) triangle ids, as the hardware has them."""
-    parts = _programs(context)
+    parts, array = _programs(context), _upload(context, prepared)
     program, query = parts["peel"], parts["query"]
     targets = _targets(context, size)
     ids = np.full((layers, *size), -1, np.int32)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import queue
 import sys
 import threading
@@ -66,7 +67,10 @@ class Worker:
             except BaseException as error:
                 future.set_exception(error)
                 if isinstance(error, PluginError) and self.context is not None:
-                    self.context = None  # Lost, perhaps: the next call makes another.
+                    lost, self.context = self.context, None  # Perhaps: the next call makes another.
+                    with contextlib.suppress(Exception):
+                        lost.release()
+                    del lost
             del task, function, args, future
         if self.context is not None:
             self.context.release()

@@ -250,6 +250,14 @@ def test_a_rough_sheet_has_neither_holes_nor_double_hits(sampler, camera, unshar
     assert (found.triangle_ids[1] == -1).all()
 
 
+@pytest.mark.parametrize("camera", ["perspective", "orthographic", "inside"])
+def test_triangles_with_corners_of_their_own_have_no_gaps_between_them(sampler, camera):
+    vertices, faces = icosphere(4)
+    expected = rasterize("reference", vertices, faces, CAMERAS[camera], (200, 250), 2)
+    apart, separate = vertices[faces].reshape(-1, 3), np.arange(faces.size, dtype=np.int32).reshape(-1, 3)
+    check(sampler, rasterize(sampler, apart, separate, CAMERAS[camera], (200, 250), 2), expected, jump=0.5)
+
+
 def test_a_quad_with_edges_through_pixel_centres_is_at_most_those_wider(sampler):
     found = rasterize(sampler, *quad(4.5, 8.5, -10.5, -5.5), PIXELS, (32, 32))
     expected = np.zeros((32, 32), bool)
