@@ -1,0 +1,323 @@
+"""Without each optional package all else works and the error says what to install; the same without a display."""
+
+import subprocess
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+from helpers import icosphere, quad, soup
+from test_raster import CAMERAS, KINDS, PIXELS, grid, triangles
+from test_samplers import interior
+
+import rts
+from rts import Camera, Part, PluginError, Proxy
+
+SIZE = (96, 120)
+Mesh = rts.plugin("surfaces", "mesh")
+
+HIDE = """
+import sys
+
+class Hidden:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == {package!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Hidden())
+import numpy as np
+import rts
+
+vertices = np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0)], np.float32)
+part = rts.Part(rts.plugin("surfaces", "mesh")([(0, 1, 2)]), {{"vertices": vertices}})
+camera, size = rts.Camera.look_at((0, 0, 3), (0, 0, 0)), (12, 15)
+expected = rts.render(part, camera, size)
+assert 0.05 < expected[..., 3].mean() < 0.95
+
+def agrees(image):
+    np.testing.assert_allclose(np.asarray(image), expected, atol=1e-5)
+
+def error(call):
+    try:
+        call()
+    except rts.PluginError as problem:
+        print("PluginError:", problem)
+    else:
+        raise AssertionError("no error")
+
+for sampler in {samplers}:
+    agrees(rts.render(part, camera, size, sampler=sampler))
+if {torch}:
+    import torch
+    pose = torch.zeros(6, requires_grad=True)
+    image = rts.render(part.replace(transform=rts.rigid(pose)), camera, size)
+    agrees(image.detach())
+    image.sum().backward()
+    assert pose.grad.abs().max() > 0
+if {jax}:
+    import jax
+    def image(pose):
+        return rts.render(part.replace(transform=rts.rigid(pose)), camera, size)
+    pose = jax.numpy.zeros(6)
+    agrees(image(pose))
+    assert abs(jax.jit(jax.grad(lambda p: image(p).sum()))(pose)).max() > 0
+"""
+
+
+def without(package, code, *, samplers=("raster", "reference"), torch=False, jax=False):
+    """What a program prints that cannot import a package."""
+    script = HIDE.format(package=package, samplers=samplers, torch=torch, jax=jax) + textwrap.dedent(code)
+    done = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+# ------------------------------------------------------------------------------------------ packages missing
+
+
+def test_without_embreex_the_rest_works_and_auto_passes_embree_by():
+    pytest.importorskip("torch")
+    printed = without(
+        "embreex",
+        """
+        error(lambda: rts.render(part, camera, size, sampler="embree"))
+        from rts import choosing
+        choosing.STATIC_FACES = 1
+        (choice,) = rts.explain(part.replace(transform=rts.rigid(pose)), camera)
+        print(choice.sampler, "since", choice.reason)
+        agrees(rts.render(rts.prepare(part), camera, size))
+        agrees(rts.render(part.replace(transform=rts.rigid(pose.detach())), camera, size, sampler="auto"))
+        """,
+        torch=True,
+    )
+    first, second = printed.splitlines()
+    assert first.startswith("PluginError:") and "'embreex'" in first and "pip install 'rts[embree]'" in first
+    assert second.startswith("raster since") and "pip install 'rts[embree]'" in second
+
+
+def test_without_moderngl_the_rest_works():
+    printed = without("moderngl", "error(lambda: rts.render(part, camera, size, sampler='opengl'))")
+    assert "'moderngl'" in printed and "pip install 'rts[opengl]'" in printed
+
+
+def test_without_torch_numpy_and_jax_work():
+    pytest.importorskip("jax")
+    printed = without("torch", "error(lambda: rts.plugin('engines', 'torch'))", jax=True)
+    assert "'torch'" in printed and "pip install 'rts[torch]'" in printed
+
+
+def test_without_jax_numpy_and_torch_work():
+    pytest.importorskip("torch")
+    printed = without("jax", "error(lambda: rts.plugin('engines', 'jax'))", torch=True)
+    assert "'jax'" in printed and "pip install 'rts[jax]'" in printed
+
+
+def test_without_optax_jax_renders():
+    pytest.importorskip("jax")
+    without("optax", "", jax=True)
+
+
+def test_without_matplotlib_all_works_but_the_plot_which_says_what_it_needs():
+    printed = without(
+        "matplotlib",
+        """
+        from pathlib import Path
+        from rts import cli, pose
+        assert pose._plot(Path("convergence.png"), [1.0, 0.1]) == []
+        cli._say_skipped_plot([])
+        """,
+    )
+    assert "pip install 'rts[bench]'" in " ".join(printed.split())
+
+
+@pytest.mark.parametrize(
+    "package, plugin",
+    [("embreex", "rts[embree]"), ("jax", "rts[jax]")],
+)
+def test_the_table_of_plugins_says_what_is_missing_and_lists_the_others(package, plugin):
+    printed = without(
+        package,
+        """
+        from rts import registry
+        for info in registry.survey():
+            print(info.group, info.name, "|", info.error)
+        """,
+        samplers=(),
+    )
+    lines = printed.splitlines()
+    assert any(f"pip install '{plugin}'" in line for line in lines)
+    assert "rts.samplers raster | None" in lines and "rts.engines numpy | None" in lines
+
+
+# ------------------------------------------------------------------------------------------- no OpenGL device
+
+
+def render(sampler):
+    return rts.render(
+        Part(Mesh([(0, 1, 2)]), {"vertices": icosphere(0)[0]}), CAMERAS["perspective"], (9, 12), sampler=sampler
+    )
+
+
+def opengl_sampler():
+    try:
+        sampler = rts.plugin("samplers", "opengl")()
+        render(sampler)
+        return sampler
+    except PluginError as error:
+        pytest.skip(str(error))
+
+
+def test_without_a_device_the_error_names_the_packages_that_help(monkeypatch):
+    moderngl = pytest.importorskip("moderngl")
+
+    def fail(**_):
+        raise Exception("libEGL.so.1 not found in /lib, /usr/lib")
+
+    monkeypatch.setattr(moderngl, "create_context", fail)
+    sampler = rts.plugin("samplers", "opengl")()
+    with pytest.raises(PluginError) as error:
+        render(sampler)
+    message = str(error.value)
+    for expected in ("libegl1", "libgl1-mesa-dri", "libEGL.so.1 not found", "GLCONTEXT_DEVICE_INDEX", "'raster'"):
+        assert expected in message
+    # The next call tries again, and does not wait for ever.
+    with pytest.raises(PluginError, match="libegl1"):
+        render(sampler)
+    monkeypatch.undo()
+    opengl_sampler()
+    np.testing.assert_allclose(render(sampler), render("raster"), atol=1e-5)
+
+
+class Lost:
+    """A context that reports an error once."""
+
+    def __init__(self, context):
+        self._context, self.errors = context, ["GL_CONTEXT_LOST"]
+
+    def __getattr__(self, name):
+        return getattr(self._context, name)
+
+    def __setattr__(self, name, value):
+        if name in ("_context", "errors"):
+            object.__setattr__(self, name, value)
+        else:
+            setattr(self._context, name, value)
+
+    @property
+    def error(self):
+        return self.errors.pop() if self.errors else self._context.error
+
+
+def test_after_a_lost_context_the_next_call_works_again():
+    sampler = opengl_sampler()
+    expected = render(sampler)
+    part = Part(Mesh(icosphere(2)[1]), {"vertices": icosphere(2)[0]})
+    kept = rts.render(part, CAMERAS["perspective"], SIZE, sampler=sampler)
+    handle = rts.prepare(part, sampler)
+    sampler._worker.context = Lost(sampler._worker.context)
+    with pytest.raises(PluginError) as error:
+        render(sampler)
+    assert "GL_CONTEXT_LOST" in str(error.value) and "libgl1-mesa-dri" in str(error.value)
+    np.testing.assert_array_equal(render(sampler), expected)
+    # What was on the device before is moved there again, kept entries and handles alike.
+    np.testing.assert_array_equal(rts.render(part, CAMERAS["perspective"], SIZE, sampler=sampler), kept)
+    np.testing.assert_array_equal(rts.render(handle, CAMERAS["perspective"], SIZE), kept)
+
+
+def test_a_closed_worker_starts_again():
+    sampler = opengl_sampler()
+    expected = render(sampler)
+    sampler._worker.close()
+    np.testing.assert_array_equal(render(sampler), expected)
+
+
+# ---------------------------------------------------------------------------------------- no Embree library
+
+
+@pytest.fixture
+def public(monkeypatch):
+    """The sampler embree where the library cannot be found."""
+    pytest.importorskip("embreex")
+    from rts_backends import embree_library, embree_public
+
+    monkeypatch.setattr(embree_library, "find", lambda: None)
+    monkeypatch.setattr(embree_library, "_library", None)
+    sampler = rts.plugin("samplers", "embree")()
+    assert isinstance(sampler.prepare(Proxy(*quad())).scene, embree_public.Scene)
+    return sampler
+
+
+def both(sampler, vertices, faces, camera, size=SIZE, layers=1, cull="none"):
+    camera = Camera(*(np.asarray(m, np.float64) for m in camera))
+    samplers = (sampler, rts.plugin("samplers", "reference")())
+    return [s.rasterize(s.prepare(Proxy(vertices, faces)), camera, size, layers, cull) for s in samplers]
+
+
+def check(found, expected, jump=0.0):
+    inside, covered = interior(expected, jump), expected.triangle_ids >= 0
+    different = found.triangle_ids != expected.triangle_ids
+    assert (different & inside).sum() <= 0.001 * inside.sum()
+    assert (different & ~inside).sum() <= 0.01 * max(100, (covered & ~inside).sum())
+    same = covered & ~different
+    np.testing.assert_allclose(found.depth[same], expected.depth[same], rtol=1e-5)
+    np.testing.assert_allclose(found.barycentrics[same], expected.barycentrics[same], atol=1e-5)
+    assert (found.depth[:-1] <= found.depth[1:])[found.triangle_ids[1:] >= 0].all()
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+def test_the_public_interface_agrees_with_the_reference(public, camera):
+    parts = [triangles(kind) for kind in KINDS if kind != "huge"] + [soup(1000, 3, size=0.2)]
+    offsets = np.cumsum([0, *(len(v) for v, _ in parts)])
+    vertices = np.concatenate([v for v, _ in parts])
+    faces = np.concatenate([f + o for (_, f), o in zip(parts, offsets, strict=False)]).astype(np.int32)
+    for cull, layers in (("none", 1), ("back", 2), ("none", 4)):
+        check(*both(public, vertices, faces, CAMERAS[camera], SIZE, layers, cull))
+        check(*both(public, *triangles("huge"), CAMERAS[camera], SIZE, layers, cull))
+        check(*both(public, *icosphere(3), CAMERAS[camera], SIZE, layers, cull), jump=0.5)
+
+
+@pytest.mark.parametrize("mesh", ["bunny_5k.obj", "teapot_2464.obj", "spot/spot_triangulated.obj"])
+def test_the_public_interface_agrees_on_real_meshes(public, mesh, data):
+    part = rts.load(data / "meshes" / mesh)
+    part = part if isinstance(part, Part) else part[0]
+    vertices = np.asarray(part.theta["vertices"], np.float32)
+    center, radius = vertices.mean(axis=0), np.ptp(vertices, axis=0).max()
+    camera = Camera.look_at(center + radius * np.array([0.7, 0.5, 1.5]), center, near=0.1 * radius, far=9 * radius)
+    for cull, layers in (("none", 1), ("back", 2), ("none", 4)):
+        check(*both(public, vertices, part.surface.faces, camera, SIZE, layers, cull), jump=0.1 * radius)
+
+
+@pytest.mark.parametrize("corner, step", [(-0.5, 1.0), (-1.0, 1.0), (-0.25, 0.75)])
+def test_the_public_interface_hits_shared_edges_once(public, corner, step):
+    vertices, faces = grid(corner, step, int(np.ceil(34 / step)))
+    found, _ = both(public, vertices, faces, PIXELS, (32, 32), 2)
+    assert (found.triangle_ids[0] >= 0).all() and (found.triangle_ids[1] == -1).all()
+
+
+def test_the_public_interface_keeps_copies_of_triangles(public):
+    vertices, faces = quad(-9, 9, -9, 9)
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0))
+    found, _ = both(public, vertices, np.concatenate([faces, faces]), camera, SIZE, 3)
+    np.testing.assert_array_equal(found.triangle_ids[1], found.triangle_ids[0] + 2)
+    assert (found.triangle_ids[0] < 2).all() and (found.triangle_ids[2] == -1).all()
+
+
+def test_the_public_interface_finds_nothing_in_an_empty_view(public):
+    found, _ = both(public, *icosphere(1, center=(50, 0, 0)), CAMERAS["perspective"], SIZE, 2)
+    assert (found.triangle_ids == -1).all() and not found.depth.any()
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1e4])
+def test_the_public_interface_works_at_any_scale(public, scale):
+    vertices, faces = soup(300, 7, size=0.3)
+    eye = np.array([1, 2, 3]) * scale
+    camera = Camera.look_at(eye, (0, 0, 0), fov_y=50, aspect=1.25, near=0.5 * scale, far=9 * scale)
+    check(*both(public, (vertices * scale).astype(np.float32), faces, camera, SIZE, 4))
+
+
+def test_the_public_interface_follows_moved_vertices(public):
+    part = Part(Mesh(icosphere(2)[1]), {"vertices": icosphere(2)[0]}, "normals")
+    for _ in range(5):
+        part.theta["vertices"][:] *= np.float32([0.9, 1.0, 0.8])
+        found = rts.render(part, CAMERAS["perspective"], SIZE, sampler=public)
+        np.testing.assert_allclose(found, rts.render(part, CAMERAS["perspective"], SIZE, sampler="raster"), atol=1e-5)
