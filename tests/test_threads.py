@@ -124,7 +124,10 @@ def resident():
     return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-@pytest.mark.parametrize("moving", [False, True], ids=["poses", "vertices"])
+@pytest.mark.parametrize(
+    "name, moving",
+    [*((name, False) for name in SAMPLERS), ("raster", True), ("embree", True), ("opengl", True)],
+)
 def test_a_thousand_renders_leave_no_memory_behind(name, moving):
     sampler, part = made(name), scene(name, 0)
     original = {key: value.copy() for key, value in part.theta.items()}
