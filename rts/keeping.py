@@ -53,7 +53,10 @@ class Keeper:
             build: makes the entry.
             follow: makes it of an older one, in place, or gives None where it cannot.
         """
-        entries = self._entries.setdefault(surface, OrderedDict())
+        try:
+            entries = self._entries.setdefault(surface, OrderedDict())
+        except TypeError:  # A surface that cannot be hashed, or referred to weakly: nothing can be kept for it.
+            return build()
         if key in entries:
             entries.move_to_end(key)
             return entries[key]

@@ -159,6 +159,8 @@ class TriangleSampler(abc.ABC):
 def _checked_proxy(surface: Any, inputs: Tree, camera: Any, size: Any) -> Proxy:
     proxy = surface.proxy(inputs, camera, size)
     check_proxy(proxy, surface)
+    if not getattr(surface, "proxy_is_cheap", False):
+        _check_faces(proxy, surface)
     return proxy
 
 
@@ -267,4 +269,19 @@ def check_proxy(proxy: Proxy, surface: Any) -> None:
         raise InputError(
             f"{len(bad)} of the {len(vertices)} vertices of {surface!r} are NaN or infinite, the first is vertex "
             f"{bad[0]}; check the input, or lower the step size if an optimisation led here"
+        )
+
+
+def _check_faces(proxy: Proxy, surface: Any) -> None:
+    """Refuse triangles that compiled samplers would read out of bounds."""
+    for name, array, dtype in (("vertices", proxy.vertices, np.float32), ("faces", proxy.faces, np.int32)):
+        if array.dtype != dtype or array.ndim != 2 or array.shape[1] != 3:
+            raise InputError(
+                f"the proxy of {surface!r} has {name} of shape {array.shape} and dtype {array.dtype}; "
+                f"expected (rows, 3) of {np.dtype(dtype).name}"
+            )
+    if len(proxy.faces) and not 0 <= proxy.faces.min() <= proxy.faces.max() < len(proxy.vertices):
+        raise InputError(
+            f"the proxy of {surface!r} has faces from {proxy.faces.min()} to {proxy.faces.max()}, "
+            f"but {len(proxy.vertices)} vertices"
         )

@@ -127,3 +127,29 @@ def test_layers_of_several_parts_are_interleaved_by_depth_and_ties_go_to_the_ear
     depth = np.where(to_numpy(merged.row) >= 0, to_numpy(merged.depth), 0)
     np.testing.assert_array_equal(depth.reshape(2, 3), [[1, 5, 7], [2, 5, 0]])
     assert namespace(merged.row) is namespace(first.row)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"faces": np.array([[0, 1, 99]], np.int32)}, "faces from 0 to 99"),
+        ({"faces": np.array([[0, 1, 2]], np.int64)}, "int64"),
+        ({"vertices": np.zeros((3, 2), np.float32)}, r"\(3, 2\)"),
+    ],
+)
+def test_a_proxy_that_would_be_read_out_of_bounds_is_refused(change, words):
+    class Bad(Ball):
+        def proxy(self, inputs, camera, size):
+            return super().proxy(inputs, camera, size)._replace(**change)
+
+    with pytest.raises(rts.InputError, match=words):
+        rts.sample(Part(Bad(), {"radius": np.array([0.9])}), CAMERA, SIZE, sampler="raster")
+
+
+def test_a_surface_that_cannot_be_hashed_is_sampled_all_the_same():
+    class Unhashable(Ball):
+        __hash__ = None
+
+    part = Part(Unhashable(), {"radius": np.array([0.9])})
+    expected = rts.render(Part(Ball(), part.theta), CAMERA, SIZE, sampler="raster")
+    np.testing.assert_array_equal(rts.render(part, CAMERA, SIZE, sampler="raster"), expected)
