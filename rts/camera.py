@@ -314,6 +314,16 @@ class Camera(NamedTuple):
         axis = self.projection[3, 3] * r[2, :]
         return at[..., 0:1] * r[0, :] + at[..., 1:2] * r[1, :] + at[..., 2:3] * r[2, :] + axis
 
+    def depth_range(self) -> tuple[Array, Array]:
+        """Linear depths of the near and the far plane; infinity where there is no such plane, in either order of z."""
+        xp, (p,) = promote(self.projection)
+        depths = []
+        for a, b in ((p[2, 3] + p[3, 3], p[2, 2] + p[3, 2]), (p[2, 3] - p[3, 3], p[2, 2] - p[3, 2])):
+            # Clip z = ∓w at the planes, with z = −depth. Rounding must not give an infinite plane a sign.
+            none = xp.abs(b) <= 1e-12 * (xp.abs(p[2, 2]) + xp.abs(p[3, 2]))
+            depths.append(xp.where(none, xp.ones_like(b) * math.inf, a / xp.where(none, xp.ones_like(b), b)))
+        return xp.minimum(*depths), xp.maximum(*depths)
+
     def rays(self, size: tuple[int, int]) -> Rays:
         """Rays (H, W, 3) through the pixel centres, world space; differentiable."""
         xp, (view, p) = promote(self.view, self.projection)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from rts import registry
 from rts.arrays import engine_of, is_constant
 from rts.camera import Camera
+from rts.checks import check_scene
 from rts.errors import PluginError
 from rts.protocols import Part, Samples
 
@@ -29,9 +31,12 @@ def choose(part: Part, *, static: bool) -> Choice:
     surface = part.surface
     if not hasattr(surface, "proxy"):
         return Choice("rays", f"{surface!r} intersects rays itself and has no triangles")
-    faces = len(getattr(surface, "faces", ()))
     if not static:
-        return Choice("raster", "triangles that may change each call are drawn at once, with nothing to build")
+        reason = "triangles that may change each call are drawn at once, with nothing to build"
+        return Choice("raster", f"{reason} (they count as unchanging where something is differentiated, but not they)")
+    if not hasattr(surface, "faces"):
+        return Choice("raster", f"{surface!r} does not say how many triangles it has (an attribute `faces`)")
+    faces = len(surface.faces)
     if faces < STATIC_FACES:
         return Choice("raster", f"{faces} triangles are drawn faster than rays find them (below {STATIC_FACES})")
     try:
@@ -48,9 +53,9 @@ def is_static(part: Part, camera: Camera) -> bool:
     return constant and engine_of(part, camera).name != "numpy"
 
 
-def explain(parts: Part | list[Part] | tuple[Part, ...], camera: Camera) -> list[Choice]:
+def explain(parts: Part | Sequence[Part], camera: Camera) -> list[Choice]:
     """What `sampler="auto"` takes for each part of a scene, and why."""
-    parts = [parts] if isinstance(parts, Part) else list(parts)
+    parts, camera = check_scene(getattr(parts, "parts", parts), camera)
     return [choose(part, static=is_static(part, camera)) for part in parts]
 
 

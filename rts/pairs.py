@@ -13,6 +13,7 @@ from rts.camera import Camera
 from rts.errors import RtsError
 from rts.protocols import Engine, Part
 from rts.rendering import APRON, render
+from rts.sampling import TriangleSampler
 
 SIZE = (14, 18)
 CAMERA = Camera.look_at((0.9, 1.6, 3.2), (0, 0, 0), aspect=SIZE[1] / SIZE[0], principal_point=(0.1, -0.05))
@@ -21,6 +22,9 @@ CAMERA = Camera.look_at((0.9, 1.6, 3.2), (0, 0, 0), aspect=SIZE[1] / SIZE[0], pr
 LAYERS = 2
 CAPACITY = LAYERS * (SIZE[0] + 2 * APRON) * (SIZE[1] + 2 * APRON)
 """A row for every cell, so that engines that compile meet the same shapes again."""
+
+DIFFERING, SHARE = 1e-3, 0.02
+"""How far an image may be from the reference's, and in which share of the pixels farther."""
 
 
 class Pair(NamedTuple):
@@ -47,7 +51,8 @@ def attempt(part: Part, sampler: Any, engine: str) -> np.ndarray:
     """The image of an example, after its gradient in θ has been taken where the engine has derivatives.
 
     Raises:
-        RtsError: the image shows nothing, or a value or derivative is not finite; or whatever rendering raises.
+        RtsError: the image shows nothing, is not that of the sampler `reference` (of triangles), or a value or
+            derivative is not finite; or whatever rendering raises.
     """
     chosen = registry.plugin("rts.engines", engine)()
     theta = constants(map_leaves(_single, part.theta), chosen, None)
@@ -59,9 +64,32 @@ def attempt(part: Part, sampler: Any, engine: str) -> np.ndarray:
     found = np.asarray(chosen.to_numpy(image(theta)))
     if not (np.isfinite(found).all() and found.any()):
         raise RtsError("the image is empty or not finite; an example lies about the origin, within two units of it")
+    if _is_of_triangles(part, sampler):
+        _check_image(found, part)
     if not is_constant(theta):
         _check_gradient(chosen, image, theta)
     return found
+
+
+def _is_of_triangles(part: Part, sampler: Any) -> bool:
+    """Whether a sampler can only show the part's triangles, not what it intersects."""
+    if not hasattr(part.surface, "intersect"):
+        return hasattr(part.surface, "proxy")
+    return isinstance(
+        registry.instance("rts.samplers", sampler) if isinstance(sampler, str) else sampler, TriangleSampler
+    )
+
+
+def _check_image(found: np.ndarray, part: Part) -> None:
+    """Refuse an image that is not the one of the sampler `reference`, in NumPy."""
+    part = part.replace(theta=map_leaves(_single, part.theta))
+    expected = render(part, CAMERA, SIZE, sampler="reference", splatter="single", layers=LAYERS, capacity=CAPACITY)
+    differing = (np.abs(found - expected) > DIFFERING).any(axis=-1)
+    if differing.mean() > SHARE:
+        raise RtsError(
+            f"{differing.sum()} of the {differing.size} pixels are not those of the sampler 'reference', by more than "
+            f"{DIFFERING:g}"
+        )
 
 
 def _check_gradient(engine: Engine, image: Any, theta: Any) -> None:

@@ -19,6 +19,8 @@ from rts.sampling import TriangleSampler
 class PreparedParts:
     """Parts with what their samplers have built; `render` and `sample` take it in place of parts.
 
+    Their argument `sampler` has no effect then. Functions given to `jax.jit` close over it.
+
     Attributes:
         parts: the parts.
         samplers: the sampler of each.
@@ -32,6 +34,12 @@ class PreparedParts:
         """The same with some fields of one part changed, such as its `transform`; the triangles are not looked at."""
         if "surface" in changes:
             raise InputError("a prepared part keeps its surface; call rts.prepare for another one")
+        unknown = set(changes) - {"theta", "shader", "transform", "cull"}
+        if unknown or not -len(self.parts) <= index < len(self.parts):
+            raise InputError(
+                f"part {index} with {sorted(changes)} was asked for; expected theta, shader, transform or cull of "
+                f"one of {len(self.parts)} parts"
+            )
         parts = list(self.parts)
         parts[index] = parts[index].replace(**changes)
         return PreparedParts(parts, self.samplers, self.entries)

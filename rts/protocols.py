@@ -187,6 +187,7 @@ class Surface(Protocol):
         reads(theta) -> tuple of the θ entries that `evaluate` needs; default all of them.
         proxy_key(inputs, camera, size) -> hashable: what besides the bytes of the inputs makes a proxy stale; without
             it the proxy may not depend on camera and size.
+        faces: where the surface has this attribute, the sampler "auto" goes by its length.
         proxy_is_cheap (bool): making the proxy costs no more than looking whether its inputs have changed.
         refine(inputs, samples, rays) -> Samples: on the host, polish or replace ids and params.
         table_specs(rows) -> dict of ArraySpec: the `Samples.tables` that `refine` fills, for at most `rows` samples.

@@ -32,7 +32,7 @@ class PluginInfo(NamedTuple):
 
 
 _found: dict[str, dict[str, list[EntryPoint]]] = {}
-_defaults: dict[tuple[str, str], Any] = {}
+_defaults: dict[tuple[str, str | type], Any] = {}
 
 
 def _entries(group: str) -> dict[str, list[EntryPoint]]:
@@ -117,13 +117,14 @@ def plugin(group: str, name: str) -> Any:
 def instance(group: str, chosen: Any) -> Any:
     """A usable plugin from a name, a class or a ready object.
 
-    A name gives one shared instance with default settings; a class is instantiated; anything else is returned.
+    A name or a class gives one shared instance with default settings; anything else is returned.
     """
-    if isinstance(chosen, str):
-        if (group, chosen) not in _defaults:
-            _defaults[group, chosen] = instance(group, plugin(group, chosen))
-        return _defaults[group, chosen]
-    return chosen() if isinstance(chosen, type) else chosen
+    if not isinstance(chosen, (str, type)):
+        return chosen
+    if (group, chosen) not in _defaults:
+        found = plugin(group, chosen) if isinstance(chosen, str) else chosen()
+        _defaults[group, chosen] = instance(group, found)
+    return _defaults[group, chosen]
 
 
 def survey() -> list[PluginInfo]:

@@ -50,6 +50,7 @@ def render(
         InputError: what was given cannot be rendered.
         EngineError: torch and jax arrays in one scene.
     """
+    size = check_size(size, layers, capacity, gradient=False)
     background = check_background(background, size)
     sampled = sample(parts, camera, size, sampler=sampler, layers=layers, capacity=capacity)
     return render_samples(sampled, parts, camera, splatter=splatter, background=background)

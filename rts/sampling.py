@@ -53,7 +53,7 @@ class TriangleSampler(abc.ABC):
         proxy = _checked_proxy(surface, inputs, camera, size)
         # A copy, since the arrays given may be changed in place, or lent for the length of one call only.
         proxy = proxy._replace(vertices=proxy.vertices.copy())
-        return Entry(proxy, self.prepare(proxy))
+        return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None)
 
     def _entry(self, surface: Any, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
         """The same, kept from call to call where that pays."""
@@ -66,7 +66,7 @@ class TriangleSampler(abc.ABC):
             if self.update is None:
                 return None
             proxy = _checked_proxy(surface, inputs, camera, size)
-            if not same_faces(old.proxy, proxy):
+            if old.prepared is None or not same_faces(old.proxy, proxy):
                 return None
             proxy = proxy._replace(vertices=proxy.vertices.copy())
             return Entry(proxy, self.update(old.prepared, proxy))
@@ -129,7 +129,11 @@ class TriangleSampler(abc.ABC):
             check_camera(host_camera)
             with self._keeper.lock:
                 found = entry or self._entry(surface, host_inputs, host_camera, size)
-                fragments = self.rasterize(found.prepared, host_camera, size, layers, part.cull)
+                if len(found.proxy.faces):
+                    fragments = self.rasterize(found.prepared, host_camera, size, layers, part.cull)
+                    _check_fragments(fragments, (layers, *size), self)
+                else:
+                    fragments = _no_fragments((layers, *size))
             samples = lift(fragments, found.proxy, capacity)
             if hasattr(surface, "refine"):
                 samples = surface.refine(host_inputs, samples, _sample_rays(samples, host_camera, size))
@@ -158,10 +162,35 @@ class TriangleSampler(abc.ABC):
 
 def _checked_proxy(surface: Any, inputs: Tree, camera: Any, size: Any) -> Proxy:
     proxy = surface.proxy(inputs, camera, size)
-    check_proxy(proxy, surface)
     if not getattr(surface, "proxy_is_cheap", False):
-        _check_faces(proxy, surface)
+        proxy = _packed_proxy(proxy, surface)
+    check_proxy(proxy, surface)
     return proxy
+
+
+def _packed_proxy(proxy: Any, surface: Any) -> Proxy:
+    """The proxy with contiguous arrays of the right dtypes; triangles that would be read out of bounds are refused."""
+    if not isinstance(proxy, Proxy):
+        raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected an rts.Proxy")
+    vertices, faces = np.asarray(proxy.vertices), np.asarray(proxy.faces)
+    for name, array, kind in (("vertices", vertices, np.floating), ("faces", faces, np.integer)):
+        if array.ndim != 2 or array.shape[1] != 3 or not np.issubdtype(array.dtype, kind):
+            raise InputError(
+                f"the proxy of {surface!r} has {name} of shape {array.shape} and dtype {array.dtype}; "
+                f"expected (rows, 3) of {'float32' if kind is np.floating else 'int32'}"
+            )
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise InputError(
+            f"the proxy of {surface!r} has faces from {faces.min()} to {faces.max()}, but {len(vertices)} vertices"
+        )
+    widths = faces.shape[1] if proxy.ids is None else np.shape(proxy.ids)[1]
+    if not hasattr(surface, "refine") and widths != surface.sample_widths[0]:
+        raise InputError(
+            f"the proxy of {surface!r} has {widths} ids a triangle, but sample_widths says {surface.sample_widths[0]}"
+        )
+    return proxy._replace(
+        vertices=np.ascontiguousarray(vertices, np.float32), faces=np.ascontiguousarray(faces, np.int32)
+    )
 
 
 def _gbuffer_specs(part: Part, host_theta: Mapping | None, row_spec: ArraySpec) -> dict[str, ArraySpec]:
@@ -175,6 +204,20 @@ def _gbuffer_specs(part: Part, host_theta: Mapping | None, row_spec: ArraySpec) 
     names = getattr(part.shader, "reads", None)
     names = list(gbuffer) if names is None else ["position", *(n for n in names if n in gbuffer)]
     return {n: row_spec._replace(shape=row_spec.shape + gbuffer[n].shape[1:]) for n in dict.fromkeys(names)}
+
+
+def _no_fragments(shape: tuple[int, int, int]) -> Fragments:
+    return Fragments(np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32))
+
+
+def _check_fragments(fragments: Any, shape: tuple[int, int, int], sampler: Any) -> None:
+    """Refuse what `rasterize` of a sampler should not have returned."""
+    expected = shape, (*shape, 2), shape
+    given = tuple(np.shape(x) for x in fragments) if isinstance(fragments, Fragments) else type(fragments).__name__
+    if given != expected:
+        raise InputError(
+            f"rasterize of {type(sampler).__name__} returned {given}; expected rts.Fragments of {expected}"
+        )
 
 
 def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None) -> Samples:
@@ -264,24 +307,9 @@ def check_camera(camera: Camera) -> None:
 def check_proxy(proxy: Proxy, surface: Any) -> None:
     """Refuse vertices that are NaN or infinite."""
     vertices = proxy.vertices
-    if not (np.isfinite(vertices.min()) and np.isfinite(vertices.max())):
+    if len(vertices) and not (np.isfinite(vertices.min()) and np.isfinite(vertices.max())):
         bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
         raise InputError(
             f"{len(bad)} of the {len(vertices)} vertices of {surface!r} are NaN or infinite, the first is vertex "
             f"{bad[0]}; check the input, or lower the step size if an optimisation led here"
-        )
-
-
-def _check_faces(proxy: Proxy, surface: Any) -> None:
-    """Refuse triangles that compiled samplers would read out of bounds."""
-    for name, array, dtype in (("vertices", proxy.vertices, np.float32), ("faces", proxy.faces, np.int32)):
-        if array.dtype != dtype or array.ndim != 2 or array.shape[1] != 3:
-            raise InputError(
-                f"the proxy of {surface!r} has {name} of shape {array.shape} and dtype {array.dtype}; "
-                f"expected (rows, 3) of {np.dtype(dtype).name}"
-            )
-    if len(proxy.faces) and not 0 <= proxy.faces.min() <= proxy.faces.max() < len(proxy.vertices):
-        raise InputError(
-            f"the proxy of {surface!r} has faces from {proxy.faces.min()} to {proxy.faces.max()}, "
-            f"but {len(proxy.vertices)} vertices"
         )

@@ -71,10 +71,7 @@ class Depth:
         if "depth_range" in theta:
             near, far = theta["depth_range"][0], theta["depth_range"][1]
         else:
-            p = camera.projection
-            # Clip z = ±w at the planes: p22 z + p23 = ∓(p32 z + p33), z = −depth.
-            near = (p[2, 3] + p[3, 3]) / (p[2, 2] + p[3, 2])
-            far = (p[2, 3] - p[3, 3]) / (p[2, 2] - p[3, 2])
+            near, far = camera.depth_range()
         grey = xp.clip((depth - near) / (far - near), 0.0, 1.0)
         return _opaque(xp.stack([grey, grey, grey], axis=-1))
 

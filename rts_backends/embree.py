@@ -14,6 +14,7 @@ from rts.sampling import TriangleSampler
 from rts_backends import embree_library, embree_public
 from rts_backends.embree_kernels import TILE, cast, facing, keep_nearest_address, pixel_matrix
 from rts_backends.threads import parallel
+from rts_backends.triangles import bounding_sphere
 
 REFITS = 32
 """After so many refits in a row the structure is built anew, since moved triangles loosen its boxes."""
@@ -32,10 +33,9 @@ class Structure:
 
     def _place(self) -> None:
         vertices = self.proxy.vertices
-        low, high = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
-        center, radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-30)
-        self.sphere = np.array([*center, radius])
-        np.divide(vertices - center, radius, out=self._unit[:-1], casting="same_kind")
+        self.sphere = bounding_sphere(vertices, self.proxy.faces)
+        with np.errstate(over="ignore"):  # Of vertices that no triangle refers to, however far away.
+            np.divide(vertices - self.sphere[:3], self.sphere[3], out=self._unit[:-1], casting="same_kind")
 
     def move(self, proxy: Proxy) -> None:
         """Follow other vertices of the same faces."""
@@ -102,8 +102,5 @@ def _planes(p: np.ndarray) -> np.ndarray:
     """
     if p[2, 0] or p[2, 1] or p[3, 0] or p[3, 1]:
         return np.array([-np.inf, np.inf, np.inf, -np.inf])
-    # Clip z = ∓w, with z = −depth.
-    sums, differences = p[2] + p[3], p[2] - p[3]
-    with np.errstate(divide="ignore"):
-        near, far = sorted((sums[3] / sums[2], differences[3] / differences[2]))
+    near, far = Camera(np.eye(4), p).depth_range()
     return np.array([near, far, near, far])

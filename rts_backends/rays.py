@@ -30,9 +30,8 @@ class Rays:
         camera = map_leaves(engine.stop_gradient, constants(camera, engine, like))
         xp = namespace(camera.view)
 
-        p = camera.projection
-        # Clip z = ∓w at the planes, with z = −depth.
-        near, far = (p[2, 3] + p[3, 3]) / (p[2, 2] + p[3, 2]), (p[2, 3] - p[3, 3]) / (p[2, 2] - p[3, 2])
+        engine.call_host(_checked, (ArraySpec((), np.int32),), camera.view, camera.projection)
+        near, far = camera.depth_range()
         rays = camera.rays(size)
         directions = xp.reshape(rays.directions, (-1, 3))
         origins = xp.reshape(rays.origins, (-1, 3)) + near * directions
@@ -43,8 +42,7 @@ class Rays:
         cells = layers * size[0] * size[1]
         rows = cells if capacity is None else capacity
 
-        def pack(hit: np.ndarray, *matrices: np.ndarray) -> tuple[np.ndarray, ...]:
-            check_camera(Camera(*(np.asarray(m, np.float64) for m in matrices)))
+        def pack(hit: np.ndarray) -> tuple[np.ndarray, ...]:
             found = np.flatnonzero(hit)
             row = np.full(cells, -1, np.int32)
             row[found[:rows]] = np.arange(min(rows, len(found)), dtype=np.int32)
@@ -54,7 +52,7 @@ class Rays:
 
         packed = ArraySpec((rows,), np.int32, packed=capacity is None)
         specs = packed, ArraySpec((layers, *size), np.int32), ArraySpec((), np.int32)
-        index, row, overflow = engine.call_host(pack, specs, hit, camera.view, camera.projection)
+        index, row, overflow = engine.call_host(pack, specs, hit)
         width_i, width_p = surface.sample_widths
         params = xp.take(xp.reshape(hits.params, (cells, width_p)), index, axis=0)
         if hits.ids is None:
@@ -63,3 +61,9 @@ class Rays:
             ids = xp.take(xp.reshape(hits.ids, (cells, width_i)), index, axis=0)
         depth = xp.where(row >= 0, xp.reshape(depth, (layers, *size)), 0.0)
         return Samples(ids, params, row, depth, overflow)
+
+
+def _checked(*matrices: np.ndarray) -> tuple[np.ndarray]:
+    """Refuse a camera that has no rays; in a compiled function, where nothing needs the result, this is left out."""
+    check_camera(Camera(*(np.asarray(m, np.float64) for m in matrices)))
+    return (np.asarray(0, np.int32),)

@@ -34,6 +34,22 @@ def facing(camera: Camera, cull: str) -> float:
     return -float(winding) if cull == "back" else 0.0
 
 
+@numba.njit(cache=True, nogil=True)
+def bounding_sphere(vertices, faces):
+    """(4,) centre and radius of a sphere around the vertices that triangles refer to, by their bounding box."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for t in range(len(faces)):
+        for c in range(3):
+            v = faces[t, c]
+            for r in range(3):
+                x = np.float64(vertices[v, r])
+                low[r], high[r] = min(low[r], x), max(high[r], x)
+    sphere = np.empty(4)
+    sphere[:3] = (low + high) / 2
+    sphere[3] = max(np.sqrt(((high - low) ** 2).sum()) / 2, 1e-30)
+    return sphere
+
+
 @numba.njit
 def to_corner(matrix, vertices, v, corners, i):
     """Transform vertex `v` into row `i` of `corners`."""

@@ -133,12 +133,17 @@ def test_layers_of_several_parts_are_interleaved_by_depth_and_ties_go_to_the_ear
     ("change", "words"),
     [
         ({"faces": np.array([[0, 1, 99]], np.int32)}, "faces from 0 to 99"),
-        ({"faces": np.array([[0, 1, 2]], np.int64)}, "int64"),
+        ({"faces": np.array([[0.0, 1, 2]])}, "float64"),
+        ({"ids": np.zeros((1, 4), np.int32)}, "4 ids a triangle"),
         ({"vertices": np.zeros((3, 2), np.float32)}, r"\(3, 2\)"),
     ],
 )
 def test_a_proxy_that_would_be_read_out_of_bounds_is_refused(change, words):
     class Bad(Ball):
+        @property
+        def refine(self):  # As if there were none.
+            raise AttributeError
+
         def proxy(self, inputs, camera, size):
             return super().proxy(inputs, camera, size)._replace(**change)
 
@@ -153,3 +158,46 @@ def test_a_surface_that_cannot_be_hashed_is_sampled_all_the_same():
     part = Part(Unhashable(), {"radius": np.array([0.9])})
     expected = rts.render(Part(Ball(), part.theta), CAMERA, SIZE, sampler="raster")
     np.testing.assert_array_equal(rts.render(part, CAMERA, SIZE, sampler="raster"), expected)
+
+
+@pytest.mark.parametrize("sampler", TRIANGLE_SAMPLERS)
+def test_a_surface_without_a_triangle_is_an_empty_picture(sampler):
+    if sampler == "opengl":
+        pytest.importorskip("moderngl")
+
+    class Nothing(Ball):
+        def proxy(self, inputs, camera, size):
+            proxy = super().proxy(inputs, camera, size)
+            return proxy._replace(vertices=proxy.vertices[:0], faces=proxy.faces[:0], ids=proxy.ids[:0])
+
+    image = rts.render(Part(Nothing(), {"radius": np.array([0.9])}), CAMERA, SIZE, sampler=sampler)
+    np.testing.assert_array_equal(image, np.zeros((*SIZE, 4)))
+
+
+@pytest.mark.parametrize("kind", ["infinite", "reversed"])
+@pytest.mark.parametrize("sampler", [*TRIANGLE_SAMPLERS, "rays"])
+def test_projections_with_an_infinite_far_plane_or_reversed_z_show_the_same(sampler, kind):
+    from analytic import Ellipsoid
+
+    if sampler == "opengl":
+        pytest.importorskip("moderngl")
+    projection = CAMERA.projection.copy()
+    projection[2] = [0, 0, -1, -2] if kind == "infinite" else -projection[2]
+    theta = {"center": np.zeros(3), "radii": np.ones(3)} if sampler == "rays" else {"radius": np.array([0.9])}
+    part = Part(Ellipsoid() if sampler == "rays" else Ball(), theta)
+    expected = rts.render(part, CAMERA, SIZE, sampler=sampler)
+    assert expected.sum() > 100
+    image = rts.render(part, CAMERA._replace(projection=projection), SIZE, sampler=sampler)
+    np.testing.assert_allclose(image, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("sampler", TRIANGLE_SAMPLERS)
+def test_a_vertex_far_away_that_no_triangle_refers_to_has_no_effect(sampler):
+    if sampler == "opengl":
+        pytest.importorskip("moderngl")
+    vertices, faces = icosphere(2)
+    mesh = rts.plugin("surfaces", "mesh")(faces)
+    expected = rts.render(Part(mesh, {"vertices": vertices}), CAMERA, SIZE, sampler=sampler)
+    stray = np.concatenate([vertices, [[1e7, 1e7, 1e7]]])
+    image = rts.render(Part(mesh, {"vertices": stray}), CAMERA, SIZE, sampler=sampler)
+    np.testing.assert_allclose(image, expected, atol=1e-5)
