@@ -7,6 +7,13 @@ from rich.table import Table
 
 from rts import pairs, registry
 
+OK = (
+    f"ok: a small image of the surface's example is finite and not empty; of triangles, at most {pairs.SHARE:.0%} of "
+    f"its pixels are more than {pairs.DIFFERING:g} off those of the sampler 'reference'; and its gradient in theta, "
+    f"where the engine has derivatives, is finite and not zero"
+)
+"""What the matrix says of a pair that works, and all that it says."""
+
 
 def plugin_table() -> Table:
     """Every plugin, and whether it loads."""
@@ -20,7 +27,7 @@ def plugin_table() -> Table:
 def matrix_table() -> Table:
     """Every surface with every sampler, tried in every engine."""
     engines = registry.plugins("rts.engines")
-    table = Table("surface", "sampler", *engines, "why not")
+    table = Table("surface", "sampler", *engines, "why not", caption=OK)
     for pair in pairs.pairs():
         cells = ["[green]ok[/]" if pair.problems[e] is None else "[red]no[/]" for e in engines]
         reasons = dict.fromkeys(p for p in pair.problems.values() if p is not None)

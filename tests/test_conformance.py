@@ -11,7 +11,7 @@ import pytest
 from analytic import Ellipsoid
 
 import rts
-from rts import Fragments, GBuffer, InputError, Part, PluginError, RayHits
+from rts import Fragments, GBuffer, InputError, Part, PluginError, RayHits, pairs
 from rts.arrays import engine_of, namespace
 from rts.registry import instance
 from rts.shading import Unlit
@@ -296,6 +296,26 @@ class Forgetful(Raster):
         return self.kept[surface]
 
 
+class StaleUpdate(Raster):
+    """Gives what was prepared before for vertices that have moved."""
+
+    def prepare(self, proxy):
+        return proxy
+
+    def update(self, prepared, proxy):
+        return prepared
+
+
+class ByIdentity(Raster):
+    """Keeps what it was given first by the identity of the faces."""
+
+    def __init__(self):
+        self.kept = {}
+
+    def rasterize(self, prepared, *scene):
+        return super().rasterize(self.kept.setdefault(id(prepared.faces), prepared), *scene)
+
+
 class Roomy:
     """Takes no notice of the capacity."""
 
@@ -360,7 +380,8 @@ SAMPLERS = {
         "row -2": altered(row=lambda s: np.where(s.row < 0, -2, s.row)),
     },
     "samples_lie_between_the_near_and_the_far_plane": {"no planes": OddRaster(camera=wider_planes)},
-    "two_calls_give_the_same": {"a counter": Unsteady()},
+    "two_calls_give_the_same": {"a counter": Unsteady(), "kept by identity": ByIdentity()},
+    "it_follows_theta": {"stale update": StaleUpdate(), "kept by identity": ByIdentity()},
     "it_sees_arrays_that_change_in_place": {"kept for ever": Forgetful()},
     "capacity_drops_the_deepest_layers_first": {
         "ignored": Roomy(),
@@ -637,6 +658,23 @@ def test_a_broken_plugin_fails_the_check(kit, check, fixtures, plugin, engine):
     with pytest.raises(AssertionError) as failure:
         method(**{name: value for name, value in arguments.items() if name in wanted})
     assert str(failure.value)
+
+
+def test_what_is_wrong_anyway_is_not_taken_for_a_change_in_place_unseen():
+    with pytest.raises(AssertionError, match="after a change in place of the arrays of θ: the depth of"):
+        SamplerConformance().test_it_sees_arrays_that_change_in_place(
+            OddRaster(lambda f, _: f._replace(depth=f.depth * np.float32(1.001))), [scenes.ball()]
+        )
+    SamplerConformance().test_it_sees_arrays_that_change_in_place(altered(depth=lambda s: s.depth), [scenes.ball()])
+
+
+@pytest.mark.parametrize(
+    "sampler", [OddRaster(lambda f, _: Fragments(*(x[:, ::-1] for x in f))), OddRaster(next_triangle)]
+)
+def test_an_image_that_is_not_the_reference_s_is_not_ok(sampler):
+    pairs.attempt(Mesh.example(), OddRaster(), "numpy")
+    with pytest.raises(rts.RtsError, match="pixels are not those of the sampler 'reference'"):
+        pairs.attempt(Mesh.example(), sampler, "numpy")
 
 
 @pytest.mark.parametrize("kit", KIT, ids=lambda kit: kit.__name__)
