@@ -16,10 +16,11 @@ import moderngl
 import numpy as np
 
 from rts.camera import Camera
+from rts.errors import InputError
 from rts.protocols import Fragments, Proxy
 from rts.sampling import TriangleSampler
 from rts_backends.neighbours import corner_lists, places, settle
-from rts_backends.opengl_worker import Worker
+from rts_backends.opengl_worker import LESS, Worker
 from rts_backends.threads import parallel
 from rts_backends.triangles import facing, pixel_matrix
 
@@ -177,13 +178,25 @@ def _targets(context: moderngl.Context, size: tuple[int, int]) -> list[tuple[Any
     """Two framebuffers of a size, each with its texture, to read one while the other is drawn."""
     kept = _programs(context)["targets"]
     if size not in kept:
+        limit = context.info["GL_MAX_TEXTURE_SIZE"]
+        if max(size) > limit:
+            raise InputError(
+                f"the image is {size[0]} × {size[1]} pixels (height × width, its border included), but OpenGL on this "
+                f"device ({context.info['GL_RENDERER']}) draws at most {limit} × {limit}; {LESS}"
+            )
         while len(kept) >= TARGETS:
             for framebuffer, texture, depth in kept.pop(next(iter(kept))):
                 _release(context, [framebuffer, texture, depth])
-        pairs = []
-        for _ in range(2):
-            texture, depth = context.texture(size[::-1], 2, dtype="i4"), context.depth_renderbuffer(size[::-1])
-            pairs.append((context.framebuffer([texture], depth), texture, depth))
+        pairs, made = [], []
+        try:
+            for _ in range(2):
+                made.append(texture := context.texture(size[::-1], 2, dtype="i4"))
+                made.append(depth := context.depth_renderbuffer(size[::-1]))
+                made.append(framebuffer := context.framebuffer([texture], depth))
+                pairs.append((framebuffer, texture, depth))
+        except BaseException:
+            _release(context, made[::-1])
+            raise
         kept[size] = pairs
     kept[size] = kept.pop(size)  # The least recently used is first.
     return [(framebuffer, texture) for framebuffer, texture, _ in kept[size]]

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import os
 import queue
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import Any
 
 import moderngl
@@ -20,6 +21,16 @@ HINT = (
     "on Debian install the packages libegl1 and libgl1-mesa-dri (or your vendor's driver); the variable "
     "GLCONTEXT_DEVICE_INDEX chooses among several devices; or use the sampler 'raster'"
 )
+LESS = "render a smaller image, or use the sampler 'raster'"
+FORKED = (
+    "OpenGL was in use before the process was forked, and its threads do not live on in the child; "
+    "start processes with the method 'spawn', or use the sampler 'raster'"
+)
+MOST_ERRORS = 32
+"""Errors read at most at once: a lost context may report one for ever."""
+
+_process: int | None = None
+"""The process that first used OpenGL. The driver's own threads are lost in its children, for new contexts too."""
 
 
 class Worker:
@@ -33,26 +44,36 @@ class Worker:
 
     def call(self, function: Callable, *args: Any) -> Any:
         """`function(context, *args)` on the worker's thread; its result, or its exception."""
+        global _process
+        if _forked():
+            raise PluginError(FORKED)
+        _process = os.getpid()
+        future: Future = Future()
         with self._start:
-            if self._thread is None:
+            if self._thread is None or not self._thread.is_alive():
                 self._thread = threading.Thread(target=self._run, name="rts-opengl", daemon=True)
                 self._thread.start()
                 atexit.register(self.close)
-        future: Future = Future()
-        self._tasks.put((function, args, future))
+            thread = self._thread
+            self._tasks.put((function, args, future))
+        while not wait([future], timeout=1).done:
+            if not thread.is_alive() and not future.done():
+                raise PluginError("the thread of the sampler 'opengl' has ended; call again to start another")
         return future.result()
 
     def later(self, function: Callable, *args: Any) -> None:
         """The same without waiting, for clean-up; nothing where the worker has ended."""
-        if self._thread is not None and self._thread.is_alive():
+        if not _forked() and self._thread is not None and self._thread.is_alive():
             self._tasks.put((function, args, Future()))
 
     def close(self) -> None:
-        """Release the context and end the thread."""
-        if self._thread is not None and self._thread.is_alive():
-            self._tasks.put(None)
-            self._thread.join(timeout=5)
-        self._thread = None
+        """Release the context and end the thread; nothing in a forked child, whose context is its parent's."""
+        if _forked():
+            return
+        with self._start:
+            if self._thread is not None and self._thread.is_alive():
+                self._tasks.put(None)
+                self._thread.join(timeout=5)
 
     def _run(self) -> None:
         while (task := self._tasks.get()) is not None:
@@ -61,20 +82,45 @@ class Worker:
                 if self.context is None:
                     self.context = _create()
                 result = function(self.context, *args)
-                if (error := self.context.error) != "GL_NO_ERROR":
-                    raise PluginError(f"OpenGL reports {error} on {self.context.info['GL_RENDERER']}; {HINT}")
+                if errors := _errors(self.context):
+                    raise PluginError(f"OpenGL reports {errors[0]} on {self.context.info['GL_RENDERER']}; {HINT}")
                 future.set_result(result)
+            except moderngl.Error as error:
+                self._drop()
+                refusal = PluginError(f"OpenGL failed ({' '.join(str(error).split())}); {LESS}")
+                refusal.__cause__ = error
+                future.set_exception(refusal)
+                del refusal
+            except PluginError as error:
+                self._drop()
+                future.set_exception(error)
             except BaseException as error:
                 future.set_exception(error)
-                if isinstance(error, PluginError) and self.context is not None:
-                    lost, self.context = self.context, None  # Perhaps: the next call makes another.
-                    with contextlib.suppress(Exception):
-                        lost.release()
-                    del lost
+                with contextlib.suppress(Exception):
+                    _errors(self.context)  # Not left for the next task to find.
             del task, function, args, future
         if self.context is not None:
             self.context.release()
             self.context = None
+
+    def _drop(self) -> None:
+        """Release a context that is perhaps lost; the next call makes another."""
+        lost, self.context = self.context, None
+        if lost is not None:
+            with contextlib.suppress(Exception):
+                lost.release()
+
+
+def _forked() -> bool:
+    return _process not in (None, os.getpid())
+
+
+def _errors(context: moderngl.Context) -> list[str]:
+    """The errors that the context has recorded; it then has none."""
+    found: list[str] = []
+    while len(found) < MOST_ERRORS and (error := context.error) != "GL_NO_ERROR":
+        found.append(error)
+    return found
 
 
 def _create() -> moderngl.Context:

@@ -8,6 +8,7 @@ by two threads at once.
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -16,6 +17,9 @@ TASKS_PER_THREAD = 4
 """More tasks than threads, so that one that gets the heavy rows does not keep the others waiting."""
 
 _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
+_lock = threading.Lock()
+if hasattr(os, "register_at_fork"):  # No child is to find it held by a thread that it does not have.
+    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
 
 
 def thread_count() -> int:
@@ -34,9 +38,11 @@ def parallel(kernel: Callable, count: int, *args: Any) -> None:
         kernel(0, count, *args)
         return
     key = os.getpid(), threads  # A forked child has none of its parent's threads.
-    if key not in _pools:
-        _pools[key] = ThreadPoolExecutor(threads, thread_name_prefix="rts")
+    with _lock:
+        if key not in _pools:
+            _pools[key] = ThreadPoolExecutor(threads, thread_name_prefix="rts")
+        pool = _pools[key]
     bounds = [count * i // tasks for i in range(tasks + 1)]
-    futures = [_pools[key].submit(kernel, a, b, *args) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    futures = [pool.submit(kernel, a, b, *args) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
     for future in futures:
         future.result()

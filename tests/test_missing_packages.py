@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import textwrap
+import time
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from test_raster import CAMERAS, KINDS, PIXELS, grid, triangles
 from test_samplers import interior
 
 import rts
-from rts import Camera, Part, PluginError, Proxy
+from rts import Camera, InputError, Part, PluginError, Proxy
 
 SIZE = (96, 120)
 Mesh = rts.plugin("surfaces", "mesh")
@@ -228,6 +229,93 @@ def test_a_closed_worker_starts_again():
     sampler = opengl_sampler()
     expected = render(sampler)
     sampler._worker.close()
+    np.testing.assert_array_equal(render(sampler), expected)
+
+
+def test_a_thread_that_ended_is_not_waited_for():
+    sampler = opengl_sampler()
+    expected, worker = render(sampler), sampler._worker
+    worker.later(lambda context: time.sleep(0.5))
+    worker._tasks.put(None)
+    with pytest.raises(PluginError, match="has ended"):
+        render(sampler)
+    np.testing.assert_array_equal(render(sampler), expected)
+
+
+# ---------------------------------------------------------------------------------- what OpenGL cannot draw
+
+
+@pytest.mark.parametrize("tall", [False, True], ids=["wide", "tall"])
+def test_an_image_beyond_the_device_is_refused_and_the_next_render_works(tall):
+    sampler = opengl_sampler()
+    expected, context = render(sampler), sampler._worker.context
+    limit = context.info["GL_MAX_TEXTURE_SIZE"]
+    size = (limit + 1, 1) if tall else (1, limit + 1)
+    part = Part(Mesh([(0, 1, 2)]), {"vertices": icosphere(0)[0]})
+    for _ in range(2):
+        with pytest.raises(InputError) as error:
+            rts.render(part, CAMERAS["perspective"], size, sampler=sampler)
+        message = str(error.value)
+        assert f"{size[0] + 2} × {size[1] + 2} pixels" in message and f"at most {limit} × {limit}" in message
+        assert "'raster'" in message and "\n" not in message
+        np.testing.assert_array_equal(render(sampler), expected)
+    assert sampler._worker.context is context
+
+
+def test_an_error_before_an_exception_is_not_found_by_the_next_render():
+    sampler = opengl_sampler()
+    expected, context = render(sampler), sampler._worker.context
+
+    def fail(context):
+        context.line_width = -1.0
+        raise ValueError("after GL_INVALID_VALUE")
+
+    with pytest.raises(ValueError, match="GL_INVALID_VALUE"):
+        sampler._worker.call(fail)
+    np.testing.assert_array_equal(render(sampler), expected)
+    assert sampler._worker.context is context
+
+
+class Failing:
+    """A context whose second framebuffer fails, and what was made of it."""
+
+    def __init__(self, context):
+        self.context, self.made = context, []
+
+    def __getattr__(self, name):
+        return getattr(self.context, name)
+
+    def _make(self, kind, *args, **kwargs):
+        self.made.append(getattr(self.context, kind)(*args, **kwargs))
+        return self.made[-1]
+
+    def texture(self, *args, **kwargs):
+        return self._make("texture", *args, **kwargs)
+
+    def depth_renderbuffer(self, *args, **kwargs):
+        return self._make("depth_renderbuffer", *args, **kwargs)
+
+    def framebuffer(self, *args, **kwargs):
+        import moderngl
+
+        if len(self.made) > 3:
+            raise moderngl.Error("the framebuffer is not complete\n(FAKE)")
+        return self._make("framebuffer", *args, **kwargs)
+
+
+def test_targets_half_made_are_released_and_the_error_is_ours():
+    sampler = opengl_sampler()
+    from rts_backends.opengl import _targets
+
+    expected, kept = render(sampler), []
+
+    def fail(context):
+        kept.append(Failing(context))
+        _targets(kept[0], (7, 8))
+
+    with pytest.raises(PluginError, match=r"is not complete \(FAKE\).*'raster'"):
+        sampler._worker.call(fail)
+    assert [type(item.mglo).__name__ for item in kept[0].made] == ["InvalidObject"] * 5
     np.testing.assert_array_equal(render(sampler), expected)
 
 

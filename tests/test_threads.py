@@ -1,7 +1,10 @@
 """Two threads at once with every sampler, and a thousand renders that leave nothing behind."""
 
 import gc
+import multiprocessing
 import os
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -108,6 +111,83 @@ def test_threads_may_share_a_part_and_a_handle(name):
     for (_, i), image in found.items():
         np.testing.assert_array_equal(image, expected[i])
     assert len(found) == 36
+
+
+def test_a_pool_is_made_once_by_threads_that_start_together(monkeypatch):
+    pytest.importorskip("numba")
+    from rts_backends import threads
+
+    made, executor, start = [], threads.ThreadPoolExecutor, threading.Barrier(8)
+
+    def slow(*args, **kwargs):
+        made.append(executor(*args, **kwargs))
+        threading.Event().wait(0.05)
+        return made[-1]
+
+    def work():
+        start.wait(30)
+        threads.parallel(lambda start, stop: None, 9)
+
+    monkeypatch.setattr(threads, "_pools", {})
+    monkeypatch.setattr(threads, "ThreadPoolExecutor", slow)
+    monkeypatch.setenv("RTS_NUM_THREADS", "2")
+    together = [threading.Thread(target=work) for _ in range(8)]
+    for thread in together:
+        thread.start()
+    for thread in together:
+        thread.join(30)
+    assert len(made) == 1
+    made[0].shutdown()
+
+
+# --------------------------------------------------------------------------------------------------- forks
+
+FORK = """
+import gc, multiprocessing
+import numpy as np
+import rts
+
+vertices = np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0)], np.float32)
+part = rts.Part(rts.plugin("surfaces", "mesh")([(0, 1, 2)]), {"vertices": vertices})
+camera = rts.Camera.look_at((0, 0, 3), (0, 0, 0))
+sampler = rts.plugin("samplers", "opengl")()
+
+def render(sampler):
+    return np.asarray(rts.render(part, camera, (12, 15), sampler=sampler))
+
+def child():
+    for used in (sampler, rts.plugin("samplers", "opengl")()):
+        try:
+            render(used)
+        except rts.PluginError as error:
+            print(error, flush=True)
+    np.testing.assert_allclose(render("raster"), expected, atol=1e-5)
+    handles.clear()
+    gc.collect()
+    sampler._worker.close()
+
+expected, handles = render("raster"), [rts.prepare(part, sampler)]
+np.testing.assert_allclose(render(sampler), expected, atol=1e-5)
+process = multiprocessing.get_context("fork").Process(target=child)
+process.start()
+process.join(60)
+if process.exitcode is None:
+    process.kill()
+    raise SystemExit("the child hangs")
+assert process.exitcode == 0, process.exitcode
+np.testing.assert_allclose(render(sampler), expected, atol=1e-5)
+np.testing.assert_allclose(np.asarray(rts.render(handles[0], camera, (12, 15))), expected, atol=1e-5)
+"""
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork on this system")
+def test_a_forked_child_is_told_that_opengl_was_in_use():
+    made("opengl")
+    environment = os.environ | {"RTS_NUM_THREADS": "2"}
+    done = subprocess.run([sys.executable, "-c", FORK], capture_output=True, text=True, timeout=120, env=environment)
+    assert done.returncode == 0, done.stderr[-3000:]
+    lines = done.stdout.splitlines()
+    assert len(lines) == 2 and all("forked" in x and "'spawn'" in x and "'raster'" in x for x in lines)
 
 
 # --------------------------------------------------------------------------------------------------- leaks
