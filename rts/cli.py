@@ -169,7 +169,14 @@ def _global(
 
 @app.command()
 def plugins(
-    matrix: Annotated[bool, typer.Option("--matrix", help="Try each surface with each sampler and engine.")] = False,
+    matrix: Annotated[
+        bool,
+        typer.Option(
+            "--matrix",
+            help="Try each surface with each sampler and engine. ok: the image is that of the sampler 'reference' "
+            "(for triangles; else finite and not empty), and its gradient is finite and not zero.",
+        ),
+    ] = False,
 ) -> None:
     """List every plugin: engines, surfaces, samplers, shaders and splatters, and whether each one loads."""
     from rts.listing import matrix_table, plugin_table

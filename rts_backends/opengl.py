@@ -22,7 +22,7 @@ from rts.sampling import TriangleSampler
 from rts_backends.neighbours import corner_lists, places, settle
 from rts_backends.opengl_worker import LESS, Worker
 from rts_backends.threads import parallel
-from rts_backends.triangles import facing, pixel_matrix
+from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
 TARGETS = 4
 """Framebuffers kept, one a size."""
@@ -75,8 +75,8 @@ class Buffers:
     def __init__(self, worker: Worker, proxy: Proxy):
         faces = np.ascontiguousarray(proxy.faces, np.int32)
         self.proxy = proxy = proxy._replace(vertices=np.ascontiguousarray(proxy.vertices, np.float32), faces=faces)
-        low, high = proxy.vertices.min(axis=0).astype(np.float64), proxy.vertices.max(axis=0).astype(np.float64)
-        self.center, self.radius = (low + high) / 2, max(np.linalg.norm(high - low) / 2, 1e-30)
+        *center, self.radius = bounding_sphere(proxy.vertices, proxy.faces)
+        self.center = np.array(center)
         around = places(proxy.vertices, proxy.faces)
         self.corners = around, *corner_lists(around, len(proxy.vertices))
         self.device = Device()
@@ -120,8 +120,7 @@ def _tight(projection: np.ndarray, view: np.ndarray, prepared: Buffers) -> np.nd
     p = projection.copy()
     if p[2, 0] or p[2, 1] or p[3, 0] or p[3, 1]:
         return p
-    # Clip z = ∓w at the planes, with z = −depth.
-    near, far = (p[2, 3] + p[3, 3]) / (p[2, 2] + p[3, 2]), (p[2, 3] - p[3, 3]) / (p[2, 2] - p[3, 2])
+    near, far = Camera(view, projection).depth_range()
     middle = -(view[2, :3] @ prepared.center + view[2, 3])
     reach = 1.01 * prepared.radius * np.linalg.norm(view[2, :3])
     near, far = max(near, middle - reach), min(far, middle + reach)
