@@ -30,18 +30,19 @@ WIDTH = 12
 class Raster(TriangleSampler):
     """K-buffer rasterization with a top-left fill rule; ties in depth go to the lower triangle index."""
 
+    def __init__(self) -> None:
+        self._scratch: dict[tuple, _Scratch] = {}  # At most one; whoever draws takes it out, so threads never share.
+
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         height, width = size
         vertices, faces = prepared.vertices, prepared.faces
         matrix = pixel_matrix(camera, size)
-        screen = np.empty((len(vertices), 2), np.float32)
+        # Drawn again and again, one mesh touches the same pages of memory: the system clears them only once.
+        key = len(vertices), len(faces), np.int16 if max(size) < 2**15 else np.int32
+        scratch = self._scratch.pop(key, None) or _Scratch(*key)
+        screen, boxes, kept, numbers, clips, planes, counts = scratch.arrays
         parallel(_project, len(vertices), vertices, matrix, screen)
-        # Room for every triangle, of which only what is used is ever touched.
-        boxes = np.empty((len(faces), 4), np.int16 if max(size) < 2**15 else np.int32)
-        kept, numbers = np.empty(len(faces), np.int32), np.empty((len(faces), WIDTH))
-        clips, planes = np.empty(len(faces), np.bool_), np.empty((len(faces), 6))
-        counts = np.zeros(-(-len(faces) // CHUNK), np.int64)
         keep = facing(camera, cull)
         parallel(_select, len(counts), vertices, faces, screen, matrix, height, width, keep, boxes, kept, clips, counts)
         given = vertices, faces, matrix, -camera.view[2], keep
@@ -54,7 +55,23 @@ class Raster(TriangleSampler):
         bands = -(-height // BAND_ROWS)
         offsets, items = _bands(bands, boxes, counts)
         parallel(_draw, bands, offsets, items, boxes, kept, clips, numbers, planes, *fragments)
+        self._scratch = {key: scratch}
         return fragments
+
+
+class _Scratch:
+    """Arrays with room for every vertex and triangle, of which only what is used is ever touched."""
+
+    def __init__(self, vertices: int, faces: int, box_dtype: type):
+        self.arrays = (
+            np.empty((vertices, 2), np.float32),
+            np.empty((faces, 4), box_dtype),
+            np.empty(faces, np.int32),
+            np.empty((faces, WIDTH)),
+            np.empty(faces, np.bool_),
+            np.empty((faces, 6)),
+            np.zeros(-(-faces // CHUNK), np.int64),
+        )
 
 
 @numba.njit(cache=True, nogil=True)

@@ -7,6 +7,7 @@ by two threads at once.
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
 from collections.abc import Callable
@@ -37,12 +38,25 @@ def parallel(kernel: Callable, count: int, *args: Any) -> None:
     if threads == 1 or tasks <= 1:
         kernel(0, count, *args)
         return
+    bounds = [count * i // tasks for i in range(tasks + 1)]
+    numbers = itertools.count()
+
+    def work() -> None:
+        while (task := next(numbers)) < tasks:
+            kernel(bounds[task], bounds[task + 1], *args)
+
+    # The caller works too, so that only its helpers have to be woken.
+    futures = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
+    try:
+        work()
+    finally:
+        for future in futures:
+            future.result()
+
+
+def _pool(threads: int) -> ThreadPoolExecutor:
     key = os.getpid(), threads  # A forked child has none of its parent's threads.
     with _lock:
         if key not in _pools:
             _pools[key] = ThreadPoolExecutor(threads, thread_name_prefix="rts")
-        pool = _pools[key]
-    bounds = [count * i // tasks for i in range(tasks + 1)]
-    futures = [pool.submit(kernel, a, b, *args) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
-    for future in futures:
-        future.result()
+        return _pools[key]
