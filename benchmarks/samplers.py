@@ -193,10 +193,11 @@ def chart(rows: list[dict], path: Path) -> None:
                     markersize=3,
                     label=f"{sampler}, K = {layers}",
                 )
-        at = crossover(rows, 2, size)
-        if at is not None:
-            axes.axvline(at, color="grey", linewidth=0.8)
-            axes.text(at, axes.get_ylim()[0] * 1.3, f" K = 2: embree ahead\n from {at / 1e3:.0f}K faces", fontsize=8)
+        for layers in LAYERS:
+            at = crossover(rows, layers, size)
+            if at is not None:
+                axes.axvline(at, color="grey", linewidth=0.8)
+                axes.text(at, 0.75, f"K = {layers}: embree ahead \nfrom {at / 1e3:.0f}K faces ", fontsize=8, ha="right")
         axes.set(title=f"{size}²", xlabel="faces", ylabel="milliseconds to sample")
         axes.grid(alpha=0.3, which="both")
     axes.legend(fontsize=7)

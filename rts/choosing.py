@@ -13,7 +13,7 @@ from rts.checks import check_scene
 from rts.errors import PluginError
 from rts.protocols import Part, Samples
 
-STATIC_FACES = 400_000
+STATIC_FACES = 1_500_000
 """From so many triangles on, rays at a structure that is kept are faster than drawing all (benchmarks/samplers.py)."""
 
 _log = logging.getLogger("rts")
