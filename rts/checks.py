@@ -86,7 +86,8 @@ def check_size(size: Any, layers: Any, capacity: Any, *, gradient: bool) -> tupl
     except (TypeError, ValueError, OverflowError):
         whole = False
     if not whole or height <= 0 or width <= 0:
-        raise InputError(f"size is {size!r}; expected (height, width), two positive integers")
+        given = " ".join(repr(size).split())[:60]
+        raise InputError(f"size is {given}; expected (height, width), two positive integers")
     if not _is_count(layers):
         raise InputError(f"layers is {layers!r}; expected an integer of at least 1")
     if capacity is not None and not _is_count(capacity):

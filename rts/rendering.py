@@ -50,8 +50,9 @@ def render(
         InputError: what was given cannot be rendered.
         EngineError: torch and jax arrays in one scene.
     """
-    size = check_size(size, layers, capacity, gradient=False)
-    background = check_background(background, size)
+    if background is not None:
+        size = check_size(size, layers, capacity, gradient=False)
+        background = check_background(background, size)
     sampled = sample(parts, camera, size, sampler=sampler, layers=layers, capacity=capacity)
     return render_samples(sampled, parts, camera, splatter=splatter, background=background)
 

@@ -8,6 +8,8 @@ in the order of the triangles, so the result does not depend on the number of th
 
 from __future__ import annotations
 
+from typing import Any, Self
+
 import numba
 import numpy as np
 
@@ -30,8 +32,13 @@ WIDTH = 12
 class Raster(TriangleSampler):
     """K-buffer rasterization with a top-left fill rule; ties in depth go to the lower triangle index."""
 
-    def __init__(self) -> None:
-        self._scratch: dict[tuple, _Scratch] = {}  # At most one; whoever draws takes it out, so threads never share.
+    _scratch: dict[tuple, _Scratch]
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Give every instance room to keep scratch memory, whatever `__init__` a subclass has."""
+        self = super().__new__(cls, *args, **kwargs)
+        self._scratch = {}  # At most one; whoever draws takes it out, so threads never share.
+        return self
 
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
