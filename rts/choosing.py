@@ -12,6 +12,7 @@ from rts.camera import Camera
 from rts.checks import check_scene
 from rts.errors import PluginError
 from rts.protocols import Part, Samples
+from rts.sampling import reads_of
 
 STATIC_FACES = 1_500_000
 """From so many triangles on, rays at a structure that is kept are faster than drawing all (benchmarks/samplers.py)."""
@@ -48,8 +49,7 @@ def choose(part: Part, *, static: bool) -> Choice:
 
 def is_static(part: Part, camera: Camera) -> bool:
     """Whether something is differentiated, but not what the surface reads: so calls repeat, and triangles stay."""
-    reads = part.surface.reads(part.theta) if hasattr(part.surface, "reads") else tuple(part.theta)
-    constant = is_constant({name: part.theta[name] for name in reads})
+    constant = is_constant({name: part.theta[name] for name in reads_of(part)})
     return constant and engine_of(part, camera).name != "numpy"
 
 

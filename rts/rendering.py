@@ -11,7 +11,7 @@ from rts.checks import check_background, check_plugin, check_scene, check_shaded
 from rts.errors import InputError
 from rts.preparing import PreparedParts
 from rts.protocols import Array, Engine, GBuffer, Part, Sampled, Samples
-from rts.sampling import merge
+from rts.sampling import merge, reads_of
 
 APRON = 1
 """Cells sampled beyond the image's border on each side, so that they can splat into it."""
@@ -128,7 +128,7 @@ def render_samples(
     for part, samples in zip(parts, sampled.samples, strict=True):
         transform = constants(part.transform, engine, like)
         gbuffer = _to_world(_evaluate(part, samples, engine, like), transform)
-        rest = {name: value for name, value in part.theta.items() if name not in _surface_reads(part)}
+        rest = {name: value for name, value in part.theta.items() if name not in reads_of(part)}
         rgba = part.shader({**part.theta, **constants(rest, engine, like)}, gbuffer, camera)
         check_shaded(rgba, gbuffer["position"].shape[0], part.shader)
         positions.append(wide.project(gbuffer["position"], grid))
@@ -141,17 +141,13 @@ def render_samples(
 
 def _evaluate(part: Part, samples: Samples, engine: Engine, like: Array | None) -> GBuffer:
     """The part's G-buffer in local space."""
-    reads = {name: part.theta[name] for name in _surface_reads(part)}
+    reads = {name: part.theta[name] for name in reads_of(part)}
     if samples.gbuffer is not None and is_constant(reads):
         wanted = getattr(part.shader, "reads", None)
         if samples.asked is None or (wanted is not None and set(wanted) <= set(samples.asked)):
             return GBuffer(samples.gbuffer)
     gbuffer = part.surface.evaluate(constants(reads, engine, like), samples)
     return gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer)
-
-
-def _surface_reads(part: Part) -> tuple[str, ...]:
-    return part.surface.reads(part.theta) if hasattr(part.surface, "reads") else tuple(part.theta)
 
 
 def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:

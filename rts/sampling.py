@@ -101,8 +101,7 @@ class TriangleSampler(abc.ABC):
             )
         engine = engine_of(theta, camera)
         inputs = surface.proxy_inputs(theta) if entry is None or hasattr(surface, "refine") else None
-        reads = surface.reads(theta) if hasattr(surface, "reads") else tuple(theta)
-        host_theta = {name: theta[name] for name in reads}
+        host_theta = {name: theta[name] for name in reads_of(part)}
         if engine.name == "numpy" or not is_constant(host_theta):
             host_theta = None
 
@@ -158,6 +157,11 @@ class TriangleSampler(abc.ABC):
             asked=getattr(part.shader, "reads", None),
             centered=getattr(surface, "centered", True),
         )
+
+
+def reads_of(part: Part) -> tuple[str, ...]:
+    """The entries of a part's θ that its surface evaluates; the others are its shader's."""
+    return part.surface.reads(part.theta) if hasattr(part.surface, "reads") else tuple(part.theta)
 
 
 def _checked_proxy(surface: Any, inputs: Tree, camera: Any, size: Any) -> Proxy:

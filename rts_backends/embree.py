@@ -12,9 +12,9 @@ from rts.camera import Camera
 from rts.protocols import Fragments, Proxy
 from rts.sampling import TriangleSampler
 from rts_backends import embree_library, embree_public
-from rts_backends.embree_kernels import TILE, cast, facing, keep_nearest_address, pixel_matrix
+from rts_backends.embree_kernels import TILE, cast, keep_nearest_address
 from rts_backends.threads import parallel
-from rts_backends.triangles import bounding_sphere
+from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
 REFITS = 32
 """After so many refits in a row the structure is built anew, since moved triangles loosen its boxes."""

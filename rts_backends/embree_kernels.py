@@ -14,9 +14,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from rts_backends.triangles import clipped, depth_of, determinant, edge_values, facing, pixel_matrix, to_corner
-
-__all__ = ["cast", "facing", "keep_nearest_address", "pixel_matrix"]
+from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
 
 TILE = 8
 ACCEPT, REJECT = -1, 0
