@@ -25,6 +25,7 @@ from rts.protocols import Array
 
 SIGMA, EPSILON = 0.5, 0.05
 OFFSETS = (-1, 0, 1)
+NEIGHBOURS = [(u, v) for v in OFFSETS for u in OFFSETS]
 
 
 class Plain:
@@ -52,16 +53,21 @@ class Kernel(abc.ABC):
         sigma: standard deviation, pixels. Below 0.45 little of the kernel reaches the neighbouring cells, and most of
             the derivative at edges is lost.
         epsilon: excess of the weights' sum over one, so that the interior is always normalised.
+        calibration: factor γ on a splat's offset from its cell's centre, P' = c + γ (P − c): nothing to the image of
+            samples on pixel centres, but a factor on its derivative. None for the γ of `exact_calibration`.
     """
 
     sigma: float = SIGMA
     epsilon: float = EPSILON
+    calibration: float | None = 1.0
 
     def __post_init__(self):
         if not (math.isfinite(self.sigma) and self.sigma > 0):
             raise InputError(f"sigma is {self.sigma}; expected a positive number of pixels")
         if not (math.isfinite(self.epsilon) and self.epsilon >= 0):
             raise InputError(f"epsilon is {self.epsilon}; expected a number of at least 0")
+        if self.calibration is not None and not (math.isfinite(self.calibration) and self.calibration > 0):
+            raise InputError(f"calibration is {self.calibration}; expected a positive number, or None for the exact")
 
     def splat(self, positions: Array, rgba: Array, row: Array) -> Array:
         """See `rts.protocols.Splatter`."""
@@ -72,13 +78,18 @@ class Kernel(abc.ABC):
     def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
         """`splat` of at least one sample."""
 
+    @property
+    def gamma(self) -> float:
+        """The calibration as a number."""
+        return exact_calibration(self.sigma) if self.calibration is None else self.calibration
+
     def weights(self, position: Array) -> tuple[dict[int, Array], dict[int, Array]]:
         """Weights of cells (h, w, ·), the first being cell (−1, −1): by target offset u, and by v; w = x[u] · y[v]."""
         xp = namespace(position)
         height, width = position.shape[:2]
         constant = engine_of(position).constant
-        rx = position[..., 0] - constant(np.arange(width) - 0.5, position)
-        ry = position[..., 1] - constant(np.arange(height) - 0.5, position)[:, None]
+        rx = self.gamma * (position[..., 0] - constant(np.arange(width) - 0.5, position))
+        ry = self.gamma * (position[..., 1] - constant(np.arange(height) - 0.5, position)[:, None])
         scale = 1 / (2 * self.sigma**2)
         peak = math.sqrt(1 + self.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
         return (
@@ -87,24 +98,24 @@ class Kernel(abc.ABC):
         )
 
 
+def exact_calibration(sigma: float) -> float:
+    """The γ with which a linear ramp of colour that moves has its true derivative: σ² (1 + 2e) / 2e, e = exp(−1/2σ²).
+
+    Without it, the first moment 1/γ of the kernel's derivative (0.852 for σ = 0.5) is the share that is delivered.
+    """
+    e = math.exp(-1 / (2 * sigma**2))
+    return sigma**2 * (1 + 2 * e) / (2 * e)
+
+
 @dataclass(frozen=True)
 class Single(Kernel):
     """One layer, occlusion ignored (paper eq. 1–3): only the front layer of `row` is splatted."""
 
     def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
         """See `Kernel`."""
-        xp = namespace(positions, rgba, row)
-        height, width = row.shape[1:]
-        cells = _bordered(row[:1])[0]
-        covered = (cells >= 0)[..., None]
-        wx, wy = self.weights(_unpack(positions, cells))
-        color = _weighted(_unpack(rgba, cells), covered)
-        total = None
-        for v in OFFSETS:
-            for u in OFFSETS:
-                splats = _sources(color * (wx[u] * wy[v])[..., None], u, v, height, width)
-                total = splats if total is None else total + splats
-        return _normalised(total, xp)
+        layers = _Layers(self, positions, rgba, row[:1])
+        total = sum(layers.splats(u, v)[0] for u, v in NEIGHBOURS)
+        return _normalised(total, namespace(rgba))
 
 
 @dataclass(frozen=True)
@@ -120,27 +131,97 @@ class Multi(Kernel):
     def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
         """See `Kernel`."""
         xp = namespace(positions, rgba, row)
-        layers, height, width = row.shape
-        cells = _bordered(row)
-        position = [_unpack(positions, cells[k]) for k in range(layers)]
-        color = [_weighted(_unpack(rgba, cells[k]), (cells[k] >= 0)[..., None]) for k in range(layers)]
-        weights = [self.weights(p) for p in position]
-        depth = _depths(position, cells)
-        target = [_sources(z, 0, 0, height, width) for z in depth]
-
-        buffers: list[Array | None] = [None, None, None]
-        for v in OFFSETS:
-            for u in OFFSETS:
-                source = [_sources(z, u, v, height, width) for z in depth]
-                s = _pairing(source, target, xp)
-                for k in range(layers):
-                    wx, wy = weights[k]
-                    splats = _sources(color[k] * (wx[u] * wy[v])[..., None], u, v, height, width)
-                    for i, chosen in enumerate((s > k, s == k, s < k)):
-                        share = xp.where(chosen[..., None], splats, 0.0)
-                        buffers[i] = share if buffers[i] is None else buffers[i] + share
+        layers = _Layers(self, positions, rgba, row)
+        buffers = [0.0, 0.0, 0.0]
+        for u, v in NEIGHBOURS:
+            s = layers.pairing(u, v)
+            for k, splats in enumerate(layers.splats(u, v)):
+                for i, chosen in enumerate((s > k, s == k, s < k)):
+                    buffers[i] = buffers[i] + xp.where(chosen[..., None], splats, 0.0)
         front, surface, behind = (_normalised(b, xp) for b in buffers)
         return _over(front, _over(surface, behind))
+
+
+@dataclass(frozen=True)
+class Visible(Kernel):
+    """`Multi` with a calibrated derivative, where opaque layers of one source hide each other.
+
+    Each buffer gets at most one layer of a source. With s of `Multi`: an empty target takes the source's front layer,
+    at the surface. A covered target takes the source's front layer in front where s > 0, and layer s at the surface
+    where s ≥ 0. Behind is only what shows next door: with m the least −s over the covered sources of s < 0, those give
+    their front layer and the others the layer l > s whose depth is nearest to z_q[m]; where there is no m, nothing.
+
+    Closed surfaces need no culling, if K reaches through their back faces to what lies behind.
+    """
+
+    epsilon: float = 1e-3
+    calibration: float | None = None
+
+    def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
+        """See `Kernel`."""
+        xp = namespace(positions, rgba, row)
+        layers = _Layers(self, positions, rgba, row)
+        shift = {n: xp.where(row[0] >= 0, layers.pairing(*n), 0) for n in NEIGHBOURS}
+        shown = {n: (s < 0) & layers.covers(*n) for n, s in shift.items()}
+        none = row.shape[0]
+        m = xp.full_like(row[0], none)
+        for n, s in shift.items():
+            m = xp.where(shown[n] & (-s < m), -s, m)
+        revealed = sum(xp.where(m == k, z, 0.0) for k, z in enumerate(layers.target))
+
+        front, surface, behind = 0.0, 0.0, 0.0
+        for n, s in shift.items():
+            hidden = xp.where(s < 0, 0, _nearest(layers.source(*n), revealed, s, xp))
+            hidden = xp.where(m < none, hidden, none)
+            for k, splats in enumerate(layers.splats(*n)):
+                if k == 0:
+                    front = front + xp.where((s > 0)[..., None], splats, 0.0)
+                surface = surface + xp.where((s == k)[..., None], splats, 0.0)
+                behind = behind + xp.where((hidden == k)[..., None], splats, 0.0)
+        front, surface, behind = (_normalised(b, xp) for b in (front, surface, behind))
+        return _over(front, _over(surface, behind))
+
+
+class _Layers:
+    """Layers of an image with a border of one empty cell, as seen from targets; (u, v) leads from source to target."""
+
+    def __init__(self, kernel: Kernel, positions: Array, rgba: Array, row: Array):
+        self.xp = namespace(positions, rgba, row)
+        self.size = row.shape[1:]
+        cells = _bordered(row)
+        layers = range(row.shape[0])
+        position = [_unpack(positions, cells[k]) for k in layers]
+        self._covered = cells[0] >= 0
+        self._color = [_weighted(_unpack(rgba, cells[k]), (cells[k] >= 0)[..., None]) for k in layers]
+        self._weights = [kernel.weights(p) for p in position]
+        self._depth = _depths(position, cells)
+        self.target = self.source(0, 0)
+
+    def source(self, u: int, v: int) -> list[Array]:
+        """Depths of the sources' layers, K times (H, W)."""
+        return [self._at(z, u, v) for z in self._depth]
+
+    def covers(self, u: int, v: int) -> Array:
+        """Whether the sources have any layer."""
+        return self._at(self._covered, u, v)
+
+    def splats(self, u: int, v: int) -> list[Array]:
+        """What the sources' layers give, K times (H, W, 5): weighted colours and the weight."""
+        return [
+            self._at(color * (wx[u] * wy[v])[..., None], u, v)
+            for color, (wx, wy) in zip(self._color, self._weights, strict=True)
+        ]
+
+    def pairing(self, u: int, v: int) -> Array:
+        """The number s of `Multi`, (H, W)."""
+        source = self.source(u, v)
+        a, best_a = _first_minimum([self.xp.abs(z - self.target[0]) for z in source], self.xp)
+        b, best_b = _first_minimum([self.xp.abs(z - source[0]) for z in self.target], self.xp)
+        return self.xp.where(best_b < best_a, -b, a)
+
+    def _at(self, cells: Array, u: int, v: int) -> Array:
+        """For each target, the cell whose splat reaches it with offset (u, v)."""
+        return cells[1 - v : 1 - v + self.size[0], 1 - u : 1 - u + self.size[1], ...]
 
 
 def check_splats(positions: Array, rgba: Array, row: Array) -> tuple[Array, Array, Array]:
@@ -181,11 +262,6 @@ def _bordered(row: Array) -> Array:
     return xp.concat([end, row, end], axis=1)
 
 
-def _sources(cells: Array, u: int, v: int, height: int, width: int) -> Array:
-    """For each target of the image, the bordered cell whose splat reaches it with offset (u, v)."""
-    return cells[1 - v : 1 - v + height, 1 - u : 1 - u + width, ...]
-
-
 def _weighted(rgba: Array, covered: Array) -> Array:
     """(h, w, 5): colour, and 1 to count the weights; zero where not covered."""
     xp = namespace(rgba)
@@ -206,13 +282,6 @@ def _depths(position: list[Array], cells: Array) -> list[Array]:
     return [xp.where(c, z, xp.where(farthest > 0, farthest, 1.0)) for c, z in zip(covered, depth, strict=True)]
 
 
-def _pairing(source: list[Array], target: list[Array], xp: Any) -> Array:
-    """S of each target for one of its sources."""
-    a, best_a = _first_minimum([xp.abs(z - target[0]) for z in source], xp)
-    b, best_b = _first_minimum([xp.abs(z - source[0]) for z in target], xp)
-    return xp.where(best_b < best_a, -b, a)
-
-
 def _first_minimum(values: list[Array], xp: Any) -> tuple[Array, Array]:
     """Index and value of the first smallest of some images."""
     best, index = values[0], xp.zeros_like(values[0], dtype=xp.int32)
@@ -220,6 +289,16 @@ def _first_minimum(values: list[Array], xp: Any) -> tuple[Array, Array]:
         smaller = value < best
         best, index = xp.where(smaller, value, best), xp.where(smaller, k, index)
     return index, best
+
+
+def _nearest(source: list[Array], depth: Array, s: Array, xp: Any) -> Array:
+    """Index of each source's layer beyond s that is nearest to a depth; K where it has none."""
+    best, index = xp.full_like(depth, xp.inf), xp.full_like(s, len(source))
+    for k, z in enumerate(source[1:], start=1):
+        distance = xp.abs(z - depth)
+        nearer = (k > s) & (distance < best)
+        best, index = xp.where(nearer, distance, best), xp.where(nearer, k, index)
+    return index
 
 
 def _over(front: Array, back: Array) -> Array:

@@ -72,7 +72,7 @@ def modules_after(code):
         ("rts.surfaces", ("mesh",)),
         ("rts.samplers", ("raster", "reference")),
         ("rts.shaders", ("blinn_phong", "depth", "lambert", "normals", "silhouette", "textured", "unlit")),
-        ("rts.splatters", ("multi", "none", "single")),
+        ("rts.splatters", ("multi", "none", "single", "visible")),
     ],
 )
 def test_built_in_plugins_are_registered_and_listed_in_order(group, names):
@@ -163,7 +163,8 @@ def test_rendering_numpy_arrays_loads_neither_torch_nor_jax():
         "import numpy as np, rts\n"
         "mesh = rts.plugin('surfaces', 'mesh')([(0, 1, 2)])\n"
         "part = rts.Part(mesh, {'vertices': np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0)], np.float32)})\n"
-        "image = rts.render(part, rts.Camera.look_at((0, 0, 3), (0, 0, 0)), (4, 5), sampler='reference')\n"
+        "camera = rts.Camera.look_at((0, 0, 3), (0, 0, 0))\n"
+        "image = rts.render(part, camera, (4, 5), sampler='reference', splatter='none')\n"
         "assert image[2, 2, 3] == 1"
     )
     assert not loaded & set(HEAVY)

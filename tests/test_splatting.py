@@ -1,6 +1,7 @@
 """Splatters against closed forms, and against plain loops written from the definition of the method."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,10 +18,11 @@ from helpers import (
 )
 
 import rts
-from rts.splatting import Multi, Plain, Single
+from rts.splatting import Multi, Plain, Single, Visible, exact_calibration
 
 E2 = math.exp(-2)
-KERNELS = {"single": Single, "multi": Multi}
+KERNELS = {"single": Single, "multi": Multi, "visible": partial(Visible, epsilon=0.05, calibration=1.0)}
+"""By name, at the paper's settings."""
 
 
 def dense(height, width, layers=1, depth=5.0):
@@ -46,7 +48,33 @@ def along_x(target, splatter, positions, rgba, row):
 # -------------------------------------------------------------------------------- the method, in plain loops
 
 
-def splat_by_loops(positions, rgba, row, sigma=0.5, epsilon=0.05):
+def multi_places(s, layers, **_):
+    """Layer → buffer."""
+    return {k: 0 if k < s else 1 if k == s else 2 for k in range(layers)}
+
+
+def visible_places(s, layers, here, there, empty, shown):
+    """Layer → buffers: what opaque layers of one source leave to be seen.
+
+    `here` and `there` are depths of source and target, `empty` whether they hold nothing, `shown` the target's hidden
+    layer that shows at a neighbour, or None.
+    """
+    places = {k: [] for k in range(layers)}
+    if empty[1]:
+        places[0] = [1]
+        return places
+    if s > 0:
+        places[0].append(0)
+    if s >= 0:
+        places[s].append(1)
+    if shown is not None and s < 0:
+        places[0].append(2)
+    elif shown is not None and s + 1 < layers:
+        places[min(range(s + 1, layers), key=lambda k: abs(here[k] - there[shown]))].append(2)
+    return places
+
+
+def splat_by_loops(positions, rgba, row, sigma=0.5, epsilon=0.05, calibration=1.0, visible=False):
     """Three accumulation buffers, one scalar at a time, from the definition."""
     layers, height, width = row.shape
     offsets = [(u, v) for v in (-1, 0, 1) for u in (-1, 0, 1)]
@@ -57,23 +85,34 @@ def splat_by_loops(positions, rgba, row, sigma=0.5, epsilon=0.05):
     def depth(k, y, x):
         return positions[row[k, y, x], 2] if row[k, y, x] >= 0 else beyond
 
+    def depths(y, x):
+        return [depth(k, y, x) for k in range(layers)]
+
+    def pairing(here, there):
+        a = [abs(z - there[0]) for z in here]
+        b = [abs(z - here[0]) for z in there]
+        return -b.index(min(b)) if min(b) < min(a) else a.index(min(a))
+
     buffers = np.zeros((3, height, width, 5))
-    for y, x in np.ndindex(height, width):
-        for u, v in offsets:
-            ty, tx = y + v, x + u
-            if not (0 <= ty < height and 0 <= tx < width):
-                continue
-            a = [abs(depth(k, y, x) - depth(0, ty, tx)) for k in range(layers)]
-            b = [abs(depth(k, ty, tx) - depth(0, y, x)) for k in range(layers)]
-            s = -b.index(min(b)) if min(b) < min(a) else a.index(min(a))
+    for ty, tx in np.ndindex(height, width):
+        sources = [(ty - v, tx - u, u, v) for u, v in offsets if 0 <= ty - v < height and 0 <= tx - u < width]
+        there = depths(ty, tx)
+        shifts = {(y, x): pairing(depths(y, x), there) for y, x, _, _ in sources}
+        shown = min((-s for (y, x), s in shifts.items() if s < 0 and row[0, y, x] >= 0), default=None)
+        for y, x, u, v in sources:
+            empty = row[0, y, x] < 0, row[0, ty, tx] < 0
+            if visible:
+                places = visible_places(shifts[y, x], layers, depths(y, x), there, empty, shown)
+            else:
+                places = {k: [i] for k, i in multi_places(shifts[y, x], layers).items()}
             for k in range(layers):
                 i = row[k, y, x]
                 if i < 0:
                     continue
-                square = (x + 0.5 + u - positions[i, 0]) ** 2 + (y + 0.5 + v - positions[i, 1]) ** 2
-                w = (1 + epsilon) / total * math.exp(-square / (2 * sigma**2))
-                buffer = 0 if k < s else 1 if k == s else 2
-                buffers[buffer, ty, tx] += w * np.array([*rgba[i], 1.0])
+                dx, dy = (calibration * (positions[i, axis] - c - 0.5) for axis, c in enumerate((x, y)))
+                w = (1 + epsilon) / total * math.exp(-((u - dx) ** 2 + (v - dy) ** 2) / (2 * sigma**2))
+                for buffer in places[k]:
+                    buffers[buffer, ty, tx] += w * np.array([*rgba[i], 1.0])
     front, surface, behind = (b[..., :4] / np.maximum(1, b[..., 4:]) for b in buffers)
     back = surface + (1 - surface[..., 3:]) * behind
     return front + (1 - front[..., 3:]) * back
@@ -101,18 +140,28 @@ def random_scene(layers, height=5, width=6, seed=0, holes=0.3, middle_holes=Fals
 
 @pytest.mark.parametrize("target", ALL)
 @pytest.mark.parametrize("layers, middle_holes", [(1, False), (2, False), (3, False), (4, False), (3, True)])
-def test_multi_is_the_loop_written_from_the_definition(target, layers, middle_holes):
+@pytest.mark.parametrize("name", ["multi", "visible"])
+def test_the_splatters_are_the_loop_written_from_the_definition(name, target, layers, middle_holes):
     for seed in range(3):
         scene = random_scene(layers, seed=seed, middle_holes=middle_holes)
-        found = to_numpy(Multi().splat(*arrays(target, scene)))
-        np.testing.assert_allclose(found, splat_by_loops(*scene), rtol=0, atol=1e-5)
+        found = to_numpy(KERNELS[name]().splat(*arrays(target, scene)))
+        np.testing.assert_allclose(found, splat_by_loops(*scene, visible=name == "visible"), rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("sigma, epsilon", [(0.3, 0.0), (0.8, 0.2)])
-def test_multi_takes_sigma_and_epsilon_of_the_definition(sigma, epsilon):
+@pytest.mark.parametrize("sigma, epsilon, calibration", [(0.3, 0.0, 1.0), (0.8, 0.2, 0.7)])
+@pytest.mark.parametrize("kernel", [Multi, Visible])
+def test_the_splatters_take_the_settings_of_the_definition(kernel, sigma, epsilon, calibration):
     scene = random_scene(2)
-    found = Multi(sigma=sigma, epsilon=epsilon).splat(*scene)
-    np.testing.assert_allclose(found, splat_by_loops(*scene, sigma, epsilon), rtol=0, atol=1e-12)
+    found = kernel(sigma, epsilon, calibration).splat(*scene)
+    expected = splat_by_loops(*scene, sigma, epsilon, calibration, visible=kernel is Visible)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
+
+
+def test_visible_is_calibrated_and_barely_exceeds_one_by_default():
+    scene = random_scene(3)
+    e = math.exp(-2)
+    expected = splat_by_loops(*scene, 0.5, 1e-3, 0.25 * (1 + 2 * e) / (2 * e), visible=True)
+    np.testing.assert_allclose(Visible().splat(*scene), expected, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("target", ALL)
@@ -128,20 +177,21 @@ def test_single_ignores_the_hidden_layers():
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_gradient_of_multi_is_the_finite_difference_of_the_loop(target):
+@pytest.mark.parametrize("name", ["multi", "visible"])
+def test_gradients_are_the_finite_differences_of_the_loop(name, target):
     positions, rgba, row = random_scene(2, 3, 4)
     weights = np.random.default_rng(1).normal(size=(3, 4, 4))
     given = {"xy": positions[:, :2], "rgba": rgba}
 
     def by_loops(tree):
         where = np.concatenate([tree["xy"], positions[:, 2:]], axis=1)
-        return (splat_by_loops(where, tree["rgba"], row) * weights).sum()
+        return (splat_by_loops(where, tree["rgba"], row, visible=name == "visible") * weights).sum()
 
     z, cells, w = arrays(target, (positions[:, 2:], row, weights))
 
     def f(tree):
         concat = rts.arrays.namespace(z).concat
-        return (Multi().splat(concat([tree["xy"], z], axis=1), tree["rgba"], cells) * w).sum()
+        return (KERNELS[name]().splat(concat([tree["xy"], z], axis=1), tree["rgba"], cells) * w).sum()
 
     found, expected = gradient(target, f, arrays(target, given)), finite_difference(by_loops, given)
     for name in given:
@@ -149,7 +199,8 @@ def test_gradient_of_multi_is_the_finite_difference_of_the_loop(target):
 
 
 @pytest.mark.parametrize("target", ALL)
-def test_two_cells_two_layers_by_hand(target):
+@pytest.mark.parametrize("name", ["multi", "visible"])
+def test_two_cells_two_layers_by_hand(name, target):
     # Cell p has layers A at depth 2 and B at depth 3; its neighbour q has C at depth 3.
     # At q, p's second layer continues q's surface (A_1 = 0): A splats in front, B with C at the surface.
     # At p, q's front layer continues p's second layer (B_1 = 0 < A_0 = 1): C splats behind, with B.
@@ -160,11 +211,79 @@ def test_two_cells_two_layers_by_hand(target):
     far = near * E2
     at_p = near * a + (1 - near) * (near * b + far * c)
     at_q = far * a + (1 - far) * (near * c + far * b)
-    found = to_numpy(Multi().splat(*arrays(target, (positions, np.stack([a, b, c]), row))))
+    found = to_numpy(KERNELS[name]().splat(*arrays(target, (positions, np.stack([a, b, c]), row))))
     np.testing.assert_allclose(found[0], [at_p, at_q], rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("target", ALL)
+def test_visible_shows_only_the_front_of_a_closed_object_by_hand(target):
+    # Cell p holds the front A and the back B of an object, its neighbour q nothing. Unlike with `multi`, B neither
+    # appears at q nor behind A at p: there is nothing behind that a neighbour reveals.
+    a, b = np.array([[1, 0, 0, 1], [0, 1, 0, 1]], np.float64)
+    positions = np.array([(0.5, 0.5, 2), (0.5, 0.5, 3)])
+    row = np.array([[[0, -1]], [[1, -1]]], np.int32)
+    near = 1.05 / (1 + 2 * E2) ** 2
+    given = arrays(target, (positions, np.stack([a, b]), row))
+    np.testing.assert_allclose(to_numpy(KERNELS["visible"]().splat(*given))[0], [near * a, near * E2 * a], atol=1e-6)
+    assert to_numpy(Multi().splat(*given))[0, 0, 1] > 0.1
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_visible_fills_what_a_neighbour_reveals_with_the_layer_nearest_to_it_by_hand(target):
+    # p: front A at 2, back B at 3, card C at 6. q: the card D at 6. At p, q's D continues p's layer 2, so that what
+    # shows behind A is the card, C and D, and not the object's own back.
+    a, b, c, d = np.array([[1, 0, 0, 1], [0, 1, 0, 1], [0, 0, 1, 1], [0, 0, 0.5, 1]], np.float64)
+    positions = np.array([(0.5, 0.5, 2), (0.5, 0.5, 3), (0.5, 0.5, 6), (1.5, 0.5, 6)])
+    row = np.array([[[0, 3]], [[1, -1]], [[2, -1]]], np.int32)
+    near = 1.05 / (1 + 2 * E2) ** 2
+    far = near * E2
+    at_p = near * a + (1 - near) * (near * c + far * d)
+    at_q = far * a + (1 - far) * (near * d + far * c)
+    found = to_numpy(KERNELS["visible"]().splat(*arrays(target, (positions, np.stack([a, b, c, d]), row))))
+    np.testing.assert_allclose(found[0], [at_p, at_q], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_visible_is_multi_where_one_layer_is_in_play(target):
+    # A translucent sheet with holes and a relief, deeper layers empty; and two opaque sheets, away from their edges.
+    positions, row = dense(9, 11, layers=3)
+    positions[:, 2] += 0.1 * np.sin(positions[:, 0] + positions[:, 1])
+    rgba = np.random.default_rng(0).random((len(positions), 4))
+    given = positions, rgba, np.where(np.random.default_rng(1).random(row.shape) < 0.3, -1, row)
+    opaque = np.concatenate([rgba[:, :3], white(positions)[:, :1]], axis=1)
+    both = np.concatenate([positions, positions + [0, 0, 5]]), np.tile(opaque, (2, 1)), row.copy()
+    both[2][1] = row[0] + len(positions)
+    for scene, inside in ((given, slice(None)), (both, slice(1, -1))):
+        found = to_numpy(KERNELS["visible"]().splat(*arrays(target, scene)))[inside, inside]
+        expected = to_numpy(Multi().splat(*arrays(target, scene)))[inside, inside]
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+
+
 # --------------------------------------------------------------------------------------------- closed forms
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize("layers", [1, 3])
+def test_visible_delivers_the_whole_derivative_of_an_edge_and_of_a_ramp(layers, target):
+    positions, row = dense(7, 16, layers)
+    rgba = white(positions)
+    rgba[:, 0] = 0.1 + 0.05 * positions[:, 0]
+    image, slope = along_x(target, Visible(), positions, rgba, row)
+    np.testing.assert_allclose(image[3, 2:-2, 0], (0.1 + 0.05 * (np.arange(16) + 0.5))[2:-2], atol=1e-6)
+    np.testing.assert_allclose(slope[3, 2:-2, 0] / -0.05, 1, atol=2e-3)
+    row[0, :, 8:] = -1
+    _, slope = along_x(target, Visible(), positions, white(positions), row)
+    assert slope[3, 5:11, 3].sum() == pytest.approx(1, abs=2e-3)
+
+
+@pytest.mark.parametrize("sigma", [0.4, 0.5, 0.7])
+def test_the_exact_calibration_is_the_first_moment_of_the_kernels_derivative(sigma):
+    # Moment of −u ∂w/∂P at P = c, by differences of the weights as written in the definition.
+    def weight(u, p):
+        return math.exp(-((u - p) ** 2) / (2 * sigma**2)) / sum(math.exp(-(i**2) / (2 * sigma**2)) for i in (-1, 0, 1))
+
+    moment = sum(u * (weight(u, 1e-6) - weight(u, -1e-6)) / 2e-6 for u in (-1, 0, 1))
+    assert exact_calibration(sigma) * moment == pytest.approx(1, abs=1e-8)
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
@@ -331,6 +450,7 @@ def test_none_has_a_gradient_in_colour_and_none_in_position(target):
     [
         *(("sigma", x) for x in (0, -1.0, math.nan, math.inf)),
         *(("epsilon", x) for x in (-0.1, math.nan, math.inf)),
+        *(("calibration", x) for x in (0, -1.0, math.nan, math.inf)),
     ],
 )
 def test_bad_settings_are_refused_by_name_and_value(kernel, name, value):
@@ -393,6 +513,12 @@ def test_a_translating_disk_is_felt_at_about_0_87_of_its_derivative(name):
     assert 0.84 < gain < 0.90
 
 
+def test_visible_delivers_the_derivative_of_a_translating_disk():
+    gain = gain_of_disk(Visible())
+    print(f"visible: gain {gain:.4f} of a disk of radius 37 px")
+    assert gain == pytest.approx(1, abs=0.015)
+
+
 def test_the_gain_of_a_disk_depends_on_sigma_as_measured():
     gains = {sigma: gain_of_disk(Single(sigma=sigma)) for sigma in (0.35, 0.4, 0.6, 0.7)}
     print("gain by sigma:", {s: round(g, 4) for s, g in gains.items()})
@@ -400,7 +526,8 @@ def test_the_gain_of_a_disk_depends_on_sigma_as_measured():
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_the_area_of_a_sphere_grows_nearly_with_its_circumference(target):
+@pytest.mark.parametrize("splatter, low, high", [("multi", 0.82, 0.89), ("visible", 0.93, 1.0)])
+def test_the_area_of_a_sphere_grows_nearly_with_its_circumference(splatter, low, high, target):
     # Orthographic, one world unit a pixel: sum(alpha) is π r², its derivative 2 π r. Of it is felt what is
     # felt of any curved edge, less a percent: the samples of the rim lie up to a pixel inside and grow less.
     vertices, faces = icosphere(4)
@@ -410,7 +537,7 @@ def test_the_area_of_a_sphere_grows_nearly_with_its_circumference(target):
 
     def area(radius):
         part = rts.Part(mesh, {"vertices": unit * radius}, cull="back")
-        return rts.render(part, camera, (128, 128))[..., 3].sum()
+        return rts.render(part, camera, (128, 128), splatter=splatter)[..., 3].sum()
 
     slope = gradient(target, area, arrays(target, np.array(60.0)))
-    assert 0.82 < slope / (2 * math.pi * 60) < 0.89
+    assert low < slope / (2 * math.pi * 60) < high
