@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from scenes import DISTANCE, bunny_and_square, camera, pixel, supersampled, translation
-from scipy.ndimage import binary_dilation, gaussian_filter
+from truth import scores
 
 import rts
 
@@ -55,22 +55,6 @@ def splatted(parts, index, step, splatter, layers) -> np.ndarray:
         return rts.render(moved(parts, index, transform), camera(), (SIZE, SIZE), splatter=splatter, layers=layers)
 
     return torch.func.jvp(image, (torch.zeros(()),), (torch.ones(()),))[1].numpy()[..., :3]
-
-
-def scores(x: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Relative L2 and cosine raw; relative L2 and gain after a Gaussian of 2 pixels; spurious energy.
-
-    The last is the share of the derivative's energy farther than 3 pixels from where the truth is not zero.
-    """
-    low, low_truth = (gaussian_filter(i.astype(np.float64), (2, 2, 0), radius=(6, 6, 0)) for i in (x, truth))
-    near = binary_dilation(np.abs(truth).max(axis=-1) > 1e-6, iterations=3)
-    return {
-        "relative_l2": float(np.linalg.norm(x - truth) / np.linalg.norm(truth)),
-        "cosine": float((x * truth).sum() / max(np.linalg.norm(x) * np.linalg.norm(truth), 1e-30)),
-        "low_relative_l2": float(np.linalg.norm(low - low_truth) / np.linalg.norm(low_truth)),
-        "low_gain": float((low * low_truth).sum() / (low_truth**2).sum()),
-        "spurious": float((x[~near] ** 2).sum() / max((x**2).sum(), 1e-30)),
-    }
 
 
 def main() -> None:

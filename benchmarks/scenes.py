@@ -59,18 +59,26 @@ def translation(offset) -> np.ndarray:
     return matrix
 
 
-def supersampled(parts, view: rts.Camera, size: tuple[int, int], samples: int, **options) -> np.ndarray:
-    """Hard render with `samples`² samples a pixel on a regular grid, box-filtered (H, W, 4); NumPy parts only."""
+def regular_grid(samples: int) -> np.ndarray:
+    """`samples`² points (S, 2) of a pixel, from its centre, in pixels: the centres of equal cells."""
+    steps = (np.arange(samples) + 0.5) / samples - 0.5
+    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+
+
+def supersampled(parts, view: rts.Camera, size: tuple[int, int], samples: int | np.ndarray, **options) -> np.ndarray:
+    """Hard render, the mean over points of each pixel (H, W, 4); NumPy parts only.
+
+    `samples` are the points (S, 2), x right and y down of the pixel's centre in pixels, or the side of a regular grid.
+    """
     total = 0.0
-    for i in range(samples):
-        for j in range(samples):
-            dx, dy = ((k + 0.5) / samples - 0.5 for k in (j, i))
-            shift = np.eye(4)
-            # Moving the image by −dx pixels puts the point at +dx under the pixel's centre.
-            shift[0, 3], shift[1, 3] = -2 * dx / size[1], 2 * dy / size[0]
-            moved = view._replace(projection=shift @ view.projection)
-            total = total + rts.render(parts, moved, size, splatter="none", layers=1, **options)
-    return total / samples**2
+    points = regular_grid(samples) if isinstance(samples, int) else samples
+    for dx, dy in points:
+        shift = np.eye(4)
+        # Moving the image by −dx pixels puts the point at +dx under the pixel's centre.
+        shift[0, 3], shift[1, 3] = -2 * dx / size[1], 2 * dy / size[0]
+        moved = view._replace(projection=shift @ view.projection)
+        total = total + rts.render(parts, moved, size, splatter="none", layers=1, **options)
+    return total / len(points)
 
 
 def bunny_and_square() -> tuple[rts.Part, rts.Part]:
