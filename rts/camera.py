@@ -285,8 +285,21 @@ class Camera(NamedTuple):
     def with_apron(self, size: tuple[int, int], apron: int) -> Camera:
         """The camera of the image with `apron` more pixels on every side."""
         height, width = size
-        signs = (width / (width + 2 * apron), height / (height + 2 * apron), 1, 1)
-        return self._replace(projection=scaled_rows(self.projection, signs))
+        return self.window(size, (-apron, -apron), (height + 2 * apron, width + 2 * apron))
+
+    def window(self, size: tuple[int, int], corner: tuple[int, int], extent: tuple[int, int]) -> Camera:
+        """The camera of a part of the image, or of more than it.
+
+        Args:
+            size: (height, width) of the image, pixels.
+            corner: (top, left) of the window in the image, pixels.
+            extent: (height, width) of the window, pixels.
+        """
+        (height, width), (top, left), (rows, columns) = size, corner, extent
+        x, y, z, w = (self.projection[i, :] for i in range(4))
+        x = x * (width / columns) + w * ((width - 2 * left) / columns - 1)
+        y = y * (height / rows) + w * (1 - (height - 2 * top) / rows)
+        return self._replace(projection=namespace(x).stack([x, y, z, w]))
 
     def project(self, points: Array, size: tuple[int, int]) -> Array:
         """Pixel x, pixel y and linear depth of world points.

@@ -78,8 +78,8 @@ def check_matrix(name: str, matrix: Any) -> None:
         raise InputError(f"{name} has shape {tuple(getattr(matrix, 'shape', ()))}; expected a (4, 4) array")
 
 
-def check_size(size: Any, layers: Any, capacity: Any, *, gradient: bool) -> tuple[int, int]:
-    """(height, width) as integers, refused where they make no image or one too large for this machine."""
+def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple[int, int]:
+    """(height, width) as integers, refused where they make no image."""
     try:
         height, width = (int(s) for s in size)
         whole = (height, width) == tuple(size)
@@ -92,13 +92,19 @@ def check_size(size: Any, layers: Any, capacity: Any, *, gradient: bool) -> tupl
         raise InputError(f"layers is {layers!r}; expected an integer of at least 1")
     if capacity is not None and not _is_count(capacity):
         raise InputError(f"capacity is {capacity!r}; expected an integer of at least 1, or None")
+    if not _is_count(supersample):
+        raise InputError(f"supersample is {supersample!r}; expected an integer of at least 1")
+    return height, width
+
+
+def check_memory(height: int, width: int, layers: int, *, gradient: bool) -> None:
+    """Refuse what would not fit into this machine."""
     needed = height * width * layers * BYTES_PER_CELL["gradient" if gradient else "forward"]
     if needed > MEMORY:
         raise InputError(
             f"{height} x {width} pixels with {layers} layers need about {needed / 2**30:.3g} GiB, and this machine has "
             f"{MEMORY / 2**30:.3g} GiB; choose a smaller size or fewer layers"
         )
-    return height, width
 
 
 def _is_count(value: Any) -> bool:

@@ -154,12 +154,12 @@ class Samples:
     centered: bool = True
 
 
-@record()
+@record(static=("supersample",))
 class Sampled:
     """A whole scene, sampled: what `rts.sample` returns and `rts.render_samples` takes.
 
     The grid has an apron of one cell around the image, so that what lies just outside can splat into it:
-    here H and W are the image's plus two.
+    here H and W are the image's, times `supersample`, plus two.
 
     Attributes:
         samples: one `Samples` a part.
@@ -167,6 +167,7 @@ class Sampled:
         row: (K, H, W) int32, the sample in each cell, counted over all parts in order, or −1.
         depth: (K, H, W) float32, linear camera depth; 0 where empty.
         overflow: () int32, samples dropped for want of capacity. Should be 0.
+        supersample: s, where each pixel has s² cells.
     """
 
     samples: tuple[Samples, ...]
@@ -174,6 +175,7 @@ class Sampled:
     row: Array
     depth: Array
     overflow: Array
+    supersample: int = 1
 
 
 # ------------------------------------------------------------------------------------------------ protocols
@@ -324,6 +326,10 @@ class Engine(Protocol):
 
     def value_and_grad(self, f: Callable) -> Callable:
         """`f(tree) -> scalar` to `tree -> (value, gradient tree)`."""
+        ...
+
+    def checkpoint(self, f: Callable[[], Array]) -> Array:
+        """The value of `f`, which is computed again for its gradient instead of keeping what it went through."""
         ...
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[Array, Array]:

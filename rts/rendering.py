@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from rts.arrays import affine, constants, engine_of, exemplar, is_constant, namespace
 from rts.camera import Camera
-from rts.checks import check_background, check_plugin, check_scene, check_shaded, check_size, differentiable
+from rts.checks import (
+    check_background,
+    check_memory,
+    check_plugin,
+    check_scene,
+    check_shaded,
+    check_size,
+    differentiable,
+)
 from rts.errors import InputError
 from rts.preparing import PreparedParts
 from rts.protocols import Array, Engine, GBuffer, Part, Sampled, Samples
@@ -15,6 +27,9 @@ from rts.sampling import merge, reads_of
 
 APRON = 1
 """Cells sampled beyond the image's border on each side, so that they can splat into it."""
+
+BAND = 2**20
+"""Cells, over all layers, that a supersampled image may have before it is rendered in bands of rows."""
 
 
 def render(
@@ -25,6 +40,7 @@ def render(
     sampler: Any = "auto",
     splatter: Any = "auto",
     layers: int = 2,
+    supersample: int = 1,
     background: Any = None,
     capacity: int | None = None,
 ) -> Array:
@@ -37,11 +53,13 @@ def render(
         sampler: name or object of a `Sampler`.
         splatter: name or object of a `Splatter`.
         layers: K, the number of surface layers kept at each pixel.
+        supersample: s, for s² samples a pixel, splatted on the finer grid and averaged. Large images are rendered in
+            bands of rows, so that memory stays bounded; in a gradient each band is then shaded once more.
         background: colour (3,) or (4,), or image (H, W, 3 or 4), premultiplied, to composite onto; None for
             transparent.
         capacity: number of rows to allot for the samples of a part inside `jax.jit`, where shapes must be known;
             None for the worst case, every cell of every layer. What does not fit is dropped, deepest layers first:
-            `rts.sample` reports how much.
+            `rts.sample` reports how much. Where the image is rendered in bands, of each band.
 
     Returns:
         (H, W, 4) premultiplied linear RGBA, row 0 on top.
@@ -50,11 +68,22 @@ def render(
         InputError: what was given cannot be rendered.
         EngineError: torch and jax arrays in one scene.
     """
-    if background is not None:
-        size = check_size(size, layers, capacity, gradient=False)
-        background = check_background(background, size)
-    sampled = sample(parts, camera, size, sampler=sampler, layers=layers, capacity=capacity)
-    return render_samples(sampled, parts, camera, splatter=splatter, background=background)
+    height, width = check_size(size, layers, capacity, supersample)
+    background = check_background(background, (height, width))
+    bands = _bands(height, width, layers, supersample)
+    images = []
+    for top, rows in bands:
+        view = camera if len(bands) == 1 else camera.window((height, width), (top, 0), (rows, width))
+        sampled = sample(
+            parts, view, (rows, width), sampler=sampler, layers=layers, supersample=supersample, capacity=capacity
+        )
+        shade = partial(render_samples, sampled, parts, view, splatter=splatter)
+        if len(bands) == 1:
+            return shade(background=background)
+        images.append(engine_of(sampled, parts, camera).checkpoint(shade))
+    image = namespace(*images).concat(images)
+    background = constants(background, engine_of(image, background), exemplar(image, background))
+    return image if background is None else _over_background(image, background)
 
 
 def sample(
@@ -64,6 +93,7 @@ def sample(
     *,
     sampler: Any = "auto",
     layers: int = 2,
+    supersample: int = 1,
     capacity: int | None = None,
 ) -> Sampled:
     """The half of `render` without derivative: where the rays through pixel centres meet the surfaces.
@@ -72,7 +102,8 @@ def sample(
     """
     prepared = parts if isinstance(parts, PreparedParts) else None
     parts, camera = check_scene(prepared.parts if prepared else parts, camera)
-    height, width = check_size(size, layers, capacity, gradient=differentiable(parts, camera))
+    height, width = (supersample * n for n in check_size(size, layers, capacity, supersample))
+    check_memory(height, width, layers, gradient=differentiable(parts, camera))
     if prepared is None:
         samplers, entries = [check_plugin("rts.samplers", sampler, "sample")] * len(parts), [None] * len(parts)
     else:
@@ -85,7 +116,7 @@ def sample(
     for part, chosen, entry in zip(parts, samplers, entries, strict=True):
         known = {} if entry is None else {"entry": entry}
         samples.append(chosen.sample(part, wide.within(part.transform), grid, layers, capacity=capacity, **known))
-    return merge(samples, layers)
+    return replace(merge(samples, layers), supersample=supersample)
 
 
 def render_samples(
@@ -118,7 +149,8 @@ def render_samples(
     splatter = check_plugin("rts.splatters", splatter, "splat")
     grid = tuple(sampled.row.shape[1:])
     size = grid[0] - 2 * APRON, grid[1] - 2 * APRON
-    background = check_background(background, size)
+    fine = sampled.supersample
+    background = check_background(background, (size[0] // fine, size[1] // fine))
     scene = parts, camera, sampled, background
     engine, like = engine_of(scene), exemplar(scene)
     camera, sampled, background = constants((camera, sampled, background), engine, like)
@@ -136,7 +168,19 @@ def render_samples(
     xp = namespace(sampled.row)
     image = splatter.splat(xp.concat(positions), xp.concat(colors), sampled.row)
     image = image[APRON : grid[0] - APRON, APRON : grid[1] - APRON, :]
+    if fine > 1:
+        image = xp.mean(xp.reshape(image, (size[0] // fine, fine, size[1] // fine, fine, 4)), axis=(1, 3))
     return image if background is None else _over_background(image, background)
+
+
+def _bands(height: int, width: int, layers: int, supersample: int) -> list[tuple[int, int]]:
+    """(first row, number of rows) of the parts in which a supersampled image is rendered."""
+    if supersample == 1:
+        return [(0, height)]
+    rows = max(1, BAND // (layers * supersample**2 * width))
+    count = math.ceil(height / rows)
+    edges = [height * i // count for i in range(count + 1)]
+    return [(top, end - top) for top, end in itertools.pairwise(edges)]
 
 
 def _evaluate(part: Part, samples: Samples, engine: Engine, like: Array | None) -> GBuffer:

@@ -101,6 +101,10 @@ class JaxEngine:
         """`jax.value_and_grad`."""
         return jax.value_and_grad(f)
 
+    def checkpoint(self, f: Callable[[], jax.Array]) -> jax.Array:
+        """By `jax.checkpoint`."""
+        return jax.checkpoint(f)()
+
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[jax.Array, jax.Array]:
         """`jax.jvp`."""
         return jax.jvp(f, (primal,), (tangent,))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.utils.checkpoint
 from array_api_compat import torch as array_api
 from torch.utils import _pytree
 
@@ -137,6 +138,12 @@ class TorchEngine:
             return value.detach(), map_leaves(lambda _: next(it), tree)
 
         return call
+
+    def checkpoint(self, f: Callable[[], torch.Tensor]) -> torch.Tensor:
+        """By `torch.utils.checkpoint`, which plain autograd knows; `torch.func` transforms keep everything."""
+        if not torch.is_grad_enabled() or torch._C._functorch.maybe_current_level() is not None:
+            return f()
+        return torch.utils.checkpoint.checkpoint(f, use_reentrant=False)
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[torch.Tensor, torch.Tensor]:
         """By forward-mode autodiff."""

@@ -1,0 +1,145 @@
+"""Several samples a pixel: the average of the finer image, rendered in bands of bounded memory."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, derivative, gradient, quad, to_numpy
+
+import rts
+from rts import rendering
+from rts.splatting import Visible
+
+MESH = rts.plugin("rts.surfaces", "mesh")
+CAMERA = rts.Camera.look_at((0.2, 0.1, 3.0), (0, 0, 0))
+SIZE = (10, 12)
+CORNERS, FACES = np.array([(-1, -1, 0), (1, -0.8, 0.3), (0.1, 1, -0.2)]), np.array([(0, 1, 2)])
+RGB = np.array([(1, 0.2, 0), (0, 1, 0.3), (0.1, 0, 1)])
+
+
+def image(vertices, supersample, size=SIZE, **options):
+    part = rts.Part(MESH(FACES), {"vertices": vertices, "colors": RGB}, "unlit")
+    return rts.render(part, CAMERA, size, supersample=supersample, **options)
+
+
+def averaged(fine, s):
+    height, width = fine.shape[0] // s, fine.shape[1] // s
+    return fine.reshape(height, s, width, s, 4).mean(axis=(1, 3))
+
+
+@pytest.fixture
+def narrow_bands(monkeypatch):
+    """Bands of a few rows."""
+    monkeypatch.setattr(rendering, "BAND", 1000)
+
+
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize("s", [2, 3])
+def test_a_pixel_is_the_average_of_its_samples(target, s):
+    vertices = arrays(target, CORNERS)
+    fine = to_numpy(image(vertices, 1, (s * SIZE[0], s * SIZE[1])))
+    np.testing.assert_allclose(to_numpy(image(vertices, s)), averaged(fine, s), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_bands_make_no_difference_to_the_image(target, narrow_bands, monkeypatch):
+    assert len(rendering._bands(*SIZE, 2, 3)) == 3
+    vertices, background = arrays(target, (CORNERS, np.random.default_rng(0).random((*SIZE, 3))))
+    found = to_numpy(image(vertices, 3, background=background))
+    monkeypatch.undo()
+    assert len(rendering._bands(*SIZE, 2, 3)) == 1
+    np.testing.assert_allclose(found, to_numpy(image(vertices, 3, background=background)), rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_bands_make_no_difference_to_derivatives(target, monkeypatch):
+    vertices, weights = arrays(target, (CORNERS, np.random.default_rng(1).normal(size=(*SIZE, 4))))
+
+    def loss(v):
+        return (image(v, 2) * weights).sum()
+
+    found = {}
+    for band in (2**20, 500):
+        monkeypatch.setattr(rendering, "BAND", band)
+        slope = derivative(target, loss, vertices, arrays(target, np.ones((3, 3))))[1]
+        found[band] = gradient(target, loss, vertices), slope
+        np.testing.assert_allclose(found[band][0].sum(), slope, rtol=1e-3)
+    for whole, banded in zip(*found.values(), strict=True):
+        np.testing.assert_allclose(banded, whole, rtol=1e-3, atol=1e-3)
+
+
+def test_bands_work_under_jit_and_torch_func(narrow_bands):
+    jax, torch = pytest.importorskip("jax"), pytest.importorskip("torch")
+
+    def loss(v):
+        return (image(v, 3)[..., :3] ** 2).sum()
+
+    expected = gradient("torch-cpu", loss, arrays("torch-cpu", CORNERS))
+    by_func = torch.func.grad(loss)(arrays("torch-cpu", CORNERS)).numpy()
+    by_jit = np.asarray(jax.jit(jax.grad(loss))(arrays("jax", CORNERS)))
+    np.testing.assert_allclose(by_func, expected, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(by_jit, expected, rtol=1e-3, atol=1e-3)
+
+
+def test_gradients_shade_each_band_again_instead_of_keeping_it(narrow_bands):
+    calls = []
+
+    class Counting(Visible):
+        def splat(self, positions, rgba, row):
+            calls.append(row.shape)
+            return super().splat(positions, rgba, row)
+
+    bands = len(rendering._bands(*SIZE, 2, 3))
+    gradient(TORCH[0], lambda v: image(v, 3, splatter=Counting()).sum(), arrays(TORCH[0], CORNERS))
+    assert len(calls) == 2 * bands
+
+
+def test_memory_stays_bounded_however_many_samples(monkeypatch):
+    monkeypatch.setattr(rendering, "BAND", 2**14)
+
+    def peak(s):
+        image(CORNERS, s, (32, 32))
+        tracemalloc.start()
+        image(CORNERS, s, (32, 32))
+        size = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return size
+
+    assert peak(16) < 1.3 * peak(4)
+
+
+def test_sampled_knows_its_samples_a_pixel():
+    part = rts.Part(MESH(FACES), {"vertices": CORNERS, "colors": RGB}, "unlit")
+    sampled = rts.sample(part, CAMERA, SIZE, supersample=2)
+    assert sampled.row.shape == (2, 2 * SIZE[0] + 2, 2 * SIZE[1] + 2) and sampled.supersample == 2
+    np.testing.assert_array_equal(rts.render_samples(sampled, part, CAMERA), image(CORNERS, 2))
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize("s", [1, 2, 4])
+def test_an_edge_is_felt_whole_at_any_number_of_samples(target, s):
+    # A world unit is a pixel: as the card moves by one, each row's alpha grows by one at the right edge.
+    vertices, faces = quad(-100, 0.3, -100, 100)
+    camera = rts.Camera.orthographic((0, 0, 10), (0, 0, 0), height=16)
+    along_x = arrays(target, np.broadcast_to([1.0, 0, 0], vertices.shape))
+
+    def alpha(v):
+        return rts.render(rts.Part(MESH(faces), {"vertices": v}), camera, (16, 16), supersample=s)[..., 3]
+
+    _, slope = derivative(target, alpha, arrays(target, vertices), along_x)
+    np.testing.assert_allclose(slope.sum(axis=1), 1, atol=2e-3)
+
+
+def test_coverage_of_an_edge_gets_nearer_the_area_with_samples():
+    vertices, faces = quad(-100, 0.3, -100, 100)
+    camera = rts.Camera.orthographic((0, 0, 10), (0, 0, 0), height=16)
+    part = rts.Part(MESH(faces), {"vertices": vertices})
+    area = np.clip(8.3 - np.arange(16), 0, 1)
+    errors = [np.abs(rts.render(part, camera, (16, 16), supersample=s)[8, :, 3] - area).sum() for s in (1, 4, 16)]
+    assert errors[0] > 0.29 and errors[1] < errors[0] / 3 and errors[2] < errors[1] / 3
+
+
+@pytest.mark.parametrize("wrong", [0, -1, 1.5, True, "2", None])
+def test_other_numbers_of_samples_are_refused(wrong):
+    with pytest.raises(rts.InputError, match="supersample is .*; expected an integer of at least 1"):
+        image(CORNERS, wrong)
