@@ -247,7 +247,9 @@ def loss_weights(height: int, width: int) -> np.ndarray:
     """Weights (L, H, W, 3) of the random losses L = Σ w · image: smooth, of fixed seed and unit variance."""
     noise = np.random.default_rng(0).normal(size=(LOSSES, height, width, 3))
     smooth = gaussian_filter(noise, (0, LOSS_SCALE, LOSS_SCALE, 0))
-    return smooth / smooth.std(axis=(1, 2, 3), keepdims=True)
+    weights = smooth / smooth.std(axis=(1, 2, 3), keepdims=True)
+    weights.setflags(write=False)
+    return weights
 
 
 def scores(x: np.ndarray, reference: Truth | np.ndarray) -> dict[str, float]:
