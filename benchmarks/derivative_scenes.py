@@ -265,9 +265,9 @@ def wires(size: int, width: float) -> Scene:
     vertices, faces = [], []
     for i, slant in enumerate(np.radians([4, -9, 17, -31, 44, 68, -83])):
         along, across = np.array([np.sin(slant), np.cos(slant)]), np.array([np.cos(slant), -np.sin(slant)])
-        center = size * np.array([0.5 + 0.11 * (i - 3), 0.5 + 0.05 * (i % 3 - 1)]) + 0.3
+        center = size * np.array([0.5 + 0.085 * (i - 3), 0.5 + 0.05 * (i % 3 - 1)]) + 0.3
         ends = [
-            center + a * 0.3 * size * along + b * width / 2 * across for a, b in ((-1, -1), (-1, 1), (1, 1), (1, -1))
+            center + a * 0.22 * size * along + b * width / 2 * across for a, b in ((-1, -1), (-1, 1), (1, 1), (1, -1))
         ]
         vertices.append(on_screen(np.array(ends), DISTANCE + 0.02 * i, size))
         faces += [[4 * i + j for j in f] for f in QUAD]

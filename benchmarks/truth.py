@@ -277,7 +277,7 @@ def _compared(x: np.ndarray, true: np.ndarray, prefix: str) -> dict[str, float]:
     product, square = float((x * true).sum()), float((true**2).sum())
     return {
         f"{prefix}relative_l2": _relative(x, true, true),
-        f"{prefix}cosine": product / max(np.linalg.norm(x) * np.linalg.norm(true), 1e-30),
+        f"{prefix}cosine": product / max(float(np.linalg.norm(x) * np.linalg.norm(true)), 1e-30),
         f"{prefix}gain": product / square,
     }
 
