@@ -24,6 +24,8 @@ from rts.errors import InputError
 from rts.protocols import Array
 
 SIGMA, EPSILON = 0.5, 0.05
+CONTINUED = 0.5
+"""Share of the error of plain pairing below which `Visible` takes the line of a front layer for its continuation."""
 OFFSETS = (-1, 0, 1)
 NEIGHBOURS = [(u, v) for v in OFFSETS for u in OFFSETS]
 
@@ -134,7 +136,7 @@ class Multi(Kernel):
         layers = _Layers(self, positions, rgba, row)
         buffers = [0.0, 0.0, 0.0]
         for u, v in NEIGHBOURS:
-            s = layers.pairing(u, v)
+            s, _ = layers.pairing(u, v)
             for k, splats in enumerate(layers.splats(u, v)):
                 for i, chosen in enumerate((s > k, s == k, s < k)):
                     buffers[i] = buffers[i] + xp.where(chosen[..., None], splats, 0.0)
@@ -146,10 +148,14 @@ class Multi(Kernel):
 class Visible(Kernel):
     """`Multi` with a calibrated derivative, where opaque layers of one source hide each other.
 
-    Each buffer gets at most one layer of a source. With s of `Multi`: an empty target takes the source's front layer,
-    at the surface. A covered target takes the source's front layer in front where s > 0, and layer s at the surface
-    where s ≥ 0. Behind is only what shows next door: with m the least −s over the covered sources of s < 0, those give
-    their front layer and the others the layer l > s whose depth is nearest to z_q[m]; where there is no m, nothing.
+    Pairing is that of `Multi`, save that front layers pair (s = 0) also where one lies on the line through the other
+    and its next cell, to half of what the best of A and B is off: depth that changes fast, as on the sides of a box
+    near its outline, is nearer to a back face than to itself.
+
+    Each buffer gets at most one layer of a source. An empty target takes the source's front layer, at the surface. A
+    covered target takes the source's front layer in front where s > 0, and layer s at the surface where s ≥ 0. Behind
+    is only what shows next door: with m the least −s over the covered sources of s < 0, those give their front layer
+    and the others the layer l > s whose depth is nearest to z_q[m]; where there is no m, nothing.
 
     Closed surfaces need no culling, if K reaches through their back faces to what lies behind.
     """
@@ -161,7 +167,10 @@ class Visible(Kernel):
         """See `Kernel`."""
         xp = namespace(positions, rgba, row)
         layers = _Layers(self, positions, rgba, row)
-        shift = {n: xp.where(row[0] >= 0, layers.pairing(*n), 0) for n in NEIGHBOURS}
+        shift = {}
+        for n in NEIGHBOURS:
+            s, off = layers.pairing(*n)
+            shift[n] = xp.where((row[0] < 0) | layers.continues(*n, CONTINUED * off), 0, s)
         shown = {n: (s < 0) & layers.covers(*n) for n, s in shift.items()}
         none = row.shape[0]
         m = xp.full_like(row[0], none)
@@ -195,6 +204,7 @@ class _Layers:
         self._color = [_weighted(_unpack(rgba, cells[k]), (cells[k] >= 0)[..., None]) for k in layers]
         self._weights = [kernel.weights(p) for p in position]
         self._depth = _depths(position, cells)
+        self._front = _bordered(self._depth[0][None])[0], _bordered(cells[:1])[0] >= 0
         self.target = self.source(0, 0)
 
     def source(self, u: int, v: int) -> list[Array]:
@@ -212,16 +222,27 @@ class _Layers:
             for color, (wx, wy) in zip(self._color, self._weights, strict=True)
         ]
 
-    def pairing(self, u: int, v: int) -> Array:
-        """The number s of `Multi`, (H, W)."""
+    def pairing(self, u: int, v: int) -> tuple[Array, Array]:
+        """The number s of `Multi`, and what the depths that it pairs are off, (H, W) both."""
         source = self.source(u, v)
         a, best_a = _first_minimum([self.xp.abs(z - self.target[0]) for z in source], self.xp)
         b, best_b = _first_minimum([self.xp.abs(z - source[0]) for z in self.target], self.xp)
-        return self.xp.where(best_b < best_a, -b, a)
+        return self.xp.where(best_b < best_a, -b, a), self.xp.minimum(best_a, best_b)
 
-    def _at(self, cells: Array, u: int, v: int) -> Array:
-        """For each target, the cell whose splat reaches it with offset (u, v)."""
-        return cells[1 - v : 1 - v + self.size[0], 1 - u : 1 - u + self.size[1], ...]
+    def continues(self, u: int, v: int, limit: Array) -> Array:
+        """Whether the front of the source or of the target is nearer than a limit to where the other's line leads."""
+        xp = self.xp
+        source, target = self._at(self._depth[0], u, v), self.target[0]
+        found = xp.zeros_like(target, dtype=xp.bool)
+        for end, start, steps in ((source, target, -1), (target, source, 2)):
+            before, covered = (self._at(x, steps * u, steps * v, border=2) for x in self._front)
+            found = found | (covered & (xp.abs(end - (2 * start - before)) < limit))
+        return found
+
+    def _at(self, cells: Array, u: int, v: int, border: int = 1) -> Array:
+        """For each target, the cell from which (u, v) leads to it; (u, v) reaches as far as the border is wide."""
+        top, left = border - v, border - u
+        return cells[top : top + self.size[0], left : left + self.size[1], ...]
 
 
 def check_splats(positions: Array, rgba: Array, row: Array) -> tuple[Array, Array, Array]:
@@ -254,7 +275,7 @@ def _unpack(values: Array, cells: Array) -> Array:
 
 
 def _bordered(row: Array) -> Array:
-    """`row` with a border of one empty cell."""
+    """`row` with a border of one cell of −1."""
     xp = namespace(row)
     side = xp.full_like(row[:, :, :1], -1)
     row = xp.concat([side, row, side], axis=2)

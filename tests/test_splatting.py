@@ -91,13 +91,25 @@ def splat_by_loops(positions, rgba, row, sigma=0.5, epsilon=0.05, calibration=1.
     def pairing(here, there):
         a = [abs(z - there[0]) for z in here]
         b = [abs(z - here[0]) for z in there]
-        return -b.index(min(b)) if min(b) < min(a) else a.index(min(a))
+        return -b.index(min(b)) if min(b) < min(a) else a.index(min(a)), min(*a, *b)
+
+    def continues(start, end, step, limit):
+        y, x = start[0] - step[0], start[1] - step[1]
+        if not (0 <= y < height and 0 <= x < width) or row[0, y, x] < 0:
+            return False
+        return abs(depth(0, *end) - (2 * depth(0, *start) - depth(0, y, x))) < limit
+
+    def shift(y, x, ty, tx):
+        s, off = pairing(depths(y, x), depths(ty, tx))
+        along, back = (ty - y, tx - x), (y - ty, x - tx)
+        joined = continues((ty, tx), (y, x), back, off / 2) or continues((y, x), (ty, tx), along, off / 2)
+        return 0 if visible and joined else s
 
     buffers = np.zeros((3, height, width, 5))
     for ty, tx in np.ndindex(height, width):
         sources = [(ty - v, tx - u, u, v) for u, v in offsets if 0 <= ty - v < height and 0 <= tx - u < width]
         there = depths(ty, tx)
-        shifts = {(y, x): pairing(depths(y, x), there) for y, x, _, _ in sources}
+        shifts = {(y, x): shift(y, x, ty, tx) for y, x, _, _ in sources}
         shown = min((-s for (y, x), s in shifts.items() if s < 0 and row[0, y, x] >= 0), default=None)
         for y, x, u, v in sources:
             empty = row[0, y, x] < 0, row[0, ty, tx] < 0
@@ -241,6 +253,18 @@ def test_visible_fills_what_a_neighbour_reveals_with_the_layer_nearest_to_it_by_
     at_q = far * a + (1 - far) * (near * d + far * c)
     found = to_numpy(KERNELS["visible"]().splat(*arrays(target, (positions, np.stack([a, b, c, d]), row))))
     np.testing.assert_allclose(found[0], [at_p, at_q], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_visible_pairs_fronts_along_their_line_by_hand(target):
+    # The side of a box, which recedes by 1 a cell, and its back, which is 0.3 behind at p: nearer to q's front than
+    # p's own front is. p's line leads exactly to q, so that q holds its side, and the back is nowhere.
+    a, b = np.array([[1, 0, 0, 1], [0, 1, 0, 1]], np.float64)
+    positions = np.array([(0.5, 0.5, 4), (1.5, 0.5, 3), (1.5, 0.5, 3.7), (2.5, 0.5, 2), (2.5, 0.5, 3.2)])
+    rgba, row = np.stack([a, a, b, a, b]), np.array([[[0, 1, 3]], [[-1, 2, 4]]], np.int32)
+    found = to_numpy(KERNELS["visible"]().splat(*arrays(target, (positions, rgba, row))))
+    assert to_numpy(Multi().splat(*arrays(target, (positions, rgba, row))))[0, :, 1].max() > 0.1
+    np.testing.assert_allclose(found[0, :, 1], 0, atol=1e-6)
 
 
 @pytest.mark.parametrize("target", ALL)
