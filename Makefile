@@ -39,7 +39,7 @@ $(BIN)/python:
 	$(BIN)/python -m pip install --quiet --upgrade pip
 
 $(VENV)/.demo: $(BIN)/python $(SOURCES)
-	$(INSTALL) -e '.[torch,bench]'
+	$(INSTALL) -e '.[torch,plots]'
 	@touch $@
 
 $(VENV)/.test: $(BIN)/python $(SOURCES) tests/plugin_example/pyproject.toml

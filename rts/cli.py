@@ -302,4 +302,4 @@ def demo(
 
 def _say_skipped_plot(files: list[Path]) -> None:
     if not any(f.name == "convergence.png" for f in files):
-        _say("no convergence.png, which needs matplotlib: pip install 'rts\\[bench]'")
+        _say("no convergence.png, which needs matplotlib: pip install 'rts\\[plots]'")

@@ -268,7 +268,7 @@ def test_fit_pose_says_which_extra_draws_the_plot(model, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     succeed("render", model, "-o", tmp_path / "t.png", "--size", 32)
     output = succeed("fit-pose", model, tmp_path / "t.png", "-o", tmp_path / "o", "--steps", 1)
-    assert "pip install 'rts[bench]'" in output
+    assert "pip install 'rts[plots]'" in output
     assert not (tmp_path / "o" / "convergence.png").exists()
 
 

@@ -128,7 +128,7 @@ def test_without_matplotlib_all_works_but_the_plot_which_says_what_it_needs():
         cli._say_skipped_plot([])
         """,
     )
-    assert "pip install 'rts[bench]'" in " ".join(printed.split())
+    assert "pip install 'rts[plots]'" in " ".join(printed.split())
 
 
 @pytest.mark.parametrize(
