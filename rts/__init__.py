@@ -9,6 +9,7 @@ from rts.camera import Camera
 from rts.choosing import explain
 from rts.errors import EngineError, InputError, PluginError, RtsError
 from rts.fitting import Fit, fit
+from rts.gradients import check_gradient, gradient_image
 from rts.preparing import prepare
 from rts.protocols import Fragments, GBuffer, Part, Proxy, RayHits, Sampled, Samples
 from rts.registry import plugin, plugins
@@ -32,8 +33,10 @@ __all__ = [
     "Sampled",
     "Samples",
     "TriangleSampler",
+    "check_gradient",
     "explain",
     "fit",
+    "gradient_image",
     "load",
     "load_image",
     "namespace",

@@ -1,0 +1,285 @@
+"""Looking at derivatives: as a picture, and beside finite differences that know nothing of splatting."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from rts.arrays import engine_of, from_numbers, is_constant, leaves, map_leaves, namespace
+from rts.camera import Camera
+from rts.errors import InputError
+from rts.protocols import Array, Engine, Part, Tree
+from rts.rendering import render
+from rts.scenes import decode_srgb
+
+Scene = Callable[[Tree], tuple[Part | Sequence[Part], Camera]]
+
+STEP_PIXELS = 1.0
+"""How far the finite differences move what moves fastest in the image."""
+STEP_COLOR = 0.05
+"""How far they change the colour that changes fastest, where nothing moves."""
+LOSS_SMOOTHNESS = 4.0
+"""Standard deviation of the Gaussian that smooths the weights of the default loss, pixels."""
+
+
+class GradientImage(NamedTuple):
+    """How an image changes with its parameters.
+
+    Attributes:
+        derivative: (H, W, C) float, change of the image for a unit step along the direction.
+        scale: the change that the picture shows at full strength.
+    """
+
+    derivative: np.ndarray
+    scale: float
+
+    @property
+    def picture(self) -> np.ndarray:
+        """(H, W, 3) linear RGB for `rts.save_image`: middle grey is zero, brighter positive, darker negative."""
+        color = self.derivative if self.derivative.shape[2] in (1, 3) else self.derivative[..., :3]
+        signed = np.clip(0.5 + 0.5 * color / self.scale, 0, 1)
+        return decode_srgb(np.broadcast_to(signed, (*signed.shape[:2], 3)))
+
+
+def gradient_image(
+    image: Callable[[Tree], Array], parameters: Tree, direction: Tree = None, *, scale: float | None = None
+) -> GradientImage:
+    """The derivative of an image along a direction of its parameters, by forward mode, as a signed picture.
+
+    Args:
+        image: parameters → (H, W, C), such as a function that calls `rts.render`.
+        parameters: a torch or jax array, or nested dicts and lists of them.
+        direction: of the same structure; None for one, if the parameters are a single number.
+        scale: the change that is shown at full strength; None for the largest there is.
+
+    Raises:
+        InputError: parameters that have no derivative, or a direction of another structure.
+    """
+    engine, parameters = _differentiable(parameters)
+    if direction is None:
+        if [math.prod(p.shape) for p in leaves(parameters)] != [1]:
+            raise InputError("parameters holds more than one number; give the direction along which to differentiate")
+        direction = map_leaves(lambda p: engine.namespace.ones_like(p), parameters)
+    direction = _like(from_numbers(direction), parameters, engine)
+    _, derivative = engine.jvp(image, parameters, direction)
+    derivative = engine.to_numpy(derivative)
+    if derivative.ndim != 3:
+        raise InputError(f"image gave an array of shape {derivative.shape}; expected (H, W, C)")
+    largest = float(np.abs(derivative).max(initial=0.0))
+    return GradientImage(derivative, float(scale) if scale is not None else largest or 1.0)
+
+
+class Slope(NamedTuple):
+    """The derivative of a loss in one number of the parameters, found in two ways.
+
+    Attributes:
+        name: where the number is, such as "pose[2]".
+        autodiff: through the splatter.
+        difference: central finite difference of area-sampled hard renders.
+        error: how far the difference may be off: what two sampling grids and two steps disagree on.
+        step: of the difference, in units of the number.
+    """
+
+    name: str
+    autodiff: float
+    difference: float
+    error: float
+    step: float
+
+
+class GradientCheck(NamedTuple):
+    """What `check_gradient` found; as a string, a table.
+
+    Attributes:
+        slopes: one for each number that was looked at.
+        tolerance: relative to the largest difference of the same array.
+    """
+
+    slopes: list[Slope]
+    tolerance: float
+
+    def agrees(self, slope: Slope) -> bool:
+        """Whether autodiff is within the tolerance and three error bars of the difference."""
+        array = slope.name.partition("[")[0]
+        largest = max(abs(s.difference) for s in self.slopes if s.name.partition("[")[0] == array)
+        return abs(slope.autodiff - slope.difference) <= self.tolerance * largest + 3 * slope.error
+
+    @property
+    def ok(self) -> bool:
+        """Whether all agree."""
+        return all(map(self.agrees, self.slopes))
+
+    def __str__(self) -> str:
+        width = max(len(s.name) for s in self.slopes)
+        lines = [f"{'parameter':{max(width, 9)}}    autodiff  difference      ± error   ratio"]
+        for s in self.slopes:
+            ratio = f"{s.autodiff / s.difference:7.3f}" if abs(s.difference) > s.error else "      –"
+            verdict = "" if self.agrees(s) else "  differs"
+            lines.append(
+                f"{s.name:{max(width, 9)}} {s.autodiff:11.4g} {s.difference:11.4g} {s.error:12.2g} {ratio}{verdict}"
+            )
+        return "\n".join(lines)
+
+
+def check_gradient(
+    scene: Scene,
+    parameters: Tree,
+    size: tuple[int, int],
+    *,
+    loss: Callable[[Array], Array] | None = None,
+    entries: int = 6,
+    samples: int = 8,
+    tolerance: float = 0.1,
+    **options: Any,
+) -> GradientCheck:
+    """Compare the gradient of a loss of a rendered scene with finite differences, to see whether it can be trusted.
+
+    The differences are of images without splatting, of `samples`² and (`samples` + 1)² samples a pixel, over a step
+    that moves what moves fastest by one pixel, and over twice that step.
+
+    Args:
+        scene: parameters → (parts, camera).
+        parameters: a torch or jax array, or nested dicts and lists of them.
+        size: (height, width).
+        loss: image (H, W, 4) → scalar; None for a smooth random weighting of the image, with a fixed seed.
+        entries: of each array, look at so many numbers: those of largest gradient, and some at random.
+        samples: the square root of the number of samples a pixel.
+        tolerance: what is called agreement, relative to the largest slope of the same array.
+        **options: splatter, layers, supersample, background, … of `rts.render`.
+
+    Raises:
+        InputError: parameters that have no derivative, or arguments that `rts.render` refuses.
+    """
+    engine, parameters = _differentiable(parameters)
+    loss = _smooth_weighting(size, engine, parameters) if loss is None else loss
+
+    def image(p: Tree, **changes: Any) -> Array:
+        parts, camera = scene(p)
+        return render(parts, camera, size, **{**options, **changes})
+
+    _, gradient = engine.value_and_grad(lambda p: loss(image(p)))(parameters)
+    slopes = []
+    for number, ((name, value), slope) in enumerate(zip(_named(parameters), leaves(gradient), strict=True)):
+        flat = engine.to_numpy(slope).reshape(-1)
+        for index in _chosen(flat, entries):
+            direction = _unit(engine, parameters, number, index)
+            step = _step(engine, image, parameters, direction)
+            hard = partial(_difference, engine, loss, partial(image, splatter="none"), parameters, direction)
+            coarse, fine, wide = hard(step, samples), hard(step, samples + 1), hard(2 * step, samples)
+            difference = (coarse + fine) / 2
+            error = abs(coarse - fine) / 2 + abs(wide - coarse) / 3
+            place = ", ".join(map(str, np.unravel_index(index, value.shape)))
+            label = f"{name}[{place}]" if value.shape else name
+            slopes.append(Slope(label, float(flat[index]), difference, error, step))
+    return GradientCheck(slopes, tolerance)
+
+
+# --------------------------------------------------------------------------------------------------- parameters
+
+
+def _differentiable(parameters: Tree) -> tuple[Engine, Tree]:
+    """The engine of parameters that have derivatives, and the parameters, dicts in the order of `leaves`."""
+    if not any(True for _ in leaves(parameters)) or any(is_constant(x) for x in leaves(parameters)):
+        raise InputError("parameters holds NumPy arrays, numbers or nothing; expected torch or jax arrays")
+    return engine_of(parameters), map_leaves(lambda p: p, parameters)
+
+
+def _like(direction: Tree, parameters: Tree, engine: Engine) -> Tree:
+    """The direction as arrays of the engine, of the parameters' shapes."""
+    given, wanted = ([tuple(np.shape(x)) for x in leaves(t)] for t in (direction, parameters))
+    if given != wanted:
+        raise InputError(f"direction has arrays of shapes {given}; expected those of the parameters, {wanted}")
+    values = iter(leaves(direction))
+
+    def leaf(p: Array) -> Array:
+        d = next(values)
+        return namespace(p).astype(engine.constant(d, p) if is_constant(d) else d, p.dtype, copy=False)
+
+    return map_leaves(leaf, parameters)
+
+
+def _named(tree: Tree, name: str = "") -> Iterator[tuple[str, Array]]:
+    """Leaves with names, in the order of `leaves`."""
+    if isinstance(tree, Mapping):
+        for key in sorted(tree):
+            yield from _named(tree[key], f"{name}.{key}" if name else str(key))
+    elif isinstance(tree, (list, tuple)):
+        for i, item in enumerate(tree):
+            yield from _named(item, f"{name}.{i}" if name else str(i))
+    elif tree is not None:
+        yield name or "parameters", tree
+
+
+def _chosen(gradient: np.ndarray, count: int) -> list[int]:
+    """Indices of the largest entries and of some others, fixed by the seed."""
+    if gradient.size <= count:
+        return list(range(gradient.size))
+    largest = np.argsort(-np.abs(gradient), kind="stable")[: (count + 1) // 2]
+    rest = np.setdiff1d(np.arange(gradient.size), largest)
+    others = np.random.default_rng(0).choice(rest, count - len(largest), replace=False)
+    return sorted(map(int, (*largest, *others)))
+
+
+def _unit(engine: Engine, parameters: Tree, number: int, index: int) -> Tree:
+    """The direction in which one number of one leaf changes."""
+    count = iter(range(sum(1 for _ in leaves(parameters))))
+
+    def leaf(p: Array) -> Array:
+        unit = np.zeros(math.prod(p.shape))
+        unit[index if next(count) == number else slice(0)] = 1
+        return namespace(p).astype(engine.constant(unit.reshape(p.shape), p), p.dtype, copy=False)
+
+    return map_leaves(leaf, parameters)
+
+
+# ------------------------------------------------------------------------------------------- finite differences
+
+
+class _Probe:
+    """A splatter that shows where samples are on the image, and their colour."""
+
+    def __init__(self, color: bool):
+        self.color = color
+
+    def splat(self, positions: Array, rgba: Array, row: Array) -> Array:
+        xp = namespace(positions, rgba, row)
+        values = rgba if self.color else xp.concat([positions[:, :2]] * 2, axis=1)
+        index = xp.reshape(xp.where(row[0] >= 0, row[0], 0), (-1,))
+        shown = xp.reshape(xp.take(values, index, axis=0), (*row.shape[1:], 4))
+        return xp.where((row[0] >= 0)[..., None], shown, 0.0)
+
+
+def _step(engine: Engine, image: Callable, parameters: Tree, direction: Tree) -> float:
+    """A step along one number that moves the image by a pixel or, where nothing moves, changes its colour."""
+    for color, wanted in ((False, STEP_PIXELS), (True, STEP_COLOR)):
+        probe = partial(image, splatter=_Probe(color), supersample=1, background=None)
+        speed = np.abs(engine.to_numpy(engine.jvp(probe, parameters, direction)[1])).max(initial=0.0)
+        if speed > 1e-6:
+            return float(wanted / speed)
+    return 1e-2
+
+
+def _difference(
+    engine: Engine, loss: Callable, image: Callable, parameters: Tree, direction: Tree, step: float, samples: int
+) -> float:
+    """Central difference of the loss of hard images."""
+
+    def at(by: float) -> float:
+        steps = iter(leaves(direction))
+        moved = map_leaves(lambda p: p + by * next(steps), parameters)
+        return float(engine.to_numpy(loss(image(moved, supersample=samples))))
+
+    return (at(step / 2) - at(-step / 2)) / step
+
+
+def _smooth_weighting(size: tuple[int, int], engine: Engine, parameters: Tree) -> Callable[[Array], Array]:
+    """Image → the sum of its pixels with smooth random weights."""
+    weights = np.random.default_rng(0).normal(size=(*size, 4))
+    weights = gaussian_filter(weights, (LOSS_SMOOTHNESS, LOSS_SMOOTHNESS, 0))
+    weights = engine.constant(weights / weights.std(), next(leaves(parameters)))
+    return lambda image: namespace(image).sum(image * weights)

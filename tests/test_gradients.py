@@ -1,0 +1,123 @@
+"""Derivatives as pictures, and gradients beside finite differences of hard renders."""
+
+import numpy as np
+import pytest
+from helpers import DIFFERENTIABLE, arrays, quad
+
+import rts
+from rts import gradients
+
+MESH = rts.plugin("rts.surfaces", "mesh")
+CAMERA = rts.Camera.orthographic((0, 0, 10), (0, 0, 0), height=16)
+SIZE = (16, 16)
+VERTICES, FACES = quad(-4.3, 3.4, -3.1, 4.2)
+
+
+def card(parameters):
+    """A card whose colour and place are the parameters; a world unit is a pixel."""
+    xp = rts.namespace(*parameters.values())
+    vertices = arrays_like(parameters["shift"], VERTICES) + parameters["shift"]
+    colors = xp.stack([parameters["color"]] * 4)
+    return rts.Part(MESH(FACES), {"vertices": vertices, "colors": colors}, "unlit"), CAMERA
+
+
+def arrays_like(x, value):
+    return rts.arrays.engine_of(x).constant(value, x)
+
+
+def parameters_of(target):
+    return arrays(target, {"shift": np.array([0.1, 0.2, 0.0]), "color": np.array([0.8, 0.5, 0.2])})
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_a_right_gradient_agrees_with_the_difference(target):
+    check = rts.check_gradient(card, parameters_of(target), SIZE, supersample=4)
+    assert check.ok
+    names = [s.name for s in check.slopes]
+    assert names == ["color[0]", "color[1]", "color[2]", "shift[0]", "shift[1]", "shift[2]"]
+    for s in check.slopes:
+        assert abs(s.autodiff - s.difference) <= 0.05 * abs(s.difference) + 3 * s.error
+    assert check.slopes[5].difference == pytest.approx(0, abs=1e-6)  # Orthographic: depth is not seen.
+
+
+def test_gradients_that_miss_the_silhouette_are_shown_to_differ():
+    check = rts.check_gradient(card, parameters_of("torch-cpu"), SIZE, splatter="none")
+    by_name = {s.name: s for s in check.slopes}
+    assert not check.ok
+    assert by_name["shift[0]"].autodiff == 0 and not check.agrees(by_name["shift[0]"])
+    assert check.agrees(by_name["color[0]"])
+    row = next(line for line in str(check).splitlines() if line.startswith("shift[0]"))
+    assert row.endswith("differs")
+
+
+def test_the_difference_is_that_of_the_area():
+    # Loss = the sum of the image, so that the slope of the shift is 0 and of the colour the card's area.
+    check = rts.check_gradient(card, parameters_of("torch-cpu"), SIZE, loss=lambda image: image[..., :3].sum())
+    by_name = {s.name: s for s in check.slopes}
+    assert by_name["color[1]"].difference == pytest.approx(7.7 * 7.3, rel=0.02)
+    assert by_name["shift[1]"].difference == pytest.approx(0, abs=max(3 * by_name["shift[1]"].error, 1e-3))
+
+
+def test_only_some_numbers_of_large_arrays_are_looked_at():
+    def scene(vertices):
+        return rts.Part(MESH(FACES), {"vertices": vertices}), CAMERA
+
+    check = rts.check_gradient(scene, arrays("torch-cpu", VERTICES), SIZE, entries=3, samples=3)
+    assert len(check.slopes) == 3 and all(s.name.startswith("parameters[") for s in check.slopes)
+    assert len({s.name for s in check.slopes}) == 3
+
+
+def test_a_step_moves_what_moves_fastest_by_a_pixel():
+    check = rts.check_gradient(card, parameters_of("torch-cpu"), SIZE, samples=2)
+    by_name = {s.name: s for s in check.slopes}
+    assert by_name["shift[0]"].step == pytest.approx(gradients.STEP_PIXELS, rel=1e-4)
+    assert by_name["color[0]"].step == pytest.approx(gradients.STEP_COLOR, rel=1e-4)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_a_gradient_image_is_the_derivative_along_a_direction(target):
+    parameters = parameters_of(target)
+    found = rts.gradient_image(
+        lambda p: rts.render(*card(p), SIZE), parameters, {"color": [0, 0, 0], "shift": [1.0, 0, 0]}
+    )
+    assert found.derivative.shape == (16, 16, 4)
+    np.testing.assert_allclose(found.derivative[6:9, 8:, 3].sum(axis=1), 1, atol=2e-3)
+    np.testing.assert_allclose(found.derivative[6:9, :8, 3].sum(axis=1), -1, atol=2e-3)
+    assert found.scale == pytest.approx(np.abs(found.derivative).max())
+
+
+def test_a_signed_picture_is_grey_where_nothing_changes(tmp_path):
+    from PIL import Image
+
+    along = {"color": [0, 0, 0], "shift": [1.0, 0, 0]}
+    found = rts.gradient_image(lambda p: rts.render(*card(p), SIZE), parameters_of("torch-cpu"), along, scale=0.5)
+    rts.save_image(tmp_path / "signed.png", found.picture)
+    pixels = np.asarray(Image.open(tmp_path / "signed.png"))
+    assert set(map(tuple, pixels[:2].reshape(-1, 3))) <= {(127, 127, 127), (128, 128, 128)}
+    assert pixels[8, 8:, 0].max() > 150 and pixels[8, :8, 0].min() < 100
+
+
+def test_one_number_needs_no_direction():
+    torch = pytest.importorskip("torch")
+    base = parameters_of("torch-cpu")
+    shift = torch.tensor([1.0, 0, 0])
+    found = rts.gradient_image(
+        lambda t: rts.render(*card({**base, "shift": base["shift"] + t * shift}), SIZE), torch.tensor(0.0)
+    )
+    assert found.derivative[8, 8:, 3].sum() == pytest.approx(1, abs=2e-3)
+
+
+@pytest.mark.parametrize("call", [lambda p: rts.check_gradient(card, p, SIZE), lambda p: rts.gradient_image(card, p)])
+def test_parameters_without_derivative_are_refused(call):
+    with pytest.raises(rts.InputError, match="expected torch or jax arrays"):
+        call({"shift": np.zeros(3)})
+
+
+def test_a_direction_that_does_not_fit_is_refused():
+    parameters = parameters_of("torch-cpu")
+    with pytest.raises(rts.InputError, match="give the direction"):
+        rts.gradient_image(card, parameters)
+    with pytest.raises(rts.InputError, match="direction has arrays of shapes"):
+        rts.gradient_image(card, parameters, {"color": [0.0, 0, 0], "shift": [0.0, 0]})
+    with pytest.raises(rts.InputError, match=r"expected \(H, W, C\)"):
+        rts.gradient_image(lambda p: p["shift"], parameters, {"color": [0.0, 0, 0], "shift": [0.0, 0, 1]})
