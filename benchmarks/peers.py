@@ -6,51 +6,25 @@
 - Mitsuba 3, `direct_projective` (Zhang et al. 2023), forward mode: Monte Carlo, noisier the fewer samples a pixel.
   Every mesh is an area emitter of its vertex colours on a black material, which gives flat colours.
 
-Both see the fronts of triangles only. Neither is a dependency:
-
-    pip install -c constraints.txt deodr==0.2.3 mitsuba==3.9.1
-
-Mitsuba compiles with the shared library of LLVM: 16 or newer (Debian's libllvm19), which DRJIT_LIBLLVM_PATH may name.
-
-    python benchmarks/peers.py -o out/peers
+Both see the fronts of triangles only. They come with the extra `bench`; Mitsuba also compiles with the shared library
+of LLVM: 16 or newer (Debian's libllvm19), which DRJIT_LIBLLVM_PATH may name.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import tempfile
-import time
 from functools import cache
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # Spinning threads of two libraries take each other's cores.
 
 import derivative_scenes as ds
 import numpy as np
 from scenes import DISTANCE, FOV
-from truth import STEPS, loss_weights, scores, truth
 
 STEP = 1e-6
 """Length of DEODR's difference, pixels."""
-WARM_UP = 2
-"""Samples a pixel of the render that compiles Mitsuba's kernels."""
-
-
-class Derivative(NamedTuple):
-    """What a renderer gives: the derivative image (H, W, 3) a pixel of motion, and how long it took."""
-
-    image: np.ndarray
-    seconds: float
-
-
-class Gradient(NamedTuple):
-    """The slope dL/dt of a loss through the gradient in every vertex, and the seconds of render and gradient."""
-
-    slope: float
-    seconds: float
 
 
 def displacement(scene: ds.Scene) -> list[np.ndarray]:
@@ -92,26 +66,16 @@ class Deodr:
         self.scene.mesh.set_vertices(self.vertices + t * self.displacement)
         return self.scene.render(self.camera)
 
+    def derivative(self) -> np.ndarray:
+        """The derivative image (H, W, 3) a pixel of motion."""
+        return (self.render(STEP / 2) - self.render(-STEP / 2)) / STEP
 
-def deodr_derivative(scene: ds.Scene) -> Derivative:
-    """The derivative image of DEODR; its seconds are those of two renders."""
-    renderer = Deodr(scene)
-    renderer.render(0.0)
-    start = time.perf_counter()
-    image = (renderer.render(STEP / 2) - renderer.render(-STEP / 2)) / STEP
-    return Derivative(image, time.perf_counter() - start)
-
-
-def deodr_gradient(scene: ds.Scene, weights: np.ndarray) -> Gradient:
-    """Of the loss Σ weights · image, weights (H, W, 3), by DEODR's reverse mode."""
-    renderer = Deodr(scene)
-    renderer.render(0.0)
-    start = time.perf_counter()
-    renderer.render(0.0)
-    renderer.scene.clear_gradients()
-    renderer.scene.render_backward(np.array(weights))  # It overwrites what it is given.
-    seconds = time.perf_counter() - start
-    return Gradient(float((renderer.scene.mesh._vertices_b * renderer.displacement).sum()), seconds)
+    def gradient(self, weights: np.ndarray) -> float:
+        """Reverse mode: the slope dL/dt of L = Σ weights · image, by the gradient in every vertex."""
+        self.render(0.0)
+        self.scene.clear_gradients()
+        self.scene.render_backward(np.array(weights))  # It overwrites what it is given.
+        return float((self.scene.mesh._vertices_b * self.displacement).sum())
 
 
 # ------------------------------------------------------------------------------------------------------------- Mitsuba
@@ -127,7 +91,7 @@ def mitsuba() -> Any:
     version = drjit.detail.llvm_version()
     if version < (16,):
         # Older ones know no fmaximum, and end the process instead of raising.
-        raise SystemExit(f"LLVM {version[0]} was found; Mitsuba needs 16 or newer, see DRJIT_LIBLLVM_PATH")
+        raise ImportError(f"LLVM {version[0]} was found; Mitsuba needs 16 or newer, see DRJIT_LIBLLVM_PATH")
     drjit.set_log_level(drjit.LogLevel.Error)
     mitsuba.set_log_level(mitsuba.LogLevel.Error)
     return mitsuba
@@ -185,7 +149,7 @@ class Mitsuba:
         return np.array(dr.grad(image))
 
     def gradient(self, weights: np.ndarray, spp: int, seed: int) -> float:
-        """Reverse mode, to every vertex that moves."""
+        """Reverse mode: the slope dL/dt of L = Σ weights · image, by the gradient in every vertex that moves."""
         import drjit as dr
 
         vertices = [v + 0 for v in self.vertices]
@@ -212,69 +176,3 @@ def _emitter(mi: Any, part: Any, path: str) -> dict:
         "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
         "emitter": {"type": "area", "radiance": {"type": "mesh_attribute", "name": "vertex_color"}},
     }
-
-
-def mitsuba_derivative(scene: ds.Scene, spp: int, seed: int = 0) -> Derivative:
-    """The derivative image of Mitsuba with `spp` samples a pixel, of the interior and of the outlines each."""
-    renderer = Mitsuba(scene)
-    renderer.derivative(WARM_UP, seed + 1)
-    start = time.perf_counter()
-    image = renderer.derivative(spp, seed)
-    return Derivative(image, time.perf_counter() - start)
-
-
-def mitsuba_gradient(scene: ds.Scene, weights: np.ndarray, spp: int, seed: int = 0) -> Gradient:
-    """Of the loss Σ weights · image, weights (H, W, 3), by Mitsuba's reverse mode."""
-    renderer = Mitsuba(scene)
-    renderer.gradient(weights, WARM_UP, seed + 1)
-    start = time.perf_counter()
-    slope = renderer.gradient(weights, spp, seed)
-    return Gradient(slope, time.perf_counter() - start)
-
-
-def main() -> None:
-    """Scores of both, and their times."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, default=Path("out/peers"))
-    parser.add_argument("--truth", type=Path, default=Path("out/truth"), help="where truths are kept")
-    parser.add_argument("--scenes", nargs="+", choices=ds.SCENES, default=["A", "B", "C"])
-    parser.add_argument("--spp", nargs="*", type=int, default=[4, 16, 64], help="of Mitsuba; none to leave it out")
-    args = parser.parse_args()
-    args.output.mkdir(parents=True, exist_ok=True)
-    print(
-        "relative L2 and cosine raw, relative L2 and gain low-passed, error of slopes; against differences of each step"
-    )
-    table: dict[str, dict] = {}
-    for name in args.scenes:
-        scene = ds.scene(name)
-        weights = loss_weights(*scene.size)[0]
-        runs = {"DEODR": (lambda: deodr_derivative(scene), lambda: deodr_gradient(scene, weights))}  # noqa: B023
-        for spp in args.spp:
-            runs[f"Mitsuba, {spp} spp"] = (
-                lambda spp=spp: mitsuba_derivative(scene, spp),  # noqa: B023
-                lambda spp=spp: mitsuba_gradient(scene, weights, spp),  # noqa: B023
-            )
-        for label, (derivative, gradient) in runs.items():
-            found, cost = derivative(), gradient()
-            row: dict[str, Any] = {"seconds": found.seconds, "gradient_seconds": cost.seconds, "slope": cost.slope}
-            row["slope_of_image"] = float((weights * found.image).sum())
-            for step in STEPS:
-                row[f"step {step:g}"] = scores(found.image, truth(scene, args.truth, step))
-            table[f"{name}, {label}"] = row
-            print(
-                f"{name}, {label:18} {found.seconds:7.2f} s, gradient {cost.seconds:7.2f} s",
-                *(
-                    f"| {step:g} px: {s['relative_l2']:.3f} {s['cosine']:.3f}  {s['low_relative_l2']:.3f}"
-                    f" {s['low_gain']:.3f}  {s['loss_error']:.3f}"
-                    for step in STEPS
-                    for s in (row[f"step {step:g}"],)
-                ),
-                f"| slope {cost.slope:.4g}, of the image {row['slope_of_image']:.4g}",
-                flush=True,
-            )
-    (args.output / "peers.json").write_text(json.dumps(table, indent=2))
-    print(f"wrote {args.output}/peers.json")
-
-
-if __name__ == "__main__":
-    main()
