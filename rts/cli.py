@@ -196,7 +196,8 @@ def render(
     engine: Annotated[str, typer.Option(help="numpy, torch or jax.")] = "numpy",
     layers: Annotated[int, typer.Option(help="Surface layers kept at each pixel.")] = 2,
     shader: Annotated[str, typer.Option(help="Name of a shader; auto is the model's own.")] = "auto",
-    splatter: Annotated[str, typer.Option(help="Name of a splatter: multi, single or none.")] = "auto",
+    splatter: Annotated[str, typer.Option(help="Name of a splatter: visible, multi, single or none.")] = "auto",
+    supersample: Annotated[int, typer.Option(help="Samples along each side of a pixel.")] = 1,
     background: Annotated[str, typer.Option(help="A colour's name, #rrggbb, or none: transparent.")] = "none",
     cull: Annotated[str, typer.Option(help="none, or back to leave out triangles seen from behind.")] = "none",
 ) -> None:
@@ -230,6 +231,7 @@ def render(
         sampler=sampler,
         splatter=splatter,
         layers=layers,
+        supersample=supersample,
         background=color,
     )
     seconds = time.perf_counter() - start
