@@ -1,0 +1,54 @@
+"""The splatters of `rts.splatting`, compiled for the CPU; what does not fit is left to the specification.
+
+What fits is float32 or float64 in the memory of the host, NumPy's or torch's. Second derivatives are those of the
+specification.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from rts import splatting
+from rts.arrays import engine_of
+from rts.protocols import Array
+from rts_backends.fused_kernels import Settings, Splats
+
+
+class _Fused(splatting.Kernel):
+    """`accumulate` by compiled kernels, before a class of `rts.splatting` in the order of bases."""
+
+    kind: ClassVar[str]
+
+    def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
+        """See `rts.splatting.Kernel`."""
+        specification = super().accumulate  # pyright: ignore[reportAbstractUsage]
+        settings = Settings(self.kind, self.sigma, self.epsilon, self.gamma)
+        engine = engine_of(positions, rgba, row).name
+        if engine == "torch":
+            from rts_backends import fused_torch
+
+            if fused_torch.fits(positions, rgba, row):
+                return fused_torch.splat(settings, specification, positions, rgba, row)
+        elif engine == "numpy" and positions.dtype == rgba.dtype and positions.dtype in (np.float32, np.float64):
+            return Splats(settings, positions, rgba, row).image()
+        return specification(positions, rgba, row)
+
+
+class Single(_Fused, splatting.Single):
+    """`rts.splatting.Single`."""
+
+    kind = "single"
+
+
+class Multi(_Fused, splatting.Multi):
+    """`rts.splatting.Multi`."""
+
+    kind = "multi"
+
+
+class Visible(_Fused, splatting.Visible):
+    """`rts.splatting.Visible`."""
+
+    kind = "visible"

@@ -1,0 +1,204 @@
+"""The splatters of `rts.splatting` and their first derivatives as compiled loops on all cores, NumPy in and out.
+
+Every target collects from its nine sources, and in the reverse direction every source from its nine targets, each in
+one fixed order: results do not depend on the number of threads. Most targets are plain (`fused_stencil`); what is
+decided for the others, the mixed ones (`fused_mixed`), is decided once and kept in `Splats`.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from rts.errors import InputError
+from rts.splatting import CONTINUED, OFFSETS
+from rts_backends import fused_choices as choosing
+from rts_backends import fused_mixed as mixed
+from rts_backends import fused_stencil as stencil
+from rts_backends.threads import parallel
+
+
+class Settings(NamedTuple):
+    """One of the splatters, as numbers.
+
+    Attributes:
+        kind: "single", "multi" or "visible".
+        sigma: standard deviation, pixels.
+        epsilon: excess of the weights' sum over one.
+        gamma: the calibration.
+    """
+
+    kind: str
+    sigma: float
+    epsilon: float
+    gamma: float
+
+
+class Choices(NamedTuple):
+    """The targets whose sources are not all paired front to front, and which layers these take.
+
+    Attributes:
+        mixed: (H, W) uint8, 1 at such targets.
+        offsets: (H + 1,) int64, where each row's begin in the lists.
+        columns: (M,) int32, their columns.
+        ranges: (M, 9, 3, 2), first and last + 1 of the layers that each source gives to each buffer; source 3 (v + 1) +
+            (u + 1) lies at −(u, v), and the buffers are in front, at the surface, behind.
+    """
+
+    mixed: np.ndarray
+    offsets: np.ndarray
+    columns: np.ndarray
+    ranges: np.ndarray
+
+
+class Splats:
+    """Samples in their cells, to be splatted, pulled back and pushed forward.
+
+    Args:
+        settings: of the splatter.
+        positions: (N, 3) float32 or float64, pixel position and linear depth.
+        rgba: (N, 4), of the same dtype, premultiplied colours.
+        row: (K, H, W) signed integers, the sample of each cell, negative where there is none.
+
+    Raises:
+        InputError: `row` refers to a sample that is not there.
+    """
+
+    def __init__(self, settings: Settings, positions: np.ndarray, rgba: np.ndarray, row: np.ndarray):
+        row = row[:1] if settings.kind == "single" else row
+        if row.size and row.max() >= len(positions):
+            raise InputError(f"row refers to sample {row.max()} of {len(positions)}; expected indices below that")
+        self.positions, self.rgba, self.row = _frozen(positions), _frozen(rgba), _frozen(row, np.int32)
+        self.visible = settings.kind == "visible"
+        scale = 1 / (2 * settings.sigma**2)
+        peak = math.sqrt(1 + settings.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
+        self._numbers = tuple(positions.dtype.type(x) for x in (scale, peak, settings.gamma))
+
+    @property
+    def _stencil(self) -> tuple:
+        """Arguments of the stencil's kernels; of `visible` no plain target takes a hidden layer."""
+        return self.positions, self.rgba, self.row[:1] if self.visible else self.row, *self._numbers
+
+    @property
+    def _mixed(self) -> tuple:
+        return self.positions, self.rgba, self.row, *self._numbers, *self.choices[1:]
+
+    @cached_property
+    def choices(self) -> Choices:
+        """What is decided for mixed targets."""
+        layers, height, width = self.row.shape
+        marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
+        z = np.empty((layers, height + 2, width + 2), self.positions.dtype)
+        beyond = z.dtype.type(1)
+        if layers > 1:
+            farthest = np.empty(height, z.dtype)
+            parallel(choosing.depths, height, self.positions, self.row, z, farthest)
+            beyond = 2 * farthest.max() if farthest.max() > 0 else beyond
+            z[:, 0] = z[:, -1] = np.nan
+            parallel(choosing.fill, height, beyond, z)
+            parallel(choosing.find, height, self.row, self.visible, beyond, z, marks, counts)
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        columns = np.empty(offsets[-1], np.int32)
+        ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
+        if len(columns):
+            continued = z.dtype.type(CONTINUED)  # An argument, since compiled code that is cached would keep its value.
+            parallel(
+                choosing.choose, height, self.row, self.visible, continued, beyond, z, marks, offsets, columns, ranges
+            )
+        return Choices(marks, offsets, columns, ranges)
+
+    def image(self) -> np.ndarray:
+        """(H, W, 4) premultiplied."""
+        _, height, width = self.row.shape
+        image = np.empty((height, width, 4), self.positions.dtype)
+        if image.size:
+            parallel(stencil.forward, height, *self._stencil, image)
+            if len(self.choices.columns):
+                parallel(mixed.forward, height, *self._mixed, image)
+        return image
+
+    def vjp(
+        self, g: np.ndarray, wanted: tuple[bool, bool] = (True, True)
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Gradients of positions (N, 3) and rgba (N, 4) from the image's (H, W, 4); None where not wanted."""
+        _, height, _ = self.row.shape
+        if self._repeated:
+            return self._vjp_of_repeated(g, wanted)
+        found = tuple(
+            np.zeros((len(x) if wish else 0, x.shape[1]), x.dtype)
+            for x, wish in zip((self.positions, self.rgba), wanted, strict=True)
+        )
+        if self.row.size:
+            g = _frozen(g)
+            parallel(stencil.pull, height, *self._stencil, self.choices.mixed, g, *found)
+            if count := len(self.choices.columns):
+                adjoints = np.empty((count, 3, 5), g.dtype)
+                parallel(mixed.adjoint, height, *self._mixed, g, adjoints)
+                parallel(mixed.pull, height, *self._mixed, adjoints, *found)
+        return found[0] if wanted[0] else None, found[1] if wanted[1] else None
+
+    def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None) -> np.ndarray:
+        """Tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4); None for zeros."""
+        _, height, width = self.row.shape
+        count = next(len(t) for t in (t_positions, t_rgba) if t is not None)
+        out = np.empty((count, height, width, 4), self.positions.dtype)
+        if out.size:
+            tangents = tuple(
+                _frozen(np.empty((count, 0, size), out.dtype) if t is None else t)
+                for t, size in ((t_positions, 3), (t_rgba, 4))
+            )
+            parallel(stencil.push, height, *self._stencil, *tangents, out)
+            if len(self.choices.columns):
+                parallel(mixed.push, height, *self._mixed, *tangents, out)
+        return out
+
+    @cached_property
+    def _repeated(self) -> bool:
+        """Whether a sample stands in several cells, which would add to its gradient at the same time."""
+        counts, seen = np.zeros(self.row.shape[1], np.int64), np.zeros(len(self.positions), np.uint8)
+        parallel(_mark, len(counts), self.row, seen, counts)
+        return int(np.count_nonzero(seen)) != int(counts.sum())
+
+    def _vjp_of_repeated(self, g: np.ndarray, wanted: tuple[bool, bool]) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """`vjp` with a copy of the sample for each cell, whose gradients are then added in the order of the cells."""
+        covered = self.row >= 0
+        index = self.row[covered]
+        own = np.full(self.row.shape, -1, np.int32)
+        own[covered] = np.arange(len(index), dtype=np.int32)
+        copy = object.__new__(Splats)
+        copy.__dict__.update(self.__dict__, _repeated=False, row=_frozen(own))
+        copy.positions, copy.rgba = _frozen(self.positions[index]), _frozen(self.rgba[index])
+        g_positions, g_rgba = copy.vjp(g, wanted)
+        return _collected(g_positions, index, self.positions), _collected(g_rgba, index, self.rgba)
+
+
+def _collected(values: np.ndarray | None, index: np.ndarray, like: np.ndarray) -> np.ndarray | None:
+    """Sums of the rows of `values` that share an index."""
+    if values is None:
+        return None
+    total = np.zeros_like(like)
+    np.add.at(total, index, values)
+    return total
+
+
+@numba.njit(cache=True, nogil=True)
+def _mark(start, stop, row, seen, counts):
+    """Mark the samples that cells of rows [start, stop) refer to, and count these cells."""
+    layers, _, width = row.shape
+    for y in range(start, stop):
+        for k in range(layers):
+            for x in range(width):
+                if row[k, y, x] >= 0:
+                    seen[row[k, y, x]] = 1
+                    counts[y] += 1
+
+
+def _frozen(x: np.ndarray, dtype: type | None = None) -> np.ndarray:
+    """A contiguous view, copied only if it has to be; always read-only, so that kernels are compiled but once."""
+    view = np.ascontiguousarray(x, dtype).view()
+    view.flags.writeable = False
+    return view

@@ -1,0 +1,160 @@
+"""The splatters where layers of different surfaces meet, target by target, by the lists of `fused_choices`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts_backends.fused_rows import compiled, exp, kernel
+
+
+@compiled
+def _splat(positions, i, y, x, u, v, scale, peak, gamma):
+    """Weight of sample i of cell (y, x) at offset (u, v), and how far the target lies from it along x and y."""
+    kind, half = positions.dtype.type, positions.dtype.type(0.5)
+    dx = kind(u) - gamma * (positions[i, 0] - (kind(x) + half))
+    dy = kind(v) - gamma * (positions[i, 1] - (kind(y) + half))
+    return peak * peak * exp(-(dx * dx + dy * dy) * scale), dx, dy
+
+
+@compiled
+def _sums(total, positions, rgba, row, y, x, choice, scale, peak, gamma):
+    """Sums (3, 5) of a target's buffers, their colours over the weight, taken as at least one."""
+    _, height, width = row.shape
+    one = total.dtype.type(1)
+    total[:] = total.dtype.type(0)
+    for n in range(9):
+        v, u = n // 3 - 1, n % 3 - 1
+        py, px = y - v, x - u
+        if not (0 <= py < height and 0 <= px < width):
+            continue
+        for b in range(3):
+            for k in range(choice[n, b, 0], choice[n, b, 1]):
+                i = row[k, py, px]
+                if i >= 0:
+                    w, _, _ = _splat(positions, i, py, px, u, v, scale, peak, gamma)
+                    for c in range(4):
+                        total[b, c] += w * rgba[i, c]
+                    total[b, 4] += w
+    for b in range(3):
+        over = one / max(total[b, 4], one)
+        for c in range(4):
+            total[b, c] *= over
+
+
+@kernel
+def forward(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, image):
+    """Mixed targets of rows [start, stop) of the image (H, W, 4)."""
+    total = np.empty((3, 5), image.dtype)
+    one = image.dtype.type(1)
+    for y in range(start, stop):
+        for d in range(offsets[y], offsets[y + 1]):
+            x = columns[d]
+            _sums(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
+            for c in range(4):
+                back = total[1, c] + (one - total[1, 3]) * total[2, c]
+                image[y, x, c] = total[0, c] + (one - total[0, 3]) * back
+
+
+@kernel
+def adjoint(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, g, adjoints):
+    """Adjoints (M, 3, 5) of the sums of mixed targets from that of the image."""
+    zero, one = g.dtype.type(0), g.dtype.type(1)
+    total = np.empty((3, 5), g.dtype)
+    for y in range(start, stop):
+        for d in range(offsets[y], offsets[y + 1]):
+            x, a = columns[d], adjoints[d]
+            _sums(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
+            shown, through = one - total[0, 3], (one - total[0, 3]) * (one - total[1, 3])
+            front, surface = zero, zero
+            for c in range(4):
+                front += g[y, x, c] * (total[1, c] + (one - total[1, 3]) * total[2, c])
+                surface += g[y, x, c] * total[2, c]
+                a[0, c], a[1, c], a[2, c] = g[y, x, c], shown * g[y, x, c], through * g[y, x, c]
+            a[0, 3] -= front
+            a[1, 3] -= shown * surface
+            for b in range(3):
+                over, dot = one / max(total[b, 4], one), zero
+                for c in range(4):
+                    dot += a[b, c] * total[b, c]
+                    a[b, c] *= over
+                a[b, 4] = zero if total[b, 4] < one else -dot * over
+
+
+@kernel
+def pull(
+    start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, adjoints, g_positions, g_rgba
+):
+    """Add to the gradients of the samples of source rows [start, stop) what mixed targets give."""
+    _, height, width = row.shape
+    slope = positions.dtype.type(2) * scale * gamma
+    for y in range(start, stop):
+        for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
+            for d in range(offsets[y + v], offsets[y + v + 1]):
+                for u in range(-1, 2):
+                    x, n = columns[d] - u, 3 * (v + 1) + u + 1
+                    if not 0 <= x < width:
+                        continue
+                    for b in range(3):
+                        for k in range(choices[d, n, b, 0], choices[d, n, b, 1]):
+                            i = row[k, y, x]
+                            if i < 0:
+                                continue
+                            w, dx, dy = _splat(positions, i, y, x, u, v, scale, peak, gamma)
+                            h = adjoints[d, b, 4]
+                            for c in range(4):
+                                h += adjoints[d, b, c] * rgba[i, c]
+                                if len(g_rgba) > 0:
+                                    g_rgba[i, c] += w * adjoints[d, b, c]
+                            if len(g_positions) > 0:
+                                g_positions[i, 0] += slope * w * h * dx
+                                g_positions[i, 1] += slope * w * h * dy
+
+
+@kernel
+def push(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, t_positions, t_rgba, out):
+    """Mixed targets of rows [start, stop) of the tangents (T, H, W, 4)."""
+    one = out.dtype.type(1)
+    total, changes = np.empty((3, 5), out.dtype), np.empty((len(out), 3, 5), out.dtype)
+    for y in range(start, stop):
+        for d in range(offsets[y], offsets[y + 1]):
+            x = columns[d]
+            _sums(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
+            _changes(changes, total, positions, rgba, row, y, x, choices[d], scale, peak, gamma, t_positions, t_rgba)
+            for t in range(len(out)):
+                change = changes[t]
+                for c in range(4):
+                    back = total[1, c] + (one - total[1, 3]) * total[2, c]
+                    d_back = change[1, c] - change[1, 3] * total[2, c] + (one - total[1, 3]) * change[2, c]
+                    out[t, y, x, c] = change[0, c] - change[0, 3] * back + (one - total[0, 3]) * d_back
+
+
+@compiled
+def _changes(changes, total, positions, rgba, row, y, x, choice, scale, peak, gamma, t_positions, t_rgba):
+    """Tangents (T, 3, 5) of the normalised sums of a target's buffers."""
+    _, height, width = row.shape
+    zero, one = total.dtype.type(0), total.dtype.type(1)
+    slope = total.dtype.type(2) * scale * gamma
+    moved, tinted = t_positions.shape[1] > 0, t_rgba.shape[1] > 0
+    changes[:] = zero
+    for n in range(9):
+        v, u = n // 3 - 1, n % 3 - 1
+        py, px = y - v, x - u
+        if not (0 <= py < height and 0 <= px < width):
+            continue
+        for b in range(3):
+            for k in range(choice[n, b, 0], choice[n, b, 1]):
+                i = row[k, py, px]
+                if i < 0:
+                    continue
+                w, dx, dy = _splat(positions, i, py, px, u, v, scale, peak, gamma)
+                for t in range(len(changes)):
+                    dw = slope * w * (dx * t_positions[t, i, 0] + dy * t_positions[t, i, 1]) if moved else zero
+                    for c in range(4):
+                        changes[t, b, c] += dw * rgba[i, c] + (w * t_rgba[t, i, c] if tinted else zero)
+                    changes[t, b, 4] += dw
+    for b in range(3):
+        over = one / max(total[b, 4], one)
+        for t in range(len(changes)):
+            grown = zero if total[b, 4] < one else changes[t, b, 4]
+            for c in range(4):
+                changes[t, b, c] = (changes[t, b, c] - grown * total[b, c]) * over

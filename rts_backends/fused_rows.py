@@ -1,0 +1,152 @@
+"""Rows of cells and of buffers as planes of numbers, which the plain part of the compiled splatters works on.
+
+A task owns a band of rows and works through it in tiles of columns. A row of a tile is kept as planes of `PITCH`
+numbers in one flat array, whose places are constants: that is what lets the compiler see that planes do not overlap,
+and use vector instructions. Source rows roll through three slots; a target row is finished when the source row below
+it has been read.
+
+Buffers here are one or two: the surface, which takes the front layers, and, where `row` has more layers, what is behind
+it, which takes all the others.
+
+Helpers are not cached on disk, only the kernels that call them (see `rts_backends.triangles`): after a change here,
+touch the files of the kernels.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numba import types
+from numba.extending import overload
+
+TILE = 128
+PITCH = TILE + 8
+"""A plane holds a row of a tile, and up to two cells more at each end."""
+
+COLOR, ONE, WX, WY, RX, RY, SOURCE = (PITCH * p for p in (0, 4, 5, 8, 11, 12, 13))
+"""Places in a source's slot: colour, 1 if covered, weights by u and by v, offset from the cell's centre."""
+
+SUM, SUMS = 5 * PITCH, 10 * PITCH
+"""Of a buffer, and of both: colours and the weight."""
+
+compiled = numba.njit(nogil=True, fastmath={"contract"})
+kernel = numba.njit(nogil=True, fastmath={"contract"}, cache=True)
+
+_F = [np.float32(1 / math.factorial(i)) for i in range(8)]
+_ONE, _F2, _F3, _F4, _F5, _F6, _F7 = _F[1:]
+_LOWEST, _LOG2E, _ROUND = np.float32(-87), np.float32(1 / math.log(2)), np.float32(1.5 * 2**23)
+_LN2_HIGH, _LN2_LOW = np.float32(0.693359375), np.float32(math.log(2) - 0.693359375)
+_MANTISSA, _BIAS = np.int32(23), np.int32(127 << 23)
+
+
+def exp(x):
+    """The exponential of a number of at most 0; in float32 by arithmetic alone, so that loops become vector code."""
+    return math.exp(x)
+
+
+@overload(exp)
+def _exp(x):
+    if x != types.float32:
+        return lambda x: math.exp(x)
+
+    def single(x):
+        x = _LOWEST if x < _LOWEST else x
+        # Adding 1.5 · 2²³ rounds to an integer, which is then found in the lowest bits.
+        shifted = np.float32(x * _LOG2E + _ROUND)
+        n = shifted - _ROUND
+        r = (x - n * _LN2_HIGH) - n * _LN2_LOW
+        power = np.int32((shifted.view(np.int32) << _MANTISSA) + _BIAS)
+        series = _F3 + r * (_F4 + r * (_F5 + r * (_F6 + r * _F7)))
+        return (_ONE + r * (_ONE + r * (_F2 + r * series))) * power.view(np.float32)
+
+    return single
+
+
+# Helpers are handed views: the compiler then knows that no index is negative, as which it would be from the end.
+
+
+@compiled
+def slot(s, k, y, size):
+    """The slot of layer k in row y ≥ −2."""
+    start = (3 * k + (y + 3) % 3) * size
+    return s[start : start + size]
+
+
+@compiled
+def tile(width, t):
+    """First column and number of columns of tile t."""
+    count = (width + TILE - 1) // TILE
+    return width * t // count, width * (t + 1) // count - width * t // count
+
+
+@compiled
+def load(s, positions, rgba, row, k, y, first, count, scale, peak, gamma):
+    """Fill a source's slot with cells first, …, first + count − 1 of a row; cells outside the image are empty."""
+    zero, half = s.dtype.type(0), s.dtype.type(0.5)
+    _, height, width = row.shape
+    for j in range(count):
+        x = first + j
+        i = row[k, y, x] if 0 <= y < height and 0 <= x < width else -1
+        if i >= 0:
+            s[RX + j] = gamma * (positions[i, 0] - (s.dtype.type(x) + half))
+            s[RY + j] = gamma * (positions[i, 1] - (s.dtype.type(y) + half))
+            for c in range(4):
+                s[c * PITCH + j] = rgba[i, c]
+            s[ONE + j] = s.dtype.type(1)
+        else:
+            s[RX + j] = s[RY + j] = zero
+            for c in range(5):
+                s[c * PITCH + j] = zero
+    for axis in range(2):
+        for u in range(3):
+            for j in range(count):
+                d = s.dtype.type(u - 1) - s[RX + axis * PITCH + j]
+                s[WX + (3 * axis + u) * PITCH + j] = peak * exp(-(d * d) * scale)
+
+
+@compiled
+def add_row(to, s, v, count):
+    """Add a source row's splats to a buffer's row; v leads from source to target; target j lies over source j + 1."""
+    wy = s[WY + (v + 1) * PITCH :]
+    for j in range(count):
+        w0, w1, w2 = s[WX + 2 * PITCH + j] * wy[j], s[WX + PITCH + j + 1] * wy[j + 1], s[WX + j + 2] * wy[j + 2]
+        for c in range(5):
+            p = c * PITCH + j
+            to[p] += w0 * s[p] + w1 * s[p + 1] + w2 * s[p + 2]
+
+
+@compiled
+def normalised_sums(total, sources, layers, y, count):
+    """Both buffers of target row y: colours over the weight, taken as at least one, and the weight."""
+    one = total.dtype.type(1)
+    total[: min(layers, 2) * SUM] = total.dtype.type(0)
+    for k in range(layers):
+        for v in range(-1, 2):
+            add_row(total[SUM:] if k > 0 else total, slot(sources, k, y - v, SOURCE), v, count)
+    for b in range(min(layers, 2)):
+        s = total[b * SUM :]
+        for j in range(count):
+            over = one / max(s[ONE + j], one)
+            for c in range(4):
+                s[c * PITCH + j] *= over
+
+
+@compiled
+def composite(total, layers, count):
+    """The image, over the surface's colours."""
+    one = total.dtype.type(1)
+    if layers > 1:
+        for j in range(count):
+            through = one - total[3 * PITCH + j]
+            for c in range(4):
+                total[c * PITCH + j] += through * total[SUM + c * PITCH + j]
+
+
+@compiled
+def store(image, y, left, s, count):
+    """Write planes to a row of an image."""
+    for j in range(count):
+        for c in range(4):
+            image[y, left + j, c] = s[c * PITCH + j]

@@ -1,0 +1,252 @@
+"""The splatters where all pairs of cells continue front to front: a 3 × 3 stencil, a row of a tile at a time."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts_backends.fused_rows import (
+    ONE,
+    PITCH,
+    RX,
+    RY,
+    SOURCE,
+    SUM,
+    SUMS,
+    TILE,
+    WX,
+    WY,
+    compiled,
+    composite,
+    kernel,
+    load,
+    normalised_sums,
+    slot,
+    store,
+    tile,
+)
+
+X, Y, TANGENT = (PITCH * p for p in (5, 6, 7))
+"""Places in a tangent's slot, after five planes D: w (D + (u X + v Y) colour) is the tangent of a weighted colour."""
+
+
+@kernel
+def forward(start, stop, positions, rgba, row, scale, peak, gamma, image):
+    """Target rows [start, stop) of the image (H, W, 4)."""
+    layers, _, width = row.shape
+    sources, total = np.empty(3 * layers * SOURCE, image.dtype), np.empty(SUMS, image.dtype)
+    for t in range((width + TILE - 1) // TILE):
+        left, count = tile(width, t)
+        for y in range(start - 1, stop + 1):
+            for k in range(layers):
+                s = slot(sources, k, y, SOURCE)
+                load(s, positions, rgba, row, k, y, left - 1, count + 2, scale, peak, gamma)
+            if y > start:
+                normalised_sums(total, sources, layers, y - 1, count)
+                composite(total, layers, count)
+                store(image, y - 1, left, total, count)
+
+
+@compiled
+def add_adjoint(to, total, g, count):
+    """Adjoint of a buffer's sums from that of its normalised colours; zero for the weight where it is below one."""
+    zero, one = to.dtype.type(0), to.dtype.type(1)
+    for j in range(count):
+        weight = total[ONE + j]
+        over = one / max(weight, one)
+        dot = zero
+        for c in range(4):
+            dot += g[c * PITCH + j] * total[c * PITCH + j]
+            to[c * PITCH + j] = g[c * PITCH + j] * over
+        to[ONE + j] = zero if weight < one else -dot * over
+
+
+@compiled
+def adjoint_row(to, total, g, layers, count):
+    """Adjoints of both buffers' sums in a row, from those of the image at `g`, which are overwritten."""
+    one = to.dtype.type(1)
+    if layers > 1:
+        for j in range(count):
+            through = one - total[3 * PITCH + j]
+            dot = to.dtype.type(0)
+            for c in range(4):
+                dot += g[c * PITCH + j] * total[SUM + c * PITCH + j]
+                g[SUM + c * PITCH + j] = g[c * PITCH + j] * through
+            g[3 * PITCH + j] -= dot
+        add_adjoint(to[SUM:], total[SUM:], g[SUM:], count)
+    add_adjoint(to, total, g, count)
+
+
+@compiled
+def load_image(s, image, mixed, y, first, count):
+    """A row of an image as planes, zero where targets are mixed."""
+    _, width, _ = image.shape
+    for j in range(count):
+        x = first + j
+        if 0 <= x < width and not mixed[y, x]:
+            for c in range(4):
+                s[c * PITCH + j] = image[y, x, c]
+        else:
+            for c in range(4):
+                s[c * PITCH + j] = s.dtype.type(0)
+
+
+@compiled
+def gather(to, s, above, level, below, count):
+    """Sums of w, w u and w v over nine targets' adjoints: for colour the first, and the three along (colour, 1).
+
+    Source j lies under target j + 1; `s` is its slot from the cell of j = 0.
+    """
+    zero = to.dtype.type(0)
+    for j in range(count):
+        up, mid, down = s[WY + j], s[WY + PITCH + j], s[WY + 2 * PITCH + j]
+        left, center, right = s[WX + j], s[WX + PITCH + j], s[WX + 2 * PITCH + j]
+        h, hx, hy = zero, zero, zero
+        for c in range(5):
+            p = c * PITCH + j
+            a0, a1, a2 = up * above[p], up * above[p + 1], up * above[p + 2]
+            b0, b1, b2 = down * below[p], down * below[p + 1], down * below[p + 2]
+            m0 = left * (a0 + mid * level[p] + b0)
+            m1 = center * (a1 + mid * level[p + 1] + b1)
+            m2 = right * (a2 + mid * level[p + 2] + b2)
+            to[p] = m0 + m1 + m2
+            h += s[p] * (m0 + m1 + m2)
+            hx += s[p] * (m2 - m0)
+            hy += s[p] * (left * (b0 - a0) + center * (b1 - a1) + right * (b2 - a2))
+        to[5 * PITCH + j], to[6 * PITCH + j], to[7 * PITCH + j] = h, hx, hy
+
+
+@kernel
+def pull(start, stop, positions, rgba, row, scale, peak, gamma, mixed, g, g_positions, g_rgba):
+    """Gradients of what source rows [start, stop) give to targets that are not mixed; each cell collects its own."""
+    layers, height, width = row.shape
+    sources, total = np.empty(3 * layers * SOURCE, g.dtype), np.empty(SUMS, g.dtype)
+    adjoints, given, found = np.empty(3 * SUMS, g.dtype), np.empty(SUMS, g.dtype), np.empty(8 * PITCH, g.dtype)
+    slope = g.dtype.type(2) * scale * gamma
+    for t in range((width + TILE - 1) // TILE):
+        left, count = tile(width, t)
+        for y in range(start - 2, stop + 2):
+            for k in range(layers):
+                s = slot(sources, k, y, SOURCE)
+                load(s, positions, rgba, row, k, y, left - 2, count + 4, scale, peak, gamma)
+            if y < start:
+                continue
+            adjoint = slot(adjoints, 0, y - 1, SUMS)
+            if 1 <= y <= height:
+                normalised_sums(total, sources, layers, y - 1, count + 2)
+                load_image(given, g, mixed, y - 1, left - 1, count + 2)
+                adjoint_row(adjoint, total, given, layers, count + 2)
+            else:
+                adjoint[:] = g.dtype.type(0)
+            if y < start + 2:
+                continue
+            for k in range(layers):
+                b = SUM if k > 0 else 0
+                above, level = slot(adjoints, 0, y - 3, SUMS)[b:], slot(adjoints, 0, y - 2, SUMS)[b:]
+                s = slot(sources, k, y - 2, SOURCE)[2:]
+                gather(found, s, above, level, adjoint[b:], count)
+                scatter(g_positions, g_rgba, row[k, y - 2], left, found, s, slope, count)
+
+
+@compiled
+def scatter(g_positions, g_rgba, row, left, found, s, slope, count):
+    """Hand what a row of cells has gathered to their samples."""
+    for j in range(count):
+        i = row[left + j]
+        if i >= 0:
+            if len(g_rgba) > 0:
+                for c in range(4):
+                    g_rgba[i, c] = found[c * PITCH + j]
+            if len(g_positions) > 0:
+                h = found[5 * PITCH + j]
+                g_positions[i, 0] = slope * (found[6 * PITCH + j] - s[RX + j] * h)
+                g_positions[i, 1] = slope * (found[7 * PITCH + j] - s[RY + j] * h)
+
+
+@compiled
+def load_tangent(to, s, t_positions, t_rgba, row, k, y, first, count, slope):
+    """Fill a tangent's slot beside its source's."""
+    zero = to.dtype.type(0)
+    _, height, width = row.shape
+    for j in range(count):
+        x = first + j
+        i = row[k, y, x] if 0 <= y < height and 0 <= x < width else -1
+        move, tint = i >= 0 and len(t_positions) > 0, i >= 0 and len(t_rgba) > 0
+        to[X + j] = slope * t_positions[i, 0] if move else zero
+        to[Y + j] = slope * t_positions[i, 1] if move else zero
+        for c in range(4):
+            to[c * PITCH + j] = t_rgba[i, c] if tint else zero
+        to[4 * PITCH + j] = zero
+    for j in range(count):
+        along = s[RX + j] * to[X + j] + s[RY + j] * to[Y + j]
+        for c in range(5):
+            to[c * PITCH + j] -= along * s[c * PITCH + j]
+
+
+@compiled
+def add_tangent_row(to, s, tangent, v, count):
+    """The tangent of `add_row`."""
+    wy, dv = s[WY + (v + 1) * PITCH :], s.dtype.type(v)
+    for j in range(count):
+        w0, w1, w2 = s[WX + 2 * PITCH + j] * wy[j], s[WX + PITCH + j + 1] * wy[j + 1], s[WX + j + 2] * wy[j + 2]
+        d0 = w0 * (dv * tangent[Y + j] + tangent[X + j])
+        d1 = w1 * (dv * tangent[Y + j + 1])
+        d2 = w2 * (dv * tangent[Y + j + 2] - tangent[X + j + 2])
+        for c in range(5):
+            p = c * PITCH + j
+            to[p] += (
+                w0 * tangent[p] + w1 * tangent[p + 1] + w2 * tangent[p + 2] + d0 * s[p] + d1 * s[p + 1] + d2 * s[p + 2]
+            )
+
+
+@compiled
+def tangent_row(to, total, layers, count):
+    """The tangent of a row of the image, in the first planes of `to`, from those of both buffers' sums."""
+    zero, one = to.dtype.type(0), to.dtype.type(1)
+    for b in range(min(layers, 2)):
+        d, s = to[b * SUM :], total[b * SUM :]
+        for j in range(count):
+            over = one / max(s[ONE + j], one)
+            change = zero if s[ONE + j] < one else d[ONE + j]
+            for c in range(4):
+                p = c * PITCH + j
+                d[p] = (d[p] - change * s[p]) * over
+    if layers > 1:
+        for j in range(count):
+            through, change = one - total[3 * PITCH + j], to[3 * PITCH + j]
+            for c in range(4):
+                p = c * PITCH + j
+                to[p] += through * to[SUM + p] - change * total[SUM + p]
+
+
+@kernel
+def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_rgba, out):
+    """Target rows [start, stop) of the tangents (T, H, W, 4); of absent tangents there are T of no rows."""
+    layers, _, width = row.shape
+    many = len(out)
+    sources, total, change = (
+        np.empty(3 * layers * SOURCE, out.dtype),
+        np.empty(SUMS, out.dtype),
+        np.empty(SUMS, out.dtype),
+    )
+    tangents = np.empty((many, 3 * layers * TANGENT), out.dtype)
+    slope = out.dtype.type(2) * scale * gamma
+    for t in range((width + TILE - 1) // TILE):
+        left, count = tile(width, t)
+        for y in range(start - 1, stop + 1):
+            for k in range(layers):
+                s = slot(sources, k, y, SOURCE)
+                load(s, positions, rgba, row, k, y, left - 1, count + 2, scale, peak, gamma)
+                for n in range(many):
+                    to = slot(tangents[n], k, y, TANGENT)
+                    load_tangent(to, s, t_positions[n], t_rgba[n], row, k, y, left - 1, count + 2, slope)
+            if y <= start:
+                continue
+            normalised_sums(total, sources, layers, y - 1, count)
+            for n in range(many):
+                change[: min(layers, 2) * SUM] = out.dtype.type(0)
+                for k in range(layers):
+                    for v in range(-1, 2):
+                        s, tangent = slot(sources, k, y - 1 - v, SOURCE), slot(tangents[n], k, y - 1 - v, TANGENT)
+                        add_tangent_row(change[SUM:] if k > 0 else change, s, tangent, v, count)
+                tangent_row(change, total, layers, count)
+                store(out[n], y - 1, left, change, count)

@@ -1,0 +1,436 @@
+"""The compiled splatters against the specification, which test_splatting.py holds against the method's definition."""
+
+import itertools
+import subprocess
+import sys
+import tracemalloc
+
+import numpy as np
+import pytest
+from helpers import DIFFERENTIABLE, arrays, gradient, to_numpy
+
+import rts
+from rts import splatting
+from rts_backends import fused
+from rts_backends.fused_kernels import Settings, Splats
+
+torch = pytest.importorskip("torch")
+
+KINDS = {"single": fused.Single, "multi": fused.Multi, "visible": fused.Visible}
+SETTINGS = [{}, {"sigma": 0.8, "epsilon": 0.2, "calibration": None}, {"sigma": 0.3, "epsilon": 0.001}]
+TOLERANCE = {np.float32: (1e-5, 1e-4), np.float64: (1e-12, 1e-10)}
+
+
+def cells(layers, size=(9, 11), seed=0, dtype=np.float64, holes=0.2, middle_holes=False, spare=5):
+    """Positions, colours and row: off-centre samples, equal depths, cut-outs, empty cells and rows of no cell."""
+    rng = np.random.default_rng(seed)
+    depth = np.sort(rng.integers(4, 16, (layers, *size)) / 4, axis=0)  # Quarters: ties are exact.
+    depth = np.where(rng.random(size) < 0.1, depth[:1], depth)
+    filled = rng.random(depth.shape) >= holes
+    if not middle_holes:
+        filled = np.logical_and.accumulate(filled, axis=0)
+    k, y, x = np.nonzero(filled)
+    total = len(k) + spare
+    place = rng.permutation(total)[: len(k)]
+    row = np.full(filled.shape, -1, np.int32)
+    row[k, y, x] = place
+    positions = rng.normal(size=(total, 3))
+    positions[place] = np.stack([x + 0.5, y + 0.5, depth[k, y, x]], axis=-1)
+    positions[place, :2] += rng.uniform(-0.4, 0.4, (len(k), 2))
+    alpha = rng.choice([0.0, 0.5, 1.0], total, p=[0.2, 0.2, 0.6])
+    rgba = np.concatenate([rng.random((total, 3)), np.ones((total, 1))], axis=1) * alpha[:, None]
+    return positions.astype(dtype), rgba.astype(dtype), row
+
+
+def compiled(splatter, scene):
+    settings = Settings(splatter.kind, splatter.sigma, splatter.epsilon, splatter.gamma)
+    return Splats(settings, *scene)
+
+
+def specification(splatter):
+    """The class of `rts.splatting` with the same settings."""
+    plain = getattr(splatting, type(splatter).__name__)
+    return plain(splatter.sigma, splatter.epsilon, splatter.calibration)
+
+
+def noise(*shape, dtype=np.float64, seed=7):
+    return np.random.default_rng(seed).normal(size=shape).astype(dtype)
+
+
+def check_against_specification(splatter, scene, dtype):
+    positions, rgba, row = scene
+    splats, reference = compiled(splatter, scene), specification(splatter)
+    image, cells_ = splats.image(), torch.tensor(row)
+    g = noise(*image.shape, dtype=dtype)
+    variables = [torch.tensor(x, requires_grad=True) for x in (positions, rgba)]
+    expected = reference.splat(*variables, cells_)
+    gradients = torch.autograd.grad(expected, variables, torch.tensor(g))
+    tangents = [noise(3, *x.shape, dtype=dtype) for x in (positions, rgba)]
+    pushed = [
+        torch.func.jvp(lambda p, c: reference.splat(p, c, cells_), tuple(map(torch.tensor, (positions, rgba))), t)[1]
+        for t in zip(*map(torch.tensor, tangents), strict=True)
+    ]
+    in_image, in_derivative = TOLERANCE[dtype]
+    np.testing.assert_allclose(image, expected.detach(), rtol=0, atol=in_image)
+    alone = splats.jvp(tangents[0], None) + splats.jvp(None, tangents[1])
+    derivatives = (*gradients, *[torch.stack(pushed)] * 2)
+    for found, wanted in zip((*splats.vjp(g), splats.jvp(*tangents), alone), derivatives, strict=True):
+        assert found.dtype == dtype
+        np.testing.assert_allclose(found, wanted, rtol=0, atol=in_derivative * max(0.1, float(wanted.abs().max())))
+    np.testing.assert_array_equal(splats.vjp(g)[0][:, 2], 0)
+
+
+# ------------------------------------------------------------------------------------------- the specification
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("layers", [1, 2, 3, 4])
+@pytest.mark.parametrize("kind", KINDS)
+def test_image_vjp_and_jvp_are_those_of_the_specification(kind, layers, dtype):
+    for (seed, holes, middle_holes), settings in zip(
+        [(0, 0.2, False), (1, 0.02, False), (2, 0.3, True)], SETTINGS, strict=True
+    ):
+        scene = cells(layers, seed=seed, dtype=dtype, holes=holes, middle_holes=middle_holes)
+        check_against_specification(KINDS[kind](**settings), scene, dtype)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (6, 1), (2, 300), (40, 129)], ids=str)
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_of_any_size_are_those_of_the_specification(kind, size):
+    check_against_specification(KINDS[kind](), cells(2, size), np.float64)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_smooth_surfaces_over_each_other_are_those_of_the_specification(kind):
+    # A dome before a tilted plane, with its far side between them: mostly plain, mixed along the outline and on slopes.
+    size = 40, 50
+    y, x = np.indices(size)
+    square = 16.3**2 - (x - 24.2) ** 2 - (y - 19.6) ** 2
+    plane = 30 + 0.3 * x + 0.1 * y
+    bulge = np.sqrt(np.maximum(square, 0))
+    depth = np.where(square > 0, [25 - bulge, 25 + 0.2 * bulge, plane], [plane, plane, plane])
+    row = np.arange(3 * 40 * 50, dtype=np.int32).reshape(3, *size)
+    row[1:, square <= 0] = -1
+    positions = np.stack([np.broadcast_to(x + 0.5, depth.shape), np.broadcast_to(y + 0.5, depth.shape), depth], axis=-1)
+    positions = positions.reshape(-1, 3) + noise(6000, 3) * (1e-3, 1e-3, 0)
+    rgba = np.concatenate([np.random.default_rng(0).random((6000, 3)), np.ones((6000, 1))], axis=1)
+    for dtype in TOLERANCE:
+        scene = positions.astype(dtype), rgba.astype(dtype), row
+        check_against_specification(KINDS[kind](), scene, dtype)
+    if kind == "visible":
+        assert 0.01 < compiled(fused.Visible(), scene).choices.mixed.mean() < 0.5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_sample_in_several_cells_gets_the_sum_of_their_gradients(kind):
+    positions, rgba, row = cells(2)
+    row[1, 3:5, 4:8] = row[0, 3, 4] = row[0, 0, 0]
+    check_against_specification(KINDS[kind](), (positions, rgba, row), np.float64)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_samples_of_no_cell_have_zero_gradients(kind):
+    scene = cells(2, spare=50)
+    unused = np.setdiff1d(np.arange(len(scene[0])), scene[2])
+    for found in compiled(KINDS[kind](), scene).vjp(noise(9, 11, 4)):
+        np.testing.assert_array_equal(found[unused], 0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gradients_that_are_not_wanted_are_not_computed(kind):
+    splats, g = compiled(KINDS[kind](), cells(2)), noise(9, 11, 4)
+    both = splats.vjp(g)
+    for wanted in ((True, False), (False, True)):
+        for found, expected, wish in zip(splats.vjp(g, wanted), both, wanted, strict=True):
+            assert found is None if not wish else np.array_equal(found, expected)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_any_layout_of_the_arrays_will_do(kind):
+    positions, rgba, row = cells(3)
+    splatter = KINDS[kind]()
+    expected = splatter.splat(positions, rgba, row)
+    strided = np.asfortranarray(row)[:, ::-1][:, ::-1]
+    for other in (strided, row.astype(np.int64), np.where(row < 0, -5, row)):
+        np.testing.assert_array_equal(splatter.splat(np.asfortranarray(positions), rgba[::-1][::-1], other), expected)
+
+
+# ------------------------------------------------------------------------------------------------- robustness
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rows_beyond_the_samples_are_refused(kind):
+    positions, rgba, row = cells(2)
+    row[0, 0, 0] = len(positions)
+    for scene in ((positions, rgba, row), tuple(map(torch.tensor, (positions, rgba, row)))):
+        with pytest.raises(rts.InputError, match=f"row refers to sample {len(positions)} of {len(positions)}"):
+            KINDS[kind]().splat(*scene)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_one_sample_that_is_nan_spoils_its_neighbourhood_alone(kind):
+    positions, rgba, row = cells(2, holes=0)
+    positions[row[0, 4, 5]] = np.nan
+    splats = compiled(KINDS[kind](), (positions, rgba, row))
+    spoiled = np.zeros((9, 11), bool)
+    spoiled[3:6, 4:7] = True
+    assert np.isfinite(splats.image()[~spoiled]).all()
+    splats.vjp(noise(9, 11, 4))
+    splats.jvp(noise(1, *positions.shape), None)
+
+
+@pytest.mark.parametrize("size", [(0, 5), (5, 0)], ids=str)
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_of_no_pixels(kind, size):
+    positions, rgba = np.ones((3, 3)), np.ones((3, 4))
+    splats = compiled(KINDS[kind](), (positions, rgba, np.zeros((2, *size), np.int32)))
+    assert splats.image().shape == (*size, 4)
+    assert splats.jvp(positions[None], None).shape == (1, *size, 4)
+    np.testing.assert_array_equal(splats.vjp(np.zeros((*size, 4)))[0], 0)
+
+
+# ------------------------------------------------------------------------------------------------ determinism
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_results_are_bitwise_the_same_on_any_number_of_threads(kind, monkeypatch):
+    scene = cells(3, (70, 150), dtype=np.float32)
+    g, tangents = noise(70, 150, 4, dtype=np.float32), noise(2, *scene[0].shape, dtype=np.float32)
+
+    def everything():
+        splats = compiled(KINDS[kind](), scene)
+        return *splats.vjp(g), splats.image(), splats.jvp(tangents, None)
+
+    monkeypatch.setenv("RTS_NUM_THREADS", "1")
+    expected = everything()
+    for threads in "1222357":
+        monkeypatch.setenv("RTS_NUM_THREADS", threads)
+        for found, known in zip(everything(), expected, strict=True):
+            np.testing.assert_array_equal(found, known)
+
+
+def test_a_step_at_512_needs_little_memory():
+    size, layers = (512, 512), 2
+    positions, rgba, row = cells(layers, size, dtype=np.float32, holes=0, spare=0)
+    g = np.ones((*size, 4), np.float32)
+    compiled(fused.Visible(), (positions, rgba, row)).vjp(g)
+    tracemalloc.start()
+    splats = compiled(fused.Visible(), (positions, rgba, row))
+    image, gradients = splats.image(), splats.vjp(g)
+    results, (_, peak) = image.nbytes + sum(x.nbytes for x in gradients), tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    mixed = splats.choices.mixed.mean()
+    print(f"{100 * mixed:.0f} % mixed: peak {peak / 2**20:.1f} MiB, of which results {results / 2**20:.1f} MiB")
+    assert mixed > 0.9 and peak < 64 * 2**20  # The worst case: random depths.
+
+
+# ------------------------------------------------------------------------------------------------------ torch
+
+
+@pytest.fixture(scope="module")
+def smooth():
+    """A scalar and an image of six parameters that move and tint every sample, and their value."""
+    positions, rgba, row = map(torch.tensor, cells(3, (4, 5), seed=1))
+    moves, tints = torch.tensor(noise(6, *positions.shape)), torch.tensor(noise(6, *rgba.shape, seed=8))
+    weights = torch.tensor(noise(4, 5, 4, seed=9))
+
+    def image(splatter, x):
+        return splatter.splat(
+            positions + torch.einsum("i,ijk->jk", x, moves), rgba + torch.einsum("i,ijk->jk", x, tints), row
+        )
+
+    def loss(splatter, x):
+        return (image(splatter, x) ** 2 * weights).sum()
+
+    return image, loss, torch.tensor(noise(6, seed=3)) * 0.05
+
+
+def batch(x):
+    return x[:, None] * torch.eye(len(x), dtype=x.dtype)
+
+
+def twice(loss):
+    """The gradient of the gradient's square, by plain autograd."""
+
+    def call(s, x):
+        x = x.clone().requires_grad_()
+        (slope,) = torch.autograd.grad(loss(s, x), x, create_graph=True)
+        return torch.autograd.grad((slope**2).sum(), x)[0]
+
+    return call
+
+
+def forward_over_reverse(loss):
+    """The gradient's tangent, by dual numbers over plain autograd."""
+
+    def call(s, x):
+        with torch.autograd.forward_ad.dual_level():
+            dual = torch.autograd.forward_ad.make_dual(x.clone().requires_grad_(), x + 1)
+            (slope,) = torch.autograd.grad(loss(s, dual), dual, create_graph=True)
+            return torch.autograd.forward_ad.unpack_dual(slope).tangent.detach()
+
+    return call
+
+
+f = torch.func
+TRANSFORMS = {
+    "grad": lambda image, loss: lambda s, x: f.grad(lambda x: loss(s, x))(x),
+    "vjp": lambda image, loss: lambda s, x: f.vjp(lambda x: image(s, x), x)[1](torch.ones(4, 5, 4, dtype=x.dtype))[0],
+    "jvp": lambda image, loss: lambda s, x: f.jvp(lambda x: image(s, x), (x,), (x + 1,))[1],
+    "jacfwd": lambda image, loss: lambda s, x: f.jacfwd(lambda x: image(s, x))(x),
+    "jacrev": lambda image, loss: lambda s, x: f.jacrev(lambda x: image(s, x)[1])(x),
+    "vmap": lambda image, loss: lambda s, x: f.vmap(lambda x: image(s, x))(batch(x)),
+    "vmap of grad": lambda image, loss: lambda s, x: f.vmap(f.grad(lambda x: loss(s, x)))(batch(x)),
+    "grad of vmap": lambda image, loss: lambda s, x: f.grad(lambda x: f.vmap(lambda x: loss(s, x))(batch(x)).sum())(x),
+    "vmap of jacfwd": lambda image, loss: lambda s, x: f.vmap(f.jacfwd(lambda x: image(s, x)))(batch(x)),
+    "hessian": lambda image, loss: lambda s, x: f.hessian(lambda x: loss(s, x))(x),
+    "jacrev of jacrev": lambda image, loss: lambda s, x: f.jacrev(f.jacrev(lambda x: loss(s, x)))(x),
+    "jacrev of jacfwd": lambda image, loss: lambda s, x: f.jacrev(f.jacfwd(lambda x: loss(s, x)))(x),
+    "jacfwd of jacfwd": lambda image, loss: lambda s, x: f.jacfwd(f.jacfwd(lambda x: loss(s, x)))(x),
+    "create_graph": lambda image, loss: twice(loss),
+    "dual numbers of grad": lambda image, loss: forward_over_reverse(loss),
+    "is_grads_batched": lambda image, loss: (
+        lambda s, x: torch.autograd.functional.jacobian(lambda x: image(s, x), x, vectorize=True)
+    ),
+    "vectorized forward mode": lambda image, loss: (
+        lambda s, x: torch.autograd.functional.jacobian(
+            lambda x: image(s, x), x, vectorize=True, strategy="forward-mode"
+        )
+    ),
+}
+
+
+@pytest.mark.parametrize("name", TRANSFORMS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_torch_transforms_are_those_of_the_specification(kind, name, smooth):
+    image, loss, x = smooth
+    splatter = KINDS[kind]()
+    call = TRANSFORMS[name](image, loss)
+    found, expected = call(splatter, x), call(specification(splatter), x)
+    assert torch.isfinite(expected).all() and expected.abs().max() > 1e-3
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_vmap_over_rows_and_colors():
+    positions, rgba, row = map(torch.tensor, cells(2))
+    rows, tints = torch.stack([row, row.flip(1), row.flip(2)]), torch.linspace(0, 1, 3, dtype=rgba.dtype)
+    splatter = fused.Visible()
+    found = f.vmap(lambda r, t: splatter.splat(positions, rgba * t, r))(rows, tints)
+    expected = [splatter.splat(positions, rgba * t, r) for r, t in zip(rows, tints, strict=True)]
+    torch.testing.assert_close(found, torch.stack(expected), rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_finite_differences_agree(kind):
+    positions, rgba, row = map(torch.tensor, cells(2, (4, 5)))
+    where = positions[:, :2].clone().requires_grad_()
+
+    def image(where, rgba):
+        return KINDS[kind]().splat(torch.cat([where, positions[:, 2:]], dim=1), rgba, row)
+
+    given = where, rgba.requires_grad_()
+    assert torch.autograd.gradcheck(image, given, check_forward_ad=True, check_undefined_grad=False)
+
+
+def test_one_sweep_pushes_all_columns_of_a_jacobian(smooth, monkeypatch):
+    image, loss, x = smooth
+    calls = []
+    for name in ("image", "vjp", "jvp"):
+        method = getattr(Splats, name)
+        monkeypatch.setattr(
+            Splats, name, lambda *args, name=name, method=method: (calls.append(name), method(*args))[1]
+        )
+    f.jacfwd(lambda x: image(fused.Visible(), x))(x)
+    assert sorted(calls) == ["image", "jvp"]
+    calls.clear()
+    f.grad(lambda x: loss(fused.Visible(), x))(x)
+    assert sorted(calls) == ["image", "vjp"]
+
+
+def test_changing_samples_before_the_backward_pass_is_noticed():
+    positions, rgba, row = map(torch.tensor, cells(2))
+    moved = positions.requires_grad_() * 1
+    image = fused.Visible().splat(moved, rgba, row)
+    with torch.no_grad():
+        moved += 1
+    with pytest.raises(RuntimeError, match="modified by an inplace operation"):
+        image.sum().backward()
+
+
+# torch itself reads .grad of intermediate tensors where it cuts a graph in two.
+@pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf:UserWarning")
+def test_torch_compile_keeps_value_and_gradient(smooth):
+    image, loss, x = smooth
+    splatter = fused.Visible()
+    x = x.clone().requires_grad_()
+    value = torch.compile(lambda x: loss(splatter, x), backend="aot_eager")(x)
+    torch.testing.assert_close(value, loss(splatter, x))
+    found, expected = (torch.autograd.grad(v, x)[0] for v in (value, loss(splatter, x)))
+    torch.testing.assert_close(found, expected)
+
+
+# ---------------------------------------------------------------------------------------- who computes, and where
+
+
+@pytest.mark.parametrize("name, kind", [*((k, k) for k in KINDS), ("auto", "visible")])
+def test_the_splatters_by_name_are_the_compiled_ones(name, kind):
+    assert rts.plugin("rts.splatters", name) is KINDS[kind]
+    assert repr(KINDS[kind]()) == repr(specification(KINDS[kind]()))
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_engine_gets_the_gradient_of_the_specification(kind, target):
+    positions, rgba, row = cells(2)
+    weights = arrays(target, noise(9, 11, 4))
+    row = arrays(target, row)
+    given = arrays(target, {"positions": positions, "rgba": rgba})
+    splatter = KINDS[kind]()
+    found, expected = (
+        gradient(target, lambda t, s=s: (s.splat(t["positions"], t["rgba"], row) * weights).sum(), given)
+        for s in (splatter, specification(splatter))
+    )
+    for name in given:
+        np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "dtypes",
+    [*itertools.product([torch.float16, torch.float32], [torch.float16, torch.float64]), (torch.bfloat16,) * 2],
+    ids=str,
+)
+def test_other_dtypes_are_left_to_the_specification(dtypes):
+    positions, rgba, row = map(torch.tensor, cells(2))
+    scene = positions.to(dtypes[0]), rgba.to(dtypes[1]), row
+    found, expected = fused.Visible().splat(*scene), splatting.Visible().splat(*scene)
+    assert found.dtype == expected.dtype
+    torch.testing.assert_close(found, expected, rtol=0, atol=0)
+
+
+def test_other_devices_are_left_to_the_specification():
+    scene = (torch.tensor(x).to("meta") for x in cells(2))
+    image = fused.Visible().splat(*scene)
+    assert image.device.type == "meta" and image.shape == (9, 11, 4)
+
+
+def test_numpy_of_two_dtypes_is_left_to_the_specification():
+    positions, rgba, row = cells(2)
+    found = fused.Multi().splat(positions, rgba.astype(np.float32), row)
+    np.testing.assert_array_equal(found, splatting.Multi().splat(positions, rgba.astype(np.float32), row))
+
+
+def test_no_torch_and_no_numba_is_loaded_in_vain():
+    code = (
+        "import sys, rts\nassert 'numba' not in sys.modules\nimport numpy as np\n"
+        "scene = np.ones((1, 3)), np.ones((1, 4)), np.zeros((1, 2, 2), int)\n"
+        "image = rts.plugin('splatters', 'visible')().splat(*scene)\n"
+        "assert image.shape == (2, 2, 4) and 'numba' in sys.modules\n"
+        "assert not {'torch', 'jax'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_image_of_numpy_is_that_of_torch():
+    scene = cells(3, dtype=np.float32)
+    found = fused.Visible().splat(*map(torch.tensor, scene))
+    np.testing.assert_array_equal(to_numpy(found), fused.Visible().splat(*scene))
