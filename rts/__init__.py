@@ -7,7 +7,7 @@ differentiate only that.
 from rts.arrays import namespace
 from rts.camera import Camera
 from rts.choosing import explain
-from rts.errors import EngineError, InputError, PluginError, RtsError
+from rts.errors import EngineError, InputError, LayersWarning, PluginError, RtsError
 from rts.fitting import Fit, fit
 from rts.gradients import check_gradient, gradient_image
 from rts.preparing import prepare
@@ -25,6 +25,7 @@ __all__ = [
     "Fragments",
     "GBuffer",
     "InputError",
+    "LayersWarning",
     "Part",
     "PluginError",
     "Proxy",

@@ -88,8 +88,8 @@ def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple
     if not whole or height <= 0 or width <= 0:
         given = " ".join(repr(size).split())[:60]
         raise InputError(f"size is {given}; expected (height, width), two positive integers")
-    if not _is_count(layers):
-        raise InputError(f"layers is {layers!r}; expected an integer of at least 1")
+    if layers != "auto" and not _is_count(layers):
+        raise InputError(f'layers is {layers!r}; expected an integer of at least 1, or "auto"')
     if capacity is not None and not _is_count(capacity):
         raise InputError(f"capacity is {capacity!r}; expected an integer of at least 1, or None")
     if not _is_count(supersample):

@@ -62,11 +62,21 @@ def explain(parts: Part | Sequence[Part], camera: Camera) -> list[Choice]:
 class Auto:
     """The sampler that suits each part."""
 
+    prunes = True
+
     def sample(
-        self, part: Part, camera: Camera, size: tuple[int, int], layers: int, *, capacity: int | None = None
+        self,
+        part: Part,
+        camera: Camera,
+        size: tuple[int, int],
+        layers: int,
+        *,
+        capacity: int | None = None,
+        needed: Any = None,
     ) -> Samples:
         """See `rts.protocols.Sampler`."""
         choice = choose(part, static=is_static(part, camera))
         _log.debug("%s for %r: %s", choice.sampler, part.surface, choice.reason)
         sampler: Any = registry.instance("rts.samplers", choice.sampler)
-        return sampler.sample(part, camera, size, layers, capacity=capacity)
+        known = {"needed": needed} if getattr(sampler, "prunes", False) else {}
+        return sampler.sample(part, camera, size, layers, capacity=capacity, **known)

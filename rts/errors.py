@@ -18,3 +18,7 @@ class EngineError(RtsError, TypeError):
 
 class PluginError(RtsError, ImportError):
     """A plugin is registered but cannot be used: a package is missing, or its import fails."""
+
+
+class LayersWarning(UserWarning):
+    """`layers="auto"` came to its limit."""

@@ -166,7 +166,7 @@ class Sampled:
         part: (K, H, W) int32, the part seen in each cell, or −1.
         row: (K, H, W) int32, the sample in each cell, counted over all parts in order, or −1.
         depth: (K, H, W) float32, linear camera depth; 0 where empty.
-        overflow: () int32, samples dropped for want of capacity. Should be 0.
+        overflow: () int32, samples dropped for want of capacity, or beyond the limit of `layers="auto"`. Should be 0.
         supersample: s, where each pixel has s² cells.
     """
 
@@ -236,7 +236,11 @@ class RaySurface(Protocol):
 
 
 class Sampler(Protocol):
-    """Finds where rays meet one part; the step without derivative."""
+    """Finds where rays meet one part; the step without derivative.
+
+    Optional member: `prunes` (bool, default False), whether `sample` also takes `needed`, a function (or None) of
+    covered (K, H, W) bool and depth (K, H, W) on the host that says which samples to keep.
+    """
 
     def sample(
         self, part: Part, camera: Any, size: tuple[int, int], layers: int, *, capacity: int | None = None
@@ -266,7 +270,11 @@ class Shader(Protocol):
 
 
 class Splatter(Protocol):
-    """Turns shaded samples into an image that has derivatives at occlusion boundaries."""
+    """Turns shaded samples into an image that has derivatives at occlusion boundaries.
+
+    Optional member: `needed(covered, depth) -> (K, H, W) bool`, of host arrays (K, H, W) bool and float: the samples
+    that can reach the image, in value or derivative, where all are opaque and on pixel centres. Others are dropped.
+    """
 
     def splat(self, positions: Array, rgba: Array, row: Array) -> Array:
         """Splat packed samples.
@@ -285,8 +293,8 @@ class Splatter(Protocol):
 class Engine(Protocol):
     """An array framework. Chosen by the type of the arrays, never a global setting.
 
-    Optional member: `take_error() -> RtsError | None`, the last error raised inside a host call, where the framework
-    wraps such errors in its own.
+    Optional members: `take_error() -> RtsError | None`, the last error raised inside a host call, where the framework
+    wraps such errors in its own; `traced(x) -> bool`, whether an array has a shape but not yet a value.
 
     The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the
     user has imported that module.

@@ -23,6 +23,7 @@ from rts.checks import (
 from rts.errors import InputError
 from rts.preparing import PreparedParts
 from rts.protocols import Array, Engine, GBuffer, Part, Sampled, Samples
+from rts.pruning import Needed, as_needed, needed_by, prune
 from rts.sampling import merge, reads_of
 
 APRON = 1
@@ -39,7 +40,7 @@ def render(
     *,
     sampler: Any = "auto",
     splatter: Any = "auto",
-    layers: int = 2,
+    layers: int | str = 2,
     supersample: int = 1,
     background: Any = None,
     capacity: int | None = None,
@@ -52,7 +53,8 @@ def render(
         size: (height, width) in pixels.
         sampler: name or object of a `Sampler`.
         splatter: name or object of a `Splatter`.
-        layers: K, the number of surface layers kept at each pixel.
+        layers: K, the number of surface layers kept at each pixel; or "auto", as many as count where surfaces hide one
+            another, up to 8 (a warning says if there are more).
         supersample: s, for s² samples a pixel, splatted on the finer grid and averaged. Large images are rendered in
             bands of rows, so that memory stays bounded; in a gradient each band is then shaded once more.
         background: colour (3,) or (4,), or image (H, W, 3 or 4), premultiplied, to composite onto; None for
@@ -75,7 +77,14 @@ def render(
     for top, rows in bands:
         view = camera if len(bands) == 1 else camera.window((height, width), (top, 0), (rows, width))
         sampled = sample(
-            parts, view, (rows, width), sampler=sampler, layers=layers, supersample=supersample, capacity=capacity
+            parts,
+            view,
+            (rows, width),
+            sampler=sampler,
+            splatter=splatter,
+            layers=layers,
+            supersample=supersample,
+            capacity=capacity,
         )
         shade = partial(render_samples, sampled, parts, view, splatter=splatter)
         if len(bands) == 1:
@@ -92,18 +101,20 @@ def sample(
     size: tuple[int, int],
     *,
     sampler: Any = "auto",
-    layers: int = 2,
+    splatter: Any = None,
+    layers: int | str = 2,
     supersample: int = 1,
     capacity: int | None = None,
 ) -> Sampled:
     """The half of `render` without derivative: where the rays through pixel centres meet the surfaces.
 
-    Takes the arguments of `render`. The result may be handed to a function under `jax.jit`.
+    Takes the arguments of `render`. With the splatter to come, hidden samples that it does not need are dropped; None
+    keeps all. The result may be handed to a function under `jax.jit`.
     """
     prepared = parts if isinstance(parts, PreparedParts) else None
     parts, camera = check_scene(prepared.parts if prepared else parts, camera)
     height, width = (supersample * n for n in check_size(size, layers, capacity, supersample))
-    check_memory(height, width, layers, gradient=differentiable(parts, camera))
+    check_memory(height, width, 2 if layers == "auto" else layers, gradient=differentiable(parts, camera))
     if prepared is None:
         samplers, entries = [check_plugin("rts.samplers", sampler, "sample")] * len(parts), [None] * len(parts)
     else:
@@ -112,11 +123,21 @@ def sample(
     camera = constants(camera, engine_of(parts, camera), exemplar(parts, camera))
     grid = height + 2 * APRON, width + 2 * APRON
     wide = camera.with_apron((height, width), APRON)
-    samples = []
-    for part, chosen, entry in zip(parts, samplers, entries, strict=True):
-        known = {} if entry is None else {"entry": entry}
-        samples.append(chosen.sample(part, wide.within(part.transform), grid, layers, capacity=capacity, **known))
-    return replace(merge(samples, layers), supersample=supersample)
+
+    def taken(count: int, needed: Needed | None) -> Sampled:
+        samples = []
+        for part, chosen, entry in zip(parts, samplers, entries, strict=True):
+            known = {} if entry is None else {"entry": entry}
+            if needed is not None and len(parts) == 1 and getattr(chosen, "prunes", False):
+                known["needed"] = needed
+            samples.append(chosen.sample(part, wide.within(part.transform), grid, count, capacity=capacity, **known))
+        sampled = merge(samples, count)
+        return sampled if needed is None or "needed" in known else prune(sampled, needed)
+
+    splatter = None if splatter is None else check_plugin("rts.splatters", splatter, "splat")
+    needed = None if splatter is None else needed_by(splatter, parts)
+    sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)
+    return replace(sampled, supersample=supersample)
 
 
 def render_samples(
@@ -173,11 +194,11 @@ def render_samples(
     return image if background is None else _over_background(image, background)
 
 
-def _bands(height: int, width: int, layers: int, supersample: int) -> list[tuple[int, int]]:
+def _bands(height: int, width: int, layers: int | str, supersample: int) -> list[tuple[int, int]]:
     """(first row, number of rows) of the parts in which a supersampled image is rendered."""
     if supersample == 1:
         return [(0, height)]
-    rows = max(1, BAND // (layers * supersample**2 * width))
+    rows = max(1, BAND // ((2 if layers == "auto" else layers) * supersample**2 * width))
     count = math.ceil(height / rows)
     edges = [height * i // count for i in range(count + 1)]
     return [(top, end - top) for top, end in itertools.pairwise(edges)]

@@ -24,6 +24,7 @@ class TriangleSampler(abc.ABC):
     """
 
     update: Callable[[Any, Proxy], Any] | None = None
+    prunes = True
     _keeper: Keeper
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
@@ -82,6 +83,7 @@ class TriangleSampler(abc.ABC):
         layers: int,
         *,
         capacity: int | None = None,
+        needed: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
         entry: Entry | None = None,
     ) -> Samples:
         """See `rts.protocols.Sampler`. One call to the host does everything.
@@ -92,6 +94,7 @@ class TriangleSampler(abc.ABC):
             size: see there.
             layers: see there.
             capacity: see there.
+            needed: see there.
             entry: to be used without a look at the surface's inputs; see `rts.prepare`.
         """
         surface, theta = part.surface, part.theta
@@ -133,6 +136,9 @@ class TriangleSampler(abc.ABC):
                     _check_fragments(fragments, (layers, *size), self)
                 else:
                     fragments = _no_fragments((layers, *size))
+            if needed is not None:
+                kept = needed(fragments.triangle_ids >= 0, fragments.depth)
+                fragments = fragments._replace(triangle_ids=np.where(kept, fragments.triangle_ids, np.int32(-1)))
             samples = lift(fragments, found.proxy, capacity)
             if hasattr(surface, "refine"):
                 samples = surface.refine(host_inputs, samples, _sample_rays(samples, host_camera, size))

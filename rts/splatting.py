@@ -13,7 +13,9 @@ derivatives (a Hessian) do not.
 from __future__ import annotations
 
 import abc
+import functools
 import math
+import operator
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,6 +28,8 @@ from rts.protocols import Array
 SIGMA, EPSILON = 0.5, 0.05
 CONTINUED = 0.5
 """Share of the error of plain pairing below which `Visible` takes the line of a front layer for its continuation."""
+TIE, LEAST_EPSILON = 1e-5, 1e-4
+"""Depths so near, relative to the farthest, may be ordered by rounding; and an ε that outweighs rounding of weights."""
 OFFSETS = (-1, 0, 1)
 NEIGHBOURS = [(u, v) for v in OFFSETS for u in OFFSETS]
 
@@ -45,6 +49,10 @@ class Plain:
             layer = xp.where((row[k] >= 0)[..., None], _unpack(rgba, row[k]), 0.0)
             image = _over(layer, image)
         return image
+
+    def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """See `rts.protocols.Splatter`: what is opaque hides all that is behind it."""
+        return _fronts(covered)
 
 
 @dataclass(frozen=True)
@@ -79,6 +87,21 @@ class Kernel(abc.ABC):
     @abc.abstractmethod
     def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
         """`splat` of at least one sample."""
+
+    def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """See `rts.protocols.Splatter`: fronts, and the hidden layers around targets that are not `plain`."""
+        if len(covered) == 1 or not covered.any():
+            return covered
+        cells = _bordered(np.where(covered, 0, -1)) >= 0
+        depths = _Depths(list(np.where(cells, _bordered(depth), 0)), cells)
+        margin = TIE * float(np.abs(depth[covered]).max())
+        mixed = np.pad(~self.plain(depths, margin), 1)
+        shows = np.logical_or.reduce([depths.at(mixed, u, v) for u, v in NEIGHBOURS])
+        return covered & np.where(np.arange(len(covered))[:, None, None] > 0, shows, True)
+
+    @abc.abstractmethod
+    def plain(self, depths: _Depths, margin: float) -> Array:
+        """Targets (H, W) at which only front layers count, however depths are rounded within a margin."""
 
     @property
     def gamma(self) -> float:
@@ -119,6 +142,10 @@ class Single(Kernel):
         total = sum(layers.splats(u, v)[0] for u, v in NEIGHBOURS)
         return _normalised(total, namespace(rgba))
 
+    def plain(self, depths: _Depths, margin: float) -> Array:
+        """See `Kernel`: everywhere."""
+        return depths.covers(0, 0) | True
+
 
 @dataclass(frozen=True)
 class Multi(Kernel):
@@ -142,6 +169,11 @@ class Multi(Kernel):
                     buffers[i] = buffers[i] + xp.where(chosen[..., None], splats, 0.0)
         front, surface, behind = (_normalised(b, xp) for b in buffers)
         return _over(front, _over(surface, behind))
+
+    def plain(self, depths: _Depths, margin: float) -> Array:
+        """See `Kernel`: where the surface fills the target, all that is behind it is covered."""
+        full = self.epsilon >= LEAST_EPSILON
+        return full & _all([depths.covers(*n) & depths.fronts_pair(*n, margin)[0] for n in NEIGHBOURS])
 
 
 @dataclass(frozen=True)
@@ -190,37 +222,35 @@ class Visible(Kernel):
         front, surface, behind = (_normalised(b, xp) for b in (front, surface, behind))
         return _over(front, _over(surface, behind))
 
+    def plain(self, depths: _Depths, margin: float) -> Array:
+        """See `Kernel`: where no source has a hidden layer in play."""
+        found = []
+        for n in NEIGHBOURS:
+            pair, off = depths.fronts_pair(*n, margin)
+            found.append(~depths.covers(*n) | pair | depths.continues(*n, CONTINUED * off - margin))
+        return ~depths.covers(0, 0) | _all(found)
 
-class _Layers:
-    """Layers of an image with a border of one empty cell, as seen from targets; (u, v) leads from source to target."""
 
-    def __init__(self, kernel: Kernel, positions: Array, rgba: Array, row: Array):
-        self.xp = namespace(positions, rgba, row)
-        self.size = row.shape[1:]
-        cells = _bordered(row)
-        layers = range(row.shape[0])
-        position = [_unpack(positions, cells[k]) for k in layers]
-        self._covered = cells[0] >= 0
-        self._color = [_weighted(_unpack(rgba, cells[k]), (cells[k] >= 0)[..., None]) for k in layers]
-        self._weights = [kernel.weights(p) for p in position]
-        self._depth = _depths(position, cells)
-        self._front = _bordered(self._depth[0][None])[0], _bordered(cells[:1])[0] >= 0
+class _Depths:
+    """Depths of an image with a border of one empty cell, as seen from targets; (u, v) leads from source to target."""
+
+    def __init__(self, depth: list[Array], covered: Array):
+        """Depths of each layer (h, w), finite, and where they are covered (K, h, w), both with the border."""
+        self.xp = namespace(covered, depth[0])
+        self.size = covered.shape[1] - 2, covered.shape[2] - 2
+        self._covered = covered[0]
+        self._depth = _beyond(depth, covered)
+        front = self._depth[0][None], self.xp.where(self._covered, 0, -1)[None]
+        self._front = _bordered(front[0])[0], _bordered(front[1])[0] >= 0
         self.target = self.source(0, 0)
 
     def source(self, u: int, v: int) -> list[Array]:
         """Depths of the sources' layers, K times (H, W)."""
-        return [self._at(z, u, v) for z in self._depth]
+        return [self.at(z, u, v) for z in self._depth]
 
     def covers(self, u: int, v: int) -> Array:
         """Whether the sources have any layer."""
-        return self._at(self._covered, u, v)
-
-    def splats(self, u: int, v: int) -> list[Array]:
-        """What the sources' layers give, K times (H, W, 5): weighted colours and the weight."""
-        return [
-            self._at(color * (wx[u] * wy[v])[..., None], u, v)
-            for color, (wx, wy) in zip(self._color, self._weights, strict=True)
-        ]
+        return self.at(self._covered, u, v)
 
     def pairing(self, u: int, v: int) -> tuple[Array, Array]:
         """The number s of `Multi`, and what the depths that it pairs are off, (H, W) both."""
@@ -229,20 +259,48 @@ class _Layers:
         b, best_b = _first_minimum([self.xp.abs(z - source[0]) for z in self.target], self.xp)
         return self.xp.where(best_b < best_a, -b, a), self.xp.minimum(best_a, best_b)
 
+    def fronts_pair(self, u: int, v: int, margin: float) -> tuple[Array, Array]:
+        """Whether fronts are nearer, by a margin, than any pair with a hidden layer; and the smallest distance."""
+        source, xp = self.source(u, v), self.xp
+        front, hidden = xp.abs(source[0] - self.target[0]), xp.full_like(source[0], xp.inf)
+        for p, q in zip(source[1:], self.target[1:], strict=True):
+            hidden = xp.minimum(hidden, xp.minimum(xp.abs(p - self.target[0]), xp.abs(q - source[0])))
+        return front + margin < hidden, xp.minimum(front, hidden)
+
     def continues(self, u: int, v: int, limit: Array) -> Array:
         """Whether the front of the source or of the target is nearer than a limit to where the other's line leads."""
         xp = self.xp
-        source, target = self._at(self._depth[0], u, v), self.target[0]
+        source, target = self.at(self._depth[0], u, v), self.target[0]
         found = xp.zeros_like(target, dtype=xp.bool)
         for end, start, steps in ((source, target, -1), (target, source, 2)):
-            before, covered = (self._at(x, steps * u, steps * v, border=2) for x in self._front)
+            before, covered = (self.at(x, steps * u, steps * v, border=2) for x in self._front)
             found = found | (covered & (xp.abs(end - (2 * start - before)) < limit))
         return found
 
-    def _at(self, cells: Array, u: int, v: int, border: int = 1) -> Array:
+    def at(self, cells: Array, u: int, v: int, border: int = 1) -> Array:
         """For each target, the cell from which (u, v) leads to it; (u, v) reaches as far as the border is wide."""
         top, left = border - v, border - u
         return cells[top : top + self.size[0], left : left + self.size[1], ...]
+
+
+class _Layers(_Depths):
+    """The same with weights and colours."""
+
+    def __init__(self, kernel: Kernel, positions: Array, rgba: Array, row: Array):
+        cells = _bordered(row)
+        position = [_unpack(positions, cells[k]) for k in range(row.shape[0])]
+        super().__init__([p[..., 2] for p in position], cells >= 0)
+        self._color = [
+            _weighted(_unpack(rgba, c), (c >= 0)[..., None]) for c in (cells[k] for k in range(row.shape[0]))
+        ]
+        self._weights = [kernel.weights(p) for p in position]
+
+    def splats(self, u: int, v: int) -> list[Array]:
+        """What the sources' layers give, K times (H, W, 5): weighted colours and the weight."""
+        return [
+            self.at(color * (wx[u] * wy[v])[..., None], u, v)
+            for color, (wx, wy) in zip(self._color, self._weights, strict=True)
+        ]
 
 
 def check_splats(positions: Array, rgba: Array, row: Array) -> tuple[Array, Array, Array]:
@@ -294,13 +352,21 @@ def _normalised(total: Array, xp: Any) -> Array:
     return total[..., :4] / xp.clip(total[..., 4:], 1.0, None)
 
 
-def _depths(position: list[Array], cells: Array) -> list[Array]:
+def _beyond(depth: list[Array], covered: Array) -> list[Array]:
     """Depths of each layer; an empty cell lies beyond everything, at a distance of the scene's own scale."""
-    xp = namespace(cells)
-    covered = [cells[k] >= 0 for k in range(len(position))]
-    depth = [xp.where(c, p[..., 2], 0.0) for c, p in zip(covered, position, strict=True)]
+    xp = namespace(covered, depth[0])
+    depth = [xp.where(covered[k], z, 0.0) for k, z in enumerate(depth)]
     farthest = 2 * xp.max(xp.abs(xp.stack(depth)))
-    return [xp.where(c, z, xp.where(farthest > 0, farthest, 1.0)) for c, z in zip(covered, depth, strict=True)]
+    return [xp.where(covered[k], z, xp.where(farthest > 0, farthest, 1.0)) for k, z in enumerate(depth)]
+
+
+def _all(conditions: list[Array]) -> Array:
+    return functools.reduce(operator.and_, conditions)
+
+
+def _fronts(covered: np.ndarray) -> np.ndarray:
+    """(K, H, W) bool: the first layer."""
+    return covered & (np.arange(len(covered)) == 0)[:, None, None]
 
 
 def _first_minimum(values: list[Array], xp: Any) -> tuple[Array, Array]:

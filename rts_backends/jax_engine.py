@@ -76,6 +76,10 @@ class JaxEngine:
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
         return tuple(jax.pure_callback(padded, shapes, *args, vmap_method="sequential"))
 
+    def traced(self, x: jax.Array) -> bool:
+        """Whether `x` is a tracer."""
+        return isinstance(x, jax.core.Tracer)
+
     def take_error(self) -> RtsError | None:
         """What the latest host call under a trace raised, once; jax replaces it by an error of its own."""
         error, self._error = self._error, None

@@ -1,0 +1,139 @@
+"""Layers that cannot be seen are dropped before they cost anything; and how many layers a scene needs."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rts.arrays import engine_of, namespace
+from rts.errors import InputError, LayersWarning
+from rts.protocols import ArraySpec, Part, Sampled, Samples
+
+LAYER_LIMIT = 8
+"""The largest number of layers that `layers="auto"` takes."""
+
+Needed = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""(K, H, W) covered (bool) and depth → which samples can reach the image (bool); on the host."""
+
+
+def needed_by(splatter: Any, parts: Sequence[Part]) -> Needed | None:
+    """What the splatter needs of a scene, or None where that is not known: all of it.
+
+    Only where all samples are opaque and lie on pixel centres are hidden ones without effect.
+    """
+    known = all(getattr(p.shader, "opaque", False) and getattr(p.surface, "centered", True) for p in parts)
+    return getattr(splatter, "needed", None) if known else None
+
+
+class Inspection:
+    """A `Needed` that takes note of how many layers there are where hidden ones count.
+
+    Attributes:
+        most: the largest number of layers in a cell that needs more than its front, at least 1; None before a call.
+        beyond: (L,) number of such cells that have an l-th layer.
+    """
+
+    def __init__(self, needed: Needed | None):
+        self._needed, self._lock = needed, threading.Lock()
+        self.most: int | None = None
+        self.beyond = np.zeros(0, np.int64)
+
+    def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """See `Needed`."""
+        kept = covered if self._needed is None else self._needed(covered, depth) & covered
+        counted = (covered[1:] & kept[1:].any(axis=0)).reshape(len(covered) - 1, -1).sum(axis=1)
+        counted = np.append(max(1, covered.shape[1] * covered.shape[2]), counted)
+        with self._lock:
+            if len(self.beyond) == len(counted):
+                counted = counted + self.beyond
+            self.beyond = counted
+            self.most = int(np.flatnonzero(counted).max()) + 1
+        return kept
+
+
+def as_needed(taken: Callable[[int, Needed], Sampled], needed: Needed | None) -> Sampled:
+    """The scene with as many layers as count.
+
+    Args:
+        taken: the scene with a number of layers, some of them dropped by a `Needed`.
+        needed: what the splatter needs.
+    """
+    count = 2
+    while True:
+        # At the limit one more is taken, to know what is missing there.
+        inspection = Inspection(needed)
+        sampled = taken(min(count, LAYER_LIMIT + 1), inspection)
+        if inspection.most is None:
+            raise InputError(
+                'layers is "auto", but the values that decide are traced; give a number inside jit or vmap'
+            )
+        if inspection.most < count or count > LAYER_LIMIT:
+            break
+        count *= 2
+    kept = min(inspection.most, LAYER_LIMIT)
+    missing = int(inspection.beyond[LAYER_LIMIT:].sum())
+    if missing:
+        warnings.warn(
+            f"{missing} cells where surfaces hide one another have more than the {LAYER_LIMIT} layers of "
+            f'layers="auto"; give a larger number if their derivative matters',
+            LayersWarning,
+            stacklevel=4,
+        )
+    arrays = {name: getattr(sampled, name)[:kept, ...] for name in ("row", "part", "depth")}
+    return replace(sampled, **arrays, overflow=sampled.overflow + missing)
+
+
+def prune(sampled: Sampled, needed: Needed) -> Sampled:
+    """The scene without the samples that are not needed; one call to the host."""
+    sizes = [s.ids.shape[0] for s in sampled.samples]
+    offsets = np.cumsum([0, *sizes])
+
+    def host(row: np.ndarray, depth: np.ndarray, *own_rows: np.ndarray) -> tuple[np.ndarray, ...]:
+        used = np.zeros(offsets[-1], bool)
+        used[row[needed(row >= 0, depth)]] = True
+        # In their order, so that neighbours in the image stay neighbours in memory.
+        indices = [np.flatnonzero(used[a:b]).astype(np.int32) for a, b in itertools.pairwise(offsets)]
+        numbers = [np.where(used[a:b], np.cumsum(used[a:b]) - 1, -1) for a, b in itertools.pairwise(offsets)]
+        rows = zip((np.concatenate(numbers), *numbers), (row, *own_rows), strict=True)
+        renumbered = [np.where(r >= 0, n[r], -1).astype(np.int32) for n, r in rows]
+        return *renumbered, *(i if len(i) else np.zeros(1, np.int32) for i in indices)
+
+    rows = sampled.row, *(s.row for s in sampled.samples)
+    shapes = [ArraySpec(tuple(r.shape), np.int32) for r in rows]
+    packed = [ArraySpec((n,), np.int32, packed=True) for n in sizes]
+    found = engine_of(sampled).call_host(host, (*shapes, *packed), rows[0], sampled.depth, *rows[1:])
+    row, own_rows, indices = found[0], found[1 : len(rows)], found[len(rows) :]
+    samples = [_selected(*z) for z in zip(sampled.samples, own_rows, indices, strict=True)]
+    xp = namespace(row)
+    # Row numbers are within parts up to here, since an engine may have padded what comes before.
+    start = 0
+    for i, index in enumerate(indices):
+        row = xp.where((row >= 0) & (sampled.part == i), row + start, row)
+        start += index.shape[0]
+    return replace(
+        sampled,
+        samples=tuple(samples),
+        row=row,
+        part=xp.where(row >= 0, sampled.part, -1),
+        depth=xp.where(row >= 0, sampled.depth, 0.0),
+    )
+
+
+def _selected(samples: Samples, row: Any, index: Any) -> Samples:
+    """Some of the rows of the samples of a part."""
+    xp = namespace(index)
+    gbuffer = samples.gbuffer
+    return replace(
+        samples,
+        ids=xp.take(samples.ids, index, axis=0),
+        params=xp.take(samples.params, index, axis=0),
+        gbuffer=None if gbuffer is None else {k: xp.take(v, index, axis=0) for k, v in gbuffer.items()},
+        row=row,
+        depth=xp.where(row >= 0, samples.depth, 0.0),
+    )

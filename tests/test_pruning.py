@@ -1,0 +1,193 @@
+"""Dropping hidden samples changes nothing; and layers="auto" takes as many as count."""
+
+import numpy as np
+import pytest
+from helpers import ALL, DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere, quad, soup, to_numpy
+
+import rts
+from rts import pruning
+from rts.arrays import map_leaves
+from rts.rendering import sample
+
+MESH = rts.plugin("rts.surfaces", "mesh")
+CAMERA = rts.Camera.look_at((0.3, 0.4, 4.0), (0, 0, 0), fov_y=50)
+SIZE = (24, 28)
+SPLATTERS = ["none", "single", "multi", "visible"]
+
+
+def part_of(mesh, seed=0, shift=(0.0, 0.0, 0.0), **options):
+    vertices, faces = mesh
+    colors = np.random.default_rng(seed).random(vertices.shape)
+    return rts.Part(MESH(faces), {"vertices": vertices + np.float32(shift), "colors": colors}, "unlit", **options)
+
+
+def card(z, half=1.0, shift=0.0):
+    return part_of(quad(-half + shift, half + shift, -half, half, z), seed=int(10 * z) + 50)
+
+
+SCENES = {
+    "soup": [part_of(soup(30))],
+    "sphere before a card": [part_of(icosphere(3, 0.7)), card(-1.0)],
+    "closed box": [part_of(box(0.6))],
+    "cards": [card(-0.3 * i, 0.5 + 0.1 * i, 0.1 * i) for i in range(4)],
+    "interpenetrating": [part_of(icosphere(2, 0.8), shift=(0.3, 0, 0)), part_of(icosphere(2, 0.8), 1)],
+}
+
+
+def with_vertices(parts, vertices):
+    return [p.replace(theta={**p.theta, "vertices": v}) for p, v in zip(parts, vertices, strict=True)]
+
+
+def images(parts, splatter, layers):
+    """The image from all samples, and from those that the splatter needs; and how many there are of each."""
+    found = []
+    for chosen in (None, splatter):
+        sampled = sample(parts, CAMERA, SIZE, splatter=chosen, layers=layers)
+        found.append((rts.render_samples(sampled, parts, CAMERA, splatter=splatter), int((sampled.row >= 0).sum())))
+    return found
+
+
+@pytest.mark.parametrize("splatter", SPLATTERS)
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("layers", [1, 2, 4])
+def test_the_image_is_the_same_without_what_is_not_needed(name, splatter, layers):
+    (whole, count), (pruned, fewer) = images(SCENES[name], splatter, layers)
+    np.testing.assert_allclose(pruned, whole, rtol=0, atol=1e-12)
+    assert fewer <= count
+    if layers > 1 and name in ("sphere before a card", "closed box"):
+        assert fewer < count
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize("splatter", ["multi", "visible"])
+@pytest.mark.parametrize("name", ["soup", "sphere before a card"])
+def test_derivatives_are_the_same_without_what_is_not_needed(name, splatter, target):
+    parts = SCENES[name]
+    vertices = arrays(target, [p.theta["vertices"] for p in parts])
+    weights = arrays(target, np.random.default_rng(0).normal(size=(*SIZE, 4)))
+    along = arrays(
+        target, [np.random.default_rng(i).normal(size=p.theta["vertices"].shape) for i, p in enumerate(parts)]
+    )
+    found = []
+    for chosen in (None, splatter):
+        sampled = sample(with_vertices(parts, vertices), CAMERA, SIZE, splatter=chosen, layers=3)
+
+        def loss(v, sampled=sampled):
+            image = rts.render_samples(sampled, with_vertices(parts, v), CAMERA, splatter=splatter)
+            return (image * weights).sum()
+
+        found.append([*gradient(target, loss, vertices), derivative(target, loss, vertices, along)[1]])
+    for whole, pruned in zip(*found, strict=True):
+        np.testing.assert_allclose(pruned, whole, rtol=1e-4, atol=1e-4 * np.abs(whole).max())
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_all_of_what_is_sampled_is_consistent_after_pruning(target):
+    parts = map_leaves(lambda x: arrays(target, x), SCENES["sphere before a card"])
+    sampled = to_numpy(sample(parts, CAMERA, SIZE, splatter="visible", layers=4))
+    whole = to_numpy(sample(parts, CAMERA, SIZE, layers=4))
+    kept = sampled.row >= 0
+    np.testing.assert_array_equal(sampled.part, np.where(kept, whole.part, -1))
+    np.testing.assert_array_equal(sampled.depth, np.where(kept, whole.depth, 0))
+    offsets = np.cumsum([0, *(len(s.ids) for s in sampled.samples)])
+    for i, (own, all_of_them) in enumerate(zip(sampled.samples, whole.samples, strict=True)):
+        np.testing.assert_array_equal((own.row >= 0).sum(), (kept & (sampled.part == i)).sum())
+        cells = kept & (sampled.part == i)
+        local = sampled.row[cells] - offsets[i]
+        before = whole.row[cells] - np.cumsum([0, *(len(s.ids) for s in whole.samples)])[i]
+        np.testing.assert_array_equal(own.ids[local], all_of_them.ids[before])
+        np.testing.assert_array_equal(own.params[local], all_of_them.params[before])
+
+
+def test_nothing_is_dropped_that_may_be_seen_through():
+    def glass(theta, gbuffer, camera):
+        return 0.5 * rts.namespace(gbuffer["position"]).ones_like(gbuffer["position"][:, :1]) * np.ones((1, 4))
+
+    parts = [p.replace(shader=glass) for p in SCENES["closed box"]]
+    (whole, count), (same, same_count) = images(parts, "visible", 4)
+    assert count == same_count
+    np.testing.assert_array_equal(same, whole)
+
+
+def test_constant_surfaces_are_evaluated_only_where_needed():
+    calls = []
+
+    class Watched(MESH):
+        def evaluate(self, theta, samples):
+            calls.append(len(samples.ids))
+            return super().evaluate(theta, samples)
+
+    torch = pytest.importorskip("torch")
+    vertices, faces = icosphere(3)
+    part = rts.Part(Watched(faces), {"vertices": vertices}, "silhouette", torch.eye(4))
+    sizes = []
+    for splatter in (None, "visible"):
+        calls.clear()
+        sample(part, CAMERA, SIZE, splatter=splatter, layers=2)
+        sizes.append(max(calls))
+    assert sizes[1] < 0.6 * sizes[0]
+
+
+def test_a_splatter_that_does_not_say_what_it_needs_gets_everything():
+    class Own:
+        def splat(self, positions, rgba, row):
+            return rts.plugin("splatters", "visible")().splat(positions, rgba, row)
+
+    (whole, count), (same, same_count) = images(SCENES["closed box"], Own(), 3)
+    assert count == same_count
+    np.testing.assert_array_equal(same, whole)
+
+
+# ---------------------------------------------------------------------------------------------- layers="auto"
+
+
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize(
+    "name, expected", [("closed box", 1), ("cards", 4), ("sphere before a card", 3), ("interpenetrating", 4)]
+)
+def test_auto_takes_the_layers_that_count(name, expected, target):
+    parts = map_leaves(lambda x: arrays(target, x), SCENES[name])
+    sampled = sample(parts, CAMERA, SIZE, splatter="visible", layers="auto")
+    assert sampled.row.shape[0] == expected
+    found = to_numpy(rts.render(parts, CAMERA, SIZE, layers="auto"))
+    np.testing.assert_allclose(found, to_numpy(rts.render(parts, CAMERA, SIZE, layers=8)), rtol=0, atol=1e-6)
+
+
+def test_auto_without_a_splatter_takes_every_layer():
+    assert rts.sample(SCENES["closed box"], CAMERA, SIZE, layers="auto").row.shape[0] == 2
+
+
+def test_auto_of_an_empty_view_takes_one_layer():
+    image = rts.render(card(50.0), CAMERA, SIZE, layers="auto")
+    np.testing.assert_array_equal(image, 0)
+
+
+def test_auto_says_what_is_beyond_its_limit(monkeypatch):
+    parts = [card(-0.1 * i, 0.5 + 0.02 * i, 0.02 * i) for i in range(12)]
+    with pytest.warns(rts.LayersWarning, match="more than the 8 layers"):
+        sampled = sample(parts, CAMERA, SIZE, splatter="visible", layers="auto")
+    assert sampled.row.shape[0] == 8 and int(sampled.overflow) > 0
+    monkeypatch.setattr(pruning, "LAYER_LIMIT", 16)
+    sampled = sample(parts, CAMERA, SIZE, splatter="visible", layers="auto")
+    assert sampled.row.shape[0] == 12 and int(sampled.overflow) == 0
+
+
+def test_auto_works_under_gradients_and_says_what_to_do_under_jit():
+    jax = pytest.importorskip("jax")
+    parts = SCENES["closed box"]
+
+    def loss(vertices):
+        return rts.render(with_vertices(parts, [vertices]), CAMERA, SIZE, layers="auto").sum()
+
+    vertices = arrays("jax", parts[0].theta["vertices"])
+    assert np.abs(jax.grad(loss)(vertices)).max() > 0
+    with pytest.raises(rts.InputError, match='layers is "auto", but the values that decide are traced; give a number'):
+        jax.jit(loss)(vertices)
+    torch = pytest.importorskip("torch")
+    assert torch.func.grad(loss)(arrays("torch-cpu", parts[0].theta["vertices"])).abs().max() > 0
+
+
+@pytest.mark.parametrize("wrong", ["all", 0, None, 1.5])
+def test_other_layers_are_refused(wrong):
+    with pytest.raises(rts.InputError, match='expected an integer of at least 1, or "auto"'):
+        rts.render(card(0.0), CAMERA, SIZE, layers=wrong)
