@@ -35,6 +35,14 @@ class _Fused(splatting.Kernel):
             return Splats(settings, positions, rgba, row).image()
         return specification(positions, rgba, row)
 
+    def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """See `rts.protocols.Splatter`."""
+        if self.kind == "single" or depth.dtype not in (np.float32, np.float64):
+            return super().needed(covered, depth)
+        from rts_backends import fused_pruning
+
+        return fused_pruning.needed(covered, depth, self.kind == "visible", self.epsilon)
+
 
 class Single(_Fused, splatting.Single):
     """`rts.splatting.Single`."""

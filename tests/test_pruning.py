@@ -5,7 +5,7 @@ import pytest
 from helpers import ALL, DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere, quad, soup, to_numpy
 
 import rts
-from rts import pruning
+from rts import pruning, splatting
 from rts.arrays import map_leaves
 from rts.rendering import sample
 
@@ -97,6 +97,24 @@ def test_all_of_what_is_sampled_is_consistent_after_pruning(target):
         before = whole.row[cells] - np.cumsum([0, *(len(s.ids) for s in whole.samples)])[i]
         np.testing.assert_array_equal(own.ids[local], all_of_them.ids[before])
         np.testing.assert_array_equal(own.params[local], all_of_them.params[before])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("name", ["multi", "visible", "single"])
+def test_the_compiled_choice_is_that_of_the_specification(name, dtype):
+    specification = {"multi": splatting.Multi, "visible": splatting.Visible, "single": splatting.Single}[name]
+    compiled = rts.plugin("rts.splatters", name)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        layers, height, width = rng.integers(1, 6), *rng.integers(1, 14, 2)
+        x, y = np.arange(width), np.arange(height)[:, None]
+        slope = rng.normal(0, 0.3, (layers, 2, 1, 1))
+        depth = 5 + slope[:, 0] * x + slope[:, 1] * y + np.where(rng.random((layers, 1, 1)) < 0.5, 2.0, 0.0)
+        depth = np.sort(np.abs(depth) + 0.1, axis=0).astype(dtype)
+        covered = np.logical_and.accumulate(rng.random(depth.shape) < 0.93, axis=0)
+        for options in ({}, {"epsilon": 0.0}):
+            expected = specification(**options).needed(covered, depth)
+            np.testing.assert_array_equal(compiled(**options).needed(covered, depth), expected)
 
 
 def test_nothing_is_dropped_that_may_be_seen_through():
