@@ -166,8 +166,12 @@ def measure(plan: list[Plan], say: Callable[[str], None], done: Callable[[], Non
     images: dict[tuple[str, str], np.ndarray] = {}
     for scene, against, ours, others in plan:
         noise = {name: reference.noise for name, reference in against._asdict().items()}
-        about = {"note": scene.note, "closed_form": against.exact.step == 0, "noise": noise}
-        results["scenes"][scene.name] = about
+        results["scenes"][scene.name] = {
+            "note": scene.note,
+            "closed_form": against.exact.step == 0,
+            "noise": noise,
+            "step": scores(against.pixel.derivative, against.exact)["low_relative_l2"],
+        }
         for method in [*ours, *others]:
             say(f"{scene.name}: {method.name}")
             row, images[scene.name, method.name] = score(scene.name, method, against)

@@ -19,13 +19,15 @@ COLUMNS = {
 """Methods of the derivative images, and their titles."""
 SHOWN, CONTRAST = slice(36, 228), 2.0
 """Rows and columns of A, B and C that are shown, and the factor on their derivatives."""
+CONTRAST_LOW = 10.0
+"""The factor on low-passed differences."""
 FAILURES = (
-    ("wires 0.5 px", 2, (96, 64, 160, 128)),
+    ("wires 0.5 px", 2, (88, 168, 72, 152)),
     ("half-plane", 2, (116, 140, 116, 140)),
-    ("box over card", 4, (72, 72, 168, 168)),
-    ("6 cards, alternating", 6, (48, 48, 208, 208)),
-    ("spheres", 4, (88, 96, 168, 176)),
-    ("C unculled", 2, (0, 0, 256, 256)),
+    ("box over card", 4, (64, 184, 72, 192)),
+    ("6 cards, alternating", 6, (40, 216, 40, 216)),
+    ("spheres", 4, (60, 190, 70, 200)),
+    ("C unculled", 2, (36, 228, 36, 228)),
 )
 """Scene, K, and what is shown: first and last row, first and last column."""
 
@@ -81,16 +83,16 @@ def error_vs_time(results: dict, path: Path) -> None:
             rows = [r for r in results["times"] if r["scene"] == scene and r["method"].startswith(start)]
             points = [(r["seconds"], errors[scene, r["method"]]) for r in rows]
             axes.loglog(*np.array(points).reshape(-1, 2).T, label=label, **style)
+            place = {"xytext": (-6, -11), "ha": "right"} if start == "visible" else {"xytext": (6, 4)}
             for point, row in zip(points, rows, strict=True):
-                axes.annotate(
-                    _sampled(row["method"]), point, (6, 4), textcoords="offset points", fontsize=9, color=style["color"]
-                )
+                text = _sampled(row["method"])
+                axes.annotate(text, point, textcoords="offset points", fontsize=9, color=style["color"], **place)
         noise = results["scenes"][scene]["noise"]["exact"]["low_relative_l2"]
         axes.axhline(noise, color="grey", linestyle="--", linewidth=1, label="noise of the truth")
         axes.set_title(scene)
         axes.set_xlabel("seconds of render and gradient")
         axes.grid(alpha=0.3, which="both")
-        axes.margins(x=0.15)
+        axes.margins(x=0.22)
     figure.axes[0].set_ylabel("low-passed relative L2 of the derivative image")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=10)
     figure.suptitle(
@@ -116,7 +118,7 @@ def failures(images: dict, against: dict, path: Path) -> None:
     chosen = [f for f in FAILURES if f[0] in against]
     if not chosen:
         return
-    titles = ["image", "derivative, truth", "derivative, visible", "low-passed difference × 4"]
+    titles = ["image", "derivative, truth", "derivative, visible", f"low-passed difference × {CONTRAST_LOW:g}"]
     figure = Figure(figsize=(2.9 * 4, 2.9 * len(chosen) + 0.4), layout="constrained")
     for n, (line, (scene, k, (top, bottom, left, right))) in enumerate(
         zip(figure.subplots(len(chosen), 4, squeeze=False), chosen, strict=True)
@@ -126,7 +128,7 @@ def failures(images: dict, against: dict, path: Path) -> None:
             reference.image.clip(0, 1),
             signed(reference.derivative),
             signed(found),
-            signed(low_pass(found - reference.derivative), 4),
+            signed(low_pass(found - reference.derivative), CONTRAST_LOW),
         ]
         for axes, picture, title in zip(line, pictures, titles, strict=True):
             show(axes, picture[top:bottom, left:right], "" if n else title)
