@@ -36,14 +36,19 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Part
     if not parts or not all(isinstance(p, Part) for p in parts):
         kinds = ", ".join(type(p).__name__ for p in parts) or "nothing"
         raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
-    if not isinstance(camera, Camera):
-        raise InputError(f"camera is a {type(camera).__name__}; expected an rts.Camera")
+    check_is_camera(camera)
     camera = Camera(*from_numbers(tuple(camera)))
     for name, matrix in zip(camera._fields, camera, strict=True):
         check_matrix(f"the camera's {name}", matrix)
     checked = [_check_part(index, part) for index, part in enumerate(parts)]
     engine_of(checked, camera)
     return checked, camera
+
+
+def check_is_camera(camera: Any) -> None:
+    """Refuse anything else."""
+    if not isinstance(camera, Camera):
+        raise InputError(f"camera is a {type(camera).__name__}; expected an rts.Camera")
 
 
 def _check_part(index: int, part: Part) -> Part:

@@ -8,7 +8,6 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from rts.arrays import engine_of, from_numbers, is_constant, leaves, map_leaves, namespace
 from rts.camera import Camera
@@ -279,6 +278,8 @@ def _difference(
 
 def _smooth_weighting(size: tuple[int, int], engine: Engine, parameters: Tree) -> Callable[[Array], Array]:
     """Image → the sum of its pixels with smooth random weights."""
+    from scipy.ndimage import gaussian_filter
+
     weights = np.random.default_rng(0).normal(size=(*size, 4))
     weights = gaussian_filter(weights, (LOSS_SMOOTHNESS, LOSS_SMOOTHNESS, 0))
     weights = engine.constant(weights / weights.std(), next(leaves(parameters)))

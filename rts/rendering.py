@@ -70,6 +70,7 @@ def render(
         InputError: what was given cannot be rendered.
         EngineError: torch and jax arrays in one scene.
     """
+    check_is_camera(camera)
     height, width = check_size(size, layers, capacity, supersample)
     background = check_background(background, (height, width))
     bands = _bands(height, width, layers, supersample)
