@@ -13,6 +13,7 @@ from rts.arrays import affine, constants, engine_of, exemplar, is_constant, name
 from rts.camera import Camera
 from rts.checks import (
     check_background,
+    check_is_camera,
     check_memory,
     check_plugin,
     check_scene,
