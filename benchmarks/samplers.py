@@ -25,7 +25,7 @@ from scenes import camera, mesh
 
 import rts
 from rts.protocols import Proxy
-from rts_backends.threads import thread_count
+from rts.threads import thread_count
 from rts_backends.triangles import pixel_matrix
 
 SCENES = {"teapot_2464": 0, "bunny": 0, "spot": 3, "nefertiti": 2}

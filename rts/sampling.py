@@ -136,10 +136,9 @@ class TriangleSampler(abc.ABC):
                     _check_fragments(fragments, (layers, *size), self)
                 else:
                     fragments = _no_fragments((layers, *size))
-            if needed is not None:
-                kept = needed(fragments.triangle_ids >= 0, fragments.depth)
-                fragments = fragments._replace(triangle_ids=np.where(kept, fragments.triangle_ids, np.int32(-1)))
-            samples = lift(fragments, found.proxy, capacity)
+            covered = fragments.triangle_ids >= 0
+            kept = covered if needed is None else needed(covered, fragments.depth)
+            samples = lift(fragments, found.proxy, capacity, kept)
             if hasattr(surface, "refine"):
                 samples = surface.refine(host_inputs, samples, _sample_rays(samples, host_camera, size))
             gbuffer = surface.evaluate(host_theta, samples) if host_theta is not None else {}
@@ -230,36 +229,20 @@ def _check_fragments(fragments: Any, shape: tuple[int, int, int], sampler: Any) 
         )
 
 
-def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None) -> Samples:
+def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None, kept: np.ndarray | None = None) -> Samples:
     """Packed samples from fragments: the triangle's ids, and its corner parameters interpolated.
 
     Samples are numbered layer by layer, each in rows and columns of the image. There is always at least one row, so
-    that what follows stays connected to θ; a row that no cell refers to has no effect.
+    that what follows stays connected to θ; a row that no cell refers to has no effect. `kept` (K, H, W) bool says which
+    of the covered cells to take, None for all.
     """
-    ids_table = proxy.faces if proxy.ids is None else proxy.ids
-    covered = np.flatnonzero(fragments.triangle_ids.reshape(-1) >= 0)
-    overflow = 0
-    if capacity is not None:
-        overflow = max(0, len(covered) - capacity)
-        covered = covered[:capacity]
-    count = len(covered)
-    rows = max(1, count) if capacity is None else capacity
-    row = np.full(fragments.triangle_ids.size, -1, np.int32)
-    row[covered] = np.arange(count, dtype=np.int32)
+    from rts import lifting
 
-    triangles = fragments.triangle_ids.reshape(-1)[covered]
-    barycentrics = fragments.barycentrics.reshape(-1, 2)[covered]
-    if proxy.corner_params is None:
-        found = barycentrics
-    else:
-        a, b, c = np.moveaxis(proxy.corner_params[triangles], 1, 0)
-        found = c + barycentrics[:, :1] * (a - c) + barycentrics[:, 1:] * (b - c)
-    ids = np.zeros((rows, ids_table.shape[1]), np.int32)
-    params = np.zeros((rows, found.shape[1]), np.float32)
-    np.take(ids_table, triangles, axis=0, out=ids[:count])
-    params[:count] = found
-    row = row.reshape(fragments.triangle_ids.shape)
-    return Samples(ids, params, row, np.where(row >= 0, fragments.depth, 0), np.asarray(overflow, np.int32))
+    kept = fragments.triangle_ids >= 0 if kept is None else kept
+    table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)
+    corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
+    ids, params, row, depth, total = lifting.pack(fragments, kept, table, corner_params, capacity or 0)
+    return Samples(ids, params, row, depth, np.asarray(max(0, total - len(ids)), np.int32))
 
 
 def _sample_rays(samples: Samples, camera: Camera, size: tuple[int, int]) -> Rays:
@@ -280,7 +263,7 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         overflow = overflow + s.overflow
     if len(samples) == 1:
         only = samples[0]
-        return Sampled(tuple(samples), xp.where(only.row >= 0, 0, -1), only.row, only.depth, overflow)
+        return Sampled(tuple(samples), xp.clip(only.row, -1, 0), only.row, only.depth, overflow)
     offsets = np.cumsum([0, *(s.ids.shape[0] for s in samples)])
     row = xp.concat([xp.where(s.row >= 0, s.row + int(o), s.row) for s, o in zip(samples, offsets, strict=False)])
     part = xp.concat([xp.where(s.row >= 0, i, s.row) for i, s in enumerate(samples)])

@@ -13,7 +13,7 @@ from rts.protocols import Fragments, Proxy
 from rts.sampling import TriangleSampler
 from rts_backends import embree_library, embree_public
 from rts_backends.embree_kernels import TILE, cast, keep_nearest_address
-from rts_backends.threads import parallel
+from rts.threads import parallel
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
 REFITS = 32

@@ -19,7 +19,7 @@ from rts.splatting import CONTINUED, OFFSETS
 from rts_backends import fused_choices as choosing
 from rts_backends import fused_mixed as mixed
 from rts_backends import fused_stencil as stencil
-from rts_backends.threads import parallel
+from rts.threads import parallel
 
 
 class Settings(NamedTuple):

@@ -6,7 +6,7 @@ import numba
 import numpy as np
 
 from rts.splatting import CONTINUED, LEAST_EPSILON, TIE
-from rts_backends.threads import parallel
+from rts.threads import parallel
 
 compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)

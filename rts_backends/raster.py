@@ -16,7 +16,7 @@ import numpy as np
 from rts.camera import Camera
 from rts.protocols import Fragments, Proxy
 from rts.sampling import TriangleSampler
-from rts_backends.threads import parallel
+from rts.threads import parallel
 from rts_backends.triangles import depth_of, determinant, edge, facing, owns, pixel_matrix, to_corner
 
 BAND_ROWS = 8

@@ -115,7 +115,7 @@ def test_threads_may_share_a_part_and_a_handle(name):
 
 def test_a_pool_is_made_once_by_threads_that_start_together(monkeypatch):
     pytest.importorskip("numba")
-    from rts_backends import threads
+    from rts import threads
 
     made, executor, start = [], threads.ThreadPoolExecutor, threading.Barrier(8)
 

@@ -1,0 +1,98 @@
+"""Packing fragments into samples, compiled. Imported when first needed, since it imports numba."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from rts.protocols import Fragments
+from rts.threads import parallel
+
+
+def pack(
+    fragments: Fragments, kept: np.ndarray, table: np.ndarray, corner_params: np.ndarray | None, capacity: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
+    """Ids (N, I), params (N, P), row and depth (K, H, W) of some cells, layer by layer; and how many there are in all.
+
+    Args:
+        fragments: what was sampled.
+        kept: (K, H, W) bool, which of them to take; covered ones.
+        table: (T, I) int32, ids of each triangle.
+        corner_params: (T, 3, P) float32, or None for the barycentrics themselves.
+        capacity: rows to allot, or 0 for as many as are covered, at least one.
+    """
+    layers, height, width = kept.shape
+    lines = layers * height
+    triangle_ids = np.ascontiguousarray(fragments.triangle_ids, np.int32).reshape(lines, width)
+    barycentrics = np.ascontiguousarray(fragments.barycentrics, np.float32).reshape(lines, width, 2)
+    depths = np.ascontiguousarray(fragments.depth, np.float32).reshape(lines, width)
+    kept = np.ascontiguousarray(kept).reshape(lines, width)
+    counts = np.zeros(lines, np.int64)
+    parallel(_count, lines, kept, counts)
+    offsets = np.cumsum(counts) - counts
+    total = int(counts.sum())
+    rows = capacity or max(1, total)
+    make = np.zeros if rows > total else np.empty
+    ids = make((rows, table.shape[1]), np.int32)
+    params = make((rows, 2 if corner_params is None else corner_params.shape[2]), np.float32)
+    row, depth = np.empty((lines, width), np.int32), np.empty((lines, width), np.float32)
+    parallel(_number, lines, kept, depths, offsets, rows, row, depth)
+    parallel(_take_ids, lines, row, triangle_ids, table, ids)
+    if corner_params is None:
+        parallel(_take, lines, row, barycentrics, params)
+    else:
+        parallel(_interpolate, lines, row, triangle_ids, barycentrics, corner_params, params)
+    shape = layers, height, width
+    return ids, params, row.reshape(shape), depth.reshape(shape), total
+
+
+@numba.njit(cache=True, nogil=True)
+def _count(start, stop, kept, counts):
+    for y in range(start, stop):
+        count = 0
+        for x in range(kept.shape[1]):
+            count += kept[y, x]
+        counts[y] = count
+
+
+@numba.njit(cache=True, nogil=True)
+def _number(start, stop, kept, depths, offsets, rows, row, depth):
+    for y in range(start, stop):
+        n = offsets[y]
+        for x in range(kept.shape[1]):
+            taken = kept[y, x] and n < rows
+            row[y, x] = n if taken else -1
+            depth[y, x] = depths[y, x] if taken else 0
+            n += taken
+
+
+@numba.njit(cache=True, nogil=True)
+def _take_ids(start, stop, row, triangle_ids, table, ids):
+    for y in range(start, stop):
+        for x in range(row.shape[1]):
+            n = row[y, x]
+            if n >= 0:
+                for i in range(table.shape[1]):
+                    ids[n, i] = table[triangle_ids[y, x], i]
+
+
+@numba.njit(cache=True, nogil=True)
+def _take(start, stop, row, barycentrics, params):
+    for y in range(start, stop):
+        for x in range(row.shape[1]):
+            n = row[y, x]
+            if n >= 0:
+                params[n, 0], params[n, 1] = barycentrics[y, x, 0], barycentrics[y, x, 1]
+
+
+@numba.njit(cache=True, nogil=True)
+def _interpolate(start, stop, row, triangle_ids, barycentrics, corner_params, params):
+    for y in range(start, stop):
+        for x in range(row.shape[1]):
+            n = row[y, x]
+            if n < 0:
+                continue
+            t, a, b = triangle_ids[y, x], barycentrics[y, x, 0], barycentrics[y, x, 1]
+            for i in range(params.shape[1]):
+                c = corner_params[t, 2, i]
+                params[n, i] = c + a * (corner_params[t, 0, i] - c) + b * (corner_params[t, 1, i] - c)
