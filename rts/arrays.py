@@ -179,3 +179,8 @@ def matmul(a: Array, b: Array) -> Array:
 def affine(row: Array, points: Array) -> Array:
     """One coordinate (N,) of an affine map of points (N, 3): `row` is (4,), its last entry the offset."""
     return points[..., 0] * row[0] + points[..., 1] * row[1] + points[..., 2] * row[2] + row[3]
+
+
+def affine_map(matrix: Array, points: Array) -> Array:
+    """Points (N, 3) under an affine map (4, 4)."""
+    return namespace(matrix, points).stack([affine(matrix[i, :], points) for i in range(3)], axis=-1)

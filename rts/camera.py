@@ -316,8 +316,9 @@ class Camera(NamedTuple):
         rows = matmul(self.projection, self.view)
         w = affine(rows[3, :], points)
         safe = xp.where(w * w > 0, w, xp.ones_like(w))
-        x, y = affine(rows[0, :], points) / safe, affine(rows[1, :], points) / safe
-        return xp.stack([(x + 1) * (width / 2), (1 - y) * (height / 2), -affine(self.view[2, :], points)], axis=-1)
+        x = affine((rows[3, :] + rows[0, :]) * (width / 2), points) / safe
+        y = affine((rows[3, :] - rows[1, :]) * (height / 2), points) / safe
+        return xp.stack([x, y, -affine(self.view[2, :], points)], axis=-1)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from rts.arrays import affine, constants, engine_of, exemplar, is_constant, namespace
+from rts.arrays import affine_map, constants, engine_of, exemplar, is_constant, namespace
 from rts.camera import Camera
 from rts.checks import (
     check_background,
@@ -182,11 +182,11 @@ def render_samples(
     positions, colors = [], []
     for part, samples in zip(parts, sampled.samples, strict=True):
         transform = constants(part.transform, engine, like)
-        gbuffer = _to_world(_evaluate(part, samples, engine, like), transform)
+        local = _evaluate(part, samples, engine, like)
         rest = {name: value for name, value in part.theta.items() if name not in reads_of(part)}
-        rgba = part.shader({**part.theta, **constants(rest, engine, like)}, gbuffer, camera)
-        check_shaded(rgba, gbuffer["position"].shape[0], part.shader)
-        positions.append(wide.project(gbuffer["position"], grid))
+        rgba = part.shader({**part.theta, **constants(rest, engine, like)}, _to_world(local, transform), camera)
+        check_shaded(rgba, local["position"].shape[0], part.shader)
+        positions.append(wide.within(transform).project(local["position"], grid))
         colors.append(constants(rgba, engine, like))
     xp = namespace(sampled.row)
     image = splatter.splat(xp.concat(positions), xp.concat(colors), sampled.row)
@@ -221,17 +221,13 @@ def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
     """Positions and normals moved by the part's transform."""
     if transform is None:
         return gbuffer
-    xp = namespace(transform)
-    local = GBuffer(gbuffer)
-    position = gbuffer["position"]
-    local["position"] = xp.stack([affine(transform[i, :], position) for i in range(3)], axis=-1)
+    world = GBuffer(like=gbuffer["position"])
     for name in gbuffer:
-        if name not in local:
-            local.defer(name, lambda name=name: gbuffer[name])
+        world.defer(name, lambda name=name: gbuffer[name])
+    world.defer("position", lambda: affine_map(transform, gbuffer["position"]))
     if "normal" in gbuffer:
-        dict.pop(local, "normal", None)
-        local.defer("normal", lambda: _move_normals(transform, gbuffer["normal"]))
-    return local
+        world.defer("normal", lambda: _move_normals(transform, gbuffer["normal"]))
+    return world
 
 
 def _move_normals(transform: Array, normals: Array) -> Array:

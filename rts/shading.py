@@ -40,8 +40,8 @@ class Silhouette:
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
         """See `rts.protocols.Shader`."""
-        position = gbuffer["position"]
-        return _opaque(namespace(position).ones_like(position))
+        white = namespace(gbuffer.like).ones_like(gbuffer.like[:, :1])
+        return namespace(white).concat([white] * 4, axis=1)
 
 
 @dataclass(frozen=True)
