@@ -19,7 +19,7 @@ from rts.sampling import TriangleSampler
 from rts.threads import parallel
 from rts_backends.triangles import depth_of, determinant, edge, facing, owns, pixel_matrix, to_corner
 
-BAND_ROWS = 8
+BAND_ROWS = 16
 CHUNK = 1 << 14
 BLOCK = 64
 SLACK = 1e-2
@@ -256,18 +256,20 @@ def _draw(first, last, offsets, items, boxes, kept, clips, numbers, planes, tria
             za, zb, zc = numbers[n, 9], numbers[n, 10], numbers[n, 11]
             # Top and left edges own the pixels exactly on them (y points down).
             own_a, own_b, own_c = owns(xa, ya), owns(xb, yb), owns(xc, yc)
+            i0, i1, clipped = boxes[n, 0], boxes[n, 1], clips[n]
             for j in range(j0, j1 + 1):
                 y = j + 0.5
                 ra, rb, rc = ya * y + wa, yb * y + wb, yc * y + wc
-                for i in range(boxes[n, 0], boxes[n, 1] + 1):
+                for i in range(i0, i1 + 1):
                     x = i + 0.5
                     ea, eb, ec = xa * x + ra, xb * x + rb, xc * x + rc
-                    if ea < 0 or eb < 0 or ec < 0:
+                    # One branch that is hard to foresee instead of three.
+                    if (ea < 0) | (eb < 0) | (ec < 0):
                         continue
-                    if (ea == 0 and not own_a) or (eb == 0 and not own_b) or (ec == 0 and not own_c):
+                    if ((ea == 0) & (not own_a)) | ((eb == 0) & (not own_b)) | ((ec == 0) & (not own_c)):
                         continue
                     total = ea + eb + ec
-                    if not total > 0 or (clips[n] and _outside(planes, n, ea, eb, ec)):
+                    if not total > 0 or (clipped and _outside(planes, n, ea, eb, ec)):
                         continue
                     z = (ea * za + eb * zb + ec * zc) / total
                     pixel = (j - top) * width + i
