@@ -17,25 +17,34 @@ CONSTANT_TYPES = (np.ndarray, np.generic, bool, int, float)
 
 def leaves(tree: Tree) -> Iterator[Any]:
     """The leaves of nested dicts, lists, tuples and records, in a fixed order; None has none."""
-    if tree is None:
-        return
-    if isinstance(tree, Mapping):
-        for key in sorted(tree):
-            yield from leaves(tree[key])
-    elif isinstance(tree, (list, tuple)):
+    found: list[Any] = []
+    _collect(tree, found)
+    return iter(found)
+
+
+def _collect(tree: Tree, found: list[Any]) -> None:
+    # Called hundreds of times a render, so what is frequent is asked first, and nothing of an abstract class.
+    if type(tree) in STATIC_FIELDS:
+        _collect(split_record(tree)[0], found)
+    elif isinstance(tree, (tuple, list)):
         for item in tree:
-            yield from leaves(item)
-    elif type(tree) in STATIC_FIELDS:
-        yield from leaves(split_record(tree)[0])
-    else:
-        yield tree
+            _collect(item, found)
+    elif _is_mapping(tree):
+        for key in sorted(tree):
+            _collect(tree[key], found)
+    elif tree is not None:
+        found.append(tree)
+
+
+def _is_mapping(tree: Any) -> bool:
+    return isinstance(tree, dict) or (not hasattr(tree, "dtype") and isinstance(tree, Mapping))
 
 
 def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
     """The same tree with `fn` applied to each leaf, visited in the order of `leaves`."""
     if tree is None:
         return None
-    if isinstance(tree, Mapping):
+    if _is_mapping(tree):
         return {key: map_leaves(fn, tree[key]) for key in sorted(tree)}
     if isinstance(tree, (list, tuple)):
         items = [map_leaves(fn, item) for item in tree]
@@ -68,6 +77,7 @@ def is_constant(tree: Tree) -> bool:
 # Plain dictionaries rather than functools caches: torch.compile looks through the latter, and warns.
 _ENGINES: dict[str, Engine] = {}
 _OWNERS: dict[type, Engine] = {}
+_BITS: dict[Any, int] = {}
 
 
 def _engine(name: str) -> Engine:
@@ -98,11 +108,11 @@ def engine_of(*trees: Tree) -> Engine:
     """
     found: dict[str, Engine] = {}
     for x in leaves(trees):
-        if isinstance(x, CONSTANT_TYPES):
-            continue
-        if type(x) not in _OWNERS:
-            _OWNERS[type(x)] = _owner(x)
-        engine = _OWNERS[type(x)]
+        engine = _OWNERS.get(type(x))
+        if engine is None:
+            if isinstance(x, CONSTANT_TYPES):
+                continue
+            engine = _OWNERS[type(x)] = _owner(x)
         found[engine.name] = engine
     if len(found) > 1:
         raise EngineError(
@@ -116,9 +126,12 @@ def exemplar(*trees: Tree) -> Array | None:
     """The widest floating array of an engine other than NumPy, which sets dtype and device for constants, or None."""
     widest, bits = None, 0
     for x in leaves(trees):
-        if isinstance(x, CONSTANT_TYPES) or not namespace(x).isdtype(x.dtype, "real floating"):
+        if isinstance(x, CONSTANT_TYPES):
             continue
-        own = namespace(x).finfo(x.dtype).bits
+        own = _BITS.get(x.dtype)
+        if own is None:
+            xp = namespace(x)
+            own = _BITS[x.dtype] = xp.finfo(x.dtype).bits if xp.isdtype(x.dtype, "real floating") else 0
         if own > bits:
             widest, bits = x, own
     return widest
@@ -126,7 +139,8 @@ def exemplar(*trees: Tree) -> Array | None:
 
 def namespace(*arrays: Array) -> Any:
     """The array-API namespace of these arrays."""
-    return engine_of(*arrays).namespace
+    engine = _OWNERS.get(type(arrays[0])) if len(arrays) == 1 else None
+    return (engine or engine_of(*arrays)).namespace
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:

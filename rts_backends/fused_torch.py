@@ -6,6 +6,7 @@ kernels; the derivatives of the last two, which are second derivatives of the im
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -213,6 +214,11 @@ class _Push(torch.autograd.Function):
         ]
         out = _Push.apply(work, positions, rgba, row, *flat)
         return out.unflatten(0, (info.batch_size, -1)), 0
+
+
+# torch asks for the signature at each call, and finding it anew takes longer than a small kernel.
+for _function in (_Image, _Pull, _Push):
+    _function.forward.__signature__ = inspect.signature(_function.forward)
 
 
 def _tangents(primals: Sequence[Tensor], *tangents: Tensor | None) -> tuple[Tensor, ...]:

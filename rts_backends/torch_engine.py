@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -72,6 +73,10 @@ class _HostCall(torch.autograd.Function):
                 values = [torch.cat([v, v.new_zeros((rows - v.shape[0], *v.shape[1:]))]) for v in values]
             outputs.append(torch.stack(tuple(values)))
         return tuple(outputs), (0,) * len(outputs)
+
+
+# torch asks for the signature at each call, and finding it anew takes longer than a small kernel.
+_HostCall.forward.__signature__ = inspect.signature(_HostCall.forward)
 
 
 class TorchEngine:
