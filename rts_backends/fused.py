@@ -1,7 +1,6 @@
 """The splatters of `rts.splatting`, compiled for the CPU; what does not fit is left to the specification.
 
-What fits is float32 or float64 in the memory of the host, NumPy's or torch's. Second derivatives are those of the
-specification.
+What fits is float32 or float64 in the memory of the host. Second derivatives are those of the specification.
 """
 
 from __future__ import annotations
@@ -31,6 +30,11 @@ class _Fused(splatting.Kernel):
 
             if fused_torch.fits(positions, rgba, row):
                 return fused_torch.splat(settings, specification, positions, rgba, row)
+        elif engine == "jax":
+            from rts_backends import fused_jax
+
+            if fused_jax.fits(positions, rgba):
+                return fused_jax.splat(settings, positions, rgba, row)
         elif engine == "numpy" and positions.dtype == rgba.dtype and positions.dtype in (np.float32, np.float64):
             return Splats(settings, positions, rgba, row).image()
         return specification(positions, rgba, row)

@@ -1,0 +1,170 @@
+"""Host functions inside compiled jax programs on the CPU, without copies of what they read.
+
+A typed custom call of XLA, whose handler is a Python function: it takes the interpreter lock, looks at the operands
+where they lie and fills the results in place. `jax.pure_callback` does the same work through copies, and takes over
+where the interface of this jaxlib is not the one that is described here.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+TARGET = "rts_host_call"
+
+HostFunction = Callable[..., Sequence[np.ndarray]]
+"""NumPy arrays in, which are read-only and lent for the length of the call, and NumPy arrays out."""
+
+_functions: dict[str, HostFunction] = {}
+
+
+def call(name: str, function: HostFunction, shapes: Sequence[jax.ShapeDtypeStruct], *operands: jax.Array) -> list:
+    """The results of a host function in a traced program for the CPU.
+
+    Args:
+        name: stands for the function in the program, and in programs that jax keeps on disk: says all that the function
+            depends on but its operands.
+        function: kept as long as the process lives.
+        shapes: of the results.
+        operands: of the function.
+    """
+    if not _available():
+        return list(jax.pure_callback(lambda *x: tuple(function(*map(np.asarray, x))), tuple(shapes), *operands))
+    _functions[name] = function
+    return list(jax.ffi.ffi_call(TARGET, tuple(shapes))(*operands, function=name))
+
+
+@functools.cache
+def _available() -> bool:
+    """Whether the handler is registered; XLA asks it for its version on the way."""
+    try:
+        handler = jax.ffi.pycapsule(ctypes.cast(_HANDLER, ctypes.c_void_p).value)
+        jax.ffi.register_ffi_target(TARGET, handler, platform="cpu", api_version=1)
+    except Exception as error:
+        warnings.warn(f"host functions in jax programs are slower than they could be: {error}", stacklevel=2)
+        return False
+    return _versions == [MAJOR]
+
+
+# ------------------------------------------------------ the interface: xla/ffi/api/c_api.h in jaxlib's include folder
+
+MAJOR, MINOR = 0, 1
+"""The version of the interface: another major one is refused, and of what later minor ones add nothing is used."""
+_versions: list[int] = []
+_METADATA, _EXECUTE, _STRING, _INTERNAL = 1, 3, 4, 13
+_DTYPES = {
+    1: np.dtype(np.bool_),
+    **{i + 2: np.dtype(f"i{2**i}") for i in range(4)},
+    **{i + 6: np.dtype(f"u{2**i}") for i in range(4)},
+    11: np.dtype(np.float32),
+    12: np.dtype(np.float64),
+}
+
+
+def _struct(name: str, **fields: Any) -> type[ctypes.Structure]:
+    """A structure of the interface: each begins with its size and a list of extensions."""
+    head = [("size_of", ctypes.c_size_t), ("extension", ctypes.c_void_p)]
+    return type(name, (ctypes.Structure,), {"_fields_": [*head, *fields.items()]})
+
+
+class _Text(ctypes.Structure):
+    _fields_ = [("start", ctypes.c_void_p), ("length", ctypes.c_size_t)]
+
+
+_Pointers = ctypes.POINTER(ctypes.c_void_p)
+_Buffer = _struct(
+    "_Buffer", dtype=ctypes.c_int, data=ctypes.c_void_p, rank=ctypes.c_int64, dims=ctypes.POINTER(ctypes.c_int64)
+)
+_Arguments = _struct("_Arguments", count=ctypes.c_int64, types=ctypes.POINTER(ctypes.c_int), items=_Pointers)
+_Attributes = _struct(
+    "_Attributes", count=ctypes.c_int64, types=ctypes.POINTER(ctypes.c_int), names=_Pointers, items=_Pointers
+)
+_Version = _struct("_Version", major=ctypes.c_int, minor=ctypes.c_int)
+_ErrorArguments = _struct("_ErrorArguments", message=ctypes.c_char_p, code=ctypes.c_int)
+_Api = _struct(
+    "_Api",
+    version=_Version,
+    internal=ctypes.c_void_p,
+    error_create=ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(_ErrorArguments)),
+)
+_Frame = _struct(
+    "_Frame",
+    api=ctypes.POINTER(_Api),
+    context=ctypes.c_void_p,
+    stage=ctypes.c_int,
+    arguments=_Arguments,
+    results=_Arguments,
+    attributes=_Attributes,
+)
+_Metadata = type("_Metadata", (ctypes.Structure,), {"_fields_": [("size_of", ctypes.c_size_t), ("version", _Version)]})
+
+
+class _Extension(ctypes.Structure):
+    _fields_ = [
+        ("size_of", ctypes.c_size_t),
+        ("type", ctypes.c_int),
+        ("next", ctypes.c_void_p),
+        ("metadata", ctypes.POINTER(_Metadata)),
+    ]
+
+
+def _handle(address: int) -> int | None:
+    """The handler: None, or the address of an error of XLA's."""
+    frame = ctypes.cast(address, ctypes.POINTER(_Frame)).contents
+    try:
+        if frame.extension:
+            extension = ctypes.cast(frame.extension, ctypes.POINTER(_Extension)).contents
+            if extension.type == _METADATA:
+                _tell_version(frame, extension.metadata.contents)
+                return None
+        if frame.stage != _EXECUTE:
+            return None
+        arguments, results = frame.arguments, frame.results
+        operands = [_array(arguments.items[i]) for i in range(arguments.count)]
+        for operand in operands:
+            operand.flags.writeable = False
+        found = _functions[_name(frame.attributes)](*operands)
+        for i, value in zip(range(results.count), found, strict=True):
+            out = _array(results.items[i])
+            if out.shape != np.shape(value):
+                raise ValueError(f"a host function returned an array of shape {np.shape(value)}, not {out.shape}")
+            out[...] = value
+    except BaseException as error:  # XLA cannot pass on an exception, only its text.
+        message = f"{type(error).__name__}: {error}".encode()
+        given = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, _INTERNAL)
+        return frame.api.contents.error_create(ctypes.byref(given))
+    return None
+
+
+def _tell_version(frame: Any, metadata: Any) -> None:
+    """Answer XLA's question which version of the interface this is, and look at what its own is."""
+    if frame.size_of < ctypes.sizeof(_Frame) or metadata.size_of < ctypes.sizeof(_Metadata):
+        raise RuntimeError("the structures of XLA's interface are smaller than expected")
+    _versions[:] = [frame.api.contents.version.major]
+    metadata.version.major, metadata.version.minor = MAJOR, MINOR
+
+
+def _array(address: int) -> np.ndarray:
+    """A view of a buffer."""
+    buffer = ctypes.cast(address, ctypes.POINTER(_Buffer)).contents
+    dtype, shape = _DTYPES[buffer.dtype], tuple(buffer.dims[: buffer.rank])
+    size = dtype.itemsize * int(np.prod(shape))
+    if size == 0:
+        return np.empty(shape, dtype)
+    return np.ndarray(shape, dtype, (ctypes.c_char * size).from_address(buffer.data))
+
+
+def _name(attributes: Any) -> str:
+    """The only attribute."""
+    assert attributes.count == 1 and attributes.types[0] == _STRING
+    text = ctypes.cast(attributes.items[0], ctypes.POINTER(_Text)).contents
+    return ctypes.string_at(text.start, text.length).decode()
+
+
+_HANDLER = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(_handle)
