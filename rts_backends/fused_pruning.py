@@ -18,7 +18,8 @@ def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, epsilon: float
     if layers == 1 or not (visible or epsilon >= LEAST_EPSILON):
         return covered
     depth = np.ascontiguousarray(depth)
-    z = np.full((layers, height + 2, width + 2), np.nan, depth.dtype)
+    z = np.empty((layers, height + 2, width + 2), depth.dtype)
+    z[:, [0, -1]] = np.nan
     farthest = np.empty(height, z.dtype)
     parallel(_depths, height, covered, depth, z, farthest)
     margin, mixed, kept = TIE * farthest.max(), np.zeros((height + 2, width + 2), np.uint8), np.empty_like(covered)
@@ -34,9 +35,10 @@ def _depths(start, stop, covered, depth, z, farthest):
     for y in range(start, stop):
         most = z.dtype.type(0)
         for k in range(layers):
+            z[k, y + 1, 0] = z[k, y + 1, width + 1] = np.nan
             for x in range(width):
+                z[k, y + 1, x + 1] = depth[k, y, x] if covered[k, y, x] else np.nan
                 if covered[k, y, x]:
-                    z[k, y + 1, x + 1] = depth[k, y, x]
                     most = max(most, abs(depth[k, y, x]))
         farthest[y] = most
 

@@ -116,8 +116,15 @@ class Mesh:
         return gbuffer
 
     def _interpolate(self, rows: Array, samples: Samples, column: int) -> Array:
+        if isinstance(rows, np.ndarray) and isinstance(samples.ids, np.ndarray):
+            from rts_surfaces.interpolation import interpolate
+
+            return interpolate(rows, samples.ids, column, samples.params)
         xp = namespace(rows, samples.ids)
-        a, b, c = (xp.take(rows, samples.ids[:, column + i], axis=0) for i in range(3))
+        # One gather of all corners: its gradient fills one array of the size of the mesh, instead of three.
+        index = xp.reshape(samples.ids[:, column : column + 3], (-1,))
+        corners = xp.reshape(xp.take(rows, index, axis=0), (-1, 3, rows.shape[1]))
+        a, b, c = corners[:, 0, :], corners[:, 1, :], corners[:, 2, :]
         return c + samples.params[:, 0:1] * (a - c) + samples.params[:, 1:2] * (b - c)
 
     def vertex_normals(self, vertices: Array) -> Array:
