@@ -1,0 +1,159 @@
+"""How fast it is: iterations of a pose fit beside other renderers, stages, splatters, memory, pruning, second order.
+
+Methods that are compared take turns in one run, so that noise of the machine hits all alike. Writes tables (speed.md),
+all numbers (speed.json) and charts:
+
+    python benchmarks/speed.py -o out/speed --mitsuba
+    python benchmarks/speed.py --quick --only pose stages
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import shlex
+import sys
+from collections.abc import Callable
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import speed_memory
+import speed_parts as parts
+import speed_stages
+import speed_tables as tables
+from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
+from speed_tasks import ENGINES, MESHES, MODES, ROUNDS, WARM_UP, Task, in_turn, subdivided
+
+from rts.threads import thread_count
+
+QUICK_MESHES, QUICK_SIZES, QUICK_ROUNDS = ("teapot", "bunny"), (256,), 5
+SPLATTED, PRUNED, STAGED = ("bunny",), ("bunny", "nefertiti"), ("teapot", "bunny", "nefertiti")
+"""Meshes of the sections that do not take all."""
+LAYERS = (1, 2, 4)
+BUDGET = 30.0
+"""Seconds of timed turns after which a method has had enough, of five at least."""
+NAMES = {"pose": "RtS-pose", "full": "full RtS", "full, both": "full RtS, both"}
+
+
+def iterations(task: Task, args: argparse.Namespace) -> dict[str, Callable[[], object]]:
+    """All methods."""
+    found = {}
+    for mode in MODES:
+        for engine, make in ENGINES.items():
+            for sampler in ("auto", "raster", "embree") if mode == "pose" else ("auto",):
+                found[f"{NAMES[mode]}, {engine}, {sampler}"] = make(task, mode, sampler)
+    if args.peers:
+        import speed_peers
+
+        found |= speed_peers.iterations(task, args.mitsuba)
+    return found
+
+
+def pose_rows(tasks: list[Task], args: argparse.Namespace, done: Callable[[], None]) -> list[dict]:
+    rows = []
+    for task in tasks:
+        times = in_turn(iterations(task, args), args.rounds, done, BUDGET)
+        rows.append({"mesh": task.name, "faces": len(task.faces), "side": task.side, "times": times})
+    return rows
+
+
+class Plan:
+    """What is measured: sections by name, each with its number of steps and the function that measures it.
+
+    Args:
+        args: of the command line.
+        done: called after each step.
+    """
+
+    def __init__(self, args: argparse.Namespace, done: Callable[[], None]):
+        self.args, self.folder = args, args.output / "meshes"
+        engines = tuple(ENGINES)
+        largest = max(args.sizes)
+        layers = LAYERS[:2] if args.quick else LAYERS
+        everything = self.tasks(MESHES)
+        staged, splatted = self.tasks(STAGED), self.tasks(SPLATTED)
+        pruned, solved = self.tasks(PRUNED, (largest,)), self.tasks(SPLATTED)
+        memory = [name for name in MESHES if name in args.meshes and name != "teapot_2464"]
+        rounds = args.rounds
+        self.sections: dict[str, tuple[int, Callable[[], list[dict]]]] = {
+            "pose": (len(everything) * (rounds + WARM_UP), lambda: pose_rows(everything, args, done)),
+            "stages": (3 * len(staged), lambda: speed_stages.measure(staged, rounds, done)),
+            "splat": (3 * len(layers) * len(splatted), lambda: parts.splat_rows(splatted, layers, rounds, done)),
+            "memory": (5 * len(memory), lambda: speed_memory.measure(memory, largest, self.folder, done)),
+            "pruning": (4 * len(pruned), lambda: parts.pruning_rows(pruned, engines, rounds, done)),
+            "lm": (4 * len(solved), lambda: parts.lm_rows(solved, engines, rounds, done)),
+        }
+
+    def tasks(self, names: tuple[str, ...] | dict, sizes: tuple[int, ...] | None = None) -> list[Task]:
+        """Those of some meshes that were asked for."""
+        return [
+            Task(name, *subdivided(name, self.folder), side)
+            for name in names
+            if name in self.args.meshes
+            for side in sizes or self.args.sizes
+        ]
+
+
+def environment() -> dict:
+    found = {}
+    for package in ("numpy", "torch", "jax", "numba", "deodr", "mitsuba", "drjit"):
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = None
+    machine = f"{thread_count()} cores, {platform.machine()}, {platform.system()}, Python {platform.python_version()}"
+    command = "python " + shlex.join([f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]])
+    return {"date": datetime.date.today().isoformat(), "machine": machine, "versions": found, "command": command}
+
+
+def load_average() -> str:
+    """Over 1 and 15 minutes."""
+    one, _, fifteen = os.getloadavg()
+    return f"{one:.1f} ({fifteen:.1f})"
+
+
+def options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/speed"))
+    parser.add_argument("--only", nargs="+", choices=tables.SECTIONS, default=list(tables.SECTIONS))
+    parser.add_argument("--meshes", nargs="+", choices=MESHES, default=None)
+    parser.add_argument("--sizes", nargs="+", type=int, default=None, help="sides of the image, default 256 512")
+    parser.add_argument("--quick", action="store_true", help=f"{' and '.join(QUICK_MESHES)}, 256², five turns")
+    parser.add_argument("--no-peers", dest="peers", action="store_false", help="without DEODR and Mitsuba")
+    parser.add_argument("--mitsuba", action="store_true", help="with Mitsuba, which takes most of the time")
+    args = parser.parse_args()
+    args.meshes = args.meshes or list(QUICK_MESHES if args.quick else MESHES)
+    args.sizes = args.sizes or list(QUICK_SIZES if args.quick else (256, 512))
+    args.rounds = QUICK_ROUNDS if args.quick else ROUNDS
+    return args
+
+
+def main() -> None:
+    args = options()
+    args.output.mkdir(parents=True, exist_ok=True)
+    results = environment()
+    before = load_average()
+    with Progress(*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn()) as progress:
+        task = progress.add_task("meshes", total=None)
+        plan = Plan(args, partial(progress.advance, task))
+        chosen = {name: section for name, section in plan.sections.items() if name in args.only}
+        progress.update(task, total=sum(steps for steps, _ in chosen.values()))
+        for name, (_, measure) in chosen.items():
+            progress.update(task, description=name)
+            results[name] = measure()
+    results["load"] = [before, load_average()]
+    (args.output / "speed.json").write_text(json.dumps(results, indent=1))
+    (args.output / "speed.md").write_text(tables.document(results))
+    for name, chart in tables.CHARTS.items():
+        if results.get(name):
+            chart(results[name], args.output / f"{name}.png")
+    print(tables.document(results))
+    print(f"wrote {args.output}/speed.md, .json and charts")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+"""Peak memory of pose iterations: each case in a process of its own.
+
+The baseline is taken with the scene loaded and all code compiled: with torch after an iteration on an image of 16²,
+with jax once the iteration is compiled. Then the peak of three iterations over it. `host` is the peak of NumPy's
+allocations in sampling, by tracemalloc.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from speed_tasks import START, Task, jax_function, subdivided, torch_iteration
+
+import rts
+
+MIB = 2**20
+CASES = [(engine, mode) for mode in ("pose", "full") for engine in ("torch", "jax")]
+
+
+def resident(peak: bool = False) -> float:
+    """Resident memory of this process now, or the most since the peak was last reset, in MiB."""
+    text = Path("/proc/self/status").read_text()
+    return int(re.search(rf"{'VmHWM' if peak else 'VmRSS'}:\s+(\d+)", text)[1]) / 1024  # pyright: ignore
+
+
+def growth(iteration: Callable[[], object]) -> float:
+    """MiB that the process needs in three iterations beyond what it holds."""
+    Path("/proc/self/clear_refs").write_text("5")
+    before = resident()
+    for _ in range(3):
+        iteration()
+    return resident(peak=True) - before
+
+
+def torch_growth(make: Callable[[int], Task], side: int, mode: str, sampler: str) -> float:
+    torch_iteration(make(16), mode, sampler)()
+    return growth(torch_iteration(make(side), mode, sampler))
+
+
+def jax_growth(make: Callable[[int], Task], side: int, mode: str, sampler: str) -> float:
+    import jax
+
+    small, state = jax_function(make(16), mode, sampler)
+    jax.block_until_ready(jax.jit(small)(*state))  # Compiles what samples on the host.
+    function, state = jax_function(make(side), mode, sampler)
+    compiled = jax.jit(function).lower(*state).compile()
+
+    def iteration() -> None:
+        nonlocal state
+        state, *_ = jax.block_until_ready(compiled(*state))
+
+    return growth(iteration)
+
+
+def host_peak(task: Task, sampler: str) -> float:
+    """MiB that NumPy allocates at most while the task is sampled, once all is kept that is kept."""
+    prepared = rts.prepare(task.posed(np.array(START)), sampler)
+    rts.sample(prepared, task.view, task.size, splatter="auto")
+    tracemalloc.start()
+    rts.sample(prepared, task.view, task.size, splatter="auto")
+    peak = tracemalloc.get_traced_memory()[1] / MIB
+    tracemalloc.stop()
+    return peak
+
+
+def worker(name: str, folder: str, side: str, engine: str, mode: str, sampler: str) -> dict:
+    """One case, in this process."""
+    vertices, faces = subdivided(name, Path(folder))
+
+    def make(side: int) -> Task:
+        return Task(name, vertices, faces, side)
+
+    grown = (torch_growth if engine == "torch" else jax_growth)(make, int(side), mode, sampler)
+    return {"mib": grown, "host": host_peak(make(int(side)), sampler), "faces": len(faces)}
+
+
+def measure(names: list[str], side: int, folder: Path, done: Callable[[], None]) -> list[dict]:
+    """Rows of the results."""
+    rows = []
+    for name in names:
+        for engine, mode in CASES:
+            for sampler in ("raster", "embree") if (engine, mode) == ("torch", "pose") else ("raster",):
+                command = [sys.executable, __file__, name, str(folder), str(side), engine, mode, sampler]
+                found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+                rows.append({"mesh": name, "side": side, "engine": engine, "mode": mode, "sampler": sampler} | found)
+                done()
+    return rows
+
+
+if __name__ == "__main__":
+    print(json.dumps(worker(*sys.argv[1:])))

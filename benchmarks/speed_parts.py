@@ -1,0 +1,184 @@
+"""Parts of the work by themselves: the splatters, what pruning saves, a step of Levenberg–Marquardt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from speed_tasks import ENGINES, START, Task, in_turn
+
+import rts
+from rts import splatting
+from rts.arrays import engine_of, namespace
+
+SPLATTERS = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}
+"""The specification of each registered name."""
+
+
+# ----------------------------------------------------------------------------------------------------------- splatters
+
+
+class Capture:
+    """A splatter that keeps what it is given, of all layers."""
+
+    def splat(self, positions: Any, rgba: Any, row: Any) -> Any:
+        """See `rts.protocols.Splatter`."""
+        self.given = positions, rgba, row
+        return namespace(positions).zeros((*row.shape[1:], 4), dtype=positions.dtype)
+
+
+def splats(task: Task, layers: int) -> tuple[np.ndarray, ...]:
+    """Positions, rgba and row of the task's mesh at the start, with shades of grey for colours."""
+    capture = Capture()
+    part = task.posed(np.array(START, np.float32)).replace(shader="lambert")
+    rts.render(part, task.view, task.size, splatter=capture, layers=layers, sampler="raster")
+    positions, rgba, row = (np.array(x) for x in capture.given)
+    return positions.astype(np.float32), rgba.astype(np.float32), row
+
+
+def torch_splat(splatter: Any, given: tuple[np.ndarray, ...], g: np.ndarray) -> Callable[[], object]:
+    """Image and both gradients."""
+    import torch
+
+    positions, rgba, row, g = (torch.from_numpy(x) for x in (*given, g))
+
+    def call() -> object:
+        variables = positions.requires_grad_(True), rgba.requires_grad_(True)
+        return torch.autograd.grad(splatter.splat(*variables, row), variables, g)
+
+    return call
+
+
+def jax_splat(splatter: Any, given: tuple[np.ndarray, ...], g: np.ndarray) -> Callable[[], object]:
+    """The same, compiled."""
+    import jax
+    import jax.numpy as jnp
+
+    @jax.jit
+    def function(positions: Any, rgba: Any, row: Any, g: Any) -> Any:
+        image, pull = jax.vjp(lambda p, c: splatter.splat(p, c, row), positions, rgba)
+        return image, pull(g)
+
+    arrays = [jnp.asarray(x) for x in (*given, g)]
+    return lambda: jax.block_until_ready(function(*arrays))
+
+
+def splat_rows(tasks: list[Task], layers: tuple[int, ...], rounds: int, done: Callable[[], None]) -> list[dict]:
+    """Forward and pullback of each splatter, specified and compiled, with torch and jax."""
+    rows = []
+    for task in tasks:
+        for k in layers:
+            given = splats(task, k)
+            g = np.random.default_rng(0).normal(size=(*given[2].shape[1:], 4)).astype(np.float32)
+            for name, specification in SPLATTERS.items():
+                kinds = {"specification": specification(), "compiled": rts.plugin("rts.splatters", name)()}
+                functions = {
+                    f"{engine}, {kind}": make(splatter, given, g)
+                    for kind, splatter in kinds.items()
+                    for engine, make in (("torch", torch_splat), ("jax", jax_splat))
+                }
+                row = {"mesh": task.name, "side": task.side, "layers": k, "splatter": name, "samples": len(given[0])}
+                rows.append(row | {"times": in_turn(functions, rounds)})
+                done()
+    return rows
+
+
+# ------------------------------------------------------------------------------------------------------------- pruning
+
+
+class Unpruned:
+    """The default splatter, which does not say what it needs."""
+
+    def __init__(self) -> None:
+        self._splatter = rts.plugin("rts.splatters", "auto")()
+
+    def splat(self, positions: Any, rgba: Any, row: Any) -> Any:
+        """See `rts.protocols.Splatter`."""
+        return self._splatter.splat(positions, rgba, row)
+
+
+def pruning_rows(tasks: list[Task], engines: tuple[str, ...], rounds: int, done: Callable[[], None]) -> list[dict]:
+    """Iterations with one layer, with two, and with two none of which is dropped."""
+    rows = []
+    for task in tasks:
+        for shader in ("silhouette", "lambert"):
+            kinds = {"K = 1": (1, "auto"), "K = 2": (2, "auto"), "K = 2, nothing dropped": (2, Unpruned())}
+            for engine in engines:
+                functions = {
+                    name: ENGINES[engine](
+                        Task(task.name, task.vertices, task.faces, task.side, shader, layers, splatter)
+                    )
+                    for name, (layers, splatter) in kinds.items()
+                }
+                row = {"mesh": task.name, "faces": len(task.faces), "side": task.side, "shader": shader}
+                rows.append(row | {"engine": engine, "times": in_turn(functions, rounds)})
+                done()
+    return rows
+
+
+# ------------------------------------------------------------------------------------------------- Levenberg–Marquardt
+
+
+def transform(x: Any) -> Any:
+    """(4, 4) of six unknowns, a rigid pose, or twelve, the entries of an affine map less the identity's."""
+    if x.shape[0] == 6:
+        return rts.rigid(x)
+    xp = namespace(x)
+    return xp.concat([xp.reshape(x, (3, 4)), xp.zeros_like(x[None, :4])]) + engine_of(x).constant(np.eye(4), x)
+
+
+def levenberg_marquardt(task: Task, engine: str, unknowns: int) -> dict[str, Callable[[], object]]:
+    """A step (Jacobian, normal equations, solution, loss at the trial), its Jacobian, and a loss with its gradient."""
+    x = np.zeros(unknowns, np.float32)
+    x[:6] = np.multiply(START, 0.2)
+    start: Any
+    if engine == "torch":
+        import torch
+
+        start = torch.from_numpy(x)
+    else:
+        import jax.numpy as jnp
+
+        start = jnp.asarray(x)
+    library = engine_of(start)
+    target = library.constant(task.target, start)
+
+    def residuals(v: Any) -> Any:
+        part = task.part.replace(transform=transform(v))
+        image = rts.render(part, task.view, task.size, splatter=task.splatter, layers=task.layers)
+        return (image[..., task.channels] - target).reshape(-1)
+
+    def equations(v: Any) -> tuple:
+        r, jacobian = library.jacobian(residuals)(v)
+        return r, jacobian.T @ jacobian, jacobian.T @ r
+
+    loss = library.jit(lambda v: (residuals(v) ** 2).mean())
+    linearize, descend = (
+        library.jit(equations),
+        library.jit(library.value_and_grad(lambda v: (residuals(v) ** 2).mean())),
+    )
+
+    def step() -> float:
+        _, matrix, gradient = (library.to_numpy(a).astype(np.float64) for a in linearize(start))
+        delta = -np.linalg.solve(matrix + 1e-3 * np.diag(np.diag(matrix)), gradient)
+        return float(loss(start + library.constant(delta, start)))
+
+    return {
+        "forward and gradient": lambda: library.block(descend(start)),
+        "linearisation": lambda: library.block(linearize(start)),
+        "step": step,
+    }
+
+
+def lm_rows(tasks: list[Task], engines: tuple[str, ...], rounds: int, done: Callable[[], None]) -> list[dict]:
+    """With 6 and 12 unknowns."""
+    rows = []
+    for task in tasks:
+        for engine in engines:
+            for unknowns in (6, 12):
+                times = in_turn(levenberg_marquardt(task, engine, unknowns), rounds)
+                row = {"mesh": task.name, "faces": len(task.faces), "side": task.side, "engine": engine}
+                rows.append(row | {"unknowns": unknowns, "times": times})
+                done()
+    return rows

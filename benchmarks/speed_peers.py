@@ -1,0 +1,217 @@
+"""The pose iteration of `speed_tasks` by other renderers.
+
+- DEODR: its compiled functions are called directly, with arrays made once and no checks of them; NumPy projects the
+  vertices and pulls the gradient back to the pose. One colour channel; its silhouette edges found by its own
+  adjacency, whose sparse matrix is converted once to the form that multiplies fastest.
+- Mitsuba 3, `direct_projective`, `llvm_ad_rgb`, 4 samples a pixel: the mesh is a white emitter.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+
+import numpy as np
+from peers import mitsuba
+from scenes import DISTANCE, FOV
+from speed_tasks import RATE, START, Task
+
+SIGMA = 1.0
+"""Width of DEODR's anti-aliased edges, pixels."""
+SAMPLES = 4
+"""A pixel, of Mitsuba."""
+
+
+class Adam:
+    """Adam (Kingma and Ba 2015) on one NumPy array."""
+
+    def __init__(self, rate: float):
+        self.rate, self.count, self.mean, self.square = rate, 0, 0.0, 0.0
+
+    def step(self, x: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        self.count += 1
+        self.mean = 0.9 * self.mean + 0.1 * gradient
+        self.square = 0.999 * self.square + 0.001 * gradient**2
+        mean, square = self.mean / (1 - 0.9**self.count), self.square / (1 - 0.999**self.count)
+        return x - self.rate * mean / (np.sqrt(square) + 1e-8)
+
+
+def rotation(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rotation (3, 3) of a rotation vector, and its derivative (3, 3, 3), first axis along r."""
+    crosses = np.array(
+        [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
+    )
+    square = r @ r
+    if square < 1e-12:
+        return np.eye(3) + np.tensordot(r, crosses, 1), crosses.astype(float)
+    angle, k = np.sqrt(square), np.tensordot(r, crosses, 1)
+    matrix = np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / square * k @ k
+    # Gallego and Yezzi, A compact formula for the derivative of a 3-D rotation in exponential coordinates, 2015.
+    turns = [r[i] * k + np.tensordot(np.cross(r, (np.eye(3) - matrix)[:, i]), crosses, 1) for i in range(3)]
+    return matrix, np.stack([turn @ matrix / square for turn in turns])
+
+
+# --------------------------------------------------------------------------------------------------------------- DEODR
+
+
+class Deodr:
+    """The task in DEODR.
+
+    Args:
+        task: the task.
+        full: also compute the gradient of the vertices.
+    """
+
+    def __init__(self, task: Task, full: bool):
+        from deodr.differentiable_renderer import Scene2DBase
+        from deodr.triangulated_mesh import TriMeshAdjacencies
+
+        self.full, self.side = full, task.side
+        self.vertices = task.vertices.astype(np.float64)
+        self.target = task.target.astype(np.float64)
+        self.focal = task.side / (2 * np.tan(np.radians(FOV / 2)))
+        self.adjacencies = TriMeshAdjacencies(task.faces, nb_vertices=len(self.vertices))
+        self.adjacencies.edges_faces_ones = self.adjacencies.edges_faces_ones.tocsr()
+        self.adjacencies.faces_edges = np.asarray(self.adjacencies.faces_edges)
+        count, faces = len(self.vertices), np.ascontiguousarray(task.faces, np.uint32)
+        self.scene = Scene2DBase(
+            faces=faces,
+            faces_uv=np.zeros_like(faces),
+            ij=np.zeros((count, 2)),
+            depths=np.zeros(count),
+            textured=np.zeros(len(faces), bool),
+            uv=np.zeros((1, 2)),
+            shade=np.zeros(count),
+            colors=np.ones((count, 1)),
+            shaded=np.zeros(len(faces), bool),
+            edgeflags=np.zeros((len(faces), 3), bool),
+            height=task.side,
+            width=task.side,
+            nb_colors=1,
+            texture=np.zeros((0, 0)),
+            background_color=np.zeros(1),
+            integer_pixel_centers=False,
+        )
+        self.image, self.depth = np.empty((task.side, task.side, 1)), np.empty((task.side, task.side))
+        self.pose, self.adam = np.array(START), Adam(RATE)
+
+    def step(self) -> float:
+        """One iteration."""
+        loss, gradient = self.value_and_gradient(self.pose)
+        self.pose = self.adam.step(self.pose, gradient)
+        return loss
+
+    def value_and_gradient(self, pose: np.ndarray) -> tuple[float, np.ndarray]:
+        """Loss, and its gradient in the pose; that of the vertices is left in `vertex_gradient`."""
+        matrix, slopes = rotation(pose[:3])
+        flip = np.array([1.0, -1.0, -1.0])
+        # The camera looks along +z, y down.
+        seen = self.vertices @ (matrix.T * flip) + (pose[3:] * flip + [0, 0, DISTANCE])
+        depths = np.ascontiguousarray(seen[:, 2])
+        inverse = self.focal / depths
+        projected = seen[:, :2] * inverse[:, None]
+        image_gradient = self._render(projected + self.side / 2, depths)
+        g_seen = np.empty_like(seen)
+        g_projected = self.scene.ij_b
+        np.multiply(g_projected, inverse[:, None], out=g_seen[:, :2])
+        g_seen[:, 2] = -(g_projected * projected).sum(axis=1) / depths
+        g_matrix = (g_seen.T @ self.vertices) * flip[:, None]
+        if self.full:
+            self.vertex_gradient = g_seen @ (matrix.T * flip).T
+        translation = g_seen.sum(axis=0) * flip
+        return image_gradient, np.concatenate([np.tensordot(slopes, g_matrix, 2), translation])
+
+    def _render(self, ij: np.ndarray, depths: np.ndarray) -> float:
+        """The loss, with its gradient in `ij` left in the scene."""
+        from deodr.differentiable_renderer_cython import renderSceneBCpp, renderSceneCpp
+
+        scene = self.scene
+        scene.ij, scene.depths = ij, depths
+        scene.edgeflags = self.adjacencies.edge_on_silhouette(ij)
+        scene.ij_b, scene.uv_b, scene.texture_b = np.zeros_like(ij), np.zeros((1, 2)), np.zeros((0, 0))
+        scene.shade_b, scene.colors_b = np.zeros_like(scene.shade), np.zeros_like(scene.colors)
+        renderSceneCpp(scene, SIGMA, self.image, self.depth, False, None, None, False)
+        difference = self.image - self.target
+        slope = difference * (2 / difference.size)
+        # It overwrites the image, which is not read again.
+        renderSceneBCpp(scene, SIGMA, self.image, self.depth, slope, False, None, None, None, False)
+        return float((difference**2).mean())
+
+
+# ------------------------------------------------------------------------------------------------------------- Mitsuba
+
+
+class Mitsuba:
+    """The task in Mitsuba.
+
+    Args:
+        task: the task.
+        full: also compute the gradient of the vertices.
+    """
+
+    def __init__(self, task: Task, full: bool):
+        mi = mitsuba()
+        film = {"type": "hdrfilm", "width": task.side, "height": task.side, "rfilter": {"type": "box"}}
+        film |= {"pixel_format": "luminance", "component_format": "float32", "sample_border": True}
+        sensor = {"type": "perspective", "fov": FOV, "fov_axis": "y", "near_clip": 0.5, "far_clip": 10.0, "film": film}
+        sensor["to_world"] = mi.ScalarTransform4f().look_at([0, 0, DISTANCE], [0, 0, 0], [0, 1, 0])
+        with tempfile.TemporaryDirectory() as folder:
+            emitter = _emitter(mi, task, f"{folder}/mesh.ply")
+            self.scene = mi.load_dict({"type": "scene", "sensor": sensor, "mesh": emitter})
+        # Nothing is lit by anything, so there are no indirect boundaries to sample.
+        self.integrator = mi.load_dict({"type": "direct_projective", "sppi": 0})
+        self.parameters = mi.traverse(self.scene)
+        self.vertices = mi.Point3f(task.vertices.T.astype(np.float32))
+        self.target = mi.TensorXf(task.target)
+        self.full, self.pose, self.adam, self.seed = full, np.array(START), Adam(RATE), 0
+
+    def step(self) -> float:
+        """One iteration."""
+        loss, gradient = self.value_and_gradient(self.pose)
+        self.pose = self.adam.step(self.pose, gradient)
+        return loss
+
+    def value_and_gradient(self, pose: np.ndarray) -> tuple[float, np.ndarray]:
+        """Loss, and its gradient in the pose; that of the vertices is left in `vertex_gradient`."""
+        import drjit as dr
+
+        mi = mitsuba()
+        matrix, slopes = rotation(pose[:3])
+        turn, move = mi.Matrix3f(matrix.tolist()), mi.Point3f(pose[3:].tolist())
+        vertices = mi.Point3f(self.vertices)
+        dr.enable_grad(turn, move)
+        if self.full:
+            dr.enable_grad(vertices)
+        self.parameters["mesh.vertex_positions"] = dr.ravel(turn @ vertices + move)
+        self.parameters.update()
+        self.seed += 1
+        image = mi.render(self.scene, self.parameters, integrator=self.integrator, spp=SAMPLES, seed=self.seed)
+        loss = dr.mean(dr.square(image - self.target), axis=None)
+        dr.backward(loss)
+        if self.full:
+            self.vertex_gradient = dr.grad(vertices)
+            dr.eval(self.vertex_gradient)
+            dr.sync_thread()
+        g_turn, g_move = np.array(dr.grad(turn)).reshape(3, 3), np.array(dr.grad(move)).reshape(3)
+        return float(np.array(loss).item()), np.concatenate([np.tensordot(slopes, g_turn, 2), g_move])
+
+
+def _emitter(mi: object, task: Task, path: str) -> dict:
+    """A mesh that shines white, on a black material."""
+    mesh = mi.Mesh("mesh", len(task.vertices), len(task.faces))
+    arrays = mi.traverse(mesh)
+    arrays["vertex_positions"] = np.ravel(task.vertices).astype(np.float32)
+    arrays["faces"] = np.ravel(task.faces).astype(np.uint32)
+    arrays.update()
+    mesh.write_ply(path)
+    black = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
+    white = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
+    return {"type": "ply", "filename": path, "face_normals": True, "bsdf": black, "emitter": white}
+
+
+def iterations(task: Task, with_mitsuba: bool) -> dict[str, Callable[[], object]]:
+    """One call of each a turn."""
+    kinds = {"DEODR": Deodr, "Mitsuba": Mitsuba} if with_mitsuba else {"DEODR": Deodr}
+    return {
+        f"{name}, {mode}": kind(task, mode == "full").step for name, kind in kinds.items() for mode in ("pose", "full")
+    }

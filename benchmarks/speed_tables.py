@@ -1,0 +1,256 @@
+"""The tables and charts of `speed`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import groupby
+from pathlib import Path
+
+from speed_stages import STAGES
+
+OURS = "RtS-pose, torch, auto"
+FULL = "full RtS, torch, auto"
+RATIOS = (
+    (OURS, "DEODR, pose"),
+    ("RtS-pose, jax, auto", "DEODR, pose"),
+    (FULL, "DEODR, full"),
+    ("full RtS, jax, auto", "DEODR, full"),
+    (OURS, "Mitsuba, pose"),
+    (FULL, "Mitsuba, full"),
+)
+"""Ours, and the peer that is divided by it."""
+LINES = {
+    OURS: {"color": "#c2410c", "marker": "o"},
+    "RtS-pose, jax, auto": {"color": "#c2410c", "marker": "o", "linestyle": "--", "markerfacecolor": "white"},
+    FULL: {"color": "#7c3aed", "marker": "D"},
+    "full RtS, jax, auto": {"color": "#7c3aed", "marker": "D", "linestyle": "--", "markerfacecolor": "white"},
+    "DEODR, pose": {"color": "#15803d", "marker": "^"},
+    "Mitsuba, pose": {"color": "#1d4ed8", "marker": "s"},
+}
+"""What the chart shows, and how."""
+
+
+def table(header: Iterable[str], lines: Iterable[Iterable[str]]) -> str:
+    header = list(header)
+    return "\n".join("| " + " | ".join(line) + " |" for line in (header, ["---"] * len(header), *lines)) + "\n"
+
+
+def number(ms: float) -> str:
+    return f"{ms:.2f}" if ms < 10 else f"{ms:.1f}" if ms < 100 else f"{ms:,.0f}"
+
+
+def faces_of(rows: list[dict]) -> dict[str, int]:
+    """Of each mesh, in their order."""
+    return {row["mesh"]: row["faces"] for row in rows}
+
+
+def by_side(rows: list[dict]) -> list[tuple[int, list[dict]]]:
+    return [(side, list(group)) for side, group in groupby(sorted(rows, key=lambda r: r["side"]), lambda r: r["side"])]
+
+
+# -------------------------------------------------------------------------------------------------------------- tables
+
+
+def pose(rows: list[dict]) -> str:
+    """Methods down, meshes across; then peers over ours."""
+    text = []
+    for side, found in by_side(rows):
+        methods = list(dict.fromkeys(name for row in found for name in row["times"]))
+        header = [f"{side}², ms", *(f"{row['faces']:,}" for row in found)]
+        text.append(table(header, ([m, *(cell(row, m) for row in found)] for m in methods)))
+        lines = []
+        for ours, peer in RATIOS:
+            if peer in methods and ours in methods:
+                ratios = (row["times"][peer]["ms"] / row["times"][ours]["ms"] for row in found)
+                lines.append([f"{peer} / {ours}", *(f"**{ratio:.1f}**" for ratio in ratios)])
+        if lines:
+            text.append(table([f"{side}², ratio of times", *header[1:]], lines))
+    return "\n".join(text)
+
+
+def cell(row: dict, method: str) -> str:
+    """Median and quartiles; the number of turns where it had not all of them."""
+    found, most = row["times"][method], max(t["turns"] for t in row["times"].values())
+    fewer = f", {found['turns']} turns" if found["turns"] < most else ""
+    return f"{number(found['ms'])} ({number(found['low'])}–{number(found['high'])}{fewer})"
+
+
+def stages(rows: list[dict]) -> str:
+    header = ["mesh, side", "mode, sampler", "prepare, once", *STAGES, "total"]
+    lines = (
+        [
+            f"{row['mesh']}, {row['side']}²",
+            f"{row['mode']}, {row['sampler']}",
+            *(f"{row['ms'][name]:.2f}" for name in ("prepare", *STAGES, "total")),
+        ]
+        for row in rows
+    )
+    return table(header, lines)
+
+
+def splat(rows: list[dict]) -> str:
+    header = ["mesh, side", "K", "samples", "splatter", *rows[0]["times"]]
+    header += [f"{engine}: specification / compiled" for engine in ("torch", "jax")]
+    lines = []
+    for row in rows:
+        times = {name: t["ms"] for name, t in row["times"].items()}
+        gains = (times[f"{e}, specification"] / times[f"{e}, compiled"] for e in ("torch", "jax"))
+        about = [f"{row['mesh']}, {row['side']}²", str(row["layers"]), f"{row['samples']:,}", row["splatter"]]
+        lines.append([*about, *map(number, times.values()), *(f"{gain:.1f}" for gain in gains)])
+    return table(header, lines)
+
+
+def memory(rows: list[dict]) -> str:
+    keys = list(dict.fromkeys((r["engine"], r["mode"], r["sampler"]) for r in rows))
+    faces = faces_of(rows)
+    found = {(r["mesh"], r["engine"], r["mode"], r["sampler"]): r for r in rows}
+    lines = [
+        [
+            ", ".join(key),
+            *(f"{found[m, *key]['mib']:.0f}" for m in faces),
+            *(f"{found[m, *key]['host']:.1f}" for m in faces),
+        ]
+        for key in keys
+    ]
+    header = ["MiB", *(f"{f:,}" for f in faces.values()), *(f"{f:,}, NumPy" for f in faces.values())]
+    return table(header, lines)
+
+
+def pruning(rows: list[dict]) -> str:
+    header = ["mesh, side", "shader, engine", *rows[0]["times"], "K = 2 / K = 1", "nothing dropped / K = 2"]
+    lines = []
+    for row in rows:
+        one, two, all_kept = (t["ms"] for t in row["times"].values())
+        about = [f"{row['mesh']}, {row['side']}²", f"{row['shader']}, {row['engine']}"]
+        lines.append([*about, *map(number, (one, two, all_kept)), f"{two / one:.2f}", f"{all_kept / two:.2f}"])
+    return table(header, lines)
+
+
+def lm(rows: list[dict]) -> str:
+    header = ["mesh, side", "engine", "unknowns", *rows[0]["times"], "linearisation / gradient", "step / gradient"]
+    lines = []
+    for row in rows:
+        gradient, linearisation, step = (t["ms"] for t in row["times"].values())
+        ratios = (f"{linearisation / gradient:.2f}", f"{step / gradient:.2f}")
+        about = [f"{row['mesh']}, {row['side']}²", row["engine"], str(row["unknowns"])]
+        lines.append([*about, *map(number, (gradient, linearisation, step)), *ratios])
+    return table(header, lines)
+
+
+SECTIONS = {
+    "pose": (
+        "Pose iteration",
+        "One iteration: render, loss, gradient, step of Adam. Medians with quartiles, all methods in turn in one run; by "
+        "faces. *RtS-pose*: vertices constant. *Full RtS*: gradient of pose and vertices, a step in the pose; *both*: a "
+        "step in both. DEODR draws one channel of front faces on one thread; the others use all cores.",
+        pose,
+    ),
+    "stages": (
+        "Stages",
+        "Of an iteration with torch, milliseconds. *pose*: vertices constant and prepared; *full*: differentiated too. "
+        "Constant surfaces are evaluated within *rest of sample*; *backward: splat* includes the loss's.",
+        stages,
+    ),
+    "splat": (
+        "Splatters alone",
+        "Forward and gradients of positions and colours, milliseconds, all layers kept.",
+        splat,
+    ),
+    "memory": (
+        "Memory",
+        "Peak of resident memory over that of the loaded scene with its code compiled, in three iterations, each case in "
+        "a process of its own; by faces. *NumPy*: peak of its allocations in sampling.",
+        memory,
+    ),
+    "pruning": ("Two layers against one", "Pose iterations, milliseconds.", pruning),
+    "lm": (
+        "Levenberg–Marquardt",
+        "A step is a linearisation (Jacobian and normal equations), a solution and a loss; milliseconds.",
+        lm,
+    ),
+}
+
+
+def document(results: dict) -> str:
+    """All as Markdown."""
+    versions = ", ".join(f"{k} {v}" for k, v in results["versions"].items() if v)
+    text = [
+        "# Speed\n",
+        f"{results['date']}, {results['machine']}; {versions}.",
+        f"`{results['command']}`; load average {results['load'][0]} before, {results['load'][1]} after.\n",
+    ]
+    for name, (title, legend, make) in SECTIONS.items():
+        if results.get(name):
+            text += [f"## {title}\n", legend + "\n", make(results[name])]
+    return "\n".join(text)
+
+
+# -------------------------------------------------------------------------------------------------------------- charts
+
+
+def pose_chart(rows: list[dict], path: Path) -> None:
+    """Time of an iteration against faces, both axes logarithmic; one panel a size."""
+    from matplotlib.figure import Figure
+
+    sides = by_side(rows)
+    figure = Figure(figsize=(5.4 * len(sides), 5.6), layout="constrained")
+    for axes, (side, found) in zip(figure.subplots(1, len(sides), sharey=True, squeeze=False)[0], sides, strict=True):
+        for name, style in LINES.items():
+            points = [(row["faces"], row["times"][name]["ms"]) for row in found if name in row["times"]]
+            if points:
+                axes.loglog(*zip(*points, strict=True), label=name, markersize=5, linewidth=1.5, **style)
+        axes.set(title=f"{side}²", xlabel="faces")
+        axes.grid(alpha=0.3, which="both")
+    figure.axes[0].set_ylabel("milliseconds an iteration")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
+    figure.suptitle("Pose from a silhouette: render, loss, gradient and step", fontsize=11)
+    figure.savefig(path, dpi=120)
+
+
+def stages_chart(rows: list[dict], path: Path) -> None:
+    """Stacked bars; one panel a size."""
+    from matplotlib import colormaps
+    from matplotlib.figure import Figure
+
+    sides = by_side(rows)
+    count = max(len(found) for _, found in sides)
+    figure = Figure(figsize=(6 * len(sides) + 1, 1.6 + 0.34 * count), layout="constrained")
+    colors = colormaps["tab20"].colors
+    for axes, (side, found) in zip(figure.subplots(1, len(sides), sharey=True, squeeze=False)[0], sides, strict=True):
+        labels = [f"{row['faces']:,} faces, {row['mode']}, {row['sampler']}" for row in found]
+        left = [0.0] * len(found)
+        for name, color in zip(STAGES, colors, strict=False):
+            values = [row["ms"][name] for row in found]
+            axes.barh(labels, values, left=left, label=name, color=color, edgecolor="white", linewidth=0.3)
+            left = [a + b for a, b in zip(left, values, strict=True)]
+        axes.set(title=f"{side}²", xlabel="milliseconds")
+        axes.grid(alpha=0.3, axis="x")
+        axes.set_axisbelow(True)
+    figure.axes[0].invert_yaxis()
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
+    figure.suptitle("Stages of a pose iteration with torch", fontsize=11)
+    figure.savefig(path, dpi=120)
+
+
+def splat_chart(rows: list[dict], path: Path) -> None:
+    """Time of each splatter against K; one panel a splatter, at the largest size."""
+    from matplotlib.figure import Figure
+
+    side, found = by_side(rows)[-1]
+    splatters = list(dict.fromkeys(row["splatter"] for row in found))
+    figure = Figure(figsize=(4 * len(splatters), 4.2), layout="constrained")
+    panels = figure.subplots(1, len(splatters), sharey=True, squeeze=False)[0]
+    for axes, splatter in zip(panels, splatters, strict=True):
+        chosen = [row for row in found if row["splatter"] == splatter]
+        for name in chosen[0]["times"]:
+            style = {"color": "#c2410c" if "torch" in name else "#1d4ed8", "linestyle": "--" if "spec" in name else "-"}
+            points = [(row["layers"], row["times"][name]["ms"]) for row in chosen]
+            axes.semilogy(*zip(*points, strict=True), label=name, marker="o", markersize=4, **style)
+        axes.set(title=f"{splatter}, {side}²", xlabel="K", xticks=[row["layers"] for row in chosen])
+        axes.grid(alpha=0.3, which="both")
+    panels[0].set_ylabel("milliseconds, forward and gradient")
+    panels[0].legend(fontsize=8)
+    figure.savefig(path, dpi=120)
+
+
+CHARTS = {"pose": pose_chart, "stages": stages_chart, "splat": splat_chart}

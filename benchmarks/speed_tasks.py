@@ -1,0 +1,223 @@
+"""The pose iteration that speed is measured on, by rts: meshes, loss, and a step with torch or jax.
+
+One iteration renders the silhouette of a mesh, takes the mean squared difference to the hard silhouette of 4 × 4
+samples a pixel at the zero pose, its gradient in the pose, and a step of Adam.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # Spinning threads of two libraries take each other's cores.
+
+import numpy as np
+from scenes import camera, mesh, supersampled
+
+import rts
+
+MESHES = {
+    "teapot_2464": ("teapot_2464", 0),
+    "teapot": ("teapot", 0),
+    "bunny": ("bunny", 0),
+    "spot": ("spot/spot_triangulated", 3),
+    "nefertiti": ("nefertiti", 2),
+}
+"""File and number of midpoint subdivisions: 2.5K, 6K, 69K, 375K and 1.6M faces."""
+
+START = (0.12, -0.15, 0.10, 0.05, -0.04, 0.06)
+RATE, VERTEX_RATE = 0.01, 1e-5
+"""Of Adam; vertices go by steps so small that the mesh stays what it is while time is taken."""
+
+MODES = ("pose", "full", "full, both")
+"""Gradient of the pose, vertices constant; of pose and vertices, a step in the pose; the same, a step in both."""
+
+WARM_UP, ROUNDS = 2, 15
+
+
+def subdivided(name: str, folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) float32 and faces (T, 3) int32 of one of MESHES, without seams; kept in the folder."""
+    import trimesh
+
+    path = folder / f"{name}.npz"
+    if not path.exists():
+        file, times = MESHES[name]
+        vertices, faces = welded(*mesh(file))
+        for _ in range(times):
+            vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+        folder.mkdir(parents=True, exist_ok=True)
+        np.savez(path, vertices=np.asarray(vertices, np.float32), faces=np.asarray(faces, np.int32))
+    kept = np.load(path)
+    return kept["vertices"], kept["faces"]
+
+
+def welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with one vertex a place, in their order: a seam of textures is no edge of the surface."""
+    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    return vertices[first[order]], rank[inverse.reshape(-1)][faces]
+
+
+class Task:
+    """A mesh, and the image that its pose is to be found from.
+
+    Args:
+        name: of the mesh.
+        vertices: (V, 3) float32.
+        faces: (T, 3) int32.
+        side: of the image, pixels.
+        shader: of the part.
+        layers: K.
+        splatter: by which it is rendered.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        side: int,
+        shader: str = "silhouette",
+        layers: int = 2,
+        splatter: Any = "auto",
+    ):
+        self.name, self.vertices, self.faces, self.side = name, vertices, faces, side
+        self.layers, self.splatter = layers, splatter
+        self.size, self.view = (side, side), camera()
+        self.part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {"vertices": vertices}, shader)
+        channels = slice(3, 4) if shader == "silhouette" else slice(0, 4)
+        self.channels = channels
+        self.target = supersampled(self.part, self.view, self.size, 4)[..., channels].astype(np.float32)
+
+    def posed(self, pose: Any, vertices: Any = None) -> rts.Part:
+        """The part at a pose (6,); its vertices replaced if others are given."""
+        part = self.part.replace(transform=rts.rigid(pose))
+        return part if vertices is None else part.replace(theta={"vertices": vertices})
+
+    def loss(self, pose: Any, vertices: Any, target: Any, sampler: str) -> Any:
+        """Mean squared difference."""
+        parts = self.posed(pose, vertices)
+        image = rts.render(parts, self.view, self.size, sampler=sampler, splatter=self.splatter, layers=self.layers)
+        difference = image[..., self.channels] - target
+        return (difference * difference).mean()
+
+
+# ------------------------------------------------------------------------------------------------------- iterations
+
+
+def torch_iteration(task: Task, mode: str = "pose", sampler: str = "auto") -> Callable[[], object]:
+    """One eager iteration a call."""
+    import torch
+
+    pose = torch.tensor(START, requires_grad=True)
+    vertices = None if mode == "pose" else torch.tensor(task.vertices, requires_grad=True)
+    groups: list[dict] = [{"params": [pose], "lr": RATE}]
+    if mode == "full, both":
+        groups.append({"params": [vertices], "lr": VERTEX_RATE})
+    optimizer = torch.optim.Adam(groups)
+    target = torch.from_numpy(task.target)
+
+    def step() -> float:
+        pose.grad = None
+        if vertices is not None:
+            vertices.grad = None
+        loss = task.loss(pose, vertices, target, sampler)
+        loss.backward()
+        optimizer.step()
+        return loss.item()
+
+    return step
+
+
+def jax_iteration(task: Task, mode: str = "pose", sampler: str = "auto") -> Callable[[], object]:
+    """One iteration a call, all of it in one compiled function."""
+    import jax
+
+    function, state = jax_function(task, mode, sampler)
+    function = jax.jit(function)
+
+    def step() -> float:
+        nonlocal state
+        state, loss, _ = function(*state)
+        jax.block_until_ready(state)
+        return loss.item()
+
+    return step
+
+
+def jax_function(task: Task, mode: str, sampler: str) -> tuple[Callable, tuple]:
+    """An iteration as a function of parameters and the optimiser's state, and the first of both."""
+    import jax
+    import jax.numpy as jnp
+    import optax
+
+    variables = {"pose": jnp.asarray(START, jnp.float32)}
+    if mode != "pose":
+        variables["vertices"] = jnp.asarray(task.vertices)
+    stepped = ("pose", "vertices") if mode == "full, both" else ("pose",)
+    rates = {"pose": RATE, "vertices": VERTEX_RATE}
+    rules = {name: optax.adam(rates[name]) for name in stepped}
+    target = jnp.asarray(task.target)
+
+    def function(variables: dict, states: dict) -> tuple:
+        value, gradient = jax.value_and_grad(lambda x: task.loss(x["pose"], x.get("vertices"), target, sampler))(
+            variables
+        )
+        moved, kept = dict(variables), {}
+        for name, rule in rules.items():
+            updates, kept[name] = rule.update(gradient[name], states[name])
+            moved[name] = optax.apply_updates(variables[name], updates)
+        # All of the gradient is handed out, lest XLA leave out what nothing reads.
+        return (moved, kept), value, gradient
+
+    return function, (variables, {name: rule.init(variables[name]) for name, rule in rules.items()})
+
+
+ENGINES = {"torch": torch_iteration, "jax": jax_iteration}
+
+
+# ------------------------------------------------------------------------------------------------------------- times
+
+
+def milliseconds(times: list[float]) -> dict:
+    """Median and quartiles, of some times in seconds."""
+    low, _, high = statistics.quantiles(times, n=4, method="inclusive") if len(times) > 1 else times * 3
+    return {"ms": 1e3 * statistics.median(times), "low": 1e3 * low, "high": 1e3 * high, "turns": len(times)}
+
+
+def in_turn(
+    functions: dict[str, Callable[[], object]],
+    rounds: int,
+    done: Callable[[], None] = lambda: None,
+    budget: float = float("inf"),
+) -> dict[str, dict]:
+    """Times of each function, one call each in turn, after two calls to warm up.
+
+    The turns are shuffled every round, since what ran before decides what is in the caches.
+
+    Args:
+        functions: by name.
+        rounds: calls to time of each.
+        done: called after each round.
+        budget: seconds after which a function, once timed five times, has no more turns.
+    """
+    times: dict[str, list[float]] = {name: [] for name in functions}
+    order, shuffle = list(functions), random.Random(0).shuffle
+    for n in range(rounds + WARM_UP):
+        shuffle(order)
+        for name in order:
+            if len(times[name]) >= 5 and sum(times[name]) > budget:
+                continue
+            start = time.perf_counter()
+            functions[name]()
+            if n >= WARM_UP:
+                times[name].append(time.perf_counter() - start)
+        done()
+    return {name: milliseconds(t) for name, t in times.items()}
