@@ -195,6 +195,9 @@ def affine(row: Array, points: Array) -> Array:
     return points[..., 0] * row[0] + points[..., 1] * row[1] + points[..., 2] * row[2] + row[3]
 
 
-def affine_map(matrix: Array, points: Array) -> Array:
-    """Points (N, 3) under an affine map (4, 4)."""
-    return namespace(matrix, points).stack([affine(matrix[i, :], points) for i in range(3)], axis=-1)
+def affine_map(rows: Array, points: Array) -> Array:
+    """Points (N, 3) under an affine map of R rows (R, 4): (N, R)."""
+    known = getattr(engine_of(rows, points), "affine_map", None)
+    if known is not None:
+        return known(rows, points)
+    return namespace(rows, points).stack([affine(rows[i, :], points) for i in range(rows.shape[0])], axis=-1)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import affine, engine_of, is_constant, matmul, namespace, promote
+from rts.arrays import affine, affine_map, engine_of, is_constant, matmul, namespace, promote
 from rts.protocols import Array, Rays
 from rts.transforms import (
     affine_matrix,
@@ -311,14 +311,13 @@ class Camera(NamedTuple):
         Returns:
             (N, 3). Points on the plane of the camera's centre have no image; they give finite values.
         """
-        xp = namespace(points)
         height, width = size
-        rows = matmul(self.projection, self.view)
-        w = affine(rows[3, :], points)
-        safe = xp.where(w * w > 0, w, xp.ones_like(w))
-        x = affine((rows[3, :] + rows[0, :]) * (width / 2), points) / safe
-        y = affine((rows[3, :] - rows[1, :]) * (height / 2), points) / safe
-        return xp.stack([x, y, -affine(self.view[2, :], points)], axis=-1)
+        matrix = matmul(self.projection, self.view)
+        xp, x, y, w = namespace(matrix), matrix[0, :], matrix[1, :], matrix[3, :]
+        divisor = affine_map(w[None, :], points)
+        safe = xp.where(divisor == 0, xp.ones_like(divisor), divisor)
+        pixels = affine_map(xp.stack([(w + x) * (width / 2), (w - y) * (height / 2)]), points)
+        return xp.concat([pixels / safe, affine_map(-self.view[2:3, :], points)], axis=1)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""

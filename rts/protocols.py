@@ -294,7 +294,8 @@ class Engine(Protocol):
     """An array framework. Chosen by the type of the arrays, never a global setting.
 
     Optional members: `take_error() -> RtsError | None`, the last error raised inside a host call, where the framework
-    wraps such errors in its own; `traced(x) -> bool`, whether an array has a shape but not yet a value.
+    wraps such errors in its own; `traced(x) -> bool`, whether an array has a shape but not yet a value;
+    `affine_map(rows, points)`, the same as in `rts.arrays`, in full precision but faster.
 
     The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the
     user has imported that module.

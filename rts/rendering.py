@@ -224,7 +224,7 @@ def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
     world = GBuffer(like=gbuffer["position"])
     for name in gbuffer:
         world.defer(name, lambda name=name: gbuffer[name])
-    world.defer("position", lambda: affine_map(transform, gbuffer["position"]))
+    world.defer("position", lambda: affine_map(transform[:3, :], gbuffer["position"]))
     if "normal" in gbuffer:
         world.defer("normal", lambda: _move_normals(transform, gbuffer["normal"]))
     return world

@@ -43,6 +43,10 @@ class NumpyEngine:
         """`x` itself."""
         return x
 
+    def affine_map(self, rows: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """As one product."""
+        return points @ rows[:, :3].T + rows[:, 3]
+
     def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> np.ndarray:
         """Sums of the rows of `values` that share a segment."""
         return np.stack([np.bincount(segments, weights=v, minlength=count) for v in values.T], axis=-1).astype(

@@ -106,6 +106,12 @@ class TorchEngine:
         """`x` detached."""
         return x.detach()
 
+    def affine_map(self, rows: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
+        """As one product on the CPU; elsewhere elementwise, since matrix units may round float32 to fewer bits."""
+        if points.device.type == "cpu" and points.dtype == rows.dtype:
+            return torch.addmm(rows[:, 3], points, rows[:, :3].T)
+        return (points[:, None, :] * rows[None, :, :3]).sum(dim=-1) + rows[:, 3]
+
     def segment_sum(self, values: torch.Tensor, segments: np.ndarray, count: int) -> torch.Tensor:
         """Sums of the rows of `values` that share a segment."""
         index = _tensor(segments, values.device)
