@@ -98,6 +98,24 @@ class SplatterConformance(Conformance):
         image = _splat(splatter, Splats(positions, rgba, splats.row))
         claim_close(image, _splat(splatter, splats), TOLERANCE, "the image with other values in padded rows")
 
+    def test_what_it_does_not_need_has_no_effect(self, splatter: Any) -> None:
+        """`needed`, where there is one: without other samples the image and its derivative are the same."""
+        chosen = _instance(splatter)
+        if not hasattr(chosen, "needed"):
+            pytest.skip("the splatter does not say which samples it needs")
+        splats = steps()
+        covered = splats.row >= 0
+        depth = np.where(covered, splats.positions[splats.row, 2], 0)
+        kept = np.asarray(chosen.needed(covered, depth))
+        claim(kept.shape == covered.shape and kept.dtype == bool, f"needed gave {kept.shape} {kept.dtype}")
+        claim(not (kept & ~covered)[0].any(), "needed asks for samples that are not there")
+        pruned = splats._replace(row=np.where(kept, splats.row, -1).astype(np.int32))
+        claim_close(_splat(splatter, pruned), _splat(splatter, splats), TOLERANCE, "the image of needed samples")
+        for engine in map(engine_named, DIFFERENTIABLE[:1]):
+            along = np.random.default_rng(0).normal(size=splats.positions.shape).astype(np.float32)
+            found, expected = (_along(engine, splatter, s, along) for s in (pruned, splats))
+            claim_close(found, expected, 1e-4, "the derivative of needed samples")
+
     # -------------------------------------------------------------------------------------- derivatives
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
@@ -178,6 +196,22 @@ def scattered() -> Splats:
     row[0][rng.random((HEIGHT, WIDTH)) < 0.3] = -1
     row[1][(rng.random((HEIGHT, WIDTH)) < 0.3) | (row[0] < 0)] = -1
     return Splats((splats.positions + off).astype(np.float32), rgba, row)
+
+
+def steps() -> Splats:
+    """Opaque samples on centres: a square before a sheet, whose own back is behind it, and a hole in both."""
+    splats = everywhere(LAYERS + 1)
+    positions, row = splats.positions.copy(), splats.row.copy()
+    positions[:, 2] += 0.05 * positions[:, 0]
+    row[2] = -1
+    behind = row[0, 2:6, 3:7].copy(), row[1, 2:6, 3:7].copy()
+    row[0, 2:6, 3:7] = _numbered(LAYERS + 1)[2, 2:6, 3:7]
+    positions[row[0, 2:6, 3:7].ravel(), 2] = 1.0
+    row[1, 2:6, 3:7], row[2, 2:6, 3:7] = behind
+    row[:, 6:, :2] = -1
+    rgba = np.random.default_rng(7).random((len(positions), 4)).astype(np.float32)
+    rgba[:, 3] = 1
+    return Splats(positions, rgba, row)
 
 
 def square() -> Splats:
