@@ -28,6 +28,11 @@ LINES = {
     "Mitsuba, pose": {"color": "#1d4ed8", "marker": "s"},
 }
 """What the chart shows, and how."""
+STAGE_COLORS = (
+    *("#111827", "#1d4ed8", "#3b82f6", "#7dd3fc", "#c7d2fe"),
+    *("#15803d", "#86efac", "#4ade80", "#eab308", "#c2410c", "#fb923c", "#9ca3af"),
+)
+"""What samples is blue, what goes forward green, what goes back orange."""
 
 
 def table(header: Iterable[str], lines: Iterable[Iterable[str]]) -> str:
@@ -140,9 +145,9 @@ def lm(rows: list[dict]) -> str:
 SECTIONS = {
     "pose": (
         "Pose iteration",
-        "One iteration: render, loss, gradient, step of Adam. Medians with quartiles, all methods in turn in one run; by "
-        "faces. *RtS-pose*: vertices constant. *Full RtS*: gradient of pose and vertices, a step in the pose; *both*: a "
-        "step in both. DEODR draws one channel of front faces on one thread; the others use all cores.",
+        "One iteration: render, loss, gradient, step of Adam. Medians with quartiles, all methods in turn in one run, "
+        "by faces. *RtS-pose*: vertices constant. *Full RtS*: gradient of pose and vertices, a step in the pose; "
+        "*both*: a step in both. DEODR draws one channel of front faces on one thread; the others use all cores.",
         pose,
     ),
     "stages": (
@@ -158,8 +163,8 @@ SECTIONS = {
     ),
     "memory": (
         "Memory",
-        "Peak of resident memory over that of the loaded scene with its code compiled, in three iterations, each case in "
-        "a process of its own; by faces. *NumPy*: peak of its allocations in sampling.",
+        "Peak of resident memory over that of the loaded scene with its code compiled, in three iterations, each case "
+        "in a process of its own; by faces. *NumPy*: peak of its allocations in sampling.",
         memory,
     ),
     "pruning": ("Two layers against one", "Pose iterations, milliseconds.", pruning),
@@ -191,6 +196,7 @@ def document(results: dict) -> str:
 def pose_chart(rows: list[dict], path: Path) -> None:
     """Time of an iteration against faces, both axes logarithmic; one panel a size."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     sides = by_side(rows)
     figure = Figure(figsize=(5.4 * len(sides), 5.6), layout="constrained")
@@ -200,6 +206,10 @@ def pose_chart(rows: list[dict], path: Path) -> None:
             if points:
                 axes.loglog(*zip(*points, strict=True), label=name, markersize=5, linewidth=1.5, **style)
         axes.set(title=f"{side}²", xlabel="faces")
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5) if axis is axes.yaxis else (1,)))
+            axis.set_major_formatter("{x:,g}" if axis is axes.yaxis else "{x:,.0f}")
+            axis.set_minor_formatter(NullFormatter())
         axes.grid(alpha=0.3, which="both")
     figure.axes[0].set_ylabel("milliseconds an iteration")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=9)
@@ -209,17 +219,15 @@ def pose_chart(rows: list[dict], path: Path) -> None:
 
 def stages_chart(rows: list[dict], path: Path) -> None:
     """Stacked bars; one panel a size."""
-    from matplotlib import colormaps
     from matplotlib.figure import Figure
 
     sides = by_side(rows)
     count = max(len(found) for _, found in sides)
     figure = Figure(figsize=(6 * len(sides) + 1, 1.6 + 0.34 * count), layout="constrained")
-    colors = colormaps["tab20"].colors
     for axes, (side, found) in zip(figure.subplots(1, len(sides), sharey=True, squeeze=False)[0], sides, strict=True):
         labels = [f"{row['faces']:,} faces, {row['mode']}, {row['sampler']}" for row in found]
         left = [0.0] * len(found)
-        for name, color in zip(STAGES, colors, strict=False):
+        for name, color in zip(STAGES, STAGE_COLORS, strict=True):
             values = [row["ms"][name] for row in found]
             axes.barh(labels, values, left=left, label=name, color=color, edgecolor="white", linewidth=0.3)
             left = [a + b for a, b in zip(left, values, strict=True)]
@@ -227,7 +235,9 @@ def stages_chart(rows: list[dict], path: Path) -> None:
         axes.grid(alpha=0.3, axis="x")
         axes.set_axisbelow(True)
     figure.axes[0].invert_yaxis()
-    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
+    figure.legend(
+        *figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3 * len(sides), fontsize=8
+    )
     figure.suptitle("Stages of a pose iteration with torch", fontsize=11)
     figure.savefig(path, dpi=120)
 
