@@ -201,6 +201,12 @@ class TestMulti(SplatterConformance):
         return "multi"
 
 
+class TestVisible(SplatterConformance):
+    @pytest.fixture
+    def splatter(self):
+        return "visible"
+
+
 # ---------------------------------------------------------------------------------------------- broken plugins
 #
 # Each differs from a plugin that conforms in one respect.
@@ -596,6 +602,11 @@ def all_rows(image, positions, rgba, row):
     return image + 1e-3 * xp.mean(rgba)
 
 
+class Frugal(OddMulti):
+    def needed(self, covered, depth):
+        return covered & (np.arange(len(covered)) == 0)[:, None, None]
+
+
 SPLATTERS = {
     "a_constant_interior_stays": {"dimmed": OddMulti(made=lambda image, *_: 0.99 * image)},
     "the_front_layer_hides_those_behind": {"back to front": OddMulti(lambda p, c, r: (p, c, r[::-1]))},
@@ -608,6 +619,7 @@ SPLATTERS = {
         "by number": OddMulti(lambda p, c, r: (p, c * np.linspace(0, 1, len(c))[:, None], r))
     },
     "rows_of_no_cell_have_no_effect": {"all rows": OddMulti(made=all_rows)},
+    "what_it_does_not_need_has_no_effect": {"fronts only": Frugal()},
     "a_shape_that_moves_brightens_what_it_moves_into": {"mirrored": OddMulti(from_centres), "none": Plain()},
     "every_engine_gives_the_same_image": {"not in torch": OddMulti(made=lambda image, *_: wrong_in_torch(image))},
     "engines_agree": {
