@@ -16,7 +16,7 @@ import os
 import platform
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -32,6 +32,7 @@ from rts.threads import thread_count
 
 QUICK_MESHES, QUICK_SIZES, QUICK_ROUNDS = ("teapot", "bunny"), (256,), 5
 SPLATTED, PRUNED, STAGED = ("bunny",), ("bunny", "nefertiti"), ("teapot", "bunny", "nefertiti")
+MEASURED = ("teapot", "bunny", "spot", "nefertiti")
 """Meshes of the sections that do not take all."""
 LAYERS = (1, 2, 4)
 BUDGET = 30.0
@@ -53,7 +54,7 @@ def iterations(task: Task, args: argparse.Namespace) -> dict[str, Callable[[], o
     return found
 
 
-def pose_rows(tasks: list[Task], args: argparse.Namespace, done: Callable[[], None]) -> list[dict]:
+def pose_rows(tasks: Iterable[Task], args: argparse.Namespace, done: Callable[[], None]) -> list[dict]:
     rows = []
     for task in tasks:
         times = in_turn(iterations(task, args), args.rounds, done, BUDGET)
@@ -71,31 +72,47 @@ class Plan:
 
     def __init__(self, args: argparse.Namespace, done: Callable[[], None]):
         self.args, self.folder = args, args.output / "meshes"
-        engines = tuple(ENGINES)
-        largest = max(args.sizes)
+        engines, rounds, largest = tuple(ENGINES), args.rounds, (max(args.sizes),)
         layers = LAYERS[:2] if args.quick else LAYERS
-        everything = self.tasks(MESHES)
-        staged, splatted = self.tasks(STAGED), self.tasks(SPLATTED)
-        pruned, solved = self.tasks(PRUNED, (largest,)), self.tasks(SPLATTED)
-        memory = [name for name in MESHES if name in args.meshes and name != "teapot_2464"]
-        rounds = args.rounds
+        staged, splatted, pruned = (self.chosen(names) for names in (STAGED, SPLATTED, PRUNED))
+        every, memory = self.chosen(MESHES), self.chosen(MEASURED)
+        count = len(args.sizes)
         self.sections: dict[str, tuple[int, Callable[[], list[dict]]]] = {
-            "pose": (len(everything) * (rounds + WARM_UP), lambda: pose_rows(everything, args, done)),
-            "stages": (3 * len(staged), lambda: speed_stages.measure(staged, rounds, done)),
-            "splat": (3 * len(layers) * len(splatted), lambda: parts.splat_rows(splatted, layers, rounds, done)),
-            "memory": (5 * len(memory), lambda: speed_memory.measure(memory, largest, self.folder, done)),
-            "pruning": (4 * len(pruned), lambda: parts.pruning_rows(pruned, engines, rounds, done)),
-            "lm": (4 * len(solved), lambda: parts.lm_rows(solved, engines, rounds, done)),
+            "pose": (
+                len(every) * count * (rounds + WARM_UP),
+                lambda: pose_rows(self.tasks(every), args, done),
+            ),
+            "stages": (
+                len(staged) * count * len(speed_stages.KINDS),
+                lambda: speed_stages.measure(self.tasks(staged), rounds, done),
+            ),
+            "splat": (
+                len(splatted) * count * len(layers) * len(parts.SPLATTERS),
+                lambda: parts.splat_rows(self.tasks(splatted), layers, rounds, done),
+            ),
+            "memory": (
+                len(memory) * len(speed_memory.CASES),
+                lambda: speed_memory.measure(memory, *largest, self.folder, done),
+            ),
+            "pruning": (
+                len(pruned) * len(parts.SHADERS) * len(engines),
+                lambda: parts.pruning_rows(self.tasks(pruned, largest), engines, rounds, done),
+            ),
+            "lm": (
+                len(splatted) * count * len(engines) * len(parts.UNKNOWNS),
+                lambda: parts.lm_rows(self.tasks(splatted), engines, rounds, done),
+            ),
         }
 
-    def tasks(self, names: tuple[str, ...] | dict, sizes: tuple[int, ...] | None = None) -> list[Task]:
-        """Those of some meshes that were asked for."""
-        return [
-            Task(name, *subdivided(name, self.folder), side)
-            for name in names
-            if name in self.args.meshes
-            for side in sizes or self.args.sizes
-        ]
+    def chosen(self, names: Iterable[str]) -> list[str]:
+        """Those that were asked for."""
+        return [name for name in names if name in self.args.meshes]
+
+    def tasks(self, names: list[str], sizes: tuple[int, ...] | None = None) -> Iterator[Task]:
+        """Made when it is their turn: large meshes take seconds."""
+        for name in names:
+            for side in sizes or self.args.sizes:
+                yield Task(name, *subdivided(name, self.folder), side)
 
 
 def environment() -> dict:
@@ -138,7 +155,7 @@ def main() -> None:
     results = environment()
     before = load_average()
     with Progress(*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn()) as progress:
-        task = progress.add_task("meshes", total=None)
+        task = progress.add_task("", total=None)
         plan = Plan(args, partial(progress.advance, task))
         chosen = {name: section for name, section in plan.sections.items() if name in args.only}
         progress.update(task, total=sum(steps for steps, _ in chosen.values()))

@@ -21,7 +21,14 @@ from speed_tasks import START, Task, jax_function, subdivided, torch_iteration
 import rts
 
 MIB = 2**20
-CASES = [(engine, mode) for mode in ("pose", "full") for engine in ("torch", "jax")]
+CASES = (
+    ("torch", "pose", "raster"),
+    ("torch", "pose", "embree"),
+    ("jax", "pose", "raster"),
+    ("torch", "full", "raster"),
+    ("jax", "full", "raster"),
+)
+"""Engine, mode and sampler."""
 
 
 def resident(peak: bool = False) -> float:
@@ -85,12 +92,11 @@ def measure(names: list[str], side: int, folder: Path, done: Callable[[], None])
     """Rows of the results."""
     rows = []
     for name in names:
-        for engine, mode in CASES:
-            for sampler in ("raster", "embree") if (engine, mode) == ("torch", "pose") else ("raster",):
-                command = [sys.executable, __file__, name, str(folder), str(side), engine, mode, sampler]
-                found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
-                rows.append({"mesh": name, "side": side, "engine": engine, "mode": mode, "sampler": sampler} | found)
-                done()
+        for engine, mode, sampler in CASES:
+            command = [sys.executable, __file__, name, str(folder), str(side), engine, mode, sampler]
+            found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+            rows.append({"mesh": name, "side": side, "engine": engine, "mode": mode, "sampler": sampler} | found)
+            done()
     return rows
 
 

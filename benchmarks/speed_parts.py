@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from rts.arrays import engine_of, namespace
 
 SPLATTERS = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}
 """The specification of each registered name."""
+SHADERS, UNKNOWNS = ("silhouette", "lambert"), (6, 12)
 
 
 # ----------------------------------------------------------------------------------------------------------- splatters
@@ -64,7 +65,7 @@ def jax_splat(splatter: Any, given: tuple[np.ndarray, ...], g: np.ndarray) -> Ca
     return lambda: jax.block_until_ready(function(*arrays))
 
 
-def splat_rows(tasks: list[Task], layers: tuple[int, ...], rounds: int, done: Callable[[], None]) -> list[dict]:
+def splat_rows(tasks: Iterable[Task], layers: tuple[int, ...], rounds: int, done: Callable[[], None]) -> list[dict]:
     """Forward and pullback of each splatter, specified and compiled, with torch and jax."""
     rows = []
     for task in tasks:
@@ -98,11 +99,11 @@ class Unpruned:
         return self._splatter.splat(positions, rgba, row)
 
 
-def pruning_rows(tasks: list[Task], engines: tuple[str, ...], rounds: int, done: Callable[[], None]) -> list[dict]:
+def pruning_rows(tasks: Iterable[Task], engines: tuple[str, ...], rounds: int, done: Callable[[], None]) -> list[dict]:
     """Iterations with one layer, with two, and with two none of which is dropped."""
     rows = []
     for task in tasks:
-        for shader in ("silhouette", "lambert"):
+        for shader in SHADERS:
             kinds = {"K = 1": (1, "auto"), "K = 2": (2, "auto"), "K = 2, nothing dropped": (2, Unpruned())}
             for engine in engines:
                 functions = {
@@ -171,12 +172,12 @@ def levenberg_marquardt(task: Task, engine: str, unknowns: int) -> dict[str, Cal
     }
 
 
-def lm_rows(tasks: list[Task], engines: tuple[str, ...], rounds: int, done: Callable[[], None]) -> list[dict]:
+def lm_rows(tasks: Iterable[Task], engines: tuple[str, ...], rounds: int, done: Callable[[], None]) -> list[dict]:
     """With 6 and 12 unknowns."""
     rows = []
     for task in tasks:
         for engine in engines:
-            for unknowns in (6, 12):
+            for unknowns in UNKNOWNS:
                 times = in_turn(levenberg_marquardt(task, engine, unknowns), rounds)
                 row = {"mesh": task.name, "faces": len(task.faces), "side": task.side, "engine": engine}
                 rows.append(row | {"unknowns": unknowns, "times": times})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 from unittest import mock
 
@@ -29,6 +29,9 @@ STAGES = (
     "Adam",
 )
 """In their order; "backward: splat" begins at the loss and ends when the gradient reaches the splats."""
+
+KINDS = (("pose", "raster"), ("pose", "embree"), ("full", "raster"))
+"""Modes and samplers."""
 
 
 class Clock:
@@ -149,11 +152,11 @@ def _one(clock: Clock, iteration: Callable[[], None]) -> dict[str, float]:
     return found
 
 
-def measure(tasks: list[Task], rounds: int, done: Callable[[], None]) -> list[dict]:
+def measure(tasks: Iterable[Task], rounds: int, done: Callable[[], None]) -> list[dict]:
     """Rows of the results: both modes, both samplers for a mesh that stays."""
     rows = []
     for task in tasks:
-        for mode, sampler in (("pose", "raster"), ("pose", "embree"), ("full", "raster")):
+        for mode, sampler in KINDS:
             row = {"mesh": task.name, "faces": len(task.faces), "side": task.side, "mode": mode, "sampler": sampler}
             rows.append(row | {"ms": stages(task, mode, sampler, rounds)})
             done()
