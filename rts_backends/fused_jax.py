@@ -58,8 +58,9 @@ def _host_push(operands: Sequence[np.ndarray], settings: Settings, wanted: Wante
 
 
 def _host_pull(operands: Sequence[np.ndarray], settings: Settings, wanted: Wanted) -> list[np.ndarray]:
-    *samples, gradients = operands
-    splats = Splats(settings, *samples)
+    positions, rgba, row, gradients = operands
+    used = int(row.max(initial=0)) + 1  # Under `jit` there may be many more.
+    splats = Splats(settings, positions[:used], rgba[:used], row)
     found = [[x for x in splats.vjp(g, wanted) if x is not None] for g in gradients]
     return [_stacked(x) for x in zip(*found, strict=True)]
 
@@ -157,6 +158,7 @@ class _Operation:
         return [(*lead, *shape) for shape in self._shapes(*shapes, **params)]
 
     def _on_host(self, operands: Sequence[np.ndarray], params: dict) -> list[np.ndarray]:
+        """The results, perhaps without the last rows, where those are zero."""
         by_item = self._by_item(operands)
         if not any(by_item):
             return self._host(operands, **params)
@@ -164,20 +166,24 @@ class _Operation:
         for b in range(len(found[0])):
             item = [x[b] if by else x for x, by in zip(operands, by_item, strict=True)]
             for out, value in zip(found, self._host(item, **params), strict=True):
-                out[b] = value
+                jax_host.fill(out[b], value)
         return found
 
     def _traced(self, *operands: jax.Array, **params: Any) -> list[jax.Array]:
         """In a program for the CPU."""
-        results = [jax.ShapeDtypeStruct(s, operands[0].dtype) for s in self._results(operands, params)]
+        results = tuple(jax.ShapeDtypeStruct(s, operands[0].dtype) for s in self._results(operands, params))
         name = f"{self.name} {sorted(params.items())}"
-        return jax_host.call(name, lambda *arrays: self._on_host(arrays, params), results, *operands)
+        return jax_host.call_named(name, lambda *arrays: self._on_host(arrays, params), results, *operands)
 
     def _eager(self, *operands: Any, **params: Any) -> list[jax.Array]:
         device = _cpu_of(operands)
         if device is None:
             return _compiled(self.primitive, tuple(params.items()))(*operands)
         found = self._on_host([np.asarray(x) for x in operands], params)
+        for i, shape in enumerate(self._results(operands, params)):
+            if found[i].shape != shape:
+                found[i], part = np.empty(shape, found[i].dtype), found[i]
+                jax_host.fill(found[i], part)
         if any(x.committed for x in operands):
             return jax.device_put(found, device)
         with jax.default_device(device):

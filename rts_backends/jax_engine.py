@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from rts.errors import RtsError
 from rts.protocols import ArraySpec, Tree
 from rts.records import STATIC_FIELDS, join_record, split_record
+from rts_backends import jax_host
 
 for _cls in STATIC_FIELDS:
     jax.tree_util.register_pytree_node(
@@ -55,30 +57,26 @@ class JaxEngine:
         """Call `fn`; packed rows are padded to a bucket where values are known, to the largest shape under a trace."""
         # Under grad and jvp this yields the plain value; only jit and vmap leave a tracer.
         args = tuple(jax.lax.stop_gradient(a) if isinstance(a, jax.Array) else a for a in args)
-        if not any(isinstance(a, jax.core.Tracer) for a in args):
+        if not any(isinstance(a, Tracer) for a in args):
             results = fn(*map(np.asarray, args))
             return tuple(
                 jnp.asarray(_pad(r, bucket(r.shape[0])) if spec.packed else r)
                 for r, spec in zip(results, specs, strict=True)
             )
 
-        def padded(*host_args: Any) -> tuple[np.ndarray, ...]:
+        def noticed(*host_args: Any) -> Sequence[np.ndarray]:
             try:
-                results = fn(*map(np.asarray, host_args))
+                return fn(*host_args)
             except RtsError as error:
                 self._error = error
                 raise
-            return tuple(
-                (_pad(r, spec.shape[0]) if spec.packed else np.asarray(r)).astype(spec.dtype)
-                for r, spec in zip(results, specs, strict=True)
-            )
 
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
-        return tuple(jax.pure_callback(padded, shapes, *args, vmap_method="sequential"))
+        return tuple(jax_host.call(noticed, shapes, *args))
 
     def traced(self, x: jax.Array) -> bool:
         """Whether `x` is a tracer."""
-        return isinstance(x, jax.core.Tracer)
+        return isinstance(x, Tracer)
 
     def take_error(self) -> RtsError | None:
         """What the latest host call under a trace raised, once; jax replaces it by an error of its own."""

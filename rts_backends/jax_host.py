@@ -1,49 +1,157 @@
-"""Host functions inside compiled jax programs on the CPU, without copies of what they read.
+"""Host functions inside compiled jax programs, on the CPU without copies of what they read.
 
 A typed custom call of XLA, whose handler is a Python function: it takes the interpreter lock, looks at the operands
-where they lie and fills the results in place. `jax.pure_callback` does the same work through copies, and takes over
-where the interface of this jaxlib is not the one that is described here.
+where they lie and fills the results in place. `jax.pure_callback` does the same work through copies. It takes over on
+other devices, and where the interface of this jaxlib is not the one that is described here.
 """
 
 from __future__ import annotations
 
 import ctypes
 import functools
+import itertools
+import os
 import warnings
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir, partial_eval
 
 TARGET = "rts_host_call"
 
 HostFunction = Callable[..., Sequence[np.ndarray]]
 """NumPy arrays in, which are read-only and lent for the length of the call, and NumPy arrays out."""
 
-_functions: dict[str, HostFunction] = {}
+Shapes = tuple[jax.ShapeDtypeStruct, ...]
+
+_named: dict[str, HostFunction] = {}
+_passing: weakref.WeakValueDictionary[str, _Selected] = weakref.WeakValueDictionary()
+_numbers = itertools.count()
 
 
-def call(name: str, function: HostFunction, shapes: Sequence[jax.ShapeDtypeStruct], *operands: jax.Array) -> list:
-    """The results of a host function in a traced program for the CPU.
+def call_named(name: str, function: HostFunction, shapes: Shapes, *operands: jax.Array) -> list[jax.Array]:
+    """The results of a host function, in a traced program for the CPU.
 
     Args:
         name: stands for the function in the program, and in programs that jax keeps on disk: says all that the function
             depends on but its operands.
         function: kept as long as the process lives.
-        shapes: of the results.
+        shapes: of the results, which may be shorter along any axis; the rest is zero.
         operands: of the function.
     """
     if not _available():
-        return list(jax.pure_callback(lambda *x: tuple(function(*map(np.asarray, x))), tuple(shapes), *operands))
-    _functions[name] = function
-    return list(jax.ffi.ffi_call(TARGET, tuple(shapes))(*operands, function=name))
+        return _copying(*operands, function=function, shapes=shapes, used=range(len(shapes)))
+    _named[name] = function
+    return list(jax.ffi.ffi_call(TARGET, shapes)(*operands, function=name))
+
+
+def call(function: HostFunction, shapes: Shapes, *operands: Any) -> list[jax.Array]:
+    """The results of a host function in any traced program, whose own life is as long as the function's.
+
+    Results that the program does not use are not copied. One that is shorter along an axis than its shape says is
+    padded with zeros. Under `vmap` the function is called for each item.
+    """
+    return _call.bind(*operands, function=function, shapes=shapes, used=tuple(range(len(shapes))))
+
+
+class _Selected:
+    """Some of the results of a function."""
+
+    def __init__(self, function: HostFunction, used: Sequence[int]):
+        self.function, self.used = function, used
+
+    def __call__(self, *operands: np.ndarray) -> list[np.ndarray]:
+        found = self.function(*operands)
+        return [found[i] for i in self.used]
+
+
+_call = Primitive("rts_host_call")
+_call.multiple_results = True
+
+
+@_call.def_impl
+def _run(*operands: Any, **params: Any) -> list[jax.Array]:
+    return jax.jit(functools.partial(_call.bind, **params))(*operands)
+
+
+@_call.def_abstract_eval
+def _results(*operands: Any, function: HostFunction, shapes: Shapes, used: Sequence[int]) -> list[ShapedArray]:
+    return [ShapedArray(shapes[i].shape, shapes[i].dtype) for i in used]
+
+
+def _batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, list[int]]:
+    mapped = [jnp.moveaxis(x, d, 0) for x, d in zip(operands, dims, strict=True) if d is not None]
+
+    def item(own: list) -> list[jax.Array]:
+        it = iter(own)
+        return _call.bind(*(x if d is None else next(it) for x, d in zip(operands, dims, strict=True)), **params)
+
+    found = jax.lax.map(item, mapped)
+    return found, [0] * len(found)
+
+
+def _without_unused(wanted: Sequence[bool], equation: Any) -> tuple[list[bool], Any]:
+    """The call with those of its results that are wanted."""
+    if not any(wanted):
+        return [False] * len(equation.invars), None
+    used = tuple(i for i, wish in zip(equation.params["used"], wanted, strict=True) if wish)
+    outvars = [v for v, wish in zip(equation.outvars, wanted, strict=True) if wish]
+    return [True] * len(equation.invars), equation.replace(outvars=outvars, params={**equation.params, "used": used})
+
+
+def _copying(*operands: Any, function: HostFunction, shapes: Shapes, used: Sequence[int]) -> list[jax.Array]:
+    results = tuple(shapes[i] for i in used)
+
+    def whole(*given: Any) -> tuple[np.ndarray, ...]:
+        outs = tuple(np.empty(r.shape, r.dtype) for r in results)
+        for out, value in zip(outs, _Selected(function, used)(*map(np.asarray, given)), strict=True):
+            fill(out, value)
+        return outs
+
+    return list(jax.pure_callback(whole, results, *operands))
+
+
+def _in_place(ctx: Any, *operands: Any, function: HostFunction, shapes: Shapes, used: Sequence[int]) -> Any:
+    if not _available():
+        rule = mlir.lower_fun(_copying, multiple_results=True)
+        return rule(ctx, *operands, function=function, shapes=shapes, used=used)
+    selected = _Selected(function, used)
+    name = f"{os.getpid()} {next(_numbers)}"
+    _passing[name] = selected
+    # A call of the usual kind, of no result, which XLA removes. But the program now keeps the function alive for as
+    # long as it lives itself, and is not kept on disk, where it would outlive it.
+    mlir.emit_python_callback(ctx.replace(avals_in=[], avals_out=[]), selected, None, [], [], [], has_side_effect=False)
+    return jax.ffi.ffi_lowering(TARGET)(ctx, *operands, function=name)
+
+
+batching.primitive_batchers[_call] = _batched
+partial_eval.dce_rules[_call] = _without_unused
+mlir.register_lowering(_call, mlir.lower_fun(_copying, multiple_results=True))
+mlir.register_lowering(_call, _in_place, platform="cpu")
+
+
+def fill(out: np.ndarray, value: np.ndarray) -> None:
+    """Copy, and zeros to where the value is short."""
+    value = np.asarray(value)
+    if value.shape != out.shape:
+        if value.ndim != out.ndim or any(n > size for n, size in zip(value.shape, out.shape, strict=True)):
+            raise ValueError(f"a host function returned an array of shape {value.shape}, where {out.shape} was said")
+        for axis, n in enumerate(value.shape):
+            out[(slice(None),) * axis + (slice(n, None),)] = 0
+    out[tuple(map(slice, value.shape))] = value
 
 
 @functools.cache
 def _available() -> bool:
     """Whether the handler is registered; XLA asks it for its version on the way."""
     try:
+        jax.local_devices(backend="cpu")  # Registers late what is given before there are any.
         handler = jax.ffi.pycapsule(ctypes.cast(_HANDLER, ctypes.c_void_p).value)
         jax.ffi.register_ffi_target(TARGET, handler, platform="cpu", api_version=1)
     except Exception as error:
@@ -129,12 +237,10 @@ def _handle(address: int) -> int | None:
         operands = [_array(arguments.items[i]) for i in range(arguments.count)]
         for operand in operands:
             operand.flags.writeable = False
-        found = _functions[_name(frame.attributes)](*operands)
+        name = _name(frame.attributes)
+        found = (_named.get(name) or _passing[name])(*operands)
         for i, value in zip(range(results.count), found, strict=True):
-            out = _array(results.items[i])
-            if out.shape != np.shape(value):
-                raise ValueError(f"a host function returned an array of shape {np.shape(value)}, not {out.shape}")
-            out[...] = value
+            fill(_array(results.items[i]), value)
     except BaseException as error:  # XLA cannot pass on an exception, only its text.
         message = f"{type(error).__name__}: {error}".encode()
         given = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, _INTERNAL)
