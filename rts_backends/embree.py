@@ -11,9 +11,9 @@ import numpy as np
 from rts.camera import Camera
 from rts.protocols import Fragments, Proxy
 from rts.sampling import TriangleSampler
+from rts.threads import parallel
 from rts_backends import embree_library, embree_public
 from rts_backends.embree_kernels import TILE, cast, keep_nearest_address
-from rts.threads import parallel
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
 REFITS = 32

@@ -15,8 +15,8 @@ from embreex.rtcore_scene import EmbreeScene
 
 from rts.camera import Camera
 from rts.protocols import Fragments, Proxy
-from rts_backends.neighbours import corner_lists, look, places
 from rts.threads import parallel
+from rts_backends.neighbours import corner_lists, look, places
 from rts_backends.triangles import facing, pixel_matrix
 
 STEP = 1e-6

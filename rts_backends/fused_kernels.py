@@ -16,10 +16,10 @@ import numpy as np
 
 from rts.errors import InputError
 from rts.splatting import CONTINUED, OFFSETS
+from rts.threads import parallel
 from rts_backends import fused_choices as choosing
 from rts_backends import fused_mixed as mixed
 from rts_backends import fused_stencil as stencil
-from rts.threads import parallel
 
 
 class Settings(NamedTuple):

@@ -19,9 +19,9 @@ from rts.camera import Camera
 from rts.errors import InputError
 from rts.protocols import Fragments, Proxy
 from rts.sampling import TriangleSampler
+from rts.threads import parallel
 from rts_backends.neighbours import corner_lists, places, settle
 from rts_backends.opengl_worker import LESS, Worker
-from rts.threads import parallel
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
 TARGETS = 4
