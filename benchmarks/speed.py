@@ -149,6 +149,15 @@ def options() -> argparse.Namespace:
     return args
 
 
+def write(results: dict, folder: Path) -> None:
+    """What is known so far."""
+    (folder / "speed.json").write_text(json.dumps(results, indent=1))
+    (folder / "speed.md").write_text(tables.document(results))
+    for name, chart in tables.CHARTS.items():
+        if results.get(name):
+            chart(results[name], folder / f"{name}.png")
+
+
 def main() -> None:
     args = options()
     args.output.mkdir(parents=True, exist_ok=True)
@@ -162,12 +171,8 @@ def main() -> None:
         for name, (_, measure) in chosen.items():
             progress.update(task, description=name)
             results[name] = measure()
-    results["load"] = [before, load_average()]
-    (args.output / "speed.json").write_text(json.dumps(results, indent=1))
-    (args.output / "speed.md").write_text(tables.document(results))
-    for name, chart in tables.CHARTS.items():
-        if results.get(name):
-            chart(results[name], args.output / f"{name}.png")
+            results["load"] = [before, load_average()]
+            write(results, args.output)
     print(tables.document(results))
     print(f"wrote {args.output}/speed.md, .json and charts")
 

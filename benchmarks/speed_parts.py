@@ -15,6 +15,8 @@ from rts.arrays import engine_of, namespace
 SPLATTERS = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}
 """The specification of each registered name."""
 SHADERS, UNKNOWNS = ("silhouette", "lambert"), (6, 12)
+BUDGET = 2.0
+"""Seconds of timed turns after which a splatter has had enough, of five at least."""
 
 
 # ----------------------------------------------------------------------------------------------------------- splatters
@@ -80,7 +82,7 @@ def splat_rows(tasks: Iterable[Task], layers: tuple[int, ...], rounds: int, done
                     for engine, make in (("torch", torch_splat), ("jax", jax_splat))
                 }
                 row = {"mesh": task.name, "side": task.side, "layers": k, "splatter": name, "samples": len(given[0])}
-                rows.append(row | {"times": in_turn(functions, rounds)})
+                rows.append(row | {"times": in_turn(functions, rounds, budget=BUDGET)})
                 done()
     return rows
 
