@@ -47,6 +47,8 @@ def iterations(task: Task, args: argparse.Namespace) -> dict[str, Callable[[], o
         for engine, make in ENGINES.items():
             for sampler in ("auto", "raster", "embree") if mode == "pose" else ("auto",):
                 found[f"{NAMES[mode]}, {engine}, {sampler}"] = make(task, mode, sampler)
+        if mode != MODES[-1]:
+            found[f"{NAMES[mode]}, jax, auto, quarter of the rows"] = ENGINES["jax"](task.limited(), mode)
     if args.peers:
         import speed_peers
 

@@ -7,6 +7,7 @@ allocations in sampling, by tracemalloc.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import re
 import subprocess
@@ -39,6 +40,7 @@ def resident(peak: bool = False) -> float:
 
 def growth(iteration: Callable[[], object]) -> float:
     """MiB that the process needs in three iterations beyond what it holds."""
+    ctypes.CDLL(None).malloc_trim(0)  # What was freed before is not to be filled unseen.
     Path("/proc/self/clear_refs").write_text("5")
     before = resident()
     for _ in range(3):
@@ -46,17 +48,17 @@ def growth(iteration: Callable[[], object]) -> float:
     return resident(peak=True) - before
 
 
-def torch_growth(make: Callable[[int], Task], side: int, mode: str, sampler: str) -> float:
-    torch_iteration(make(16), mode, sampler)()
-    return growth(torch_iteration(make(side), mode, sampler))
+def torch_growth(task: Task, mode: str, sampler: str) -> float:
+    torch_iteration(task.resized(16), mode, sampler)()
+    return growth(torch_iteration(task, mode, sampler))
 
 
-def jax_growth(make: Callable[[int], Task], side: int, mode: str, sampler: str) -> float:
+def jax_growth(task: Task, mode: str, sampler: str) -> float:
     import jax
 
-    small, state = jax_function(make(16), mode, sampler)
+    small, state = jax_function(task.resized(16), mode, sampler)
     jax.block_until_ready(jax.jit(small)(*state))  # Compiles what samples on the host.
-    function, state = jax_function(make(side), mode, sampler)
+    function, state = jax_function(task, mode, sampler)
     compiled = jax.jit(function).lower(*state).compile()
 
     def iteration() -> None:
@@ -79,13 +81,9 @@ def host_peak(task: Task, sampler: str) -> float:
 
 def worker(name: str, folder: str, side: str, engine: str, mode: str, sampler: str) -> dict:
     """One case, in this process."""
-    vertices, faces = subdivided(name, Path(folder))
-
-    def make(side: int) -> Task:
-        return Task(name, vertices, faces, side)
-
-    grown = (torch_growth if engine == "torch" else jax_growth)(make, int(side), mode, sampler)
-    return {"mib": grown, "host": host_peak(make(int(side)), sampler), "faces": len(faces)}
+    task = Task(name, *subdivided(name, Path(folder)), int(side))
+    grown = (torch_growth if engine == "torch" else jax_growth)(task, mode, sampler)
+    return {"mib": grown, "host": host_peak(task, sampler), "faces": len(task.faces)}
 
 
 def measure(names: list[str], side: int, folder: Path, done: Callable[[], None]) -> list[dict]:

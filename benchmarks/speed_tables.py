@@ -13,6 +13,7 @@ FULL = "full RtS, torch, auto"
 RATIOS = (
     (OURS, "DEODR, pose"),
     ("RtS-pose, jax, auto", "DEODR, pose"),
+    ("RtS-pose, jax, auto, quarter of the rows", "DEODR, pose"),
     (FULL, "DEODR, full"),
     ("full RtS, jax, auto", "DEODR, full"),
     (OURS, "Mitsuba, pose"),
@@ -147,7 +148,8 @@ SECTIONS = {
         "Pose iteration",
         "One iteration: render, loss, gradient, step of Adam. Medians with quartiles, all methods in turn in one run, "
         "by faces. *RtS-pose*: vertices constant. *Full RtS*: gradient of pose and vertices, a step in the pose; "
-        "*both*: a step in both. DEODR draws one channel of front faces on one thread; the others use all cores.",
+        "*both*: a step in both. *Quarter of the rows*: jax is told by `capacity` to allot so many, not one for every "
+        "cell of every layer. DEODR draws one channel of front faces on one thread; the others use all cores.",
         pose,
     ),
     "stages": (

@@ -6,6 +6,7 @@ samples a pixel at the zero pose, its gradient in the pose, and a step of Adam.
 
 from __future__ import annotations
 
+import copy
 import os
 import random
 import statistics
@@ -90,11 +91,34 @@ class Task:
     ):
         self.name, self.vertices, self.faces, self.side = name, vertices, faces, side
         self.layers, self.splatter = layers, splatter
+        self.capacity: int | None = None
         self.size, self.view = (side, side), camera()
         self.part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {"vertices": vertices}, shader)
-        channels = slice(3, 4) if shader == "silhouette" else slice(0, 4)
-        self.channels = channels
-        self.target = supersampled(self.part, self.view, self.size, 4)[..., channels].astype(np.float32)
+        self.channels = slice(3, 4) if shader == "silhouette" else slice(0, 4)
+        self.target = self._target()
+
+    def _target(self) -> np.ndarray:
+        image = supersampled(self.part, self.view, self.size, 4)
+        return image[..., self.channels].astype(np.float32)
+
+    def resized(self, side: int) -> Task:
+        """The same part, with what samplers keep of it, in an image of another size."""
+        other = copy.copy(self)
+        other.side, other.size = side, (side, side)
+        other.target = other._target()
+        return other
+
+    def limited(self) -> Task:
+        """The same with rows for a quarter of all cells, which must do for the samples of the start."""
+        other = copy.copy(self)
+        other.capacity = self.layers * self.side**2 // 4
+        part = self.posed(np.array(START, np.float32))
+        sampled = rts.sample(
+            part, self.view, self.size, splatter=self.splatter, layers=self.layers, capacity=other.capacity
+        )
+        if int(sampled.overflow):
+            raise ValueError(f"{self.name} has {sampled.overflow} samples beyond {other.capacity}")
+        return other
 
     def posed(self, pose: Any, vertices: Any = None) -> rts.Part:
         """The part at a pose (6,); its vertices replaced if others are given."""
@@ -104,7 +128,15 @@ class Task:
     def loss(self, pose: Any, vertices: Any, target: Any, sampler: str) -> Any:
         """Mean squared difference."""
         parts = self.posed(pose, vertices)
-        image = rts.render(parts, self.view, self.size, sampler=sampler, splatter=self.splatter, layers=self.layers)
+        image = rts.render(
+            parts,
+            self.view,
+            self.size,
+            sampler=sampler,
+            splatter=self.splatter,
+            layers=self.layers,
+            capacity=self.capacity,
+        )
         difference = image[..., self.channels] - target
         return (difference * difference).mean()
 
