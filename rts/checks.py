@@ -36,19 +36,14 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Part
     if not parts or not all(isinstance(p, Part) for p in parts):
         kinds = ", ".join(type(p).__name__ for p in parts) or "nothing"
         raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
-    check_is_camera(camera)
+    if not isinstance(camera, Camera):
+        raise InputError(f"camera is a {type(camera).__name__}; expected an rts.Camera")
     camera = Camera(*from_numbers(tuple(camera)))
     for name, matrix in zip(camera._fields, camera, strict=True):
         check_matrix(f"the camera's {name}", matrix)
     checked = [_check_part(index, part) for index, part in enumerate(parts)]
     engine_of(checked, camera)
     return checked, camera
-
-
-def check_is_camera(camera: Any) -> None:
-    """Refuse anything else."""
-    if not isinstance(camera, Camera):
-        raise InputError(f"camera is a {type(camera).__name__}; expected an rts.Camera")
 
 
 def _check_part(index: int, part: Part) -> Part:
@@ -93,7 +88,7 @@ def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple
     if not whole or height <= 0 or width <= 0:
         given = " ".join(repr(size).split())[:60]
         raise InputError(f"size is {given}; expected (height, width), two positive integers")
-    if layers != "auto" and not _is_count(layers):
+    if not (isinstance(layers, str) and layers == "auto") and not _is_count(layers):
         raise InputError(f'layers is {layers!r}; expected an integer of at least 1, or "auto"')
     if capacity is not None and not _is_count(capacity):
         raise InputError(f"capacity is {capacity!r}; expected an integer of at least 1, or None")
@@ -108,7 +103,7 @@ def check_memory(height: int, width: int, layers: int, *, gradient: bool) -> Non
     if needed > MEMORY:
         raise InputError(
             f"{height} x {width} pixels with {layers} layers need about {needed / 2**30:.3g} GiB, and this machine has "
-            f"{MEMORY / 2**30:.3g} GiB; choose a smaller size or fewer layers"
+            f"{MEMORY / 2**30:.3g} GiB; choose a smaller size, or fewer samples a pixel or layers"
         )
 
 

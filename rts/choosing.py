@@ -62,21 +62,14 @@ def explain(parts: Part | Sequence[Part], camera: Camera) -> list[Choice]:
 class Auto:
     """The sampler that suits each part."""
 
-    prunes = True
-
-    def sample(
-        self,
-        part: Part,
-        camera: Camera,
-        size: tuple[int, int],
-        layers: int,
-        *,
-        capacity: int | None = None,
-        needed: Any = None,
-    ) -> Samples:
-        """See `rts.protocols.Sampler`."""
+    def of(self, part: Part, camera: Camera) -> Any:
+        """The sampler of a part."""
         choice = choose(part, static=is_static(part, camera))
         _log.debug("%s for %r: %s", choice.sampler, part.surface, choice.reason)
-        sampler: Any = registry.instance("rts.samplers", choice.sampler)
-        known = {"needed": needed} if getattr(sampler, "prunes", False) else {}
-        return sampler.sample(part, camera, size, layers, capacity=capacity, **known)
+        return registry.instance("rts.samplers", choice.sampler)
+
+    def sample(
+        self, part: Part, camera: Camera, size: tuple[int, int], layers: int, *, capacity: int | None = None
+    ) -> Samples:
+        """See `rts.protocols.Sampler`."""
+        return self.of(part, camera).sample(part, camera, size, layers, capacity=capacity)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rts.arrays import engine_of, from_numbers, is_constant, leaves, map_leaves, namespace
 from rts.camera import Camera
+from rts.checks import check_size
 from rts.errors import InputError
 from rts.protocols import Array, Engine, Part, Tree
 from rts.rendering import render
@@ -22,6 +24,8 @@ STEP_PIXELS = 1.0
 """How far the finite differences move what moves fastest in the image."""
 STEP_COLOR = 0.05
 """How far they change the colour that changes fastest, where nothing moves."""
+NEGLIGIBLE = 0.01
+"""What does not matter, as a share of the largest effect of a step."""
 LOSS_SMOOTHNESS = 4.0
 """Standard deviation of the Gaussian that smooths the weights of the default loss, pixels."""
 
@@ -40,6 +44,8 @@ class GradientImage(NamedTuple):
     @property
     def picture(self) -> np.ndarray:
         """(H, W, 3) linear RGB for `rts.save_image`: middle grey is zero, brighter positive, darker negative."""
+        if self.derivative.shape[2] not in (1, 3, 4):
+            raise InputError(f"the image has {self.derivative.shape[2]} channels; expected 1, 3 or 4 for a picture")
         color = self.derivative if self.derivative.shape[2] in (1, 3) else self.derivative[..., :3]
         signed = np.clip(0.5 + 0.5 * color / self.scale, 0, 1)
         return decode_srgb(np.broadcast_to(signed, (*signed.shape[:2], 3)))
@@ -65,10 +71,18 @@ def gradient_image(
             raise InputError("parameters holds more than one number; give the direction along which to differentiate")
         direction = map_leaves(lambda p: engine.namespace.ones_like(p), parameters)
     direction = _like(from_numbers(direction), parameters, engine)
-    _, derivative = engine.jvp(image, parameters, direction)
-    derivative = engine.to_numpy(derivative)
-    if derivative.ndim != 3:
-        raise InputError(f"image gave an array of shape {derivative.shape}; expected (H, W, C)")
+    if scale is not None and not (isinstance(scale, Real) and 0 < scale < math.inf):
+        raise InputError(f"scale is {scale!r}; expected a positive number, or None for the largest change")
+
+    def checked(p: Tree) -> Array:
+        found = image(p)
+        if not engine.owns(found) or found.ndim != 3:
+            raise InputError(f"image gave {_kind(found)}; expected a {engine.name} array (H, W, C)")
+        return found
+
+    derivative = engine.to_numpy(engine.jvp(checked, parameters, direction)[1])
+    if not np.isfinite(derivative).all():
+        raise InputError("the derivative of the image is not finite; check the parameters for NaN")
     largest = float(np.abs(derivative).max(initial=0.0))
     return GradientImage(derivative, float(scale) if scale is not None else largest or 1.0)
 
@@ -96,17 +110,20 @@ class GradientCheck(NamedTuple):
 
     Attributes:
         slopes: one for each number that was looked at.
-        tolerance: relative to the largest difference of the same array.
+        tolerance: how far a derivative may be off, relative to itself.
     """
 
     slopes: list[Slope]
     tolerance: float
 
     def agrees(self, slope: Slope) -> bool:
-        """Whether autodiff is within the tolerance and three error bars of the difference."""
-        array = slope.name.partition("[")[0]
-        largest = max(abs(s.difference) for s in self.slopes if s.name.partition("[")[0] == array)
-        return abs(slope.autodiff - slope.difference) <= self.tolerance * largest + 3 * slope.error
+        """Whether autodiff is within the tolerance, three error bars, and what hardly matters beside the others.
+
+        Numbers of different units are compared by what a step of a pixel does to the loss.
+        """
+        largest = max(abs(s.difference * s.step) for s in self.slopes)
+        allowed = self.tolerance * abs(slope.difference) + 3 * slope.error + NEGLIGIBLE * largest / slope.step
+        return abs(slope.autodiff - slope.difference) <= allowed
 
     @property
     def ok(self) -> bool:
@@ -148,20 +165,27 @@ def check_gradient(
         loss: image (H, W, 4) → scalar; None for a smooth random weighting of the image, with a fixed seed.
         entries: of each array, look at so many numbers: those of largest gradient, and some at random.
         samples: the square root of the number of samples a pixel.
-        tolerance: what is called agreement, relative to the largest slope of the same array.
+        tolerance: what is called agreement, relative to each derivative.
         **options: splatter, layers, supersample, background, … of `rts.render`.
 
     Raises:
         InputError: parameters that have no derivative, or arguments that `rts.render` refuses.
     """
     engine, parameters = _differentiable(parameters)
-    loss = _smooth_weighting(size, engine, parameters) if loss is None else loss
+    size = check_size(size, 1, None, samples)
+    if isinstance(entries, bool) or not isinstance(entries, Integral) or entries < 1:
+        raise InputError(f"entries is {entries!r}; expected an integer of at least 1")
+    loss = _scalar(_smooth_weighting(size, engine, parameters) if loss is None else loss, engine)
 
     def image(p: Tree, **changes: Any) -> Array:
-        parts, camera = scene(p)
-        return render(parts, camera, size, **{**options, **changes})
+        found = scene(p)
+        if not isinstance(found, tuple) or len(found) != 2:
+            raise InputError(f"scene gave {_kind(found)}; expected (parts, camera)")
+        return render(*found, size, **{**options, **changes})
 
-    _, gradient = engine.value_and_grad(lambda p: loss(image(p)))(parameters)
+    value, gradient = engine.value_and_grad(lambda p: loss(image(p)))(parameters)
+    if getattr(engine, "traced", lambda x: False)(value):
+        raise InputError("the parameters are traced; call check_gradient outside jit")
     slopes = []
     for number, ((name, value), slope) in enumerate(zip(_named(parameters), leaves(gradient), strict=True)):
         flat = engine.to_numpy(slope).reshape(-1)
@@ -185,21 +209,45 @@ def _differentiable(parameters: Tree) -> tuple[Engine, Tree]:
     """The engine of parameters that have derivatives, and the parameters, dicts in the order of `leaves`."""
     if not any(True for _ in leaves(parameters)) or any(is_constant(x) for x in leaves(parameters)):
         raise InputError("parameters holds NumPy arrays, numbers or nothing; expected torch or jax arrays")
+    for x in leaves(parameters):
+        if not namespace(x).isdtype(x.dtype, "real floating"):
+            raise InputError(f"parameters holds an array of dtype {x.dtype}; expected a floating one")
     return engine_of(parameters), map_leaves(lambda p: p, parameters)
 
 
 def _like(direction: Tree, parameters: Tree, engine: Engine) -> Tree:
-    """The direction as arrays of the engine, of the parameters' shapes."""
-    given, wanted = ([tuple(np.shape(x)) for x in leaves(t)] for t in (direction, parameters))
+    """The direction as arrays of the engine, of the parameters' names and shapes."""
+    given, wanted = ([(name, tuple(np.shape(x))) for name, x in _named(t)] for t in (direction, parameters))
     if given != wanted:
         raise InputError(f"direction has arrays of shapes {given}; expected those of the parameters, {wanted}")
+    if engine_of(direction, parameters) is not engine:  # Arrays of two engines are refused by `engine_of`.
+        raise InputError(f"direction holds arrays of another engine; expected {engine.name}")
     values = iter(leaves(direction))
 
     def leaf(p: Array) -> Array:
         d = next(values)
-        return namespace(p).astype(engine.constant(d, p) if is_constant(d) else d, p.dtype, copy=False)
+        return namespace(p).astype(engine.constant(np.asarray(d), p) if is_constant(d) else d, p.dtype, copy=False)
 
     return map_leaves(leaf, parameters)
+
+
+def _scalar(loss: Callable[[Array], Array], engine: Engine) -> Callable[[Array], Array]:
+    """The loss, known to be a scalar of the engine."""
+
+    def call(image: Array) -> Array:
+        if not engine.owns(image):
+            raise InputError(f"the image is {_kind(image)}: nothing in the scene depends on the parameters")
+        value = loss(image)
+        if not engine.owns(value) or value.shape != ():
+            raise InputError(f"loss gave {_kind(value)}; expected a {engine.name} scalar, of shape ()")
+        return value
+
+    return call
+
+
+def _kind(value: Any) -> str:
+    shape = f" of shape {tuple(value.shape)}" if hasattr(value, "shape") else ""
+    return f"a {type(value).__name__}{shape}"
 
 
 def _named(tree: Tree, name: str = "") -> Iterator[tuple[str, Array]]:

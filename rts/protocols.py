@@ -158,8 +158,8 @@ class Samples:
 class Sampled:
     """A whole scene, sampled: what `rts.sample` returns and `rts.render_samples` takes.
 
-    The grid has an apron of one cell around the image, so that what lies just outside can splat into it:
-    here H and W are the image's, times `supersample`, plus two.
+    The grid has an apron of two cells around the image, so that what lies just outside can splat into it:
+    here H and W are the image's, times `supersample`, plus four.
 
     Attributes:
         samples: one `Samples` a part.
@@ -190,6 +190,7 @@ class Surface(Protocol):
         proxy_key(inputs, camera, size) -> hashable: what besides the bytes of the inputs makes a proxy stale; without
             it the proxy may not depend on camera and size.
         faces: where the surface has this attribute, the sampler "auto" goes by its length.
+        centered (bool): whether its samples reproject to pixel centres; default True.
         proxy_is_cheap (bool): making the proxy costs no more than looking whether its inputs have changed.
         refine(inputs, samples, rays) -> Samples: on the host, polish or replace ids and params.
         table_specs(rows) -> dict of ArraySpec: the `Samples.tables` that `refine` fills, for at most `rows` samples.
@@ -337,8 +338,11 @@ class Engine(Protocol):
         """`f(tree) -> scalar` to `tree -> (value, gradient tree)`."""
         ...
 
-    def checkpoint(self, f: Callable[[], Array]) -> Array:
-        """The value of `f`, which is computed again for its gradient instead of keeping what it went through."""
+    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Array]) -> Array:
+        """`f(make())`, done again for its gradient instead of keeping what it went through; `make` has no derivative.
+
+        What `make` gives may be kept where it could not be made again as it was.
+        """
         ...
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[Array, Array]:

@@ -28,7 +28,17 @@ def needed_by(splatter: Any, parts: Sequence[Part]) -> Needed | None:
     Only where all samples are opaque and lie on pixel centres are hidden ones without effect.
     """
     known = all(getattr(p.shader, "opaque", False) and getattr(p.surface, "centered", True) for p in parts)
-    return getattr(splatter, "needed", None) if known else None
+    if not known or not hasattr(splatter, "needed"):
+        return None
+
+    def needed(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        kept = splatter.needed(covered, depth)
+        if not (isinstance(kept, np.ndarray) and kept.shape == covered.shape and kept.dtype == bool):
+            given = f"{kept.dtype} of {kept.shape}" if isinstance(kept, np.ndarray) else type(kept).__name__
+            raise InputError(f"needed of {splatter!r} gave {given}; expected a NumPy array, bool of {covered.shape}")
+        return kept & covered
+
+    return needed
 
 
 class Inspection:
@@ -46,7 +56,7 @@ class Inspection:
 
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `Needed`."""
-        kept = covered if self._needed is None else self._needed(covered, depth) & covered
+        kept = covered if self._needed is None else self._needed(covered, depth)
         counted = (covered[1:] & kept[1:].any(axis=0)).reshape(len(covered) - 1, -1).sum(axis=1)
         counted = np.append(max(1, covered.shape[1] * covered.shape[2]), counted)
         with self._lock:
@@ -70,9 +80,9 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: Needed | None) ->
         inspection = Inspection(needed)
         sampled = taken(min(count, LAYER_LIMIT + 1), inspection)
         if inspection.most is None:
-            raise InputError(
-                'layers is "auto", but the values that decide are traced; give a number inside jit or vmap'
-            )
+            traced = getattr(engine_of(sampled), "traced", lambda x: False)(sampled.row)
+            why = "the values that decide are traced" if traced else "the sampler did not ask which samples are needed"
+            raise InputError(f'layers is "auto", but {why}; give a number of layers')
         if inspection.most < count or count > LAYER_LIMIT:
             break
         count *= 2
@@ -93,13 +103,18 @@ def prune(sampled: Sampled, needed: Needed) -> Sampled:
     """The scene without the samples that are not needed; one call to the host."""
     sizes = [s.ids.shape[0] for s in sampled.samples]
     offsets = np.cumsum([0, *sizes])
+    # Tables may have a row a sample: those parts keep their rows, though no cell refers to some of them.
+    fixed = [(a, a + n) for a, n, s in zip(offsets, sizes, sampled.samples, strict=False) if s.tables]
 
     def host(row: np.ndarray, depth: np.ndarray, *own_rows: np.ndarray) -> tuple[np.ndarray, ...]:
-        used = np.zeros(offsets[-1], bool)
-        used[row[needed(row >= 0, depth)]] = True
+        shown = np.zeros(offsets[-1], bool)
+        shown[row[needed(row >= 0, depth)]] = True
+        used = shown.copy()
+        for a, b in fixed:
+            used[a:b] = True
         # In their order, so that neighbours in the image stay neighbours in memory.
         indices = [np.flatnonzero(used[a:b]).astype(np.int32) for a, b in itertools.pairwise(offsets)]
-        numbers = [np.where(used[a:b], np.cumsum(used[a:b]) - 1, -1) for a, b in itertools.pairwise(offsets)]
+        numbers = [np.where(shown[a:b], np.cumsum(used[a:b]) - 1, -1) for a, b in itertools.pairwise(offsets)]
         rows = zip((np.concatenate(numbers), *numbers), (row, *own_rows), strict=True)
         renumbered = [np.where(r >= 0, n[r], -1).astype(np.int32) for n, r in rows]
         return *renumbered, *(i if len(i) else np.zeros(1, np.int32) for i in indices)

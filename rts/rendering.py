@@ -13,7 +13,6 @@ from rts.arrays import affine_map, constants, engine_of, exemplar, is_constant, 
 from rts.camera import Camera
 from rts.checks import (
     check_background,
-    check_is_camera,
     check_memory,
     check_plugin,
     check_scene,
@@ -21,14 +20,15 @@ from rts.checks import (
     check_size,
     differentiable,
 )
+from rts.choosing import Auto
 from rts.errors import InputError
 from rts.preparing import PreparedParts
 from rts.protocols import Array, Engine, GBuffer, Part, Sampled, Samples
 from rts.pruning import Needed, as_needed, needed_by, prune
 from rts.sampling import merge, reads_of
 
-APRON = 1
-"""Cells sampled beyond the image's border on each side, so that they can splat into it."""
+APRON = 2
+"""Cells sampled beyond the image's border on each side: the first splats into it, and pairing looks at the second."""
 
 BAND = 2**20
 """Cells, over all layers, that a supersampled image may have before it is rendered in bands of rows."""
@@ -57,7 +57,7 @@ def render(
         layers: K, the number of surface layers kept at each pixel; or "auto", as many as count where surfaces hide one
             another, up to 8 (a warning says if there are more).
         supersample: s, for s² samples a pixel, splatted on the finer grid and averaged. Large images are rendered in
-            bands of rows, so that memory stays bounded; in a gradient each band is then shaded once more.
+            bands of rows, so that memory stays bounded; in a gradient each band is then made once more.
         background: colour (3,) or (4,), or image (H, W, 3 or 4), premultiplied, to composite onto; None for
             transparent.
         capacity: number of rows to allot for the samples of a part inside `jax.jit`, where shapes must be known;
@@ -71,29 +71,22 @@ def render(
         InputError: what was given cannot be rendered.
         EngineError: torch and jax arrays in one scene.
     """
-    check_is_camera(camera)
-    height, width = check_size(size, layers, capacity, supersample)
-    background = check_background(background, (height, width))
-    bands = _bands(height, width, layers, supersample)
+    known = parts.parts if isinstance(parts, PreparedParts) else parts
+    checked, camera = check_scene(known, camera)
+    size = check_size(size, layers, capacity, supersample)
+    background = check_background(background, size)
+    options = dict(sampler=sampler, splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
+    bands = _bands(*size, layers, supersample)
+    if len(bands) == 1:
+        sampled = sample(parts, camera, size, **options)
+        return render_samples(sampled, parts, camera, splatter=splatter, background=background)
+    engine, like = engine_of(checked, camera, background), exemplar(checked, camera, background)
     images = []
     for top, rows in bands:
-        view = camera if len(bands) == 1 else camera.window((height, width), (top, 0), (rows, width))
-        sampled = sample(
-            parts,
-            view,
-            (rows, width),
-            sampler=sampler,
-            splatter=splatter,
-            layers=layers,
-            supersample=supersample,
-            capacity=capacity,
-        )
-        shade = partial(render_samples, sampled, parts, view, splatter=splatter)
-        if len(bands) == 1:
-            return shade(background=background)
-        images.append(engine_of(sampled, parts, camera).checkpoint(shade))
-    image = namespace(*images).concat(images)
-    background = constants(background, engine_of(image, background), exemplar(image, background))
+        window = camera.window(size, (top, 0), (rows, size[1]))
+        take = partial(sample, parts, window, (rows, size[1]), **options)
+        images.append(engine.checkpoint(take, lambda s, w=window: _splatted(s, checked, camera, w, splatter)))
+    image, background = constants((namespace(*images).concat(images), background), engine, like)
     return image if background is None else _over_background(image, background)
 
 
@@ -115,8 +108,8 @@ def sample(
     """
     prepared = parts if isinstance(parts, PreparedParts) else None
     parts, camera = check_scene(prepared.parts if prepared else parts, camera)
-    height, width = (supersample * n for n in check_size(size, layers, capacity, supersample))
-    check_memory(height, width, 2 if layers == "auto" else layers, gradient=differentiable(parts, camera))
+    height, width = (int(supersample) * n for n in check_size(size, layers, capacity, supersample))
+    check_memory(height, width, _planned(layers), gradient=differentiable(parts, camera))
     if prepared is None:
         samplers, entries = [check_plugin("rts.samplers", sampler, "sample")] * len(parts), [None] * len(parts)
     else:
@@ -134,7 +127,11 @@ def sample(
                 known["needed"] = needed
             samples.append(chosen.sample(part, wide.within(part.transform), grid, count, capacity=capacity, **known))
         sampled = merge(samples, count)
-        return sampled if needed is None or "needed" in known else prune(sampled, needed)
+        # What is traced has the shape of the worst case, with or without them.
+        traced = getattr(engine_of(sampled), "traced", lambda x: False)(sampled.row)
+        return sampled if needed is None or "needed" in known or traced else prune(sampled, needed)
+
+    samplers = [c.of(p, camera) if isinstance(c, Auto) else c for p, c in zip(parts, samplers, strict=True)]
 
     splatter = None if splatter is None else check_plugin("rts.splatters", splatter, "splat")
     needed = None if splatter is None else needed_by(splatter, parts)
@@ -169,15 +166,35 @@ def render_samples(
         raise InputError(
             f"{len(parts)} parts were given for the samples of {len(sampled.samples)}; pass the same parts"
         )
-    splatter = check_plugin("rts.splatters", splatter, "splat")
-    grid = tuple(sampled.row.shape[1:])
-    size = grid[0] - 2 * APRON, grid[1] - 2 * APRON
     fine = sampled.supersample
-    background = check_background(background, (size[0] // fine, size[1] // fine))
-    scene = parts, camera, sampled, background
+    size = tuple((n - 2 * APRON) // fine for n in sampled.row.shape[1:])
+    background = check_background(background, size)
+    image = _splatted(sampled, parts, camera, camera, splatter, background)
+    if background is None:
+        return image
+    return _over_background(image, constants(background, engine_of(image), image))
+
+
+def _splatted(
+    sampled: Sampled, parts: Sequence[Part], camera: Camera, window: Camera, splatter: Any, beside: Any = None
+) -> Array:
+    """The image (H, W, 4) of what was sampled through a window of the camera's image.
+
+    Args:
+        sampled: the samples.
+        parts: checked parts.
+        camera: of the whole image, which shaders see.
+        window: the camera of the samples.
+        splatter: name or object.
+        beside: what else the engine has to suit.
+    """
+    splatter = check_plugin("rts.splatters", splatter, "splat")
+    grid, fine = tuple(sampled.row.shape[1:]), sampled.supersample
+    size = grid[0] - 2 * APRON, grid[1] - 2 * APRON
+    scene = parts, camera, window, sampled, beside
     engine, like = engine_of(scene), exemplar(scene)
-    camera, sampled, background = constants((camera, sampled, background), engine, like)
-    wide = camera.with_apron(size, APRON)
+    camera, window, sampled = constants((camera, window, sampled), engine, like)
+    wide = window.with_apron(size, APRON)
 
     positions, colors = [], []
     for part, samples in zip(parts, sampled.samples, strict=True):
@@ -193,14 +210,19 @@ def render_samples(
     image = image[APRON : grid[0] - APRON, APRON : grid[1] - APRON, :]
     if fine > 1:
         image = xp.mean(xp.reshape(image, (size[0] // fine, fine, size[1] // fine, fine, 4)), axis=(1, 3))
-    return image if background is None else _over_background(image, background)
+    return image
+
+
+def _planned(layers: int | str) -> int:
+    """Layers to count with before they are known."""
+    return 4 if layers == "auto" else int(layers)
 
 
 def _bands(height: int, width: int, layers: int | str, supersample: int) -> list[tuple[int, int]]:
     """(first row, number of rows) of the parts in which a supersampled image is rendered."""
     if supersample == 1:
         return [(0, height)]
-    rows = max(1, BAND // ((2 if layers == "auto" else layers) * supersample**2 * width))
+    rows = max(1, BAND // (_planned(layers) * int(supersample) ** 2 * width))
     count = math.ceil(height / rows)
     edges = [height * i // count for i in range(count + 1)]
     return [(top, end - top) for top, end in itertools.pairwise(edges)]

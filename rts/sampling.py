@@ -133,7 +133,7 @@ class TriangleSampler(abc.ABC):
                 found = entry or self._entry(surface, host_inputs, host_camera, size)
                 if len(found.proxy.faces):
                     fragments = self.rasterize(found.prepared, host_camera, size, layers, part.cull)
-                    _check_fragments(fragments, (layers, *size), self)
+                    _check_fragments(fragments, (layers, *size), len(found.proxy.faces), self)
                 else:
                     fragments = _no_fragments((layers, *size))
             covered = fragments.triangle_ids >= 0
@@ -197,6 +197,12 @@ def _packed_proxy(proxy: Any, surface: Any) -> Proxy:
         raise InputError(
             f"the proxy of {surface!r} has {widths} ids a triangle, but sample_widths says {surface.sample_widths[0]}"
         )
+    for name, array in (("ids", proxy.ids), ("corner_params", proxy.corner_params)):
+        if array is not None and len(array) < len(faces):
+            raise InputError(
+                f"the proxy of {surface!r} has {len(faces)} faces, but {name} of shape {np.shape(array)}; "
+                f"expected a row a face"
+            )
     return proxy._replace(
         vertices=np.ascontiguousarray(vertices, np.float32), faces=np.ascontiguousarray(faces, np.int32)
     )
@@ -219,7 +225,7 @@ def _no_fragments(shape: tuple[int, int, int]) -> Fragments:
     return Fragments(np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32))
 
 
-def _check_fragments(fragments: Any, shape: tuple[int, int, int], sampler: Any) -> None:
+def _check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sampler: Any) -> None:
     """Refuse what `rasterize` of a sampler should not have returned."""
     expected = shape, (*shape, 2), shape
     given = tuple(np.shape(x) for x in fragments) if isinstance(fragments, Fragments) else type(fragments).__name__
@@ -227,6 +233,9 @@ def _check_fragments(fragments: Any, shape: tuple[int, int, int], sampler: Any) 
         raise InputError(
             f"rasterize of {type(sampler).__name__} returned {given}; expected rts.Fragments of {expected}"
         )
+    last = int(np.max(fragments.triangle_ids))
+    if last >= faces:
+        raise InputError(f"rasterize of {type(sampler).__name__} returned triangle {last} of {faces}")
 
 
 def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None, kept: np.ndarray | None = None) -> Samples:

@@ -17,6 +17,7 @@ import functools
 import math
 import operator
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from rts.protocols import Array
 SIGMA, EPSILON = 0.5, 0.05
 CONTINUED = 0.5
 """Share of the error of plain pairing below which `Visible` takes the line of a front layer for its continuation."""
+LEAST_SIGMA, LARGEST_SIGMA = 0.1, 1e3
 TIE, LEAST_EPSILON = 1e-5, 1e-4
 """Depths so near, relative to the farthest, may be ordered by rounding; and an ε that outweighs rounding of weights."""
 OFFSETS = (-1, 0, 1)
@@ -72,11 +74,11 @@ class Kernel(abc.ABC):
     calibration: float | None = 1.0
 
     def __post_init__(self):
-        if not (math.isfinite(self.sigma) and self.sigma > 0):
-            raise InputError(f"sigma is {self.sigma}; expected a positive number of pixels")
-        if not (math.isfinite(self.epsilon) and self.epsilon >= 0):
+        if not (_is_real(self.sigma) and LEAST_SIGMA <= self.sigma <= LARGEST_SIGMA):
+            raise InputError(f"sigma is {self.sigma}; expected pixels, from {LEAST_SIGMA} to {LARGEST_SIGMA:g}")
+        if not (_is_real(self.epsilon) and self.epsilon >= 0):
             raise InputError(f"epsilon is {self.epsilon}; expected a number of at least 0")
-        if self.calibration is not None and not (math.isfinite(self.calibration) and self.calibration > 0):
+        if self.calibration is not None and not (_is_real(self.calibration) and self.calibration > 0):
             raise InputError(f"calibration is {self.calibration}; expected a positive number, or None for the exact")
 
     def splat(self, positions: Array, rgba: Array, row: Array) -> Array:
@@ -121,6 +123,10 @@ class Kernel(abc.ABC):
             {u: peak * xp.exp(-((u - rx) ** 2) * scale) for u in OFFSETS},
             {v: peak * xp.exp(-((v - ry) ** 2) * scale) for v in OFFSETS},
         )
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 def exact_calibration(sigma: float) -> float:

@@ -63,12 +63,20 @@ class Splats:
         positions: (N, 3) float32 or float64, pixel position and linear depth.
         rgba: (N, 4), of the same dtype, premultiplied colours.
         row: (K, H, W) signed integers, the sample of each cell, negative where there is none.
+        choices: those of the same samples, where they are known.
 
     Raises:
         InputError: `row` refers to a sample that is not there.
     """
 
-    def __init__(self, settings: Settings, positions: np.ndarray, rgba: np.ndarray, row: np.ndarray):
+    def __init__(
+        self,
+        settings: Settings,
+        positions: np.ndarray,
+        rgba: np.ndarray,
+        row: np.ndarray,
+        choices: Choices | None = None,
+    ):
         row = row[:1] if settings.kind == "single" else row
         if row.size and row.max() >= len(positions):
             raise InputError(f"row refers to sample {row.max()} of {len(positions)}; expected indices below that")
@@ -77,6 +85,8 @@ class Splats:
         scale = 1 / (2 * settings.sigma**2)
         peak = math.sqrt(1 + settings.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
         self._numbers = tuple(positions.dtype.type(x) for x in (scale, peak, settings.gamma))
+        if choices is not None:
+            self.choices = choices
 
     @property
     def _stencil(self) -> tuple:

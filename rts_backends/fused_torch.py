@@ -15,7 +15,7 @@ from torch import Tensor
 from torch._C._functorch import is_legacy_batchedtensor
 from torch.utils import _pytree
 
-from rts_backends.fused_kernels import Settings, Splats
+from rts_backends.fused_kernels import Choices, Settings, Splats
 
 
 def fits(*tensors: Tensor) -> bool:
@@ -34,20 +34,21 @@ def splat(settings: Settings, specification: Callable, positions: Tensor, rgba: 
 
 
 class _Work:
-    """What is to be computed, and the samples and decisions of its forward pass, for the derivatives.
+    """What is to be computed, and the decisions of its forward pass, for the derivatives.
 
-    Under `vmap` each item has its own, since samples differ; a new one finds its samples when it is first asked.
+    The samples themselves are torch's to keep, or not, as under `torch.utils.checkpoint`. Under `vmap` each item has
+    its own work, since samples differ.
     """
 
     def __init__(self, settings: Settings, specification: Callable):
         self.settings, self.specification = settings, specification
-        self._splats: Splats | None = None
+        self._choices: Choices | None = None
 
     def splats(self, positions: Tensor, rgba: Tensor, row: Tensor) -> Splats:
-        """Those of these very tensors."""
-        if self._splats is None:
-            self._splats = Splats(self.settings, *(x.detach().numpy() for x in (positions, rgba, row)))
-        return self._splats
+        """Those of these tensors, which must be the same each time."""
+        splats = Splats(self.settings, *(x.detach().numpy() for x in (positions, rgba, row)), self._choices)
+        self._choices = splats.choices
+        return splats
 
     def another(self) -> _Work:
         """The same work, for other samples."""

@@ -103,9 +103,10 @@ class JaxEngine:
         """`jax.value_and_grad`."""
         return jax.value_and_grad(f)
 
-    def checkpoint(self, f: Callable[[], jax.Array]) -> jax.Array:
-        """By `jax.checkpoint`."""
-        return jax.checkpoint(f)()
+    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], jax.Array]) -> jax.Array:
+        """By `jax.checkpoint`; what was made is kept, since to trace it would fix its shapes."""
+        made = make()
+        return jax.checkpoint(lambda: f(made))()
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[jax.Array, jax.Array]:
         """`jax.jvp`."""

@@ -61,9 +61,9 @@ class NumpyEngine:
         """Nothing to wait for."""
         return x
 
-    def checkpoint(self, f: Callable[[], Array]) -> np.ndarray:
-        """The value of `f`."""
-        return f()
+    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Array]) -> np.ndarray:
+        """The value of `f(make())`."""
+        return f(make())
 
     def jit(self, f: Callable) -> Callable:
         """`f` itself."""

@@ -150,11 +150,11 @@ class TorchEngine:
 
         return call
 
-    def checkpoint(self, f: Callable[[], torch.Tensor]) -> torch.Tensor:
+    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], torch.Tensor]) -> torch.Tensor:
         """By `torch.utils.checkpoint`, which plain autograd knows; `torch.func` transforms keep everything."""
         if not torch.is_grad_enabled() or torch._C._functorch.maybe_current_level() is not None:
-            return f()
-        return torch.utils.checkpoint.checkpoint(f, use_reentrant=False)
+            return f(make())
+        return torch.utils.checkpoint.checkpoint(lambda: f(make()), use_reentrant=False)
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[torch.Tensor, torch.Tensor]:
         """By forward-mode autodiff."""

@@ -119,6 +119,9 @@ class Mesh:
         if isinstance(rows, np.ndarray) and isinstance(samples.ids, np.ndarray):
             from rts_surfaces.interpolation import interpolate
 
+            last = samples.ids[:, column : column + 3].max(initial=-1)
+            if last >= len(rows):
+                raise InputError(f"samples refer to row {last} of an array of {len(rows)}; sample this mesh anew")
             return interpolate(rows, samples.ids, column, samples.params)
         xp = namespace(rows, samples.ids)
         # One gather of all corners: its gradient fills one array of the size of the mesh, instead of three.
@@ -131,10 +134,10 @@ class Mesh:
         """(V, 3) unit normals, the area-weighted mean of the faces around each vertex; zero where there is none."""
         if not is_constant(vertices):
             return self._vertex_normals(vertices)
-        key = fingerprint(vertices)
-        if self._normals is None or self._normals[0] != key:
-            self._normals = (key, self._vertex_normals(vertices))
-        return self._normals[1]
+        key, kept = fingerprint(vertices), self._normals
+        if kept is None or kept[0] != key:
+            kept = self._normals = (key, self._vertex_normals(vertices))
+        return kept[1]
 
     def _vertex_normals(self, vertices: Array) -> Array:
         xp, engine = namespace(vertices), engine_of(vertices)

@@ -119,5 +119,54 @@ def test_a_direction_that_does_not_fit_is_refused():
         rts.gradient_image(card, parameters)
     with pytest.raises(rts.InputError, match="direction has arrays of shapes"):
         rts.gradient_image(card, parameters, {"color": [0.0, 0, 0], "shift": [0.0, 0]})
-    with pytest.raises(rts.InputError, match=r"expected \(H, W, C\)"):
+    with pytest.raises(rts.InputError, match=r"expected a torch array \(H, W, C\)"):
         rts.gradient_image(lambda p: p["shift"], parameters, {"color": [0.0, 0, 0], "shift": [0.0, 0, 1]})
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"scene": lambda p: card(p)[0]}, r"scene gave a Part; expected \(parts, camera\)"),
+        ({"scene": lambda p: None}, "scene gave a NoneType"),
+        ({"loss": lambda image: image}, "loss gave .*; expected a .* scalar"),
+        ({"loss": lambda image: 1.0}, "loss gave a float"),
+        ({"size": 64}, "size is 64; expected"),
+        ({"size": (-3, 4)}, "expected .height, width."),
+        ({"entries": 0}, "entries is 0; expected an integer of at least 1"),
+        ({"samples": 0}, "expected an integer of at least 1"),
+    ],
+)
+def test_bad_input_to_a_check_is_refused_in_one_line(change, said, target):
+    given = {"scene": card, "parameters": parameters_of(target), "size": SIZE, **change}
+    with pytest.raises(rts.InputError, match=said):
+        rts.check_gradient(given.pop("scene"), given.pop("parameters"), given.pop("size"), **given)
+
+
+def test_a_scene_that_ignores_the_parameters_is_refused():
+    constant = card({"shift": np.zeros(3), "color": np.ones(3)})
+    with pytest.raises(rts.InputError, match="nothing in the scene depends on the parameters"):
+        rts.check_gradient(lambda p: constant, parameters_of("torch-cpu"), SIZE)
+
+
+def test_integer_parameters_are_refused():
+    torch = pytest.importorskip("torch")
+    for call in (lambda p: rts.check_gradient(card, p, SIZE), lambda p: rts.gradient_image(card, p, p)):
+        with pytest.raises(rts.InputError, match="dtype torch.int64; expected a floating one"):
+            call(torch.tensor([1, 2, 3]))
+
+
+@pytest.mark.parametrize("scale", [0, -1.0, float("nan"), "1"])
+def test_a_scale_that_is_none_is_refused(scale):
+    along = {"color": [0, 0, 0], "shift": [1.0, 0, 0]}
+    with pytest.raises(rts.InputError, match="scale is .*; expected a positive number"):
+        rts.gradient_image(lambda p: rts.render(*card(p), SIZE), parameters_of("torch-cpu"), along, scale=scale)
+
+
+def test_a_derivative_of_the_wrong_sign_differs_however_small_beside_others():
+    slopes = [
+        gradients.Slope("pose[0]", 6000.0, 6100.0, 5.0, 0.01),
+        gradients.Slope("pose[1]", -600.0, 51.0, 23.0, 0.01),
+    ]
+    check = gradients.GradientCheck(slopes, 0.1)
+    assert check.agrees(slopes[0]) and not check.agrees(slopes[1]) and not check.ok

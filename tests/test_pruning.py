@@ -1,12 +1,16 @@
 """Dropping hidden samples changes nothing; and layers="auto" takes as many as count."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from analytic import Ellipsoid
 from helpers import ALL, DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere, quad, soup, to_numpy
 
 import rts
 from rts import pruning, splatting
 from rts.arrays import map_leaves
+from rts.protocols import ArraySpec
 from rts.rendering import sample
 
 MESH = rts.plugin("rts.surfaces", "mesh")
@@ -156,7 +160,66 @@ def test_a_splatter_that_does_not_say_what_it_needs_gets_everything():
     np.testing.assert_array_equal(same, whole)
 
 
+def test_tables_with_a_row_a_sample_stay_in_step():
+    class Tabled(MESH):
+        """A mesh that evaluates from a table of its own instead of the barycentrics."""
+
+        def table_specs(self, rows):
+            return {"weights": ArraySpec((rows, 2), np.float32, packed=True)}
+
+        def refine(self, inputs, samples, rays):
+            return replace(samples, tables={"weights": samples.params.copy()}, params=samples.params * 0)
+
+        def evaluate(self, theta, samples):
+            return super().evaluate(theta, replace(samples, params=samples.tables["weights"]))
+
+    parts = [p.replace(surface=Tabled(p.surface.faces)) for p in SCENES["sphere before a card"]]
+    for target in ("numpy", "torch-cpu"):
+        moving = with_vertices(parts, arrays(target, [p.theta["vertices"] for p in parts]))
+        (whole, count), (pruned, fewer) = images(moving, "visible", 4)
+        assert fewer < count
+        np.testing.assert_allclose(to_numpy(pruned), to_numpy(whole), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "given, said", [(np.ones, "float64 of"), (lambda shape: np.ones(shape[1:], bool), "bool of"), (list, "list")]
+)
+def test_what_a_splatter_says_it_needs_is_checked(given, said):
+    class Odd(splatting.Visible):
+        def needed(self, covered, depth):
+            return given(covered.shape)
+
+    with pytest.raises(rts.InputError, match=f"gave {said}.*expected a NumPy array, bool of"):
+        rts.render(SCENES["closed box"], CAMERA, SIZE, splatter=Odd())
+
+
+def test_a_splatter_that_needs_what_is_not_there_gets_no_ghosts():
+    class Greedy(splatting.Visible):
+        def needed(self, covered, depth):
+            return np.ones_like(covered)
+
+    (whole, _), (same, _) = images(SCENES["closed box"], Greedy(), 2)
+    np.testing.assert_array_equal(same, whole)
+
+
 # ---------------------------------------------------------------------------------------------- layers="auto"
+
+
+def test_auto_layers_of_a_surface_that_the_automatic_sampler_casts_rays_at():
+    part = rts.Part(Ellipsoid(), {"center": np.zeros(3), "radii": np.array([0.8, 0.6, 0.7])})
+    sampled = sample(part, CAMERA, SIZE, splatter="visible", layers="auto")
+    assert sampled.row.shape[0] == 1
+    rays = sample(part, CAMERA, SIZE, sampler="rays", splatter="visible", layers=2)
+    assert (sample(part, CAMERA, SIZE, splatter="visible", layers=2).row >= 0).sum() == (rays.row >= 0).sum()
+
+
+def test_auto_layers_with_a_sampler_that_does_not_ask_what_is_needed():
+    class Deaf(rts.plugin("rts.samplers", "raster")):
+        def sample(self, *args, needed=None, **options):
+            return super().sample(*args, **options)
+
+    with pytest.raises(rts.InputError, match="the sampler did not ask which samples are needed; give a number"):
+        sample(SCENES["closed box"], CAMERA, SIZE, sampler=Deaf(), splatter="visible", layers="auto")
 
 
 @pytest.mark.parametrize("target", ALL)

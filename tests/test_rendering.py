@@ -21,6 +21,7 @@ from helpers import (
 
 import rts
 from rts import Camera, GBuffer, Part
+from rts.rendering import APRON
 from rts.shading import BlinnPhong, Depth, Lambert, Normals, Silhouette, Textured, Unlit, sample_texture
 
 Mesh = rts.plugin("surfaces", "mesh")
@@ -50,7 +51,7 @@ def test_render_is_sample_then_render_samples(target):
     found = rts.render_samples(sampled, part, camera, background=(0.1, 0.2, 0.3))
     np.testing.assert_array_equal(to_numpy(found), image)
     assert image.shape == (*SIZE, 4) and image.dtype == np.float32
-    assert sampled.row.shape == (3, SIZE[0] + 2, SIZE[1] + 2) and int(sampled.overflow) == 0
+    assert sampled.row.shape == (3, SIZE[0] + 4, SIZE[1] + 4) and int(sampled.overflow) == 0
 
 
 @pytest.mark.parametrize("splatter", ["none", "single", "multi"])
@@ -118,7 +119,7 @@ def test_normals_under_a_stretch_are_those_of_the_ellipsoid():
     part = mesh_part((vertices, faces), theta={"normals": vertices}, transform=transform, shader="normals")
     image = show(part, splatter="none")
     sampled = rts.sample(part, CAMERA, SIZE)
-    row = sampled.row[0, 1:-1, 1:-1]
+    row = sampled.row[0, APRON:-APRON, APRON:-APRON]
     points = moved(transform, part.surface.evaluate(part.theta, sampled.samples[0])["position"])[row]
     expected = points / np.array([1.5, 0.75, 1.0]) ** 2
     expected /= np.linalg.norm(expected, axis=-1, keepdims=True)

@@ -201,3 +201,25 @@ def test_a_vertex_far_away_that_no_triangle_refers_to_has_no_effect(sampler):
     stray = np.concatenate([vertices, [[1e7, 1e7, 1e7]]])
     image = rts.render(Part(mesh, {"vertices": stray}), CAMERA, SIZE, sampler=sampler)
     np.testing.assert_allclose(image, expected, atol=1e-5)
+
+
+def test_triangles_that_are_not_there_are_refused():
+    class Beyond(rts.plugin("rts.samplers", "raster")):
+        def rasterize(self, *args):
+            found = super().rasterize(*args)
+            return found._replace(triangle_ids=np.where(found.triangle_ids >= 0, found.triangle_ids + 1000, -1))
+
+    part = rts.plugin("rts.surfaces", "mesh").example()
+    camera = rts.Camera.look_at((0, 0, 5), (0, 0, 0))
+    with pytest.raises(rts.InputError, match="rasterize of Beyond returned triangle 1[0-9]+ of"):
+        rts.sample(part, camera, (16, 16), sampler=Beyond())
+
+
+def test_samples_of_another_mesh_are_refused():
+    mesh = rts.plugin("rts.surfaces", "mesh")
+    camera = rts.Camera.look_at((0, 0, 5), (0, 0, 0))
+    corners = np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0)], np.float32)
+    large = rts.Part(mesh([(7, 8, 9)]), {"vertices": np.concatenate([np.zeros((7, 3), np.float32), corners])})
+    small = rts.Part(mesh([(0, 1, 2)]), {"vertices": corners})
+    with pytest.raises(rts.InputError, match="samples refer to row 9 of an array of 3; sample this mesh anew"):
+        rts.render_samples(rts.sample(large, camera, (16, 16)), small, camera)

@@ -4,7 +4,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, derivative, gradient, quad, to_numpy
+from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, derivative, gradient, icosphere, quad, to_numpy
 
 import rts
 from rts import rendering
@@ -94,24 +94,77 @@ def test_gradients_shade_each_band_again_instead_of_keeping_it(narrow_bands):
     assert len(calls) == 2 * bands
 
 
-def test_memory_stays_bounded_however_many_samples(monkeypatch):
-    monkeypatch.setattr(rendering, "BAND", 2**14)
+def memory(render, size=(32, 32), s=16):
+    """Bytes of arrays, at most and at the end, of a render with s² samples a pixel; what torch itself allots aside."""
+    kept = render(s, size)
+    tracemalloc.start()
+    kept = render(s, size)
+    current, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    del kept
+    return current, peak
 
-    def peak(s):
-        image(CORNERS, s, (32, 32))
-        tracemalloc.start()
-        image(CORNERS, s, (32, 32))
-        size = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return size
 
-    assert peak(16) < 1.3 * peak(4)
+def test_memory_is_bounded_by_the_bands(monkeypatch):
+    _, whole = memory(lambda s, size: image(CORNERS, s, size))
+    monkeypatch.setattr(rendering, "BAND", 2**15)
+    _, banded = memory(lambda s, size: image(CORNERS, s, size))
+    assert banded < 0.3 * whole
+
+
+def test_between_forward_and_backward_bands_keep_next_to_nothing(monkeypatch):
+    vertices = arrays(TORCH[0], CORNERS).requires_grad_(True)
+    whole, _ = memory(lambda s, size: image(vertices, s, size))
+    monkeypatch.setattr(rendering, "BAND", 2**15)
+    banded, _ = memory(lambda s, size: image(vertices, s, size))
+    assert banded < 0.2 * whole
+
+
+@pytest.mark.parametrize("splatter", ["multi", "visible"])
+def test_bands_of_a_closed_surface_have_no_seams(splatter, monkeypatch):
+    vertices, faces = icosphere(1)
+    part = rts.Part(MESH(faces), {"vertices": vertices, "colors": (vertices + 1) / 2}, "unlit")
+    found = []
+    for band in (2**30, 2**11):
+        monkeypatch.setattr(rendering, "BAND", band)
+        found.append(rts.render(part, CAMERA, (24, 24), supersample=4, splatter=splatter, layers=3))
+    assert len(rendering._bands(24, 24, 3, 4)) > 8
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-9)
+
+
+def test_shaders_see_the_camera_of_the_whole_image(monkeypatch):
+    def where(theta, gbuffer, camera):
+        xp = rts.namespace(gbuffer["position"])
+        pixels = camera.project(gbuffer["position"], (1, 1))[:, :2]
+        return xp.concat([pixels, pixels[:, :1] * 0, pixels[:, :1] * 0 + 1], axis=1)
+
+    part = rts.Part(MESH(FACES), {"vertices": CORNERS}, where)
+    found = []
+    for band in (2**30, 500):
+        monkeypatch.setattr(rendering, "BAND", band)
+        found.append(rts.render(part, CAMERA, SIZE, supersample=2))
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_a_background_has_its_gradient_over_bands_of_constants(target, narrow_bands):
+    background = arrays(target, np.random.default_rng(0).random((*SIZE, 3)))
+    found = gradient(target, lambda b: image(CORNERS, 3, background=b).sum(), background)
+    alpha = image(CORNERS, 3)[..., 3:]
+    np.testing.assert_allclose(found, np.broadcast_to(1 - alpha, found.shape), atol=1e-5)
+
+
+def test_prepared_parts_are_rendered_in_bands(narrow_bands):
+    part = rts.Part(MESH(FACES), {"vertices": CORNERS, "colors": RGB}, "unlit")
+    np.testing.assert_array_equal(
+        rts.render(rts.prepare(part), CAMERA, SIZE, supersample=3), rts.render(part, CAMERA, SIZE, supersample=3)
+    )
 
 
 def test_sampled_knows_its_samples_a_pixel():
     part = rts.Part(MESH(FACES), {"vertices": CORNERS, "colors": RGB}, "unlit")
     sampled = rts.sample(part, CAMERA, SIZE, supersample=2)
-    assert sampled.row.shape == (2, 2 * SIZE[0] + 2, 2 * SIZE[1] + 2) and sampled.supersample == 2
+    assert sampled.row.shape == (2, 2 * SIZE[0] + 4, 2 * SIZE[1] + 4) and sampled.supersample == 2
     np.testing.assert_array_equal(rts.render_samples(sampled, part, CAMERA), image(CORNERS, 2))
 
 

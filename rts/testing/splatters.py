@@ -108,7 +108,7 @@ class SplatterConformance(Conformance):
         depth = np.where(covered, splats.positions[splats.row, 2], 0)
         kept = np.asarray(chosen.needed(covered, depth))
         claim(kept.shape == covered.shape and kept.dtype == bool, f"needed gave {kept.shape} {kept.dtype}")
-        claim(not (kept & ~covered)[0].any(), "needed asks for samples that are not there")
+        claim(not (kept & ~covered).any(), "needed asks for samples that are not there")
         pruned = splats._replace(row=np.where(kept, splats.row, -1).astype(np.int32))
         claim_close(_splat(splatter, pruned), _splat(splatter, splats), TOLERANCE, "the image of needed samples")
         for engine in map(engine_named, DIFFERENTIABLE[:1]):
