@@ -83,13 +83,18 @@ def tile(width, t):
 
 @compiled
 def load(s, positions, rgba, row, k, y, first, count, scale, peak, gamma):
-    """Fill a source's slot with cells first, …, first + count − 1 of a row; cells outside the image are empty."""
+    """Fill a source's slot with cells first, …, first + count − 1 of a row; cells outside the image are empty.
+
+    Returns whether any is not.
+    """
     zero, half = s.dtype.type(0), s.dtype.type(0.5)
     _, height, width = row.shape
+    filled = False
     for j in range(count):
         x = first + j
         i = row[k, y, x] if 0 <= y < height and 0 <= x < width else -1
         if i >= 0:
+            filled = True
             s[RX + j] = gamma * (positions[i, 0] - (s.dtype.type(x) + half))
             s[RY + j] = gamma * (positions[i, 1] - (s.dtype.type(y) + half))
             for c in range(4):
@@ -99,11 +104,15 @@ def load(s, positions, rgba, row, k, y, first, count, scale, peak, gamma):
             s[RX + j] = s[RY + j] = zero
             for c in range(5):
                 s[c * PITCH + j] = zero
+    if not filled:
+        s[WX:RX] = zero
+        return False
     for axis in range(2):
         for u in range(3):
             for j in range(count):
                 d = s.dtype.type(u - 1) - s[RX + axis * PITCH + j]
                 s[WX + (3 * axis + u) * PITCH + j] = peak * exp(-(d * d) * scale)
+    return True
 
 
 @compiled

@@ -36,11 +36,15 @@ def forward(start, stop, positions, rgba, row, scale, peak, gamma, image):
     sources, total = np.empty(3 * layers * SOURCE, image.dtype), np.empty(SUMS, image.dtype)
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
+        last = start - 4  # The last source row that is not empty: where three are, there is nothing to compute.
         for y in range(start - 1, stop + 1):
             for k in range(layers):
                 s = slot(sources, k, y, SOURCE)
-                load(s, positions, rgba, row, k, y, left - 1, count + 2, scale, peak, gamma)
-            if y > start:
+                if load(s, positions, rgba, row, k, y, left - 1, count + 2, scale, peak, gamma):
+                    last = y
+            if y > start and y - last > 2:
+                image[y - 1, left : left + count] = image.dtype.type(0)
+            elif y > start:
                 normalised_sums(total, sources, layers, y - 1, count)
                 composite(total, layers, count)
                 store(image, y - 1, left, total, count)
@@ -124,20 +128,22 @@ def pull(start, stop, positions, rgba, row, scale, peak, gamma, mixed, g, g_posi
     slope = g.dtype.type(2) * scale * gamma
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
+        last = start - 8  # As in `forward`; four empty rows make the source row in their middle empty, too.
         for y in range(start - 2, stop + 2):
             for k in range(layers):
                 s = slot(sources, k, y, SOURCE)
-                load(s, positions, rgba, row, k, y, left - 2, count + 4, scale, peak, gamma)
+                if load(s, positions, rgba, row, k, y, left - 2, count + 4, scale, peak, gamma):
+                    last = y
             if y < start:
                 continue
             adjoint = slot(adjoints, 0, y - 1, SUMS)
-            if 1 <= y <= height:
+            if 1 <= y <= height and y - last <= 2:
                 normalised_sums(total, sources, layers, y - 1, count + 2)
                 load_image(given, g, mixed, y - 1, left - 1, count + 2)
                 adjoint_row(adjoint, total, given, layers, count + 2)
             else:
                 adjoint[:] = g.dtype.type(0)
-            if y < start + 2:
+            if y < start + 2 or y - last > 2:
                 continue
             for k in range(layers):
                 b = SUM if k > 0 else 0
@@ -232,14 +238,19 @@ def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_r
     slope = out.dtype.type(2) * scale * gamma
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
+        last = start - 4  # As in `forward`.
         for y in range(start - 1, stop + 1):
             for k in range(layers):
                 s = slot(sources, k, y, SOURCE)
-                load(s, positions, rgba, row, k, y, left - 1, count + 2, scale, peak, gamma)
+                if load(s, positions, rgba, row, k, y, left - 1, count + 2, scale, peak, gamma):
+                    last = y
                 for n in range(many):
                     to = slot(tangents[n], k, y, TANGENT)
                     load_tangent(to, s, t_positions[n], t_rgba[n], row, k, y, left - 1, count + 2, slope)
             if y <= start:
+                continue
+            if y - last > 2:
+                out[:, y - 1, left : left + count] = out.dtype.type(0)
                 continue
             normalised_sums(total, sources, layers, y - 1, count)
             for n in range(many):
