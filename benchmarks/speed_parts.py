@@ -153,8 +153,8 @@ def levenberg_marquardt(task: Task, engine: str, unknowns: int) -> dict[str, Cal
         return (image[..., task.channels] - target).reshape(-1)
 
     def equations(v: Any) -> tuple:
-        r, jacobian = library.jacobian(residuals)(v)
-        return r, jacobian.T @ jacobian, jacobian.T @ r
+        r, rows = library.jacobian(residuals)(v)
+        return r, rows @ rows.T, rows @ r
 
     loss = library.jit(lambda v: (residuals(v) ** 2).mean())
     linearize, descend = (

@@ -201,3 +201,9 @@ def affine_map(rows: Array, points: Array) -> Array:
     if known is not None:
         return known(rows, points)
     return namespace(rows, points).stack([affine(rows[i, :], points) for i in range(rows.shape[0])], axis=-1)
+
+
+def take(rows: Array, index: Array) -> Array:
+    """(M, C): the rows of (V, C) that (M,) integers name."""
+    known = getattr(engine_of(rows, index), "take", None)
+    return namespace(rows, index).take(rows, index, axis=0) if known is None else known(rows, index)

@@ -57,9 +57,8 @@ def _least_squares(residuals: Callable, engine: Engine, run: Run, jit: bool) -> 
         return xp.reshape(residuals(v), (-1,))
 
     def equations(v: Array) -> tuple[Array, Array, Array]:
-        r, jacobian = engine.jacobian(flat)(v)
-        transposed = xp.matrix_transpose(jacobian)
-        return xp.mean(r * r), transposed @ jacobian / r.shape[0], transposed @ r / r.shape[0]
+        r, rows = engine.jacobian(flat)(v)
+        return xp.mean(r * r), rows @ xp.matrix_transpose(rows) / r.shape[0], rows @ r / r.shape[0]
 
     def loss(v: Array) -> Array:
         return mean_square(flat(v))

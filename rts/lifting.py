@@ -36,12 +36,11 @@ def pack(
     ids = make((rows, table.shape[1]), np.int32)
     params = make((rows, 2 if corner_params is None else corner_params.shape[2]), np.float32)
     row, depth = np.empty((lines, width), np.int32), np.empty((lines, width), np.float32)
-    parallel(_number, lines, kept, depths, offsets, rows, row, depth)
-    parallel(_take_ids, lines, row, triangle_ids, table, ids)
+    given = kept, triangle_ids, barycentrics, depths, table, offsets
     if corner_params is None:
-        parallel(_take, lines, row, barycentrics, params)
+        parallel(_pack, lines, *given, ids, params, row, depth)
     else:
-        parallel(_interpolate, lines, row, triangle_ids, barycentrics, corner_params, params)
+        parallel(_pack_params, lines, *given, corner_params, ids, params, row, depth)
     shape = layers, height, width
     return ids, params, row.reshape(shape), depth.reshape(shape), total
 
@@ -56,43 +55,35 @@ def _count(start, stop, kept, counts):
 
 
 @numba.njit(cache=True, nogil=True)
-def _number(start, stop, kept, depths, offsets, rows, row, depth):
+def _pack(start, stop, kept, triangle_ids, barycentrics, depths, table, offsets, ids, params, row, depth):
     for y in range(start, stop):
         n = offsets[y]
         for x in range(kept.shape[1]):
-            taken = kept[y, x] and n < rows
-            row[y, x] = n if taken else -1
-            depth[y, x] = depths[y, x] if taken else 0
-            n += taken
+            if not kept[y, x] or n >= len(ids):
+                row[y, x], depth[y, x] = -1, 0
+                continue
+            for i in range(ids.shape[1]):
+                ids[n, i] = table[triangle_ids[y, x], i]
+            params[n, 0], params[n, 1] = barycentrics[y, x, 0], barycentrics[y, x, 1]
+            row[y, x], depth[y, x] = n, depths[y, x]
+            n += 1
 
 
 @numba.njit(cache=True, nogil=True)
-def _take_ids(start, stop, row, triangle_ids, table, ids):
+def _pack_params(
+    start, stop, kept, triangle_ids, barycentrics, depths, table, offsets, corner_params, ids, params, row, depth
+):
     for y in range(start, stop):
-        for x in range(row.shape[1]):
-            n = row[y, x]
-            if n >= 0:
-                for i in range(table.shape[1]):
-                    ids[n, i] = table[triangle_ids[y, x], i]
-
-
-@numba.njit(cache=True, nogil=True)
-def _take(start, stop, row, barycentrics, params):
-    for y in range(start, stop):
-        for x in range(row.shape[1]):
-            n = row[y, x]
-            if n >= 0:
-                params[n, 0], params[n, 1] = barycentrics[y, x, 0], barycentrics[y, x, 1]
-
-
-@numba.njit(cache=True, nogil=True)
-def _interpolate(start, stop, row, triangle_ids, barycentrics, corner_params, params):
-    for y in range(start, stop):
-        for x in range(row.shape[1]):
-            n = row[y, x]
-            if n < 0:
+        n = offsets[y]
+        for x in range(kept.shape[1]):
+            if not kept[y, x] or n >= len(ids):
+                row[y, x], depth[y, x] = -1, 0
                 continue
             t, a, b = triangle_ids[y, x], barycentrics[y, x, 0], barycentrics[y, x, 1]
+            for i in range(ids.shape[1]):
+                ids[n, i] = table[t, i]
             for i in range(params.shape[1]):
                 c = corner_params[t, 2, i]
                 params[n, i] = c + a * (corner_params[t, 0, i] - c) + b * (corner_params[t, 1, i] - c)
+            row[y, x], depth[y, x] = n, depths[y, x]
+            n += 1

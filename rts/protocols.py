@@ -296,7 +296,7 @@ class Engine(Protocol):
 
     Optional members: `take_error() -> RtsError | None`, the last error raised inside a host call, where the framework
     wraps such errors in its own; `traced(x) -> bool`, whether an array has a shape but not yet a value;
-    `affine_map(rows, points)`, the same as in `rts.arrays`, in full precision but faster.
+    `affine_map(rows, points)` and `take(rows, index)`, the same as in `rts.arrays`, in full precision but faster.
 
     The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the
     user has imported that module.
@@ -350,7 +350,7 @@ class Engine(Protocol):
         ...
 
     def jacobian(self, f: Callable) -> Callable:
-        """`f(vector) -> array` to `vector -> (value, forward-mode Jacobian)`."""
+        """`f(vector) -> array` to `vector -> (value, derivatives)`, a row for each unknown, by forward mode."""
         ...
 
     def jit(self, f: Callable) -> Callable:

@@ -112,6 +112,14 @@ class TorchEngine:
             return torch.addmm(rows[:, 3], points, rows[:, :3].T)
         return (points[:, None, :] * rows[None, :, :3]).sum(dim=-1) + rows[:, 3]
 
+    def take(self, rows: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
+        """By compiled code on the CPU."""
+        if rows.device.type == "cpu" and rows.dtype in (torch.float32, torch.float64) and rows.ndim == 2:
+            from rts_backends import torch_rows
+
+            return torch_rows.take(rows, index)
+        return torch.index_select(rows, 0, index)
+
     def segment_sum(self, values: torch.Tensor, segments: np.ndarray, count: int) -> torch.Tensor:
         """Sums of the rows of `values` that share a segment."""
         index = _tensor(segments, values.device)
@@ -161,12 +169,12 @@ class TorchEngine:
         return torch.func.jvp(f, (primal,), (tangent,))
 
     def jacobian(self, f: Callable) -> Callable:
-        """By forward-mode autodiff, all columns in one vectorised pass."""
-        jacobian = torch.func.jacfwd(lambda v: (lambda r: (r, r))(f(v)), has_aux=True)
+        """By forward-mode autodiff, all unknowns in one vectorised pass."""
 
         def call(vector: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-            matrix, value = jacobian(vector.detach())
-            return value, matrix
+            vector = vector.detach()
+            along = torch.eye(vector.numel(), dtype=vector.dtype, device=vector.device)
+            return torch.func.vmap(lambda t: torch.func.jvp(f, (vector,), (t,)), out_dims=(None, 0))(along)
 
         return call
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import engine_of, is_constant, namespace, unit
+from rts.arrays import engine_of, is_constant, namespace, take, unit
 from rts.errors import InputError
 from rts.keeping import fingerprint
 from rts.protocols import Array, GBuffer, Part, Proxy, Samples, Tree
@@ -126,7 +126,7 @@ class Mesh:
         xp = namespace(rows, samples.ids)
         # One gather of all corners: its gradient fills one array of the size of the mesh, instead of three.
         index = xp.reshape(samples.ids[:, column : column + 3], (-1,))
-        corners = xp.reshape(xp.take(rows, index, axis=0), (-1, 3, rows.shape[1]))
+        corners = xp.reshape(take(rows, index), (-1, 3, rows.shape[1]))
         a, b, c = corners[:, 0, :], corners[:, 1, :], corners[:, 2, :]
         return c + samples.params[:, 0:1] * (a - c) + samples.params[:, 1:2] * (b - c)
 

@@ -1,0 +1,99 @@
+"""Rows of a tensor by index, whose gradient is added up by compiled code: torch's own takes milliseconds for it."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import numba
+import numpy as np
+import torch
+from torch import Tensor
+
+
+def take(rows: Tensor, index: Tensor) -> Tensor:
+    """(M, C): the rows of (V, C) that (M,) integers name, on the CPU."""
+    if torch.compiler.is_compiling():
+        return torch.index_select(rows, 0, index)
+    return _Take.apply(rows, index)
+
+
+class _Take(torch.autograd.Function):
+    """The rows."""
+
+    @staticmethod
+    def forward(rows, index):
+        return torch.index_select(rows, 0, index)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        rows, index = inputs
+        ctx.count = rows.shape[0]
+        ctx.save_for_backward(index)
+        ctx.save_for_forward(index)
+
+    @staticmethod
+    def backward(ctx, *gradients):
+        return _Add.apply(gradients[0], ctx.saved_tensors[0], ctx.count), None
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        return _Take.apply(tangents[0], ctx.saved_tensors[0])
+
+    @staticmethod
+    def vmap(info, in_dims, rows, index):
+        return _columns(info, in_dims[:2], (rows, index), _Take.apply)
+
+
+class _Add(torch.autograd.Function):
+    """(V, C): sums of the rows of (M, C) that share an index, added in their order."""
+
+    @staticmethod
+    def forward(values, index, count):
+        total = np.zeros((count, values.shape[1]), values.detach().numpy().dtype)
+        _add(np.ascontiguousarray(values.detach().numpy()), index.detach().numpy(), total)
+        return torch.from_numpy(total)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        _, index, ctx.count = inputs
+        ctx.save_for_backward(index)
+        ctx.save_for_forward(index)
+
+    @staticmethod
+    def backward(ctx, *gradients):
+        return _Take.apply(gradients[0], ctx.saved_tensors[0]), None, None
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        return _Add.apply(tangents[0], ctx.saved_tensors[0], ctx.count)
+
+    @staticmethod
+    def vmap(info, in_dims, values, index, count):
+        return _columns(info, in_dims[:2], (values, index), lambda v, i: _Add.apply(v, i, count))
+
+
+# torch asks for the signature at each call, and finding it anew takes longer than the work.
+for _function in (_Take, _Add):
+    _function.forward.__signature__ = inspect.signature(_function.forward)
+
+
+def _columns(info: Any, in_dims: tuple, given: tuple[Tensor, Tensor], f: Callable) -> tuple[Tensor, int]:
+    """A batch of either: as more columns where all items share an index, else one by one."""
+    (rows, index), (row_dim, index_dim) = given, in_dims
+    if index_dim is None:
+        wide = rows.movedim(row_dim, 1)
+        return f(wide.flatten(1), index).unflatten(1, wide.shape[1:]).movedim(1, 0), 0
+    items = [
+        f(rows if row_dim is None else rows.select(row_dim, b), index.select(index_dim, b))
+        for b in range(info.batch_size)
+    ]
+    return torch.stack(items), 0
+
+
+@numba.njit(cache=True, nogil=True)
+def _add(values, index, total):
+    for m in range(len(index)):
+        for c in range(values.shape[1]):
+            total[index[m], c] += values[m, c]
