@@ -14,7 +14,7 @@ from rts.errors import PluginError
 from rts.protocols import Part, Samples
 from rts.sampling import reads_of
 
-STATIC_FACES = 1_500_000
+STATIC_FACES = 4_000_000
 """From so many triangles on, rays at a structure that is kept are faster than drawing all (benchmarks/samplers.py)."""
 
 _log = logging.getLogger("rts")

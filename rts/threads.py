@@ -17,6 +17,9 @@ from typing import Any
 TASKS_PER_THREAD = 4
 """More tasks than threads, so that one that gets the heavy rows does not keep the others waiting."""
 
+LITTLE_WORK = 20_000
+"""Below so many steps a loop stays on the thread that asks for it."""
+
 _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
 _lock = threading.Lock()
 if hasattr(os, "register_at_fork"):  # No child is to find it held by a thread that it does not have.
@@ -31,11 +34,18 @@ def thread_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def parallel(kernel: Callable, count: int, *args: Any) -> None:
-    """Call `kernel(start, stop, *args)` so that the ranges cover [0, count); the kernel must release the lock."""
+def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) -> None:
+    """Call `kernel(start, stop, *args)` so that the ranges cover [0, count); the kernel must release the lock.
+
+    Args:
+        kernel: the loop.
+        count: the end of the range.
+        *args: handed on.
+        work: steps of some nanoseconds in all; where they are few, waking threads would take longer.
+    """
     threads = thread_count()
     tasks = min(count, threads * TASKS_PER_THREAD)
-    if threads == 1 or tasks <= 1:
+    if threads == 1 or tasks <= 1 or work < LITTLE_WORK:
         kernel(0, count, *args)
         return
     bounds = [count * i // tasks for i in range(tasks + 1)]

@@ -94,6 +94,11 @@ class Splats:
         return self.positions, self.rgba, self.row[:1] if self.visible else self.row, *self._numbers
 
     @property
+    def _mixed_work(self) -> int:
+        """Steps that the mixed targets take: nine sources of several numbers each."""
+        return 50 * len(self.choices.columns)
+
+    @property
     def _mixed(self) -> tuple:
         return self.positions, self.rgba, self.row, *self._numbers, *self.choices[1:]
 
@@ -116,9 +121,8 @@ class Splats:
         ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
         if len(columns):
             continued = z.dtype.type(CONTINUED)  # An argument, since compiled code that is cached would keep its value.
-            parallel(
-                choosing.choose, height, self.row, self.visible, continued, beyond, z, marks, offsets, columns, ranges
-            )
+            given = self.row, self.visible, continued, beyond, z, marks, offsets, columns, ranges
+            parallel(choosing.choose, height, *given, work=50 * len(columns))
         return Choices(marks, offsets, columns, ranges)
 
     def image(self) -> np.ndarray:
@@ -128,7 +132,7 @@ class Splats:
         if image.size:
             parallel(stencil.forward, height, *self._stencil, image)
             if len(self.choices.columns):
-                parallel(mixed.forward, height, *self._mixed, image)
+                parallel(mixed.forward, height, *self._mixed, image, work=self._mixed_work)
         return image
 
     def vjp(
@@ -147,8 +151,8 @@ class Splats:
             parallel(stencil.pull, height, *self._stencil, self.choices.mixed, g, *found)
             if count := len(self.choices.columns):
                 adjoints = np.empty((count, 3, 5), g.dtype)
-                parallel(mixed.adjoint, height, *self._mixed, g, adjoints)
-                parallel(mixed.pull, height, *self._mixed, adjoints, *found)
+                parallel(mixed.adjoint, height, *self._mixed, g, adjoints, work=self._mixed_work)
+                parallel(mixed.pull, height, *self._mixed, adjoints, *found, work=self._mixed_work)
         return found[0] if wanted[0] else None, found[1] if wanted[1] else None
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None) -> np.ndarray:
@@ -163,7 +167,7 @@ class Splats:
             )
             parallel(stencil.push, height, *self._stencil, *tangents, out)
             if len(self.choices.columns):
-                parallel(mixed.push, height, *self._mixed, *tangents, out)
+                parallel(mixed.push, height, *self._mixed, *tangents, out, work=self._mixed_work * count)
         return out
 
     @cached_property
