@@ -233,6 +233,13 @@ class OddRaster(Raster):
         return self.alter(fragments, (prepared, camera, size))
 
 
+class Hoarder(OddRaster):
+    """A rasterizer that is told what is needed, and keeps everything."""
+
+    def sample(self, part, camera, size, layers, *, needed=None, **options):
+        return super().sample(part, camera, size, layers, **options)
+
+
 class OddSampler:
     """A sampler whose samples are altered."""
 
@@ -370,6 +377,7 @@ SAMPLERS = {
         "no perspective": OddRaster(affine_barycentrics),
         "depth of another scale": OddRaster(lambda f, _: f._replace(depth=f.depth * np.float32(1.1))),
     },
+    "it_leaves_out_what_is_not_needed": {"keeps everything": Hoarder()},
     "it_agrees_with_the_reference": {
         "nothing culled": OddRaster(cull="none"),
         "edges lost": OddRaster(eroded),

@@ -13,6 +13,7 @@ from rts.arrays import leaves
 from rts.camera import Camera
 from rts.gbuffer import GBuffer
 from rts.protocols import Part, Sampled
+from rts.rendering import APRON
 from rts.testing import engines, scenes
 from rts.testing.conformance import Conformance, claim, no_error, refusal
 from rts.testing.engines import DIFFERENTIABLE, ENGINES, engine_named, joined, split
@@ -90,7 +91,7 @@ class SamplerConformance(Conformance):
             sampled = scenes.find(part, camera, sampler)
             claim_empty_where_empty(sampled, view)
             image = scenes.render(part, camera, scenes.SIZE, sampler=sampler, splatter="none")
-            empty = np.asarray(sampled.row)[0, 1:-1, 1:-1] < 0
+            empty = np.asarray(sampled.row)[0, APRON:-APRON, APRON:-APRON] < 0
             claim((image[empty] == 0).all(), f"{view}: the image is not zero where nothing is seen")
 
     def test_samples_lie_between_the_near_and_the_far_plane(self, sampler: Any, parts: list[Part]) -> None:
@@ -159,6 +160,23 @@ class SamplerConformance(Conformance):
         claim(dropped == hits - capacity, f"overflow is {dropped}; {hits - capacity} were dropped")
         claim((row >= 0).sum() == capacity, f"{(row >= 0).sum()} cells have samples; the capacity is {capacity}")
         claim((row[0] >= 0).sum() == front, "samples of the front layer were dropped before those behind")
+
+    def test_it_leaves_out_what_is_not_needed(self, sampler: Any, parts: list[Part]) -> None:
+        """Where it says that it prunes: fronts alone, if `needed` keeps these."""
+        chosen = registry.instance("rts.samplers", sampler)
+        if not getattr(chosen, "prunes", False):
+            pytest.skip("the sampler does not prune")
+
+        def fronts(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+            claim(covered.dtype == bool and covered.shape == depth.shape, "needed is not asked with (K, H, W) arrays")
+            return covered & (np.arange(len(covered)) == 0)[:, None, None]
+
+        part = parts[0]
+        whole = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2)
+        found = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2, needed=fronts)
+        claim((np.asarray(found.row)[1] < 0).all(), "samples that are not needed are kept")
+        kept = (np.asarray(found.row)[0] >= 0) == (np.asarray(whole.row)[0] >= 0)
+        claim(kept.all(), "samples that are needed are left out")
 
     def test_what_it_cannot_sample_is_refused_in_one_line(self, sampler: Any) -> None:
         """An `rts.InputError` that says what to do, for a surface with neither triangles nor an intersection."""
