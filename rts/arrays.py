@@ -207,3 +207,18 @@ def take(rows: Array, index: Array) -> Array:
     """(M, C): the rows of (V, C) that (M,) integers name."""
     known = getattr(engine_of(rows, index), "take", None)
     return namespace(rows, index).take(rows, index, axis=0) if known is None else known(rows, index)
+
+
+def projective_map(rows: Array, points: Array) -> Array:
+    """(N, 3): of four affine maps (4, 4) of points (N, 3), the first two over the third, and the fourth.
+
+    Where the third is zero there is no image; the result is finite.
+    """
+    known = getattr(engine_of(rows, points), "projective_map", None)
+    found = None if known is None else known(rows, points)
+    if found is not None:
+        return found
+    divisor = affine_map(rows[2:3, :], points)
+    xp = namespace(divisor)
+    safe = xp.where(divisor == 0, xp.ones_like(divisor), divisor)
+    return xp.concat([affine_map(rows[:2, :], points) / safe, affine_map(rows[3:, :], points)], axis=1)

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import affine, affine_map, engine_of, is_constant, matmul, namespace, promote
+from rts.arrays import affine, engine_of, is_constant, matmul, namespace, projective_map, promote
 from rts.protocols import Array, Rays
 from rts.transforms import (
     affine_matrix,
@@ -314,10 +314,8 @@ class Camera(NamedTuple):
         height, width = size
         matrix = matmul(self.projection, self.view)
         xp, x, y, w = namespace(matrix), matrix[0, :], matrix[1, :], matrix[3, :]
-        divisor = affine_map(w[None, :], points)
-        safe = xp.where(divisor == 0, xp.ones_like(divisor), divisor)
-        pixels = affine_map(xp.stack([(w + x) * (width / 2), (w - y) * (height / 2)]), points)
-        return xp.concat([pixels / safe, affine_map(-self.view[2:3, :], points)], axis=1)
+        rows = xp.stack([(w + x) * (width / 2), (w - y) * (height / 2), w, -self.view[2, :]])
+        return projective_map(rows, points)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""

@@ -296,7 +296,8 @@ class Engine(Protocol):
 
     Optional members: `take_error() -> RtsError | None`, the last error raised inside a host call, where the framework
     wraps such errors in its own; `traced(x) -> bool`, whether an array has a shape but not yet a value;
-    `affine_map(rows, points)` and `take(rows, index)`, the same as in `rts.arrays`, in full precision but faster.
+    `affine_map(rows, points)`, `take(rows, index)` and `projective_map(rows, points)`, the same as in `rts.arrays`, in
+    full precision but faster (the last may give None, for arrays that it does not know).
 
     The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the
     user has imported that module.

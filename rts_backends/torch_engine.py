@@ -112,6 +112,15 @@ class TorchEngine:
             return torch.addmm(rows[:, 3], points, rows[:, :3].T)
         return (points[:, None, :] * rows[None, :, :3]).sum(dim=-1) + rows[:, 3]
 
+    def projective_map(self, rows: torch.Tensor, points: torch.Tensor) -> torch.Tensor | None:
+        """By compiled code on the CPU; else None."""
+        dtypes = {rows.dtype, points.dtype}
+        if points.device.type != "cpu" or dtypes not in ({torch.float32}, {torch.float64}):
+            return None
+        from rts_backends import torch_projection
+
+        return torch_projection.project(rows, points)
+
     def take(self, rows: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
         """By compiled code on the CPU."""
         if rows.device.type == "cpu" and rows.dtype in (torch.float32, torch.float64) and rows.ndim == 2:
