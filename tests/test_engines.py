@@ -300,7 +300,7 @@ def test_torch_vmap_over_poses_of_a_constant_mesh_is_a_loop(on_torch):
     poses = arrays(target, np.stack([rigid((0, 1, 0), a, (0.1, 0, 0)) for a in (0, 40, 80)]))
     images = torch.func.vmap(lambda pose: image_of({**SCENE, "transform": pose}))(poses)
     for pose, image in zip(poses, images, strict=True):
-        np.testing.assert_allclose(to_numpy(image), to_numpy(image_of({**SCENE, "transform": pose})), rtol=0, atol=1e-6)
+        np.testing.assert_allclose(to_numpy(image), to_numpy(image_of({**SCENE, "transform": pose})), rtol=0, atol=5e-6)
 
 
 # torch itself reads .grad of intermediate tensors where it cuts a graph in two.
@@ -344,7 +344,7 @@ def test_torch_records_are_arguments_of_its_transforms(on_torch):
 
     cameras = Camera(*(torch.stack(m) for m in zip(*map(camera_at, arrays(target, EYES)), strict=True)))
     images = torch.func.vmap(lambda camera: rts.render(part, camera, SIZE))(cameras)
-    np.testing.assert_allclose(to_numpy(images[0]), plain_image(target), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(to_numpy(images[0]), plain_image(target), rtol=0, atol=5e-6)
 
 
 # --------------------------------------------------------------------------------------- jax's transforms
@@ -379,7 +379,7 @@ def test_jax_jit_with_enough_capacity_keeps_the_image_and_counts_no_overflow(jax
     sampled = jax.jit(lambda p, c: rts.sample(p, c, SIZE, capacity=covered))(part, camera)
     assert int(sampled.overflow) == 0 and sampled.samples[0].ids.shape[0] == covered
     image = rts.render_samples(sampled, part, camera)
-    np.testing.assert_allclose(np.asarray(image), plain_image("jax"), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(image), plain_image("jax"), rtol=0, atol=5e-6)
 
 
 def test_jax_jit_with_too_little_capacity_drops_the_deepest_layers_and_counts_them(jax, scene_of_jax):
@@ -395,7 +395,7 @@ def test_jax_jit_with_too_little_capacity_drops_the_deepest_layers_and_counts_th
 
 def test_jax_vjp_is_the_gradient(jax, scene_of_jax):
     image, pull = jax.vjp(image_of, scene_of_jax)
-    np.testing.assert_allclose(np.asarray(image), plain_image("jax"), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(np.asarray(image), plain_image("jax"), rtol=0, atol=5e-6)
     (found,) = pull(arrays("jax", WEIGHTS))
     assert_trees_close(to_numpy(found), plain_gradient("jax"))
 
