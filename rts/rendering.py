@@ -108,7 +108,9 @@ def sample(
     """
     prepared = parts if isinstance(parts, PreparedParts) else None
     parts, camera = check_scene(prepared.parts if prepared else parts, camera)
-    height, width = (int(supersample) * n for n in check_size(size, layers, capacity, supersample))
+    height, width = check_size(size, layers, capacity, supersample)
+    supersample = int(supersample)  # It may be of a type that overflows.
+    height, width = supersample * height, supersample * width
     check_memory(height, width, _planned(layers), gradient=differentiable(parts, camera))
     if prepared is None:
         samplers, entries = [check_plugin("rts.samplers", sampler, "sample")] * len(parts), [None] * len(parts)
