@@ -6,13 +6,14 @@ import abc
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
+import array_api_compat
 import numpy as np
 
 from rts.arrays import engine_of, exemplar, is_constant, leaves, map_leaves, namespace
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.keeping import Entry, Keeper, fingerprint, same_faces
-from rts.protocols import ArraySpec, Fragments, Part, Proxy, Rays, Sampled, Samples, Tree
+from rts.protocols import Array, ArraySpec, Fragments, Part, Proxy, Rays, Sampled, Samples, Tree
 
 
 class TriangleSampler(abc.ABC):
@@ -273,14 +274,37 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
     if len(samples) == 1:
         only = samples[0]
         return Sampled(tuple(samples), xp.clip(only.row, -1, 0), only.row, only.depth, overflow)
-    offsets = np.cumsum([0, *(s.ids.shape[0] for s in samples)])
-    row = xp.concat([xp.where(s.row >= 0, s.row + int(o), s.row) for s, o in zip(samples, offsets, strict=False)])
-    part = xp.concat([xp.where(s.row >= 0, i, s.row) for i, s in enumerate(samples)])
-    depth = xp.concat([s.depth for s in samples])
-    last = xp.max(depth) + 1
-    order = xp.argsort(xp.where(row >= 0, depth, last), axis=0, stable=True)[:layers]
-    row, part, depth = (xp.take_along_axis(x, order, axis=0) for x in (row, part, depth))
+    on_host = "cpu" in str(array_api_compat.device(samples[0].row)).lower()
+    if on_host and not getattr(engine_of(samples), "traced", lambda x: False)(samples[0].row):
+        part, row, depth = _interleaved_on_the_host(samples, layers)
+    else:
+        row = xp.concat([s.row for s in samples])
+        part = xp.concat([xp.where(s.row >= 0, i, s.row) for i, s in enumerate(samples)])
+        depth = xp.concat([s.depth for s in samples])
+        last = xp.max(depth) + 1
+        order = xp.argsort(xp.where(row >= 0, depth, last), axis=0, stable=True)[:layers]
+        row, part, depth = (xp.take_along_axis(x, order, axis=0) for x in (row, part, depth))
+    start = 0
+    for i, s in enumerate(samples):
+        row = xp.where(part == i, row + start, row) if start else row
+        start += s.ids.shape[0]
     return Sampled(tuple(samples), part, row, depth, overflow)
+
+
+def _interleaved_on_the_host(samples: Sequence[Samples], layers: int) -> tuple[Array, ...]:
+    """Part, row within it and depth, (K, H, W) each: sorting many short columns takes array code far longer."""
+    count = len(samples)
+    kept = min(layers, sum(s.row.shape[0] for s in samples))
+    shape, dtype = (kept, *samples[0].row.shape[1:]), np.dtype(str(samples[0].depth.dtype).removeprefix("torch."))
+
+    def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+        from rts import lifting
+
+        return lifting.interleave(arrays[:count], arrays[count:], layers)
+
+    specs = ArraySpec(shape, np.int32), ArraySpec(shape, np.int32), ArraySpec(shape, dtype)
+    given = *(s.row for s in samples), *(s.depth for s in samples)
+    return engine_of(samples).call_host(host, specs, *given)
 
 
 def check_camera(camera: Camera) -> None:

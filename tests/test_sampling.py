@@ -223,3 +223,24 @@ def test_samples_of_another_mesh_are_refused():
     small = rts.Part(mesh([(0, 1, 2)]), {"vertices": corners})
     with pytest.raises(rts.InputError, match="samples refer to row 9 of an array of 3; sample this mesh anew"):
         rts.render_samples(rts.sample(large, camera, (16, 16)), small, camera)
+
+
+@pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
+def test_parts_are_interleaved_alike_on_the_host_and_in_array_code(target, monkeypatch):
+    rng = np.random.default_rng(0)
+    parts = []
+    for layers in (2, 3, 1):
+        covered = np.logical_and.accumulate(rng.random((layers, 6, 7)) < 0.7, axis=0)
+        depth = np.where(covered, np.sort(rng.integers(1, 6, covered.shape), axis=0), 0).astype(np.float32)
+        row = np.full(covered.shape, -1, np.int32)
+        row[covered] = rng.permutation(covered.sum())
+        count = int(covered.sum())
+        fields = np.zeros((count, 3), np.int32), np.zeros((count, 2), np.float32), row, depth, np.int32(0)
+        parts.append(Samples(*(arrays(target, x) for x in fields)))
+    for layers in (1, 3, 6):
+        host = to_numpy(merge(parts, layers))
+        with monkeypatch.context() as patch:
+            patch.setattr("rts.sampling.array_api_compat.device", lambda x: "elsewhere")
+            array_code = to_numpy(merge(parts, layers))
+        for name in ("part", "row", "depth"):
+            np.testing.assert_array_equal(getattr(host, name), getattr(array_code, name), err_msg=name)
