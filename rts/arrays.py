@@ -122,6 +122,11 @@ def engine_of(*trees: Tree) -> Engine:
     return next(iter(found.values())) if found else _engine("numpy")
 
 
+def is_traced(x: Array) -> bool:
+    """Whether an array has a shape but not yet a value."""
+    return getattr(engine_of(x), "traced", lambda x: False)(x)
+
+
 def exemplar(*trees: Tree) -> Array | None:
     """The widest floating array of an engine other than NumPy, which sets dtype and device for constants, or None."""
     widest, bits = None, 0

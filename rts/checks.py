@@ -16,7 +16,7 @@ from rts.errors import InputError
 from rts.protocols import Array, Part
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}
-"""Rough memory of one cell of one layer through sampling, shading and splatting, measured with the splatter `multi`."""
+"""Rough memory of one cell of one layer through sampling, shading and splatting in array code; compiled, it is a fraction."""
 
 
 def _memory() -> float:

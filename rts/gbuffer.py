@@ -15,15 +15,19 @@ class GBuffer(dict):
     Built-in surfaces use the names position, normal, uv and color, and any others that the user adds.
     """
 
-    def __init__(self, *args: Any, like: Any = None, **kwargs: Any):
+    def __init__(self, *args: Any, **kwargs: Any):
         super().__init__(*args, **kwargs)
         self._deferred: dict[str, Callable[[], Any]] = {}
-        self._like = like
+        self._like = None
 
     @property
     def like(self) -> Any:
         """An array (N, ·) of the samples' number, dtype and device that costs nothing to read."""
         return self["position"] if self._like is None else self._like
+
+    @like.setter
+    def like(self, value: Any) -> None:
+        self._like = value
 
     def defer(self, name: str, compute: Callable[[], Any]) -> None:
         """Add an attribute that `compute()` gives when it is first read."""

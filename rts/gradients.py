@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import engine_of, from_numbers, is_constant, leaves, map_leaves, namespace
+from rts.arrays import engine_of, from_numbers, is_constant, is_traced, leaves, map_leaves, namespace
 from rts.camera import Camera
 from rts.checks import check_size
 from rts.errors import InputError
@@ -184,7 +184,7 @@ def check_gradient(
         return render(*found, size, **{**options, **changes})
 
     value, gradient = engine.value_and_grad(lambda p: loss(image(p)))(parameters)
-    if getattr(engine, "traced", lambda x: False)(value):
+    if is_traced(value):
         raise InputError("the parameters are traced; call check_gradient outside jit")
     slopes = []
     for number, ((name, value), slope) in enumerate(zip(_named(parameters), leaves(gradient), strict=True)):

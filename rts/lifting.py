@@ -36,11 +36,10 @@ def pack(
     ids = make((rows, table.shape[1]), np.int32)
     params = make((rows, 2 if corner_params is None else corner_params.shape[2]), np.float32)
     row, depth = np.empty((lines, width), np.int32), np.empty((lines, width), np.float32)
-    given = kept, triangle_ids, barycentrics, depths, table, offsets
-    if corner_params is None:
-        parallel(_pack, lines, *given, ids, params, row, depth)
-    else:
-        parallel(_pack_params, lines, *given, corner_params, ids, params, row, depth)
+    # Without any, the barycentrics themselves are taken.
+    corners = np.empty((0, 3, 0), np.float32) if corner_params is None else corner_params
+    given = kept, triangle_ids, barycentrics, depths, table, corners, offsets
+    parallel(_pack, lines, *given, ids, params, row, depth)
     shape = layers, height, width
     return ids, params, row.reshape(shape), depth.reshape(shape), total
 
@@ -55,24 +54,7 @@ def _count(start, stop, kept, counts):
 
 
 @numba.njit(cache=True, nogil=True)
-def _pack(start, stop, kept, triangle_ids, barycentrics, depths, table, offsets, ids, params, row, depth):
-    for y in range(start, stop):
-        n = offsets[y]
-        for x in range(kept.shape[1]):
-            if not kept[y, x] or n >= len(ids):
-                row[y, x], depth[y, x] = -1, 0
-                continue
-            for i in range(ids.shape[1]):
-                ids[n, i] = table[triangle_ids[y, x], i]
-            params[n, 0], params[n, 1] = barycentrics[y, x, 0], barycentrics[y, x, 1]
-            row[y, x], depth[y, x] = n, depths[y, x]
-            n += 1
-
-
-@numba.njit(cache=True, nogil=True)
-def _pack_params(
-    start, stop, kept, triangle_ids, barycentrics, depths, table, offsets, corner_params, ids, params, row, depth
-):
+def _pack(start, stop, kept, triangle_ids, barycentrics, depths, table, corners, offsets, ids, params, row, depth):
     for y in range(start, stop):
         n = offsets[y]
         for x in range(kept.shape[1]):
@@ -82,9 +64,12 @@ def _pack_params(
             t, a, b = triangle_ids[y, x], barycentrics[y, x, 0], barycentrics[y, x, 1]
             for i in range(ids.shape[1]):
                 ids[n, i] = table[t, i]
-            for i in range(params.shape[1]):
-                c = corner_params[t, 2, i]
-                params[n, i] = c + a * (corner_params[t, 0, i] - c) + b * (corner_params[t, 1, i] - c)
+            if len(corners) == 0:
+                params[n, 0], params[n, 1] = a, b
+            else:
+                for i in range(params.shape[1]):
+                    c = corners[t, 2, i]
+                    params[n, i] = c + a * (corners[t, 0, i] - c) + b * (corners[t, 1, i] - c)
             row[y, x], depth[y, x] = n, depths[y, x]
             n += 1
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import engine_of, namespace
+from rts.arrays import engine_of, is_traced, namespace
 from rts.errors import InputError, LayersWarning
 from rts.protocols import ArraySpec, Part, Sampled, Samples
 
@@ -80,8 +80,8 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: Needed | None) ->
         inspection = Inspection(needed)
         sampled = taken(min(count, LAYER_LIMIT + 1), inspection)
         if inspection.most is None:
-            traced = getattr(engine_of(sampled), "traced", lambda x: False)(sampled.row)
-            why = "the values that decide are traced" if traced else "the sampler did not ask which samples are needed"
+            traced, deaf = "the values that decide are traced", "the sampler did not ask which samples are needed"
+            why = traced if is_traced(sampled.row) else deaf
             raise InputError(f'layers is "auto", but {why}; give a number of layers')
         if inspection.most < count or count > LAYER_LIMIT:
             break

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from rts.arrays import affine_map, constants, engine_of, exemplar, is_constant, namespace
+from rts.arrays import affine_map, constants, engine_of, exemplar, is_constant, is_traced, namespace
 from rts.camera import Camera
 from rts.checks import (
     check_background,
@@ -130,8 +130,8 @@ def sample(
             samples.append(chosen.sample(part, wide.within(part.transform), grid, count, capacity=capacity, **known))
         sampled = merge(samples, count)
         # What is traced has the shape of the worst case, with or without them.
-        traced = getattr(engine_of(sampled), "traced", lambda x: False)(sampled.row)
-        return sampled if needed is None or "needed" in known or traced else prune(sampled, needed)
+        done = needed is None or "needed" in known or is_traced(sampled.row)
+        return sampled if done else prune(sampled, needed)
 
     samplers = [c.of(p, camera) if isinstance(c, Auto) else c for p, c in zip(parts, samplers, strict=True)]
 
@@ -245,7 +245,8 @@ def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
     """Positions and normals moved by the part's transform."""
     if transform is None:
         return gbuffer
-    world = GBuffer(like=gbuffer["position"])
+    world = GBuffer()
+    world.like = gbuffer["position"]
     for name in gbuffer:
         world.defer(name, lambda name=name: gbuffer[name])
     world.defer("position", lambda: affine_map(transform[:3, :], gbuffer["position"]))

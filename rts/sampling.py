@@ -9,7 +9,7 @@ from typing import Any, Self
 import array_api_compat
 import numpy as np
 
-from rts.arrays import engine_of, exemplar, is_constant, leaves, map_leaves, namespace
+from rts.arrays import engine_of, exemplar, is_constant, is_traced, leaves, map_leaves, namespace
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.keeping import Entry, Keeper, fingerprint, same_faces
@@ -275,7 +275,7 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         only = samples[0]
         return Sampled(tuple(samples), xp.clip(only.row, -1, 0), only.row, only.depth, overflow)
     on_host = "cpu" in str(array_api_compat.device(samples[0].row)).lower()
-    if on_host and not getattr(engine_of(samples), "traced", lambda x: False)(samples[0].row):
+    if on_host and not is_traced(samples[0].row):
         part, row, depth = _interleaved_on_the_host(samples, layers)
     else:
         row = xp.concat([s.row for s in samples])
@@ -295,7 +295,8 @@ def _interleaved_on_the_host(samples: Sequence[Samples], layers: int) -> tuple[A
     """Part, row within it and depth, (K, H, W) each: sorting many short columns takes array code far longer."""
     count = len(samples)
     kept = min(layers, sum(s.row.shape[0] for s in samples))
-    shape, dtype = (kept, *samples[0].row.shape[1:]), np.dtype(str(samples[0].depth.dtype).removeprefix("torch."))
+    shape, depth = (kept, *samples[0].row.shape[1:]), samples[0].depth
+    dtype = np.float64 if namespace(depth).finfo(depth.dtype).bits == 64 else np.float32
 
     def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
         from rts import lifting

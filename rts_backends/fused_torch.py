@@ -6,16 +6,15 @@ kernels; the derivatives of the last two, which are second derivatives of the im
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch._C._functorch import is_legacy_batchedtensor
-from torch.utils import _pytree
 
 from rts_backends.fused_kernels import Choices, Settings, Splats
+from rts_backends.torch_functions import along, quick
 
 
 def fits(*tensors: Tensor) -> bool:
@@ -67,11 +66,11 @@ class _Work:
         """The specification's pushforward, as a function of positions, rgba and tangents of them (T, N, ·)."""
 
         def push(positions: Tensor, rgba: Tensor, t_positions: Tensor, t_rgba: Tensor) -> Tensor:
-            def along(tp: Tensor, tc: Tensor) -> Tensor:
+            def one(tp: Tensor, tc: Tensor) -> Tensor:
                 image = lambda p, c: self.specification(p, c, row)  # noqa: E731
-                return _along(image, (positions, rgba), (tp, tc))
+                return along(image, (positions, rgba), (tp, tc))
 
-            return torch.stack([along(tp, tc) for tp, tc in zip(t_positions, t_rgba, strict=True)])
+            return torch.stack([one(tp, tc) for tp, tc in zip(t_positions, t_rgba, strict=True)])
 
         return push
 
@@ -118,8 +117,7 @@ class _Image(torch.autograd.Function):
         _, t_positions, t_rgba, _ = given
         if _foreign(t_positions) or _foreign(t_rgba):
             *primals, row = ctx.saved_tensors
-            tangents = _tangents(primals, t_positions, t_rgba)
-            return _along(lambda p, c: ctx.work.specification(p, c, row), primals, tangents)
+            return along(lambda p, c: ctx.work.specification(p, c, row), primals, (t_positions, t_rgba))
         t_positions, t_rgba = (None if t is None else t[None] for t in (t_positions, t_rgba))
         return _Push.apply(ctx.work, *ctx.saved_tensors, t_positions, t_rgba)[0]
 
@@ -156,7 +154,7 @@ class _Pull(torch.autograd.Function):
         _, _, t_positions, t_rgba, _, t_g = given
         positions, rgba, row, g = ctx.saved_tensors
         primals = positions, rgba, g
-        return _along(ctx.work.pulled(row, ctx.wanted), primals, _tangents(primals, t_positions, t_rgba, t_g))
+        return along(ctx.work.pulled(row, ctx.wanted), primals, (t_positions, t_rgba, t_g))
 
     @staticmethod
     def vmap(info, in_dims, *args):
@@ -200,7 +198,7 @@ class _Push(torch.autograd.Function):
         _, t_positions, t_rgba, _, *t_tangents = given
         positions, rgba, row, *tangents = ctx.saved_tensors
         primals = positions, rgba, *tangents
-        return _along(ctx.work.pushed(row), primals, _tangents(primals, t_positions, t_rgba, *t_tangents))
+        return along(ctx.work.pushed(row), primals, (t_positions, t_rgba, *t_tangents))
 
     @staticmethod
     def vmap(info, in_dims, *args):
@@ -217,17 +215,4 @@ class _Push(torch.autograd.Function):
         return out.unflatten(0, (info.batch_size, -1)), 0
 
 
-# torch asks for the signature at each call, and finding it anew takes longer than a small kernel.
-for _function in (_Image, _Pull, _Push):
-    _function.forward.__signature__ = inspect.signature(_function.forward)
-
-
-def _tangents(primals: Sequence[Tensor], *tangents: Tensor | None) -> tuple[Tensor, ...]:
-    return tuple(torch.zeros_like(p) if t is None else t for p, t in zip(primals, tangents, strict=True))
-
-
-def _along(f: Callable, primals: Sequence[Tensor], tangents: Sequence[Tensor]) -> Any:
-    """The directional derivative, by reverse mode twice: torch does not nest its forward mode."""
-    value, pull = torch.func.vjp(f, *primals)[:2]
-    zeros = _pytree.tree_map(torch.zeros_like, value)
-    return torch.func.vjp(pull, zeros)[1](tuple(tangents))[0]
+quick(_Image, _Pull, _Push)

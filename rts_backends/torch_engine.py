@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -15,6 +14,7 @@ from torch.utils import _pytree
 from rts.arrays import leaves, map_leaves
 from rts.protocols import ArraySpec, Tree
 from rts.records import STATIC_FIELDS, join_record, split_record
+from rts_backends.torch_functions import quick
 
 for _cls in STATIC_FIELDS:
     _pytree.register_pytree_node(
@@ -75,8 +75,7 @@ class _HostCall(torch.autograd.Function):
         return tuple(outputs), (0,) * len(outputs)
 
 
-# torch asks for the signature at each call, and finding it anew takes longer than a small kernel.
-_HostCall.forward.__signature__ = inspect.signature(_HostCall.forward)
+quick(_HostCall)
 
 
 class TorchEngine:

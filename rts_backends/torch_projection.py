@@ -5,9 +5,7 @@ Written in torch it takes a dozen passes over the points, and twice as many back
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
-from typing import Any
 
 import numba
 import numpy as np
@@ -15,6 +13,7 @@ import torch
 from torch import Tensor
 
 from rts.threads import parallel
+from rts_backends.torch_functions import along, quick
 
 CHUNK = 4096
 """Points whose sums are taken together; fixed, so that results do not depend on the number of threads."""
@@ -34,8 +33,14 @@ def project(rows: Tensor, points: Tensor) -> Tensor:
     return _Project.apply(rows, points)
 
 
-def _pull(rows: Tensor, points: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
-    return torch.func.vjp(specification, rows, points)[1](g)
+def _pulled(wanted: bool) -> Callable:
+    """The specification's pullback of rows, points and the gradient; of no points where these are not wanted."""
+
+    def pull(rows: Tensor, points: Tensor, g: Tensor) -> tuple[Tensor, Tensor]:
+        g_rows, g_points = torch.func.vjp(specification, rows, points)[1](g)
+        return g_rows, g_points if wanted else g_points[:0]
+
+    return pull
 
 
 class _Project(torch.autograd.Function):
@@ -92,41 +97,19 @@ class _Pull(torch.autograd.Function):
         ctx.save_for_forward(*tensors)
 
     @staticmethod
-    def _part(ctx) -> Callable:
-        def part(*tensors: Tensor) -> tuple[Tensor, Tensor]:
-            g_rows, g_points = _pull(*tensors)
-            return g_rows, g_points if ctx.wanted else g_points[:0]
-
-        return part
-
-    @staticmethod
     def backward(ctx, *gradients):
-        return *torch.func.vjp(_Pull._part(ctx), *ctx.saved_tensors)[1](gradients), None
+        return *torch.func.vjp(_pulled(ctx.wanted), *ctx.saved_tensors)[1](gradients), None
 
     @staticmethod
     def jvp(ctx, *tangents):
-        return _along(_Pull._part(ctx), ctx.saved_tensors, tangents[:3])
+        return along(_pulled(ctx.wanted), ctx.saved_tensors, tangents[:3])
 
     @staticmethod
     def vmap(info, in_dims, rows, points, g, wanted):
-        def part(*tensors: Tensor) -> tuple[Tensor, Tensor]:
-            g_rows, g_points = _pull(*tensors)
-            return g_rows, g_points if wanted else g_points[:0]
-
-        return torch.vmap(part, in_dims[:3])(rows, points, g), (0, 0)
+        return torch.vmap(_pulled(wanted), in_dims[:3])(rows, points, g), (0, 0)
 
 
-# torch asks for the signature at each call, and finding it anew takes longer than the work.
-for _function in (_Project, _Pull):
-    _function.forward.__signature__ = inspect.signature(_function.forward)
-
-
-def _along(f: Callable, primals: tuple, tangents: tuple) -> Any:
-    """The directional derivative, by reverse mode twice: torch does not nest its forward mode."""
-    tangents = tuple(torch.zeros_like(p) if t is None else t for p, t in zip(primals, tangents, strict=True))
-    value, pull = torch.func.vjp(f, *primals)
-    zeros = torch.zeros_like(value) if isinstance(value, Tensor) else tuple(map(torch.zeros_like, value))
-    return torch.func.vjp(pull, zeros)[1](tangents)[0]
+quick(_Project, _Pull)
 
 
 def _arrays(rows: Tensor, points: Tensor) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +9,8 @@ import numba
 import numpy as np
 import torch
 from torch import Tensor
+
+from rts_backends.torch_functions import quick
 
 
 def take(rows: Tensor, index: Tensor) -> Tensor:
@@ -74,9 +75,7 @@ class _Add(torch.autograd.Function):
         return _columns(info, in_dims[:2], (values, index), lambda v, i: _Add.apply(v, i, count))
 
 
-# torch asks for the signature at each call, and finding it anew takes longer than the work.
-for _function in (_Take, _Add):
-    _function.forward.__signature__ = inspect.signature(_function.forward)
+quick(_Take, _Add)
 
 
 def _columns(info: Any, in_dims: tuple, given: tuple[Tensor, Tensor], f: Callable) -> tuple[Tensor, int]:

@@ -1,0 +1,29 @@
+"""What the compiled torch functions share."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils import _pytree
+
+
+def quick(*functions: type[torch.autograd.Function]) -> None:
+    """Keep the signature of `forward`: torch asks at each call, and finding it takes longer than a small kernel."""
+    for function in functions:
+        function.forward.__signature__ = inspect.signature(function.forward)  # pyright: ignore[reportFunctionMemberAccess]
+
+
+def filled(primals: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> tuple[Tensor, ...]:
+    """Tangents, zero where there are none."""
+    return tuple(torch.zeros_like(p) if t is None else t for p, t in zip(primals, tangents, strict=True))
+
+
+def along(f: Callable, primals: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> Any:
+    """The directional derivative, by reverse mode twice: torch does not nest its forward mode."""
+    value, pull = torch.func.vjp(f, *primals)[:2]
+    zeros = _pytree.tree_map(torch.zeros_like, value)
+    return torch.func.vjp(pull, zeros)[1](filled(primals, tangents))[0]
