@@ -42,7 +42,12 @@ class Run:
             self._reference, self._last_gain = loss, len(self.history)
         if self.callback is not None and self.callback(len(self.history) - 1, parameters, loss):
             return self.stop("the callback asked to")
-        return len(self.history) < self.steps
+        return self.left > 0
+
+    @property
+    def left(self) -> int:
+        """How many more steps there may be."""
+        return self.steps - len(self.history)
 
     def stop(self, reason: str) -> bool:
         """Say why; always False."""

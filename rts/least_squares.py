@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,33 +21,51 @@ def mean_square(residuals: Array) -> Array:
     return namespace(residuals).mean(residuals * residuals)
 
 
+class _Linear(NamedTuple):
+    """What is known of the residuals around a point: their mean square, and the normal equations JᵀJ and Jᵀr over n."""
+
+    value: float
+    matrix: np.ndarray
+    gradient: np.ndarray
+
+    def checked(self, start: bool) -> _Linear:
+        """The same, which must be finite."""
+        require(math.isfinite(self.value), f"the loss is {self.value}", start)
+        require(bool(np.isfinite(self.matrix).all()), "the Jacobian is not finite", start)
+        return self
+
+
 def levenberg_marquardt(residuals: Callable, parameters: Tree, engine: Engine, run: Run, jit: bool) -> None:
     """Normal equations with Marquardt's scaling and Nielsen's control of the damping (Madsen et al. 2004)."""
     vector, unflatten = _flatten(parameters)
     linearize, loss_at = _least_squares(lambda v: residuals(unflatten(v)), engine, run, jit)
-    value, matrix, gradient = linearize(vector)
-    going = run.record(unflatten(vector), value)
+    here = linearize(vector).checked(start=True)
+    going = run.record(unflatten(vector), here.value)
     damping, growth = FIRST_DAMPING, 2.0
+    promising = True
     while going:
-        if not (gradient.any() and matrix.any()):
+        if not (here.gradient.any() and here.matrix.any()):
             run.stop("the gradient is zero")
             return
-        delta, predicted, damping = _damped_step(matrix, gradient, damping)
+        delta, predicted, damping = _damped_step(here.matrix, here.gradient, damping)
         trial = vector + engine.constant(delta, vector)
-        trial_value = loss_at(trial)
+        # A trial after one that was accepted probably is, too: its normal equations come with its loss.
+        there = linearize(trial) if promising and run.left > 1 else None
+        trial_value = loss_at(trial) if there is None else there.value
         if not run.record(unflatten(trial), trial_value):
             return
-        gain = value - trial_value
-        if not gain > 0:  # Trials that are not finite, too.
+        gain = here.value - trial_value
+        promising = gain > 0  # Not where trials are not finite, too.
+        if not promising:
             damping, growth = damping * growth, growth * 2
             going = damping <= LARGEST_DAMPING or run.stop("no step lowers the loss")
-        elif gain <= run.tolerance * value:
+        elif gain <= run.tolerance * here.value:
             going = run.stop(f"the last step gained less than {run.tolerance:g} of the loss")
         else:
             ratio = gain / max(predicted, gain)
             damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
             vector = trial
-            value, matrix, gradient = linearize(vector)
+            here = (there or linearize(vector)).checked(start=False)
 
 
 def _least_squares(residuals: Callable, engine: Engine, run: Run, jit: bool) -> tuple[Callable, Callable]:
@@ -66,12 +85,9 @@ def _least_squares(residuals: Callable, engine: Engine, run: Run, jit: bool) -> 
     if jit:
         equations, loss = engine.jit(equations), engine.jit(loss)
 
-    def linearize(v: Array) -> tuple[float, np.ndarray, np.ndarray]:
+    def linearize(v: Array) -> _Linear:
         value, *rest = run.attempt(engine, equations, v)
-        matrix, gradient = (engine.to_numpy(x).astype(np.float64) for x in rest)
-        require(math.isfinite(value), f"the loss is {float(value)}", not run.history)
-        require(bool(np.isfinite(matrix).all()), "the Jacobian is not finite", not run.history)
-        return float(value), matrix, gradient
+        return _Linear(float(value), *(engine.to_numpy(x).astype(np.float64) for x in rest))
 
     return linearize, lambda v: float(run.attempt(engine, loss, v))
 

@@ -197,14 +197,33 @@ def test_no_jacobian_is_made_that_nobody_uses():
     start = torch.tensor([0.9, 0.9])
     rts.fit(residuals, start, method="lm", steps=1)
     assert traced == [True]
-    for options in (
-        {"steps": 2},
-        {"tolerance": 1.0},
-        {"callback": lambda step, p, loss: step == 1},
-    ):
-        traced.clear()
-        fit = rts.fit(residuals, start, method="lm", **options)
-        assert traced == [True, False] and fit.steps == 2
+    traced.clear()
+    rts.fit(residuals, start, method="lm", steps=2)
+    assert traced == [True, False]
+
+
+def test_residuals_are_computed_once_where_a_trial_is_accepted():
+    torch = _torch()
+    calls = []
+
+    def residuals(p):
+        derived = torch._C._functorch.is_functorch_wrapped_tensor(p)
+        calls.append("linearised" if derived else "valued")
+        return torch.stack([1 - p[0], 10 * (p[1] - p[0] ** 2)])
+
+    fit = rts.fit(residuals, torch.tensor([-1.2, 1.0]), method="lm", steps=12, tolerance=0)
+    best, expected = fit.history[0], ["linearised"]
+    assert fit.steps == 12
+    accepted, refused = True, 0
+    for value in fit.history[1:-1]:
+        after, accepted = accepted, value < best
+        refused += not accepted
+        expected.append("linearised" if after else "valued")
+        if accepted and not after:
+            expected.append("linearised")  # Its derivative was not known.
+        best = min(best, value)
+    assert refused > 0
+    assert calls == [*expected, "valued"]  # After the last there is no step to make.
 
 
 @targets
