@@ -193,10 +193,26 @@ def _splatted(
     splatter = check_plugin("rts.splatters", splatter, "splat")
     grid, fine = tuple(sampled.row.shape[1:]), sampled.supersample
     size = grid[0] - 2 * APRON, grid[1] - 2 * APRON
+    image = splatter.splat(*to_splats(sampled, parts, camera, window, beside))
+    image = image[APRON : grid[0] - APRON, APRON : grid[1] - APRON, :]
+    if fine > 1:
+        xp = namespace(image)
+        image = xp.mean(xp.reshape(image, (size[0] // fine, fine, size[1] // fine, fine, 4)), axis=(1, 3))
+    return image
+
+
+def to_splats(
+    sampled: Sampled, parts: Sequence[Part], camera: Camera, window: Camera, beside: Any = None
+) -> tuple[Array, Array, Array]:
+    """Positions (N, 3), rgba (N, 4) and row (K, H, W) of what was sampled, apron included, as splatters take them.
+
+    The arguments are those of `_splatted`.
+    """
+    grid = tuple(sampled.row.shape[1:])
     scene = parts, camera, window, sampled, beside
     engine, like = engine_of(scene), exemplar(scene)
     camera, window, sampled = constants((camera, window, sampled), engine, like)
-    wide = window.with_apron(size, APRON)
+    wide = window.with_apron((grid[0] - 2 * APRON, grid[1] - 2 * APRON), APRON)
 
     positions, colors = [], []
     for part, samples in zip(parts, sampled.samples, strict=True):
@@ -208,11 +224,7 @@ def _splatted(
         positions.append(wide.within(transform).project(local["position"], grid))
         colors.append(constants(rgba, engine, like))
     xp = namespace(sampled.row)
-    image = splatter.splat(xp.concat(positions), xp.concat(colors), sampled.row)
-    image = image[APRON : grid[0] - APRON, APRON : grid[1] - APRON, :]
-    if fine > 1:
-        image = xp.mean(xp.reshape(image, (size[0] // fine, fine, size[1] // fine, fine, 4)), axis=(1, 3))
-    return image
+    return xp.concat(positions), xp.concat(colors), sampled.row
 
 
 def _planned(layers: int | str) -> int:
