@@ -273,8 +273,10 @@ class Shader(Protocol):
 class Splatter(Protocol):
     """Turns shaded samples into an image that has derivatives at occlusion boundaries.
 
-    Optional member: `needed(covered, depth) -> (K, H, W) bool`, of host arrays (K, H, W) bool and float: the samples
+    Optional members: `needed(covered, depth) -> (K, H, W) bool`, of host arrays (K, H, W) bool and float: the samples
     that can reach the image, in value or derivative, where all are opaque and on pixel centres. Others are dropped.
+    `crops = True` says that `splat` takes a fourth argument `border`, the number of cells at each side that splat into
+    the image but are not part of it: the result is then (H − 2 border, W − 2 border, 4).
     """
 
     def splat(self, positions: Array, rgba: Array, row: Array) -> Array:

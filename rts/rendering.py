@@ -26,6 +26,7 @@ from rts.preparing import PreparedParts
 from rts.protocols import Array, Engine, GBuffer, Part, Sampled, Samples
 from rts.pruning import Needed, as_needed, needed_by, prune
 from rts.sampling import merge, reads_of
+from rts.splatting import inside
 
 APRON = 2
 """Cells sampled beyond the image's border on each side: the first splats into it, and pairing looks at the second."""
@@ -193,8 +194,9 @@ def _splatted(
     splatter = check_plugin("rts.splatters", splatter, "splat")
     grid, fine = tuple(sampled.row.shape[1:]), sampled.supersample
     size = grid[0] - 2 * APRON, grid[1] - 2 * APRON
-    image = splatter.splat(*to_splats(sampled, parts, camera, window, beside))
-    image = image[APRON : grid[0] - APRON, APRON : grid[1] - APRON, :]
+    splats = to_splats(sampled, parts, camera, window, beside)
+    crops = getattr(splatter, "crops", False)
+    image = splatter.splat(*splats, border=APRON) if crops else inside(splatter.splat(*splats), APRON)
     if fine > 1:
         xp = namespace(image)
         image = xp.mean(xp.reshape(image, (size[0] // fine, fine, size[1] // fine, fine, 4)), axis=(1, 3))
@@ -223,6 +225,8 @@ def to_splats(
         check_shaded(rgba, local["position"].shape[0], part.shader)
         positions.append(wide.within(transform).project(local["position"], grid))
         colors.append(constants(rgba, engine, like))
+    if len(parts) == 1:
+        return positions[0], colors[0], sampled.row
     xp = namespace(sampled.row)
     return xp.concat(positions), xp.concat(colors), sampled.row
 

@@ -18,7 +18,7 @@ import math
 import operator
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -72,6 +72,7 @@ class Kernel(abc.ABC):
     sigma: float = SIGMA
     epsilon: float = EPSILON
     calibration: float | None = 1.0
+    crops: ClassVar[bool] = True
 
     def __post_init__(self):
         if not (_is_real(self.sigma) and LEAST_SIGMA <= self.sigma <= LARGEST_SIGMA):
@@ -81,14 +82,20 @@ class Kernel(abc.ABC):
         if self.calibration is not None and not (_is_real(self.calibration) and self.calibration > 0):
             raise InputError(f"calibration is {self.calibration}; expected a positive number, or None for the exact")
 
-    def splat(self, positions: Array, rgba: Array, row: Array) -> Array:
+    def splat(self, positions: Array, rgba: Array, row: Array, border: int = 0) -> Array:
         """See `rts.protocols.Splatter`."""
         positions, rgba, row = check_splats(positions, rgba, row)
-        return _nothing(rgba, row) if rgba.shape[0] == 0 else self.accumulate(positions, rgba, row)
+        if rgba.shape[0] == 0:
+            return inside(_nothing(rgba, row), border)
+        return self.image(positions, rgba, row, border)
+
+    def image(self, positions: Array, rgba: Array, row: Array, border: int) -> Array:
+        """`splat` of at least one sample."""
+        return inside(self.accumulate(positions, rgba, row), border)
 
     @abc.abstractmethod
     def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
-        """`splat` of at least one sample."""
+        """The image of all cells, of at least one sample."""
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.protocols.Splatter`: fronts, and the hidden layers around targets that are not `plain`."""
@@ -324,6 +331,12 @@ def check_splats(positions: Array, rgba: Array, row: Array) -> tuple[Array, Arra
         raise InputError(f"row has dtype {row.dtype}; expected signed integers, -1 where a cell is empty")
     positions, rgba, row = constants((*given, row), engine_of(given, row), exemplar(given))
     return positions, rgba, row
+
+
+def inside(image: Array, border: int) -> Array:
+    """An image (H, W, C) without so many rows and columns at each side."""
+    height, width = image.shape[:2]
+    return image[border : height - border, border : width - border, ...] if border else image
 
 
 def _nothing(rgba: Array, row: Array) -> Array:

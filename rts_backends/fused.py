@@ -5,6 +5,7 @@ What fits is float32 or float64 in the memory of the host. Second derivatives ar
 
 from __future__ import annotations
 
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -16,14 +17,14 @@ from rts_backends.fused_kernels import Settings, Splats
 
 
 class _Fused(splatting.Kernel):
-    """`accumulate` by compiled kernels, before a class of `rts.splatting` in the order of bases."""
+    """`image` by compiled kernels, before a class of `rts.splatting` in the order of bases."""
 
     kind: ClassVar[str]
 
-    def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
+    def image(self, positions: Array, rgba: Array, row: Array, border: int) -> Array:
         """See `rts.splatting.Kernel`."""
-        specification = super().accumulate  # pyright: ignore[reportAbstractUsage]
-        settings = Settings(self.kind, self.sigma, self.epsilon, self.gamma)
+        specification = partial(super().image, border=border)
+        settings = Settings(self.kind, self.sigma, self.epsilon, self.gamma, border)
         engine = engine_of(positions, rgba, row).name
         if engine == "torch":
             from rts_backends import fused_torch
@@ -34,7 +35,7 @@ class _Fused(splatting.Kernel):
             from rts_backends import fused_jax
 
             if fused_jax.fits(positions, rgba):
-                return fused_jax.splat(settings, positions, rgba, row)
+                return splatting.inside(fused_jax.splat(settings._replace(border=0), positions, rgba, row), border)
         elif engine == "numpy" and positions.dtype == rgba.dtype and positions.dtype in (np.float32, np.float64):
             return Splats(settings, positions, rgba, row).image()
         return specification(positions, rgba, row)

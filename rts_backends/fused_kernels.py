@@ -30,12 +30,14 @@ class Settings(NamedTuple):
         sigma: standard deviation, pixels.
         epsilon: excess of the weights' sum over one.
         gamma: the calibration.
+        border: rows and columns at each side of the cells that are no part of the image.
     """
 
     kind: str
     sigma: float
     epsilon: float
     gamma: float
+    border: int = 0
 
 
 class Choices(NamedTuple):
@@ -81,7 +83,7 @@ class Splats:
         if row.size and row.max() >= len(positions):
             raise InputError(f"row refers to sample {row.max()} of {len(positions)}; expected indices below that")
         self.positions, self.rgba, self.row = _frozen(positions), _frozen(rgba), _frozen(row, np.int32)
-        self.visible = settings.kind == "visible"
+        self.visible, self.border = settings.kind == "visible", settings.border
         scale = 1 / (2 * settings.sigma**2)
         peak = math.sqrt(1 + settings.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
         self._numbers = tuple(positions.dtype.type(x) for x in (scale, peak, settings.gamma))
@@ -125,14 +127,19 @@ class Splats:
             parallel(choosing.choose, height, *given, work=50 * len(columns))
         return Choices(marks, offsets, columns, ranges)
 
+    @property
+    def _size(self) -> tuple[int, int]:
+        """Of the image."""
+        height, width = (max(0, n - 2 * self.border) for n in self.row.shape[1:])
+        return height, width
+
     def image(self) -> np.ndarray:
-        """(H, W, 4) premultiplied."""
-        _, height, width = self.row.shape
-        image = np.empty((height, width, 4), self.positions.dtype)
+        """(H, W, 4) premultiplied, H and W less than those of the cells by both borders."""
+        image = np.empty((*self._size, 4), self.positions.dtype)
         if image.size:
-            parallel(stencil.forward, height, *self._stencil, image)
+            parallel(stencil.forward, len(image), *self._stencil, self.border, image)
             if len(self.choices.columns):
-                parallel(mixed.forward, height, *self._mixed, image, work=self._mixed_work)
+                parallel(mixed.forward, len(image), *self._mixed, self.border, image, work=self._mixed_work)
         return image
 
     def vjp(
@@ -148,26 +155,26 @@ class Splats:
         )
         if self.row.size:
             g = _frozen(g)
-            parallel(stencil.pull, height, *self._stencil, self.choices.mixed, g, *found)
+            parallel(stencil.pull, height, *self._stencil, self.choices.mixed, self.border, g, *found)
             if count := len(self.choices.columns):
                 adjoints = np.empty((count, 3, 5), g.dtype)
-                parallel(mixed.adjoint, height, *self._mixed, g, adjoints, work=self._mixed_work)
+                parallel(mixed.adjoint, height, *self._mixed, self.border, g, adjoints, work=self._mixed_work)
                 parallel(mixed.pull, height, *self._mixed, adjoints, *found, work=self._mixed_work)
         return found[0] if wanted[0] else None, found[1] if wanted[1] else None
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None) -> np.ndarray:
         """Tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4); None for zeros."""
-        _, height, width = self.row.shape
         count = next(len(t) for t in (t_positions, t_rgba) if t is not None)
-        out = np.empty((count, height, width, 4), self.positions.dtype)
+        out = np.empty((count, *self._size, 4), self.positions.dtype)
         if out.size:
             tangents = tuple(
                 _frozen(np.empty((count, 0, size), out.dtype) if t is None else t)
                 for t, size in ((t_positions, 3), (t_rgba, 4))
             )
-            parallel(stencil.push, height, *self._stencil, *tangents, out)
+            parallel(stencil.push, out.shape[1], *self._stencil, *tangents, self.border, out)
             if len(self.choices.columns):
-                parallel(mixed.push, height, *self._mixed, *tangents, out, work=self._mixed_work * count)
+                work = self._mixed_work * count
+                parallel(mixed.push, out.shape[1], *self._mixed, *tangents, self.border, out, work=work)
         return out
 
     @cached_property

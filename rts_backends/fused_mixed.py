@@ -42,34 +42,40 @@ def _sums(total, positions, rgba, row, y, x, choice, scale, peak, gamma):
 
 
 @kernel
-def forward(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, image):
-    """Mixed targets of rows [start, stop) of the image (H, W, 4)."""
+def forward(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, border, image):
+    """Mixed targets of rows [start, stop) of the image (H, W, 4), so much smaller than the cells at each side."""
     total = np.empty((3, 5), image.dtype)
     one = image.dtype.type(1)
-    for y in range(start, stop):
+    for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
             x = columns[d]
+            if not 0 <= x - border < image.shape[1]:
+                continue
             _sums(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
             for c in range(4):
                 back = total[1, c] + (one - total[1, 3]) * total[2, c]
-                image[y, x, c] = total[0, c] + (one - total[0, 3]) * back
+                image[y - border, x - border, c] = total[0, c] + (one - total[0, 3]) * back
 
 
 @kernel
-def adjoint(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, g, adjoints):
-    """Adjoints (M, 3, 5) of the sums of mixed targets from that of the image."""
+def adjoint(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, border, g, adjoints):
+    """Adjoints (M, 3, 5) of the sums of mixed targets from that of the image, zero beyond it."""
     zero, one = g.dtype.type(0), g.dtype.type(1)
     total = np.empty((3, 5), g.dtype)
     for y in range(start, stop):
         for d in range(offsets[y], offsets[y + 1]):
             x, a = columns[d], adjoints[d]
+            if not (0 <= y - border < g.shape[0] and 0 <= x - border < g.shape[1]):
+                a[:] = zero
+                continue
             _sums(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
             shown, through = one - total[0, 3], (one - total[0, 3]) * (one - total[1, 3])
             front, surface = zero, zero
             for c in range(4):
-                front += g[y, x, c] * (total[1, c] + (one - total[1, 3]) * total[2, c])
-                surface += g[y, x, c] * total[2, c]
-                a[0, c], a[1, c], a[2, c] = g[y, x, c], shown * g[y, x, c], through * g[y, x, c]
+                h = g[y - border, x - border, c]
+                front += h * (total[1, c] + (one - total[1, 3]) * total[2, c])
+                surface += h * total[2, c]
+                a[0, c], a[1, c], a[2, c] = h, shown * h, through * h
             a[0, 3] -= front
             a[1, 3] -= shown * surface
             for b in range(3):
@@ -111,21 +117,25 @@ def pull(
 
 
 @kernel
-def push(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, t_positions, t_rgba, out):
+def push(
+    start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, t_positions, t_rgba, border, out
+):
     """Mixed targets of rows [start, stop) of the tangents (T, H, W, 4)."""
     one = out.dtype.type(1)
     total, changes = np.empty((3, 5), out.dtype), np.empty((len(out), 3, 5), out.dtype)
-    for y in range(start, stop):
+    for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
             x = columns[d]
+            if not 0 <= x - border < out.shape[2]:
+                continue
             _sums(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
             _changes(changes, total, positions, rgba, row, y, x, choices[d], scale, peak, gamma, t_positions, t_rgba)
             for t in range(len(out)):
-                change = changes[t]
+                change, pixel = changes[t], out[t, y - border, x - border]
                 for c in range(4):
                     back = total[1, c] + (one - total[1, 3]) * total[2, c]
                     d_back = change[1, c] - change[1, 3] * total[2, c] + (one - total[1, 3]) * change[2, c]
-                    out[t, y, x, c] = change[0, c] - change[0, 3] * back + (one - total[0, 3]) * d_back
+                    pixel[c] = change[0, c] - change[0, 3] * back + (one - total[0, 3]) * d_back
 
 
 @compiled

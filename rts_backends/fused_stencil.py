@@ -30,17 +30,17 @@ X, Y, TANGENT = (PITCH * p for p in (5, 6, 7))
 
 
 @kernel
-def forward(start, stop, positions, rgba, row, scale, peak, gamma, image):
-    """Target rows [start, stop) of the image (H, W, 4)."""
-    layers, _, width = row.shape
+def forward(start, stop, positions, rgba, row, scale, peak, gamma, border, image):
+    """Rows [start, stop) of the image (H, W, 4), which is so much smaller than the cells at each side."""
+    layers, (_, width, _) = len(row), image.shape
     sources, total = np.empty(3 * layers * SOURCE, image.dtype), np.empty(SUMS, image.dtype)
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
         last = start - 4  # The last source row that is not empty: where three are, there is nothing to compute.
         for y in range(start - 1, stop + 1):
             for k in range(layers):
-                s = slot(sources, k, y, SOURCE)
-                if load(s, positions, rgba, row, k, y, left - 1, count + 2, scale, peak, gamma):
+                s, at = slot(sources, k, y, SOURCE), left + border - 1
+                if load(s, positions, rgba, row, k, y + border, at, count + 2, scale, peak, gamma):
                     last = y
             if y > start and y - last > 2:
                 image[y - 1, left : left + count] = image.dtype.type(0)
@@ -81,14 +81,15 @@ def adjoint_row(to, total, g, layers, count):
 
 
 @compiled
-def load_image(s, image, mixed, y, first, count):
-    """A row of an image as planes, zero where targets are mixed."""
-    _, width, _ = image.shape
+def load_image(s, image, mixed, border, y, first, count):
+    """Cells of an image as planes, zero beyond it and where targets are mixed."""
+    height, width, _ = image.shape
+    within = 0 <= y - border < height
     for j in range(count):
         x = first + j
-        if 0 <= x < width and not mixed[y, x]:
+        if within and 0 <= x - border < width and not mixed[y, x]:
             for c in range(4):
-                s[c * PITCH + j] = image[y, x, c]
+                s[c * PITCH + j] = image[y - border, x - border, c]
         else:
             for c in range(4):
                 s[c * PITCH + j] = s.dtype.type(0)
@@ -120,7 +121,7 @@ def gather(to, s, above, level, below, count):
 
 
 @kernel
-def pull(start, stop, positions, rgba, row, scale, peak, gamma, mixed, g, g_positions, g_rgba):
+def pull(start, stop, positions, rgba, row, scale, peak, gamma, mixed, border, g, g_positions, g_rgba):
     """Gradients of what source rows [start, stop) give to targets that are not mixed; each cell collects its own."""
     layers, height, width = row.shape
     sources, total = np.empty(3 * layers * SOURCE, g.dtype), np.empty(SUMS, g.dtype)
@@ -139,7 +140,7 @@ def pull(start, stop, positions, rgba, row, scale, peak, gamma, mixed, g, g_posi
             adjoint = slot(adjoints, 0, y - 1, SUMS)
             if 1 <= y <= height and y - last <= 2:
                 normalised_sums(total, sources, layers, y - 1, count + 2)
-                load_image(given, g, mixed, y - 1, left - 1, count + 2)
+                load_image(given, g, mixed, border, y - 1, left - 1, count + 2)
                 adjoint_row(adjoint, total, given, layers, count + 2)
             else:
                 adjoint[:] = g.dtype.type(0)
@@ -225,10 +226,9 @@ def tangent_row(to, total, layers, count):
 
 
 @kernel
-def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_rgba, out):
-    """Target rows [start, stop) of the tangents (T, H, W, 4); of absent tangents there are T of no rows."""
-    layers, _, width = row.shape
-    many = len(out)
+def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_rgba, border, out):
+    """Rows [start, stop) of the tangents (T, H, W, 4); of absent tangents there are T of no rows."""
+    layers, (many, _, width, _) = len(row), out.shape
     sources, total, change = (
         np.empty(3 * layers * SOURCE, out.dtype),
         np.empty(SUMS, out.dtype),
@@ -241,12 +241,12 @@ def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_r
         last = start - 4  # As in `forward`.
         for y in range(start - 1, stop + 1):
             for k in range(layers):
-                s = slot(sources, k, y, SOURCE)
-                if load(s, positions, rgba, row, k, y, left - 1, count + 2, scale, peak, gamma):
+                s, at = slot(sources, k, y, SOURCE), left + border - 1
+                if load(s, positions, rgba, row, k, y + border, at, count + 2, scale, peak, gamma):
                     last = y
                 for n in range(many):
                     to = slot(tangents[n], k, y, TANGENT)
-                    load_tangent(to, s, t_positions[n], t_rgba[n], row, k, y, left - 1, count + 2, slope)
+                    load_tangent(to, s, t_positions[n], t_rgba[n], row, k, y + border, at, count + 2, slope)
             if y <= start:
                 continue
             if y - last > 2:

@@ -42,8 +42,8 @@ def cells(layers, size=(9, 11), seed=0, dtype=np.float64, holes=0.2, middle_hole
     return positions.astype(dtype), rgba.astype(dtype), row
 
 
-def compiled(splatter, scene):
-    settings = Settings(splatter.kind, splatter.sigma, splatter.epsilon, splatter.gamma)
+def compiled(splatter, scene, border=0):
+    settings = Settings(splatter.kind, splatter.sigma, splatter.epsilon, splatter.gamma, border)
     return Splats(settings, *scene)
 
 
@@ -57,17 +57,19 @@ def noise(*shape, dtype=np.float64, seed=7):
     return np.random.default_rng(seed).normal(size=shape).astype(dtype)
 
 
-def check_against_specification(splatter, scene, dtype):
+def check_against_specification(splatter, scene, dtype, border=0):
     positions, rgba, row = scene
-    splats, reference = compiled(splatter, scene), specification(splatter)
+    splats, reference = compiled(splatter, scene, border), specification(splatter)
     image, cells_ = splats.image(), torch.tensor(row)
     g = noise(*image.shape, dtype=dtype)
     variables = [torch.tensor(x, requires_grad=True) for x in (positions, rgba)]
-    expected = reference.splat(*variables, cells_)
+    expected = reference.splat(*variables, cells_, border)
     gradients = torch.autograd.grad(expected, variables, torch.tensor(g))
     tangents = [noise(3, *x.shape, dtype=dtype) for x in (positions, rgba)]
     pushed = [
-        torch.func.jvp(lambda p, c: reference.splat(p, c, cells_), tuple(map(torch.tensor, (positions, rgba))), t)[1]
+        torch.func.jvp(
+            lambda p, c: reference.splat(p, c, cells_, border), tuple(map(torch.tensor, (positions, rgba))), t
+        )[1]
         for t in zip(*map(torch.tensor, tangents), strict=True)
     ]
     in_image, in_derivative = TOLERANCE[dtype]
@@ -98,6 +100,15 @@ def test_image_vjp_and_jvp_are_those_of_the_specification(kind, layers, dtype):
 @pytest.mark.parametrize("kind", KINDS)
 def test_images_of_any_size_are_those_of_the_specification(kind, size):
     check_against_specification(KINDS[kind](), cells(2, size), np.float64)
+
+
+@pytest.mark.parametrize("border", [1, 2, 5])
+@pytest.mark.parametrize("kind", KINDS)
+def test_cells_of_the_border_splat_into_the_image_but_are_no_part_of_it(kind, border):
+    scene = cells(3, (17, 141), dtype=np.float32)
+    check_against_specification(KINDS[kind](), scene, np.float32, border)
+    whole, splatter = KINDS[kind]().splat(*scene), KINDS[kind]()
+    np.testing.assert_array_equal(splatter.splat(*scene, border=border), splatting.inside(whole, border))
 
 
 @pytest.mark.parametrize("kind", KINDS)
