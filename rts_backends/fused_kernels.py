@@ -91,7 +91,7 @@ class Splats:
             self.choices = choices
 
     @property
-    def _stencil(self) -> tuple:
+    def plain_arguments(self) -> tuple:
         """Arguments of the stencil's kernels; of `visible` no plain target takes a hidden layer."""
         return self.positions, self.rgba, self.row[:1] if self.visible else self.row, *self._numbers
 
@@ -101,7 +101,8 @@ class Splats:
         return 50 * len(self.choices.columns)
 
     @property
-    def _mixed(self) -> tuple:
+    def mixed_arguments(self) -> tuple:
+        """Arguments of the kernels of mixed targets."""
         return self.positions, self.rgba, self.row, *self._numbers, *self.choices[1:]
 
     @cached_property
@@ -137,9 +138,9 @@ class Splats:
         """(H, W, 4) premultiplied, H and W less than those of the cells by both borders."""
         image = np.empty((*self._size, 4), self.positions.dtype)
         if image.size:
-            parallel(stencil.forward, len(image), *self._stencil, self.border, image)
+            parallel(stencil.forward, len(image), *self.plain_arguments, self.border, image)
             if len(self.choices.columns):
-                parallel(mixed.forward, len(image), *self._mixed, self.border, image, work=self._mixed_work)
+                parallel(mixed.forward, len(image), *self.mixed_arguments, self.border, image, work=self._mixed_work)
         return image
 
     def vjp(
@@ -155,11 +156,11 @@ class Splats:
         )
         if self.row.size:
             g = _frozen(g)
-            parallel(stencil.pull, height, *self._stencil, self.choices.mixed, self.border, g, *found)
+            parallel(stencil.pull, height, *self.plain_arguments, self.choices.mixed, self.border, g, *found)
             if count := len(self.choices.columns):
                 adjoints = np.empty((count, 3, 5), g.dtype)
-                parallel(mixed.adjoint, height, *self._mixed, self.border, g, adjoints, work=self._mixed_work)
-                parallel(mixed.pull, height, *self._mixed, adjoints, *found, work=self._mixed_work)
+                parallel(mixed.adjoint, height, *self.mixed_arguments, self.border, g, adjoints, work=self._mixed_work)
+                parallel(mixed.pull, height, *self.mixed_arguments, adjoints, *found, work=self._mixed_work)
         return found[0] if wanted[0] else None, found[1] if wanted[1] else None
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None) -> np.ndarray:
@@ -171,10 +172,10 @@ class Splats:
                 _frozen(np.empty((count, 0, size), out.dtype) if t is None else t)
                 for t, size in ((t_positions, 3), (t_rgba, 4))
             )
-            parallel(stencil.push, out.shape[1], *self._stencil, *tangents, self.border, out)
+            parallel(stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.border, out)
             if len(self.choices.columns):
                 work = self._mixed_work * count
-                parallel(mixed.push, out.shape[1], *self._mixed, *tangents, self.border, out, work=work)
+                parallel(mixed.push, out.shape[1], *self.mixed_arguments, *tangents, self.border, out, work=work)
         return out
 
     @cached_property

@@ -17,7 +17,7 @@ def _splat(positions, i, y, x, u, v, scale, peak, gamma):
 
 
 @compiled
-def _sums(total, positions, rgba, row, y, x, choice, scale, peak, gamma):
+def sums_of(total, positions, rgba, row, y, x, choice, scale, peak, gamma):
     """Sums (3, 5) of a target's buffers, their colours over the weight, taken as at least one."""
     _, height, width = row.shape
     one = total.dtype.type(1)
@@ -51,7 +51,7 @@ def forward(start, stop, positions, rgba, row, scale, peak, gamma, offsets, colu
             x = columns[d]
             if not 0 <= x - border < image.shape[1]:
                 continue
-            _sums(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
+            sums_of(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
             for c in range(4):
                 back = total[1, c] + (one - total[1, 3]) * total[2, c]
                 image[y - border, x - border, c] = total[0, c] + (one - total[0, 3]) * back
@@ -68,7 +68,7 @@ def adjoint(start, stop, positions, rgba, row, scale, peak, gamma, offsets, colu
             if not (0 <= y - border < g.shape[0] and 0 <= x - border < g.shape[1]):
                 a[:] = zero
                 continue
-            _sums(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
+            sums_of(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
             shown, through = one - total[0, 3], (one - total[0, 3]) * (one - total[1, 3])
             front, surface = zero, zero
             for c in range(4):
@@ -128,8 +128,8 @@ def push(
             x = columns[d]
             if not 0 <= x - border < out.shape[2]:
                 continue
-            _sums(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
-            _changes(changes, total, positions, rgba, row, y, x, choices[d], scale, peak, gamma, t_positions, t_rgba)
+            sums_of(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
+            changes_of(changes, total, positions, rgba, row, y, x, choices[d], scale, peak, gamma, t_positions, t_rgba)
             for t in range(len(out)):
                 change, pixel = changes[t], out[t, y - border, x - border]
                 for c in range(4):
@@ -139,7 +139,7 @@ def push(
 
 
 @compiled
-def _changes(changes, total, positions, rgba, row, y, x, choice, scale, peak, gamma, t_positions, t_rgba):
+def changes_of(changes, total, positions, rgba, row, y, x, choice, scale, peak, gamma, t_positions, t_rgba):
     """Tangents (T, 3, 5) of the normalised sums of a target's buffers."""
     _, height, width = row.shape
     zero, one = total.dtype.type(0), total.dtype.type(1)

@@ -25,6 +25,9 @@ from rts_backends.fused_rows import (
     tile,
 )
 
+COLORS, ALPHA = (0,) * 5, (0,) * 2
+"""The planes of a tangent that count, as tuples whose length compiled code knows: all five, or alpha and the weight."""
+
 X, Y, TANGENT = (PITCH * p for p in (5, 6, 7))
 """Places in a tangent's slot, after five planes D: w (D + (u X + v Y) colour) is the tangent of a weighted colour."""
 
@@ -170,9 +173,9 @@ def scatter(g_positions, g_rgba, row, left, found, s, slope, count):
 
 
 @compiled
-def load_tangent(to, s, t_positions, t_rgba, row, k, y, first, count, slope):
+def load_tangent(to, s, t_positions, t_rgba, row, k, y, first, count, slope, planes=COLORS):
     """Fill a tangent's slot beside its source's."""
-    zero = to.dtype.type(0)
+    zero, lowest = to.dtype.type(0), 5 - len(planes)
     _, height, width = row.shape
     for j in range(count):
         x = first + j
@@ -180,17 +183,17 @@ def load_tangent(to, s, t_positions, t_rgba, row, k, y, first, count, slope):
         move, tint = i >= 0 and len(t_positions) > 0, i >= 0 and len(t_rgba) > 0
         to[X + j] = slope * t_positions[i, 0] if move else zero
         to[Y + j] = slope * t_positions[i, 1] if move else zero
-        for c in range(4):
+        for c in range(lowest, 4):
             to[c * PITCH + j] = t_rgba[i, c] if tint else zero
         to[4 * PITCH + j] = zero
     for j in range(count):
         along = s[RX + j] * to[X + j] + s[RY + j] * to[Y + j]
-        for c in range(5):
+        for c in range(lowest, 5):
             to[c * PITCH + j] -= along * s[c * PITCH + j]
 
 
 @compiled
-def add_tangent_row(to, s, tangent, v, count):
+def add_tangent_row(to, s, tangent, v, count, planes=COLORS):
     """The tangent of `add_row`."""
     wy, dv = s[WY + (v + 1) * PITCH :], s.dtype.type(v)
     for j in range(count):
@@ -198,7 +201,7 @@ def add_tangent_row(to, s, tangent, v, count):
         d0 = w0 * (dv * tangent[Y + j] + tangent[X + j])
         d1 = w1 * (dv * tangent[Y + j + 1])
         d2 = w2 * (dv * tangent[Y + j + 2] - tangent[X + j + 2])
-        for c in range(5):
+        for c in range(5 - len(planes), 5):
             p = c * PITCH + j
             to[p] += (
                 w0 * tangent[p] + w1 * tangent[p + 1] + w2 * tangent[p + 2] + d0 * s[p] + d1 * s[p + 1] + d2 * s[p + 2]
@@ -206,21 +209,21 @@ def add_tangent_row(to, s, tangent, v, count):
 
 
 @compiled
-def tangent_row(to, total, layers, count):
+def tangent_row(to, total, layers, count, planes=COLORS):
     """The tangent of a row of the image, in the first planes of `to`, from those of both buffers' sums."""
-    zero, one = to.dtype.type(0), to.dtype.type(1)
+    zero, one, lowest = to.dtype.type(0), to.dtype.type(1), 5 - len(planes)
     for b in range(min(layers, 2)):
         d, s = to[b * SUM :], total[b * SUM :]
         for j in range(count):
             over = one / max(s[ONE + j], one)
             change = zero if s[ONE + j] < one else d[ONE + j]
-            for c in range(4):
+            for c in range(lowest, 4):
                 p = c * PITCH + j
                 d[p] = (d[p] - change * s[p]) * over
     if layers > 1:
         for j in range(count):
             through, change = one - total[3 * PITCH + j], to[3 * PITCH + j]
-            for c in range(4):
+            for c in range(lowest, 4):
                 p = c * PITCH + j
                 to[p] += through * to[SUM + p] - change * total[SUM + p]
 
