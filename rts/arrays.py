@@ -187,12 +187,19 @@ def unit(x: Array, axis: int = -1) -> Array:
     return x / xp.sqrt(safe)
 
 
+def offered(name: str, *arguments: Any) -> Array | None:
+    """What an optional member of the arguments' engine gives for them; None where there is none, or it declines."""
+    known = getattr(engine_of([x for x in arguments if hasattr(x, "dtype")]), name, None)
+    return None if known is None else known(*arguments)
+
+
 # Elementwise, since matrix units of some devices round float32 products to fewer bits.
 
 
 def matmul(a: Array, b: Array) -> Array:
     """Product of two small matrices in full precision."""
-    return namespace(a, b).sum(a[:, :, None] * b[None, :, :], axis=1)
+    found = offered("matmul", a, b)
+    return found if found is not None else namespace(a, b).sum(a[:, :, None] * b[None, :, :], axis=1)
 
 
 def affine(row: Array, points: Array) -> Array:
@@ -212,6 +219,31 @@ def take(rows: Array, index: Array) -> Array:
     """(M, C): the rows of (V, C) that (M,) integers name."""
     known = getattr(engine_of(rows, index), "take", None)
     return namespace(rows, index).take(rows, index, axis=0) if known is None else known(rows, index)
+
+
+def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
+    """(N, C): c + w₀ (a − c) + w₁ (b − c), for the rows a, b, c of (V, C) that three columns of `ids` name.
+
+    Args:
+        rows: (V, C) float.
+        ids: (N, I) integers.
+        column: the first of the three.
+        weights: (N, W) float, the first two of which count.
+    """
+    if isinstance(rows, np.ndarray) and isinstance(ids, np.ndarray):
+        from rts import interpolation
+
+        return interpolation.interpolate(rows, ids, column, weights)
+    known = getattr(engine_of(rows, ids), "interpolate", None)
+    found = None if known is None else known(rows, ids, column, weights)
+    if found is not None:
+        return found
+    xp = namespace(rows, ids)
+    # One gather of all corners: its gradient fills one array of the size of the mesh, instead of three.
+    index = xp.reshape(ids[:, column : column + 3], (-1,))
+    corners = xp.reshape(take(rows, index), (-1, 3, rows.shape[1]))
+    a, b, c = corners[:, 0, :], corners[:, 1, :], corners[:, 2, :]
+    return c + weights[:, 0:1] * (a - c) + weights[:, 1:2] * (b - c)
 
 
 def projective_map(rows: Array, points: Array) -> Array:

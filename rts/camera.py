@@ -311,11 +311,13 @@ class Camera(NamedTuple):
         Returns:
             (N, 3). Points on the plane of the camera's centre have no image; they give finite values.
         """
-        height, width = size
-        matrix = matmul(self.projection, self.view)
-        xp, x, y, w = namespace(matrix), matrix[0, :], matrix[1, :], matrix[3, :]
-        rows = xp.stack([(w + x) * (width / 2), (w - y) * (height / 2), w, -self.view[2, :]])
-        return projective_map(rows, points)
+        (height, width), p = size, self.projection
+        xp, x, y, w = namespace(p), p[0, :], p[1, :], p[3, :]
+        depth = np.array([0, 0, -1, 0]) if is_constant(p) else engine_of(p).constant(np.array([0.0, 0, -1, 0]), p)
+        # A constant projection is multiplied out in NumPy.
+        to_pixels = xp.stack([(w + x) * (width / 2), (w - y) * (height / 2), w, depth])
+        _, matrices = promote(to_pixels, self.view)
+        return projective_map(matmul(*matrices), points)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""

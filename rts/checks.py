@@ -16,7 +16,7 @@ from rts.errors import InputError
 from rts.protocols import Array, Part
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}
-"""Rough memory of one cell of one layer through sampling, shading and splatting in array code; compiled, it is a fraction."""
+"""Rough memory of a cell of a layer through sampling, shading and splatting in array code; compiled, it is less."""
 
 
 def _memory() -> float:

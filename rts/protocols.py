@@ -298,8 +298,9 @@ class Engine(Protocol):
 
     Optional members: `take_error() -> RtsError | None`, the last error raised inside a host call, where the framework
     wraps such errors in its own; `traced(x) -> bool`, whether an array has a shape but not yet a value;
-    `affine_map(rows, points)`, `take(rows, index)` and `projective_map(rows, points)`, the same as in `rts.arrays`, in
-    full precision but faster (the last may give None, for arrays that it does not know).
+    and functions of `rts.arrays` and `rts.transforms` in full precision but faster: `matmul(a, b)`, `rigid(pose, center)`,
+    `affine_map(rows, points)`, `take(rows, index)` and `projective_map(rows, points)`; they may give None, for arrays
+    that they do not know.
 
     The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the
     user has imported that module.

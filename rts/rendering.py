@@ -117,10 +117,10 @@ def sample(
         samplers, entries = [check_plugin("rts.samplers", sampler, "sample")] * len(parts), [None] * len(parts)
     else:
         samplers, entries = prepared.samplers, prepared.entries
-    # Every part is sampled by the one engine, and by the very matrices that samples are projected with.
-    camera = constants(camera, engine_of(parts, camera), exemplar(parts, camera))
     grid = height + 2 * APRON, width + 2 * APRON
+    # Every part is sampled by the one engine, and by the very views that samples are projected with.
     wide = camera.with_apron((height, width), APRON)
+    wide = constants(wide, engine_of(parts, camera), exemplar(parts, camera))
 
     def taken(count: int, needed: Needed | None) -> Sampled:
         samples = []
@@ -213,8 +213,9 @@ def to_splats(
     grid = tuple(sampled.row.shape[1:])
     scene = parts, camera, window, sampled, beside
     engine, like = engine_of(scene), exemplar(scene)
-    camera, window, sampled = constants((camera, window, sampled), engine, like)
     wide = window.with_apron((grid[0] - 2 * APRON, grid[1] - 2 * APRON), APRON)
+    wide = wide._replace(view=constants(wide.view, engine, like))
+    camera, sampled = constants((camera, sampled), engine, like)
 
     positions, colors = [], []
     for part, samples in zip(parts, sampled.samples, strict=True):

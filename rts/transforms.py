@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import is_constant, matmul, namespace, promote, unit
+from rts.arrays import is_constant, matmul, namespace, offered, promote, unit
 from rts.errors import InputError
 from rts.protocols import Array
 
@@ -149,7 +149,14 @@ def rigid(pose: Any, center: Any = (0.0, 0.0, 0.0)) -> Array:
     shape = tuple(getattr(pose, "shape", ()))
     if shape != (6,):
         raise InputError(f"pose has shape {shape}; expected (6,): rotation vector, translation")
-    xp, (pose, center) = promote(pose, center)
+    _, (pose, center) = promote(pose, center)
+    found = offered("rigid", pose, center)
+    return rigid_by_arrays(pose, center) if found is None else found
+
+
+def rigid_by_arrays(pose: Array, center: Array) -> Array:
+    """`rigid` of arrays (6,) and (3,), in array-API code."""
+    xp = namespace(pose, center)
     x, y, z = pose[0], pose[1], pose[2]
     square = x * x + y * y + z * z
     # Below a tenth of a radian the series is exact to rounding; the square root is kept away from zero, where its

@@ -14,7 +14,7 @@ from torch.utils import _pytree
 from rts.arrays import leaves, map_leaves
 from rts.protocols import ArraySpec, Tree
 from rts.records import STATIC_FIELDS, join_record, split_record
-from rts_backends.torch_functions import quick
+from rts_backends.torch_functions import quick, transformed
 
 for _cls in STATIC_FIELDS:
     _pytree.register_pytree_node(
@@ -105,6 +105,19 @@ class TorchEngine:
         """`x` detached."""
         return x.detach()
 
+    def matmul(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor | None:
+        """As one product on the CPU; elsewhere elementwise, since matrix units may round float32 to fewer bits."""
+        return a @ b if a.device.type == "cpu" and a.dtype == b.dtype else None
+
+    def rigid(self, pose: torch.Tensor, center: torch.Tensor) -> torch.Tensor | None:
+        """By compiled code for plain autograd on the CPU."""
+        dtypes = {pose.dtype, center.dtype}
+        if pose.device.type != "cpu" or dtypes not in ({torch.float32}, {torch.float64}) or transformed():
+            return None
+        from rts_backends import torch_rigid
+
+        return torch_rigid.rigid(pose, center)
+
     def affine_map(self, rows: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         """As one product on the CPU; elsewhere elementwise, since matrix units may round float32 to fewer bits."""
         if points.device.type == "cpu" and points.dtype == rows.dtype:
@@ -168,7 +181,7 @@ class TorchEngine:
 
     def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], torch.Tensor]) -> torch.Tensor:
         """By `torch.utils.checkpoint`, which plain autograd knows; `torch.func` transforms keep everything."""
-        if not torch.is_grad_enabled() or torch._C._functorch.maybe_current_level() is not None:
+        if not torch.is_grad_enabled() or transformed():
             return f(make())
         return torch.utils.checkpoint.checkpoint(lambda: f(make()), use_reentrant=False)
 

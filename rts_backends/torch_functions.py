@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.utils import _pytree
 
 
@@ -15,6 +16,13 @@ def quick(*functions: type[torch.autograd.Function]) -> None:
     """Keep the signature of `forward`: torch asks at each call, and finding it takes longer than a small kernel."""
     for function in functions:
         function.forward.__signature__ = inspect.signature(function.forward)  # pyright: ignore[reportFunctionMemberAccess]
+
+
+def transformed() -> bool:
+    """Whether a transform of torch, forward mode or a compilation looks at what is computed now."""
+    if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
+        return True
+    return torch._C._functorch.maybe_current_level() is not None
 
 
 def filled(primals: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> tuple[Tensor, ...]:

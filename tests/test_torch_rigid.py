@@ -1,0 +1,57 @@
+"""The compiled rigid matrix of torch against the array code."""
+
+import numpy as np
+import pytest
+
+import rts
+from rts.transforms import rigid_by_arrays
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("numba")
+
+POSES = {
+    "zero": [0.0] * 6,
+    "tiny": [1e-5, -2e-5, 3e-6, 0.1, 0.2, 0.3],
+    "below the series' end": [0.05, -0.06, 0.06, 1.0, 2.0, 3.0],
+    "above it": [0.06, -0.06, 0.06, 1.0, 2.0, 3.0],
+    "half a turn": [0.0, np.pi, 0.0, -1.0, 0.5, 0.2],
+    "many turns": [9.0, -4.0, 7.0, 0.0, 0.0, 5.0],
+}
+CENTER = [0.3, -0.2, 0.7]
+
+
+@pytest.mark.parametrize("pose", POSES.values(), ids=POSES)
+def test_value_and_derivatives_are_those_of_the_array_code(pose):
+    pose, center = torch.tensor(pose, dtype=torch.float64), torch.tensor(CENTER, dtype=torch.float64)
+    given = [x.clone().requires_grad_(True) for x in (pose, center)]
+    found = rts.rigid(*given)
+    assert "_Rigid" in type(found.grad_fn).__name__
+    torch.testing.assert_close(found, rigid_by_arrays(pose, center), rtol=0, atol=1e-14)
+    g = torch.tensor(np.random.default_rng(0).normal(size=(4, 4)))
+    gradients = torch.autograd.grad(found, given, g, create_graph=True)
+    expected = torch.func.vjp(rigid_by_arrays, pose, center)[1](g)
+    torch.testing.assert_close(gradients, expected, rtol=1e-12, atol=1e-12)
+    # The second derivative, of a sum of all first ones.
+    second = torch.autograd.grad(sum(x.sum() for x in gradients), given)
+    of_first = lambda p, c: sum(x.sum() for x in torch.func.vjp(rigid_by_arrays, p, c)[1](g))  # noqa: E731
+    torch.testing.assert_close(second, torch.func.grad(of_first, (0, 1))(pose, center), rtol=1e-10, atol=1e-10)
+
+
+def test_float32_stays_float32():
+    pose = torch.tensor(POSES["above it"], requires_grad=True)
+    matrix = rts.rigid(pose)
+    matrix.sum().backward()
+    assert matrix.dtype == pose.grad.dtype == torch.float32
+    torch.testing.assert_close(matrix, rigid_by_arrays(pose.detach(), torch.zeros(3)), rtol=0, atol=1e-6)
+
+
+def test_transforms_of_torch_look_inside():
+    pose = torch.tensor(POSES["above it"], dtype=torch.float64)
+    tangent = torch.ones(6, dtype=torch.float64)
+    expected = torch.func.jvp(lambda p: rigid_by_arrays(p, torch.zeros(3, dtype=p.dtype)), (pose,), (tangent,))
+    torch.testing.assert_close(torch.func.jvp(rts.rigid, (pose,), (tangent,)), expected)
+    with torch.autograd.forward_ad.dual_level():
+        dual = torch.autograd.forward_ad.make_dual(pose, tangent)
+        torch.testing.assert_close(torch.autograd.forward_ad.unpack_dual(rts.rigid(dual)).tangent, expected[1])
+    batch = torch.stack([pose, 2 * pose])
+    torch.testing.assert_close(torch.func.vmap(rts.rigid)(batch)[1], rts.rigid(2 * pose))
