@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,7 +14,7 @@ from jax.core import Tracer
 from rts.errors import RtsError
 from rts.protocols import ArraySpec, Tree
 from rts.records import STATIC_FIELDS, join_record, split_record
-from rts_backends import jax_host
+from rts_backends import jax_host, jax_samples
 
 for _cls in STATIC_FIELDS:
     jax.tree_util.register_pytree_node(
@@ -40,6 +41,9 @@ class JaxEngine:
     namespace = jnp
     _error: RtsError | None = None
 
+    def __init__(self):
+        self._used: dict[int, tuple[weakref.ref, jax.Array]] = {}
+
     def owns(self, x: Any) -> bool:
         """Whether `x` is a jax array or a tracer."""
         return isinstance(x, jax.Array)
@@ -64,15 +68,33 @@ class JaxEngine:
                 for r, spec in zip(results, specs, strict=True)
             )
 
+        packed = [i for i, spec in enumerate(specs) if spec.packed]
+
         def noticed(*host_args: Any) -> Sequence[np.ndarray]:
             try:
-                return fn(*host_args)
+                found = fn(*host_args)
             except RtsError as error:
                 self._error = error
                 raise
+            return [*found, np.int32(len(found[packed[0]]) if packed else 0)]
 
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
-        return tuple(jax_host.call(noticed, shapes, *args))
+        *results, used = jax_host.call(noticed, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args)
+        for i in packed:
+            self._note(results[i], used)
+        return tuple(results)
+
+    def _note(self, x: jax.Array, used: jax.Array | np.int32) -> jax.Array:
+        """Remember of a tracer how many of its rows are used; the others are zero."""
+        if isinstance(used, Tracer):
+            key = id(x)
+            self._used[key] = weakref.ref(x, lambda _: self._used.pop(key, None)), used
+        return x
+
+    def _used_of(self, x: jax.Array) -> jax.Array | np.int32:
+        """How many rows of (N, ·) are used, as far as is known."""
+        known = self._used.get(id(x))
+        return np.int32(x.shape[0]) if known is None else known[1]
 
     def traced(self, x: jax.Array) -> bool:
         """Whether `x` is a tracer."""
@@ -86,6 +108,21 @@ class JaxEngine:
     def stop_gradient(self, x: jax.Array) -> jax.Array:
         """`jax.lax.stop_gradient`."""
         return jax.lax.stop_gradient(x)
+
+    def projective_map(self, rows: jax.Array, points: jax.Array) -> jax.Array | None:
+        """By compiled code, on CPUs, of what is float32 or float64; else None."""
+        if rows.dtype != points.dtype or rows.dtype not in (np.float32, np.float64):
+            return None
+        used = self._used_of(points)
+        return self._note(jax_samples.project(rows, points, used), used)
+
+    def interpolate(self, rows: jax.Array, ids: jax.Array, column: int, weights: jax.Array) -> jax.Array | None:
+        """By compiled code, on CPUs, of what is float32 or float64; else None."""
+        dtype = jnp.result_type(rows, weights)
+        if rows.dtype != dtype or dtype not in (np.float32, np.float64):
+            return None
+        used = self._used_of(ids)
+        return self._note(jax_samples.interpolate(rows, weights.astype(dtype), ids, used, column), used)
 
     def segment_sum(self, values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:
         """Sums of the rows of `values` that share a segment."""

@@ -3,6 +3,9 @@
 A typed custom call of XLA, whose handler is a Python function: it takes the interpreter lock, looks at the operands
 where they lie and fills the results in place. `jax.pure_callback` does the same work through copies. It takes over on
 other devices, and where the interface of this jaxlib is not the one that is described here.
+
+Shapes in a program are those of the worst case. What is not used of an array is zero, and made so without touching
+its memory (`clear`): where nobody reads it, it takes neither time nor room.
 """
 
 from __future__ import annotations
@@ -10,7 +13,9 @@ from __future__ import annotations
 import ctypes
 import functools
 import itertools
+import mmap
 import os
+import sys
 import warnings
 import weakref
 from collections.abc import Callable, Sequence
@@ -28,25 +33,28 @@ TARGET = "rts_host_call"
 HostFunction = Callable[..., Sequence[np.ndarray]]
 """NumPy arrays in, which are read-only and lent for the length of the call, and NumPy arrays out."""
 
+Filler = Callable[[Sequence[np.ndarray], Sequence[np.ndarray]], None]
+"""Operands, which are read-only and lent like the results, and the results, to be filled."""
+
 Shapes = tuple[jax.ShapeDtypeStruct, ...]
 
-_named: dict[str, HostFunction] = {}
+_named: dict[str, Filler] = {}
 _passing: weakref.WeakValueDictionary[str, _Selected] = weakref.WeakValueDictionary()
 _numbers = itertools.count()
 
 
-def call_named(name: str, function: HostFunction, shapes: Shapes, *operands: jax.Array) -> list[jax.Array]:
+def call_named(name: str, function: Filler, shapes: Shapes, *operands: jax.Array) -> list[jax.Array]:
     """The results of a host function, in a traced program for the CPU.
 
     Args:
         name: stands for the function in the program, and in programs that jax keeps on disk: says all that the function
             depends on but its operands.
         function: kept as long as the process lives.
-        shapes: of the results, which may be shorter along any axis; the rest is zero.
+        shapes: of the results.
         operands: of the function.
     """
     if not _available():
-        return _copying(*operands, function=function, shapes=shapes, used=range(len(shapes)))
+        return _copying(function, shapes, *operands)
     _named[name] = function
     return list(jax.ffi.ffi_call(TARGET, shapes)(*operands, function=name))
 
@@ -66,9 +74,10 @@ class _Selected:
     def __init__(self, function: HostFunction, used: Sequence[int]):
         self.function, self.used = function, used
 
-    def __call__(self, *operands: np.ndarray) -> list[np.ndarray]:
+    def __call__(self, operands: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
         found = self.function(*operands)
-        return [found[i] for i in self.used]
+        for i, result in zip(self.used, results, strict=True):
+            fill(result, found[i])
 
 
 _call = Primitive("rts_host_call")
@@ -105,21 +114,22 @@ def _without_unused(wanted: Sequence[bool], equation: Any) -> tuple[list[bool], 
     return [True] * len(equation.invars), equation.replace(outvars=outvars, params={**equation.params, "used": used})
 
 
-def _copying(*operands: Any, function: HostFunction, shapes: Shapes, used: Sequence[int]) -> list[jax.Array]:
-    results = tuple(shapes[i] for i in used)
-
+def _copying(function: Filler, shapes: Sequence[jax.ShapeDtypeStruct], *operands: Any) -> list[jax.Array]:
     def whole(*given: Any) -> tuple[np.ndarray, ...]:
-        outs = tuple(np.empty(r.shape, r.dtype) for r in results)
-        for out, value in zip(outs, _Selected(function, used)(*map(np.asarray, given)), strict=True):
-            fill(out, value)
-        return outs
+        results = tuple(np.empty(shape.shape, shape.dtype) for shape in shapes)
+        function(list(map(np.asarray, given)), results)
+        return results
 
-    return list(jax.pure_callback(whole, results, *operands))
+    return list(jax.pure_callback(whole, tuple(shapes), *operands))
+
+
+def _copying_some(*operands: Any, function: HostFunction, shapes: Shapes, used: Sequence[int]) -> list[jax.Array]:
+    return _copying(_Selected(function, used), [shapes[i] for i in used], *operands)
 
 
 def _in_place(ctx: Any, *operands: Any, function: HostFunction, shapes: Shapes, used: Sequence[int]) -> Any:
     if not _available():
-        rule = mlir.lower_fun(_copying, multiple_results=True)
+        rule = mlir.lower_fun(_copying_some, multiple_results=True)
         return rule(ctx, *operands, function=function, shapes=shapes, used=used)
     selected = _Selected(function, used)
     name = f"{os.getpid()} {next(_numbers)}"
@@ -132,7 +142,7 @@ def _in_place(ctx: Any, *operands: Any, function: HostFunction, shapes: Shapes, 
 
 batching.primitive_batchers[_call] = _batched
 partial_eval.dce_rules[_call] = _without_unused
-mlir.register_lowering(_call, mlir.lower_fun(_copying, multiple_results=True))
+mlir.register_lowering(_call, mlir.lower_fun(_copying_some, multiple_results=True))
 mlir.register_lowering(_call, _in_place, platform="cpu")
 
 
@@ -143,8 +153,31 @@ def fill(out: np.ndarray, value: np.ndarray) -> None:
         if value.ndim != out.ndim or any(n > size for n, size in zip(value.shape, out.shape, strict=True)):
             raise ValueError(f"a host function returned an array of shape {value.shape}, where {out.shape} was said")
         for axis, n in enumerate(value.shape):
-            out[(slice(None),) * axis + (slice(n, None),)] = 0
+            clear(out[(*map(slice, value.shape[:axis]), slice(n, None))])
     out[tuple(map(slice, value.shape))] = value
+
+
+def clear(out: np.ndarray) -> None:
+    """Zeros. Of a large array pages of memory are handed back: the system gives empty ones when they are touched."""
+    if out.nbytes < _LEAST or not out.flags.c_contiguous or _give_back is None:
+        out[...] = 0
+        return
+    data = out.reshape(-1).view(np.uint8)
+    start = -data.ctypes.data % mmap.PAGESIZE
+    stop = start + (len(data) - start) // mmap.PAGESIZE * mmap.PAGESIZE
+    # Memory that is shared would come back as it was: the mark tells.
+    data[:start], data[stop:], data[start] = 0, 0, 1
+    if _give_back(data[start:].ctypes.data, stop - start, mmap.MADV_DONTNEED) or data[start]:
+        out[...] = 0
+
+
+_LEAST = 1 << 17
+"""Bytes, below which a call to the system is not worth it."""
+
+_give_back: Callable[[int, int, int], int] | None = None
+if sys.platform == "linux":  # Elsewhere the advice promises no zeros.
+    _give_back = ctypes.CDLL(None).madvise
+    _give_back.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
 
 
 @functools.cache
@@ -238,9 +271,7 @@ def _handle(address: int) -> int | None:
         for operand in operands:
             operand.flags.writeable = False
         name = _name(frame.attributes)
-        found = (_named.get(name) or _passing[name])(*operands)
-        for i, value in zip(range(results.count), found, strict=True):
-            fill(_array(results.items[i]), value)
+        (_named.get(name) or _passing[name])(operands, [_array(results.items[i]) for i in range(results.count)])
     except BaseException as error:  # XLA cannot pass on an exception, only its text.
         message = f"{type(error).__name__}: {error}".encode()
         given = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, _INTERNAL)

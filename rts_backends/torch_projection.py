@@ -7,16 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numba
-import numpy as np
 import torch
 from torch import Tensor
 
-from rts.threads import parallel
+from rts_backends import projection_kernels
 from rts_backends.torch_functions import along, quick
-
-CHUNK = 4096
-"""Points whose sums are taken together; fixed, so that results do not depend on the number of threads."""
 
 
 def specification(rows: Tensor, points: Tensor) -> Tensor:
@@ -48,9 +43,9 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def forward(rows, points):
-        out = np.empty(points.shape, points.detach().numpy().dtype)
-        parallel(_forward, len(out), *_arrays(rows, points), out, work=10 * len(out))
-        return torch.from_numpy(out)
+        out = torch.empty(points.shape, dtype=points.dtype)
+        projection_kernels.project(rows.detach().numpy(), points.detach().numpy(), out.numpy())
+        return out
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -83,12 +78,10 @@ class _Pull(torch.autograd.Function):
 
     @staticmethod
     def forward(rows, points, g, wanted):
-        matrix, where = _arrays(rows, points)
-        sums = np.empty((-(-len(where) // CHUNK), 4, 4))
-        g_points = np.empty(where.shape if wanted else (0, 3), where.dtype)
-        given = matrix, where, np.ascontiguousarray(g.detach().numpy())
-        parallel(_backward, len(sums), *given, sums, g_points, work=20 * len(where))
-        return torch.from_numpy(sums.sum(axis=0).astype(where.dtype)), torch.from_numpy(g_points)
+        g_points = torch.empty(points.shape if wanted else (0, 3), dtype=points.dtype)
+        given = (x.detach().numpy() for x in (rows, points, g))
+        g_rows = projection_kernels.pull(*given, g_points.numpy() if wanted else None)
+        return torch.from_numpy(g_rows), g_points
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -110,43 +103,3 @@ class _Pull(torch.autograd.Function):
 
 
 quick(_Project, _Pull)
-
-
-def _arrays(rows: Tensor, points: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    return np.ascontiguousarray(rows.detach().numpy()), np.ascontiguousarray(points.detach().numpy())
-
-
-@numba.njit(cache=True, nogil=True)
-def _forward(start, stop, m, points, out):
-    one = out.dtype.type(1)
-    for n in range(start, stop):
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        over = one / (one if w == 0 else w)
-        out[n, 0] = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * over
-        out[n, 1] = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * over
-        out[n, 2] = m[3, 0] * x + m[3, 1] * y + m[3, 2] * z + m[3, 3]
-
-
-@numba.njit(cache=True, nogil=True)
-def _backward(start, stop, m, points, g, sums, g_points):
-    one = points.dtype.type(1)
-    for chunk in range(start, stop):
-        total = np.zeros((4, 4))
-        for n in range(chunk * CHUNK, min(len(points), (chunk + 1) * CHUNK)):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-            over = one / (one if w == 0 else w)
-            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * over
-            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * over
-            a, b, d = g[n, 0] * over, g[n, 1] * over, g[n, 2]
-            c = points.dtype.type(0) if w == 0 else -(g[n, 0] * u + g[n, 1] * v) * over
-            for r, h in enumerate((a, b, c, d)):
-                total[r, 0] += h * x
-                total[r, 1] += h * y
-                total[r, 2] += h * z
-                total[r, 3] += h
-            if len(g_points):
-                for i in range(3):
-                    g_points[n, i] = a * m[0, i] + b * m[1, i] + c * m[2, i] + d * m[3, i]
-        sums[chunk] = total

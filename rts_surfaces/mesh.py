@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import engine_of, is_constant, namespace, take, unit
+from rts.arrays import engine_of, interpolate, is_constant, namespace, unit
 from rts.errors import InputError
 from rts.keeping import fingerprint
 from rts.protocols import Array, GBuffer, Part, Proxy, Samples, Tree
@@ -109,26 +109,18 @@ class Mesh:
         """Interpolated positions and attributes; see the class for their names."""
         gbuffer = GBuffer(position=self._interpolate(theta["vertices"], samples, 0))
         for name in self._attributes(theta):
-            interpolate = partial(self._interpolate, theta[name], samples, self._columns[name])
-            gbuffer.defer(G_BUFFER_NAMES.get(name, name), interpolate)
+            attribute = partial(self._interpolate, theta[name], samples, self._columns[name])
+            gbuffer.defer(G_BUFFER_NAMES.get(name, name), attribute)
         if "normals" not in theta:
             gbuffer.defer("normal", lambda: self._interpolate(self.vertex_normals(theta["vertices"]), samples, 0))
         return gbuffer
 
     def _interpolate(self, rows: Array, samples: Samples, column: int) -> Array:
         if isinstance(rows, np.ndarray) and isinstance(samples.ids, np.ndarray):
-            from rts_surfaces.interpolation import interpolate
-
             last = samples.ids[:, column : column + 3].max(initial=-1)
             if last >= len(rows):
                 raise InputError(f"samples refer to row {last} of an array of {len(rows)}; sample this mesh anew")
-            return interpolate(rows, samples.ids, column, samples.params)
-        xp = namespace(rows, samples.ids)
-        # One gather of all corners: its gradient fills one array of the size of the mesh, instead of three.
-        index = xp.reshape(samples.ids[:, column : column + 3], (-1,))
-        corners = xp.reshape(take(rows, index), (-1, 3, rows.shape[1]))
-        a, b, c = corners[:, 0, :], corners[:, 1, :], corners[:, 2, :]
-        return c + samples.params[:, 0:1] * (a - c) + samples.params[:, 1:2] * (b - c)
+        return interpolate(rows, samples.ids, column, samples.params)
 
     def vertex_normals(self, vertices: Array) -> Array:
         """(V, 3) unit normals, the area-weighted mean of the faces around each vertex; zero where there is none."""

@@ -1,0 +1,126 @@
+"""Interpolation over triangles and its derivatives, compiled for arrays on the host. It imports numba.
+
+Three columns of `ids` (N, I), from `column`, name rows a, b, c of (V, C); weights are (N, 2) and the result
+c + w₀ (a − c) + w₁ (b − c) is (N, C). An id of no row gives NaN, and no gradient.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from rts.threads import parallel
+
+
+def interpolate(
+    rows: np.ndarray, ids: np.ndarray, column: int, weights: np.ndarray, out: np.ndarray | None = None
+) -> np.ndarray:
+    """The result (N, C), into `out` where that is given."""
+    if out is None:
+        out = np.empty((len(ids), rows.shape[1]), np.result_type(rows, weights))
+    parallel(_interpolate, len(ids), *_given(rows, ids), column, *_given(weights), out)
+    return out
+
+
+def push(
+    rows: np.ndarray,
+    ids: np.ndarray,
+    column: int,
+    weights: np.ndarray,
+    t_rows: np.ndarray | None,
+    t_weights: np.ndarray | None,
+    out: np.ndarray,
+) -> None:
+    """Fill `out` (N, C) with the tangent along those of rows (V, C) and weights (N, 2), or None for zeros."""
+    if t_rows is None:
+        out[...] = 0
+    else:
+        interpolate(t_rows, ids, column, weights, out)
+    if t_weights is not None:
+        given = _given(rows, ids), _given(t_weights)
+        parallel(_add_weighted, len(ids), *given[0], column, *given[1], out)
+
+
+def pull(
+    rows: np.ndarray,
+    ids: np.ndarray,
+    column: int,
+    weights: np.ndarray,
+    g: np.ndarray,
+    g_rows: np.ndarray | None,
+    g_weights: np.ndarray | None,
+) -> None:
+    """From the gradient of the result (N, C) add to that of rows (V, C), and fill that of weights (N, 2).
+
+    Both may be None, where they are not wanted. Sums are taken in the order of the samples.
+    """
+    if g_rows is not None:
+        _scatter(*_given(ids), column, *_given(weights, g), g_rows)
+    if g_weights is not None:
+        parallel(_weigh, len(ids), *_given(rows, ids), column, *_given(g), g_weights)
+
+
+def _given(*arrays: np.ndarray) -> list[np.ndarray]:
+    """Contiguous views, always read-only, so that kernels are compiled but once."""
+    views = [np.ascontiguousarray(x).view() for x in arrays]
+    for view in views:
+        view.flags.writeable = False
+    return views
+
+
+@numba.njit
+def _known(a, b, c, count):
+    return 0 <= a < count and 0 <= b < count and 0 <= c < count
+
+
+@numba.njit(cache=True, nogil=True)
+def _interpolate(start, stop, rows, ids, column, weights, out):
+    for n in range(start, stop):
+        a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
+        if not _known(a, b, c, len(rows)):
+            out[n] = np.nan
+            continue
+        for i in range(rows.shape[1]):
+            last = rows[c, i]
+            out[n, i] = last + weights[n, 0] * (rows[a, i] - last) + weights[n, 1] * (rows[b, i] - last)
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_weighted(start, stop, rows, ids, column, weights, out):
+    for n in range(start, stop):
+        a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
+        if not _known(a, b, c, len(rows)):
+            out[n] = np.nan
+            continue
+        for i in range(rows.shape[1]):
+            last = rows[c, i]
+            out[n, i] += weights[n, 0] * (rows[a, i] - last) + weights[n, 1] * (rows[b, i] - last)
+
+
+@numba.njit(cache=True, nogil=True)
+def _scatter(ids, column, weights, g, g_rows):
+    one = g.dtype.type(1)
+    for n in range(len(ids)):
+        a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
+        if not _known(a, b, c, len(g_rows)):
+            continue
+        u, v = weights[n, 0], weights[n, 1]
+        w = one - u - v
+        for i in range(g.shape[1]):
+            x = g[n, i]
+            if x != 0:
+                g_rows[a, i] += u * x
+                g_rows[b, i] += v * x
+                g_rows[c, i] += w * x
+
+
+@numba.njit(cache=True, nogil=True)
+def _weigh(start, stop, rows, ids, column, g, g_weights):
+    for n in range(start, stop):
+        a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
+        u = v = g.dtype.type(0)
+        if _known(a, b, c, len(rows)):
+            for i in range(g.shape[1]):
+                u += g[n, i] * (rows[a, i] - rows[c, i])
+                v += g[n, i] * (rows[b, i] - rows[c, i])
+        g_weights[n, 0], g_weights[n, 1] = u, v

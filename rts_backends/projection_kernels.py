@@ -1,0 +1,103 @@
+"""Perspective projection of points and its derivatives: NumPy in and out, one compiled pass each.
+
+Four affine maps (4, 4) of points (N, 3) give (N, 3): the first two over the third, and the fourth. Where the third is
+zero there is no image; the result is finite. All floats are of one dtype.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from rts.threads import parallel
+
+CHUNK = 4096
+"""Points whose sums are taken together; fixed, so that results do not depend on the number of threads."""
+
+
+def project(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
+    """Fill `out` (N, 3)."""
+    parallel(_project, len(out), *_given(rows, points), out, work=10 * len(out))
+
+
+def push(
+    rows: np.ndarray, points: np.ndarray, t_rows: np.ndarray | None, t_points: np.ndarray | None, out: np.ndarray
+) -> None:
+    """Fill `out` (N, 3) with the tangent along those of rows (4, 4) and points (N, 3), or None for zeros."""
+    turn = np.zeros_like(rows) if t_rows is None else t_rows
+    move = np.empty((0, 3), points.dtype) if t_points is None else t_points
+    parallel(_push, len(out), *_given(rows, points, turn, move), out, work=20 * len(out))
+
+
+def pull(rows: np.ndarray, points: np.ndarray, g: np.ndarray, g_points: np.ndarray | None) -> np.ndarray:
+    """The gradient of rows (4, 4) from that of the result (N, 3); fills that of the points (N, 3) if there is one."""
+    sums = np.empty((-(-len(points) // CHUNK), 4, 4))
+    g_points = np.empty((0, 3), points.dtype) if g_points is None else g_points
+    parallel(_pull, len(sums), *_given(rows, points, g), sums, g_points, work=20 * len(points))
+    return sums.sum(axis=0).astype(rows.dtype)
+
+
+def _given(*arrays: np.ndarray) -> list[np.ndarray]:
+    """Contiguous views, always read-only, so that kernels are compiled but once."""
+    views = [np.ascontiguousarray(x).view() for x in arrays]
+    for view in views:
+        view.flags.writeable = False
+    return views
+
+
+@numba.njit(cache=True, nogil=True)
+def _project(start, stop, m, points, out):
+    one = out.dtype.type(1)
+    for n in range(start, stop):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+        over = one / (one if w == 0 else w)
+        out[n, 0] = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * over
+        out[n, 1] = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * over
+        out[n, 2] = m[3, 0] * x + m[3, 1] * y + m[3, 2] * z + m[3, 3]
+
+
+@numba.njit(cache=True, nogil=True)
+def _push(start, stop, m, points, turn, move, out):
+    zero, one = out.dtype.type(0), out.dtype.type(1)
+    value, change = np.empty(4, out.dtype), np.empty(4, out.dtype)
+    for n in range(start, stop):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        for r in range(4):
+            value[r] = m[r, 0] * x + m[r, 1] * y + m[r, 2] * z + m[r, 3]
+            change[r] = turn[r, 0] * x + turn[r, 1] * y + turn[r, 2] * z + turn[r, 3]
+            if len(move):
+                change[r] += m[r, 0] * move[n, 0] + m[r, 1] * move[n, 1] + m[r, 2] * move[n, 2]
+        over = one / (one if value[2] == 0 else value[2])
+        deeper = zero if value[2] == 0 else change[2]
+        out[n, 0] = (change[0] - value[0] * over * deeper) * over
+        out[n, 1] = (change[1] - value[1] * over * deeper) * over
+        out[n, 2] = change[3]
+
+
+@numba.njit(cache=True, nogil=True)
+def _pull(start, stop, m, points, g, sums, g_points):
+    zero, one = points.dtype.type(0), points.dtype.type(1)
+    for chunk in range(start, stop):
+        total = np.zeros((4, 4))
+        for n in range(chunk * CHUNK, min(len(points), (chunk + 1) * CHUNK)):
+            if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:  # As in the interior of a silhouette.
+                if len(g_points):
+                    g_points[n, 0] = g_points[n, 1] = g_points[n, 2] = zero
+                continue
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+            over = one / (one if w == 0 else w)
+            u = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * over
+            v = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * over
+            a, b, d = g[n, 0] * over, g[n, 1] * over, g[n, 2]
+            c = zero if w == 0 else -(g[n, 0] * u + g[n, 1] * v) * over
+            for r, h in enumerate((a, b, c, d)):
+                total[r, 0] += h * x
+                total[r, 1] += h * y
+                total[r, 2] += h * z
+                total[r, 3] += h
+            if len(g_points):
+                for i in range(3):
+                    g_points[n, i] = a * m[0, i] + b * m[1, i] + c * m[2, i] + d * m[3, i]
+        sums[chunk] = total

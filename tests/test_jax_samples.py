@@ -1,0 +1,247 @@
+"""Projection and interpolation of packed samples in jax: the same as in plain jax, in every transform."""
+
+import mmap
+
+import numpy as np
+import pytest
+from helpers import icosphere
+
+import rts
+from rts.arrays import interpolate, projective_map
+
+jax = pytest.importorskip("jax")
+test_fused_jax = pytest.importorskip("test_fused_jax")
+jax_host = pytest.importorskip("rts_backends.jax_host")
+jax_samples = pytest.importorskip("rts_backends.jax_samples")
+jnp = jax.numpy
+MODES, close, x64 = test_fused_jax.MODES, test_fused_jax.close, test_fused_jax.x64
+
+COLUMN, ROWS, COUNT = 3, 5, 7
+IDS = np.random.default_rng(2).integers(0, ROWS, (COUNT, 6)).astype(np.int32)
+
+
+def projected(rows, points):
+    maps = points @ rows[:, :3].T + rows[:, 3]
+    divisor = jnp.where(maps[:, 2:3] == 0, 1, maps[:, 2:3])
+    return jnp.concatenate([maps[:, :2] / divisor, maps[:, 3:]], axis=1)
+
+
+def interpolated(rows, weights):
+    corners = rows[IDS[:, COLUMN : COLUMN + 3]]
+    share = jnp.stack([weights[:, 0], weights[:, 1], 1 - weights[:, 0] - weights[:, 1]], axis=1)
+    return (corners * share[..., None]).sum(axis=1)
+
+
+def numbers(*shape, seed=0):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=shape), jnp.float32)
+
+
+FUNCTIONS = {
+    "projection": (
+        projective_map,
+        projected,
+        (numbers(4, 4).at[2, 3].add(6), numbers(COUNT, 3, seed=1)),
+    ),
+    "interpolation": (
+        lambda rows, weights: interpolate(rows, jnp.asarray(IDS), COLUMN, weights),
+        interpolated,
+        (numbers(ROWS, 4), numbers(COUNT, 2, seed=1)),
+    ),
+}
+
+
+def weighted(f, shape):
+    weights = numbers(*shape, seed=3)
+    return lambda a, b: (f(a, b) ** 2 * weights).sum()
+
+
+def stacked(x):
+    return jnp.stack([x, 0.5 * x + 0.1, x * x])
+
+
+def over_items(f):
+    """Items of both operands, of the first and of the second."""
+    return lambda a, b: (
+        jax.vmap(f)(stacked(a), stacked(b)),
+        jax.vmap(f, (0, None))(stacked(a), b),
+        jax.vmap(f, (None, 0))(a, stacked(b)),
+    )
+
+
+TRANSFORMS = {
+    "value": lambda f, s: f,
+    "grad": lambda f, s: jax.grad(s, (0, 1)),
+    "grad of the first": lambda f, s: jax.grad(s),
+    "grad of the second": lambda f, s: jax.grad(s, 1),
+    "jvp": lambda f, s: lambda a, b: jax.jvp(f, (a, b), (a + 1, b * b))[1],
+    "jvp of the first": lambda f, s: lambda a, b: jax.jvp(lambda a: f(a, b), (a,), (a + 1,))[1],
+    "jvp of the second": lambda f, s: lambda a, b: jax.jvp(lambda b: f(a, b), (b,), (b + 1,))[1],
+    "jacfwd": lambda f, s: jax.jacfwd(f, (0, 1)),
+    "jacrev": lambda f, s: jax.jacrev(f, (0, 1)),
+    "vmap": lambda f, s: over_items(f),
+    "vmap of grad": lambda f, s: over_items(jax.grad(s, (0, 1))),
+    "vmap of jacfwd": lambda f, s: over_items(jax.jacfwd(f, (0, 1))),
+    "grad of vmap": lambda f, s: jax.grad(lambda a, b: sum(x.sum() for x in over_items(s)(a, b)), (0, 1)),
+    "jacrev of vmap": lambda f, s: jax.jacrev(lambda a, b: over_items(f)(a, b)[1], (0, 1)),
+    "hessian": lambda f, s: jax.hessian(s, (0, 1)),
+    "jacrev of grad": lambda f, s: jax.jacrev(jax.grad(s, (0, 1)), (0, 1)),
+    "grad of jvp": lambda f, s: jax.grad(lambda a, b: (jax.jvp(f, (a, b), (b[:1, :1] + a, b))[1] ** 2).sum(), (0, 1)),
+    "grad of checkpoint": lambda f, s: jax.grad(jax.checkpoint(s), (0, 1)),
+}
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("transform", TRANSFORMS)
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_transforms_are_those_of_plain_jax(name, transform, mode):
+    ours, plain, given = FUNCTIONS[name]
+    shape = plain(*given).shape
+    found, expected = (MODES[mode](TRANSFORMS[transform](f, weighted(f, shape)))(*given) for f in (ours, plain))
+    found, expected = jax.tree.leaves(found), jax.tree.leaves(expected)
+    largest = max(float(np.abs(x).max()) for x in expected)
+    assert len(found) == len(expected) and largest > 1e-3
+    for x, y in zip(found, expected, strict=True):
+        np.testing.assert_allclose(x, y, rtol=0, atol=2e-5 * largest)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_double_precision_and_finite_differences(name):
+    ours, plain, given = FUNCTIONS[name]
+    with x64():
+        a, b = (jnp.asarray(np.asarray(x), jnp.float64) for x in given)
+        move = jnp.sin(100 * a), jnp.cos(100 * b)
+        step = lambda h: (a + h * move[0], b + h * move[1])  # noqa: E731
+        for mode in MODES.values():
+            value, along = mode(lambda a, b: jax.jvp(ours, (a, b), move))(a, b)
+            assert value.dtype == along.dtype == np.float64
+            np.testing.assert_allclose(value, plain(a, b), rtol=1e-12, atol=1e-12)
+            difference = (plain(*step(1e-6)) - plain(*step(-1e-6))) / 2e-6
+            np.testing.assert_allclose(along, difference, rtol=1e-7, atol=1e-7)
+            g = jnp.sin(jnp.arange(value.size, dtype=jnp.float64)).reshape(value.shape)
+            pulled = mode(lambda a, b: jax.vjp(ours, a, b)[1](g))(a, b)  # noqa: B023
+            product = sum(float((x * t).sum()) for x, t in zip(pulled, move, strict=True))
+            np.testing.assert_allclose(product, float((along * g).sum()), rtol=1e-12)
+
+
+def test_other_dtypes_are_left_to_array_code():
+    rows, points = (x.astype(jnp.float16) for x in FUNCTIONS["projection"][2])
+    assert projective_map(rows, points).dtype == jnp.float16
+    vertices, weights = FUNCTIONS["interpolation"][2]
+    found = interpolate(vertices.astype(jnp.float16), jnp.asarray(IDS), COLUMN, weights)
+    close(found, interpolated(vertices, weights), 1e-2)
+
+
+def test_other_devices_are_left_to_array_code():
+    ours, _, given = FUNCTIONS["projection"]
+    f = jax.jit(jax.grad(lambda a, b: ours(a, b).sum(), (0, 1)))
+    for platform, by_kernels in (("cuda", False), ("cpu", True)):
+        allowed = [jax.export.DisabledSafetyCheck.custom_call(jax_host.TARGET)]
+        exported = jax.export.export(f, platforms=[platform], disabled_checks=allowed)(*given)
+        assert (jax_host.TARGET in exported.mlir_module()) == by_kernels
+
+
+# ---------------------------------------------------------------------------------------------- rows that are not used
+
+MANY, USED = 70_000, 20_001
+
+
+def long(columns):
+    return jnp.where(jnp.arange(MANY)[:, None] < USED, numbers(MANY, columns, seed=4), 0.0)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_is_not_used_is_zero_and_gives_no_gradient(mode):
+    rows, points = FUNCTIONS["projection"][2][0], long(3)
+    vertices, weights = numbers(100, 3), long(2)
+    ids = jnp.asarray(np.random.default_rng(5).integers(0, 100, (MANY, 3)), jnp.int32)
+    g = numbers(MANY, 3, seed=6)
+    project = lambda r, p: jax_samples.project(r, p, np.int32(USED))  # noqa: E731
+    at = lambda v, w: jax_samples.interpolate(v, w, ids, np.int32(USED), 0)  # noqa: E731
+    blend = lambda v, w: (v[ids] * jnp.stack([w[:, 0], w[:, 1], 1 - w.sum(1)], 1)[..., None]).sum(1)  # noqa: E731
+    for ours, plain, given in ((project, projected, (rows, points)), (at, blend, (vertices, weights))):
+        value, pull = jax.vjp(MODES[mode](ours), *given)
+        expected, expected_pull = jax.vjp(plain, *given)
+        close(value[:USED], expected[:USED], 1e-5)
+        np.testing.assert_array_equal(value[USED:], 0)
+        for x, y in zip(pull(g), expected_pull(g.at[USED:].set(0)), strict=True):
+            close(x, y, 1e-5)
+        tangents = tuple(jnp.cos(x) for x in given)
+        pushed, expected = (jax.jvp(MODES[mode](f), given, tangents)[1] for f in (ours, plain))
+        close(pushed[:USED], expected[:USED], 1e-5)
+        np.testing.assert_array_equal(pushed[USED:], 0)
+
+
+def test_results_do_not_depend_on_the_number_of_threads(monkeypatch):
+    rows, points = FUNCTIONS["projection"][2][0], long(3)
+    vertices, weights = numbers(100, 3), long(2)
+    ids = jnp.asarray(np.random.default_rng(5).integers(0, 100, (MANY, 3)), jnp.int32)
+
+    @jax.jit
+    def everything(rows, vertices, weights):
+        moved = interpolate(vertices, ids, 0, weights) + points
+        return (projective_map(rows, moved) ** 2).mean()
+
+    found = []
+    for threads in "12":
+        monkeypatch.setenv("RTS_NUM_THREADS", threads)
+        found.append(jax.grad(everything, (0, 1, 2))(rows, vertices, weights))
+    for x, y in zip(*found, strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+@pytest.mark.parametrize("shader", ["silhouette", "lambert"])
+def test_a_jitted_render_has_the_gradients_of_an_eager_one(shader):
+    vertices, faces = icosphere(2)
+    part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {}, shader)
+    camera, size = rts.Camera.look_at((0, 0, 3), (0, 0, 0)), (90, 120)
+
+    def loss(pose, vertices):
+        moved = part.replace(theta={"vertices": vertices}, transform=rts.rigid(pose))
+        return (rts.render(moved, camera, size)[..., :2] ** 2).sum()
+
+    pose, vertices = jnp.asarray([0.1, -0.2, 0.1, 0.05, 0.02, 0.1]), jnp.asarray(vertices, jnp.float32)
+    gradient = jax.grad(loss, (0, 1))
+    for x, y in zip(jax.jit(gradient)(pose, vertices), gradient(pose, vertices), strict=True):
+        close(x, y)
+    constant = jax.grad(lambda p: loss(p, np.asarray(vertices)))
+    close(jax.jit(constant)(pose), gradient(pose, vertices)[0])
+    both = jnp.stack([pose, -pose])
+    for x, y in zip(jax.jit(jax.vmap(constant))(both), both, strict=True):
+        close(x, constant(y))
+
+
+# ---------------------------------------------------------------------------------------------------------- robustness
+
+
+def test_points_without_an_image_are_finite_with_finite_gradients():
+    rows, points = FUNCTIONS["projection"][2]
+    rows, points = rows.at[2, 3].set(0), points.at[0].set(0)
+    for mode in MODES.values():
+        value, pull = jax.vjp(mode(projective_map), rows, points)
+        pushed = jax.jvp(projective_map, (rows, points), (rows, points))[1]
+        for x in (value, *pull(jnp.ones_like(value)), pushed):
+            assert np.isfinite(x).all()
+        np.testing.assert_allclose(value, projected(rows, points), rtol=1e-4)
+
+
+@pytest.mark.parametrize("wrong", [ROWS, -1, 2**30])
+def test_an_id_of_no_row_gives_nan_and_no_gradient(wrong):
+    rows, weights = FUNCTIONS["interpolation"][2]
+    ids = jnp.asarray(IDS).at[2, COLUMN + 1].set(wrong)
+    for mode in MODES.values():
+        value, pull = jax.vjp(mode(lambda r, w: interpolate(r, ids, COLUMN, w)), rows, weights)
+        assert np.isnan(value[2]).all() and np.isnan(value).sum() == value.shape[1]
+        g = jnp.ones_like(value)
+        expected = jax.vjp(interpolated, rows, weights)[1](g.at[2].set(0))
+        for x, y in zip(pull(g), expected, strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-5)
+
+
+def test_cleared_memory_is_zero_shared_or_not():
+    shared = np.frombuffer(mmap.mmap(-1, 2**20), np.uint8)
+    for whole in (np.ones(2**20, np.uint8), np.ones((2**18, 1), np.float32), np.ones((2, 1, 2**15)), shared):
+        for part in (whole, whole[1:], whole[: 2**17 + 5], whole[3:9], whole[:0], whole[::2]):
+            whole[...] = 1
+            jax_host.clear(part)
+            assert not part.any()
+            assert np.count_nonzero(whole) == whole.size - part.size
