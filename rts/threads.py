@@ -11,7 +11,6 @@ import itertools
 import os
 import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 TASKS_PER_THREAD = 4
@@ -20,10 +19,64 @@ TASKS_PER_THREAD = 4
 LITTLE_WORK = 20_000
 """Below so many steps a loop stays on the thread that asks for it."""
 
-_pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
+
+class _Helper:
+    """A thread that does one job at a time, and in between waits for the next."""
+
+    def __init__(self) -> None:
+        self._wake = threading.Lock()
+        self._wake.acquire()
+        self._job: _Job
+        threading.Thread(target=self._serve, name="rts", daemon=True).start()
+
+    def begin(self, job: _Job) -> None:
+        """Do this next."""
+        self._job = job
+        self._wake.release()
+
+    def _serve(self) -> None:
+        while True:
+            self._wake.acquire()
+            job = self._job
+            try:
+                job.work()
+            except BaseException as error:
+                job.error = error
+            with _lock:
+                _idle.append(self)
+            job.done.release()
+
+
+class _Job:
+    """Work for one helper, its end and its error."""
+
+    def __init__(self, work: Callable[[], None]):
+        self.work, self.done = work, threading.Lock()
+        self.error: BaseException | None = None
+        self.done.acquire()
+
+    def wait(self) -> None:
+        """Until it is done; raises what it raised."""
+        self.done.acquire()
+        if self.error is not None:
+            raise self.error
+
+
+_idle: list[_Helper] = []
+_made = 0
 _lock = threading.Lock()
-if hasattr(os, "register_at_fork"):  # No child is to find it held by a thread that it does not have.
-    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_lock.release)
+
+
+def _forget() -> None:
+    """A forked child has none of its parent's threads."""
+    global _made
+    _idle.clear()
+    _made = 0
+    _lock.release()
+
+
+if hasattr(os, "register_at_fork"):  # No child is to find the lock held by a thread that it does not have.
+    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_forget)
 
 
 def thread_count() -> int:
@@ -56,17 +109,21 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
             kernel(bounds[task], bounds[task + 1], *args)
 
     # The caller works too, so that only its helpers have to be woken.
-    futures = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
+    jobs = []
+    for helper in _helpers(threads - 1):
+        jobs.append(_Job(work))
+        helper.begin(jobs[-1])
     try:
         work()
     finally:
-        for future in futures:
-            future.result()
+        for job in jobs:
+            job.wait()
 
 
-def _pool(threads: int) -> ThreadPoolExecutor:
-    key = os.getpid(), threads  # A forked child has none of its parent's threads.
+def _helpers(count: int) -> list[_Helper]:
+    """So many idle helpers; fewer where some of those that there may be are busy for other threads."""
+    global _made
     with _lock:
-        if key not in _pools:
-            _pools[key] = ThreadPoolExecutor(threads, thread_name_prefix="rts")
-        return _pools[key]
+        missing = max(0, min(count - len(_idle), count - _made))
+        _made += missing
+        return [_idle.pop() for _ in range(min(count, len(_idle)))] + [_Helper() for _ in range(missing)]

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -113,31 +114,65 @@ def test_threads_may_share_a_part_and_a_handle(name):
     assert len(found) == 36
 
 
-def test_a_pool_is_made_once_by_threads_that_start_together(monkeypatch):
-    pytest.importorskip("numba")
+@pytest.fixture
+def own_helpers(monkeypatch):
+    """`rts.threads` as if nothing had been run yet, with the helpers that it makes from here on."""
     from rts import threads
 
-    made, executor, start = [], threads.ThreadPoolExecutor, threading.Barrier(8)
+    made, helper = [], threads._Helper
 
-    def slow(*args, **kwargs):
-        made.append(executor(*args, **kwargs))
-        threading.Event().wait(0.05)
+    def make():
+        made.append(helper())
         return made[-1]
+
+    monkeypatch.setattr(threads, "_idle", [])
+    monkeypatch.setattr(threads, "_made", 0)
+    monkeypatch.setattr(threads, "_Helper", make)
+    return made
+
+
+def test_threads_that_start_together_share_few_helpers(monkeypatch, own_helpers):
+    from rts import threads
+
+    start, done = threading.Barrier(8), []
+
+    def kernel(start, stop):
+        time.sleep(0.001)
+        done.append(stop - start)
 
     def work():
         start.wait(30)
-        threads.parallel(lambda start, stop: None, 9)
+        for _ in range(20):
+            threads.parallel(kernel, 9)
 
-    monkeypatch.setattr(threads, "_pools", {})
-    monkeypatch.setattr(threads, "ThreadPoolExecutor", slow)
-    monkeypatch.setenv("RTS_NUM_THREADS", "2")
+    monkeypatch.setenv("RTS_NUM_THREADS", "3")
     together = [threading.Thread(target=work) for _ in range(8)]
     for thread in together:
         thread.start()
     for thread in together:
-        thread.join(30)
-    assert len(made) == 1
-    made[0].shutdown()
+        thread.join(60)
+    assert len(own_helpers) == 2 and len(threads._idle) == 2
+    assert sum(done) == 8 * 20 * 9
+
+
+def test_an_error_in_a_helper_reaches_the_caller_and_the_helper_lives_on(monkeypatch, own_helpers):
+    from rts import threads
+
+    monkeypatch.setenv("RTS_NUM_THREADS", "2")
+    caller, both, seen = threading.get_ident(), threading.Barrier(2), []
+
+    def kernel(start, stop):
+        if start == 0 or stop == 9:
+            return
+        both.wait(30)  # So that either has one of the two tasks in between.
+        if threading.get_ident() != caller:
+            raise ValueError("in a helper")
+
+    monkeypatch.setattr(threads, "TASKS_PER_THREAD", 2)
+    with pytest.raises(ValueError, match="in a helper"):
+        threads.parallel(kernel, 9)
+    threads.parallel(lambda start, stop: seen.append((start, stop)), 9)
+    assert sorted(seen) == [(0, 2), (2, 4), (4, 6), (6, 9)] and len(own_helpers) == 1
 
 
 # --------------------------------------------------------------------------------------------------- forks
