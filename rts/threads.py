@@ -11,6 +11,7 @@ import itertools
 import os
 import threading
 from collections.abc import Callable
+from queue import SimpleQueue
 from typing import Any
 
 TASKS_PER_THREAD = 4
@@ -20,63 +21,69 @@ LITTLE_WORK = 20_000
 """Below so many steps a loop stays on the thread that asks for it."""
 
 
-class _Helper:
-    """A thread that does one job at a time, and in between waits for the next."""
-
-    def __init__(self) -> None:
-        self._wake = threading.Lock()
-        self._wake.acquire()
-        self._job: _Job
-        threading.Thread(target=self._serve, name="rts", daemon=True).start()
-
-    def begin(self, job: _Job) -> None:
-        """Do this next."""
-        self._job = job
-        self._wake.release()
-
-    def _serve(self) -> None:
-        while True:
-            self._wake.acquire()
-            job = self._job
-            try:
-                job.work()
-            except BaseException as error:
-                job.error = error
-            with _lock:
-                _idle.append(self)
-            job.done.release()
-
-
 class _Job:
-    """Work for one helper, its end and its error."""
+    """Work that a helper is asked to join in; whoever claims it first, helper or caller, decides whether it does."""
 
     def __init__(self, work: Callable[[], None]):
-        self.work, self.done = work, threading.Lock()
+        self.work = work
         self.error: BaseException | None = None
-        self.done.acquire()
+        self._unclaimed, self._going = threading.Lock(), threading.Lock()
+        self._going.acquire()
+
+    def claim(self) -> bool:
+        """True for the first who asks."""
+        return self._unclaimed.acquire(blocking=False)
+
+    def run(self) -> None:
+        """Do it, and say so."""
+        try:
+            self.work()
+        except BaseException as error:
+            self.error = error
+        self._going.release()
 
     def wait(self) -> None:
         """Until it is done; raises what it raised."""
-        self.done.acquire()
+        self._going.acquire()
         if self.error is not None:
             raise self.error
 
 
-_idle: list[_Helper] = []
-_made = 0
-_lock = threading.Lock()
+class _Helpers:
+    """Threads that wait for jobs."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._jobs: SimpleQueue[_Job] = SimpleQueue()
+        self._lock = threading.Lock()
+
+    def ask(self, job: _Job, count: int) -> None:
+        """Hand a job to one of at least so many helpers."""
+        if self.count < count:
+            with self._lock:
+                while self.count < count:
+                    self.count += 1
+                    threading.Thread(target=self._serve, name="rts", daemon=True).start()
+        self._jobs.put(job)
+
+    def _serve(self) -> None:
+        while True:
+            job = self._jobs.get()
+            if job.claim():
+                job.run()
+
+
+_helpers = _Helpers()
 
 
 def _forget() -> None:
     """A forked child has none of its parent's threads."""
-    global _made
-    _idle.clear()
-    _made = 0
-    _lock.release()
+    global _helpers
+    _helpers = _Helpers()
 
 
-if hasattr(os, "register_at_fork"):  # No child is to find the lock held by a thread that it does not have.
-    os.register_at_fork(before=_lock.acquire, after_in_parent=_lock.release, after_in_child=_forget)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_forget)
 
 
 def thread_count() -> int:
@@ -108,22 +115,13 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
         while (task := next(numbers)) < tasks:
             kernel(bounds[task], bounds[task + 1], *args)
 
-    # The caller works too, so that only its helpers have to be woken.
-    jobs = []
-    for helper in _helpers(threads - 1):
-        jobs.append(_Job(work))
-        helper.begin(jobs[-1])
+    # The caller works too. A helper that has not woken by the time all is begun is not waited for.
+    jobs = [_Job(work) for _ in range(threads - 1)]
+    for job in jobs:
+        _helpers.ask(job, threads - 1)
     try:
         work()
     finally:
         for job in jobs:
-            job.wait()
-
-
-def _helpers(count: int) -> list[_Helper]:
-    """So many idle helpers; fewer where some of those that there may be are busy for other threads."""
-    global _made
-    with _lock:
-        missing = max(0, min(count - len(_idle), count - _made))
-        _made += missing
-        return [_idle.pop() for _ in range(min(count, len(_idle)))] + [_Helper() for _ in range(missing)]
+            if not job.claim():
+                job.wait()

@@ -115,23 +115,15 @@ def test_threads_may_share_a_part_and_a_handle(name):
 
 
 @pytest.fixture
-def own_helpers(monkeypatch):
-    """`rts.threads` as if nothing had been run yet, with the helpers that it makes from here on."""
+def helpers(monkeypatch):
+    """The helpers of `rts.threads`, as if nothing had been run yet."""
     from rts import threads
 
-    made, helper = [], threads._Helper
-
-    def make():
-        made.append(helper())
-        return made[-1]
-
-    monkeypatch.setattr(threads, "_idle", [])
-    monkeypatch.setattr(threads, "_made", 0)
-    monkeypatch.setattr(threads, "_Helper", make)
-    return made
+    monkeypatch.setattr(threads, "_helpers", threads._Helpers())
+    return threads._helpers
 
 
-def test_threads_that_start_together_share_few_helpers(monkeypatch, own_helpers):
+def test_threads_that_start_together_share_few_helpers(monkeypatch, helpers):
     from rts import threads
 
     start, done = threading.Barrier(8), []
@@ -151,11 +143,11 @@ def test_threads_that_start_together_share_few_helpers(monkeypatch, own_helpers)
         thread.start()
     for thread in together:
         thread.join(60)
-    assert len(own_helpers) == 2 and len(threads._idle) == 2
+    assert helpers.count == 2
     assert sum(done) == 8 * 20 * 9
 
 
-def test_an_error_in_a_helper_reaches_the_caller_and_the_helper_lives_on(monkeypatch, own_helpers):
+def test_an_error_in_a_helper_reaches_the_caller_and_the_helper_lives_on(monkeypatch, helpers):
     from rts import threads
 
     monkeypatch.setenv("RTS_NUM_THREADS", "2")
@@ -172,7 +164,7 @@ def test_an_error_in_a_helper_reaches_the_caller_and_the_helper_lives_on(monkeyp
     with pytest.raises(ValueError, match="in a helper"):
         threads.parallel(kernel, 9)
     threads.parallel(lambda start, stop: seen.append((start, stop)), 9)
-    assert sorted(seen) == [(0, 2), (2, 4), (4, 6), (6, 9)] and len(own_helpers) == 1
+    assert sorted(seen) == [(0, 2), (2, 4), (4, 6), (6, 9)] and helpers.count == 1
 
 
 # --------------------------------------------------------------------------------------------------- forks
