@@ -35,7 +35,7 @@ class _Fused(splatting.Kernel):
             from rts_backends import fused_jax
 
             if fused_jax.fits(positions, rgba):
-                return splatting.inside(fused_jax.splat(settings._replace(border=0), positions, rgba, row), border)
+                return fused_jax.splat(settings, positions, rgba, row)
         elif engine == "numpy" and positions.dtype == rgba.dtype and positions.dtype in (np.float32, np.float64):
             return Splats(settings, positions, rgba, row).image()
         return specification(positions, rgba, row)

@@ -19,36 +19,46 @@ def fits(positions: jax.Array, rgba: jax.Array) -> bool:
 
 
 def splat(settings: Settings, positions: jax.Array, rgba: jax.Array, row: jax.Array) -> jax.Array:
-    """The image (H, W, 4) of positions (N, 3), rgba (N, 4) and row (K, H, W)."""
+    """The image (H, W, 4) of positions (N, 3), rgba (N, 4) and row (K, H, W), without the settings' border."""
     return _image(positions, rgba, row, settings=settings)
 
 
 def _host_image(samples: Arrays, image: np.ndarray, settings: Settings) -> None:
-    image[...] = Splats(settings, *samples).image()
+    image[...] = _splats(samples, settings).image()
 
 
 def _host_push(samples: Arrays, tangents: Some, out: np.ndarray, settings: Settings) -> None:
-    out[...] = Splats(settings, *samples).jvp(*tangents)
+    out[...] = _splats(samples, settings).jvp(*tangents)
 
 
 def _host_pull(samples: Arrays, gradients: np.ndarray, results: Some, settings: Settings) -> None:
-    positions, rgba, row = samples
-    used = int(row.max(initial=0)) + 1  # Under `jit` there may be many more.
-    splats = Splats(settings, positions[:used], rgba[:used], row)
+    splats = _splats(samples, settings)
+    used, wanted = len(splats.positions), (results[0] is not None, results[1] is not None)
     for i, g in enumerate(gradients):
-        for result, found in zip(results, splats.vjp(g, (results[0] is not None, results[1] is not None)), strict=True):
+        for result, found in zip(results, splats.vjp(g, wanted), strict=True):
             if result is not None:
                 result[i, :used] = found
                 clear(result[i, used:])
 
 
+def _splats(samples: Arrays, settings: Settings) -> Splats:
+    """The samples in use: under `jit` there may be many more."""
+    positions, rgba, row = samples
+    used = max(1, int(row.max(initial=0)) + 1)
+    rgba = np.broadcast_to(rgba, (used, 4)) if len(rgba) == 1 else rgba[:used]
+    return Splats(settings, positions[:used], rgba, row)
+
+
 def _specification(positions: jax.Array, rgba: jax.Array, row: jax.Array, *, settings: Settings) -> jax.Array:
     kernel = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}[settings.kind]
-    return kernel(settings.sigma, settings.epsilon, settings.gamma).accumulate(positions, rgba, row)
+    return kernel(settings.sigma, settings.epsilon, settings.gamma).image(positions, rgba, row, settings.border)
 
 
-def _shape(positions: tuple, rgba: tuple, row: tuple, **_: Any) -> tuple[int, int, int]:
-    return *row[1:], 4
+def _shape(positions: tuple, rgba: tuple, row: tuple, *, settings: Settings | None = None, **_: Any) -> tuple[int, ...]:
+    border = 0 if settings is None else settings.border
+    return *(max(0, n - 2 * border) for n in row[1:]), 4
 
 
-_image = Differentiable("image", (2, 2, 3), _shape, Kernels(_host_image, _host_push, _host_pull), _specification)
+_image = Differentiable(
+    "image", (2, 2, 3), _shape, Kernels(_host_image, _host_push, _host_pull), _specification, even=(1,)
+)

@@ -11,6 +11,7 @@ that differ by item an axis B.
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -20,11 +21,15 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jaxlib.mlir.dialects import stablehlo as hlo
 
 from rts_backends import jax_host
 
 Wanted = tuple[bool, bool]
 """Whether the first, and whether the second operand has a tangent or wants a gradient."""
+
+# Rules whose results are kept for the next equation alike do not see what operands come from.
+_SEEING_OPERANDS = {"cacheable": False} if "cacheable" in inspect.signature(mlir.register_lowering).parameters else {}
 
 Arrays = Sequence[np.ndarray]
 Some = Sequence[np.ndarray | None]
@@ -53,10 +58,17 @@ class Differentiable:
         shape: of the result, from the shapes of the operands and the parameters.
         kernels: by which it is computed on the host.
         specification: the function in jax, of operands and parameters.
+        even: operands whose rows are often all alike; where a program says so, kernels are given one row of them.
     """
 
     def __init__(
-        self, name: str, ranks: tuple[int, ...], shape: Callable[..., tuple], kernels: Kernels, specification: Callable
+        self,
+        name: str,
+        ranks: tuple[int, ...],
+        shape: Callable[..., tuple],
+        kernels: Kernels,
+        specification: Callable,
+        even: tuple[int, ...] = (),
     ):
         self.kernels, self._specification, self.rank = kernels, specification, len(shape(*((1,) * r for r in ranks)))
         self.count = count = len(ranks)
@@ -67,12 +79,13 @@ class Differentiable:
         def pushed(*shapes: tuple, wanted: Wanted, **params: Any) -> list[tuple]:
             return [(shapes[count][0], *shape(*shapes[:count], **params))]
 
-        self._value = _Operation(name, ranks, count, lambda *s, **p: [shape(*s, **p)], self._host_value, self._plain)
-        swept = *ranks, *(r + 1 for r in ranks[:2])
-        self._push = _Operation(f"{name}_push", swept, count, pushed, self._host_push, self._specified_push)
-        self._pull = _Operation(
-            f"{name}_pull", (*ranks, self.rank + 1), count, pulled, self._host_pull, self._specified_pull
-        )
+        def valued(*shapes: tuple, **params: Any) -> list[tuple]:
+            return [shape(*shapes, **params)]
+
+        swept, given = (*ranks, *(r + 1 for r in ranks[:2])), (*ranks, self.rank + 1)
+        self._value = _Operation(name, ranks, count, valued, self._host_value, self._plain, even)
+        self._push = _Operation(f"{name}_push", swept, count, pushed, self._host_push, self._specified_push, even)
+        self._pull = _Operation(f"{name}_pull", given, count, pulled, self._host_pull, self._specified_pull, even)
         ad.primitive_jvps[self._value.primitive] = self._value_jvp
         ad.primitive_jvps[self._push.primitive] = self._push_jvp
         ad.primitive_jvps[self._pull.primitive] = self._pull_jvp
@@ -190,6 +203,7 @@ class _Operation:
         shapes: of the results without it, from the shapes of the operands without it and the parameters.
         host: fills the results for one item.
         specified: the same by specification.
+        even: see `Differentiable`.
     """
 
     def __init__(
@@ -200,8 +214,9 @@ class _Operation:
         shapes: Callable,
         host: Callable,
         specified: Callable,
+        even: tuple[int, ...],
     ):
-        self.name, self.ranks, self.samples = name, ranks, samples
+        self.name, self.ranks, self.samples, self._even = name, ranks, samples, even
         self._shapes, self._host, self._specified = shapes, host, specified
         self.primitive = primitive = Primitive(f"rts_{name}")
         primitive.multiple_results = True
@@ -210,7 +225,7 @@ class _Operation:
             lambda *avals, **params: [ShapedArray(s, avals[0].dtype) for s in self._results(avals, params)]
         )
         mlir.register_lowering(primitive, mlir.lower_fun(self.specification, multiple_results=True))
-        mlir.register_lowering(primitive, mlir.lower_fun(self._traced, multiple_results=True), platform="cpu")
+        mlir.register_lowering(primitive, self._lowered, platform="cpu", **_SEEING_OPERANDS)
         batching.primitive_batchers[primitive] = self._batched
 
     def __call__(self, *operands: jax.Array, **params: Any) -> list[jax.Array]:
@@ -251,11 +266,20 @@ class _Operation:
             item = [x[b] if by else x for x, by in zip(operands, by_item, strict=True)]
             self._host(item, [x[b, ...] for x in results], **params)
 
-    def _traced(self, *operands: jax.Array, **params: Any) -> list[jax.Array]:
+    def _lowered(self, ctx: Any, *operands: Any, **params: Any) -> Any:
         """In a program for the CPU."""
-        shapes = tuple(jax.ShapeDtypeStruct(s, operands[0].dtype) for s in self._results(operands, params))
-        name = f"{self.name} {sorted(params.items())}"
-        return jax_host.call_named(name, lambda given, out: self._on_host(given, out, params), shapes, *operands)
+        shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in ctx.avals_out)
+        operands, avals = list(operands), list(ctx.avals_in)
+        for i in self._even:
+            row = _only_row(operands[i]) if avals[i].ndim == self.ranks[i] and avals[i].shape[0] else None
+            if row is not None:
+                operands[i], avals[i] = row, avals[i].update(shape=(1, *avals[i].shape[1:]))
+
+        def call(*given: jax.Array) -> list[jax.Array]:
+            name = f"{self.name} {sorted(params.items())}"
+            return jax_host.call_named(name, lambda i, o: self._on_host(i, o, params), shapes, *given)
+
+        return mlir.lower_fun(call, multiple_results=True)(ctx.replace(avals_in=avals), *operands)
 
     def _eager(self, *operands: Any, **params: Any) -> list[jax.Array]:
         device = _cpu_of(operands)
@@ -304,6 +328,24 @@ class _Operation:
                 operands[i] = jnp.broadcast_to(x, (*lead, *own)).reshape(size * inner[0], *own)
         found = self(*operands, **params)
         return [x.reshape(*lead, *x.shape[1:]) for x in found], [0] * len(found)
+
+
+def _only_row(value: Any) -> Any:
+    """The first row of an array in a program that is about to be compiled, if it plainly equals all others, or None."""
+    ir, operation = mlir.ir, value.owner
+    name = getattr(operation, "name", "")  # Of the owner of an argument there is none.
+    kind = value.type
+    shape = ir.RankedTensorType.get([1, *kind.shape[1:]], kind.element_type)
+    if name == "stablehlo.broadcast_in_dim":
+        operand, dims = operation.operands[0], [int(d) for d in operation.attributes["broadcast_dimensions"]]
+        if 0 in dims and operand.type.shape[dims.index(0)] != 1:
+            return None
+        return hlo.broadcast_in_dim(shape, operand, mlir.dense_int_array(dims))
+    if name == "stablehlo.concatenate" and ir.IntegerAttr(operation.attributes["dimension"]).value > 0:
+        rows = [_only_row(operand) for operand in operation.operands]
+        if all(row is not None for row in rows):
+            return hlo.concatenate(rows, operation.attributes["dimension"])
+    return None
 
 
 def _cpu_of(operands: Sequence[jax.Array]) -> Any:

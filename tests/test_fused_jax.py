@@ -204,6 +204,50 @@ def test_what_is_constant_costs_no_derivative(mode, calls):
     assert calls == [("image",), ("vjp", (True, False))]
 
 
+def test_colors_that_are_all_alike_are_not_written_out():
+    positions, rgba, row = scene32(2)
+    splatter, count = KINDS["visible"](), len(positions)
+
+    def image(positions, color):
+        alpha = jnp.ones_like(positions[:, :1])
+        return splatter.splat(positions, jnp.concat([jnp.broadcast_to(color, (count, 3)), alpha], axis=1), row)
+
+    def loss(positions, color):
+        return (image(positions, color) ** 2).sum()
+
+    color = jnp.asarray([0.2, 0.9, 0.4])
+    program = jax.jit(image).lower(positions, color).compile()
+    assert f"f32[{count},3]" in program.as_text() and f"f32[{count},4]" not in program.as_text()
+    np.testing.assert_array_equal(program(positions, color), image(positions, color))
+    gradient = jax.grad(loss, (0, 1))
+    for found, expected in zip(jax.jit(gradient)(positions, color), gradient(positions, color), strict=True):
+        close(found, expected, 1e-6)
+    along = lambda p, c: jax.jvp(image, (p, c), (p, c))[1]  # noqa: E731
+    close(jax.jit(along)(positions, color), along(positions, color), 1e-6)
+    many = jnp.stack([color, color[::-1]])
+    found = jax.jit(jax.vmap(image, (None, 0)))(positions, many)
+    np.testing.assert_array_equal(found, jnp.stack([image(positions, c) for c in many]))
+    # Alike in a column, or as many as there are samples, is not alike in all rows.
+    shades = jnp.linspace(0, 1, count)
+    grey = lambda s: splatter.splat(positions, jnp.broadcast_to(s[:, None], (count, 4)), row)  # noqa: E731
+    np.testing.assert_array_equal(jax.jit(grey)(shades), grey(shades))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_without_their_border(kind):
+    positions, rgba, row = scene32(2)
+    splatter, g = KINDS[kind](), jnp.asarray(noise(5, 7, 4, dtype=np.float32))
+    inside = lambda p, c: splatter.splat(p, c, row, border=2)  # noqa: E731
+    cropped = lambda p, c: splatter.splat(p, c, row)[2:-2, 2:-2]  # noqa: E731
+    for mode in MODES.values():
+        (found, pull), (expected, expected_pull) = (jax.vjp(mode(f), positions, rgba) for f in (inside, cropped))
+        np.testing.assert_array_equal(found, expected)
+        for x, y in zip(pull(g), expected_pull(g), strict=True):
+            np.testing.assert_array_equal(x, y)
+    second = lambda f: jax.jvp(jax.grad(lambda p: (f(p, rgba) ** 2).sum()), (positions,), (positions,))[1]  # noqa: E731
+    close(second(inside), second(cropped))
+
+
 def test_eager_calls_compile_nothing():
     positions, rgba, row = scene32(2)
     splatter, g = KINDS["visible"](), jnp.asarray(noise(9, 11, 4, dtype=np.float32))
