@@ -23,36 +23,53 @@ def leaves(tree: Tree) -> Iterator[Any]:
 
 
 def _collect(tree: Tree, found: list[Any]) -> None:
-    # Called hundreds of times a render, so what is frequent is asked first, and nothing of an abstract class.
-    if type(tree) in STATIC_FIELDS:
+    kind = _KINDS.get(type(tree)) or _kind(tree)
+    if kind == _LEAF:
+        found.append(tree)
+    elif kind == _RECORD:
         _collect(split_record(tree)[0], found)
-    elif isinstance(tree, (tuple, list)):
+    elif kind == _SEQUENCE:
         for item in tree:
             _collect(item, found)
-    elif _is_mapping(tree):
+    elif kind == _MAPPING:
         for key in sorted(tree):
             _collect(tree[key], found)
-    elif tree is not None:
-        found.append(tree)
 
 
-def _is_mapping(tree: Any) -> bool:
-    return isinstance(tree, dict) or (not hasattr(tree, "dtype") and isinstance(tree, Mapping))
+_LEAF, _NOTHING, _RECORD, _SEQUENCE, _MAPPING = range(1, 6)
+_KINDS: dict[type, int] = {}
+"""What trees of a type are. Looked up, since it is asked hundreds of times a render."""
+
+
+def _kind(tree: Tree) -> int:
+    if tree is None:
+        kind = _NOTHING
+    elif type(tree) in STATIC_FIELDS:
+        kind = _RECORD
+    elif isinstance(tree, (list, tuple)):
+        kind = _SEQUENCE
+    elif isinstance(tree, dict) or (not hasattr(tree, "dtype") and isinstance(tree, Mapping)):
+        kind = _MAPPING
+    else:
+        kind = _LEAF
+    _KINDS[type(tree)] = kind
+    return kind
 
 
 def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
     """The same tree with `fn` applied to each leaf, visited in the order of `leaves`."""
-    if tree is None:
-        return None
-    if _is_mapping(tree):
-        return {key: map_leaves(fn, tree[key]) for key in sorted(tree)}
-    if isinstance(tree, (list, tuple)):
-        items = [map_leaves(fn, item) for item in tree]
-        return type(tree)(*items) if hasattr(tree, "_fields") else type(tree)(items)
-    if type(tree) in STATIC_FIELDS:
+    kind = _KINDS.get(type(tree)) or _kind(tree)
+    if kind == _LEAF:
+        return fn(tree)
+    if kind == _RECORD:
         arrays, static = split_record(tree)
         return join_record(type(tree), map_leaves(fn, arrays), static)
-    return fn(tree)
+    if kind == _SEQUENCE:
+        items = [map_leaves(fn, item) for item in tree]
+        return type(tree)(*items) if hasattr(tree, "_fields") else type(tree)(items)
+    if kind == _MAPPING:
+        return {key: map_leaves(fn, tree[key]) for key in sorted(tree)}
+    return None
 
 
 def from_numbers(tree: Tree) -> Tree:
@@ -209,16 +226,16 @@ def affine(row: Array, points: Array) -> Array:
 
 def affine_map(rows: Array, points: Array) -> Array:
     """Points (N, 3) under an affine map of R rows (R, 4): (N, R)."""
-    known = getattr(engine_of(rows, points), "affine_map", None)
-    if known is not None:
-        return known(rows, points)
+    found = offered("affine_map", rows, points)
+    if found is not None:
+        return found
     return namespace(rows, points).stack([affine(rows[i, :], points) for i in range(rows.shape[0])], axis=-1)
 
 
 def take(rows: Array, index: Array) -> Array:
     """(M, C): the rows of (V, C) that (M,) integers name."""
-    known = getattr(engine_of(rows, index), "take", None)
-    return namespace(rows, index).take(rows, index, axis=0) if known is None else known(rows, index)
+    found = offered("take", rows, index)
+    return namespace(rows, index).take(rows, index, axis=0) if found is None else found
 
 
 def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
@@ -234,8 +251,7 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
         from rts import interpolation
 
         return interpolation.interpolate(rows, ids, column, weights)
-    known = getattr(engine_of(rows, ids), "interpolate", None)
-    found = None if known is None else known(rows, ids, column, weights)
+    found = offered("interpolate", rows, ids, column, weights)
     if found is not None:
         return found
     xp = namespace(rows, ids)
@@ -251,8 +267,7 @@ def projective_map(rows: Array, points: Array) -> Array:
 
     Where the third is zero there is no image; the result is finite.
     """
-    known = getattr(engine_of(rows, points), "projective_map", None)
-    found = None if known is None else known(rows, points)
+    found = offered("projective_map", rows, points)
     if found is not None:
         return found
     divisor = affine_map(rows[2:3, :], points)

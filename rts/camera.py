@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import affine, engine_of, is_constant, matmul, namespace, projective_map, promote
+from rts.arrays import affine, constants, engine_of, exemplar, is_constant, matmul, namespace, projective_map, promote
 from rts.protocols import Array, Rays
 from rts.transforms import (
     affine_matrix,
@@ -313,11 +313,11 @@ class Camera(NamedTuple):
         """
         (height, width), p = size, self.projection
         xp, x, y, w = namespace(p), p[0, :], p[1, :], p[3, :]
-        depth = np.array([0, 0, -1, 0]) if is_constant(p) else engine_of(p).constant(np.array([0.0, 0, -1, 0]), p)
+        depth = engine_of(p).constant(np.array([0.0, 0, -1, 0]), p)
         # A constant projection is multiplied out in NumPy.
         to_pixels = xp.stack([(w + x) * (width / 2), (w - y) * (height / 2), w, depth])
-        _, matrices = promote(to_pixels, self.view)
-        return projective_map(matmul(*matrices), points)
+        to_pixels = constants(to_pixels, engine_of(self.view), exemplar(self.view))
+        return projective_map(matmul(to_pixels, self.view), points)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""

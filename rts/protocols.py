@@ -275,8 +275,8 @@ class Splatter(Protocol):
 
     Optional members: `needed(covered, depth) -> (K, H, W) bool`, of host arrays (K, H, W) bool and float: the samples
     that can reach the image, in value or derivative, where all are opaque and on pixel centres. Others are dropped.
-    `crops = True` says that `splat` takes a fourth argument `border`, the number of cells at each side that splat into
-    the image but are not part of it: the result is then (H − 2 border, W − 2 border, 4).
+    `splat` may take a further argument `border`, the number of cells at each side that splat into the image but are no
+    part of it: the result is then (H − 2 border, W − 2 border, 4).
     """
 
     def splat(self, positions: Array, rgba: Array, row: Array) -> Array:
@@ -297,10 +297,10 @@ class Engine(Protocol):
     """An array framework. Chosen by the type of the arrays, never a global setting.
 
     Optional members: `take_error() -> RtsError | None`, the last error raised inside a host call, where the framework
-    wraps such errors in its own; `traced(x) -> bool`, whether an array has a shape but not yet a value;
-    and functions of `rts.arrays` and `rts.transforms` in full precision but faster: `matmul(a, b)`, `rigid(pose, center)`,
-    `affine_map(rows, points)`, `take(rows, index)` and `projective_map(rows, points)`; they may give None, for arrays
-    that they do not know.
+    wraps such errors in its own; `traced(x) -> bool`, whether an array has a shape but not yet a value; and functions
+    of `rts.arrays` and `rts.transforms` in full precision but faster, `matmul(a, b)`, `rigid(pose, center)`,
+    `affine_map(rows, points)`, `take(rows, index)`, `interpolate(rows, ids, column, weights)` and
+    `projective_map(rows, points)`, which may give None for arrays that they do not know.
 
     The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the
     user has imported that module.

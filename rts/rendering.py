@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from rts.arrays import affine_map, constants, engine_of, exemplar, is_constant, is_traced, namespace
 from rts.camera import Camera
@@ -72,21 +73,20 @@ def render(
         InputError: what was given cannot be rendered.
         EngineError: torch and jax arrays in one scene.
     """
-    known = parts.parts if isinstance(parts, PreparedParts) else parts
-    checked, camera = check_scene(known, camera)
+    scene = _Scene.of(parts, camera, sampler)
     size = check_size(size, layers, capacity, supersample)
     background = check_background(background, size)
-    options = dict(sampler=sampler, splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
+    splatter = check_plugin("rts.splatters", splatter, "splat")
+    options = dict(splatter=splatter, layers=layers, supersample=int(supersample), capacity=capacity)
     bands = _bands(*size, layers, supersample)
     if len(bands) == 1:
-        sampled = sample(parts, camera, size, **options)
-        return render_samples(sampled, parts, camera, splatter=splatter, background=background)
-    engine, like = engine_of(checked, camera, background), exemplar(checked, camera, background)
+        return _finished(_sampled(scene, scene.camera, size, **options), scene, splatter, background)
+    engine, like = engine_of(*scene[:2], background), exemplar(*scene[:2], background)
     images = []
     for top, rows in bands:
-        window = camera.window(size, (top, 0), (rows, size[1]))
-        take = partial(sample, parts, window, (rows, size[1]), **options)
-        images.append(engine.checkpoint(take, lambda s, w=window: _splatted(s, checked, camera, w, splatter)))
+        window = scene.camera.window(size, (top, 0), (rows, size[1]))
+        take = partial(_sampled, scene, window, (rows, size[1]), **options)
+        images.append(engine.checkpoint(take, lambda s, w=window: _splatted(s, *scene[:2], w, splatter)))
     image, background = constants((namespace(*images).concat(images), background), engine, like)
     return image if background is None else _over_background(image, background)
 
@@ -107,16 +107,53 @@ def sample(
     Takes the arguments of `render`. With the splatter to come, hidden samples that it does not need are dropped; None
     keeps all. The result may be handed to a function under `jax.jit`.
     """
-    prepared = parts if isinstance(parts, PreparedParts) else None
-    parts, camera = check_scene(prepared.parts if prepared else parts, camera)
-    height, width = check_size(size, layers, capacity, supersample)
-    supersample = int(supersample)  # It may be of a type that overflows.
-    height, width = supersample * height, supersample * width
+    scene = _Scene.of(parts, camera, sampler)
+    size = check_size(size, layers, capacity, supersample)
+    splatter = None if splatter is None else check_plugin("rts.splatters", splatter, "splat")
+    options = dict(splatter=splatter, layers=layers, supersample=int(supersample), capacity=capacity)
+    return _sampled(scene, scene.camera, size, **options)
+
+
+class _Scene(NamedTuple):
+    """What is checked once for sampling and shading.
+
+    Attributes:
+        parts: checked parts.
+        camera: of the whole image.
+        samplers: of each part.
+        entries: what each sampler has built for its part, or None.
+    """
+
+    parts: list[Part]
+    camera: Camera
+    samplers: Sequence[Any]
+    entries: Sequence[Any]
+
+    @classmethod
+    def of(cls, parts: Part | Sequence[Part] | PreparedParts, camera: Camera, sampler: Any) -> _Scene:
+        """From what the user gave."""
+        prepared = parts if isinstance(parts, PreparedParts) else None
+        checked, camera = check_scene(prepared.parts if prepared else parts, camera)
+        if prepared is not None:
+            return cls(checked, camera, prepared.samplers, prepared.entries)
+        chosen = check_plugin("rts.samplers", sampler, "sample")
+        return cls(checked, camera, [chosen] * len(checked), [None] * len(checked))
+
+
+def _sampled(
+    scene: _Scene,
+    camera: Camera,
+    size: tuple[int, int],
+    *,
+    splatter: Any,
+    layers: int | str,
+    supersample: int,
+    capacity: int | None,
+) -> Sampled:
+    """The samples of a window of the image, through the camera of this window."""
+    parts, _, samplers, entries = scene
+    height, width = supersample * size[0], supersample * size[1]
     check_memory(height, width, _planned(layers), gradient=differentiable(parts, camera))
-    if prepared is None:
-        samplers, entries = [check_plugin("rts.samplers", sampler, "sample")] * len(parts), [None] * len(parts)
-    else:
-        samplers, entries = prepared.samplers, prepared.entries
     grid = height + 2 * APRON, width + 2 * APRON
     # Every part is sampled by the one engine, and by the very views that samples are projected with.
     wide = camera.with_apron((height, width), APRON)
@@ -135,8 +172,6 @@ def sample(
         return sampled if done else prune(sampled, needed)
 
     samplers = [c.of(p, camera) if isinstance(c, Auto) else c for p, c in zip(parts, samplers, strict=True)]
-
-    splatter = None if splatter is None else check_plugin("rts.splatters", splatter, "splat")
     needed = None if splatter is None else needed_by(splatter, parts)
     sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)
     return replace(sampled, supersample=supersample)
@@ -163,16 +198,19 @@ def render_samples(
     Returns:
         (H, W, 4) premultiplied linear RGBA.
     """
-    prepared = parts if isinstance(parts, PreparedParts) else None
-    parts, camera = check_scene(prepared.parts if prepared else parts, camera)
-    if len(parts) != len(sampled.samples):
+    scene = _Scene.of(parts, camera, "auto")
+    if len(scene.parts) != len(sampled.samples):
         raise InputError(
-            f"{len(parts)} parts were given for the samples of {len(sampled.samples)}; pass the same parts"
+            f"{len(scene.parts)} parts were given for the samples of {len(sampled.samples)}; pass the same parts"
         )
     fine = sampled.supersample
-    size = tuple((n - 2 * APRON) // fine for n in sampled.row.shape[1:])
-    background = check_background(background, size)
-    image = _splatted(sampled, parts, camera, camera, splatter, background)
+    background = check_background(background, tuple((n - 2 * APRON) // fine for n in sampled.row.shape[1:]))
+    return _finished(sampled, scene, check_plugin("rts.splatters", splatter, "splat"), background)
+
+
+def _finished(sampled: Sampled, scene: _Scene, splatter: Any, background: Any) -> Array:
+    """The image of all samples over its background."""
+    image = _splatted(sampled, *scene[:2], scene.camera, splatter, background)
     if background is None:
         return image
     return _over_background(image, constants(background, engine_of(image), image))
@@ -188,14 +226,13 @@ def _splatted(
         parts: checked parts.
         camera: of the whole image, which shaders see.
         window: the camera of the samples.
-        splatter: name or object.
+        splatter: a splatter.
         beside: what else the engine has to suit.
     """
-    splatter = check_plugin("rts.splatters", splatter, "splat")
     grid, fine = tuple(sampled.row.shape[1:]), sampled.supersample
     size = grid[0] - 2 * APRON, grid[1] - 2 * APRON
     splats = to_splats(sampled, parts, camera, window, beside)
-    crops = getattr(splatter, "crops", False)
+    crops = _takes_border(type(splatter))
     image = splatter.splat(*splats, border=APRON) if crops else inside(splatter.splat(*splats), APRON)
     if fine > 1:
         xp = namespace(image)
@@ -230,6 +267,16 @@ def to_splats(
         return positions[0], colors[0], sampled.row
     xp = namespace(sampled.row)
     return xp.concat(positions), xp.concat(colors), sampled.row
+
+
+_TAKE_BORDER: dict[type, bool] = {}
+
+
+def _takes_border(kind: type) -> bool:
+    """Whether splatters of a class crop the image themselves."""
+    if kind not in _TAKE_BORDER:
+        _TAKE_BORDER[kind] = "border" in inspect.signature(kind.splat).parameters
+    return _TAKE_BORDER[kind]
 
 
 def _planned(layers: int | str) -> int:

@@ -18,7 +18,7 @@ import math
 import operator
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -72,7 +72,6 @@ class Kernel(abc.ABC):
     sigma: float = SIGMA
     epsilon: float = EPSILON
     calibration: float | None = 1.0
-    crops: ClassVar[bool] = True
 
     def __post_init__(self):
         if not (_is_real(self.sigma) and LEAST_SIGMA <= self.sigma <= LARGEST_SIGMA):

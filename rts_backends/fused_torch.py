@@ -14,7 +14,7 @@ from torch import Tensor
 from torch._C._functorch import is_legacy_batchedtensor
 
 from rts_backends.fused_kernels import Choices, Settings, Splats
-from rts_backends.torch_functions import along, quick
+from rts_backends.torch_functions import along, applied
 
 
 def fits(*tensors: Tensor) -> bool:
@@ -28,8 +28,8 @@ def splat(settings: Settings, specification: Callable, positions: Tensor, rgba: 
     """The image (H, W, 4) of positions (N, 3), rgba (N, 4) and row (K, H, W)."""
     work = _Work(settings, specification)
     if torch.compiler.is_compiling():
-        return torch.compiler.disable(_Image.apply)(work, positions, rgba, row)  # pyright: ignore[reportCallIssue]
-    return _Image.apply(work, positions, rgba, row)
+        return torch.compiler.disable(applied)(_Image, work, positions, rgba, row)  # pyright: ignore[reportCallIssue]
+    return applied(_Image, work, positions, rgba, row)
 
 
 class _Work:
@@ -109,7 +109,7 @@ class _Image(torch.autograd.Function):
             positions, rgba, row = ctx.saved_tensors
             found = ctx.work.pulled(row, wanted)(positions, rgba, g)
         else:
-            found = _Pull.apply(ctx.work, wanted, *ctx.saved_tensors, g)
+            found = applied(_Pull, ctx.work, wanted, *ctx.saved_tensors, g)
         return None, *(x if wish else None for x, wish in zip(found, wanted, strict=True)), None
 
     @staticmethod
@@ -119,13 +119,13 @@ class _Image(torch.autograd.Function):
             *primals, row = ctx.saved_tensors
             return along(lambda p, c: ctx.work.specification(p, c, row), primals, (t_positions, t_rgba))
         t_positions, t_rgba = (None if t is None else t[None] for t in (t_positions, t_rgba))
-        return _Push.apply(ctx.work, *ctx.saved_tensors, t_positions, t_rgba)[0]
+        return applied(_Push, ctx.work, *ctx.saved_tensors, t_positions, t_rgba)[0]
 
     @staticmethod
     def vmap(info, in_dims, *args):
         work, *tensors = args
         items = _items(info, in_dims[1:], tensors)
-        return torch.stack([_Image.apply(work.another(), *item) for item in items]), 0
+        return torch.stack([applied(_Image, work.another(), *item) for item in items]), 0
 
 
 class _Pull(torch.autograd.Function):
@@ -161,7 +161,8 @@ class _Pull(torch.autograd.Function):
         work, wanted, *tensors = args
         same = all(d is None for d in in_dims[2:5])
         items = [
-            _Pull.apply(work if same else work.another(), wanted, *item) for item in _items(info, in_dims[2:], tensors)
+            applied(_Pull, work if same else work.another(), wanted, *item)
+            for item in _items(info, in_dims[2:], tensors)
         ]
         return tuple(torch.stack(x) for x in zip(*items, strict=True)), (0, 0)
 
@@ -205,14 +206,11 @@ class _Push(torch.autograd.Function):
         work, positions, rgba, row, *tangents = args
         if any(d is not None for d in in_dims[1:4]):
             items = _items(info, in_dims[1:], (positions, rgba, row, *tangents))
-            return torch.stack([_Push.apply(work.another(), *item) for item in items]), 0
+            return torch.stack([applied(_Push, work.another(), *item) for item in items]), 0
         # The batch is more tangents of the same samples: one sweep for all.
         flat = [
             t if t is None else (t.expand(info.batch_size, *t.shape) if d is None else t.movedim(d, 0)).flatten(0, 1)
             for t, d in zip(tangents, in_dims[4:], strict=True)
         ]
-        out = _Push.apply(work, positions, rgba, row, *flat)
+        out = applied(_Push, work, positions, rgba, row, *flat)
         return out.unflatten(0, (info.batch_size, -1)), 0
-
-
-quick(_Image, _Pull, _Push)

@@ -14,7 +14,7 @@ from torch.utils import _pytree
 from rts.arrays import leaves, map_leaves
 from rts.protocols import ArraySpec, Tree
 from rts.records import STATIC_FIELDS, join_record, split_record
-from rts_backends.torch_functions import quick, transformed
+from rts_backends.torch_functions import applied, transformed
 
 for _cls in STATIC_FIELDS:
     _pytree.register_pytree_node(
@@ -65,7 +65,7 @@ class _HostCall(torch.autograd.Function):
         def select(b):
             return [a if d is None else a.select(d, b) for a, d in zip(args, in_dims[2:], strict=True)]
 
-        items = [_HostCall.apply(fn, specs, *select(b)) for b in range(info.batch_size)]
+        items = [applied(_HostCall, fn, specs, *select(b)) for b in range(info.batch_size)]
         outputs = []
         for spec, values in zip(specs, zip(*items, strict=True), strict=True):
             if spec.packed:
@@ -73,9 +73,6 @@ class _HostCall(torch.autograd.Function):
                 values = [torch.cat([v, v.new_zeros((rows - v.shape[0], *v.shape[1:]))]) for v in values]
             outputs.append(torch.stack(tuple(values)))
         return tuple(outputs), (0,) * len(outputs)
-
-
-quick(_HostCall)
 
 
 class TorchEngine:
@@ -98,8 +95,8 @@ class TorchEngine:
     def call_host(self, fn: Callable, specs: tuple[ArraySpec, ...], *args: Any) -> tuple[torch.Tensor, ...]:
         """Call `fn` on NumPy views or copies of `args`; under vmap once an item, packed rows padded alike."""
         if torch.compiler.is_compiling():
-            return torch.compiler.disable(_HostCall.apply)(fn, specs, *args)
-        return _HostCall.apply(fn, specs, *args)
+            return torch.compiler.disable(applied)(_HostCall, fn, specs, *args)
+        return applied(_HostCall, fn, specs, *args)
 
     def stop_gradient(self, x: torch.Tensor) -> torch.Tensor:
         """`x` detached."""

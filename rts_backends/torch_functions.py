@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch._functorch.utils import unwrap_dead_wrappers
 from torch.autograd import forward_ad
 from torch.utils import _pytree
 
 
-def quick(*functions: type[torch.autograd.Function]) -> None:
-    """Keep the signature of `forward`: torch asks at each call, and finding it takes longer than a small kernel."""
-    for function in functions:
-        function.forward.__signature__ = inspect.signature(function.forward)  # pyright: ignore[reportFunctionMemberAccess]
+def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
+    """`function.apply(*args)`, of all arguments.
+
+    Outside of transforms without torch's look for those that have defaults, which takes longer than a small kernel.
+    """
+    if torch._C._are_functorch_transforms_active():
+        return function.apply(*args)
+    args = unwrap_dead_wrappers(args)
+    return super(torch.autograd.Function, function).apply(*args)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def transformed() -> bool:

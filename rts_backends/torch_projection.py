@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rts_backends import projection_kernels
-from rts_backends.torch_functions import along, quick
+from rts_backends.torch_functions import along, applied
 
 
 def specification(rows: Tensor, points: Tensor) -> Tensor:
@@ -25,7 +25,7 @@ def project(rows: Tensor, points: Tensor) -> Tensor:
     """(N, 3): of the four affine maps (4, 4) of points (N, 3), the first two over the third, and the fourth."""
     if torch.compiler.is_compiling():
         return specification(rows, points)
-    return _Project.apply(rows, points)
+    return applied(_Project, rows, points)
 
 
 def _pulled(wanted: bool) -> Callable:
@@ -54,7 +54,7 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *gradients):
-        found = _Pull.apply(*ctx.saved_tensors, gradients[0], ctx.needs_input_grad[1])
+        found = applied(_Pull, *ctx.saved_tensors, gradients[0], ctx.needs_input_grad[1])
         return found[0], found[1] if ctx.needs_input_grad[1] else None
 
     @staticmethod
@@ -100,6 +100,3 @@ class _Pull(torch.autograd.Function):
     @staticmethod
     def vmap(info, in_dims, rows, points, g, wanted):
         return torch.vmap(_pulled(wanted), in_dims[:3])(rows, points, g), (0, 0)
-
-
-quick(_Project, _Pull)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rts.transforms import rigid_by_arrays
-from rts_backends.torch_functions import quick
+from rts_backends.torch_functions import applied
 
 SMALL = 1e-2
 """Squared angles below which series are exact to rounding."""
@@ -18,7 +18,7 @@ SMALL = 1e-2
 
 def rigid(pose: Tensor, center: Tensor) -> Tensor:
     """(4, 4) of a pose (6,) about a centre (3,), on the CPU and outside of torch's transforms."""
-    return _Rigid.apply(pose, center)[0]
+    return applied(_Rigid, pose, center)[0]
 
 
 class _Rigid(torch.autograd.Function):
@@ -45,9 +45,6 @@ class _Rigid(torch.autograd.Function):
             slopes = torch.func.jacrev(lambda x: rigid_by_arrays(x[:6], x[6:]).reshape(-1))
             found = found + torch.func.vjp(slopes, torch.cat([pose, center]))[1](g_jacobian)[0]
         return found[:6], found[6:]
-
-
-quick(_Rigid)
 
 
 @numba.njit(cache=True)

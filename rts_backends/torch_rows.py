@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numba
@@ -10,14 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rts_backends.torch_functions import quick
+from rts_backends.torch_functions import applied
 
 
 def take(rows: Tensor, index: Tensor) -> Tensor:
     """(M, C): the rows of (V, C) that (M,) integers name, on the CPU."""
     if torch.compiler.is_compiling():
         return torch.index_select(rows, 0, index)
-    return _Take.apply(rows, index)
+    return applied(_Take, rows, index)
 
 
 class _Take(torch.autograd.Function):
@@ -36,15 +37,15 @@ class _Take(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *gradients):
-        return _Add.apply(gradients[0], ctx.saved_tensors[0], ctx.count), None
+        return applied(_Add, gradients[0], ctx.saved_tensors[0], ctx.count), None
 
     @staticmethod
     def jvp(ctx, *tangents):
-        return _Take.apply(tangents[0], ctx.saved_tensors[0])
+        return applied(_Take, tangents[0], ctx.saved_tensors[0])
 
     @staticmethod
     def vmap(info, in_dims, rows, index):
-        return _columns(info, in_dims[:2], (rows, index), _Take.apply)
+        return _columns(info, in_dims[:2], (rows, index), partial(applied, _Take))
 
 
 class _Add(torch.autograd.Function):
@@ -64,18 +65,15 @@ class _Add(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *gradients):
-        return _Take.apply(gradients[0], ctx.saved_tensors[0]), None, None
+        return applied(_Take, gradients[0], ctx.saved_tensors[0]), None, None
 
     @staticmethod
     def jvp(ctx, *tangents):
-        return _Add.apply(tangents[0], ctx.saved_tensors[0], ctx.count)
+        return applied(_Add, tangents[0], ctx.saved_tensors[0], ctx.count)
 
     @staticmethod
     def vmap(info, in_dims, values, index, count):
-        return _columns(info, in_dims[:2], (values, index), lambda v, i: _Add.apply(v, i, count))
-
-
-quick(_Take, _Add)
+        return _columns(info, in_dims[:2], (values, index), lambda v, i: applied(_Add, v, i, count))
 
 
 def _columns(info: Any, in_dims: tuple, given: tuple[Tensor, Tensor], f: Callable) -> tuple[Tensor, int]:
