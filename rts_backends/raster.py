@@ -1,9 +1,13 @@
 """Rasterizer for the CPU: K nearest triangles a pixel in one pass, on all cores (numba).
 
 Most triangles of a large mesh cover no pixel's centre. A first pass sees only their corners on screen, in float32, and
-keeps those that may cover one; for these alone a second works out, in float64 and homogeneous coordinates
-(`rts_backends.triangles`), all that drawing needs. The third draws the image in bands of rows, each by one thread and
-in the order of the triangles, so the result does not depend on the number of threads.
+lists those that may cover one. The second draws the image in bands of rows, each by one thread and in the order of the
+triangles, so the result does not depend on the number of threads. For blocks of listed triangles it works out, in
+float64 and homogeneous coordinates, the numbers of `rts_backends.triangles`, finds the pixels that they may cover, and
+inserts these into the layers.
+
+Loops run over arrays of one short block (a row for each number, a column for each triangle) and have no branches, so
+that they compile to vector instructions and no jump is mispredicted; what is rare is sorted out last.
 """
 
 from __future__ import annotations
@@ -17,22 +21,28 @@ from rts.camera import Camera
 from rts.protocols import Fragments, Proxy
 from rts.sampling import TriangleSampler
 from rts.threads import parallel
-from rts_backends.triangles import depth_of, determinant, edge, facing, owns, pixel_matrix, to_corner
+from rts_backends.triangles import facing, owns, pixel_matrix, to_corner
 
 BAND_ROWS = 16
-CHUNK = 1 << 14
+CHUNK = 1 << 11
 BLOCK = 64
+LONG_BLOCK = 256
+"""Where less is kept of a triangle, or of a vertex."""
+
 SLACK = 1e-2
 """Pixels, for the rounding of corners to float32."""
 
-WIDTH = 12
-"""What is kept of a triangle: three edge functions (x, y, 1) turned inward, and the depths of its corners."""
+LISTED = 8
+"""What is listed of a triangle: its index, its three corners, and its first and last column and row of pixels."""
+
+NUMBERS = 18
+"""Three edge functions (x, y, 1) turned inward; of the corners the depths, and w + z and w − z of clip space."""
 
 
 class Raster(TriangleSampler):
     """K-buffer rasterization with a top-left fill rule; ties in depth go to the lower triangle index."""
 
-    _scratch: dict[tuple, _Scratch]
+    _scratch: dict[tuple, tuple]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Give every instance room to keep scratch memory, whatever `__init__` a subclass has."""
@@ -43,160 +53,120 @@ class Raster(TriangleSampler):
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         height, width = size
-        vertices, faces = prepared.vertices, prepared.faces
-        matrix = pixel_matrix(camera, size)
-        # Drawn again and again, one mesh touches the same pages of memory: the system clears them only once.
-        key = len(vertices), len(faces), np.int16 if max(size) < 2**15 else np.int32
-        scratch = self._scratch.pop(key, None) or _Scratch(*key)
-        screen, boxes, kept, numbers, clips, planes, counts = scratch.arrays
-        parallel(_project, len(vertices), vertices, matrix, screen)
-        keep = facing(camera, cull)
-        parallel(_select, len(counts), vertices, faces, screen, matrix, height, width, keep, boxes, kept, clips, counts)
-        given = vertices, faces, matrix, -camera.view[2], keep
-        parallel(_set_up, len(counts), *given, boxes, kept, clips, numbers, planes, counts)
+        vertices, faces = prepared.vertices, prepared.faces.view(np.uint32)  # Unsigned, no index has to be wrapped.
+        matrix, keep = pixel_matrix(camera, size), facing(camera, cull)
+        # Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
+        # room for every vertex and triangle, but only what is used is ever touched.
+        key = len(vertices), len(faces)
+        screen, listed = self._scratch.pop(key, None) or (
+            np.empty((len(vertices), 2), np.float32),
+            np.empty((len(faces), LISTED), np.int32),
+        )
+        parallel(_project, len(vertices), vertices, matrix, screen, work=4 * len(vertices))
+        chunks, bands = -(-len(faces) // CHUNK), -(-height // BAND_ROWS)
+        spans, counts = np.empty((chunks, 2), np.int64), np.zeros((bands, chunks), np.int64)
+        given = vertices, faces, screen, matrix, height, width, keep
+        parallel(_select, chunks, *given, listed, spans, counts, work=4 * len(faces))
+        offsets = np.append(0, np.cumsum(counts.sum(axis=1)))
+        places = offsets[:-1, None] + np.cumsum(counts, axis=1) - counts
+        items = np.empty(offsets[-1], np.uint32)
+        parallel(_sort, chunks, listed, spans, places, items, work=4 * len(items))
         fragments = Fragments(
             np.empty((layers, height, width), np.int32),
             np.empty((layers, height, width, 2), np.float32),
             np.empty((layers, height, width), np.float32),
         )
-        bands = -(-height // BAND_ROWS)
-        offsets, items = _bands(bands, boxes, counts)
-        parallel(_draw, bands, offsets, items, boxes, kept, clips, numbers, planes, *fragments)
-        self._scratch = {key: scratch}
+        parallel(_draw, bands, offsets, items, listed, vertices, matrix, -camera.view[2], keep, *fragments)
+        self._scratch = {key: (screen, listed)}
         return fragments
 
 
-class _Scratch:
-    """Arrays with room for every vertex and triangle, of which only what is used is ever touched."""
-
-    def __init__(self, vertices: int, faces: int, box_dtype: type):
-        self.arrays = (
-            np.empty((vertices, 2), np.float32),
-            np.empty((faces, 4), box_dtype),
-            np.empty(faces, np.int32),
-            np.empty((faces, WIDTH)),
-            np.empty(faces, np.bool_),
-            np.empty((faces, 6)),
-            np.zeros(-(-faces // CHUNK), np.int64),
-        )
-
-
-@numba.njit(cache=True, nogil=True)
-def _project(start, stop, vertices, matrix, screen):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _project(start, stop, vertices, m, screen):
     """Pixel positions (V, 2); +inf before the near plane (or NaN), −inf beyond the far plane."""
-    m = matrix
-    for v in range(start, stop):
-        x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
-        depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
-        w = m[3, 0] * x + m[3, 1] * y + m[3, 2] * z + m[3, 3]
-        if not (depth >= -w and w > 0):
-            screen[v, 0] = screen[v, 1] = np.inf
-        elif not depth <= w:
-            screen[v, 0] = screen[v, 1] = -np.inf
-        else:
-            screen[v, 0] = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) / w
-            screen[v, 1] = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) / w
+    points, pixels = np.empty((3, LONG_BLOCK), np.float32), np.empty((2, LONG_BLOCK), np.float32)
+    for first in range(start, stop, LONG_BLOCK):
+        block = slice(first, min(stop, first + LONG_BLOCK))
+        read, written = vertices[block], screen[block]
+        for v in range(len(read)):
+            points[0, v], points[1, v], points[2, v] = read[v, 0], read[v, 1], read[v, 2]
+        for v in range(len(read)):
+            x, y, z = np.float64(points[0, v]), np.float64(points[1, v]), np.float64(points[2, v])
+            depth = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3]
+            w = m[3, 0] * x + m[3, 1] * y + m[3, 2] * z + m[3, 3]
+            scale = 1 / w
+            column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * scale
+            row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * scale
+            behind_near, before_far = (depth >= -w) & (w > 0), depth <= w
+            column, row = column if before_far else -np.inf, row if before_far else -np.inf
+            pixels[0, v], pixels[1, v] = column if behind_near else np.inf, row if behind_near else np.inf
+        for v in range(len(read)):
+            written[v, 0], written[v, 1] = pixels[0, v], pixels[1, v]
 
 
-@numba.njit(cache=True, nogil=True)
-def _select(first, last, vertices, faces, screen, matrix, height, width, keep, boxes, kept, clips, counts):
-    """List, chunk by chunk, the triangles that may cover a pixel's centre, with their boxes of pixels."""
-    corners = np.empty((3, 4))
-    low, slack = np.float32(-SLACK), np.float32(SLACK)
-    right, bottom = np.float32(width + SLACK), np.float32(height + SLACK)
-    half, half_out, half_in = np.float32(0.5), np.float32(0.5 + SLACK), np.float32(0.5 - SLACK)
-    infinity, zero = np.float32(np.inf), np.float32(0)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _select(first, last, vertices, faces, screen, matrix, height, width, keep, listed, spans, counts):
+    """List the triangles that may cover a pixel's centre; spans (chunks, 2) of the list, counts (bands, chunks)."""
+    xy, box = np.empty((3, LONG_BLOCK, 2), np.float32), np.empty((4, LONG_BLOCK), np.float32)
+    clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
+    chosen, corners = np.empty(LONG_BLOCK, np.uint32), np.empty((3, 4))
+    slack, half, infinity, sign = np.float32(SLACK), np.float32(0.5), np.float32(np.inf), np.float32(keep)
+    found = first * CHUNK
     for chunk in range(first, last):
-        start, stop = chunk * CHUNK, min(len(faces), (chunk + 1) * CHUNK)
-        found = start
-        for t in range(start, stop):
-            ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
-            xa, xb, xc = screen[ia, 0], screen[ib, 0], screen[ic, 0]
-            x0, x1 = min(xa, xb, xc), max(xa, xb, xc)
-            if x0 == infinity or x1 == -infinity:
-                continue
-            ya, yb, yc = screen[ia, 1], screen[ib, 1], screen[ic, 1]
-            y0, y1 = min(ya, yb, yc), max(ya, yb, yc)
-            clip = x1 == infinity or x0 == -infinity
-            if clip:
-                to_corner(matrix, vertices, ia, corners, 0)
-                to_corner(matrix, vertices, ib, corners, 1)
-                to_corner(matrix, vertices, ic, corners, 2)
-                x0, x1, y0, y1 = _clipped_box(corners, width, height)
-            # Pixel centres lie at i + 0.5; clamped before rounding, since a far point overflows an integer.
-            i0, i1 = np.int32(np.ceil(max(x0, low) - half_out)), np.int32(np.floor(min(x1, right) - half_in))
-            if i0 > i1:
-                continue
-            j0, j1 = np.int32(np.ceil(max(y0, low) - half_out)), np.int32(np.floor(min(y1, bottom) - half_in))
-            if j0 > j1:
-                continue
-            i0, j0, i1, j1 = max(i0, 0), max(j0, 0), min(i1, width - 1), min(j1, height - 1)
-            if i0 > i1 or j0 > j1:
-                continue
-            if i0 == i1 and j0 == j1 and not clip:
-                # One centre: most triangles whose box holds it do not.
-                x, y = np.float32(i0) + half, np.float32(j0) + half
+        spans[chunk, 0] = found
+        end = min(len(faces), (chunk + 1) * CHUNK)
+        for start in range(chunk * CHUNK, end, LONG_BLOCK):
+            block = faces[start : min(end, start + LONG_BLOCK)]
+            for b in range(len(block)):
+                for c in range(3):
+                    v = block[b, c]
+                    xy[c, b, 0], xy[c, b, 1] = screen[v, 0], screen[v, 1]
+            for b in range(len(block)):
+                xa, xb, xc = xy[0, b, 0], xy[1, b, 0], xy[2, b, 0]
+                ya, yb, yc = xy[0, b, 1], xy[1, b, 1], xy[2, b, 1]
+                x0, x1, y0, y1 = min(xa, xb, xc), max(xa, xb, xc), min(ya, yb, yc), max(ya, yb, yc)
+                i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width)
+                box[0, b], box[1, b], box[2, b], box[3, b] = i0, i1, j0, j1
+                # Where there is one centre, most triangles whose box holds it do not.
+                x, y = i0 + half, j0 + half
                 ax, ay, bx, by, cx, cy = xa - x, ya - y, xb - x, yb - y, xc - x, yc - y
                 ea, eb, ec = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
                 bound = slack * (x1 - x0 + y1 - y0)
-                if min(ea, eb, ec) < -bound and max(ea, eb, ec) > bound:
-                    continue
-                area = ea + eb + ec
-                if keep != 0 and area * np.float32(keep) < -bound and abs(area) > zero:
-                    continue
-            kept[found], clips[found] = t, clip
-            boxes[found, 0], boxes[found, 1], boxes[found, 2], boxes[found, 3] = i0, i1, j0, j1
-            found += 1
-        counts[chunk] = found - start
-
-
-@numba.njit(cache=True, nogil=True)
-def _set_up(first, last, vertices, faces, matrix, view_depth, keep, boxes, kept, clips, numbers, planes, counts):
-    """Work out what drawing needs of the listed triangles; those of no area, or facing away, leave the list."""
-    corners = np.empty((3, 4))
-    near_faces, near_vertices = np.empty((BLOCK, 3), np.int32), np.empty((3 * BLOCK, 3), np.float32)
-    for chunk in range(first, last):
-        start, found = chunk * CHUNK, chunk * CHUNK
-        for n in range(start, start + counts[chunk]):
-            at = (n - start) % BLOCK
-            if at == 0:
-                # Corners are gathered by loops so short that the processor overlaps their waits for memory.
-                block = min(BLOCK, start + counts[chunk] - n)
-                for b in range(block):
-                    t = kept[n + b]
-                    near_faces[b, 0], near_faces[b, 1], near_faces[b, 2] = faces[t, 0], faces[t, 1], faces[t, 2]
-                for b in range(block):
+                away = (ea + eb + ec) * sign < -bound
+                missed = (i0 == i1) & (j0 == j1) & (((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound)) | away)
+                clips[b] = ((x1 == infinity) | (x0 == -infinity)) & (x0 < infinity) & (x1 > -infinity)
+                near[b] = clips[b] | ((i0 <= i1) & (j0 <= j1) & ~missed)
+            count = 0
+            for b in range(len(block)):
+                chosen[count] = b
+                count += near[b]
+            for b in chosen[:count]:
+                i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
+                if clips[b]:
                     for c in range(3):
-                        v = near_faces[b, c]
-                        near_vertices[3 * b + c, 0] = vertices[v, 0]
-                        near_vertices[3 * b + c, 1] = vertices[v, 1]
-                        near_vertices[3 * b + c, 2] = vertices[v, 2]
-            t = kept[n]
-            to_corner(matrix, near_vertices, 3 * at, corners, 0)
-            to_corner(matrix, near_vertices, 3 * at + 1, corners, 1)
-            to_corner(matrix, near_vertices, 3 * at + 2, corners, 2)
-            area = determinant(corners, 0, 1, 2)
-            if not (area * keep > 0 or (keep == 0 and area != 0)):
-                continue
-            sign = 1.0 if area > 0 else -1.0
-            xa, ya, wa = edge(corners, 1, 2)
-            xb, yb, wb = edge(corners, 2, 0)
-            xc, yc, wc = edge(corners, 0, 1)
-            numbers[found, 0], numbers[found, 1], numbers[found, 2] = sign * xa, sign * ya, sign * wa
-            numbers[found, 3], numbers[found, 4], numbers[found, 5] = sign * xb, sign * yb, sign * wb
-            numbers[found, 6], numbers[found, 7], numbers[found, 8] = sign * xc, sign * yc, sign * wc
-            numbers[found, 9] = depth_of(view_depth, near_vertices, 3 * at)
-            numbers[found, 10] = depth_of(view_depth, near_vertices, 3 * at + 1)
-            numbers[found, 11] = depth_of(view_depth, near_vertices, 3 * at + 2)
-            if clips[n]:
-                for c in range(3):
-                    planes[found, c] = corners[c, 3] + corners[c, 2]
-                    planes[found, 3 + c] = corners[c, 3] - corners[c, 2]
-            kept[found], clips[found] = t, clips[n]
-            for c in range(4):
-                boxes[found, c] = boxes[n, c]
-            found += 1
-        counts[chunk] = found - start
+                        to_corner(matrix, vertices, block[b, c], corners, c)
+                    x0, x1, y0, y1 = _clipped_box(corners, width, height)
+                    i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width)
+                    if i0 > i1 or j0 > j1:
+                        continue
+                listed[found, 0] = start + b
+                listed[found, 1], listed[found, 2], listed[found, 3] = block[b, 0], block[b, 1], block[b, 2]
+                listed[found, 4], listed[found, 5], listed[found, 6], listed[found, 7] = i0, i1, j0, j1
+                found += 1
+                for band in range(int(j0) // BAND_ROWS, int(j1) // BAND_ROWS + 1):
+                    counts[band, chunk] += 1
+        spans[chunk, 1] = found
+
+
+@numba.njit
+def _centres(x0, x1, y0, y1, height, width):
+    """First and last column and row, in float32, whose pixels have their centres in a box."""
+    # Pixel centres lie at i + 0.5; clamped before rounding, since a far point overflows an integer.
+    low, out, into = np.float32(-SLACK), np.float32(0.5 + SLACK), np.float32(0.5 - SLACK)
+    right, bottom = np.float32(width + SLACK), np.float32(height + SLACK)
+    i0, i1 = np.ceil(max(x0, low) - out), np.floor(min(x1, right) - into)
+    j0, j1 = np.ceil(max(y0, low) - out), np.floor(min(y1, bottom) - into)
+    return i0, i1, j0, j1
 
 
 @numba.njit
@@ -220,88 +190,169 @@ def _clipped_box(corners, width, height):
 
 
 @numba.njit(cache=True, nogil=True)
-def _bands(count, boxes, counts):
-    """For each band of rows the listed triangles that touch it, in order: offsets (bands + 1,) into items."""
-    offsets = np.zeros(count + 1, np.int64)
-    for chunk in range(len(counts)):
-        for n in range(chunk * CHUNK, chunk * CHUNK + counts[chunk]):
-            for band in range(boxes[n, 2] // BAND_ROWS, boxes[n, 3] // BAND_ROWS + 1):
-                offsets[band + 1] += 1
-    for band in range(count):
-        offsets[band + 1] += offsets[band]
-    items, filled = np.empty(offsets[count], np.int32), offsets[:-1].copy()
-    for chunk in range(len(counts)):
-        for n in range(chunk * CHUNK, chunk * CHUNK + counts[chunk]):
-            for band in range(boxes[n, 2] // BAND_ROWS, boxes[n, 3] // BAND_ROWS + 1):
-                items[filled[band]] = n
-                filled[band] += 1
-    return offsets, items
+def _sort(first, last, listed, spans, places, items):
+    """Write the places in the list of each band's triangles, in order, from `places` (bands, chunks) on."""
+    for chunk in range(first, last):
+        for n in range(spans[chunk, 0], spans[chunk, 1]):
+            for band in range(listed[n, 6] // BAND_ROWS, listed[n, 7] // BAND_ROWS + 1):
+                items[places[band, chunk]] = n
+                places[band, chunk] += 1
 
 
-@numba.njit(cache=True, nogil=True)
-def _draw(first, last, offsets, items, boxes, kept, clips, numbers, planes, triangle_ids, barycentrics, depths):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _draw(first, last, offsets, items, listed, vertices, matrix, view_depth, keep, triangle_ids, barycentrics, depths):
     """Fill the three fragment arrays, band by band."""
     layers, height, width = triangle_ids.shape
-    nearest = np.empty((BAND_ROWS * width, layers))
-    winners = np.empty((BAND_ROWS * width, layers), np.int32)
+    nearest = np.empty((layers, BAND_ROWS, width))
+    entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
+    numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
+    most = 4 * BLOCK
+    hits = np.empty((most + width, 2), np.int32)
     for band in range(first, last):
         top, bottom = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS) - 1
-        nearest[:], winners[:] = np.inf, -1
-        for at in range(offsets[band], offsets[band + 1]):
-            n = items[at]
-            j0, j1 = max(top, boxes[n, 2]), min(bottom, boxes[n, 3])
-            xa, ya, wa = numbers[n, 0], numbers[n, 1], numbers[n, 2]
-            xb, yb, wb = numbers[n, 3], numbers[n, 4], numbers[n, 5]
-            xc, yc, wc = numbers[n, 6], numbers[n, 7], numbers[n, 8]
-            za, zb, zc = numbers[n, 9], numbers[n, 10], numbers[n, 11]
-            # Top and left edges own the pixels exactly on them (y points down).
-            own_a, own_b, own_c = owns(xa, ya), owns(xb, yb), owns(xc, yc)
-            i0, i1, clipped = boxes[n, 0], boxes[n, 1], clips[n]
-            for j in range(j0, j1 + 1):
-                y = j + 0.5
-                ra, rb, rc = ya * y + wa, yb * y + wb, yc * y + wc
-                for i in range(i0, i1 + 1):
-                    x = i + 0.5
-                    ea, eb, ec = xa * x + ra, xb * x + rb, xc * x + rc
-                    # One branch that is hard to foresee instead of three.
-                    if (ea < 0) | (eb < 0) | (ec < 0):
-                        continue
-                    if ((ea == 0) & (not own_a)) | ((eb == 0) & (not own_b)) | ((ec == 0) & (not own_c)):
-                        continue
-                    total = ea + eb + ec
-                    if not total > 0 or (clipped and _outside(planes, n, ea, eb, ec)):
-                        continue
-                    z = (ea * za + eb * zb + ec * zc) / total
-                    pixel = (j - top) * width + i
-                    if not z < nearest[pixel, layers - 1]:
-                        continue
-                    k = layers - 1
-                    while k > 0 and z < nearest[pixel, k - 1]:
-                        nearest[pixel, k], winners[pixel, k] = nearest[pixel, k - 1], winners[pixel, k - 1]
-                        k -= 1
-                    nearest[pixel, k], winners[pixel, k] = z, n
+        rows = slice(top, bottom + 1)
+        nearest[:], triangle_ids[:, rows], barycentrics[:, rows] = np.inf, -1, 0
+        for start in range(offsets[band], offsets[band + 1], BLOCK):
+            block = items[start : min(offsets[band + 1], start + BLOCK)]
+            _gather(block, listed, vertices, entries, points)
+            _set_up(len(block), points, matrix, view_depth, keep, top, bottom, entries, numbers, clips)
+            _cover(len(block), entries, numbers, covers)
+            found = 0
+            for b in range(len(block)):
+                i0, i1, j0, j1 = entries[4, b], entries[5, b], entries[6, b], entries[7, b]
+                place = b * BAND_ROWS + j0 - top
+                if (i1 - i0 < 2) & (j1 - j0 < 2):
+                    for n in range(4):
+                        hits[found, 0], hits[found, 1] = place + (n >> 1), i0 + (n & 1)
+                        found += (covers[b] >> n) & 1
+                    continue
+                for j in range(j0, j1 + 1):
+                    y = j + 0.5
+                    ra, rb = numbers[1, b] * y + numbers[2, b], numbers[4, b] * y + numbers[5, b]
+                    rc = numbers[7, b] * y + numbers[8, b]
+                    for i in range(i0, i1 + 1):
+                        x = i + 0.5
+                        ea, eb, ec = numbers[0, b] * x + ra, numbers[3, b] * x + rb, numbers[6, b] * x + rc
+                        hits[found, 0], hits[found, 1] = place, i
+                        found += (ea >= 0) & (eb >= 0) & (ec >= 0)
+                    place += 1
+                    if found > most - 4:
+                        _insert(hits[:found], top, entries, numbers, clips, nearest, triangle_ids, barycentrics)
+                        found = 0
+            _insert(hits[:found], top, entries, numbers, clips, nearest, triangle_ids, barycentrics)
         for k in range(layers):
             for j in range(top, bottom + 1):
-                y = j + 0.5
                 for i in range(width):
-                    n = winners[(j - top) * width + i, k]
-                    if n < 0:
-                        triangle_ids[k, j, i] = -1
-                        barycentrics[k, j, i, 0] = barycentrics[k, j, i, 1] = depths[k, j, i] = 0
-                        continue
-                    x = i + 0.5
-                    ea = numbers[n, 0] * x + (numbers[n, 1] * y + numbers[n, 2])
-                    eb = numbers[n, 3] * x + (numbers[n, 4] * y + numbers[n, 5])
-                    ec = numbers[n, 6] * x + (numbers[n, 7] * y + numbers[n, 8])
-                    scale = 1 / (ea + eb + ec)
-                    triangle_ids[k, j, i] = kept[n]
-                    barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = ea * scale, eb * scale
-                    depths[k, j, i] = nearest[(j - top) * width + i, k]
+                    z = nearest[k, j - top, i]
+                    depths[k, j, i] = z if z < np.inf else 0.0
+
+
+# Only inlined by numba itself, so that lengths of rows are known, do loops over several arrays become vectors.
+
+
+@numba.njit(inline="always")
+def _gather(block, listed, vertices, entries, points):
+    """What is listed of the triangles (LISTED, BLOCK), and their corners (3, 3, BLOCK).
+
+    The loops are so short that the processor overlaps their waits for memory.
+    """
+    for b in range(len(block)):
+        for r in range(LISTED):
+            entries[r, b] = listed[block[b], r]
+    for b in range(len(block)):
+        for c in range(3):
+            v = np.uint32(entries[1 + c, b])
+            for r in range(3):
+                points[c, r, b] = vertices[v, r]
+
+
+@numba.njit(inline="always")
+def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, clips):
+    """Work out the numbers (NUMBERS, BLOCK) of triangles, and which may need clipping.
+
+    Rows are cut to the band; none are left of a triangle of no area, or facing away.
+    """
+    corners, signs = np.empty((3, 4, BLOCK)), np.empty(BLOCK)
+    for c in range(3):
+        for b in range(count):
+            px, py, pz = points[c, 0, b], points[c, 1, b], points[c, 2, b]
+            numbers[9 + c, b] = view_depth[0] * px + view_depth[1] * py + view_depth[2] * pz + view_depth[3]
+            x, y, z = np.float64(px), np.float64(py), np.float64(pz)
+            for r in range(4):
+                corners[c, r, b] = m[r, 0] * x + m[r, 1] * y + m[r, 2] * z + m[r, 3]
+            numbers[12 + c, b] = corners[c, 3, b] + corners[c, 2, b]
+            numbers[15 + c, b] = corners[c, 3, b] - corners[c, 2, b]
+    for b in range(count):
+        ax, ay, aw = corners[0, 0, b], corners[0, 1, b], corners[0, 3, b]
+        bx, by, bw = corners[1, 0, b], corners[1, 1, b], corners[1, 3, b]
+        cx, cy, cw = corners[2, 0, b], corners[2, 1, b], corners[2, 3, b]
+        area = ax * (by * cw - bw * cy) - ay * (bx * cw - bw * cx) + aw * (bx * cy - by * cx)
+        signs[b] = 1.0 if area > 0 else -1.0
+        drawn = (area * keep > 0) | ((keep == 0) & (area != 0))
+        entries[6, b], entries[7, b] = max(entries[6, b], top), min(entries[7, b], bottom) if drawn else -1
+        near = min(numbers[12, b], numbers[13, b], numbers[14, b])
+        far = min(numbers[15, b], numbers[16, b], numbers[17, b])
+        clips[b] = (near < 0) | (far < 0)
+    for c in range(3):
+        i, j = (c + 1) % 3, (c + 2) % 3
+        for b in range(count):
+            ax, ay, aw = corners[i, 0, b], corners[i, 1, b], corners[i, 3, b]
+            bx, by, bw = corners[j, 0, b], corners[j, 1, b], corners[j, 3, b]
+            numbers[3 * c, b] = signs[b] * (ay * bw - aw * by)
+            numbers[3 * c + 1, b] = signs[b] * (aw * bx - ax * bw)
+            numbers[3 * c + 2, b] = signs[b] * (ax * by - ay * bx)
+
+
+@numba.njit(inline="always")
+def _cover(count, entries, numbers, covers):
+    """Which of the first 2 × 2 pixels of its box each triangle may cover, as bits."""
+    for b in range(count):
+        bits = 0
+        for n in range(4):
+            i, j = entries[4, b] + (n & 1), entries[6, b] + (n >> 1)
+            x, y = i + 0.5, j + 0.5
+            ea = numbers[0, b] * x + (numbers[1, b] * y + numbers[2, b])
+            eb = numbers[3, b] * x + (numbers[4, b] * y + numbers[5, b])
+            ec = numbers[6, b] * x + (numbers[7, b] * y + numbers[8, b])
+            bits |= ((i <= entries[5, b]) & (j <= entries[7, b]) & (ea >= 0) & (eb >= 0) & (ec >= 0)) << n
+        covers[b] = bits
+
+
+@numba.njit(error_model="numpy")
+def _insert(hits, top, entries, numbers, clips, nearest, triangle_ids, barycentrics):
+    """Insert the block's triangles into the layers of pixels; hits (n, 2) are triangle and row of the band, column."""
+    layers = len(triangle_ids)
+    for h in range(len(hits)):
+        place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
+        b, row = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS)
+        j = row + np.uint32(top)
+        x, y = i + 0.5, j + 0.5
+        xa, ya, wa = numbers[0, b], numbers[1, b], numbers[2, b]
+        xb, yb, wb = numbers[3, b], numbers[4, b], numbers[5, b]
+        xc, yc, wc = numbers[6, b], numbers[7, b], numbers[8, b]
+        ea, eb, ec = xa * x + (ya * y + wa), xb * x + (yb * y + wb), xc * x + (yc * y + wc)
+        # Top and left edges own the pixels exactly on them (y points down).
+        if (ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc)):
+            continue
+        total = ea + eb + ec
+        if not total > 0 or (clips[b] and _outside(numbers, b, ea, eb, ec)):
+            continue
+        z, scale = (ea * numbers[9, b] + eb * numbers[10, b] + ec * numbers[11, b]) / total, 1 / total
+        # Behind what is as near, before what is farther; a branch would be foreseen every other time.
+        moved, t, p, q = z, entries[0, b], np.float32(ea * scale), np.float32(eb * scale)
+        for k in range(layers):
+            old, old_t = nearest[k, row, i], triangle_ids[k, j, i]
+            old_p, old_q = barycentrics[k, j, i, 0], barycentrics[k, j, i, 1]
+            before = z < old
+            nearest[k, row, i], triangle_ids[k, j, i] = moved if before else old, t if before else old_t
+            barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = p if before else old_p, q if before else old_q
+            moved, t = old if before else moved, old_t if before else t
+            p, q = old_p if before else p, old_q if before else q
 
 
 @numba.njit
-def _outside(planes, n, ea, eb, ec):
+def _outside(numbers, b, ea, eb, ec):
     """Whether the point with barycentrics in the ratio ea : eb : ec lies outside the near or the far plane."""
-    near = ea * planes[n, 0] + eb * planes[n, 1] + ec * planes[n, 2]
-    far = ea * planes[n, 3] + eb * planes[n, 4] + ec * planes[n, 5]
+    near = ea * numbers[12, b] + eb * numbers[13, b] + ec * numbers[14, b]
+    far = ea * numbers[15, b] + eb * numbers[16, b] + ec * numbers[17, b]
     return near < 0 or far < 0
