@@ -297,7 +297,8 @@ class Engine(Protocol):
     """An array framework. Chosen by the type of the arrays, never a global setting.
 
     Optional members: `take_error() -> RtsError | None`, the last error raised inside a host call, where the framework
-    wraps such errors in its own; `traced(x) -> bool`, whether an array has a shape but not yet a value; and functions
+    wraps such errors in its own; `traced(x) -> bool`, whether an array has a shape but not yet a value, and
+    with it `on_cpu(f, otherwise, *arrays)`, `f` of traced arrays where they turn out to be on a CPU; and functions
     of `rts.arrays` and `rts.transforms` in full precision but faster, `matmul(a, b)`, `rigid(pose, center)`,
     `affine_map(rows, points)`, `take(rows, index)`, `interpolate(rows, ids, column, weights)` and
     `projective_map(rows, points)`, which may give None for arrays that they do not know.

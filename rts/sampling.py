@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Self
 
 import array_api_compat
@@ -274,16 +275,13 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
     if len(samples) == 1:
         only = samples[0]
         return Sampled(tuple(samples), xp.clip(only.row, -1, 0), only.row, only.depth, overflow)
-    on_host = "cpu" in str(array_api_compat.device(samples[0].row)).lower()
-    if on_host and not is_traced(samples[0].row):
-        part, row, depth = _interleaved_on_the_host(samples, layers)
+    given = *(s.row for s in samples), *(s.depth for s in samples)
+    on_host, elsewhere = partial(_interleaved_on_the_host, layers), partial(_interleaved, layers)
+    if is_traced(given[0]):
+        part, row, depth = engine_of(given).on_cpu(on_host, elsewhere, *given)
     else:
-        row = xp.concat([s.row for s in samples])
-        part = xp.concat([xp.where(s.row >= 0, i, s.row) for i, s in enumerate(samples)])
-        depth = xp.concat([s.depth for s in samples])
-        last = xp.max(depth) + 1
-        order = xp.argsort(xp.where(row >= 0, depth, last), axis=0, stable=True)[:layers]
-        row, part, depth = (xp.take_along_axis(x, order, axis=0) for x in (row, part, depth))
+        on_cpu = "cpu" in str(array_api_compat.device(given[0])).lower()
+        part, row, depth = on_host(*given) if on_cpu else elsewhere(*given)
     start = 0
     for i, s in enumerate(samples):
         row = xp.where(part == i, row + start, row) if start else row
@@ -291,21 +289,29 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
     return Sampled(tuple(samples), part, row, depth, overflow)
 
 
-def _interleaved_on_the_host(samples: Sequence[Samples], layers: int) -> tuple[Array, ...]:
-    """Part, row within it and depth, (K, H, W) each: sorting many short columns takes array code far longer."""
-    count = len(samples)
-    kept = min(layers, sum(s.row.shape[0] for s in samples))
-    shape, depth = (kept, *samples[0].row.shape[1:]), samples[0].depth
-    dtype = np.float64 if namespace(depth).finfo(depth.dtype).bits == 64 else np.float32
+def _interleaved(layers: int, *given: Array) -> tuple[Array, ...]:
+    """Part, row within it and depth, (K, H, W) each, from the rows of each part and the depths of each."""
+    xp, rows = namespace(given[0]), given[: len(given) // 2]
+    row, depth = xp.concat(rows), xp.concat(given[len(rows) :])
+    part = xp.concat([xp.where(r >= 0, i, r) for i, r in enumerate(rows)])
+    order = xp.argsort(xp.where(row >= 0, depth, xp.max(depth) + 1), axis=0, stable=True)[:layers]
+    part, row, depth = (xp.take_along_axis(x, order, axis=0) for x in (part, row, depth))
+    return part, row, depth
+
+
+def _interleaved_on_the_host(layers: int, *given: Array) -> tuple[Array, ...]:
+    """The same: sorting many short columns takes array code far longer."""
+    rows, depths = given[: len(given) // 2], given[len(given) // 2 :]
+    shape = (min(layers, sum(r.shape[0] for r in rows)), *rows[0].shape[1:])
+    dtype = np.float64 if any(namespace(d).finfo(d.dtype).bits == 64 for d in depths) else np.float32
 
     def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
         from rts import lifting
 
-        return lifting.interleave(arrays[:count], arrays[count:], layers)
+        return lifting.interleave(arrays[: len(rows)], arrays[len(rows) :], layers)
 
     specs = ArraySpec(shape, np.int32), ArraySpec(shape, np.int32), ArraySpec(shape, dtype)
-    given = *(s.row for s in samples), *(s.depth for s in samples)
-    return engine_of(samples).call_host(host, specs, *given)
+    return engine_of(given).call_host(host, specs, *given)
 
 
 def check_camera(camera: Camera) -> None:

@@ -100,6 +100,10 @@ class JaxEngine:
         """Whether `x` is a tracer."""
         return isinstance(x, Tracer)
 
+    def on_cpu(self, f: Callable, otherwise: Callable, *args: jax.Array) -> tuple[jax.Array, ...]:
+        """`f` of tracers in programs for the CPU, and `otherwise` of them on other devices; the results are alike."""
+        return jax.lax.platform_dependent(*args, cpu=f, default=otherwise)
+
     def take_error(self) -> RtsError | None:
         """What the latest host call under a trace raised, once; jax replaces it by an error of its own."""
         error, self._error = self._error, None
