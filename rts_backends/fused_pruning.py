@@ -8,111 +8,170 @@ import numpy as np
 from rts.splatting import CONTINUED, LEAST_EPSILON, TIE
 from rts.threads import parallel
 
+HALO = 3
+"""Rows that the decision for a row looks at on either side: its marks, their neighbours, and those one farther on."""
+
 compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
 
 
 def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, epsilon: float) -> np.ndarray:
     """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W); for `Visible`, or for `Multi`."""
-    layers, height, width = covered.shape
+    layers, height, _ = covered.shape
     if layers == 1 or not (visible or epsilon >= LEAST_EPSILON):
         return covered
-    depth = np.ascontiguousarray(depth)
-    z = np.empty((layers, height + 2, width + 2), depth.dtype)
-    z[:, [0, -1]] = np.nan
-    farthest = np.empty(height, z.dtype)
-    parallel(_depths, height, covered, depth, z, farthest)
-    margin, mixed, kept = TIE * farthest.max(), np.zeros((height + 2, width + 2), np.uint8), np.empty_like(covered)
-    parallel(_mark, height, z, visible, 2 * farthest.max(), z.dtype.type(margin), z.dtype.type(CONTINUED), mixed)
-    parallel(_spread, height, covered, mixed, kept)
+    covered, depth = np.ascontiguousarray(covered), np.ascontiguousarray(depth)
+    farthest, kept = np.zeros(height, depth.dtype), np.empty_like(covered)
+    parallel(_farthest, height, covered, depth, farthest, work=covered.size // 8)
+    beyond, kind = 2 * farthest.max(initial=0), depth.dtype.type
+    parallel(_keep, height, covered, depth, visible, beyond, kind(TIE * beyond / 2), kind(CONTINUED), kept)
     return kept
 
 
 @kernel
-def _depths(start, stop, covered, depth, z, farthest):
-    """Depths into z (K, H + 2, W + 2), which is NaN where there is nothing; the largest size in each row."""
-    layers, _, width = covered.shape
+def _farthest(start, stop, covered, depth, farthest):
+    """The largest size of a depth in each row."""
     for y in range(start, stop):
-        most = z.dtype.type(0)
-        for k in range(layers):
-            z[k, y + 1, 0] = z[k, y + 1, width + 1] = np.nan
-            for x in range(width):
-                z[k, y + 1, x + 1] = depth[k, y, x] if covered[k, y, x] else np.nan
-                if covered[k, y, x]:
-                    most = max(most, abs(depth[k, y, x]))
+        most = depth.dtype.type(0)
+        for k in range(len(covered)):
+            cells, depths = covered[k, y], depth[k, y]
+            for x in range(len(cells)):
+                size = abs(depths[x]) if cells[x] else depth.dtype.type(0)
+                most = size if size > most else most
         farthest[y] = most
 
 
 @kernel
-def _mark(start, stop, z, visible, beyond, margin, continued, mixed):
-    """Mark targets, in `mixed` (H + 2, W + 2), at which more than front layers may count."""
-    layers, _, width = z.shape
-    width -= 2
+def _keep(start, stop, covered, depth, visible, beyond, margin, continued, kept):
+    """Keep the fronts of rows [start, stop), and hidden layers around targets at which more than fronts may count."""
+    layers, height, width = covered.shape
+    # From row start − HALO on: depths with a border, NaN where there is nothing; least and largest front, least hidden.
+    rows = stop - start + 2 * HALO
+    z = np.full((layers, rows, width + 2), np.nan, depth.dtype)
+    bounds = np.empty((rows, 3, width), depth.dtype)
+    for r in range(rows):
+        y = start - HALO + r
+        if 0 <= y < height:
+            for k in range(layers):
+                _load(z[k, r], covered[k, y], depth[k, y])
+        _bound(bounds[r, 0], bounds[r, 1], bounds[r, 2], z[0, r], z[1, r])
+    marks = np.zeros((rows, width + 2), np.uint8)
+    for r in range(HALO - 1, rows - HALO + 1):
+        _mark(marks[r, 1:], z, r, bounds, visible, beyond, margin, continued)
     for y in range(start, stop):
-        marks = mixed[y + 1, 1:-1]
+        r = y - start + HALO
+        kept[0, y] = covered[0, y]
         for k in range(1, layers):
+            _spread(kept[k, y], covered[k, y], marks[r - 1], marks[r], marks[r + 1])
+
+
+@compiled
+def _load(z, covered, depth):
+    nothing = z.dtype.type(np.nan)
+    for x in range(len(covered)):
+        z[x + 1] = depth[x] if covered[x] else nothing
+
+
+@compiled
+def _bound(least, largest, hidden, front, second):
+    """Least and largest front of each cell and its two neighbours, and their least depth of the second layer."""
+    infinity = least.dtype.type(np.inf)
+    for x in range(len(least)):
+        a, b, c = front[x], front[x + 1], front[x + 2]
+        # Comparisons with NaN are false.
+        low = a if a < infinity else infinity
+        high = a if a > -infinity else -infinity
+        low, high = b if b < low else low, b if b > high else high
+        least[x], largest[x] = c if c < low else low, c if c > high else high
+        a, b, c = second[x], second[x + 1], second[x + 2]
+        low = a if a < infinity else infinity
+        low = b if b < low else low
+        hidden[x] = c if c < low else low
+
+
+@compiled
+def _mark(marks, z, r, bounds, visible, beyond, margin, continued):
+    """Mark the targets of a row."""
+    width = z.shape[2] - 2
+    above, level, below = bounds[r - 1], bounds[r], bounds[r + 1]
+    least, largest = (above[0], level[0], below[0]), (above[1], level[1], below[1])
+    _suspect(marks, z[0, r, 1:], *least, *largest, above[2], level[2], below[2], margin)
+    for x in range(width):
+        if visible and not marks[x]:
+            continue
+        target, near = z[0, r, x + 1], marks[x] and _near(z, r, x, margin)
+        if visible:
+            marks[x] = near and not _continued(z, r, x, beyond, margin, continued)
+        else:
+            empty = target != target
             for n in range(9):
-                at = n % 3
-                _near(marks, z[0, y + n // 3, at:], z[k, y + n // 3, at:], z[0, y + 1, 1:], z[k, y + 1, 1:], margin)
-        for x in range(width):
-            covered = z[0, y + 1, x + 1] == z[0, y + 1, x + 1]
-            if not visible and covered:
-                for n in range(9):
-                    marks[x] |= np.uint8(z[0, y + n // 3, x + n % 3] != z[0, y + n // 3, x + n % 3])
-            elif visible and marks[x] and _continued(z, y, x, beyond, margin, continued):
-                marks[x] = 0
-            elif not visible:
-                marks[x] = 1
+                source = z[0, r - 1 + n // 3, x + n % 3]
+                empty |= source != source
+            marks[x] = near or empty
+
+
+# Rows are handed over one by one, which the compiler needs to see that they do not overlap.
 
 
 @compiled
-def _near(marks, source, source_hidden, target, target_hidden, margin):
-    """Mark where a hidden layer is about as near as the fronts are; where there is nothing, NaN compares as false."""
-    for x in range(len(marks)):
-        d = abs(source[x] - target[x]) + margin
-        nearer = (abs(source_hidden[x] - target[x]) <= d) | (abs(target_hidden[x] - source[x]) <= d)
-        marks[x] |= np.uint8(nearer)
+def _suspect(marks, front, least0, least1, least2, largest0, largest1, largest2, hidden0, hidden1, hidden2, margin):
+    """Mark covered targets but where all that is hidden lies farther behind the fronts than these are apart: most."""
+    for x in range(len(least0)):
+        a, b, c = least0[x], least1[x], least2[x]
+        least = b if b < a else a
+        least = c if c < least else least
+        a, b, c = largest0[x], largest1[x], largest2[x]
+        largest = b if b > a else a
+        largest = c if c > largest else largest
+        a, b, c = hidden0[x], hidden1[x], hidden2[x]
+        hidden = b if b < a else a
+        hidden = c if c < hidden else hidden
+        far = hidden - largest > largest - least + margin + margin
+        marks[x] = np.uint8((front[x] == front[x]) & (not far))
 
 
 @compiled
-def _continued(z, y, x, beyond, margin, continued):
+def _near(z, r, x, margin):
+    """Whether a hidden layer is about as near as the fronts are; where there is nothing, NaN compares as false."""
+    target = z[0, r, x + 1]
+    for n in range(9):
+        source = z[0, r - 1 + n // 3, x + n % 3]
+        d = abs(source - target) + margin
+        for k in range(1, len(z)):
+            if abs(z[k, r - 1 + n // 3, x + n % 3] - target) <= d or abs(z[k, r, x + 1] - source) <= d:
+                return True
+    return False
+
+
+@compiled
+def _continued(z, r, x, beyond, margin, continued):
     """Whether every source that is not nearest front to front continues the target's front along a line."""
-    layers, height, width = z.shape
-    target = z[0, y + 1, x + 1]
+    layers, rows, width = z.shape
+    target = z[0, r, x + 1]
     for n in range(9):
         v, u = n // 3 - 1, n % 3 - 1
-        source = z[0, y + 1 - v, x + 1 - u]
+        source = z[0, r - v, x + 1 - u]
         if source != source:
             continue
         front, hidden = abs(source - target), z.dtype.type(np.inf)
         for k in range(1, layers):
-            p, q = z[k, y + 1 - v, x + 1 - u], z[k, y + 1, x + 1]
+            p, q = z[k, r - v, x + 1 - u], z[k, r, x + 1]
             hidden = min(hidden, abs((p if p == p else beyond) - target), abs((q if q == q else beyond) - source))
         if front + margin < hidden:
             continue
         limit, joined = continued * min(front, hidden) - margin, False
         for steps, end, start in ((-1, source, target), (2, target, source)):
-            by, bx = y + 1 - steps * v, x + 1 - steps * u
-            if 0 <= by < height and 0 <= bx < width:
+            by, bx = r - steps * v, x + 1 - steps * u
+            if 0 <= by < rows and 0 <= bx < width:
                 joined |= abs(end - (start + start - z[0, by, bx])) < limit
         if not joined:
             return False
     return True
 
 
-@kernel
-def _spread(start, stop, covered, mixed, kept):
-    """Keep fronts, and hidden layers in the neighbourhood of marks."""
-    layers, _, width = covered.shape
-    for y in range(start, stop):
-        for x in range(width):
-            kept[0, y, x] = covered[0, y, x]
-            if layers > 1 and covered[1, y, x]:
-                around = 0
-                for n in range(9):
-                    around |= mixed[y + n // 3, x + n % 3]
-                for k in range(1, layers):
-                    kept[k, y, x] = covered[k, y, x] and around != 0
-            else:
-                for k in range(1, layers):
-                    kept[k, y, x] = covered[k, y, x]
+@compiled
+def _spread(kept, covered, above, level, below):
+    """Keep what lies around marks."""
+    for x in range(len(kept)):
+        around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
+        kept[x] = covered[x] & ((around | below[x] | below[x + 1] | below[x + 2]) != 0)
