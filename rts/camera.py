@@ -296,10 +296,10 @@ class Camera(NamedTuple):
             extent: (height, width) of the window, pixels.
         """
         (height, width), (top, left), (rows, columns) = size, corner, extent
-        x, y, z, w = (self.projection[i, :] for i in range(4))
-        x = x * (width / columns) + w * ((width - 2 * left) / columns - 1)
-        y = y * (height / rows) + w * (1 - (height - 2 * top) / rows)
-        return self._replace(projection=namespace(x).stack([x, y, z, w]))
+        change = np.diag([width / columns, height / rows, 1.0, 1.0])
+        change[:2, 3] = (width - 2 * left) / columns - 1, 1 - (height - 2 * top) / rows
+        change = engine_of(self.projection).constant(change, self.projection)
+        return self._replace(projection=matmul(change, self.projection))
 
     def project(self, points: Array, size: tuple[int, int]) -> Array:
         """Pixel x, pixel y and linear depth of world points.
@@ -311,13 +311,14 @@ class Camera(NamedTuple):
         Returns:
             (N, 3). Points on the plane of the camera's centre have no image; they give finite values.
         """
-        (height, width), p = size, self.projection
-        xp, x, y, w = namespace(p), p[0, :], p[1, :], p[3, :]
-        depth = engine_of(p).constant(np.array([0.0, 0, -1, 0]), p)
-        # A constant projection is multiplied out in NumPy.
-        to_pixels = xp.stack([(w + x) * (width / 2), (w - y) * (height / 2), w, depth])
-        to_pixels = constants(to_pixels, engine_of(self.view), exemplar(self.view))
-        return projective_map(matmul(to_pixels, self.view), points)
+        (x, y), p = (size[1] / 2, size[0] / 2), self.projection
+        from_clip = np.array([[x, 0, 0, x], [0, -y, 0, y], [0, 0, 0, 1], [0, 0, 0, 0]])
+        depth = np.zeros((4, 4))
+        depth[3, 2] = -1
+        from_clip, depth = constants((from_clip, depth), engine_of(p), p)
+        # Of what is constant, in NumPy.
+        rows = constants(matmul(from_clip, p) + depth, engine_of(self.view), exemplar(self.view))
+        return projective_map(matmul(rows, self.view), points)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""

@@ -252,7 +252,9 @@ def to_splats(
     engine, like = engine_of(scene), exemplar(scene)
     wide = window.with_apron((grid[0] - 2 * APRON, grid[1] - 2 * APRON), APRON)
     wide = wide._replace(view=constants(wide.view, engine, like))
-    camera, sampled = constants((camera, sampled), engine, like)
+    camera = constants(camera, engine, like)
+    if not engine.owns(sampled.row):
+        sampled = constants(sampled, engine, like)
 
     positions, colors = [], []
     for part, samples in zip(parts, sampled.samples, strict=True):

@@ -314,6 +314,10 @@ def _interleaved_on_the_host(layers: int, *given: Array) -> tuple[Array, ...]:
     return engine_of(given).call_host(host, specs, *given)
 
 
+WELL_CONDITIONED = 1e-3
+"""A determinant over the product of the rows' lengths, from which on a matrix is far from singular."""
+
+
 def check_camera(camera: Camera) -> None:
     """Refuse host matrices that are not finite, not invertible, or a view that is not affine."""
     for name, matrix in zip(("view", "projection"), camera, strict=True):
@@ -325,6 +329,8 @@ def check_camera(camera: Camera) -> None:
         length = np.linalg.norm(projection, axis=axis, keepdims=True)
         projection = projection / np.where(length > 0, length, 1)
     for name, matrix in (("view", camera.view[:3, :3]), ("projection", projection)):
+        if abs(np.linalg.det(matrix)) > WELL_CONDITIONED * np.prod(np.linalg.norm(matrix, axis=1)):
+            continue  # As most are; singular values take longer.
         singular_values = np.linalg.svd(matrix, compute_uv=False)
         if not singular_values[-1] > 1e-12 * singular_values[0]:
             raise InputError(

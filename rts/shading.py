@@ -40,8 +40,9 @@ class Silhouette:
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
         """See `rts.protocols.Shader`."""
-        white = namespace(gbuffer.like).ones_like(gbuffer.like[:, :1])
-        return namespace(white).concat([white] * 4, axis=1)
+        like = gbuffer.like
+        xp = namespace(like)
+        return xp.broadcast_to(xp.ones_like(like[:1, :1]), (like.shape[0], 4))
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ class Splats:
         choices: Choices | None = None,
     ):
         row = row[:1] if settings.kind == "single" else row
-        if row.size and row.max() >= len(positions):
+        if choices is None and row.size and row.max() >= len(positions):
             raise InputError(f"row refers to sample {row.max()} of {len(positions)}; expected indices below that")
         self.positions, self.rgba, self.row = _frozen(positions), _frozen(rgba), _frozen(row, np.int32)
         self.visible, self.border = settings.kind == "visible", settings.border

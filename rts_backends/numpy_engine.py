@@ -39,6 +39,10 @@ class NumpyEngine:
         """Call `fn`: everything is on the host already."""
         return fn(*args)
 
+    def matmul(self, a: Array, b: Array) -> Array:
+        """As one product."""
+        return a @ b
+
     def stop_gradient(self, x: Array) -> Array:
         """`x` itself."""
         return x

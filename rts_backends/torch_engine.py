@@ -26,10 +26,11 @@ for _cls in STATIC_FIELDS:
 
 
 def _tensor(value: Any, device: torch.device | None = None) -> torch.Tensor:
-    array = np.ascontiguousarray(value)
-    if not array.flags.writeable:
-        array = array.copy()  # torch warns of read-only memory, since it cannot mark a tensor so.
-    return torch.from_numpy(array).reshape(np.shape(value)).to(device)
+    array = np.asarray(value)
+    if not (array.flags.c_contiguous and array.flags.writeable):
+        array = array.copy("C")  # torch warns of read-only memory, since it cannot mark a tensor so.
+    tensor = torch.from_numpy(array)
+    return tensor if device is None or device.type == "cpu" else tensor.to(device)
 
 
 def _to_host(x: torch.Tensor) -> np.ndarray:
