@@ -10,6 +10,7 @@ from rts.choosing import explain
 from rts.errors import EngineError, InputError, LayersWarning, PluginError, RtsError
 from rts.fitting import Fit, fit
 from rts.gradients import check_gradient, gradient_image
+from rts.image_residuals import ImageResiduals
 from rts.preparing import prepare
 from rts.protocols import Fragments, GBuffer, Part, Proxy, RayHits, Sampled, Samples
 from rts.registry import plugin, plugins
@@ -24,6 +25,7 @@ __all__ = [
     "Fit",
     "Fragments",
     "GBuffer",
+    "ImageResiduals",
     "InputError",
     "LayersWarning",
     "Part",

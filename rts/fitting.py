@@ -61,7 +61,8 @@ def fit(
     InputError, the fit stops, says so in its `reason`, and returns the best parameters met before.
 
     Args:
-        residuals: parameters → array of any shape, such as an image difference.
+        residuals: parameters → array of any shape, such as an image difference; see `ImageResiduals` for one that
+            "lm" takes less time and memory for, and `rts.protocols.Residuals` for what makes it so.
         parameters: a torch or jax array, or nested dicts and lists of them; where to start.
         method: "adam" or "sgd" (torch.optim or optax, on the gradient of the loss), or "lm": Levenberg–Marquardt on the
             sum of squares, by the forward-mode Jacobian, for up to some hundred unknowns.
@@ -87,7 +88,8 @@ def fit(
     with progress_bar(progress, run.steps, method, run):
         try:
             if method == "lm":
-                levenberg_marquardt(_checked(residuals, engine), parameters, engine, run, jit)
+                own = getattr(residuals, "normal_equations", None)
+                levenberg_marquardt(_checked(residuals, engine), parameters, engine, run, jit, own)
             else:
                 rate = LEARNING_RATES[method] if learning_rate is None else float(learning_rate)
                 objective = _objective(_checked(residuals, engine), loss, engine)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rts.arrays import leaves, map_leaves, namespace
+from rts.errors import InputError
 from rts.fit_runs import Run, require
 from rts.protocols import Array, Engine, Tree
 
@@ -35,10 +36,21 @@ class _Linear(NamedTuple):
         return self
 
 
-def levenberg_marquardt(residuals: Callable, parameters: Tree, engine: Engine, run: Run, jit: bool) -> None:
-    """Normal equations with Marquardt's scaling and Nielsen's control of the damping (Madsen et al. 2004)."""
-    vector, unflatten = _flatten(parameters)
-    linearize, loss_at = _least_squares(lambda v: residuals(unflatten(v)), engine, run, jit)
+def levenberg_marquardt(
+    residuals: Callable, parameters: Tree, engine: Engine, run: Run, jit: bool, own: Callable | None = None
+) -> None:
+    """Normal equations with Marquardt's scaling and Nielsen's control of the damping (Madsen et al. 2004).
+
+    Args:
+        residuals: checked.
+        parameters: where to start; the fit's own.
+        engine: of the parameters.
+        run: what is kept.
+        jit: compile.
+        own: the residuals' method `normal_equations`, where they have one; see `rts.protocols.Residuals`.
+    """
+    vector, unflatten = flatten(parameters)
+    linearize, loss_at = _least_squares(residuals, own, parameters, engine, run, jit)
     here = linearize(vector).checked(start=True)
     going = run.record(unflatten(vector), here.value)
     damping, growth = FIRST_DAMPING, 2.0
@@ -68,19 +80,29 @@ def levenberg_marquardt(residuals: Callable, parameters: Tree, engine: Engine, r
             here = (there or linearize(vector)).checked(start=False)
 
 
-def _least_squares(residuals: Callable, engine: Engine, run: Run, jit: bool) -> tuple[Callable, Callable]:
-    """Functions of a vector: mean square with normal equations JᵀJ and Jᵀr on the host, and mean square alone."""
+def normal_equations(
+    residuals: Callable[[Tree], Array], parameters: Tree, engine: Engine
+) -> tuple[Array, Array, Array]:
+    """Mean square of the n residuals, JᵀJ / n and Jᵀr / n, by the Jacobian; see `rts.protocols.Residuals`."""
     xp = engine.namespace
+    vector, unflatten = flatten(parameters)
+    r, rows = engine.jacobian(lambda v: xp.reshape(residuals(unflatten(v)), (-1,)))(vector)
+    return xp.mean(r * r), rows @ xp.matrix_transpose(rows) / r.shape[0], rows @ r / r.shape[0]
 
-    def flat(v: Array) -> Array:
-        return xp.reshape(residuals(v), (-1,))
+
+def _least_squares(
+    residuals: Callable, own: Callable | None, parameters: Tree, engine: Engine, run: Run, jit: bool
+) -> tuple[Callable, Callable]:
+    """Functions of a vector: mean square with normal equations JᵀJ and Jᵀr on the host, and mean square alone."""
+    vector, unflatten = flatten(parameters)
 
     def equations(v: Array) -> tuple[Array, Array, Array]:
-        r, rows = engine.jacobian(flat)(v)
-        return xp.mean(r * r), rows @ xp.matrix_transpose(rows) / r.shape[0], rows @ r / r.shape[0]
+        if own is None:
+            return normal_equations(residuals, unflatten(v), engine)
+        return _checked_equations(own(unflatten(v)), v.shape[0], engine)
 
     def loss(v: Array) -> Array:
-        return mean_square(flat(v))
+        return mean_square(residuals(unflatten(v)))
 
     if jit:
         equations, loss = engine.jit(equations), engine.jit(loss)
@@ -90,6 +112,19 @@ def _least_squares(residuals: Callable, engine: Engine, run: Run, jit: bool) -> 
         return _Linear(float(value), *(engine.to_numpy(x).astype(np.float64) for x in rest))
 
     return linearize, lambda v: float(run.attempt(engine, loss, v))
+
+
+def _checked_equations(found: Any, count: int, engine: Engine) -> tuple[Array, Array, Array]:
+    """What a user's method gave, refused where it is of another form."""
+    expected = (), (count, count), (count,)
+    given = tuple(found) if isinstance(found, (tuple, list)) else (found,)
+    if not all(engine.owns(x) for x in given) or tuple(tuple(x.shape) for x in given) != expected:
+        shapes = ", ".join(str(tuple(x.shape)) if engine.owns(x) else f"a {type(x).__name__}" for x in given)
+        raise InputError(
+            f"normal_equations gave {shapes}; expected {engine.name} arrays of shapes {', '.join(map(str, expected))}: "
+            f"mean square, JᵀJ / n, Jᵀr / n"
+        )
+    return given
 
 
 def _damped_step(matrix: np.ndarray, gradient: np.ndarray, damping: float) -> tuple[np.ndarray, float, float]:
@@ -106,7 +141,7 @@ def _damped_step(matrix: np.ndarray, gradient: np.ndarray, damping: float) -> tu
             damping *= 10
 
 
-def _flatten(parameters: Tree) -> tuple[Array, Callable[[Array], Tree]]:
+def flatten(parameters: Tree) -> tuple[Array, Callable[[Array], Tree]]:
     """All leaves as one vector, and the way back."""
     arrays = list(leaves(parameters))
     xp = namespace(*arrays)

@@ -277,6 +277,10 @@ class Splatter(Protocol):
     that can reach the image, in value or derivative, where all are opaque and on pixel centres. Others are dropped.
     `splat` may take a further argument `border`, the number of cells at each side that splat into the image but are no
     part of it: the result is then (H − 2 border, W − 2 border, 4).
+    `normal_equations(positions, rgba, row, t_positions, t_rgba, target, weights=None, background=None, border=0)`:
+    mean square () of the n residuals weight · (image − target), JᵀJ / n (T, T) and Jᵀr / n (T,) for tangents (T, N, 3)
+    of positions and (T, N, 4) or None of rgba; None where the arrays are not of a kind that it knows. The target
+    (h, w, C) is alpha (C = 1), colours (3) or both (4); weights are (h, w, 1) or (h, w, C), the background (h, w, 4).
     """
 
     def splat(self, positions: Array, rgba: Array, row: Array) -> Array:
@@ -290,6 +294,19 @@ class Splatter(Protocol):
         Returns:
             (H, W, 4) premultiplied RGBA.
         """
+        ...
+
+
+class Residuals(Protocol):
+    """What `rts.fit` makes small: any function of parameters will do.
+
+    Optional member: `normal_equations(parameters) -> (mean square (), JᵀJ / n (U, U), Jᵀr / n (U,))` for n residuals r
+    and their Jacobian J by the U numbers in the parameters, in the order of `rts.arrays.leaves`; all are arrays of the
+    parameters' engine, which may be traced. Levenberg–Marquardt then makes no Jacobian of its own.
+    """
+
+    def __call__(self, parameters: Tree) -> Array:
+        """Residuals, of any shape."""
         ...
 
 
@@ -355,7 +372,7 @@ class Engine(Protocol):
         ...
 
     def jacobian(self, f: Callable) -> Callable:
-        """`f(vector) -> array` to `vector -> (value, derivatives)`, a row for each unknown, by forward mode."""
+        """`f(vector) -> arrays` to `vector -> (values, derivatives)`, a row for each unknown, by forward mode."""
         ...
 
     def jit(self, f: Callable) -> Callable:

@@ -40,6 +40,25 @@ class _Fused(splatting.Kernel):
             return Splats(settings, positions, rgba, row).image()
         return specification(positions, rgba, row)
 
+    def normal_equations(
+        self,
+        positions: Array,
+        rgba: Array,
+        row: Array,
+        t_positions: Array,
+        t_rgba: Array | None,
+        target: Array,
+        weights: Array | None = None,
+        background: Array | None = None,
+        border: int = 0,
+    ) -> tuple[Array, Array, Array] | None:
+        """See `rts.protocols.Splatter`."""
+        from rts_backends import fused_normal
+
+        settings = Settings(self.kind, self.sigma, self.epsilon, self.gamma, border)
+        given = positions, rgba, row, t_positions, t_rgba, target, weights, background
+        return fused_normal.equations(settings, engine_of(given), *given)
+
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.protocols.Splatter`."""
         if self.kind == "single" or depth.dtype not in (np.float32, np.float64):

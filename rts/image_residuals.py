@@ -1,0 +1,193 @@
+"""Residuals that know they are an image: their normal equations need no Jacobian of the image's size."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rts.arrays import constants, engine_of, exemplar, from_numbers, namespace
+from rts.camera import Camera
+from rts.checks import check_background, check_floating, check_plugin, check_scene, check_size
+from rts.errors import InputError
+from rts.least_squares import flatten, normal_equations
+from rts.preparing import PreparedParts
+from rts.protocols import Array, Engine, Part, Tree
+from rts.rendering import APRON, render, sample, to_splats
+
+Parts = Part | Sequence[Part] | PreparedParts
+Scene = Callable[[Tree], "Parts | tuple[Parts, Camera]"]
+
+CHANNELS = {1: slice(3, 4), 3: slice(0, 3), 4: slice(0, 4)}
+"""Which channels of an image a target has, by their number."""
+
+
+class ImageResiduals:
+    """The difference between the render of a scene and a target, as a function of the scene's parameters.
+
+    Usable wherever a function of parameters is, such as with `rts.fit`. Levenberg–Marquardt takes less time and memory
+    for it than for a function: derivatives along all unknowns are multiplied together as the image is swept.
+
+    Args:
+        scene: parameters → part or parts, or what `prepare` made of them; or a tuple of these and a camera.
+        camera: the camera, where `scene` gives none.
+        size: (height, width) in pixels.
+        target: (H, W) or (H, W, 1), compared with the image's alpha; (H, W, 3) with its premultiplied linear colours;
+            or (H, W, 4) with both. Floating; a constant.
+        weights: factors on the differences, (H, W), (H, W, 1) or of the target's shape; such as a mask. Floating or
+            bool; constants.
+        background: as in `render`; a constant.
+        sampler: as in `render`.
+        splatter: as in `render`.
+        layers: as in `render`.
+        supersample: as in `render`.
+        capacity: as in `render`.
+
+    Raises:
+        InputError: shapes that do not fit, or integers as target.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera: Camera | None,
+        size: tuple[int, int],
+        target: Array,
+        *,
+        weights: Array | None = None,
+        background: Any = None,
+        sampler: Any = "auto",
+        splatter: Any = "auto",
+        layers: int | str = 2,
+        supersample: int = 1,
+        capacity: int | None = None,
+    ):
+        self.size = check_size(size, layers, capacity, supersample)
+        self._scene, self._camera, self._splatter = scene, camera, splatter
+        self._target, self._channels = _checked_target(target, self.size)
+        self._weights = _checked_weights(weights, self._target.shape, self.size)
+        self._background = check_background(background, self.size)
+        self._supersample = supersample
+        self._sampling = dict(sampler=sampler, layers=layers, capacity=capacity)
+
+    def __call__(self, parameters: Tree) -> Array:
+        """`weights * (image − target)`, of the target's shape."""
+        parts, camera = self.scene(parameters)
+        image = render(
+            parts,
+            camera,
+            self.size,
+            splatter=self._splatter,
+            supersample=self._supersample,
+            background=self._background,
+            **self._sampling,
+        )
+        image = constants(image, engine_of(image, parameters), exemplar(parameters))
+        target, weights, _ = self._constants(image)
+        difference = image[..., CHANNELS[self._channels]] - target
+        if weights is not None:
+            difference = difference * weights
+        return namespace(image).reshape(difference, tuple(self._target.shape))
+
+    def scene(self, parameters: Tree) -> tuple[Any, Camera]:
+        """Parts and camera for these parameters."""
+        found = self._scene(parameters)
+        if isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Camera):
+            return found
+        if self._camera is None:
+            raise InputError(
+                "camera is None, and scene gives none; expected an rts.Camera, or (parts, camera) of scene"
+            )
+        return found, self._camera
+
+    def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
+        """Mean square () of the n residuals, JᵀJ / n (U, U) and Jᵀr / n (U,) for the U numbers in the parameters."""
+        engine = engine_of(parameters)
+        splatter = check_plugin("rts.splatters", self._splatter, "splat")
+        found = None
+        if hasattr(splatter, "normal_equations") and self._supersample == 1 and engine.name != "numpy":
+            found = self._swept(splatter, parameters, engine)
+        return normal_equations(self, parameters, engine) if found is None else found
+
+    def _swept(self, splatter: Any, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
+        """By the splatter; None where it cannot."""
+        vector, unflatten = flatten(parameters)
+        parts, camera = self.scene(parameters)
+        sampled = sample(parts, camera, self.size, splatter=splatter, **self._sampling)
+        colored = self._channels > 1 or not _all_opaque(parts, camera)
+
+        def splats(v: Array) -> tuple[Array, Array]:
+            parts, camera = _checked(*self.scene(unflatten(v)))
+            positions, rgba, _ = constants(to_splats(sampled, parts, camera, camera, v), engine, v)
+            # What is opaque has an alpha of one, whatever its colours.
+            return positions, rgba if colored else engine.stop_gradient(rgba)
+
+        (positions, rgba), (t_positions, t_rgba) = engine.jacobian(splats)(vector)
+        target, weights, background = self._constants(vector)
+        return splatter.normal_equations(
+            positions,
+            rgba,
+            constants(sampled.row, engine, vector),
+            t_positions,
+            t_rgba if colored else None,
+            target,
+            weights=weights,
+            background=background,
+            border=APRON,
+        )
+
+    def _constants(self, like: Array) -> tuple[Array, Array | None, Array | None]:
+        """Target (H, W, C), weights (H, W, 1 or C) and background (H, W, 4) in the engine of an array."""
+        engine = engine_of(like, self._target, self._weights, self._background)
+        fields = constants((self._target, self._weights, self._background), engine, like)
+        xp = namespace(like)
+        target, weights, background = (None if x is None else engine.stop_gradient(x) for x in fields)
+        shape = *self.size, self._channels
+        target = xp.reshape(target, shape)
+        if weights is not None:
+            weights = xp.reshape(weights, (*self.size, -1))
+        if background is not None:
+            if background.shape[-1] == 3:
+                background = xp.concat([background, xp.ones_like(background[..., :1])], axis=-1)
+            background = xp.broadcast_to(background, (*self.size, 4))
+        return target, weights, background
+
+
+def _checked(parts: Any, camera: Camera) -> tuple[list[Part], Camera]:
+    return check_scene(parts.parts if isinstance(parts, PreparedParts) else parts, camera)
+
+
+def _all_opaque(parts: Any, camera: Camera) -> bool:
+    return all(getattr(part.shader, "opaque", False) for part in _checked(parts, camera)[0])
+
+
+def _checked_target(target: Any, size: tuple[int, int]) -> tuple[Array, int]:
+    """The target, and its number of channels."""
+    target = from_numbers(target)
+    shape = tuple(getattr(target, "shape", ()))
+    if shape[:2] != size or shape[2:] not in ((), *((c,) for c in CHANNELS)):
+        height, width = size
+        raise InputError(
+            f"target {_described(target, shape)}; expected ({height}, {width}) or ({height}, {width}, 1) to compare "
+            f"with alpha, ({height}, {width}, 3) with colours, or ({height}, {width}, 4) with both"
+        )
+    check_floating("target", target)
+    return target, shape[2] if len(shape) > 2 else 1
+
+
+def _checked_weights(weights: Any, shape: tuple[int, ...], size: tuple[int, int]) -> Array | None:
+    if weights is None:
+        return None
+    weights = from_numbers(weights)
+    given = tuple(getattr(weights, "shape", ()))
+    allowed = dict.fromkeys((size, (*size, 1), tuple(shape)))
+    if given not in allowed:
+        raise InputError(f"weights {_described(weights, given)}; expected {' or '.join(map(str, allowed))}")
+    xp = namespace(weights)
+    if xp.isdtype(weights.dtype, "bool"):
+        return xp.astype(weights, xp.float32)
+    check_floating("weights", weights)
+    return weights
+
+
+def _described(value: Any, shape: tuple[int, ...]) -> str:
+    return f"has shape {shape}" if hasattr(value, "shape") else f"is a {type(value).__name__}"

@@ -1,0 +1,221 @@
+"""Normal equations of the difference between a splatted image and a target, without its Jacobian.
+
+A sweep goes over bands of rows: the derivatives of a row of a tile along all unknowns are made as in `fused_stencil`
+and `fused_mixed`, multiplied with one another and with the residuals, and forgotten. Bands have a fixed height and are
+added in their order, so results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from rts.protocols import Array, ArraySpec, Engine
+from rts.threads import parallel
+from rts_backends.fused_kernels import Settings, Splats
+from rts_backends.fused_mixed import changes_of, sums_of
+from rts_backends.fused_rows import (
+    PITCH,
+    SOURCE,
+    SUM,
+    SUMS,
+    TILE,
+    compiled,
+    composite,
+    kernel,
+    load,
+    normalised_sums,
+    slot,
+    tile,
+)
+from rts_backends.fused_stencil import ALPHA, COLORS, TANGENT, add_tangent_row, load_tangent, tangent_row
+
+BAND = 16
+"""Rows of the image whose products are added up together."""
+
+OPACITY = 3 * PITCH
+"""Place of alpha among the planes of a row."""
+
+
+def equations(settings: Settings, engine: Engine, *given: Array | None) -> tuple[Array, ...] | None:
+    """`normal_equations` of arrays of any engine on the host, traced or not; None for others.
+
+    Args:
+        settings: of the splatter.
+        engine: of the arrays.
+        *given: positions, rgba, row and the arguments of `normal_equations` from `t_positions`.
+    """
+    positions, rgba, _, t_positions = given[:4]
+    kind = {32: np.float32, 64: np.float64}.get(engine.namespace.finfo(positions.dtype).bits)
+    on_device = engine.name == "torch" and any(x is not None and x.device.type != "cpu" for x in given)
+    if kind is None or rgba.dtype != positions.dtype or on_device:
+        return None
+    present = [x is not None for x in given]
+
+    def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+        it = iter(arrays)
+        positions, rgba, row, *rest = (next(it) if there else None for there in present)
+        used = int(row.max(initial=-1)) + 1  # Under `jit` there may be many more.
+        splats = Splats(settings, positions[:used], rgba[:used], row)
+        return tuple(np.asarray(x, kind) for x in normal_equations(splats, *rest))
+
+    count = t_positions.shape[0]
+    specs = ArraySpec((), kind), ArraySpec((count, count), kind), ArraySpec((count,), kind)
+    return engine.call_host(host, specs, *(x for x in given if x is not None))
+
+
+def normal_equations(
+    splats: Splats,
+    t_positions: np.ndarray,
+    t_rgba: np.ndarray | None,
+    target: np.ndarray,
+    weights: np.ndarray | None,
+    background: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean square of the n residuals weight · (image − target), JᵀJ / n and Jᵀr / n, float64.
+
+    Args:
+        splats: the samples.
+        t_positions: (T, N, 2), or more columns, tangents of their positions along T directions.
+        t_rgba: (T, N, 4) of their colours; None for zeros.
+        target: (H, W, C), of alpha (C = 1), colours (3) or both (4).
+        weights: (H, W, 1) or (H, W, C), or None.
+        background: (H, W, 4), what the image is composited onto, or None.
+    """
+    count, dtype = len(t_positions), splats.positions.dtype
+    if t_rgba is None or not _any(t_rgba):
+        t_rgba = np.empty((count, 0, 4), dtype)
+    tangents = _frozen(t_positions, dtype), _frozen(t_rgba, dtype)
+    fields = (_frozen(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
+    bands = -(-len(target) // BAND)
+    sums = np.zeros((bands, count + 1, count + 1))
+    given = splats.plain_arguments, splats.row, splats.choices[1:], tangents, tuple(fields), splats.border
+    parallel(_accumulate, bands, ALPHA if target.shape[2] == 1 else COLORS, *given, sums)
+    total = sums.sum(axis=0) / max(target.size, 1)
+    matrix = total[:count, :count]
+    return total[count, count], matrix + np.tril(matrix, -1).T, total[count, :count]
+
+
+def _any(tangents: np.ndarray) -> bool:
+    """Whether any is not zero; those of what does not depend on the unknowns may be one array that is repeated."""
+    return bool((tangents[:1] if tangents.strides[0] == 0 else tangents).any())
+
+
+def _frozen(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """A contiguous read-only view, or a copy."""
+    view = np.ascontiguousarray(x, dtype).view()
+    view.flags.writeable = False
+    return view
+
+
+@kernel
+def _accumulate(start, stop, planes, plain, row, lists, tangents, fields, border, sums):
+    """Products (B, T + 1, T + 1) of tangents and, last, residuals in bands [start, stop); the lower triangles."""
+    positions, rgba, fronts, scale, peak, gamma = plain
+    t_positions, t_rgba = tangents
+    target, layers, many = fields[0], len(fronts), len(t_positions)
+    height, width, channels = target.shape
+    kind, slope = positions.dtype.type, positions.dtype.type(2) * scale * gamma
+    sources, value = np.empty(3 * layers * SOURCE, positions.dtype), np.empty(SUMS, positions.dtype)
+    moving, change = (
+        np.empty((many, 3 * layers * TANGENT), positions.dtype),
+        np.empty((many, SUMS), positions.dtype),
+    )
+    products = np.empty((many + 1, channels * PITCH), positions.dtype)
+    scratch = np.empty((3, 5), positions.dtype), np.empty((many, 3, 5), positions.dtype)
+    for band in range(start, stop):
+        top, bottom = band * BAND, min(height, (band + 1) * BAND)
+        for t in range((width + TILE - 1) // TILE):
+            left, count = tile(width, t)
+            last = top - 4  # The last source row that is not empty, as in `fused_stencil.forward`.
+            for y in range(top - 1, bottom + 1):
+                at = left + border - 1
+                for k in range(layers):
+                    s = slot(sources, k, y, SOURCE)
+                    if load(s, positions, rgba, fronts, k, y + border, at, count + 2, scale, peak, gamma):
+                        last = y
+                    for n in range(many):
+                        to = slot(moving[n], k, y, TANGENT)
+                        load_tangent(
+                            to, s, t_positions[n], t_rgba[n], fronts, k, y + border, at, count + 2, slope, planes
+                        )
+                if y <= top:
+                    continue
+                covered = y - last <= 2
+                if covered:
+                    normalised_sums(value, sources, layers, y - 1, count)
+                    for n in range(many):
+                        to = change[n]
+                        to[: min(layers, 2) * SUM] = kind(0)
+                        for k in range(layers):
+                            for v in range(-1, 2):
+                                s, tangent = slot(sources, k, y - 1 - v, SOURCE), slot(moving[n], k, y - 1 - v, TANGENT)
+                                add_tangent_row(to[SUM:] if k > 0 else to, s, tangent, v, count, planes)
+                        tangent_row(to, value, layers, count, planes)
+                    composite(value, layers, count)
+                    _mix(change, value, plain, row, lists, tangents, border, y - 1, left, count, scratch)
+                else:
+                    value[:SUM] = kind(0)
+                _multiply(sums[band], products, change, value, fields, y - 1, left, count, covered)
+
+
+@compiled
+def _mix(change, value, plain, row, lists, tangents, border, y, left, count, scratch):
+    """Values and tangents of the mixed targets of a row of a tile, in place of those of the stencil."""
+    positions, rgba, _, scale, peak, gamma = plain
+    offsets, columns, choices = lists
+    total, changes = scratch
+    one = value.dtype.type(1)
+    for d in range(offsets[y + border], offsets[y + border + 1]):
+        j = columns[d] - border - left
+        if not 0 <= j < count:
+            continue
+        given = positions, rgba, row, y + border, columns[d], choices[d], scale, peak, gamma
+        sums_of(total, *given)
+        changes_of(changes, total, *given, *tangents)
+        for c in range(4):
+            back = total[1, c] + (one - total[1, 3]) * total[2, c]
+            value[c * PITCH + j] = total[0, c] + (one - total[0, 3]) * back
+            for n in range(len(change)):
+                own = changes[n]
+                d_back = own[1, c] - own[1, 3] * total[2, c] + (one - total[1, 3]) * own[2, c]
+                change[n, c * PITCH + j] = own[0, c] - own[0, 3] * back + (one - total[0, 3]) * d_back
+
+
+@compiled
+def _multiply(sums, products, change, value, fields, y, left, count, covered):
+    """Add the products of a row of a tile; where nothing is covered, of the residuals alone."""
+    target, weights, background = fields
+    channels, many = target.shape[2], len(change)
+    first, one = 3 if channels == 1 else 0, value.dtype.type(1)
+    for c in range(channels):
+        p, own = (first + c) * PITCH, c * count
+        for n in range(0 if covered else many, many + 1):
+            to = products[n, own : own + count]
+            if n < many:
+                to[:] = change[n, p : p + count]
+                if len(background) > 0:
+                    for j in range(count):
+                        to[j] -= change[n, OPACITY + j] * background[y, left + j, first + c]
+            else:
+                for j in range(count):
+                    to[j] = value[p + j] - target[y, left + j, c]
+                if len(background) > 0:
+                    for j in range(count):
+                        to[j] += (one - value[OPACITY + j]) * background[y, left + j, first + c]
+            if len(weights) > 0:
+                w = min(c, weights.shape[2] - 1)
+                for j in range(count):
+                    to[j] *= weights[y, left + j, w]
+    for a in range(0 if covered else many, many + 1):
+        for b in range(0 if covered else many, a + 1):
+            sums[a, b] += _dot(products[a], products[b], channels * count)
+
+
+@numba.njit(nogil=True, fastmath={"contract", "reassoc"})
+def _dot(a, b, count):
+    """The sum of products, in an order that suits vector instructions."""
+    total = a.dtype.type(0)
+    for j in range(count):
+        total += a[j] * b[j]
+    return total

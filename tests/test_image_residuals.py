@@ -1,0 +1,454 @@
+"""Image residuals: values by `render`, normal equations against those formed from the whole Jacobian."""
+
+import contextlib
+import itertools
+import tracemalloc
+
+import numpy as np
+import pytest
+from helpers import DIFFERENTIABLE, arrays, box, icosphere, quad, soup, to_numpy
+
+import rts
+import rts.least_squares
+from rts import splatting
+from rts.arrays import engine_of
+from rts.errors import InputError
+from rts.least_squares import normal_equations
+from rts_backends import fused, fused_normal
+from rts_backends.fused_kernels import Settings, Splats
+
+SIZE = (26, 31)
+CAMERA = rts.Camera.look_at((0.7, 0.9, 3.2), (0, 0, 0), fov_y=45, aspect=31 / 26)
+KINDS = ("single", "multi", "visible")
+POSE = np.array([0.2, -0.3, 0.1, 0.05, -0.07, 0.1])
+TOLERANCE = {np.float32: 1e-5, np.float64: 1e-10}
+CASES = [
+    *((kind, *case, "torch-cpu", dtype) for kind in KINDS for case in ((1, 2), (3, 1), (4, 3)) for dtype in TOLERANCE),
+    ("single", 1, 2, "jax", np.float64),
+    ("multi", 3, 1, "jax", np.float32),
+    ("visible", 4, 3, "jax", np.float64),
+]
+"""Splatter, channels, layers, engine and dtype."""
+targets = pytest.mark.parametrize("target", DIFFERENTIABLE)
+
+
+@contextlib.contextmanager
+def precision(target, dtype):
+    """float64 in jax for as long as it lasts."""
+    if target != "jax" or dtype != np.float64:
+        yield
+        return
+    jax = pytest.importorskip("jax")
+    jax.config.update("jax_enable_x64", True)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_enable_x64", False)
+
+
+def mesh(vertices, faces, shader="silhouette", **theta):
+    return rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {"vertices": vertices, **theta}, shader)
+
+
+def scene(parameters):
+    """A box with coloured corners that moves, before a sphere and a wall, and triangles that cross them."""
+    vertices, faces = box(0.5)
+    colors = np.random.default_rng(0).random((8, 3)).astype(np.float32)
+    moving = mesh(vertices, faces, "lambert", colors=colors).replace(transform=rts.rigid(parameters["pose"]))
+    lit = {"color": parameters["color"]}
+    return [
+        moving,
+        mesh(*icosphere(1, 0.6, (0.6, 0.1, -0.6)), "unlit", **lit),
+        mesh(*quad(-0.9, 0.8, -1.1, 0.6, -0.8), "unlit"),
+        mesh(*soup(6, seed=3, extent=0.7, size=0.3), "unlit"),
+    ]
+
+
+def start(target, dtype=np.float32):
+    return arrays(target, {"color": np.array([0.9, 0.5, 0.2, 0.7]), "pose": POSE}, dtype)
+
+
+def fields(channels, seed=1):
+    """A target and weights, one number a pixel or a channel, some of them zero."""
+    rng = np.random.default_rng(seed)
+    weights = rng.random((*SIZE, channels)) * (rng.random((*SIZE, channels)) > 0.3)
+    return rng.random((*SIZE, channels)), weights
+
+
+def count_sweeps(monkeypatch):
+    calls = []
+    whole = fused_normal.normal_equations
+
+    def counted(*args):
+        calls.append(args)
+        return whole(*args)
+
+    monkeypatch.setattr(fused_normal, "normal_equations", counted)
+    return calls
+
+
+def check(residuals, parameters, tolerance):
+    """Normal equations and, from the Jacobian of the residuals, the same in float64."""
+    engine = engine_of(parameters)
+    found = engine.jit(residuals.normal_equations)(parameters)
+    kinds = {str(x.dtype) for x in found}
+    assert len(kinds) == 1
+    flat, unflatten = rts.least_squares.flatten(parameters)
+    xp = engine.namespace
+    r, rows = map(to_numpy, engine.jit(engine.jacobian(lambda v: xp.reshape(residuals(unflatten(v)), (-1,))))(flat))
+    r, rows = r.astype(np.float64), rows.astype(np.float64)
+    assert len(r) == np.prod(residuals(parameters).shape)
+    expected = np.mean(r * r), rows @ rows.T / len(r), rows @ r / len(r)
+    scales = expected[0], np.abs(expected[1]).max(), np.abs(expected[1]).max() ** 0.5 * expected[0] ** 0.5
+    assert scales[1] > 1e-6
+    for own, formed, scale in zip(map(to_numpy, found), expected, scales, strict=True):
+        np.testing.assert_allclose(own, formed, rtol=0, atol=tolerance * scale)
+    return found
+
+
+# ----------------------------------------------------------------------------------------------- normal equations
+
+
+@pytest.mark.parametrize(("kind", "channels", "layers", "target", "dtype"), CASES)
+def test_normal_equations_are_those_of_the_jacobian(kind, channels, layers, target, dtype, monkeypatch):
+    sweeps = count_sweeps(monkeypatch)
+    goal, weights = fields(channels)
+    with precision(target, dtype):
+        residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, weights=weights, splatter=kind, layers=layers)
+        check(residuals, start(target, dtype), TOLERANCE[dtype])
+    assert len(sweeps) == 1
+
+
+@pytest.mark.parametrize(
+    ("background", "channels", "target"),
+    [
+        ("color", 1, "torch-cpu"),
+        ("color", 3, "torch-cpu"),
+        ("rgba", 4, "torch-cpu"),
+        ("image", 1, "torch-cpu"),
+        ("rgba", 4, "jax"),
+    ],
+)
+def test_backgrounds_are_composited_under_the_image(background, channels, target):
+    rng = np.random.default_rng(4)
+    behind = {"color": rng.random(3), "rgba": rng.random(4), "image": rng.random((*SIZE, 4))}[background]
+    goal, weights = fields(channels)
+    residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, weights=weights, background=behind)
+    if channels == 1 and background == "color":  # All is opaque then, and nothing changes.
+        np.testing.assert_allclose(to_numpy(residuals.normal_equations(start(target))[1]), 0, atol=1e-9)
+        return
+    check(residuals, start(target), 1e-5)
+
+
+@targets
+def test_jitted_and_with_few_rows(target):
+    goal, _ = fields(3)
+    residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal)
+    eager = residuals.normal_equations(start(target))
+    jitted = check(residuals, start(target), 1e-5)
+    for a, b in zip(map(to_numpy, eager), map(to_numpy, jitted), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * np.abs(a).max())
+    few = rts.ImageResiduals(scene, CAMERA, SIZE, goal, capacity=600)
+    check(few, start(target), 1e-5)
+
+
+@targets
+def test_shapes_of_target_and_weights(target):
+    alpha, weights = fields(1)
+    both, _ = fields(4)
+    parameters = start(target)
+    flat = rts.ImageResiduals(scene, CAMERA, SIZE, alpha[..., 0], weights=weights[..., 0])
+    assert tuple(flat(parameters).shape) == SIZE
+    column = rts.ImageResiduals(scene, CAMERA, SIZE, alpha, weights=weights)
+    assert tuple(column(parameters).shape) == (*SIZE, 1)
+    for a, b in zip(check(flat, parameters, 1e-5), check(column, parameters, 1e-5), strict=True):
+        np.testing.assert_array_equal(to_numpy(a), to_numpy(b))
+    mask = weights[..., 0] > 0.5
+    masked = rts.ImageResiduals(scene, CAMERA, SIZE, both, weights=mask)
+    assert not to_numpy(masked(parameters))[~mask].any()
+    check(masked, parameters, 1e-5)
+    image = to_numpy(rts.render(scene(parameters), CAMERA, SIZE))
+    np.testing.assert_allclose(to_numpy(masked(parameters)), (image - both) * mask[..., None], atol=1e-6)
+
+
+@targets
+def test_target_and_weights_may_be_arrays_of_the_engine(target):
+    goal, weights = fields(3)
+    given, parameters = arrays(target, {"goal": goal, "weights": weights}), start(target)
+    own = rts.ImageResiduals(scene, CAMERA, SIZE, given["goal"], weights=given["weights"])
+    host = rts.ImageResiduals(scene, CAMERA, SIZE, goal, weights=weights)
+    for a, b in zip(check(own, parameters, 1e-5), host.normal_equations(parameters), strict=True):
+        np.testing.assert_allclose(to_numpy(a), to_numpy(b), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("side", [1, 7, 16, 17, 140])
+def test_images_of_any_size(side):
+    """Bands and tiles are cut wherever they may."""
+    size = side, 145 - side
+    camera = rts.Camera.look_at((0.3, 0.4, 1.5), (0, 0, 0), aspect=size[1] / size[0])
+    goal = np.random.default_rng(0).random((*size, 4))
+    residuals = rts.ImageResiduals(scene, camera, size, goal)
+    check(residuals, start("torch-cpu"), 1e-4)
+
+
+@targets
+def test_cameras_vertices_and_prepared_parts(target):
+    vertices, faces = box(0.6)
+    fixed = mesh(vertices, faces, "lambert")
+    goal, _ = fields(3)
+    parameters = arrays(target, {"eye": np.array([0.7, 0.9, 3.2]), "vertices": vertices})
+
+    def moved(p):
+        camera = rts.Camera.look_at(p["eye"], (0, 0, 0), aspect=31 / 26)
+        return fixed.replace(theta={"vertices": p["vertices"]}), camera
+
+    check(rts.ImageResiduals(moved, None, SIZE, goal), parameters, 1e-5)
+    prepared = rts.prepare(fixed)
+    eye = {"eye": parameters["eye"]}
+    held = rts.ImageResiduals(lambda p: (prepared, moved({**p, "vertices": vertices})[1]), None, SIZE, goal)
+    free = rts.ImageResiduals(lambda p: moved({**p, "vertices": vertices}), None, SIZE, goal)
+    for a, b in zip(check(held, eye, 1e-5), free.normal_equations(eye), strict=True):
+        np.testing.assert_allclose(to_numpy(a), to_numpy(b), rtol=1e-5, atol=1e-7)
+
+
+@targets
+def test_nothing_in_view_has_zero_derivatives(target):
+    goal, _ = fields(4)
+    far = arrays(target, np.array([0, 0, 0, 50.0, 0, 0]))
+    residuals = rts.ImageResiduals(lambda p: mesh(*box(0.5)).replace(transform=rts.rigid(p)), CAMERA, SIZE, goal)
+    value, matrix, gradient = map(to_numpy, residuals.normal_equations(far))
+    np.testing.assert_allclose(value, np.mean(goal**2), rtol=1e-5)
+    assert not matrix.any() and not gradient.any()
+
+
+# ---------------------------------------------------------------------------------------------- the Jacobian's turn
+
+
+@pytest.mark.parametrize(
+    ("options", "target"),
+    [
+        ({"splatter": splatting.Visible()}, "torch-cpu"),
+        ({"splatter": "none"}, "torch-cpu"),
+        ({"supersample": 2}, "torch-cpu"),
+        ({"supersample": 2}, "jax"),
+    ],
+)
+def test_what_no_sweep_knows_is_done_by_the_jacobian(options, target, monkeypatch):
+    sweeps = count_sweeps(monkeypatch)
+    goal, weights = fields(3)
+    check(rts.ImageResiduals(scene, CAMERA, SIZE, goal, weights=weights, **options), start(target), 1e-5)
+    assert not sweeps
+
+
+def test_half_precision_is_done_by_the_jacobian(monkeypatch):
+    torch = pytest.importorskip("torch")
+    sweeps = count_sweeps(monkeypatch)
+    splats = [torch.zeros(n, dtype=torch.bfloat16) for n in ((5, 3), (5, 4))]
+    row = torch.zeros((1, 3, 3), dtype=torch.int32)
+    tangents = torch.zeros((2, 5, 3), dtype=torch.bfloat16)
+    goal = torch.zeros((3, 3, 1))
+    assert fused.Visible().normal_equations(*splats, row, tangents, None, goal) is None
+    elsewhere = [x.float().to("meta") for x in (*splats, row, tangents)]
+    assert fused.Visible().normal_equations(*elsewhere, None, goal) is None
+    assert not sweeps
+
+
+# -------------------------------------------------------------------------------------------------------- sweeps
+
+
+def splats_of(kind, layers=2, size=(40, 150), dtype=np.float64, seed=0):
+    """Samples off their centres at depths of no order, some cells empty, and tangents of both."""
+    rng = np.random.default_rng(seed)
+    k, y, x = np.nonzero(np.logical_and.accumulate(rng.random((layers, *size)) > 0.2, axis=0))
+    row = np.full((layers, *size), -1, np.int32)
+    row[k, y, x] = np.arange(len(k))
+    positions = np.stack([x + 0.5, y + 0.5, rng.uniform(1, 2, len(k)) + k], axis=1)
+    positions[:, :2] += rng.uniform(-0.3, 0.3, (len(k), 2))
+    rgba = rng.random((len(k), 4))
+    tangents = rng.normal(size=(3, len(k), 3)), rng.normal(size=(3, len(k), 4))
+    kernel = {"single": fused.Single, "multi": fused.Multi, "visible": fused.Visible}[kind]()
+    settings = Settings(kind, kernel.sigma, kernel.epsilon, kernel.gamma, 2)
+    splats = Splats(settings, positions.astype(dtype), rgba.astype(dtype), row)
+    return splats, *(t.astype(dtype) for t in tangents)
+
+
+@pytest.mark.parametrize("colored", [True, False])
+@pytest.mark.parametrize("channels", [1, 3, 4])
+@pytest.mark.parametrize("kind", KINDS)
+def test_sweeps_are_products_of_pushed_tangents(kind, channels, colored):
+    for layers in (1, 2, 3):
+        splats, t_positions, t_rgba = splats_of(kind, layers)
+        t_rgba = t_rgba if colored else None
+        chosen = slice(3, 4) if channels == 1 else slice(0, channels)
+        image, rows = splats.image()[..., chosen], splats.jvp(t_positions, t_rgba)[..., chosen]
+        goal = np.random.default_rng(1).random(image.shape)
+        r, rows = (image - goal).ravel(), rows.reshape(3, -1)
+        found = fused_normal.normal_equations(splats, t_positions, t_rgba, goal, None, None)
+        for own, expected in zip(found, (r @ r, rows @ rows.T, rows @ r), strict=True):
+            np.testing.assert_allclose(own, expected / len(r), rtol=1e-11, atol=1e-13)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_results_are_bitwise_the_same_on_any_number_of_threads(kind, monkeypatch):
+    splats, *tangents = splats_of(kind, dtype=np.float32)
+    goal, weights = (np.random.default_rng(n).random((36, 146, 4)) for n in (1, 2))
+    results = []
+    for threads in ("1", "2", "5"):
+        monkeypatch.setenv("RTS_NUM_THREADS", threads)
+        results.append(fused_normal.normal_equations(splats, *tangents, goal, weights, goal))
+    for one, other in itertools.pairwise(results):
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_a_sweep_at_512_needs_little_memory():
+    splats, _, _ = splats_of("visible", size=(516, 516), dtype=np.float32)
+    tangents = np.ones((12, len(splats.positions), 3), np.float32)
+    goal = np.ones((512, 512, 4), np.float32)
+    splats.choices  # noqa: B018  (made before, as the image has it)
+    fused_normal.normal_equations(splats, tangents, None, goal, None, None)
+    tracemalloc.start()
+    try:
+        fused_normal.normal_equations(splats, tangents, None, goal, None, None)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak < goal.nbytes / 4, "the Jacobian alone is twelve times the target"
+
+
+# ------------------------------------------------------------------------------------------------------------ fits
+
+
+def block():
+    vertices, faces = box(0.5)
+    vertices = vertices * np.array([1.5, 0.9, 0.6], np.float32)
+    return mesh(vertices * (1 + np.random.default_rng(3).uniform(-0.2, 0.2, vertices.shape).astype(np.float32)), faces)
+
+
+@targets
+@pytest.mark.parametrize("jit", [True, False])
+def test_a_pose_is_found_as_from_a_function(jit, target, monkeypatch):
+    part = block()
+    camera = rts.Camera.look_at((0.9, 0.8, 2.2), (0, 0, 0), fov_y=40)
+    moved = lambda p: part.replace(transform=rts.rigid(p))  # noqa: E731
+    options = {"splatter": "single", "layers": 1}
+    goal = rts.render(moved(np.array([0.12, -0.18, 0.1, 0.06, -0.05, 0.08])), camera, (40, 40), **options)[..., 3]
+    there = arrays(target, goal)
+    calls = []
+    known = rts.ImageResiduals(moved, camera, (40, 40), goal, **options)
+    sweeps = count_sweeps(monkeypatch)
+    ours = rts.fit(known, arrays(target, np.zeros(6)), method="lm", jit=jit)
+    assert len(sweeps) > 3
+    sweeps.clear()
+
+    def residuals(p):
+        calls.append(p)
+        return rts.render(moved(p), camera, (40, 40), **options)[..., 3] - there
+
+    theirs = rts.fit(residuals, arrays(target, np.zeros(6)), method="lm", jit=jit)
+    assert calls and not sweeps
+    np.testing.assert_allclose(ours.history[:4], theirs.history[:4], rtol=1e-3)
+    assert ours.loss < ours.history[0] / 50 and abs(ours.loss - theirs.loss) < 1e-3 * ours.history[0]
+    np.testing.assert_allclose(to_numpy(ours.parameters), to_numpy(theirs.parameters), atol=5e-3)
+
+
+def test_adam_takes_them_for_the_function_that_they_are():
+    goal, _ = fields(3)
+    residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal)
+    fit = rts.fit(residuals, start("torch-cpu"), steps=3)
+    assert fit.history[0] == pytest.approx(float((residuals(start("torch-cpu")) ** 2).mean()), rel=1e-5)
+    assert fit.loss < fit.history[0]
+
+
+@targets
+def test_what_goes_wrong_in_sampling_stops_the_fit_with_its_reason(target):
+    goal = np.zeros(SIZE)
+
+    def scene(p):
+        return mesh(*box(0.5)).replace(transform=rts.rigid(p))
+
+    with pytest.raises(InputError, match="NaN or infinity"):
+        rts.fit(rts.ImageResiduals(scene, CAMERA, SIZE, goal), arrays(target, np.full(6, np.nan)), method="lm")
+
+
+# ------------------------------------------------------------------------------------------------ the protocol
+
+
+class Line:
+    """Residuals A x − b that know AᵀA."""
+
+    def __init__(self, target):
+        rng = np.random.default_rng(0)
+        self.matrix, self.goal = (arrays(target, rng.normal(size=s)) for s in ((9, 3), 9))
+        self.used = 0
+
+    def __call__(self, p):
+        return self.matrix @ p["x"] - self.goal
+
+    def normal_equations(self, p):
+        self.used += 1
+        r = self(p)
+        return (r * r).mean(), self.matrix.T @ self.matrix / 9, self.matrix.T @ r / 9
+
+
+@targets
+def test_any_residuals_may_bring_their_normal_equations(target):
+    own, plain = Line(target), Line(target)
+    start = arrays(target, {"x": np.zeros(3)})
+    fit = rts.fit(own, start, method="lm", tolerance=1e-9)
+    assert own.used
+    expected = rts.fit(lambda p: plain(p), start, method="lm", tolerance=1e-9)
+    np.testing.assert_allclose(to_numpy(fit.parameters["x"]), to_numpy(expected.parameters["x"]), atol=1e-4)
+    for a, b in zip(own.normal_equations(start), normal_equations(plain, start, engine_of(start)), strict=True):
+        np.testing.assert_allclose(to_numpy(a), to_numpy(b), rtol=1e-5)
+
+
+@targets
+def test_normal_equations_of_another_form_are_refused(target):
+    class Wrong(Line):
+        def normal_equations(self, p):
+            return self.answer(*super().normal_equations(p))
+
+    residuals, start = Wrong(target), arrays(target, {"x": np.zeros(3)})
+    for answer, given in (
+        (lambda value, matrix, gradient: (value, matrix), r"\(\), \(3, 3\)"),
+        (lambda value, matrix, gradient: (value, gradient, matrix), r"\(\), \(3,\), \(3, 3\)"),
+        (lambda value, matrix, gradient: None, "a NoneType"),
+        (lambda value, matrix, gradient: (1.0, matrix, gradient), r"a float, \(3, 3\), \(3,\)"),
+    ):
+        residuals.answer = answer
+        with pytest.raises(
+            InputError, match=rf"normal_equations gave {given}; expected \w+ arrays of shapes \(\), \(3"
+        ):
+            rts.fit(residuals, start, method="lm")
+
+
+# ----------------------------------------------------------------------------------------------------- arguments
+
+
+@pytest.mark.parametrize(
+    ("target", "options", "expected"),
+    [
+        (np.zeros((26, 30)), {}, r"target has shape \(26, 30\); expected \(26, 31\) or \(26, 31, 1\)"),
+        (np.zeros((26, 31, 2)), {}, r"target has shape \(26, 31, 2\)"),
+        ("mask.png", {}, "target is a str"),
+        (np.zeros(SIZE, np.uint8), {}, "target has dtype uint8; expected floating"),
+        (
+            np.zeros((*SIZE, 3)),
+            {"weights": np.zeros((*SIZE, 4))},
+            r"weights has shape \(26, 31, 4\); expected \(26, 31\) or \(26, 31, 1\) or \(26, 31, 3\)",
+        ),
+        (np.zeros(SIZE), {"weights": np.zeros(SIZE, np.int32)}, "weights has dtype int32"),
+        (np.zeros(SIZE), {"background": np.zeros(2)}, r"background has shape \(2,\)"),
+        (np.zeros(SIZE), {"layers": 0}, "layers is 0"),
+    ],
+)
+def test_wrong_arguments_say_what_was_expected(target, options, expected):
+    with pytest.raises(InputError, match=expected):
+        rts.ImageResiduals(scene, CAMERA, SIZE, target, **options)
+
+
+def test_a_camera_must_come_from_somewhere():
+    residuals = rts.ImageResiduals(scene, None, SIZE, np.zeros(SIZE))
+    with pytest.raises(InputError, match="camera is None, and scene gives none"):
+        residuals(start("torch-cpu"))
