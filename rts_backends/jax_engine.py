@@ -94,7 +94,7 @@ class JaxEngine:
     def _used_of(self, x: jax.Array) -> jax.Array | np.int32:
         """How many rows of (N, ·) are used, as far as is known."""
         known = self._used.get(id(x))
-        return np.int32(x.shape[0]) if known is None else known[1]
+        return known[1] if known is not None and known[0]() is x else np.int32(x.shape[0])
 
     def traced(self, x: jax.Array) -> bool:
         """Whether `x` is a tracer."""

@@ -334,11 +334,11 @@ def _only_row(value: Any) -> Any:
     """The first row of an array in a program that is about to be compiled, if it plainly equals all others, or None."""
     ir, operation = mlir.ir, value.owner
     name = getattr(operation, "name", "")  # Of the owner of an argument there is none.
-    kind = value.type
+    kind = ir.RankedTensorType(value.type)
     shape = ir.RankedTensorType.get([1, *kind.shape[1:]], kind.element_type)
     if name == "stablehlo.broadcast_in_dim":
         operand, dims = operation.operands[0], [int(d) for d in operation.attributes["broadcast_dimensions"]]
-        if 0 in dims and operand.type.shape[dims.index(0)] != 1:
+        if 0 in dims and ir.RankedTensorType(operand.type).shape[dims.index(0)] != 1:
             return None
         return hlo.broadcast_in_dim(shape, operand, mlir.dense_int_array(dims))
     if name == "stablehlo.concatenate" and ir.IntegerAttr(operation.attributes["dimension"]).value > 0:
