@@ -1,6 +1,6 @@
 """Rasterizer for the CPU: K nearest triangles a pixel in one pass, on all cores (numba).
 
-Most triangles of a large mesh cover no pixel's centre. A first pass sees only their corners on screen, in float32, and
+Most triangles of a large mesh cover no pixel's centre. A first pass sees only their corners on screen, rounded, and
 lists those that may cover one. The second draws the image in bands of rows, each by one thread and in the order of the
 triangles, so the result does not depend on the number of threads. For blocks of listed triangles it works out, in
 float64 and homogeneous coordinates, the numbers of `rts_backends.triangles`, finds the pixels that they may cover, and
@@ -29,8 +29,11 @@ BLOCK = 64
 LONG_BLOCK = 256
 """Where less is kept of a triangle, or of a vertex."""
 
-SLACK = 1e-2
-"""Pixels, for the rounding of corners to float32."""
+LIMIT = np.float32(2**15 - 2)
+"""Of positions on screen, which take 16 bits so that more of them stay in caches: two pixels outside of the image."""
+
+BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
+"""In place of a position: before the near plane (or NaN), beyond the far plane."""
 
 LISTED = 8
 """What is listed of a triangle: its index, its three corners, and its first and last column and row of pixels."""
@@ -59,13 +62,16 @@ class Raster(TriangleSampler):
         # room for every vertex and triangle, but only what is used is ever touched.
         key = len(vertices), len(faces)
         screen, listed = self._scratch.pop(key, None) or (
-            np.empty((len(vertices), 2), np.float32),
+            np.empty((len(vertices), 2), np.int16),
             np.empty((len(faces), LISTED), np.int32),
         )
-        parallel(_project, len(vertices), vertices, matrix, screen, work=4 * len(vertices))
+        step = (max(size) / 2 + 2) / LIMIT
+        to_steps = np.diag([1 / step, 1 / step, 1, 1])
+        to_steps[:2, 3] = -width / 2 / step, -height / 2 / step
+        parallel(_project, len(vertices), vertices, to_steps @ matrix, screen, work=4 * len(vertices))
         chunks, bands = -(-len(faces) // CHUNK), -(-height // BAND_ROWS)
         spans, counts = np.empty((chunks, 2), np.int64), np.zeros((bands, chunks), np.int64)
-        given = vertices, faces, screen, matrix, height, width, keep
+        given = vertices, faces, screen, matrix, height, width, step, keep
         parallel(_select, chunks, *given, listed, spans, counts, work=4 * len(faces))
         offsets = np.append(0, np.cumsum(counts.sum(axis=1)))
         places = offsets[:-1, None] + np.cumsum(counts, axis=1) - counts
@@ -83,8 +89,8 @@ class Raster(TriangleSampler):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _project(start, stop, vertices, m, screen):
-    """Pixel positions (V, 2); +inf before the near plane (or NaN), −inf beyond the far plane."""
-    points, pixels = np.empty((3, LONG_BLOCK), np.float32), np.empty((2, LONG_BLOCK), np.float32)
+    """Positions (V, 2) on screen, in steps from the middle of the image."""
+    points, pixels = np.empty((3, LONG_BLOCK), np.float32), np.empty((2, LONG_BLOCK), np.int16)
     for first in range(start, stop, LONG_BLOCK):
         block = slice(first, min(stop, first + LONG_BLOCK))
         read, written = vertices[block], screen[block]
@@ -97,20 +103,22 @@ def _project(start, stop, vertices, m, screen):
             scale = 1 / w
             column = (m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3]) * scale
             row = (m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3]) * scale
+            column, row = min(max(np.rint(column), -LIMIT), LIMIT), min(max(np.rint(row), -LIMIT), LIMIT)
             behind_near, before_far = (depth >= -w) & (w > 0), depth <= w
-            column, row = column if before_far else -np.inf, row if before_far else -np.inf
-            pixels[0, v], pixels[1, v] = column if behind_near else np.inf, row if behind_near else np.inf
+            column, row = column if before_far else BEYOND, row if before_far else BEYOND
+            pixels[0, v], pixels[1, v] = column if behind_near else BEFORE, row if behind_near else BEFORE
         for v in range(len(read)):
             written[v, 0], written[v, 1] = pixels[0, v], pixels[1, v]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _select(first, last, vertices, faces, screen, matrix, height, width, keep, listed, spans, counts):
+def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, listed, spans, counts):
     """List the triangles that may cover a pixel's centre; spans (chunks, 2) of the list, counts (bands, chunks)."""
-    xy, box = np.empty((3, LONG_BLOCK, 2), np.float32), np.empty((4, LONG_BLOCK), np.float32)
+    xy, box = np.empty((3, LONG_BLOCK, 2), np.int16), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
     chosen, corners = np.empty(LONG_BLOCK, np.uint32), np.empty((3, 4))
-    slack, half, infinity, sign = np.float32(SLACK), np.float32(0.5), np.float32(np.inf), np.float32(keep)
+    step, sign = np.float32(step), np.float32(keep)
+    middle, center, half, five = np.float32(width / 2), np.float32(height / 2), np.float32(0.5), np.float32(5)
     found = first * CHUNK
     for chunk in range(first, last):
         spans[chunk, 0] = found
@@ -122,20 +130,23 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, keep, l
                     v = block[b, c]
                     xy[c, b, 0], xy[c, b, 1] = screen[v, 0], screen[v, 1]
             for b in range(len(block)):
-                xa, xb, xc = xy[0, b, 0], xy[1, b, 0], xy[2, b, 0]
-                ya, yb, yc = xy[0, b, 1], xy[1, b, 1], xy[2, b, 1]
+                xa, xb, xc = np.float32(xy[0, b, 0]), np.float32(xy[1, b, 0]), np.float32(xy[2, b, 0])
+                ya, yb, yc = np.float32(xy[0, b, 1]), np.float32(xy[1, b, 1]), np.float32(xy[2, b, 1])
                 x0, x1, y0, y1 = min(xa, xb, xc), max(xa, xb, xc), min(ya, yb, yc), max(ya, yb, yc)
-                i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width)
+                i0, i1, j0, j1 = _centres(
+                    x0 * step + middle, x1 * step + middle, y0 * step + center, y1 * step + center, height, width, step
+                )
                 box[0, b], box[1, b], box[2, b], box[3, b] = i0, i1, j0, j1
                 # Where there is one centre, most triangles whose box holds it do not.
-                x, y = i0 + half, j0 + half
+                x, y = (i0 + half - middle) / step, (j0 + half - center) / step
                 ax, ay, bx, by, cx, cy = xa - x, ya - y, xb - x, yb - y, xc - x, yc - y
                 ea, eb, ec = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
-                bound = slack * (x1 - x0 + y1 - y0)
+                bound = five * (x1 - x0 + y1 - y0 + five)  # Twice what rounding to whole steps may come to.
                 away = (ea + eb + ec) * sign < -bound
-                missed = (i0 == i1) & (j0 == j1) & (((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound)) | away)
-                clips[b] = ((x1 == infinity) | (x0 == -infinity)) & (x0 < infinity) & (x1 > -infinity)
-                near[b] = clips[b] | ((i0 <= i1) & (j0 <= j1) & ~missed)
+                missed = ((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound)) | away
+                placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
+                clips[b] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)
+                near[b] = clips[b] | ((i0 <= i1) & (j0 <= j1) & ~((i0 == i1) & (j0 == j1) & placed & missed))
             count = 0
             for b in range(len(block)):
                 chosen[count] = b
@@ -146,7 +157,7 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, keep, l
                     for c in range(3):
                         to_corner(matrix, vertices, block[b, c], corners, c)
                     x0, x1, y0, y1 = _clipped_box(corners, width, height)
-                    i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width)
+                    i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
                     if i0 > i1 or j0 > j1:
                         continue
                 listed[found, 0] = start + b
@@ -159,13 +170,11 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, keep, l
 
 
 @numba.njit
-def _centres(x0, x1, y0, y1, height, width):
-    """First and last column and row, in float32, whose pixels have their centres in a box."""
-    # Pixel centres lie at i + 0.5; clamped before rounding, since a far point overflows an integer.
-    low, out, into = np.float32(-SLACK), np.float32(0.5 + SLACK), np.float32(0.5 - SLACK)
-    right, bottom = np.float32(width + SLACK), np.float32(height + SLACK)
-    i0, i1 = np.ceil(max(x0, low) - out), np.floor(min(x1, right) - into)
-    j0, j1 = np.ceil(max(y0, low) - out), np.floor(min(y1, bottom) - into)
+def _centres(x0, x1, y0, y1, height, width, step):
+    """First and last column and row, in float32, whose pixels have their centres in a box, known to half a step."""
+    slack, half, zero = np.float32(0.75) * step, np.float32(0.5), np.float32(0)
+    i0, i1 = max(np.ceil(x0 - half - slack), zero), min(np.floor(x1 - half + slack), np.float32(width - 1))
+    j0, j1 = max(np.ceil(y0 - half - slack), zero), min(np.floor(y1 - half + slack), np.float32(height - 1))
     return i0, i1, j0, j1
 
 
@@ -332,8 +341,9 @@ def _insert(hits, top, entries, numbers, clips, nearest, triangle_ids, barycentr
         xc, yc, wc = numbers[6, b], numbers[7, b], numbers[8, b]
         ea, eb, ec = xa * x + (ya * y + wa), xb * x + (yb * y + wb), xc * x + (yc * y + wc)
         # Top and left edges own the pixels exactly on them (y points down).
-        if (ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc)):
-            continue
+        if min(ea, eb, ec) == 0:
+            if (ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc)):
+                continue
         total = ea + eb + ec
         if not total > 0 or (clips[b] and _outside(numbers, b, ea, eb, ec)):
             continue
