@@ -59,18 +59,75 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx, *tangents):
-        (rows, points), (t_rows, t_points) = ctx.saved_tensors, tangents
-        x, y, w, _ = torch.addmm(rows[:, 3], points, rows[:, :3].T).unbind(1)
-        safe = torch.where(w == 0, torch.ones_like(w), w)
-        moved = 0.0 if t_points is None else t_points @ rows[:, :3].T
-        turned = 0.0 if t_rows is None else torch.addmm(t_rows[:, 3], points, t_rows[:, :3].T)
-        tx, ty, tw, tz = (moved + turned).unbind(1)
-        tw = torch.where(w == 0, torch.zeros_like(tw), tw)
-        return torch.stack([(tx - x / safe * tw) / safe, (ty - y / safe * tw) / safe, tz], dim=1)
+        t_rows, t_points = (None if t is None else t[None] for t in tangents)
+        return applied(_Push, *ctx.saved_tensors, t_rows, t_points)[0]
 
     @staticmethod
     def vmap(info, in_dims, rows, points):
         return torch.vmap(specification, in_dims)(rows, points), 0
+
+
+def _pushed(rows: Tensor, points: Tensor, t_rows: Tensor | None, t_points: Tensor | None) -> Tensor:
+    """Tangents (T, N, 3) along those of rows (T, 4, 4) and points (T, N, 3), or None for zeros, in torch."""
+    x, y, w, _ = torch.addmm(rows[:, 3], points, rows[:, :3].T).unbind(1)
+    safe = torch.where(w == 0, torch.ones_like(w), w)
+    moved = 0.0 if t_points is None else t_points @ rows[:, :3].T
+    turned = 0.0 if t_rows is None else points @ t_rows[:, :, :3].mT + t_rows[:, None, :, 3]
+    tx, ty, tw, tz = (moved + turned).unbind(2)  # pyright: ignore[reportAttributeAccessIssue]
+    tw = torch.where(w == 0, torch.zeros_like(tw), tw)
+    return torch.stack([(tx - x / safe * tw) / safe, (ty - y / safe * tw) / safe, tz], dim=2)
+
+
+class _Push(torch.autograd.Function):
+    """Tangents along T directions."""
+
+    @staticmethod
+    def forward(rows, points, t_rows, t_points):
+        count = next(len(t) for t in (t_rows, t_points) if t is not None)
+        out = torch.empty((count, *points.shape), dtype=points.dtype)
+        given = [x.detach().numpy() for x in (rows, points)]
+        along_rows, along_points = ([None] * count if t is None else t.detach().numpy() for t in (t_rows, t_points))
+        for turn, move, result in zip(along_rows, along_points, out.numpy(), strict=True):
+            projection_kernels.push(*given, turn, move, result)
+        return out
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.present = [t is not None for t in inputs]
+        given = [t for t in inputs if t is not None]
+        ctx.save_for_backward(*given)
+        ctx.save_for_forward(*given)
+
+    @staticmethod
+    def _function(ctx):
+        """The specification, of those that are present."""
+
+        def push(*given: Tensor) -> Tensor:
+            it = iter(given)
+            return _pushed(*(next(it) if there else None for there in ctx.present))  # pyright: ignore[reportArgumentType]
+
+        return push
+
+    @staticmethod
+    def backward(ctx, *gradients):
+        found = iter(torch.func.vjp(_Push._function(ctx), *ctx.saved_tensors)[1](gradients[0]))
+        return tuple(next(found) if there else None for there in ctx.present)
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        given = [t for t, there in zip(tangents, ctx.present, strict=True) if there]
+        return along(_Push._function(ctx), ctx.saved_tensors, given)
+
+    @staticmethod
+    def vmap(info, in_dims, rows, points, t_rows, t_points):
+        if in_dims[0] is not None or in_dims[1] is not None:
+            return torch.vmap(_pushed, in_dims)(rows, points, t_rows, t_points), 0
+        # The batch is more tangents of the same points: one sweep for all.
+        folded = (
+            t if t is None else (t.expand(info.batch_size, *t.shape) if d is None else t.movedim(d, 0)).flatten(0, 1)
+            for t, d in zip((t_rows, t_points), in_dims[2:], strict=True)
+        )
+        return applied(_Push, rows, points, *folded).unflatten(0, (info.batch_size, -1)), 0
 
 
 class _Pull(torch.autograd.Function):
