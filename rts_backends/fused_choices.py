@@ -11,6 +11,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from rts_backends.fused_survey import EMPTY
+
 compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
 
@@ -83,7 +85,7 @@ def _mark(marks, front, hidden, target_front, target_hidden):
 
 
 @kernel
-def choose(start, stop, row, visible, continued, beyond, z, mixed, offsets, columns, choices):
+def choose(start, stop, row, visible, continued, beyond, z, mixed, offsets, columns, choices, states):
     """List each row's mixed targets: their columns (M,), and ranges of layers (M, 9, 3, 2) by source and buffer."""
     layers, _, width = row.shape
     target, shift = np.empty(layers, z.dtype), np.empty(9, np.int64)
@@ -92,7 +94,7 @@ def choose(start, stop, row, visible, continued, beyond, z, mixed, offsets, colu
         for x in range(width):
             if not mixed[y, x]:
                 continue
-            columns[d] = x
+            columns[d], states[y, x] = x, EMPTY
             choices[d] = 0
             for k in range(layers):
                 depth = z[k, y + 1, x + 1]

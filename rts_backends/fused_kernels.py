@@ -11,15 +11,15 @@ import math
 from functools import cached_property
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from rts.errors import InputError
-from rts.splatting import CONTINUED, OFFSETS
+from rts.splatting import CONTINUED, LEAST_EPSILON, OFFSETS
 from rts.threads import parallel
 from rts_backends import fused_choices as choosing
 from rts_backends import fused_mixed as mixed
 from rts_backends import fused_stencil as stencil
+from rts_backends import fused_survey as surveying
 
 
 class Settings(NamedTuple):
@@ -49,12 +49,16 @@ class Choices(NamedTuple):
         columns: (M,) int32, their columns.
         ranges: (M, 9, 3, 2), first and last + 1 of the layers that each source gives to each buffer; source 3 (v + 1) +
             (u + 1) lies at −(u, v), and the buffers are in front, at the surface, behind.
+        states: (H, W) uint8, of the other targets (`fused_survey`); such are EMPTY in it.
+        repeated: whether a sample stands in several cells, which would add to its gradient at the same time.
     """
 
     mixed: np.ndarray
     offsets: np.ndarray
     columns: np.ndarray
     ranges: np.ndarray
+    states: np.ndarray
+    repeated: bool
 
 
 class Splats:
@@ -87,6 +91,7 @@ class Splats:
         scale = 1 / (2 * settings.sigma**2)
         peak = math.sqrt(1 + settings.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
         self._numbers = tuple(positions.dtype.type(x) for x in (scale, peak, settings.gamma))
+        self._reach = positions.dtype.type(_reach(settings))
         if choices is not None:
             self.choices = choices
 
@@ -103,12 +108,13 @@ class Splats:
     @property
     def mixed_arguments(self) -> tuple:
         """Arguments of the kernels of mixed targets."""
-        return self.positions, self.rgba, self.row, *self._numbers, *self.choices[1:]
+        return self.positions, self.rgba, self.row, *self._numbers, *self.choices[1:4]
 
     @cached_property
     def choices(self) -> Choices:
-        """What is decided for mixed targets."""
+        """What is decided for each target."""
         layers, height, width = self.row.shape
+        states, repeated = self._survey()
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
         z = np.empty((layers, height + 2, width + 2), self.positions.dtype)
         beyond = z.dtype.type(1)
@@ -124,9 +130,18 @@ class Splats:
         ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
         if len(columns):
             continued = z.dtype.type(CONTINUED)  # An argument, since compiled code that is cached would keep its value.
-            given = self.row, self.visible, continued, beyond, z, marks, offsets, columns, ranges
+            given = self.row, self.visible, continued, beyond, z, marks, offsets, columns, ranges, states
             parallel(choosing.choose, height, *given, work=50 * len(columns))
-        return Choices(marks, offsets, columns, ranges)
+        return Choices(marks, offsets, columns, ranges, states, repeated)
+
+    def _survey(self) -> tuple[np.ndarray, bool]:
+        """States of all targets, and whether samples are repeated."""
+        _, height, width = self.row.shape
+        states, counts = np.empty((height, width), np.uint8), np.zeros(height, np.int64)
+        seen = np.zeros(len(self.positions), np.uint8)
+        given = self.positions, self.rgba, self.row, self.visible or len(self.row) == 1, self._reach
+        parallel(surveying.survey, height, *given, states, seen, counts)
+        return states, int(np.count_nonzero(seen)) != int(counts.sum())
 
     @property
     def _size(self) -> tuple[int, int]:
@@ -138,7 +153,8 @@ class Splats:
         """(H, W, 4) premultiplied, H and W less than those of the cells by both borders."""
         image = np.empty((*self._size, 4), self.positions.dtype)
         if image.size:
-            parallel(stencil.forward, len(image), *self.plain_arguments, self.border, image)
+            given = *self.plain_arguments, self.choices.states, self.border
+            parallel(stencil.forward, len(image), *given, image)
             if len(self.choices.columns):
                 parallel(mixed.forward, len(image), *self.mixed_arguments, self.border, image, work=self._mixed_work)
         return image
@@ -148,7 +164,7 @@ class Splats:
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Gradients of positions (N, 3) and rgba (N, 4) from the image's (H, W, 4); None where not wanted."""
         _, height, _ = self.row.shape
-        if self._repeated:
+        if self.row.size and self.choices.repeated:
             return self._vjp_of_repeated(g, wanted)
         found = tuple(
             np.zeros((len(x) if wish else 0, x.shape[1]), x.dtype)
@@ -156,7 +172,7 @@ class Splats:
         )
         if self.row.size:
             g = _frozen(g)
-            parallel(stencil.pull, height, *self.plain_arguments, self.choices.mixed, self.border, g, *found)
+            parallel(stencil.pull, height, *self.plain_arguments, self.choices.states, self.border, g, *found)
             if count := len(self.choices.columns):
                 adjoints = np.empty((count, 3, 5), g.dtype)
                 parallel(mixed.adjoint, height, *self.mixed_arguments, self.border, g, adjoints, work=self._mixed_work)
@@ -172,18 +188,13 @@ class Splats:
                 _frozen(np.empty((count, 0, size), out.dtype) if t is None else t)
                 for t, size in ((t_positions, 3), (t_rgba, 4))
             )
-            parallel(stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.border, out)
+            parallel(
+                stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.choices.states, self.border, out
+            )
             if len(self.choices.columns):
                 work = self._mixed_work * count
                 parallel(mixed.push, out.shape[1], *self.mixed_arguments, *tangents, self.border, out, work=work)
         return out
-
-    @cached_property
-    def _repeated(self) -> bool:
-        """Whether a sample stands in several cells, which would add to its gradient at the same time."""
-        counts, seen = np.zeros(self.row.shape[1], np.int64), np.zeros(len(self.positions), np.uint8)
-        parallel(_mark, len(counts), self.row, seen, counts)
-        return int(np.count_nonzero(seen)) != int(counts.sum())
 
     def _vjp_of_repeated(self, g: np.ndarray, wanted: tuple[bool, bool]) -> tuple[np.ndarray | None, np.ndarray | None]:
         """`vjp` with a copy of the sample for each cell, whose gradients are then added in the order of the cells."""
@@ -192,10 +203,21 @@ class Splats:
         own = np.full(self.row.shape, -1, np.int32)
         own[covered] = np.arange(len(index), dtype=np.int32)
         copy = object.__new__(Splats)
-        copy.__dict__.update(self.__dict__, _repeated=False, row=_frozen(own))
+        copy.__dict__.update(self.__dict__, choices=self.choices._replace(repeated=False), row=_frozen(own))
         copy.positions, copy.rgba = _frozen(self.positions[index]), _frozen(self.rgba[index])
         g_positions, g_rgba = copy.vjp(g, wanted)
         return _collected(g_positions, index, self.positions), _collected(g_rgba, index, self.rgba)
+
+
+def _reach(settings: Settings) -> float:
+    """How far, in pixels along x and y, samples may lie off their cells' centres while weights surely sum up to one."""
+    if settings.epsilon < LEAST_EPSILON:
+        return -1.0
+    scale = 1 / (2 * settings.sigma**2)
+    side = math.exp(-scale)
+    # What the sum of the weights, 1 + ε at the centres, loses to first order if each goes the worst way; and a tenth.
+    loss = 2 * (1 + settings.epsilon) * 2 * side / (1 + 2 * side) * 2 * scale * settings.gamma
+    return settings.epsilon / (1.1 * loss)
 
 
 def _collected(values: np.ndarray | None, index: np.ndarray, like: np.ndarray) -> np.ndarray | None:
@@ -205,18 +227,6 @@ def _collected(values: np.ndarray | None, index: np.ndarray, like: np.ndarray) -
     total = np.zeros_like(like)
     np.add.at(total, index, values)
     return total
-
-
-@numba.njit(cache=True, nogil=True)
-def _mark(start, stop, row, seen, counts):
-    """Mark the samples that cells of rows [start, stop) refer to, and count these cells."""
-    layers, _, width = row.shape
-    for y in range(start, stop):
-        for k in range(layers):
-            for x in range(width):
-                if row[k, y, x] >= 0:
-                    seen[row[k, y, x]] = 1
-                    counts[y] += 1
 
 
 def _frozen(x: np.ndarray, dtype: type | None = None) -> np.ndarray:

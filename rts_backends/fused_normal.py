@@ -20,15 +20,17 @@ from rts_backends.fused_rows import (
     SUM,
     SUMS,
     TILE,
+    busy,
     compiled,
     composite,
+    fill,
     kernel,
-    load,
     normalised_sums,
     slot,
     tile,
 )
-from rts_backends.fused_stencil import ALPHA, COLORS, TANGENT, add_tangent_row, load_tangent, tangent_row
+from rts_backends.fused_stencil import ALPHA, COLORS, TANGENT, add_tangent_row, load_around, load_tangent, tangent_row
+from rts_backends.fused_survey import BUSY, FLAT
 
 BAND = 16
 """Rows of the image whose products are added up together."""
@@ -89,7 +91,7 @@ def normal_equations(
     fields = (_frozen(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
     bands = -(-len(target) // BAND)
     sums = np.zeros((bands, count + 1, count + 1))
-    given = splats.plain_arguments, splats.row, splats.choices[1:], tangents, tuple(fields), splats.border
+    given = splats.plain_arguments, splats.row, splats.choices[:5], tangents, tuple(fields), splats.border
     parallel(_accumulate, bands, ALPHA if target.shape[2] == 1 else COLORS, *given, sums)
     total = sums.sum(axis=0) / max(target.size, 1)
     matrix = total[:count, :count]
@@ -123,40 +125,41 @@ def _accumulate(start, stop, planes, plain, row, lists, tangents, fields, border
     )
     products = np.empty((many + 1, channels * PITCH), positions.dtype)
     scratch = np.empty((3, 5), positions.dtype), np.empty((many, 3, 5), positions.dtype)
+    mixed, _, _, _, states = lists
+    loaded, least = np.empty(3, np.int64), FLAT if t_rgba.shape[1] > 0 else BUSY
     for band in range(start, stop):
         top, bottom = band * BAND, min(height, (band + 1) * BAND)
         for t in range((width + TILE - 1) // TILE):
             left, count = tile(width, t)
-            last = top - 4  # The last source row that is not empty, as in `fused_stencil.forward`.
-            for y in range(top - 1, bottom + 1):
-                at = left + border - 1
-                for k in range(layers):
-                    s = slot(sources, k, y, SOURCE)
-                    if load(s, positions, rgba, fronts, k, y + border, at, count + 2, scale, peak, gamma):
-                        last = y
-                    for n in range(many):
-                        to = slot(moving[n], k, y, TANGENT)
-                        load_tangent(
-                            to, s, t_positions[n], t_rgba[n], fronts, k, y + border, at, count + 2, slope, planes
-                        )
-                if y <= top:
-                    continue
-                covered = y - last <= 2
-                if covered:
-                    normalised_sums(value, sources, layers, y - 1, count)
+            loaded[:] = -9
+            for y in range(top, bottom):
+                at = y + border, left + border
+                changing = busy(states, *at, count, least) or busy(mixed, *at, count, 1)
+                if changing:
+                    given = y + border, left + border - 1, count + 2
+                    first = load_around(sources, loaded, positions, rgba, fronts, *given, scale, peak, gamma)
+                    for v in range(first, y + border + 2):
+                        for k in range(layers):
+                            s = slot(sources, k, v, SOURCE)
+                            for n in range(many):
+                                to, own = slot(moving[n], k, v, TANGENT), (t_positions[n], t_rgba[n])
+                                at = left + border - 1, count + 2
+                                load_tangent(to, s, *own, fronts, k, v, *at, slope, planes)
+                    normalised_sums(value, sources, layers, y + border, count)
                     for n in range(many):
                         to = change[n]
                         to[: min(layers, 2) * SUM] = kind(0)
                         for k in range(layers):
                             for v in range(-1, 2):
-                                s, tangent = slot(sources, k, y - 1 - v, SOURCE), slot(moving[n], k, y - 1 - v, TANGENT)
+                                source = y + border - v
+                                s, tangent = slot(sources, k, source, SOURCE), slot(moving[n], k, source, TANGENT)
                                 add_tangent_row(to[SUM:] if k > 0 else to, s, tangent, v, count, planes)
                         tangent_row(to, value, layers, count, planes)
                     composite(value, layers, count)
-                    _mix(change, value, plain, row, lists, tangents, border, y - 1, left, count, scratch)
+                    _mix(change, value, plain, row, lists[1:4], tangents, border, y, left, count, scratch)
                 else:
-                    value[:SUM] = kind(0)
-                _multiply(sums[band], products, change, value, fields, y - 1, left, count, covered)
+                    fill(value, rgba, row[0, y + border, border:], states[y + border, border:], left, count)
+                _multiply(sums[band], products, change, value, fields, y, left, count, changing)
 
 
 @compiled
@@ -183,14 +186,14 @@ def _mix(change, value, plain, row, lists, tangents, border, y, left, count, scr
 
 
 @compiled
-def _multiply(sums, products, change, value, fields, y, left, count, covered):
-    """Add the products of a row of a tile; where nothing is covered, of the residuals alone."""
+def _multiply(sums, products, change, value, fields, y, left, count, changing):
+    """Add the products of a row of a tile; where nothing changes, of the residuals alone."""
     target, weights, background = fields
     channels, many = target.shape[2], len(change)
     first, one = 3 if channels == 1 else 0, value.dtype.type(1)
     for c in range(channels):
         p, own = (first + c) * PITCH, c * count
-        for n in range(0 if covered else many, many + 1):
+        for n in range(0 if changing else many, many + 1):
             to = products[n, own : own + count]
             if n < many:
                 to[:] = change[n, p : p + count]
@@ -207,8 +210,8 @@ def _multiply(sums, products, change, value, fields, y, left, count, covered):
                 w = min(c, weights.shape[2] - 1)
                 for j in range(count):
                     to[j] *= weights[y, left + j, w]
-    for a in range(0 if covered else many, many + 1):
-        for b in range(0 if covered else many, a + 1):
+    for a in range(0 if changing else many, many + 1):
+        for b in range(0 if changing else many, a + 1):
             sums[a, b] += _dot(products[a], products[b], channels * count)
 
 

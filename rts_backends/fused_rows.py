@@ -21,7 +21,9 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
-TILE = 128
+from rts_backends.fused_survey import FLAT
+
+TILE = 32
 PITCH = TILE + 8
 """A plane holds a row of a tile, and up to two cells more at each end."""
 
@@ -82,11 +84,19 @@ def tile(width, t):
 
 
 @compiled
-def load(s, positions, rgba, row, k, y, first, count, scale, peak, gamma):
-    """Fill a source's slot with cells first, …, first + count − 1 of a row; cells outside the image are empty.
+def busy(states, y, first, count, least):
+    """Whether some target of a row is of at least this state."""
+    height, width = states.shape
+    found = False
+    if 0 <= y < height:
+        for x in range(max(first, 0), min(first + count, width)):
+            found |= states[y, x] >= least
+    return found
 
-    Returns whether any is not.
-    """
+
+@compiled
+def load(s, positions, rgba, row, k, y, first, count, scale, peak, gamma):
+    """Fill a source's slot with cells first, …, first + count − 1 of a row; cells outside the image are empty."""
     zero, half = s.dtype.type(0), s.dtype.type(0.5)
     _, height, width = row.shape
     filled = False
@@ -106,13 +116,12 @@ def load(s, positions, rgba, row, k, y, first, count, scale, peak, gamma):
                 s[c * PITCH + j] = zero
     if not filled:
         s[WX:RX] = zero
-        return False
+        return
     for axis in range(2):
         for u in range(3):
             for j in range(count):
                 d = s.dtype.type(u - 1) - s[RX + axis * PITCH + j]
                 s[WX + (3 * axis + u) * PITCH + j] = peak * exp(-(d * d) * scale)
-    return True
 
 
 @compiled
@@ -151,6 +160,14 @@ def composite(total, layers, count):
             through = one - total[3 * PITCH + j]
             for c in range(4):
                 total[c * PITCH + j] += through * total[SUM + c * PITCH + j]
+
+
+@compiled
+def fill(s, rgba, cells, states, left, count):
+    """The image where all around is of one colour, or nothing."""
+    for j in range(count):
+        for c in range(4):
+            s[c * PITCH + j] = rgba[cells[left + j], c] if states[left + j] == FLAT else s.dtype.type(0)
 
 
 @compiled

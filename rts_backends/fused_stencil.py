@@ -15,8 +15,10 @@ from rts_backends.fused_rows import (
     TILE,
     WX,
     WY,
+    busy,
     compiled,
     composite,
+    fill,
     kernel,
     load,
     normalised_sums,
@@ -24,6 +26,7 @@ from rts_backends.fused_rows import (
     store,
     tile,
 )
+from rts_backends.fused_survey import BUSY, FLAT
 
 COLORS, ALPHA = (0,) * 5, (0,) * 2
 """The planes of a tangent that count, as tuples whose length compiled code knows: all five, or alpha and the weight."""
@@ -32,25 +35,36 @@ X, Y, TANGENT = (PITCH * p for p in (5, 6, 7))
 """Places in a tangent's slot, after five planes D: w (D + (u X + v Y) colour) is the tangent of a weighted colour."""
 
 
+@compiled
+def load_around(sources, loaded, positions, rgba, row, y, first, count, scale, peak, gamma):
+    """Fill the slots of source rows y − 1, y and y + 1 that are not loaded yet; returns the first row that was not."""
+    start = y + 2
+    for v in range(y + 1, y - 2, -1):
+        if loaded[(v + 3) % 3] != v:
+            loaded[(v + 3) % 3], start = v, v
+            for k in range(len(row)):
+                load(slot(sources, k, v, SOURCE), positions, rgba, row, k, v, first, count, scale, peak, gamma)
+    return start
+
+
 @kernel
-def forward(start, stop, positions, rgba, row, scale, peak, gamma, border, image):
+def forward(start, stop, positions, rgba, row, scale, peak, gamma, states, border, image):
     """Rows [start, stop) of the image (H, W, 4), which is so much smaller than the cells at each side."""
     layers, (_, width, _) = len(row), image.shape
     sources, total = np.empty(3 * layers * SOURCE, image.dtype), np.empty(SUMS, image.dtype)
+    loaded = np.empty(3, np.int64)
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
-        last = start - 4  # The last source row that is not empty: where three are, there is nothing to compute.
-        for y in range(start - 1, stop + 1):
-            for k in range(layers):
-                s, at = slot(sources, k, y, SOURCE), left + border - 1
-                if load(s, positions, rgba, row, k, y + border, at, count + 2, scale, peak, gamma):
-                    last = y
-            if y > start and y - last > 2:
-                image[y - 1, left : left + count] = image.dtype.type(0)
-            elif y > start:
-                normalised_sums(total, sources, layers, y - 1, count)
+        loaded[:] = -9
+        for y in range(start, stop):
+            if busy(states, y + border, left + border, count, BUSY):
+                at = left + border - 1
+                load_around(sources, loaded, positions, rgba, row, y + border, at, count + 2, scale, peak, gamma)
+                normalised_sums(total, sources, layers, y + border, count)
                 composite(total, layers, count)
-                store(image, y - 1, left, total, count)
+            else:
+                fill(total, rgba, row[0, y + border, border:], states[y + border, border:], left, count)
+            store(image, y, left, total, count)
 
 
 @compiled
@@ -84,13 +98,13 @@ def adjoint_row(to, total, g, layers, count):
 
 
 @compiled
-def load_image(s, image, mixed, border, y, first, count):
-    """Cells of an image as planes, zero beyond it and where targets are mixed."""
+def load_image(s, image, states, least, border, y, first, count):
+    """Cells of an image as planes, zero beyond it and where targets are of less than a state."""
     height, width, _ = image.shape
     within = 0 <= y - border < height
     for j in range(count):
         x = first + j
-        if within and 0 <= x - border < width and not mixed[y, x]:
+        if within and 0 <= x - border < width and states[y, x] >= least:
             for c in range(4):
                 s[c * PITCH + j] = image[y - border, x - border, c]
         else:
@@ -124,37 +138,34 @@ def gather(to, s, above, level, below, count):
 
 
 @kernel
-def pull(start, stop, positions, rgba, row, scale, peak, gamma, mixed, border, g, g_positions, g_rgba):
+def pull(start, stop, positions, rgba, row, scale, peak, gamma, states, border, g, g_positions, g_rgba):
     """Gradients of what source rows [start, stop) give to targets that are not mixed; each cell collects its own."""
-    layers, height, width = row.shape
+    layers, _, width = row.shape
     sources, total = np.empty(3 * layers * SOURCE, g.dtype), np.empty(SUMS, g.dtype)
     adjoints, given, found = np.empty(3 * SUMS, g.dtype), np.empty(SUMS, g.dtype), np.empty(8 * PITCH, g.dtype)
-    slope = g.dtype.type(2) * scale * gamma
+    loaded, active = np.empty(3, np.int64), np.empty(3, np.bool_)
+    slope, least = g.dtype.type(2) * scale * gamma, FLAT if len(g_rgba) > 0 else BUSY
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
-        last = start - 8  # As in `forward`; four empty rows make the source row in their middle empty, too.
-        for y in range(start - 2, stop + 2):
-            for k in range(layers):
-                s = slot(sources, k, y, SOURCE)
-                if load(s, positions, rgba, row, k, y, left - 2, count + 4, scale, peak, gamma):
-                    last = y
-            if y < start:
-                continue
-            adjoint = slot(adjoints, 0, y - 1, SUMS)
-            if 1 <= y <= height and y - last <= 2:
-                normalised_sums(total, sources, layers, y - 1, count + 2)
-                load_image(given, g, mixed, border, y - 1, left - 1, count + 2)
+        loaded[:] = -9
+        for y in range(start - 1, stop + 1):
+            adjoint = slot(adjoints, 0, y, SUMS)
+            active[(y + 3) % 3] = busy(states, y, left - 1, count + 2, least)
+            if active[(y + 3) % 3]:
+                load_around(sources, loaded, positions, rgba, row, y, left - 2, count + 4, scale, peak, gamma)
+                normalised_sums(total, sources, layers, y, count + 2)
+                load_image(given, g, states, least, border, y, left - 1, count + 2)
                 adjoint_row(adjoint, total, given, layers, count + 2)
             else:
                 adjoint[:] = g.dtype.type(0)
-            if y < start + 2 or y - last > 2:
+            if y <= start or not active.any():
                 continue
             for k in range(layers):
                 b = SUM if k > 0 else 0
-                above, level = slot(adjoints, 0, y - 3, SUMS)[b:], slot(adjoints, 0, y - 2, SUMS)[b:]
-                s = slot(sources, k, y - 2, SOURCE)[2:]
+                above, level = slot(adjoints, 0, y - 2, SUMS)[b:], slot(adjoints, 0, y - 1, SUMS)[b:]
+                s = slot(sources, k, y - 1, SOURCE)[2:]
                 gather(found, s, above, level, adjoint[b:], count)
-                scatter(g_positions, g_rgba, row[k, y - 2], left, found, s, slope, count)
+                scatter(g_positions, g_rgba, row[k, y - 1], left, found, s, slope, count)
 
 
 @compiled
@@ -229,7 +240,7 @@ def tangent_row(to, total, layers, count, planes=COLORS):
 
 
 @kernel
-def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_rgba, border, out):
+def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_rgba, states, border, out):
     """Rows [start, stop) of the tangents (T, H, W, 4); of absent tangents there are T of no rows."""
     layers, (many, _, width, _) = len(row), out.shape
     sources, total, change = (
@@ -237,30 +248,30 @@ def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_r
         np.empty(SUMS, out.dtype),
         np.empty(SUMS, out.dtype),
     )
-    tangents = np.empty((many, 3 * layers * TANGENT), out.dtype)
-    slope = out.dtype.type(2) * scale * gamma
+    tangents, loaded = np.empty((many, 3 * layers * TANGENT), out.dtype), np.empty(3, np.int64)
+    slope, least = out.dtype.type(2) * scale * gamma, FLAT if t_rgba.shape[1] > 0 else BUSY
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
-        last = start - 4  # As in `forward`.
-        for y in range(start - 1, stop + 1):
-            for k in range(layers):
-                s, at = slot(sources, k, y, SOURCE), left + border - 1
-                if load(s, positions, rgba, row, k, y + border, at, count + 2, scale, peak, gamma):
-                    last = y
-                for n in range(many):
-                    to = slot(tangents[n], k, y, TANGENT)
-                    load_tangent(to, s, t_positions[n], t_rgba[n], row, k, y + border, at, count + 2, slope)
-            if y <= start:
+        loaded[:] = -9
+        for y in range(start, stop):
+            if not busy(states, y + border, left + border, count, least):
+                out[:, y, left : left + count] = out.dtype.type(0)
                 continue
-            if y - last > 2:
-                out[:, y - 1, left : left + count] = out.dtype.type(0)
-                continue
-            normalised_sums(total, sources, layers, y - 1, count)
+            at = y + border, left + border - 1, count + 2
+            first = load_around(sources, loaded, positions, rgba, row, *at, scale, peak, gamma)
+            for v in range(first, y + border + 2):
+                for k in range(layers):
+                    s = slot(sources, k, v, SOURCE)
+                    for n in range(many):
+                        to = slot(tangents[n], k, v, TANGENT)
+                        load_tangent(to, s, t_positions[n], t_rgba[n], row, k, v, left + border - 1, count + 2, slope)
+            normalised_sums(total, sources, layers, y + border, count)
             for n in range(many):
                 change[: min(layers, 2) * SUM] = out.dtype.type(0)
                 for k in range(layers):
                     for v in range(-1, 2):
-                        s, tangent = slot(sources, k, y - 1 - v, SOURCE), slot(tangents[n], k, y - 1 - v, TANGENT)
+                        at = y + border - v
+                        s, tangent = slot(sources, k, at, SOURCE), slot(tangents[n], k, at, TANGENT)
                         add_tangent_row(change[SUM:] if k > 0 else change, s, tangent, v, count)
                 tangent_row(change, total, layers, count)
-                store(out[n], y - 1, left, change, count)
+                store(out[n], y, left, change, count)

@@ -13,6 +13,7 @@ import rts
 from rts import splatting
 from rts_backends import fused
 from rts_backends.fused_kernels import Settings, Splats
+from rts_backends.fused_survey import BUSY, EMPTY, FLAT
 
 torch = pytest.importorskip("torch")
 
@@ -130,6 +131,55 @@ def test_smooth_surfaces_over_each_other_are_those_of_the_specification(kind):
         check_against_specification(KINDS[kind](), scene, dtype)
     if kind == "visible":
         assert 0.01 < compiled(fused.Visible(), scene).choices.mixed.mean() < 0.5
+
+
+def discs(off=0.0, alpha=1.0, dtype=np.float64):
+    """A red disc before a green one, over nothing; samples that lie off their cells' centres by at most so much."""
+    y, x = np.indices((70, 90))
+    near, far = np.hypot(x - 40, y - 30) < 22.3, np.hypot(x - 52, y - 40) < 24.8
+    row = np.full((2, 70, 90), -1, np.int32)
+    row[0, near | far] = np.arange((near | far).sum())
+    row[1, near & far] = np.arange((near & far).sum()) + row.max() + 1
+    k, y, x = np.nonzero(row >= 0)
+    red = (k == 0) & near[y, x]
+    places = np.stack([x + 0.5, y + 0.5], axis=1) + np.random.default_rng(3).uniform(-off, off, (len(x), 2))
+    positions = np.concatenate([places, np.where(red, 2.0, 5.0)[:, None]], axis=1)
+    rgba = np.where(red[:, None], (1, 0, 0, 1), (0, 0.5, 0, 1)) * alpha
+    return positions.astype(dtype), rgba.astype(dtype), row
+
+
+@pytest.mark.parametrize("alpha", [1.0, 0.5])
+@pytest.mark.parametrize("off", [0.0, 1e-4, 0.2])
+@pytest.mark.parametrize("kind", KINDS)
+def test_plain_colours_are_those_of_the_specification(kind, off, alpha):
+    for dtype in TOLERANCE:
+        scene = discs(off, alpha, dtype)
+        splatter = KINDS[kind]()
+        check_against_specification(splatter, scene, dtype)
+        check_against_specification(splatter, scene, dtype, border=2)
+        # Without the colours' derivatives, which leave nothing to be done inside.
+        splats, g = compiled(splatter, scene), noise(70, 90, 4, dtype=dtype)
+        np.testing.assert_allclose(splats.vjp(g, (True, False))[0], splats.vjp(g)[0], rtol=0, atol=1e-5)
+        moved, still = noise(1, *scene[0].shape, dtype=dtype), np.zeros((1, *scene[1].shape), dtype)
+        np.testing.assert_allclose(splats.jvp(moved, None), splats.jvp(moved, still), rtol=0, atol=1e-5)
+
+
+def test_amid_one_colour_nothing_is_computed_for_positions():
+    scene = discs()
+    for kind in KINDS:
+        states = compiled(KINDS[kind](), scene).choices.states
+        assert 0.3 < (states == FLAT).mean() < 0.5 and 0.4 < (states == EMPTY).mean() < 0.7
+    # Where layers show through, only the front one alone is the same all around.
+    states = {kind: compiled(KINDS[kind](), discs(alpha=0.5)).choices.states for kind in KINDS}
+    assert (states["multi"] == FLAT).sum() == 0 < (states["visible"] == FLAT).sum()
+    # Weights of samples far off the centres may add up to less than one; those of no ε may, too.
+    assert not (compiled(fused.Visible(), discs(off=0.01)).choices.states == FLAT).any()
+    assert not (compiled(fused.Visible(epsilon=0.0), scene).choices.states == FLAT).any()
+    # NaN is no colour.
+    positions, rgba, row = scene
+    broken = np.where(np.arange(len(rgba))[:, None] == row[0, 30, 40], np.nan, rgba)
+    around = compiled(fused.Visible(), (positions, broken, row)).choices.states[29:32, 39:42]
+    np.testing.assert_array_equal(around, BUSY)
 
 
 @pytest.mark.parametrize("kind", KINDS)

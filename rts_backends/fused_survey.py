@@ -1,0 +1,108 @@
+"""Where a splatted image is the same colour all around: there it is that colour, and no motion of splats changes it."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+EMPTY, FLAT, BUSY = 0, 1, 2
+"""Targets that no splat reaches, that are amid splats of one colour, and all others."""
+
+compiled = numba.njit(nogil=True)
+kernel = numba.njit(nogil=True, cache=True)
+
+
+@kernel
+def survey(start, stop, positions, rgba, row, fronts, reach, states, seen, counts):
+    """States of the targets of rows [start, stop); samples that cells refer to are marked, and these cells counted.
+
+    Args:
+        start: first row.
+        stop: end of the rows.
+        positions: (N, 3).
+        rgba: (N, 4).
+        row: (K, H, W).
+        fronts: whether only front layers count; otherwise those behind must be hidden by opaque ones.
+        reach: pixels that a sample may lie off its cell's centre, so that the weights are sure to add up to one.
+        states: (H, W) uint8, to be filled.
+        seen: (N,) uint8, to be marked.
+        counts: (H,), to be filled.
+    """
+    _, height, width = row.shape
+    # Of three rows of cells: covered, three alike in a row, alike with the cell above.
+    cells = np.zeros((3, 3, width + 2), np.uint8)
+    covered, calm, joins = cells[0], cells[1], cells[2]
+    for y in range(start - 1, stop + 1):
+        now, before = (y + 3) % 3, (y + 2) % 3
+        covered[now], calm[now], joins[now] = 0, 0, 0
+        if 0 <= y < height:
+            above = row[0, max(y - 1, 0)]
+            _inspect(positions, rgba, row[0, y], above, y, fronts, reach, covered[now], calm[now], joins[now])
+            for k in range(len(row)):
+                if k > 0 and not fronts:
+                    _cover(covered[now], row[k, y])
+                if start <= y < stop:
+                    counts[y] += _count(row[k, y], seen)
+        if y > start:
+            first = (y + 1) % 3
+            runs = calm[first], calm[before], calm[now]
+            _decide(states[y - 1], covered[0], covered[1], covered[2], *runs, joins[before], joins[now])
+
+
+@compiled
+def _inspect(positions, rgba, cells, above, y, fronts, reach, covered, calm, joins):
+    """Fill what is to be known of a row of cells; places are one to the right of the cells'."""
+    kind = positions.dtype.type
+    half, opaque, last, run = kind(0.5), kind(1), -1, 0
+    for x in range(len(cells)):
+        i = cells[x]
+        if i < 0:
+            run = 0
+            continue
+        covered[x + 1] = 1
+        centered = (abs(positions[i, 0] - (kind(x) + half)) <= reach) & (
+            abs(positions[i, 1] - (kind(y) + half)) <= reach
+        )
+        if not (centered and (fronts or rgba[i, 3] == opaque)):
+            run = 0
+            continue
+        run = run + 1 if run > 0 and _alike(rgba, i, last) else 1
+        last = i
+        if run >= 3:
+            calm[x] = 1
+        # Whether the other is centred is seen where its own row is calm.
+        if above[x] >= 0 and _alike(rgba, i, above[x]):
+            joins[x + 1] = 1
+
+
+@compiled
+def _alike(rgba, i, j):
+    same = True
+    for c in range(4):
+        same &= rgba[i, c] == rgba[j, c]
+    return same
+
+
+@compiled
+def _cover(covered, cells):
+    for x in range(len(cells)):
+        covered[x + 1] |= np.uint8(cells[x] >= 0)
+
+
+@compiled
+def _count(cells, seen):
+    count = 0
+    for x in range(len(cells)):
+        if cells[x] >= 0:
+            seen[cells[x]] = 1
+            count += 1
+    return count
+
+
+@compiled
+def _decide(states, covered0, covered1, covered2, calm0, calm1, calm2, joins1, joins2):
+    for x in range(len(states)):
+        some = covered0[x] | covered0[x + 1] | covered0[x + 2] | covered1[x] | covered1[x + 1] | covered1[x + 2]
+        some |= covered2[x] | covered2[x + 1] | covered2[x + 2]
+        flat = calm0[x + 1] & calm1[x + 1] & calm2[x + 1] & joins1[x + 1] & joins2[x + 1]
+        states[x] = (some << 1) - flat
