@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rts.arrays import namespace, unit
+from rts.arrays import engine_of, is_constant, namespace, unit
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.protocols import Array, GBuffer, Tree
@@ -157,7 +157,7 @@ class Lambert(Unlit):
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
         """See `rts.protocols.Shader`."""
         color, alpha = self.base_color(theta, gbuffer)
-        normal, _ = facing_normals(gbuffer, camera)
+        normal = _turned(unit(gbuffer["normal"]), _towards(gbuffer, camera))
         xp = namespace(color)
         light = _light(theta, camera)
         shade = light["ambient"] + xp.zeros_like(color)
@@ -196,8 +196,19 @@ class BlinnPhong(Unlit):
 def facing_normals(gbuffer: GBuffer, camera: Camera) -> tuple[Array, Array]:
     """Unit normals (N, 3) turned to the viewer's side, and unit vectors (N, 3) towards the viewer; world space."""
     normal, toward = unit(gbuffer["normal"]), unit(camera.toward(gbuffer["position"]))
-    xp = namespace(normal)
-    return xp.where(_dot(normal, toward) < 0, -normal, normal), toward
+    return _turned(normal, toward), toward
+
+
+def _towards(gbuffer: GBuffer, camera: Camera) -> Array:
+    """Vectors (N, 3) towards the viewer, of any length and without derivative: what it takes to tell a side."""
+    given = gbuffer["position"], *camera
+    engine = engine_of(given)
+    position, *matrices = (x if is_constant(x) else engine.stop_gradient(x) for x in given)
+    return Camera(*matrices).toward(position)
+
+
+def _turned(normal: Array, toward: Array) -> Array:
+    return namespace(normal).where(_dot(normal, toward) < 0, -normal, normal)
 
 
 def sample_texture(texture: Array, uv: Array, wrap: str = "repeat") -> Array:
