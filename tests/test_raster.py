@@ -354,3 +354,37 @@ def test_any_size_of_image_is_filled(size):
     found = rasterize("raster", vertices, faces, Camera.look_at((0, 0, 3), (0, 0, 0)), size, 2)
     assert found.triangle_ids.shape == (2, *size)
     assert (found.triangle_ids[0] >= 0).all() and (found.triangle_ids[1] == -1).all()
+
+
+def pixels(size):
+    """A camera in whose image of this size pixel (x, y) has its corners at world (x, −y), (x + 1, −y − 1)."""
+    height, width = size
+    middle = width / 2, -height / 2
+    return Camera.orthographic((*middle, 50), (*middle, 0), height=height, aspect=width / height, near=1, far=100)
+
+
+@pytest.mark.parametrize("size", [(3000, 2), (2, 3000), (5, 7)])
+def test_no_small_triangle_is_lost_to_rounding_on_screen(size):
+    rng = np.random.default_rng(0)
+    count = 3000
+    centers = np.floor(rng.uniform(0, size[::-1], (count, 2))) + 0.5
+    corners = centers[:, None] + rng.normal(size=(count, 3, 2)) * 10 ** rng.uniform(-2, 0.5, (count, 1, 1))
+    vertices = np.concatenate([corners * (1, -1), rng.uniform(-1, 1, (count, 3, 1))], -1).reshape(-1, 3)
+    vertices, faces = vertices.astype(np.float32), np.arange(3 * count).reshape(-1, 3).astype(np.int32)
+    for cull in ("none", "back"):
+        found = rasterize("raster", vertices, faces, pixels(size), size, 9, cull)
+        expected = rasterize("reference", vertices, faces, pixels(size), size, 9, cull)
+        np.testing.assert_array_equal(found.triangle_ids, expected.triangle_ids)
+        assert len(np.unique(found.triangle_ids)) > 150
+
+
+@pytest.mark.parametrize("x", [-1000.0, -9.0, 1000.0])
+def test_a_corner_far_outside_does_not_bend_a_thin_triangle(x):
+    # At the pixel on the border its edges are 0.04 apart around the centre; its third corner is one row lower.
+    near = 1.2 if x < 0 else 5.8
+    vertices = np.array([(near, -0.48, 0), (near, -0.52, 0), (x, -0.9, 0)], np.float32)
+    vertices[:2, 1] += (0.4 - 0.02) * (0.7 / abs(x - near))
+    found = rasterize("raster", vertices, np.array([(0, 1, 2)], np.int32), pixels((5, 7)), (5, 7))
+    expected = np.full((5, 7), -1)
+    expected[0, 0 if x < 0 else 6] = 0
+    np.testing.assert_array_equal(found.triangle_ids[0], expected)
