@@ -11,6 +11,7 @@ from speed_tasks import ENGINES, START, Task, in_turn
 import rts
 from rts import splatting
 from rts.arrays import engine_of, namespace
+from rts.least_squares import normal_equations
 
 SPLATTERS = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}
 """The specification of each registered name."""
@@ -132,7 +133,7 @@ def transform(x: Any) -> Any:
 
 
 def levenberg_marquardt(task: Task, engine: str, unknowns: int) -> dict[str, Callable[[], object]]:
-    """A step (Jacobian, normal equations, solution, loss at the trial), its Jacobian, and a loss with its gradient."""
+    """A loss with its gradient, and a step: solution, loss and normal equations at the trial, which is accepted."""
     x = np.zeros(unknowns, np.float32)
     x[:6] = np.multiply(START, 0.2)
     start: Any
@@ -145,32 +146,31 @@ def levenberg_marquardt(task: Task, engine: str, unknowns: int) -> dict[str, Cal
 
         start = jnp.asarray(x)
     library = engine_of(start)
-    target = library.constant(task.target, start)
 
-    def residuals(v: Any) -> Any:
-        part = task.part.replace(transform=transform(v))
-        image = rts.render(part, task.view, task.size, splatter=task.splatter, layers=task.layers)
-        return (image[..., task.channels] - target).reshape(-1)
+    def scene(v: Any) -> rts.Part:
+        return task.part.replace(transform=transform(v))
 
-    def equations(v: Any) -> tuple:
-        r, rows = library.jacobian(residuals)(v)
-        return r, rows @ rows.T, rows @ r
+    residuals = rts.ImageResiduals(scene, task.view, task.size, task.target, splatter=task.splatter, layers=task.layers)
+    descend = library.jit(library.value_and_grad(lambda v: (residuals(v) ** 2).mean()))
 
-    loss = library.jit(lambda v: (residuals(v) ** 2).mean())
-    linearize, descend = (
-        library.jit(equations),
-        library.jit(library.value_and_grad(lambda v: (residuals(v) ** 2).mean())),
-    )
+    def step_of(equations: Callable) -> Callable[[], object]:
+        linearize = library.jit(equations)
 
-    def step() -> float:
-        _, matrix, gradient = (library.to_numpy(a).astype(np.float64) for a in linearize(start))
-        delta = -np.linalg.solve(matrix + 1e-3 * np.diag(np.diag(matrix)), gradient)
-        return float(loss(start + library.constant(delta, start)))
+        def at(v: Any) -> list[np.ndarray]:
+            return [library.to_numpy(a).astype(np.float64) for a in linearize(v)]
+
+        _, matrix, gradient = at(start)
+
+        def step() -> object:
+            delta = -np.linalg.solve(matrix + 1e-3 * np.diag(np.diag(matrix)), gradient)
+            return at(start + library.constant(delta, start))
+
+        return step
 
     return {
         "forward and gradient": lambda: library.block(descend(start)),
-        "linearisation": lambda: library.block(linearize(start)),
-        "step": step,
+        "step": step_of(residuals.normal_equations),
+        "step by the Jacobian": step_of(lambda v: normal_equations(residuals, v, library)),
     }
 
 

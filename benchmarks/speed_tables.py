@@ -133,13 +133,13 @@ def pruning(rows: list[dict]) -> str:
 
 
 def lm(rows: list[dict]) -> str:
-    header = ["mesh, side", "engine", "unknowns", *rows[0]["times"], "linearisation / gradient", "step / gradient"]
+    header = ["mesh, side", "engine", "unknowns", *rows[0]["times"], "step / gradient", "by the Jacobian / gradient"]
     lines = []
     for row in rows:
-        gradient, linearisation, step = (t["ms"] for t in row["times"].values())
-        ratios = (f"{linearisation / gradient:.2f}", f"{step / gradient:.2f}")
+        gradient, step, jacobian = (t["ms"] for t in row["times"].values())
+        ratios = (f"{step / gradient:.2f}", f"{jacobian / gradient:.2f}")
         about = [f"{row['mesh']}, {row['side']}²", row["engine"], str(row["unknowns"])]
-        lines.append([*about, *map(number, (gradient, linearisation, step)), *ratios])
+        lines.append([*about, *map(number, (gradient, step, jacobian)), *ratios])
     return table(header, lines)
 
 
@@ -172,7 +172,8 @@ SECTIONS = {
     "pruning": ("Two layers against one", "Pose iterations, milliseconds.", pruning),
     "lm": (
         "Levenberg–Marquardt",
-        "A step is a linearisation (Jacobian and normal equations), a solution and a loss; milliseconds.",
+        "A step that is accepted: a solution, and loss and normal equations at the trial; milliseconds. *step*: by "
+        "`ImageResiduals`.",
         lm,
     ),
 }

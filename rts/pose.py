@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ from rts.camera import Camera
 from rts.errors import InputError, PluginError
 from rts.fitting import fit
 from rts.framing import Bounds
+from rts.image_residuals import ImageResiduals
 from rts.protocols import Array, Engine, Part
 from rts.rendering import render
 from rts.scenes import save_animation, save_image
@@ -156,15 +157,12 @@ def _engine(name: str) -> Engine:
 
 def _residuals(
     parts: Sequence[Part], camera: Camera, mask: np.ndarray, bounds: Bounds, weights: np.ndarray, engine: Engine
-) -> Callable[[Array], Array]:
-    goal = engine.constant(mask)
-
-    def residuals(pose: Array) -> Array:
+) -> ImageResiduals:
+    def silhouettes(pose: Array) -> list[Part]:
         transform = rigid(pose * engine.constant(weights, pose), bounds.center)
-        silhouettes = posed(parts, transform, "silhouette")
-        return render(silhouettes, camera, mask.shape, layers=1, splatter="single")[..., 3] - goal
+        return posed(parts, transform, "silhouette")
 
-    return residuals
+    return ImageResiduals(silhouettes, camera, mask.shape, mask, layers=1, splatter="single")
 
 
 def _pyramid(target: np.ndarray) -> list[np.ndarray]:
