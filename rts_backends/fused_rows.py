@@ -87,11 +87,12 @@ def tile(width, t):
 def busy(states, y, first, count, least):
     """Whether some target of a row is of at least this state."""
     height, width = states.shape
-    found = False
-    if 0 <= y < height:
-        for x in range(max(first, 0), min(first + count, width)):
-            found |= states[y, x] >= least
-    return found
+    if not 0 <= y < height:
+        return False
+    most = np.uint8(0)
+    for state in states[y, max(first, 0) : min(first + count, width)]:
+        most = max(most, state)
+    return most >= least
 
 
 @compiled

@@ -18,7 +18,6 @@ from rts_backends.fused_rows import (
     busy,
     compiled,
     composite,
-    fill,
     kernel,
     load,
     normalised_sums,
@@ -62,9 +61,22 @@ def forward(start, stop, positions, rgba, row, scale, peak, gamma, states, borde
                 load_around(sources, loaded, positions, rgba, row, y + border, at, count + 2, scale, peak, gamma)
                 normalised_sums(total, sources, layers, y + border, count)
                 composite(total, layers, count)
+                store(image, y, left, total, count)
             else:
-                fill(total, rgba, row[0, y + border, border:], states[y + border, border:], left, count)
-            store(image, y, left, total, count)
+                at = left + border
+                own = image[y, left : left + count]
+                _copy(own, rgba, row[0, y + border, at : at + count], states[y + border, at : at + count])
+
+
+@compiled
+def _copy(image, rgba, cells, states):
+    """Where all around is of one colour, or nothing."""
+    for x in range(len(image)):
+        if states[x] == FLAT:
+            i = cells[x]
+            image[x, 0], image[x, 1], image[x, 2], image[x, 3] = rgba[i, 0], rgba[i, 1], rgba[i, 2], rgba[i, 3]
+        else:
+            image[x] = image.dtype.type(0)
 
 
 @compiled
