@@ -30,7 +30,10 @@ LONG_BLOCK = 256
 """Where less is kept of a triangle, or of a vertex."""
 
 LIMIT = np.float32(2**15 - 2)
-"""Of positions on screen, which take 16 bits so that more of them stay in caches: two pixels outside of the image."""
+"""Steps from the middle of the image to two pixels outside of it; a position beyond is put there.
+
+Positions on screen take 16 bits, so that those of a million triangles stay in caches.
+"""
 
 BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 """In place of a position: before the near plane (or NaN), beyond the far plane."""
@@ -65,7 +68,7 @@ class Raster(TriangleSampler):
             np.empty((len(vertices), 2), np.int16),
             np.empty((len(faces), LISTED), np.int32),
         )
-        step = (max(size) / 2 + 2) / LIMIT
+        step = (max(size) / 2 + 2) / float(LIMIT)
         to_steps = np.diag([1 / step, 1 / step, 1, 1])
         to_steps[:2, 3] = -width / 2 / step, -height / 2 / step
         parallel(_project, len(vertices), vertices, to_steps @ matrix, screen, work=4 * len(vertices))
@@ -113,7 +116,11 @@ def _project(start, stop, vertices, m, screen):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, listed, spans, counts):
-    """List the triangles that may cover a pixel's centre; spans (chunks, 2) of the list, counts (bands, chunks)."""
+    """List the triangles that may cover a pixel's centre, and count them.
+
+    Chunks of one call follow on each other in the list; `spans` (chunks, 2) says where each begins and ends, `counts`
+    (bands, chunks) how many of its triangles touch a band of rows.
+    """
     xy, box = np.empty((3, LONG_BLOCK, 2), np.int16), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
     chosen, corners = np.empty(LONG_BLOCK, np.uint32), np.empty((3, 4))
@@ -200,7 +207,7 @@ def _clipped_box(corners, width, height):
 
 @numba.njit(cache=True, nogil=True)
 def _sort(first, last, listed, spans, places, items):
-    """Write the places in the list of each band's triangles, in order, from `places` (bands, chunks) on."""
+    """Sort the list by bands: write where each band's triangles are, in order, from `places` (bands, chunks) on."""
     for chunk in range(first, last):
         for n in range(spans[chunk, 0], spans[chunk, 1]):
             for band in range(listed[n, 6] // BAND_ROWS, listed[n, 7] // BAND_ROWS + 1):
