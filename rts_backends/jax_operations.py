@@ -39,7 +39,7 @@ class Kernels(NamedTuple):
     """A function on the host. Results are arrays to be filled, each whole; parameters are handed on as keywords.
 
     Attributes:
-        value: (operands, result).
+        value: (operands, result), and where there is a note, that as a third.
         push: (operands, tangents of the first two with axis T or None for zeros, result with axis T).
         pull: (operands, gradients with axis T, gradients of the first two with axis T or None where not wanted).
     """
@@ -59,6 +59,8 @@ class Differentiable:
         kernels: by which it is computed on the host.
         specification: the function in jax, of operands and parameters.
         even: operands whose rows are often all alike; where a program says so, kernels are given one row of them.
+        noted: whether `value` also leaves a note () int32, which `push` and `pull` of the same operands are given as
+            the last of these: it may tell them what has been worked out already.
     """
 
     def __init__(
@@ -69,21 +71,24 @@ class Differentiable:
         kernels: Kernels,
         specification: Callable,
         even: tuple[int, ...] = (),
+        noted: bool = False,
     ):
         self.kernels, self._specification, self.rank = kernels, specification, len(shape(*((1,) * r for r in ranks)))
-        self.count = count = len(ranks)
+        self._inputs, self.count = len(ranks), len(ranks) + noted
+        inputs, count = self._inputs, self.count
 
         def pulled(*shapes: tuple, wanted: Wanted, **_: Any) -> list[tuple]:
             return [(shapes[count][0], *x) for x, wish in zip(shapes[:2], wanted, strict=True) if wish]
 
         def pushed(*shapes: tuple, wanted: Wanted, **params: Any) -> list[tuple]:
-            return [(shapes[count][0], *shape(*shapes[:count], **params))]
+            return [(shapes[count][0], *shape(*shapes[:inputs], **params))]
 
         def valued(*shapes: tuple, **params: Any) -> list[tuple]:
-            return [shape(*shapes, **params)]
+            return [shape(*shapes, **params), *[()] * noted]
 
+        self._value = _Operation(name, ranks, inputs, valued, self._host_value, self._plain, even, noted)
+        ranks = *ranks, *[0] * noted
         swept, given = (*ranks, *(r + 1 for r in ranks[:2])), (*ranks, self.rank + 1)
-        self._value = _Operation(name, ranks, count, valued, self._host_value, self._plain, even)
         self._push = _Operation(f"{name}_push", swept, count, pushed, self._host_push, self._specified_push, even)
         self._pull = _Operation(f"{name}_pull", given, count, pulled, self._host_pull, self._specified_pull, even)
         ad.primitive_jvps[self._value.primitive] = self._value_jvp
@@ -99,7 +104,7 @@ class Differentiable:
     # ------------------------------------------------------------------------------------------ by compiled kernels
 
     def _host_value(self, operands: Arrays, results: Arrays, **params: Any) -> None:
-        self.kernels.value(operands, results[0], **params)
+        self.kernels.value(operands, *results, **params)
 
     def _host_push(self, operands: Arrays, results: Arrays, wanted: Wanted, **params: Any) -> None:
         self.kernels.push(operands[: self.count], _spread(operands[self.count :], wanted), results[0], **params)
@@ -110,7 +115,8 @@ class Differentiable:
     # --------------------------------------------------------------------------------------------- by specification
 
     def _plain(self, *operands: jax.Array, **params: Any) -> list[jax.Array]:
-        return [self._specification(*operands, **params)]
+        note = [jnp.zeros((), np.int32)] * (self.count - self._inputs)
+        return [self._specification(*operands, **params), *note]
 
     def _specified_push(self, *operands: jax.Array, wanted: Wanted, **params: Any) -> list[jax.Array]:
         function, given = self._among(wanted, operands[: self.count], params)
@@ -125,7 +131,7 @@ class Differentiable:
 
         def function(*given: jax.Array) -> jax.Array:
             both = (x if g is None else g for x, g in zip(operands[:2], _spread(given, wanted), strict=True))
-            return self._specification(*both, *operands[2:], **params)
+            return self._specification(*both, *operands[2 : self._inputs], **params)
 
         return function, [x for x, wish in zip(operands[:2], wanted, strict=True) if wish]
 
@@ -140,8 +146,8 @@ class Differentiable:
         # Of operands by item, tangents have B before T; of the others T alone.
         ranks = (r for r, wish in zip(self._value.ranks, wanted, strict=False) if wish)
         swept = [jnp.expand_dims(t, t.ndim - rank) for t, rank in zip(given, ranks, strict=True)]
-        (pushed,) = self._push(*primals, *swept, wanted=wanted, **params)
-        return found, [jax.lax.squeeze(pushed, (at,))]
+        (pushed,) = self._push(*primals, *found[1:], *swept, wanted=wanted, **params)
+        return found, [jax.lax.squeeze(pushed, (at,)), *_zeros(found[1:])]
 
     def _push_jvp(self, primals: Sequence, tangents: Sequence, *, wanted: Wanted, **params: Any) -> tuple[list, list]:
         found = self._push(*primals, wanted=wanted, **params)
@@ -204,6 +210,7 @@ class _Operation:
         host: fills the results for one item.
         specified: the same by specification.
         even: see `Differentiable`.
+        noted: whether the last result is a note.
     """
 
     def __init__(
@@ -215,14 +222,15 @@ class _Operation:
         host: Callable,
         specified: Callable,
         even: tuple[int, ...],
+        noted: bool = False,
     ):
-        self.name, self.ranks, self.samples, self._even = name, ranks, samples, even
+        self.name, self.ranks, self.samples, self._even, self._noted = name, ranks, samples, even, noted
         self._shapes, self._host, self._specified = shapes, host, specified
         self.primitive = primitive = Primitive(f"rts_{name}")
         primitive.multiple_results = True
         primitive.def_impl(self._eager)
         primitive.def_abstract_eval(
-            lambda *avals, **params: [ShapedArray(s, avals[0].dtype) for s in self._results(avals, params)]
+            lambda *avals, **params: [ShapedArray(r.shape, r.dtype) for r in self._results(avals, params)]
         )
         mlir.register_lowering(primitive, mlir.lower_fun(self.specification, multiple_results=True))
         mlir.register_lowering(primitive, self._lowered, platform="cpu", **_SEEING_OPERANDS)
@@ -249,12 +257,14 @@ class _Operation:
         """Which operands have the axis B."""
         return [x.ndim > rank for x, rank in zip(operands, self._own_ranks(params), strict=True)]
 
-    def _results(self, operands: Sequence[Any], params: dict) -> list[tuple[int, ...]]:
-        """Shapes of the results."""
+    def _results(self, operands: Sequence[Any], params: dict) -> list[jax.ShapeDtypeStruct]:
+        """Shapes and dtypes of the results."""
         by_item = self._by_item(operands, params)
         lead = next(((x.shape[0],) for x, b in zip(operands, by_item, strict=True) if b), ())
         shapes = (x.shape[1:] if b else x.shape for x, b in zip(operands, by_item, strict=True))
-        return [(*lead, *shape) for shape in self._shapes(*shapes, **params)]
+        shapes = [(*lead, *shape) for shape in self._shapes(*shapes, **params)]
+        dtypes = [operands[0].dtype] * (len(shapes) - self._noted) + [np.int32] * self._noted
+        return list(map(jax.ShapeDtypeStruct, shapes, dtypes))
 
     def _on_host(self, operands: Arrays, results: Arrays, params: dict) -> None:
         """Fill the results."""
@@ -285,7 +295,7 @@ class _Operation:
         device = _cpu_of(operands)
         if device is None:
             return _compiled(self.primitive, tuple(params.items()))(*operands)
-        found = [np.empty(shape, operands[0].dtype) for shape in self._results(operands, params)]
+        found = [np.empty(result.shape, result.dtype) for result in self._results(operands, params)]
         self._on_host([np.asarray(x) for x in operands], found, params)
         if any(x.committed for x in operands if isinstance(x, jax.Array)):
             return jax.device_put(found, device)
@@ -376,7 +386,7 @@ def _is_zero(x: Any) -> bool:
 
 
 def _zeros(like: Sequence[jax.Array]) -> list:
-    return [ad.Zero(ShapedArray(x.shape, x.dtype)) for x in like]
+    return [ad.Zero(ShapedArray(x.shape, x.dtype).to_tangent_aval()) for x in like]
 
 
 def _present(tangents: Sequence, wanted: Wanted = (True, True)) -> tuple[list, Wanted]:

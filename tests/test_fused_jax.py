@@ -233,6 +233,36 @@ def test_colors_that_are_all_alike_are_not_written_out():
     np.testing.assert_array_equal(jax.jit(grey)(shades), grey(shades))
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_what_the_image_decides_is_not_decided_again(mode, monkeypatch):
+    decided = []
+
+    class Listening(type(Splats.choices)):
+        def __get__(self, instance, owner=None):
+            if instance is not None and "choices" not in instance.__dict__:
+                decided.append(1)
+            return super().__get__(instance, owner)
+
+    listening = Listening(Splats.choices.func)
+    listening.__set_name__(Splats, "choices")
+    monkeypatch.setattr(Splats, "choices", listening)
+    ours = Smooth(KINDS["visible"](), jnp.asarray, 3)
+    gradient, along = jax.grad(ours.loss), lambda x: jax.jvp(ours.image, (x,), (x + 1,))[1]
+    several = jax.vmap(jax.grad(ours.loss))
+    given = ours.x, ours.x, ours.x * ours.eye[:3]
+    expected = []
+    for f, x, times in zip((gradient, along, several), given, (1, 1, 3), strict=True):
+        decided.clear()
+        expected.append(MODES[mode](f)(x).block_until_ready())
+        assert len(decided) == times
+    # Nor is it needed: what is no longer known is decided anew.
+    monkeypatch.setattr(fused_jax, "MOST_KEPT", 0)
+    for f, x, known in zip((gradient, along, several), given, expected, strict=True):
+        decided.clear()
+        np.testing.assert_array_equal(MODES[mode](f)(x), known)
+        assert decided
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_images_without_their_border(kind):
     positions, rgba, row = scene32(2)
