@@ -108,9 +108,10 @@ class TorchEngine:
         return a @ b if a.device.type == "cpu" and a.dtype == b.dtype else None
 
     def rigid(self, pose: torch.Tensor, center: torch.Tensor) -> torch.Tensor | None:
-        """By compiled code for plain autograd on the CPU."""
+        """By compiled code on the CPU."""
         dtypes = {pose.dtype, center.dtype}
-        if pose.device.type != "cpu" or dtypes not in ({torch.float32}, {torch.float64}) or transformed():
+        known = pose.device.type == "cpu" and dtypes in ({torch.float32}, {torch.float64})
+        if not known or torch.compiler.is_compiling():
             return None
         from rts_backends import torch_rigid
 

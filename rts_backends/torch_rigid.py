@@ -10,26 +10,99 @@ import torch
 from torch import Tensor
 
 from rts.transforms import rigid_by_arrays
-from rts_backends.torch_functions import applied
+from rts_backends.torch_functions import along, applied, filled, transformed
 
 SMALL = 1e-2
 """Squared angles below which series are exact to rounding."""
 
 
 def rigid(pose: Tensor, center: Tensor) -> Tensor:
-    """(4, 4) of a pose (6,) about a centre (3,), on the CPU and outside of torch's transforms."""
-    return applied(_Rigid, pose, center)[0]
+    """(4, 4) of a pose (6,) about a centre (3,), on the CPU."""
+    return applied(_Turn, pose, center) if transformed() else applied(_Rigid, pose, center)[0]
 
 
-class _Rigid(torch.autograd.Function):
-    """The matrix, and its Jacobian (16, 9), whose own derivative is that of the specification."""
+def _computed(pose: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
+    """The matrix, and its Jacobian (16, 9)."""
+    matrix, jacobian = np.empty((4, 4)), np.empty((16, 9))
+    numbers = (x.detach().numpy().astype(np.float64) for x in (pose, center))
+    _rigid(*numbers, matrix, jacobian)
+    return torch.from_numpy(matrix).to(pose.dtype), torch.from_numpy(jacobian).to(pose.dtype)
+
+
+def _specified_slopes(pose: Tensor, center: Tensor) -> Tensor:
+    """The Jacobian in torch."""
+    return torch.func.jacrev(lambda x: rigid_by_arrays(x[:6], x[6:]).reshape(-1))(torch.cat([pose, center]))
+
+
+def _pushed(pose: Tensor, center: Tensor, tangents: Tensor) -> Tensor:
+    """Tangents (T, 4, 4) along those (T, 9) of pose and centre, in torch."""
+    return (tangents @ _specified_slopes(pose, center).T).reshape(-1, 4, 4)
+
+
+class _Turn(torch.autograd.Function):
+    """The matrix, for torch's transforms."""
 
     @staticmethod
     def forward(pose, center):
-        matrix, jacobian = np.empty((4, 4)), np.empty((16, 9))
-        numbers = (x.detach().numpy().astype(np.float64) for x in (pose, center))
-        _rigid(*numbers, matrix, jacobian)
-        return torch.from_numpy(matrix).to(pose.dtype), torch.from_numpy(jacobian).to(pose.dtype)
+        return _computed(pose, center)[0]
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def backward(ctx, *gradients):
+        pose, center = ctx.saved_tensors
+        slopes = applied(_Push, pose, center, torch.eye(9, dtype=pose.dtype))
+        found = slopes.reshape(9, 16) @ gradients[0].reshape(-1)
+        return found[:6], found[6:]
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        # A function, since what is computed here carries no derivative of a forward mode around this one.
+        joined = torch.cat(filled(ctx.saved_tensors, tangents))
+        return applied(_Push, *ctx.saved_tensors, joined[None])[0]
+
+    @staticmethod
+    def vmap(info, in_dims, pose, center):
+        return torch.vmap(rigid_by_arrays, in_dims)(pose, center), 0
+
+
+class _Push(torch.autograd.Function):
+    """Tangents of the matrix."""
+
+    @staticmethod
+    def forward(pose, center, tangents):
+        return (tangents.detach() @ _computed(pose, center)[1].T).reshape(-1, 4, 4)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.save_for_backward(*inputs)
+        ctx.save_for_forward(*inputs)
+
+    @staticmethod
+    def backward(ctx, *gradients):
+        return torch.func.vjp(_pushed, *ctx.saved_tensors)[1](gradients[0])
+
+    @staticmethod
+    def jvp(ctx, *tangents):
+        return along(_pushed, ctx.saved_tensors, tangents)
+
+    @staticmethod
+    def vmap(info, in_dims, pose, center, tangents):
+        if in_dims[0] is not None or in_dims[1] is not None:
+            return torch.vmap(_pushed, in_dims)(pose, center, tangents), 0
+        out = applied(_Push, pose, center, tangents.movedim(in_dims[2], 0).flatten(0, 1))
+        return out.unflatten(0, (info.batch_size, -1)), 0
+
+
+class _Rigid(torch.autograd.Function):
+    """The matrix and its Jacobian, whose own derivative is that of the specification; one call for plain autograd."""
+
+    @staticmethod
+    def forward(pose, center):
+        return _computed(pose, center)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
@@ -42,8 +115,7 @@ class _Rigid(torch.autograd.Function):
         pose, center, jacobian = ctx.saved_tensors
         found = torch.zeros_like(jacobian[0]) if g_matrix is None else g_matrix.reshape(-1) @ jacobian
         if g_jacobian is not None:
-            slopes = torch.func.jacrev(lambda x: rigid_by_arrays(x[:6], x[6:]).reshape(-1))
-            found = found + torch.func.vjp(slopes, torch.cat([pose, center]))[1](g_jacobian)[0]
+            found = found + torch.cat(torch.func.vjp(_specified_slopes, pose, center)[1](g_jacobian))
         return found[:6], found[6:]
 
 

@@ -53,8 +53,9 @@ def test_both_modes_and_second_derivatives_by_finite_differences():
         lambda f: torch.func.jacfwd(torch.func.grad(f)),
         lambda f: torch.func.jacrev(torch.func.jacfwd(f)),
         torch.func.jacfwd,
+        lambda f: torch.func.jacfwd(torch.func.jacfwd(f)),
     ],
-    ids=["grad", "hessian", "jacfwd grad", "jacrev jacfwd", "jacfwd"],
+    ids=["grad", "hessian", "jacfwd grad", "jacrev jacfwd", "jacfwd", "jacfwd jacfwd"],
 )
 def test_transforms_agree_with_plain_torch(transform):
     rows, points = given()

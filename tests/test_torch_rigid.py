@@ -55,3 +55,32 @@ def test_transforms_of_torch_look_inside():
         torch.testing.assert_close(torch.autograd.forward_ad.unpack_dual(rts.rigid(dual)).tangent, expected[1])
     batch = torch.stack([pose, 2 * pose])
     torch.testing.assert_close(torch.func.vmap(rts.rigid)(batch)[1], rts.rigid(2 * pose))
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        torch.func.jacfwd,
+        torch.func.jacrev,
+        torch.func.hessian,
+        lambda f: torch.func.jacfwd(torch.func.jacfwd(f)),
+        lambda f: torch.func.jacrev(torch.func.jacfwd(f)),
+        lambda f: torch.func.jacrev(torch.func.jacrev(f)),
+    ],
+    ids=["forward", "reverse", "forward reverse", "forward forward", "reverse forward", "reverse reverse"],
+)
+@pytest.mark.parametrize("pose", [POSES["tiny"], POSES["above it"]], ids=["tiny", "turned"])
+def test_transforms_give_the_derivatives_of_the_array_code(pose, transform):
+    given = torch.tensor([*pose, *CENTER], dtype=torch.float64)
+    found, expected = (transform(lambda x, f=f: f(x[:6], x[6:]))(given) for f in (rts.rigid, rigid_by_arrays))
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_batches_of_derivatives():
+    poses = torch.tensor(list(POSES.values()), dtype=torch.float64)
+    center = torch.tensor(CENTER, dtype=torch.float64)
+    for derivative in (torch.func.jacfwd, torch.func.jacrev, torch.func.hessian):
+        found, expected = (
+            torch.func.vmap(derivative(lambda p, f=f: f(p, center)))(poses) for f in (rts.rigid, rigid_by_arrays)
+        )
+        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
