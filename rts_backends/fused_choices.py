@@ -11,68 +11,97 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from rts_backends.fused_survey import EMPTY
+from rts_backends.fused_survey import BLOCK, BUSY, EMPTY
 
 compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
 
 
-@kernel
-def depths(start, stop, positions, row, z, farthest):
-    """Linear depth into z (K, H + 2, W + 2), NaN where not covered; the largest size of each row's into `farthest`."""
-    layers, _, width = row.shape
-    z[:, start + 1 : stop + 1, 0] = z[:, start + 1 : stop + 1, width + 1] = np.nan
-    for y in range(start, stop):
-        most = z.dtype.type(0)
-        for k in range(layers):
-            for x in range(width):
-                i = row[k, y, x]
-                z[k, y + 1, x + 1] = positions[i, 2] if i >= 0 else np.nan
-                if i >= 0:
-                    most = max(most, abs(positions[i, 2]))
-        farthest[y] = most
+@compiled
+def depth_at(positions, row, k, y, x, beyond):
+    """Depth of layer k of a cell: `beyond` where only other layers are covered, NaN where none is."""
+    _, height, width = row.shape
+    if not (0 <= y < height and 0 <= x < width):
+        return positions.dtype.type(np.nan)
+    if row[k, y, x] >= 0:
+        return positions[row[k, y, x], 2]
+    for other in range(len(row)):
+        if row[other, y, x] >= 0:
+            return beyond
+    return positions.dtype.type(np.nan)
 
 
 @kernel
-def fill(start, stop, beyond, z):
-    """Make the depth of uncovered layers `beyond`; where a cell has no layer it stays NaN, and pairs with nothing."""
-    layers, _, width = z.shape
-    covered = np.empty(width, np.bool_)
-    for y in range(start + 1, stop + 1):
-        covered[:] = False
-        for k in range(layers):
-            _cover(covered, z[k, y], z.dtype.type(beyond))
-        for k in range(layers):
-            _cover(covered, z[k, y], z.dtype.type(beyond))
+def find(start, stop, positions, row, visible, everywhere, beyond, hidden, states, mixed, counts):
+    """Mark mixed targets (H, W), and count those of each row.
+
+    Args:
+        start: first row.
+        stop: end of the rows.
+        positions: (N, 3).
+        row: (K, H, W).
+        visible: whether the splatter is `Visible`.
+        everywhere: whether to look at all blocks, not only where `hidden` and `states` allow for mixed targets.
+        beyond: depth of layers that are not covered.
+        hidden: (H, B) uint8, the blocks of columns in or beside which hidden layers are covered.
+        states: (H, W) of `fused_survey`.
+        mixed: (H, W) uint8, to be filled.
+        counts: (H,) zeros, to be filled.
+    """
+    layers, height, width = row.shape
+    z, target = np.empty((3, layers, BLOCK + 2), positions.dtype), np.empty((layers, BLOCK), positions.dtype)
+    loaded = np.empty(3, np.int64)
+    for b in range(hidden.shape[1]):
+        left, right = b * BLOCK, min((b + 1) * BLOCK, width)
+        loaded[:] = -9
+        for y in range(start, stop):
+            marks = mixed[y, left:right]
+            marks[:] = 0
+            near = hidden[max(y - 1, 0), b] | hidden[y, b] | hidden[min(y + 1, height - 1), b]
+            if not (everywhere or near or (not visible and _any(states[y, left:right]))):
+                continue
+            for v in range(y - 1, y + 2):
+                if loaded[(v + 3) % 3] != v:
+                    loaded[(v + 3) % 3] = v
+                    _load(z[(v + 3) % 3], positions, row, v, left - 1, right + 1, beyond)
+            for k in range(layers):
+                for x in range(right - left):
+                    d = z[y % 3, k, x + 1]
+                    target[k, x] = d if d == d else beyond
+            for k in range(1, layers):
+                for n in range(9):
+                    source = z[(y + 2 + n // 3) % 3]
+                    _mark(marks, source[0, n % 3 :], source[k, n % 3 :], target[0], target[k])
+            if visible:
+                for x in range(left, right):
+                    if row[0, y, x] < 0:
+                        mixed[y, x] = 0
+            counts[y] += marks.sum()
 
 
 @compiled
-def _cover(covered, z, beyond):
-    for x in range(len(z)):
-        covered[x] |= z[x] == z[x]
-        z[x] = beyond if covered[x] and z[x] != z[x] else z[x]
-
-
-@kernel
-def find(start, stop, row, visible, beyond, z, mixed, counts):
-    """Mark mixed targets (H, W), and count those of each row."""
-    layers, _, width = row.shape
-    target = np.empty((layers, width), z.dtype)
-    for y in range(start, stop):
-        marks = mixed[y]
-        marks[:] = 0
+def _load(z, positions, row, y, first, last, beyond):
+    """Depths (K, ·) of cells of a row, as `depth_at` gives them."""
+    layers, height, width = row.shape
+    nothing = z.dtype.type(np.nan)
+    for x in range(first, last):
+        some = False
+        if 0 <= y < height and 0 <= x < width:
+            for k in range(layers):
+                some |= row[k, y, x] >= 0
         for k in range(layers):
-            for x in range(width):
-                d = z[k, y + 1, x + 1]
-                target[k, x] = d if d == d else beyond
-        for k in range(1, layers):
-            for n in range(9):
-                _mark(marks, z[0, y + n // 3, n % 3 :], z[k, y + n // 3, n % 3 :], target[0], target[k])
-        if visible:
-            for x in range(width):
-                if row[0, y, x] < 0:
-                    marks[x] = 0
-        counts[y] = marks.sum()
+            z[k, x - first] = nothing
+            if some:
+                i = row[k, y, x]
+                z[k, x - first] = positions[i, 2] if i >= 0 else beyond
+
+
+@compiled
+def _any(states):
+    most = np.uint8(0)
+    for state in states:
+        most = max(most, state)
+    return most == BUSY
 
 
 @compiled
@@ -85,10 +114,11 @@ def _mark(marks, front, hidden, target_front, target_hidden):
 
 
 @kernel
-def choose(start, stop, row, visible, continued, beyond, z, mixed, offsets, columns, choices, states):
+def choose(start, stop, positions, row, visible, continued, beyond, mixed, offsets, columns, choices, states):
     """List each row's mixed targets: their columns (M,), and ranges of layers (M, 9, 3, 2) by source and buffer."""
-    layers, _, width = row.shape
-    target, shift = np.empty(layers, z.dtype), np.empty(9, np.int64)
+    layers, height, width = row.shape
+    z, target = np.empty((9, layers), positions.dtype), np.empty(layers, positions.dtype)
+    shift = np.empty(9, np.int64)
     for y in range(start, stop):
         d = offsets[y]
         for x in range(width):
@@ -96,13 +126,14 @@ def choose(start, stop, row, visible, continued, beyond, z, mixed, offsets, colu
                 continue
             columns[d], states[y, x] = x, EMPTY
             choices[d] = 0
-            for k in range(layers):
-                depth = z[k, y + 1, x + 1]
-                target[k] = depth if depth == depth else beyond
             for n in range(9):
-                v, u = n // 3 - 1, n % 3 - 1
-                shift[n], off = _pairing(z, y + 1 - v, x + 1 - u, target)
-                if visible and shift[n] != 0 and _continues(z, row, y, x, u, v, continued * off):
+                for k in range(layers):
+                    z[n, k] = depth_at(positions, row, k, y + 1 - n // 3, x + 1 - n % 3, beyond)
+            for k in range(layers):
+                target[k] = z[4, k] if z[4, k] == z[4, k] else beyond
+            for n in range(9):
+                shift[n], off = _pairing(z[n], target)
+                if visible and shift[n] != 0 and _continues(positions, row, y, x, n, z[n, 0], z[4, 0], continued * off):
                     shift[n] = 0
             if visible:
                 _choose_visible(choices[d], shift, z, row, y, x, target)
@@ -116,29 +147,29 @@ def choose(start, stop, row, visible, continued, beyond, z, mixed, offsets, colu
 
 
 @compiled
-def _pairing(z, y, x, target):
+def _pairing(source, target):
     """The number s of `rts.splatting.Multi`, and what the depths that it pairs are off."""
     a, b = 0, 0
-    best_a, best_b = abs(z[0, y, x] - target[0]), abs(target[0] - z[0, y, x])
+    best_a, best_b = abs(source[0] - target[0]), abs(target[0] - source[0])
     for k in range(1, len(target)):
-        distance = abs(z[k, y, x] - target[0])
+        distance = abs(source[k] - target[0])
         if distance < best_a:
             best_a, a = distance, k
-        distance = abs(target[k] - z[0, y, x])
+        distance = abs(target[k] - source[0])
         if distance < best_b:
             best_b, b = distance, k
     return (-b, best_b) if best_b < best_a else (a, best_a)
 
 
 @compiled
-def _continues(z, row, y, x, u, v, limit):
+def _continues(positions, row, y, x, n, source, target, limit):
     """Whether the front of the source or of the target is nearer than a limit to where the other's line leads."""
     _, height, width = row.shape
-    source, target = z[0, y + 1 - v, x + 1 - u], z[0, y + 1, x + 1]
+    v, u = n // 3 - 1, n % 3 - 1
     for steps, end, start in ((-1, source, target), (2, target, source)):
         by, bx = y - steps * v, x - steps * u
         if 0 <= by < height and 0 <= bx < width and row[0, by, bx] >= 0:
-            if abs(end - (start + start - z[0, by + 1, bx + 1])) < limit:
+            if abs(end - (start + start - positions[row[0, by, bx], 2])) < limit:
                 return True
     return False
 
@@ -162,7 +193,7 @@ def _choose_visible(choice, shift, z, row, y, x, target):
             continue
         hidden, best = layers if s >= 0 else 0, z.dtype.type(np.inf)
         for k in range(s + 1 if s >= 0 else layers, layers):
-            distance = abs(z[k, y + 2 - n // 3, x + 2 - n % 3] - target[m])
+            distance = abs(z[n, k] - target[m])
             if distance < best:
                 best, hidden = distance, k
         if hidden < layers:

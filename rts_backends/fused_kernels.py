@@ -19,7 +19,7 @@ from rts.threads import parallel
 from rts_backends import fused_choices as choosing
 from rts_backends import fused_mixed as mixed
 from rts_backends import fused_stencil as stencil
-from rts_backends import fused_survey as surveying
+from rts_backends.fused_survey import BLOCK, survey
 
 
 class Settings(NamedTuple):
@@ -114,34 +114,29 @@ class Splats:
     def choices(self) -> Choices:
         """What is decided for each target."""
         layers, height, width = self.row.shape
-        states, repeated = self._survey()
+        count, kind = len(self.positions), self.positions.dtype
+        states, counts = np.empty((height, width), np.uint8), np.zeros(height, np.int64)
+        hidden, seen = np.zeros((height, -(-width // BLOCK)), np.uint8), np.zeros(count, np.uint8)
+        depths = np.zeros((height, 2), kind)
+        fronts = self.visible or layers == 1
+        noted = states, hidden, depths, seen, counts
+        parallel(survey, height, self.positions, self.rgba, self.row, fronts, self._reach, *noted)
+        repeated = int(np.count_nonzero(seen)) != int(counts.sum())
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
-        z = np.empty((layers, height + 2, width + 2), self.positions.dtype)
-        beyond = z.dtype.type(1)
+        least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
+        beyond = 2 * max(-least, largest) if least < 0 or largest > 0 else kind.type(1)
         if layers > 1:
-            farthest = np.empty(height, z.dtype)
-            parallel(choosing.depths, height, self.positions, self.row, z, farthest)
-            beyond = 2 * farthest.max() if farthest.max() > 0 else beyond
-            z[:, 0] = z[:, -1] = np.nan
-            parallel(choosing.fill, height, beyond, z)
-            parallel(choosing.find, height, self.row, self.visible, beyond, z, marks, counts)
+            # With no depth below zero, nothing is nearer to what is beyond everything than to a front.
+            given = self.row, self.visible, least < 0, beyond, hidden, states
+            parallel(choosing.find, height, self.positions, *given, marks, counts)
         offsets = np.concatenate([[0], np.cumsum(counts)])
         columns = np.empty(offsets[-1], np.int32)
         ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
         if len(columns):
-            continued = z.dtype.type(CONTINUED)  # An argument, since compiled code that is cached would keep its value.
-            given = self.row, self.visible, continued, beyond, z, marks, offsets, columns, ranges, states
-            parallel(choosing.choose, height, *given, work=50 * len(columns))
+            continued = kind.type(CONTINUED)  # An argument, since compiled code that is cached would keep its value.
+            given = self.row, self.visible, continued, beyond, marks, offsets, columns, ranges, states
+            parallel(choosing.choose, height, self.positions, *given, work=50 * len(columns))
         return Choices(marks, offsets, columns, ranges, states, repeated)
-
-    def _survey(self) -> tuple[np.ndarray, bool]:
-        """States of all targets, and whether samples are repeated."""
-        _, height, width = self.row.shape
-        states, counts = np.empty((height, width), np.uint8), np.zeros(height, np.int64)
-        seen = np.zeros(len(self.positions), np.uint8)
-        given = self.positions, self.rgba, self.row, self.visible or len(self.row) == 1, self._reach
-        parallel(surveying.survey, height, *given, states, seen, counts)
-        return states, int(np.count_nonzero(seen)) != int(counts.sum())
 
     @property
     def _size(self) -> tuple[int, int]:

@@ -28,7 +28,7 @@ def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, epsilon: float
     return kept
 
 
-@kernel
+@numba.njit(nogil=True, cache=True, fastmath={"nnan", "nsz"})
 def _farthest(start, stop, covered, depth, farthest):
     """The largest size of a depth in each row."""
     for y in range(start, stop):

@@ -5,6 +5,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+BLOCK = 32
+"""Columns that share a note of whether hidden layers are near."""
+
 EMPTY, FLAT, BUSY = 0, 1, 2
 """Targets that no splat reaches, that are amid splats of one colour, and all others."""
 
@@ -13,8 +16,8 @@ kernel = numba.njit(nogil=True, cache=True)
 
 
 @kernel
-def survey(start, stop, positions, rgba, row, fronts, reach, states, seen, counts):
-    """States of the targets of rows [start, stop); samples that cells refer to are marked, and these cells counted.
+def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, depths, seen, counts):
+    """States of the targets of rows [start, stop), and what else is to be known of all cells.
 
     Args:
         start: first row.
@@ -25,8 +28,10 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, seen, count
         fronts: whether only front layers count; otherwise those behind must be hidden by opaque ones.
         reach: pixels that a sample may lie off its cell's centre, so that the weights are sure to add up to one.
         states: (H, W) uint8, to be filled.
-        seen: (N,) uint8, to be marked.
-        counts: (H,), to be filled.
+        hidden: (H, B) uint8, zeros, to be marked: the blocks of columns in or beside which hidden layers are covered.
+        depths: (H, 2) zeros, for the least and the largest depth of each row, and zero.
+        seen: (N,) uint8, zeros, to be marked: samples that some cell refers to.
+        counts: (H,) zeros, for the number of such cells.
     """
     _, height, width = row.shape
     # Of three rows of cells: covered, three alike in a row, alike with the cell above.
@@ -42,7 +47,7 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, seen, count
                 if k > 0 and not fronts:
                     _cover(covered[now], row[k, y])
                 if start <= y < stop:
-                    counts[y] += _count(row[k, y], seen)
+                    counts[y] += _note(row[k, y], positions, k > 0, hidden[y], depths[y], seen)
         if y > start:
             first = (y + 1) % 3
             runs = calm[first], calm[before], calm[now]
@@ -90,12 +95,19 @@ def _cover(covered, cells):
 
 
 @compiled
-def _count(cells, seen):
-    count = 0
+def _note(cells, positions, behind, hidden, depths, seen):
+    """Take note of a row of a layer; returns how many of its cells are covered."""
+    count, last = 0, len(cells) - 1
+    least, largest = depths[0], depths[1]
     for x in range(len(cells)):
-        if cells[x] >= 0:
-            seen[cells[x]] = 1
+        i = cells[x]
+        if i >= 0:
             count += 1
+            seen[i] = 1
+            least, largest = min(least, positions[i, 2]), max(largest, positions[i, 2])
+            if behind:
+                hidden[max(x - 1, 0) // BLOCK] = hidden[min(x + 1, last) // BLOCK] = 1
+    depths[0], depths[1] = least, largest
     return count
 
 
