@@ -151,8 +151,8 @@ SECTIONS = {
         "One iteration: render, loss, gradient, step of Adam. Medians with quartiles, all methods in turn in one run, "
         "by faces. *RtS-pose*: vertices constant. *Full RtS*: gradient of pose and vertices, a step in the pose; "
         "*both*: a step in both. *Quarter of the rows*: jax is told by `capacity` to allot so many, not one for every "
-        "cell of every layer. DEODR draws one channel of front faces on one thread, by its own classes, which always give "
-        "the gradient of the vertices, or called at its compiled functions; the others use all cores.",
+        "cell of every layer. DEODR draws one channel of front faces on one thread, by its own classes, which always "
+        "give the gradient of the vertices, or called at its compiled functions; the others use all cores.",
         pose,
     ),
     "stages": (

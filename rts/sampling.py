@@ -314,8 +314,8 @@ def _interleaved_on_the_host(layers: int, *given: Array) -> tuple[Array, ...]:
     return engine_of(given).call_host(host, specs, *given)
 
 
-WELL_CONDITIONED = 1e-3
-"""A determinant over the product of the rows' lengths, from which on a matrix is far from singular."""
+WELL_CONDITIONED = 1e-6
+"""The `_spread` of rows from which on a matrix is far from singular."""
 
 
 def check_camera(camera: Camera) -> None:
@@ -323,24 +323,34 @@ def check_camera(camera: Camera) -> None:
     for name, matrix in zip(("view", "projection"), camera, strict=True):
         if not np.isfinite(matrix).all():
             raise InputError(f"the camera's {name} matrix holds NaN or infinity; check how it was made")
+    # Most are far from singular; singular values take longer.
+    if not min(_spread(camera.view[:3, :3]), _spread(camera.projection)) > WELL_CONDITIONED:
+        _check_invertible(camera)
+    if not np.array_equal(camera.view[3], [0, 0, 0, 1]):
+        raise InputError(
+            f"the last row of the camera's view times the part's transform is {camera.view[3].tolist()}; "
+            f"expected 0, 0, 0, 1"
+        )
+
+
+def _spread(matrix: np.ndarray) -> float:
+    """The square of the determinant over that of the rows' lengths: 1 for orthogonal rows, 0 for dependent ones."""
+    square = float((matrix * matrix).sum(axis=1).prod())
+    return float(np.linalg.det(matrix)) ** 2 / square if square > 0 else 0.0
+
+
+def _check_invertible(camera: Camera) -> None:
     # Far from the origin, or at lengths far from one, a matrix is none the worse: so rows and columns are scaled.
     projection = camera.projection
     for axis in (1, 0):
         length = np.linalg.norm(projection, axis=axis, keepdims=True)
         projection = projection / np.where(length > 0, length, 1)
     for name, matrix in (("view", camera.view[:3, :3]), ("projection", projection)):
-        if abs(np.linalg.det(matrix)) > WELL_CONDITIONED * np.prod(np.linalg.norm(matrix, axis=1)):
-            continue  # As most are; singular values take longer.
         singular_values = np.linalg.svd(matrix, compute_uv=False)
         if not singular_values[-1] > 1e-12 * singular_values[0]:
             raise InputError(
                 f"the camera's {name} matrix is singular (times the part's transform, for view); it has no inverse"
             )
-    if not np.array_equal(camera.view[3], [0, 0, 0, 1]):
-        raise InputError(
-            f"the last row of the camera's view times the part's transform is {camera.view[3].tolist()}; "
-            f"expected 0, 0, 0, 1"
-        )
 
 
 def check_proxy(proxy: Proxy, surface: Any) -> None:
