@@ -28,7 +28,7 @@ def pack(
     depths = np.ascontiguousarray(fragments.depth, np.float32).reshape(lines, width)
     kept = np.ascontiguousarray(kept).reshape(lines, width)
     counts = np.zeros(lines, np.int64)
-    parallel(_count, lines, kept, counts)
+    parallel(_count, lines, kept, counts, work=kept.size // 8)
     offsets = np.cumsum(counts) - counts
     total = int(counts.sum())
     rows = capacity or max(1, total)
