@@ -15,7 +15,7 @@ from rts import Fragments, GBuffer, InputError, Part, PluginError, RayHits, pair
 from rts.arrays import engine_of, namespace
 from rts.registry import instance
 from rts.shading import Unlit
-from rts.splatting import Multi, Plain
+from rts.splatting import Multi, Plain, inside
 from rts.testing import (
     SamplerConformance,
     ShaderConformance,
@@ -615,6 +615,15 @@ class Frugal(OddMulti):
         return covered & (np.arange(len(covered)) == 0)[:, None, None]
 
 
+class Cutting(OddMulti):
+    """What lies in the border does not splat at all."""
+
+    def splat(self, positions, rgba, row, border=0):
+        middle = np.zeros(row.shape[1:], bool)
+        middle[border : len(middle) - border, border : middle.shape[1] - border] = True
+        return inside(super().splat(positions, rgba, np.where(middle, row, -1)), border)
+
+
 SPLATTERS = {
     "a_constant_interior_stays": {"dimmed": OddMulti(made=lambda image, *_: 0.99 * image)},
     "the_front_layer_hides_those_behind": {"back to front": OddMulti(lambda p, c, r: (p, c, r[::-1]))},
@@ -628,6 +637,7 @@ SPLATTERS = {
     },
     "rows_of_no_cell_have_no_effect": {"all rows": OddMulti(made=all_rows)},
     "what_it_does_not_need_has_no_effect": {"fronts only": Frugal()},
+    "cells_of_the_border_only_splat": {"cut off": Cutting()},
     "a_shape_that_moves_brightens_what_it_moves_into": {"mirrored": OddMulti(from_centres), "none": Plain()},
     "every_engine_gives_the_same_image": {"not in torch": OddMulti(made=lambda image, *_: wrong_in_torch(image))},
     "engines_agree": {

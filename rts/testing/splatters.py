@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -115,6 +116,18 @@ class SplatterConformance(Conformance):
             along = np.random.default_rng(0).normal(size=splats.positions.shape).astype(np.float32)
             found, expected = (_along(engine, splatter, s, along) for s in (pruned, splats))
             claim_close(found, expected, 1e-4, "the derivative of needed samples")
+
+    def test_cells_of_the_border_only_splat(self, splatter: Any) -> None:
+        """`border`, where `splat` takes it: the image of all cells, cropped."""
+        chosen = _instance(splatter)
+        if "border" not in inspect.signature(chosen.splat).parameters:
+            pytest.skip("the splatter leaves cropping to others")
+        whole = _splat(splatter, scattered())
+        for border in (1, 2):
+            image = np.asarray(chosen.splat(*scattered(), border=border))
+            expected = whole[border : HEIGHT - border, border : WIDTH - border]
+            claim(image.shape == expected.shape, f"with border={border} it is {image.shape}; not {expected.shape}")
+            claim_close(image, expected, TOLERANCE, f"the image with border={border}")
 
     # -------------------------------------------------------------------------------------- derivatives
 
