@@ -59,18 +59,37 @@ def arrays(engine: str, x: np.ndarray):
     return jnp.asarray(x, jnp.float32)
 
 
+class Views:
+    """The residuals of images of one size, all at once."""
+
+    def __init__(self, images: list[rts.ImageResiduals]):
+        self.images = images
+
+    def __call__(self, pose):
+        differences = [image(pose) for image in self.images]
+        return namespace(*differences).stack(differences)
+
+    def normal_equations(self, pose):
+        """See `rts.protocols.Residuals`: means over images of means over pixels."""
+        found = [image.normal_equations(pose) for image in self.images]
+        return tuple(sum(terms) / len(found) for terms in zip(*found, strict=True))
+
+
 class Task:
     """One mesh seen from some views."""
 
     def __init__(self, part: rts.Part, views: list[rts.Camera], engine: str, splatter: str):
-        self.part, self.views, self.engine, self.splatter = part, views, engine, splatter
-        self.targets = [arrays(engine, supersampled(part, v, SIZE, 4)[..., 3]) for v in views]
+        self.engine = engine
 
-    def residuals(self, pose):
-        part = self.part.replace(transform=rts.rigid(pose))
-        images = [rts.render(part, v, SIZE, layers=1, splatter=self.splatter)[..., 3] for v in self.views]
-        differences = [image - target for image, target in zip(images, self.targets, strict=True)]
-        return namespace(*differences).stack(differences)
+        def moved(pose):
+            return part.replace(transform=rts.rigid(pose))
+
+        self.residuals = Views(
+            [
+                rts.ImageResiduals(moved, v, SIZE, supersampled(part, v, SIZE, 4)[..., 3], layers=1, splatter=splatter)
+                for v in views
+            ]
+        )
 
     def run(self, seed: int, method: str) -> dict:
         """One fit."""
