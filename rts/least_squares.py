@@ -117,7 +117,7 @@ def _least_squares(
 def _checked_equations(found: Any, count: int, engine: Engine) -> tuple[Array, Array, Array]:
     """What a user's method gave, refused where it is of another form."""
     expected = (), (count, count), (count,)
-    given = tuple(found) if isinstance(found, (tuple, list)) else (found,)
+    given: Any = tuple(found) if isinstance(found, (tuple, list)) else (found,)
     if not all(engine.owns(x) for x in given) or tuple(tuple(x.shape) for x in given) != expected:
         shapes = ", ".join(str(tuple(x.shape)) if engine.owns(x) else f"a {type(x).__name__}" for x in given)
         raise InputError(

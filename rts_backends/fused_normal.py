@@ -7,6 +7,8 @@ added in their order, so results do not depend on the number of threads.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
 
@@ -39,13 +41,13 @@ OPACITY = 3 * PITCH
 """Place of alpha among the planes of a row."""
 
 
-def equations(settings: Settings, engine: Engine, *given: Array | None) -> tuple[Array, ...] | None:
+def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, ...] | None:
     """`normal_equations` of arrays of any engine on the host, traced or not; None for others.
 
     Args:
         settings: of the splatter.
         engine: of the arrays.
-        *given: positions, rgba, row and the arguments of `normal_equations` from `t_positions`.
+        *given: positions, rgba, row and the arguments of `normal_equations` from `t_positions`, arrays or None.
     """
     positions, rgba, _, t_positions = given[:4]
     kind = {32: np.float32, 64: np.float64}.get(engine.namespace.finfo(positions.dtype).bits)
@@ -54,9 +56,10 @@ def equations(settings: Settings, engine: Engine, *given: Array | None) -> tuple
         return None
     present = [x is not None for x in given]
 
-    def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    def host(*arrays: Any) -> tuple[np.ndarray, ...]:
         it = iter(arrays)
-        positions, rgba, row, *rest = (next(it) if there else None for there in present)
+        whole: list[Any] = [next(it) if there else None for there in present]
+        positions, rgba, row, *rest = whole
         used = int(row.max(initial=-1)) + 1  # Under `jit` there may be many more.
         splats = Splats(settings, positions[:used], rgba[:used], row)
         return tuple(np.asarray(x, kind) for x in normal_equations(splats, *rest))
