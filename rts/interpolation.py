@@ -18,7 +18,7 @@ def interpolate(
     """The result (N, C), into `out` where that is given."""
     if out is None:
         out = np.empty((len(ids), rows.shape[1]), np.result_type(rows, weights))
-    parallel(_interpolate, len(ids), *_given(rows, ids), column, *_given(weights), out)
+    parallel(_interpolate, len(ids), *_given(rows, ids), column, *_given(weights), out, work=8 * len(ids))
     return out
 
 

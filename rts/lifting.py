@@ -39,7 +39,7 @@ def pack(
     # Without any, the barycentrics themselves are taken.
     corners = np.empty((0, 3, 0), np.float32) if corner_params is None else corner_params
     given = kept, triangle_ids, barycentrics, depths, table, corners, offsets
-    parallel(_pack, lines, *given, ids, params, row, depth)
+    parallel(_pack, lines, *given, ids, params, row, depth, work=2 * kept.size)
     shape = layers, height, width
     return ids, params, row.reshape(shape), depth.reshape(shape), total
 

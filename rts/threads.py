@@ -17,8 +17,8 @@ from typing import Any
 TASKS_PER_THREAD = 4
 """More tasks than threads, so that one that gets the heavy rows does not keep the others waiting."""
 
-LITTLE_WORK = 20_000
-"""Below so many steps a loop stays on the thread that asks for it."""
+LITTLE_WORK = 100_000
+"""Nanoseconds, below which a loop stays on the thread that asks for it: to ask another takes tens of thousands."""
 
 
 class _Job:
@@ -101,7 +101,7 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
         kernel: the loop.
         count: the end of the range.
         *args: handed on.
-        work: steps of some nanoseconds in all; where they are few, waking threads would take longer.
+        work: nanoseconds that it takes on one thread, roughly.
     """
     threads = thread_count()
     tasks = min(count, threads * TASKS_PER_THREAD)

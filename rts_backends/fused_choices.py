@@ -18,17 +18,18 @@ kernel = numba.njit(nogil=True, cache=True)
 
 
 @compiled
-def depth_at(positions, row, k, y, x, beyond):
-    """Depth of layer k of a cell: `beyond` where only other layers are covered, NaN where none is."""
-    _, height, width = row.shape
-    if not (0 <= y < height and 0 <= x < width):
-        return positions.dtype.type(np.nan)
-    if row[k, y, x] >= 0:
-        return positions[row[k, y, x], 2]
-    for other in range(len(row)):
-        if row[other, y, x] >= 0:
-            return beyond
-    return positions.dtype.type(np.nan)
+def _depths(z, at, positions, row, y, x, beyond):
+    """Column `at` of z (K, ·): depths of a cell's layers, `beyond` where not covered; NaN where none is."""
+    layers, height, width = row.shape
+    some = False
+    if 0 <= y < height and 0 <= x < width:
+        for k in range(layers):
+            i = row[k, y, x]
+            some |= i >= 0
+            z[k, at] = positions[i, 2] if i >= 0 else beyond
+    if not some:
+        for k in range(layers):
+            z[k, at] = z.dtype.type(np.nan)
 
 
 @kernel
@@ -81,7 +82,7 @@ def find(start, stop, positions, row, visible, everywhere, beyond, hidden, state
 
 @compiled
 def _load(z, positions, row, y, first, last, beyond):
-    """Depths (K, ·) of cells of a row, as `depth_at` gives them."""
+    """The same of cells of a row."""
     layers, height, width = row.shape
     nothing = z.dtype.type(np.nan)
     for x in range(first, last):
@@ -117,7 +118,7 @@ def _mark(marks, front, hidden, target_front, target_hidden):
 def choose(start, stop, positions, row, visible, continued, beyond, mixed, offsets, columns, choices, states):
     """List each row's mixed targets: their columns (M,), and ranges of layers (M, 9, 3, 2) by source and buffer."""
     layers, height, width = row.shape
-    z, target = np.empty((9, layers), positions.dtype), np.empty(layers, positions.dtype)
+    z, target = np.empty((layers, 9), positions.dtype), np.empty(layers, positions.dtype)
     shift = np.empty(9, np.int64)
     for y in range(start, stop):
         d = offsets[y]
@@ -127,13 +128,12 @@ def choose(start, stop, positions, row, visible, continued, beyond, mixed, offse
             columns[d], states[y, x] = x, EMPTY
             choices[d] = 0
             for n in range(9):
-                for k in range(layers):
-                    z[n, k] = depth_at(positions, row, k, y + 1 - n // 3, x + 1 - n % 3, beyond)
+                _depths(z, n, positions, row, y + 1 - n // 3, x + 1 - n % 3, beyond)
             for k in range(layers):
-                target[k] = z[4, k] if z[4, k] == z[4, k] else beyond
+                target[k] = z[k, 4] if z[k, 4] == z[k, 4] else beyond
             for n in range(9):
-                shift[n], off = _pairing(z[n], target)
-                if visible and shift[n] != 0 and _continues(positions, row, y, x, n, z[n, 0], z[4, 0], continued * off):
+                shift[n], off = _pairing(z, n, target)
+                if visible and shift[n] != 0 and _continues(positions, row, y, x, n, z[0], continued * off):
                     shift[n] = 0
             if visible:
                 _choose_visible(choices[d], shift, z, row, y, x, target)
@@ -147,26 +147,27 @@ def choose(start, stop, positions, row, visible, continued, beyond, mixed, offse
 
 
 @compiled
-def _pairing(source, target):
+def _pairing(z, n, target):
     """The number s of `rts.splatting.Multi`, and what the depths that it pairs are off."""
     a, b = 0, 0
-    best_a, best_b = abs(source[0] - target[0]), abs(target[0] - source[0])
+    front = z[0, n]
+    best_a, best_b = abs(front - target[0]), abs(target[0] - front)
     for k in range(1, len(target)):
-        distance = abs(source[k] - target[0])
+        distance = abs(z[k, n] - target[0])
         if distance < best_a:
             best_a, a = distance, k
-        distance = abs(target[k] - source[0])
+        distance = abs(target[k] - front)
         if distance < best_b:
             best_b, b = distance, k
     return (-b, best_b) if best_b < best_a else (a, best_a)
 
 
 @compiled
-def _continues(positions, row, y, x, n, source, target, limit):
+def _continues(positions, row, y, x, n, fronts, limit):
     """Whether the front of the source or of the target is nearer than a limit to where the other's line leads."""
     _, height, width = row.shape
     v, u = n // 3 - 1, n % 3 - 1
-    for steps, end, start in ((-1, source, target), (2, target, source)):
+    for steps, end, start in ((-1, fronts[n], fronts[4]), (2, fronts[4], fronts[n])):
         by, bx = y - steps * v, x - steps * u
         if 0 <= by < height and 0 <= bx < width and row[0, by, bx] >= 0:
             if abs(end - (start + start - positions[row[0, by, bx], 2])) < limit:
@@ -193,7 +194,7 @@ def _choose_visible(choice, shift, z, row, y, x, target):
             continue
         hidden, best = layers if s >= 0 else 0, z.dtype.type(np.inf)
         for k in range(s + 1 if s >= 0 else layers, layers):
-            distance = abs(z[n, k] - target[m])
+            distance = abs(z[k, n] - target[m])
             if distance < best:
                 best, hidden = distance, k
         if hidden < layers:

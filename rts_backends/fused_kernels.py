@@ -101,9 +101,14 @@ class Splats:
         return self.positions, self.rgba, self.row[:1] if self.visible else self.row, *self._numbers
 
     @property
+    def _plain_work(self) -> int:
+        """Nanoseconds that the stencil takes at least."""
+        return 4 * self.row.shape[1] * self.row.shape[2]
+
+    @property
     def _mixed_work(self) -> int:
-        """Steps that the mixed targets take: nine sources of several numbers each."""
-        return 50 * len(self.choices.columns)
+        """Nanoseconds that the mixed targets take: nine sources of several numbers each."""
+        return 160 * len(self.choices.columns)
 
     @property
     def mixed_arguments(self) -> tuple:
@@ -120,7 +125,8 @@ class Splats:
         depths = np.zeros((height, 2), kind)
         fronts = self.visible or layers == 1
         noted = states, hidden, depths, seen, counts
-        parallel(survey, height, self.positions, self.rgba, self.row, fronts, self._reach, *noted)
+        given = self.positions, self.rgba, self.row, fronts, self._reach
+        parallel(survey, height, *given, *noted, work=2 * self.row.size)
         repeated = int(np.count_nonzero(seen)) != int(counts.sum())
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
         least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
@@ -128,14 +134,14 @@ class Splats:
         if layers > 1:
             # With no depth below zero, nothing is nearer to what is beyond everything than to a front.
             given = self.row, self.visible, least < 0, beyond, hidden, states
-            parallel(choosing.find, height, self.positions, *given, marks, counts)
+            parallel(choosing.find, height, self.positions, *given, marks, counts, work=self.row.size)
         offsets = np.concatenate([[0], np.cumsum(counts)])
         columns = np.empty(offsets[-1], np.int32)
         ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
         if len(columns):
             continued = kind.type(CONTINUED)  # An argument, since compiled code that is cached would keep its value.
             given = self.row, self.visible, continued, beyond, marks, offsets, columns, ranges, states
-            parallel(choosing.choose, height, self.positions, *given, work=50 * len(columns))
+            parallel(choosing.choose, height, self.positions, *given, work=350 * len(columns))
         return Choices(marks, offsets, columns, ranges, states, repeated)
 
     @property
@@ -149,7 +155,7 @@ class Splats:
         image = np.empty((*self._size, 4), self.positions.dtype)
         if image.size:
             given = *self.plain_arguments, self.choices.states, self.border
-            parallel(stencil.forward, len(image), *given, image)
+            parallel(stencil.forward, len(image), *given, image, work=self._plain_work)
             if len(self.choices.columns):
                 parallel(mixed.forward, len(image), *self.mixed_arguments, self.border, image, work=self._mixed_work)
         return image
@@ -167,7 +173,16 @@ class Splats:
         )
         if self.row.size:
             g = _frozen(g)
-            parallel(stencil.pull, height, *self.plain_arguments, self.choices.states, self.border, g, *found)
+            parallel(
+                stencil.pull,
+                height,
+                *self.plain_arguments,
+                self.choices.states,
+                self.border,
+                g,
+                *found,
+                work=self._plain_work,
+            )
             if count := len(self.choices.columns):
                 adjoints = np.empty((count, 3, 5), g.dtype)
                 parallel(mixed.adjoint, height, *self.mixed_arguments, self.border, g, adjoints, work=self._mixed_work)

@@ -22,23 +22,29 @@ def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, epsilon: float
         return covered
     covered, depth = np.ascontiguousarray(covered), np.ascontiguousarray(depth)
     farthest, kept = np.zeros(height, depth.dtype), np.empty_like(covered)
-    parallel(_farthest, height, covered, depth, farthest, work=covered.size // 8)
+    parallel(_farthest, height, covered, depth, farthest, work=covered.size // 4)
     beyond, kind = 2 * farthest.max(initial=0), depth.dtype.type
-    parallel(_keep, height, covered, depth, visible, beyond, kind(TIE * beyond / 2), kind(CONTINUED), kept)
+    numbers = beyond, kind(TIE * beyond / 2), kind(CONTINUED)
+    parallel(_keep, height, covered, depth, visible, *numbers, kept, work=2 * covered.size)
     return kept
 
 
-@numba.njit(nogil=True, cache=True, fastmath={"nnan", "nsz"})
+@kernel
 def _farthest(start, stop, covered, depth, farthest):
     """The largest size of a depth in each row."""
+    sizes = np.empty(covered.shape[2], depth.dtype)
     for y in range(start, stop):
-        most = depth.dtype.type(0)
+        sizes[:] = depth.dtype.type(0)
         for k in range(len(covered)):
-            cells, depths = covered[k, y], depth[k, y]
-            for x in range(len(cells)):
-                size = abs(depths[x]) if cells[x] else depth.dtype.type(0)
-                most = size if size > most else most
-        farthest[y] = most
+            _enlarge(sizes, covered[k, y], depth[k, y])
+        farthest[y] = sizes.max()
+
+
+@compiled
+def _enlarge(sizes, covered, depth):
+    for x in range(len(sizes)):
+        size = abs(depth[x]) if covered[x] else sizes[x]
+        sizes[x] = size if size > sizes[x] else sizes[x]
 
 
 @kernel

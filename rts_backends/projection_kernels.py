@@ -17,7 +17,7 @@ CHUNK = 4096
 
 def project(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
     """Fill `out` (N, 3)."""
-    parallel(_project, len(out), *_given(rows, points), out, work=10 * len(out))
+    parallel(_project, len(out), *_given(rows, points), out, work=4 * len(out))
 
 
 def push(
@@ -26,14 +26,14 @@ def push(
     """Fill `out` (N, 3) with the tangent along those of rows (4, 4) and points (N, 3), or None for zeros."""
     turn = np.zeros_like(rows) if t_rows is None else t_rows
     move = np.empty((0, 3), points.dtype) if t_points is None else t_points
-    parallel(_push, len(out), *_given(rows, points, turn, move), out, work=20 * len(out))
+    parallel(_push, len(out), *_given(rows, points, turn, move), out, work=8 * len(out))
 
 
 def pull(rows: np.ndarray, points: np.ndarray, g: np.ndarray, g_points: np.ndarray | None) -> np.ndarray:
     """The gradient of rows (4, 4) from that of the result (N, 3); fills that of the points (N, 3) if there is one."""
     sums = np.empty((-(-len(points) // CHUNK), 4, 4))
     g_points = np.empty((0, 3), points.dtype) if g_points is None else g_points
-    parallel(_pull, len(sums), *_given(rows, points, g), sums, g_points, work=20 * len(points))
+    parallel(_pull, len(sums), *_given(rows, points, g), sums, g_points, work=5 * len(points))
     return sums.sum(axis=0).astype(rows.dtype)
 
 

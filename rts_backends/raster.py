@@ -75,11 +75,11 @@ class Raster(TriangleSampler):
         chunks, bands = -(-len(faces) // CHUNK), -(-height // BAND_ROWS)
         spans, counts = np.empty((chunks, 2), np.int64), np.zeros((bands, chunks), np.int64)
         given = vertices, faces, screen, matrix, height, width, step, keep
-        parallel(_select, chunks, *given, listed, spans, counts, work=4 * len(faces))
+        parallel(_select, chunks, *given, listed, spans, counts, work=10 * len(faces))
         offsets = np.append(0, np.cumsum(counts.sum(axis=1)))
         places = offsets[:-1, None] + np.cumsum(counts, axis=1) - counts
         items = np.empty(offsets[-1], np.uint32)
-        parallel(_sort, chunks, listed, spans, places, items, work=4 * len(items))
+        parallel(_sort, chunks, listed, spans, places, items, work=8 * len(items))
         fragments = Fragments(
             np.empty((layers, height, width), np.int32),
             np.empty((layers, height, width, 2), np.float32),
