@@ -11,6 +11,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from rts_backends.fused_mixed import sums_of
 from rts_backends.fused_survey import BLOCK, BUSY, EMPTY
 
 compiled = numba.njit(nogil=True)
@@ -115,8 +116,26 @@ def _mark(marks, front, hidden, target_front, target_hidden):
 
 
 @kernel
-def choose(start, stop, positions, row, visible, continued, beyond, mixed, offsets, columns, choices, states):
-    """List each row's mixed targets: their columns (M,), and ranges of layers (M, 9, 3, 2) by source and buffer."""
+def choose(
+    start,
+    stop,
+    positions,
+    rgba,
+    row,
+    scale,
+    peak,
+    gamma,
+    visible,
+    continued,
+    beyond,
+    mixed,
+    offsets,
+    columns,
+    choices,
+    sums,
+    states,
+):
+    """List each row's mixed targets: the arrays of `fused_kernels.Choices` from `columns` to `sums`."""
     layers, height, width = row.shape
     z, target = np.empty((layers, 9), positions.dtype), np.empty(layers, positions.dtype)
     shift = np.empty(9, np.int64)
@@ -143,6 +162,7 @@ def choose(start, stop, positions, row, visible, continued, beyond, mixed, offse
                     choices[d, n, 0, 1] = max(s, 0)
                     choices[d, n, 1, 0], choices[d, n, 1, 1] = max(s, 0), max(s + 1, 0)
                     choices[d, n, 2, 0], choices[d, n, 2, 1] = max(s + 1, 0), layers
+            sums_of(sums[d], positions, rgba, row, y, x, choices[d], scale, peak, gamma)
             d += 1
 
 

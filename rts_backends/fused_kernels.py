@@ -49,6 +49,7 @@ class Choices(NamedTuple):
         columns: (M,) int32, their columns.
         ranges: (M, 9, 3, 2), first and last + 1 of the layers that each source gives to each buffer; source 3 (v + 1) +
             (u + 1) lies at −(u, v), and the buffers are in front, at the surface, behind.
+        sums: (M, 3, 5), of each buffer the colours over the weight, taken as at least one, and the weight.
         states: (H, W) uint8, of the other targets (`fused_survey`); such are EMPTY in it.
         repeated: whether a sample stands in several cells, which would add to its gradient at the same time.
     """
@@ -57,6 +58,7 @@ class Choices(NamedTuple):
     offsets: np.ndarray
     columns: np.ndarray
     ranges: np.ndarray
+    sums: np.ndarray
     states: np.ndarray
     repeated: bool
 
@@ -115,6 +117,10 @@ class Splats:
         """Arguments of the kernels of mixed targets."""
         return self.positions, self.rgba, self.row, *self._numbers, *self.choices[1:4]
 
+    @property
+    def _mixed_sums(self) -> tuple:
+        return self.choices.offsets, self.choices.columns, self.choices.sums
+
     @cached_property
     def choices(self) -> Choices:
         """What is decided for each target."""
@@ -138,11 +144,13 @@ class Splats:
         offsets = np.concatenate([[0], np.cumsum(counts)])
         columns = np.empty(offsets[-1], np.int32)
         ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
+        sums = np.empty((offsets[-1], 3, 5), kind)
         if len(columns):
             continued = kind.type(CONTINUED)  # An argument, since compiled code that is cached would keep its value.
-            given = self.row, self.visible, continued, beyond, marks, offsets, columns, ranges, states
-            parallel(choosing.choose, height, self.positions, *given, work=350 * len(columns))
-        return Choices(marks, offsets, columns, ranges, states, repeated)
+            given = self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states
+            arrays = self.positions, self.rgba, self.row, *self._numbers
+            parallel(choosing.choose, height, *arrays, *given, work=500 * len(columns))
+        return Choices(marks, offsets, columns, ranges, sums, states, repeated)
 
     @property
     def _size(self) -> tuple[int, int]:
@@ -157,7 +165,7 @@ class Splats:
             given = *self.plain_arguments, self.choices.states, self.border
             parallel(stencil.forward, len(image), *given, image, work=self._plain_work)
             if len(self.choices.columns):
-                parallel(mixed.forward, len(image), *self.mixed_arguments, self.border, image, work=self._mixed_work)
+                parallel(mixed.forward, len(image), *self._mixed_sums, self.border, image, work=self._mixed_work // 10)
         return image
 
     def vjp(
@@ -185,7 +193,7 @@ class Splats:
             )
             if count := len(self.choices.columns):
                 adjoints = np.empty((count, 3, 5), g.dtype)
-                parallel(mixed.adjoint, height, *self.mixed_arguments, self.border, g, adjoints, work=self._mixed_work)
+                parallel(mixed.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=self._mixed_work // 5)
                 parallel(mixed.pull, height, *self.mixed_arguments, adjoints, *found, work=self._mixed_work)
         return found[0] if wanted[0] else None, found[1] if wanted[1] else None
 
@@ -203,7 +211,8 @@ class Splats:
             )
             if len(self.choices.columns):
                 work = self._mixed_work * count
-                parallel(mixed.push, out.shape[1], *self.mixed_arguments, *tangents, self.border, out, work=work)
+                given = *self.mixed_arguments, self.choices.sums, tangents, self.border
+                parallel(mixed.push, out.shape[1], *given, out, work=work)
         return out
 
     def _vjp_of_repeated(self, g: np.ndarray, wanted: tuple[bool, bool]) -> tuple[np.ndarray | None, np.ndarray | None]:

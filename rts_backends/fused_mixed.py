@@ -42,33 +42,29 @@ def sums_of(total, positions, rgba, row, y, x, choice, scale, peak, gamma):
 
 
 @kernel
-def forward(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, border, image):
+def forward(start, stop, offsets, columns, sums, border, image):
     """Mixed targets of rows [start, stop) of the image (H, W, 4), so much smaller than the cells at each side."""
-    total = np.empty((3, 5), image.dtype)
     one = image.dtype.type(1)
     for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
-            x = columns[d]
+            x, total = columns[d], sums[d]
             if not 0 <= x - border < image.shape[1]:
                 continue
-            sums_of(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
             for c in range(4):
                 back = total[1, c] + (one - total[1, 3]) * total[2, c]
                 image[y - border, x - border, c] = total[0, c] + (one - total[0, 3]) * back
 
 
 @kernel
-def adjoint(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, border, g, adjoints):
+def adjoint(start, stop, offsets, columns, sums, border, g, adjoints):
     """Adjoints (M, 3, 5) of the sums of mixed targets from that of the image, zero beyond it."""
     zero, one = g.dtype.type(0), g.dtype.type(1)
-    total = np.empty((3, 5), g.dtype)
     for y in range(start, stop):
         for d in range(offsets[y], offsets[y + 1]):
-            x, a = columns[d], adjoints[d]
+            x, a, total = columns[d], adjoints[d], sums[d]
             if not (0 <= y - border < g.shape[0] and 0 <= x - border < g.shape[1]):
                 a[:] = zero
                 continue
-            sums_of(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
             shown, through = one - total[0, 3], (one - total[0, 3]) * (one - total[1, 3])
             front, surface = zero, zero
             for c in range(4):
@@ -117,19 +113,15 @@ def pull(
 
 
 @kernel
-def push(
-    start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, t_positions, t_rgba, border, out
-):
-    """Mixed targets of rows [start, stop) of the tangents (T, H, W, 4)."""
-    one = out.dtype.type(1)
-    total, changes = np.empty((3, 5), out.dtype), np.empty((len(out), 3, 5), out.dtype)
+def push(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, sums, tangents, border, out):
+    """Mixed targets of rows [start, stop) of the tangents (T, H, W, 4); `tangents` are those of positions and rgba."""
+    one, changes = out.dtype.type(1), np.empty((len(out), 3, 5), out.dtype)
     for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
-            x = columns[d]
+            x, total = columns[d], sums[d]
             if not 0 <= x - border < out.shape[2]:
                 continue
-            sums_of(total, positions, rgba, row, y, x, choices[d], scale, peak, gamma)
-            changes_of(changes, total, positions, rgba, row, y, x, choices[d], scale, peak, gamma, t_positions, t_rgba)
+            changes_of(changes, total, positions, rgba, row, y, x, choices[d], scale, peak, gamma, *tangents)
             for t in range(len(out)):
                 change, pixel = changes[t], out[t, y - border, x - border]
                 for c in range(4):

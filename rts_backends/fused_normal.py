@@ -15,7 +15,7 @@ import numpy as np
 from rts.protocols import Array, ArraySpec, Engine
 from rts.threads import parallel
 from rts_backends.fused_kernels import Settings, Splats
-from rts_backends.fused_mixed import changes_of, sums_of
+from rts_backends.fused_mixed import changes_of
 from rts_backends.fused_rows import (
     PITCH,
     SOURCE,
@@ -94,7 +94,7 @@ def normal_equations(
     fields = (_frozen(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
     bands = -(-len(target) // BAND)
     sums = np.zeros((bands, count + 1, count + 1))
-    given = splats.plain_arguments, splats.row, splats.choices[:5], tangents, tuple(fields), splats.border
+    given = splats.plain_arguments, splats.row, splats.choices[:6], tangents, tuple(fields), splats.border
     parallel(_accumulate, bands, ALPHA if target.shape[2] == 1 else COLORS, *given, sums)
     total = sums.sum(axis=0) / max(target.size, 1)
     matrix = total[:count, :count]
@@ -127,8 +127,8 @@ def _accumulate(start, stop, planes, plain, row, lists, tangents, fields, border
         np.empty((many, SUMS), positions.dtype),
     )
     products = np.empty((many + 1, channels * PITCH), positions.dtype)
-    scratch = np.empty((3, 5), positions.dtype), np.empty((many, 3, 5), positions.dtype)
-    mixed, _, _, _, states = lists
+    changes = np.empty((many, 3, 5), positions.dtype)
+    mixed, _, _, _, _, states = lists
     loaded, least = np.empty(3, np.int64), FLAT if t_rgba.shape[1] > 0 else BUSY
     for band in range(start, stop):
         top, bottom = band * BAND, min(height, (band + 1) * BAND)
@@ -159,25 +159,23 @@ def _accumulate(start, stop, planes, plain, row, lists, tangents, fields, border
                                 add_tangent_row(to[SUM:] if k > 0 else to, s, tangent, v, count, planes)
                         tangent_row(to, value, layers, count, planes)
                     composite(value, layers, count)
-                    _mix(change, value, plain, row, lists[1:4], tangents, border, y, left, count, scratch)
+                    _mix(change, value, plain, row, lists[1:5], tangents, border, y, left, count, changes)
                 else:
                     fill(value, rgba, row[0, y + border, border:], states[y + border, border:], left, count)
                 _multiply(sums[band], products, change, value, fields, y, left, count, changing)
 
 
 @compiled
-def _mix(change, value, plain, row, lists, tangents, border, y, left, count, scratch):
+def _mix(change, value, plain, row, lists, tangents, border, y, left, count, changes):
     """Values and tangents of the mixed targets of a row of a tile, in place of those of the stencil."""
     positions, rgba, _, scale, peak, gamma = plain
-    offsets, columns, choices = lists
-    total, changes = scratch
+    offsets, columns, choices, sums = lists
     one = value.dtype.type(1)
     for d in range(offsets[y + border], offsets[y + border + 1]):
         j = columns[d] - border - left
         if not 0 <= j < count:
             continue
-        given = positions, rgba, row, y + border, columns[d], choices[d], scale, peak, gamma
-        sums_of(total, *given)
+        total, given = sums[d], (positions, rgba, row, y + border, columns[d], choices[d], scale, peak, gamma)
         changes_of(changes, total, *given, *tangents)
         for c in range(4):
             back = total[1, c] + (one - total[1, 3]) * total[2, c]
