@@ -59,7 +59,8 @@ class Raster(TriangleSampler):
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         height, width = size
-        vertices, faces = prepared.vertices, prepared.faces.view(np.uint32)  # Unsigned, no index has to be wrapped.
+        # Unsigned, no index has to be wrapped.
+        vertices, faces = prepared.vertices, np.asarray(prepared.faces, np.int32).view(np.uint32)
         matrix, keep = pixel_matrix(camera, size), facing(camera, cull)
         # Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
         # room for every vertex and triangle, but only what is used is ever touched.

@@ -330,6 +330,15 @@ def test_triangles_without_area_are_never_hit(sampler):
     assert (found.triangle_ids == -1).all()
 
 
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_faces_may_be_integers_of_any_size_and_order(sampler):
+    vertices, faces = icosphere(1)
+    expected = rasterize(sampler, vertices, faces.astype(np.int32), CAMERAS["perspective"])
+    for given in (faces.astype(np.int64), np.asfortranarray(faces.astype(np.int32))):
+        found = rasterize(sampler, vertices, given, CAMERAS["perspective"])
+        np.testing.assert_array_equal(found.triangle_ids, expected.triangle_ids)
+
+
 def test_the_rasterizer_drops_triangles_with_nan_and_keeps_the_others():
     vertices, faces = quad(-9, 9, -9, 9)
     vertices[3] = np.nan
