@@ -1,7 +1,7 @@
 """Interpolation over triangles and its derivatives, compiled for arrays on the host. It imports numba.
 
-Three columns of `ids` (N, I), from `column`, name rows a, b, c of (V, C); weights are (N, 2) and the result
-c + w₀ (a − c) + w₁ (b − c) is (N, C). An id of no row gives NaN, and no gradient.
+Three columns of `ids` (N, I), from `column`, name rows a, b, c of (V, C); weights are (N, W), of which the first two
+count, and the result c + w₀ (a − c) + w₁ (b − c) is (N, C). An id of no row gives NaN, and no gradient.
 """
 
 from __future__ import annotations
@@ -123,4 +123,4 @@ def _weigh(start, stop, rows, ids, column, g, g_weights):
             for i in range(g.shape[1]):
                 u += g[n, i] * (rows[a, i] - rows[c, i])
                 v += g[n, i] * (rows[b, i] - rows[c, i])
-        g_weights[n, 0], g_weights[n, 1] = u, v
+        g_weights[n, 0], g_weights[n, 1], g_weights[n, 2:] = u, v, 0
