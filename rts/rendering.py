@@ -232,7 +232,7 @@ def _splatted(
     grid, fine = tuple(sampled.row.shape[1:]), sampled.supersample
     size = grid[0] - 2 * APRON, grid[1] - 2 * APRON
     splats = to_splats(sampled, parts, camera, window, beside)
-    crops = _takes_border(type(splatter))
+    crops = _takes_border(splatter)
     image = splatter.splat(*splats, border=APRON) if crops else inside(splatter.splat(*splats), APRON)
     if fine > 1:
         xp = namespace(image)
@@ -274,8 +274,11 @@ def to_splats(
 _TAKE_BORDER: dict[type, bool] = {}
 
 
-def _takes_border(kind: type) -> bool:
-    """Whether splatters of a class crop the image themselves."""
+def _takes_border(splatter: Any) -> bool:
+    """Whether a splatter crops the image itself."""
+    kind = type(splatter)
+    if not hasattr(kind, "splat") or "splat" in getattr(splatter, "__dict__", ()):  # A function of this object alone.
+        return "border" in inspect.signature(splatter.splat).parameters
     if kind not in _TAKE_BORDER:
         _TAKE_BORDER[kind] = "border" in inspect.signature(kind.splat).parameters
     return _TAKE_BORDER[kind]
