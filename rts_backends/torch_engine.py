@@ -39,6 +39,11 @@ def _to_host(x: torch.Tensor) -> np.ndarray:
     return (x.float() if x.dtype in (torch.bfloat16, torch.float16) else x).numpy()
 
 
+def _exact(a: torch.Tensor, b: torch.Tensor) -> bool:
+    """Whether torch multiplies matrices in their own precision: on the CPU, but for `torch.autocast`."""
+    return a.device.type == "cpu" and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
+
+
 class _HostCall(torch.autograd.Function):
     """A host function without derivative, transparent to every torch transform."""
 
@@ -105,7 +110,7 @@ class TorchEngine:
 
     def matmul(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor | None:
         """As one product on the CPU; elsewhere elementwise, since matrix units may round float32 to fewer bits."""
-        return a @ b if a.device.type == "cpu" and a.dtype == b.dtype else None
+        return a @ b if _exact(a, b) else None
 
     def rigid(self, pose: torch.Tensor, center: torch.Tensor) -> torch.Tensor | None:
         """By compiled code on the CPU."""
@@ -119,7 +124,7 @@ class TorchEngine:
 
     def affine_map(self, rows: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
         """As one product on the CPU; elsewhere elementwise, since matrix units may round float32 to fewer bits."""
-        if points.device.type == "cpu" and points.dtype == rows.dtype:
+        if _exact(rows, points):
             return torch.addmm(rows[:, 3], points, rows[:, :3].T)
         return (points[:, None, :] * rows[None, :, :3]).sum(dim=-1) + rows[:, 3]
 

@@ -313,6 +313,15 @@ def test_torch_compile_keeps_value_and_gradient(on_torch):
     assert_trees_close(gradient(target, compiled, scene), gradient(target, loss, scene))
 
 
+def test_torch_autocast_leaves_cameras_and_projection_as_exact_as_they_are(on_torch):
+    torch, target = on_torch
+    scene = arrays(target, SCENE)
+    expected = to_numpy(image_of(scene))
+    with torch.autocast("cpu", torch.bfloat16):
+        found = to_numpy(image_of(scene))
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
+
+
 def test_torch_updates_in_place_are_seen(on_torch):
     torch, target = on_torch
     scene = arrays(target, SCENE)
