@@ -318,7 +318,8 @@ class Camera(NamedTuple):
         from_clip, depth = constants((from_clip, depth), engine_of(p), p)
         # Of what is constant, in NumPy.
         rows = constants(matmul(from_clip, p) + depth, engine_of(self.view), exemplar(self.view))
-        return projective_map(matmul(rows, self.view), points)
+        rows = matmul(rows, self.view)
+        return projective_map(rows, constants(points, engine_of(rows, points), exemplar(rows, points)))
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""

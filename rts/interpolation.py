@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from rts.threads import parallel
+from rts.threads import parallel, read_all
 
 
 def interpolate(
@@ -18,7 +18,7 @@ def interpolate(
     """The result (N, C), into `out` where that is given."""
     if out is None:
         out = np.empty((len(ids), rows.shape[1]), np.result_type(rows, weights))
-    parallel(_interpolate, len(ids), *_given(rows, ids), column, *_given(weights), out, work=8 * len(ids))
+    parallel(_interpolate, len(ids), *read_all(rows, ids), column, *read_all(weights), out, work=8 * len(ids))
     return out
 
 
@@ -37,7 +37,7 @@ def push(
     else:
         interpolate(t_rows, ids, column, weights, out)
     if t_weights is not None:
-        given = _given(rows, ids), _given(t_weights)
+        given = read_all(rows, ids), read_all(t_weights)
         parallel(_add_weighted, len(ids), *given[0], column, *given[1], out)
 
 
@@ -55,17 +55,9 @@ def pull(
     Both may be None, where they are not wanted. Sums are taken in the order of the samples.
     """
     if g_rows is not None:
-        _scatter(*_given(ids), column, *_given(weights, g), g_rows)
+        _scatter(*read_all(ids), column, *read_all(weights, g), g_rows)
     if g_weights is not None:
-        parallel(_weigh, len(ids), *_given(rows, ids), column, *_given(g), g_weights)
-
-
-def _given(*arrays: np.ndarray) -> list[np.ndarray]:
-    """Contiguous views, always read-only, so that kernels are compiled but once."""
-    views = [np.ascontiguousarray(x).view() for x in arrays]
-    for view in views:
-        view.flags.writeable = False
-    return views
+        parallel(_weigh, len(ids), *read_all(rows, ids), column, *read_all(g), g_weights)
 
 
 @numba.njit

@@ -318,7 +318,8 @@ class Engine(Protocol):
     with it `on_cpu(f, otherwise, *arrays)`, `f` of traced arrays where they turn out to be on a CPU; and functions
     of `rts.arrays` and `rts.transforms` in full precision but faster, `matmul(a, b)`, `rigid(pose, center)`,
     `affine_map(rows, points)`, `take(rows, index)`, `interpolate(rows, ids, column, weights)` and
-    `projective_map(rows, points)`, which may give None for arrays that they do not know.
+    `projective_map(rows, points)`, which may give None for arrays that they do not know. And `fill_unused(x, row)`, for
+    engines that allot more rows than are used: x (N, ·) with its first row for those that no cell of `row` names.
 
     The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the
     user has imported that module.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import itertools
 import math
+import weakref
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -261,7 +262,8 @@ def to_splats(
         transform = constants(part.transform, engine, like)
         local = _evaluate(part, samples, engine, like)
         rest = {name: value for name, value in part.theta.items() if name not in reads_of(part)}
-        rgba = part.shader({**part.theta, **constants(rest, engine, like)}, _to_world(local, transform), camera)
+        read = _to_world(_readable(local, samples, engine), transform)
+        rgba = part.shader({**part.theta, **constants(rest, engine, like)}, read, camera)
         check_shaded(rgba, local["position"].shape[0], part.shader)
         positions.append(wide.within(transform).project(local["position"], grid))
         colors.append(constants(rgba, engine, like))
@@ -271,7 +273,7 @@ def to_splats(
     return xp.concat(positions), xp.concat(colors), sampled.row
 
 
-_TAKE_BORDER: dict[type, bool] = {}
+_TAKE_BORDER: weakref.WeakKeyDictionary[type, bool] = weakref.WeakKeyDictionary()
 
 
 def _takes_border(splatter: Any) -> bool:
@@ -310,12 +312,24 @@ def _evaluate(part: Part, samples: Samples, engine: Engine, like: Array | None) 
     return gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer)
 
 
+def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
+    """The attributes as shaders may read them: in rows that no cell refers to a derivative must be finite, too."""
+    fill = getattr(engine, "fill_unused", None)
+    if fill is None:
+        return gbuffer
+    found = GBuffer()
+    found.like = gbuffer["position"]
+    for name in gbuffer:
+        found.defer(name, lambda name=name: fill(gbuffer[name], samples.row))
+    return found
+
+
 def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
     """Positions and normals moved by the part's transform."""
     if transform is None:
         return gbuffer
     world = GBuffer()
-    world.like = gbuffer["position"]
+    world.like = gbuffer.like
     for name in gbuffer:
         world.defer(name, lambda name=name: gbuffer[name])
     world.defer("position", lambda: affine_map(transform[:3, :], gbuffer["position"]))

@@ -14,6 +14,8 @@ from collections.abc import Callable
 from queue import SimpleQueue
 from typing import Any
 
+import numpy as np
+
 TASKS_PER_THREAD = 4
 """More tasks than threads, so that one that gets the heavy rows does not keep the others waiting."""
 
@@ -43,10 +45,8 @@ class _Job:
         self._going.release()
 
     def wait(self) -> None:
-        """Until it is done; raises what it raised."""
+        """Until it is done."""
         self._going.acquire()
-        if self.error is not None:
-            raise self.error
 
 
 class _Helpers:
@@ -58,12 +58,15 @@ class _Helpers:
         self._lock = threading.Lock()
 
     def ask(self, job: _Job, count: int) -> None:
-        """Hand a job to one of at least so many helpers."""
+        """Hand a job to one of so many helpers."""
         if self.count < count:
             with self._lock:
                 while self.count < count:
+                    try:
+                        threading.Thread(target=self._serve, name="rts", daemon=True).start()
+                    except RuntimeError:  # The system has no more: those that there are, or the caller, do the work.
+                        break
                     self.count += 1
-                    threading.Thread(target=self._serve, name="rts", daemon=True).start()
         self._jobs.put(job)
 
     def _serve(self) -> None:
@@ -94,6 +97,18 @@ def thread_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
+    """A contiguous view, copied only if it has to be; always read-only, so that kernels are compiled but once."""
+    view = np.ascontiguousarray(x, dtype).view()
+    view.flags.writeable = False
+    return view
+
+
+def read_all(*arrays: np.ndarray) -> list[np.ndarray]:
+    """`read_only` of each."""
+    return [read_only(x) for x in arrays]
+
+
 def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) -> None:
     """Call `kernel(start, stop, *args)` so that the ranges cover [0, count); the kernel must release the lock.
 
@@ -111,17 +126,22 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
     bounds = [count * i // tasks for i in range(tasks + 1)]
     numbers = itertools.count()
 
-    def work() -> None:
+    def share() -> None:
         while (task := next(numbers)) < tasks:
             kernel(bounds[task], bounds[task + 1], *args)
 
     # The caller works too. A helper that has not woken by the time all is begun is not waited for.
-    jobs = [_Job(work) for _ in range(threads - 1)]
-    for job in jobs:
-        _helpers.ask(job, threads - 1)
+    jobs: list[_Job] = []
     try:
-        work()
+        for _ in range(threads - 1):
+            jobs.append(_Job(share))
+            _helpers.ask(jobs[-1], threads - 1)
+        share()
     finally:
+        # Whatever happens, none is to be left that writes to arrays which the caller may give away.
         for job in jobs:
             if not job.claim():
                 job.wait()
+    for job in jobs:
+        if job.error is not None:
+            raise job.error

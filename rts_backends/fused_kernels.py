@@ -8,14 +8,14 @@ decided for the others, the mixed ones (`fused_mixed`), is decided once and kept
 from __future__ import annotations
 
 import math
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from rts.errors import InputError
 from rts.splatting import CONTINUED, LEAST_EPSILON, OFFSETS
-from rts.threads import parallel
+from rts.threads import parallel, read_only
 from rts_backends import fused_choices as choosing
 from rts_backends import fused_mixed as mixed
 from rts_backends import fused_stencil as stencil
@@ -88,7 +88,7 @@ class Splats:
         row = row[:1] if settings.kind == "single" else row
         if choices is None and row.size and row.max() >= len(positions):
             raise InputError(f"row refers to sample {row.max()} of {len(positions)}; expected indices below that")
-        self.positions, self.rgba, self.row = _frozen(positions), _frozen(rgba), _frozen(row, np.int32)
+        self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
         self.visible, self.border = settings.kind == "visible", settings.border
         scale = 1 / (2 * settings.sigma**2)
         peak = math.sqrt(1 + settings.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
@@ -180,7 +180,7 @@ class Splats:
             for x, wish in zip((self.positions, self.rgba), wanted, strict=True)
         )
         if self.row.size:
-            g = _frozen(g)
+            g = read_only(g)
             parallel(
                 stencil.pull,
                 height,
@@ -203,7 +203,7 @@ class Splats:
         out = np.empty((count, *self._size, 4), self.positions.dtype)
         if out.size:
             tangents = tuple(
-                _frozen(np.empty((count, 0, size), out.dtype) if t is None else t)
+                read_only(np.empty((count, 0, size), out.dtype) if t is None else t)
                 for t, size in ((t_positions, 3), (t_rgba, 4))
             )
             parallel(
@@ -222,21 +222,29 @@ class Splats:
         own = np.full(self.row.shape, -1, np.int32)
         own[covered] = np.arange(len(index), dtype=np.int32)
         copy = object.__new__(Splats)
-        copy.__dict__.update(self.__dict__, choices=self.choices._replace(repeated=False), row=_frozen(own))
-        copy.positions, copy.rgba = _frozen(self.positions[index]), _frozen(self.rgba[index])
+        copy.__dict__.update(self.__dict__, choices=self.choices._replace(repeated=False), row=read_only(own))
+        copy.positions, copy.rgba = read_only(self.positions[index]), read_only(self.rgba[index])
         g_positions, g_rgba = copy.vjp(g, wanted)
         return _collected(g_positions, index, self.positions), _collected(g_rgba, index, self.rgba)
 
 
+@lru_cache
 def _reach(settings: Settings) -> float:
     """How far, in pixels along x and y, samples may lie off their cells' centres while weights surely sum up to one."""
     if settings.epsilon < LEAST_EPSILON:
         return -1.0
-    scale = 1 / (2 * settings.sigma**2)
-    side = math.exp(-scale)
-    # What the sum of the weights, 1 + ε at the centres, loses to first order if each goes the worst way; and a tenth.
-    loss = 2 * (1 + settings.epsilon) * 2 * side / (1 + 2 * side) * 2 * scale * settings.gamma
-    return settings.epsilon / (1.1 * loss)
+    scale, low, high = 1 / (2 * settings.sigma**2), 0.0, 1.0
+    full = 1 + 2 * math.exp(-scale)
+
+    def least(off: float) -> float:
+        off = settings.gamma * off  # All go the worst way.
+        side = (math.exp(-(off**2) * scale) + 2 * math.exp(-((1 + off) ** 2) * scale)) / full
+        return (1 + settings.epsilon) * side**2
+
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if least(middle) >= 1 else (low, middle)
+    return 0.9 * low  # Weights are rounded.
 
 
 def _collected(values: np.ndarray | None, index: np.ndarray, like: np.ndarray) -> np.ndarray | None:
@@ -246,10 +254,3 @@ def _collected(values: np.ndarray | None, index: np.ndarray, like: np.ndarray) -
     total = np.zeros_like(like)
     np.add.at(total, index, values)
     return total
-
-
-def _frozen(x: np.ndarray, dtype: type | None = None) -> np.ndarray:
-    """A contiguous view, copied only if it has to be; always read-only, so that kernels are compiled but once."""
-    view = np.ascontiguousarray(x, dtype).view()
-    view.flags.writeable = False
-    return view

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from rts.protocols import Array, ArraySpec, Engine
-from rts.threads import parallel
+from rts.threads import parallel, read_only
 from rts_backends.fused_kernels import Settings, Splats
 from rts_backends.fused_mixed import changes_of
 from rts_backends.fused_rows import (
@@ -90,8 +90,8 @@ def normal_equations(
     count, dtype = len(t_positions), splats.positions.dtype
     if t_rgba is None or not _any(t_rgba):
         t_rgba = np.empty((count, 0, 4), dtype)
-    tangents = _frozen(t_positions, dtype), _frozen(t_rgba, dtype)
-    fields = (_frozen(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
+    tangents = read_only(t_positions, dtype), read_only(t_rgba, dtype)
+    fields = (read_only(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
     bands = -(-len(target) // BAND)
     sums = np.zeros((bands, count + 1, count + 1))
     given = splats.plain_arguments, splats.row, splats.choices[:6], tangents, tuple(fields), splats.border
@@ -104,13 +104,6 @@ def normal_equations(
 def _any(tangents: np.ndarray) -> bool:
     """Whether any is not zero; those of what does not depend on the unknowns may be one array that is repeated."""
     return bool((tangents[:1] if tangents.strides[0] == 0 else tangents).any())
-
-
-def _frozen(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """A contiguous read-only view, or a copy."""
-    view = np.ascontiguousarray(x, dtype).view()
-    view.flags.writeable = False
-    return view
 
 
 @kernel

@@ -11,10 +11,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch._C._functorch import is_legacy_batchedtensor
 
 from rts_backends.fused_kernels import Choices, Settings, Splats
-from rts_backends.torch_functions import along, applied
+from rts_backends.torch_functions import along, applied, foreign
 
 
 def fits(*tensors: Tensor) -> bool:
@@ -75,11 +74,6 @@ class _Work:
         return push
 
 
-def _foreign(t: Tensor | None) -> bool:
-    """Whether this is a batch of `torch.autograd.grad(..., is_grads_batched=True)`, which no function can look into."""
-    return t is not None and is_legacy_batchedtensor(t)
-
-
 def _items(info: Any, in_dims: Sequence, args: Sequence) -> list[tuple]:
     """Arguments of each item of a batch."""
     return [
@@ -105,7 +99,7 @@ class _Image(torch.autograd.Function):
     def backward(ctx, *gradients):
         (g,) = gradients
         wanted = ctx.needs_input_grad[1:3]
-        if _foreign(g):
+        if foreign(g):
             positions, rgba, row = ctx.saved_tensors
             found = ctx.work.pulled(row, wanted)(positions, rgba, g)
         else:
@@ -115,7 +109,7 @@ class _Image(torch.autograd.Function):
     @staticmethod
     def jvp(ctx, *given):
         _, t_positions, t_rgba, _ = given
-        if _foreign(t_positions) or _foreign(t_rgba):
+        if foreign(t_positions) or foreign(t_rgba):
             *primals, row = ctx.saved_tensors
             return along(lambda p, c: ctx.work.specification(p, c, row), primals, (t_positions, t_rgba))
         t_positions, t_rgba = (None if t is None else t[None] for t in (t_positions, t_rgba))

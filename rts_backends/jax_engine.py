@@ -76,7 +76,7 @@ class JaxEngine:
             except RtsError as error:
                 self._error = error
                 raise
-            return [*found, np.int32(len(found[packed[0]]) if packed else 0)]
+            return [*found, np.int32(max((len(found[i]) for i in packed), default=0))]
 
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
         *results, used = jax_host.call(noticed, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args)
@@ -127,6 +127,12 @@ class JaxEngine:
             return None
         used = self._used_of(ids)
         return self._note(jax_samples.interpolate(rows, weights.astype(dtype), ids, used, column), used)
+
+    def fill_unused(self, x: jax.Array, row: jax.Array) -> jax.Array:
+        """As part of what reads it; ones where no cell refers to any row."""
+        used = jnp.max(row) + 1
+        index = jnp.arange(x.shape[0]).reshape(-1, *[1] * (x.ndim - 1))
+        return jnp.where(index < used, x, jnp.where(used > 0, x[:1], 1))
 
     def segment_sum(self, values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:
         """Sums of the rows of `values` that share a segment."""

@@ -145,6 +145,14 @@ class TorchEngine:
             return torch_rows.take(rows, index)
         return torch.index_select(rows, 0, index)
 
+    def fill_unused(self, x: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
+        """`x` itself, save under `torch.vmap`, whose items have as many rows as the largest."""
+        if torch._C._functorch.maybe_current_level() is None:
+            return x
+        used = row.max() + 1
+        index = torch.arange(x.shape[0], device=x.device).reshape(-1, *[1] * (x.ndim - 1))
+        return torch.where(index < used, x, torch.where(used > 0, x[:1], torch.ones_like(x[:1])))
+
     def segment_sum(self, values: torch.Tensor, segments: np.ndarray, count: int) -> torch.Tensor:
         """Sums of the rows of `values` that share a segment."""
         index = _tensor(segments, values.device)

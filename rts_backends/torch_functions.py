@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch._C._functorch import is_legacy_batchedtensor
 from torch._functorch.utils import unwrap_dead_wrappers
 from torch.autograd import forward_ad
 from torch.utils import _pytree
@@ -28,6 +29,11 @@ def transformed() -> bool:
     if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
         return True
     return torch._C._functorch.maybe_current_level() is not None
+
+
+def foreign(*tensors: Tensor | None) -> bool:
+    """Whether any is a batch of `torch.autograd.grad(..., is_grads_batched=True)`, which no function can look into."""
+    return any(t is not None and is_legacy_batchedtensor(t) for t in tensors)
 
 
 def filled(primals: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> tuple[Tensor, ...]:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from rts_backends import projection_kernels
-from rts_backends.torch_functions import along, applied
+from rts_backends.torch_functions import along, applied, foreign
 
 
 def specification(rows: Tensor, points: Tensor) -> Tensor:
@@ -54,11 +54,17 @@ class _Project(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *gradients):
-        found = applied(_Pull, *ctx.saved_tensors, gradients[0], ctx.needs_input_grad[1])
-        return found[0], found[1] if ctx.needs_input_grad[1] else None
+        wanted = ctx.needs_input_grad[1]
+        if foreign(*gradients):
+            found = _pulled(wanted)(*ctx.saved_tensors, gradients[0])
+        else:
+            found = applied(_Pull, *ctx.saved_tensors, gradients[0], wanted)
+        return found[0], found[1] if wanted else None
 
     @staticmethod
     def jvp(ctx, *tangents):
+        if foreign(*tangents):
+            return along(specification, ctx.saved_tensors, tangents)
         t_rows, t_points = (None if t is None else t[None] for t in tangents)
         return applied(_Push, *ctx.saved_tensors, t_rows, t_points)[0]
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from rts.transforms import rigid_by_arrays
-from rts_backends.torch_functions import along, applied, filled, transformed
+from rts_backends.torch_functions import along, applied, filled, foreign, transformed
 
 SMALL = 1e-2
 """Squared angles below which series are exact to rounding."""
@@ -60,6 +60,8 @@ class _Turn(torch.autograd.Function):
 
     @staticmethod
     def jvp(ctx, *tangents):
+        if foreign(*tangents):
+            return along(rigid_by_arrays, ctx.saved_tensors, tangents)
         # A function, since what is computed here carries no derivative of a forward mode around this one.
         joined = torch.cat(filled(ctx.saved_tensors, tangents))
         return applied(_Push, *ctx.saved_tensors, joined[None])[0]

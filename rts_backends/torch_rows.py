@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rts_backends.torch_functions import applied
+from rts_backends.torch_functions import applied, foreign
 
 
 def take(rows: Tensor, index: Tensor) -> Tensor:
@@ -37,7 +37,11 @@ class _Take(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, *gradients):
-        return applied(_Add, gradients[0], ctx.saved_tensors[0], ctx.count), None
+        (g,), (index,) = gradients, ctx.saved_tensors
+        if foreign(g):
+            rows = g.new_zeros((ctx.count, g.shape[1]))
+            return torch.func.vjp(lambda r: torch.index_select(r, 0, index), rows)[1](g)[0], None
+        return applied(_Add, g, index, ctx.count), None
 
     @staticmethod
     def jvp(ctx, *tangents):

@@ -12,7 +12,7 @@ from helpers import DIFFERENTIABLE, arrays, gradient, to_numpy
 import rts
 from rts import splatting
 from rts_backends import fused
-from rts_backends.fused_kernels import Settings, Splats
+from rts_backends.fused_kernels import Settings, Splats, _reach
 from rts_backends.fused_survey import BUSY, EMPTY, FLAT
 
 torch = pytest.importorskip("torch")
@@ -175,6 +175,15 @@ def test_amid_one_colour_nothing_is_computed_for_positions():
     # Weights of samples far off the centres may add up to less than one; those of no ε may, too.
     assert not (compiled(fused.Visible(), discs(off=0.01)).choices.states == FLAT).any()
     assert not (compiled(fused.Visible(epsilon=0.0), scene).choices.states == FLAT).any()
+    for sigma in (1.0, 3.0, 10.0):
+        # Off by as much as goes for flat, all in the worst way for one target, weights still add up to one.
+        splatter = fused.Visible(sigma=sigma, epsilon=0.05, calibration=1.0)
+        reach = 0.999 * _reach(Settings("visible", sigma, 0.05, 1.0))
+        y, x = np.indices((3, 3)) - 1.0
+        places = np.stack([x, y], axis=-1).reshape(-1, 2) * (1 + reach) + 1.5
+        ninefold = np.concatenate([places, np.ones((9, 1))], axis=1), np.ones((9, 4)), np.arange(9).reshape(1, 3, 3)
+        assert compiled(splatter, ninefold).choices.states[1, 1] == FLAT and reach > 0.01
+        assert specification(splatter).splat(*ninefold)[1, 1, 3] == 1
     # NaN is no colour.
     positions, rgba, row = scene
     broken = np.where(np.arange(len(rgba))[:, None] == row[0, 30, 40], np.nan, rgba)

@@ -214,6 +214,27 @@ def test_a_jitted_render_has_the_gradients_of_an_eager_one():
         close(x, constant(y))
 
 
+@pytest.mark.parametrize("constant", [True, False])
+def test_a_shader_may_divide_by_what_it_reads(constant):
+    # Rows that are allotted but not used hold what makes no NaN of a zero gradient.
+    vertices, faces = icosphere(1)
+    vertices = np.asarray(vertices, np.float32) if constant else jnp.asarray(vertices, jnp.float32)
+
+    def shader(theta, gbuffer, camera):
+        normal = gbuffer["normal"] / jnp.linalg.norm(gbuffer["normal"], axis=1, keepdims=True)
+        color = normal @ theta["w"] / jnp.linalg.norm(gbuffer["position"], axis=1, keepdims=True)
+        return jnp.concatenate([color, jnp.ones_like(color[:, :1])], axis=1)
+
+    def loss(w):
+        part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {"vertices": vertices, "w": w}, shader)
+        return rts.render(part, rts.Camera.look_at((0, 0, 4), (0, 0, 0)), (24, 24)).sum()
+
+    gradient = jax.grad(loss)
+    eager = gradient(jnp.ones((3, 3)))
+    assert np.isfinite(eager).all() and np.abs(eager).max() > 1
+    close(jax.jit(gradient)(jnp.ones((3, 3))), eager)
+
+
 # ---------------------------------------------------------------------------------------------------------- robustness
 
 

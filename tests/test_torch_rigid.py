@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import rts
+from rts.arrays import projective_map, take
 from rts.transforms import rigid_by_arrays
 
 torch = pytest.importorskip("torch")
@@ -84,3 +85,18 @@ def test_batches_of_derivatives():
             torch.func.vmap(derivative(lambda p, f=f: f(p, center)))(poses) for f in (rts.rigid, rigid_by_arrays)
         )
         torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("strategy", ["reverse-mode", "forward-mode"])
+def test_the_older_batches_of_torch_are_known(strategy):
+    rng = np.random.default_rng(0)
+    rows, points = (torch.tensor(rng.normal(size=shape)) for shape in ((4, 4), (7, 3)))
+    index = torch.tensor([1, 2, 2])
+    functions = {
+        "rigid": (rts.rigid, torch.tensor(POSES["above it"], dtype=torch.float64)),
+        "projective_map": (lambda p: projective_map(rows, p), points),
+        "take": (lambda p: take(p, index), points),
+    }
+    for f, x in functions.values():
+        found = torch.autograd.functional.jacobian(f, x, vectorize=True, strategy=strategy)
+        torch.testing.assert_close(found, torch.func.jacrev(f)(x))
