@@ -74,6 +74,7 @@ class _Helpers:
             job = self._jobs.get()
             if job.claim():
                 job.run()
+            del job  # What waits is to hold no arrays.
 
 
 _helpers = _Helpers()
@@ -140,7 +141,9 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
     finally:
         # Whatever happens, none is to be left that writes to arrays which the caller may give away.
         for job in jobs:
-            if not job.claim():
+            if job.claim():
+                job.work = None
+            else:
                 job.wait()
     for job in jobs:
         if job.error is not None:
