@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from rts.errors import EngineError, InputError
 from rts.protocols import Array, Engine, Tree
 from rts.records import STATIC_FIELDS, join_record, split_record
 
+_F = TypeVar("_F", bound=Callable)
 CONSTANT_TYPES = (np.ndarray, np.generic, bool, int, float)
 
 
@@ -137,6 +139,26 @@ def engine_of(*trees: Tree) -> Engine:
             f"(NumPy arrays may stand beside either, as constants)"
         )
     return next(iter(found.values())) if found else _engine("numpy")
+
+
+def uncompiled(f: _F) -> _F:
+    """`f`, which what compiles Python code, as `torch.compile` does, is to call and not to look into.
+
+    Such a compiler would follow it through checks, caches and plugins, for most of a minute, and sees little of the
+    work, which is compiled already.
+    """
+
+    @functools.wraps(f)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        from rts.registry import plugins
+
+        for name in plugins("rts.engines"):
+            outside = getattr(_engine(name), "uncompiled", None) if name in sys.modules else None
+            if outside is not None:
+                return outside(f)(*args, **kwargs)
+        return f(*args, **kwargs)
+
+    return call  # pyright: ignore[reportReturnType]
 
 
 def is_traced(x: Array) -> bool:

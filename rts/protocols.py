@@ -319,7 +319,8 @@ class Engine(Protocol):
     of `rts.arrays` and `rts.transforms` in full precision but faster, `matmul(a, b)`, `rigid(pose, center)`,
     `affine_map(rows, points)`, `take(rows, index)`, `interpolate(rows, ids, column, weights)` and
     `projective_map(rows, points)`, which may give None for arrays that they do not know. And `fill_unused(x, row)`, for
-    engines that allot more rows than are used: x (N, ·) with its first row for those that no cell of `row` names.
+    engines that allot more rows than are used: x (N, ·) with its first row for those that no cell of `row` names. And
+    `uncompiled(f)`, for engines whose compiler looks into Python code: `f`, which it is to call as it is.
 
     The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the
     user has imported that module.

@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from rts.arrays import affine_map, constants, engine_of, exemplar, is_constant, is_traced, namespace
+from rts.arrays import affine_map, constants, engine_of, exemplar, is_constant, is_traced, namespace, uncompiled
 from rts.camera import Camera
 from rts.checks import (
     check_background,
@@ -37,6 +37,7 @@ BAND = 2**20
 """Cells, over all layers, that a supersampled image may have before it is rendered in bands of rows."""
 
 
+@uncompiled
 def render(
     parts: Part | Sequence[Part] | PreparedParts,
     camera: Camera,
@@ -92,6 +93,7 @@ def render(
     return image if background is None else _over_background(image, background)
 
 
+@uncompiled
 def sample(
     parts: Part | Sequence[Part] | PreparedParts,
     camera: Camera,
@@ -178,6 +180,7 @@ def _sampled(
     return replace(sampled, supersample=supersample)
 
 
+@uncompiled
 def render_samples(
     sampled: Sampled,
     parts: Part | Sequence[Part],

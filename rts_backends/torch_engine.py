@@ -104,6 +104,10 @@ class TorchEngine:
             return torch.compiler.disable(applied)(_HostCall, fn, specs, *args)
         return applied(_HostCall, fn, specs, *args)
 
+    def uncompiled(self, f: Callable) -> Callable:
+        """`f` itself, called and not traced where `torch.compile` meets it."""
+        return torch.compiler.disable(f) if torch.compiler.is_compiling() else f
+
     def stop_gradient(self, x: torch.Tensor) -> torch.Tensor:
         """`x` detached."""
         return x.detach()
