@@ -163,7 +163,6 @@ class Sampled:
 
     Attributes:
         samples: one `Samples` a part.
-        part: (K, H, W) int32, the part seen in each cell, or −1.
         row: (K, H, W) int32, the sample in each cell, counted over all parts in order, or −1.
         depth: (K, H, W) float32, linear camera depth; 0 where empty.
         overflow: () int32, samples dropped for want of capacity, or beyond the limit of `layers="auto"`. Should be 0.
@@ -171,11 +170,22 @@ class Sampled:
     """
 
     samples: tuple[Samples, ...]
-    part: Array
     row: Array
     depth: Array
     overflow: Array
     supersample: int = 1
+
+    @property
+    def part(self) -> Array:
+        """(K, H, W) int32, the part seen in each cell, or −1."""
+        from rts.arrays import namespace
+
+        xp, first = namespace(self.row), 0
+        part = xp.astype(self.row >= 0, self.row.dtype) - 1
+        for samples in self.samples[:-1]:
+            first += samples.ids.shape[0]
+            part = part + xp.astype(self.row >= first, self.row.dtype)
+        return part
 
 
 # ------------------------------------------------------------------------------------------------ protocols

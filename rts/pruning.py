@@ -93,9 +93,9 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: Needed | None) ->
             f"{missing} cells where surfaces hide one another have more than the {LAYER_LIMIT} layers of "
             f'layers="auto"; give a larger number if their derivative matters',
             LayersWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
-    arrays = {name: getattr(sampled, name)[:kept, ...] for name in ("row", "part", "depth")}
+    arrays = {name: getattr(sampled, name)[:kept, ...] for name in ("row", "depth")}
     return replace(sampled, **arrays, overflow=sampled.overflow + missing)
 
 
@@ -125,19 +125,13 @@ def prune(sampled: Sampled, needed: Needed) -> Sampled:
     found = engine_of(sampled).call_host(host, (*shapes, *packed), rows[0], sampled.depth, *rows[1:])
     row, own_rows, indices = found[0], found[1 : len(rows)], found[len(rows) :]
     samples = [_selected(*z) for z in zip(sampled.samples, own_rows, indices, strict=True)]
-    xp = namespace(row)
+    xp, part = namespace(row), sampled.part
     # Row numbers are within parts up to here, since an engine may have padded what comes before.
     start = 0
     for i, index in enumerate(indices):
-        row = xp.where((row >= 0) & (sampled.part == i), row + start, row)
+        row = xp.where((row >= 0) & (part == i), row + start, row)
         start += index.shape[0]
-    return replace(
-        sampled,
-        samples=tuple(samples),
-        row=row,
-        part=xp.where(row >= 0, sampled.part, -1),
-        depth=xp.where(row >= 0, sampled.depth, 0.0),
-    )
+    return replace(sampled, samples=tuple(samples), row=row, depth=xp.where(row >= 0, sampled.depth, 0.0))
 
 
 def _selected(samples: Samples, row: Any, index: Any) -> Samples:

@@ -268,13 +268,12 @@ def _sample_rays(samples: Samples, camera: Camera, size: tuple[int, int]) -> Ray
 
 def merge(samples: Sequence[Samples], layers: int) -> Sampled:
     """Interleave the layers of several parts by depth and keep the nearest; equal depths go to the earlier part."""
-    xp = namespace(samples[0].row)
     overflow = samples[0].overflow
     for s in samples[1:]:
         overflow = overflow + s.overflow
     if len(samples) == 1:
         only = samples[0]
-        return Sampled(tuple(samples), xp.clip(only.row, -1, 0), only.row, only.depth, overflow)
+        return Sampled(tuple(samples), only.row, only.depth, overflow)
     given = *(s.row for s in samples), *(s.depth for s in samples)
     on_host, elsewhere = partial(_interleaved_on_the_host, layers), partial(_interleaved, layers)
     if is_traced(given[0]):
@@ -282,11 +281,11 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
     else:
         on_cpu = "cpu" in str(array_api_compat.device(given[0])).lower()
         part, row, depth = on_host(*given) if on_cpu else elsewhere(*given)
-    start = 0
+    xp, start = namespace(row), 0
     for i, s in enumerate(samples):
         row = xp.where(part == i, row + start, row) if start else row
         start += s.ids.shape[0]
-    return Sampled(tuple(samples), part, row, depth, overflow)
+    return Sampled(tuple(samples), row, depth, overflow)
 
 
 def _interleaved(layers: int, *given: Array) -> tuple[Array, ...]:
