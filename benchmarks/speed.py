@@ -30,13 +30,13 @@ from speed_tasks import ENGINES, MESHES, MODES, ROUNDS, WARM_UP, Task, in_turn, 
 
 from rts.threads import thread_count
 
-QUICK_MESHES, QUICK_SIZES, QUICK_ROUNDS = ("teapot", "bunny"), (256,), 5
+QUICK_MESHES, QUICK_SIZES, QUICK_ROUNDS = ("teapot", "bunny"), (256,), 3
 SPLATTED, PRUNED, STAGED = ("bunny",), ("bunny", "nefertiti"), ("teapot", "bunny", "nefertiti")
 MEASURED = ("teapot", "bunny", "spot", "nefertiti")
 """Meshes of the sections that do not take all."""
 LAYERS = (1, 2, 4)
 BUDGET = 30.0
-"""Seconds of timed turns after which a method has had enough, of five at least."""
+"""Seconds of timed calls after which a method has had enough turns."""
 NAMES = {"pose": "RtS-pose", "full": "full RtS", "full, both": "full RtS, both"}
 
 
@@ -45,10 +45,8 @@ def iterations(task: Task, args: argparse.Namespace) -> dict[str, Callable[[], o
     found = {}
     for mode in MODES:
         for engine, make in ENGINES.items():
-            for sampler in ("auto", "raster", "embree") if mode == "pose" else ("auto",):
+            for sampler in ("auto", "embree") if mode == "pose" else ("auto",):
                 found[f"{NAMES[mode]}, {engine}, {sampler}"] = make(task, mode, sampler)
-        if mode != MODES[-1]:
-            found[f"{NAMES[mode]}, jax, auto, quarter of the rows"] = ENGINES["jax"](task.limited(), mode)
     if args.peers:
         import speed_peers
 
@@ -141,7 +139,7 @@ def options() -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", choices=tables.SECTIONS, default=list(tables.SECTIONS))
     parser.add_argument("--meshes", nargs="+", choices=MESHES, default=None)
     parser.add_argument("--sizes", nargs="+", type=int, default=None, help="sides of the image, default 256 512")
-    parser.add_argument("--quick", action="store_true", help=f"{' and '.join(QUICK_MESHES)}, 256², five turns")
+    parser.add_argument("--quick", action="store_true", help=f"{' and '.join(QUICK_MESHES)}, 256², three turns")
     parser.add_argument("--no-peers", dest="peers", action="store_false", help="without DEODR and Mitsuba")
     parser.add_argument("--mitsuba", action="store_true", help="with Mitsuba, which takes most of the time")
     args = parser.parse_args()

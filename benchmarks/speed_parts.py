@@ -17,7 +17,7 @@ SPLATTERS = {"single": splatting.Single, "multi": splatting.Multi, "visible": sp
 """The specification of each registered name."""
 SHADERS, UNKNOWNS = ("silhouette", "lambert"), (6, 12)
 BUDGET = 2.0
-"""Seconds of timed turns after which a splatter has had enough, of five at least."""
+"""Seconds of timed calls after which a splatter has had enough turns."""
 
 
 # ----------------------------------------------------------------------------------------------------------- splatters

@@ -7,6 +7,7 @@ from itertools import groupby
 from pathlib import Path
 
 from speed_stages import STAGES
+from speed_tasks import CONSECUTIVE
 
 OURS = "RtS-pose, torch, auto"
 FULL = "full RtS, torch, auto"
@@ -77,9 +78,9 @@ def pose(rows: list[dict]) -> str:
 
 
 def cell(row: dict, method: str) -> str:
-    """Median and quartiles; the number of turns where it had not all of them."""
-    found, most = row["times"][method], max(t["turns"] for t in row["times"].values())
-    fewer = f", {found['turns']} turns" if found["turns"] < most else ""
+    """Median and quartiles; the number of calls where it had not all of them."""
+    found, most = row["times"][method], max(t["calls"] for t in row["times"].values())
+    fewer = f", {found['calls']} calls" if found["calls"] < most else ""
     return f"{number(found['ms'])} ({number(found['low'])}–{number(found['high'])}{fewer})"
 
 
@@ -149,10 +150,10 @@ SECTIONS = {
     "pose": (
         "Pose iteration",
         "One iteration: render, loss, gradient, step of Adam. Medians with quartiles, all methods in turn in one run, "
-        "by faces. *RtS-pose*: vertices constant. *Full RtS*: gradient of pose and vertices, a step in the pose; "
-        "*both*: a step in both. *Quarter of the rows*: jax is told by `capacity` to allot so many, not one for every "
-        "cell of every layer. DEODR draws one channel of front faces on one thread, by its own classes, which always "
-        "give the gradient of the vertices, or called at its compiled functions; the others use all cores.",
+        f"{CONSECUTIVE} iterations after one that is not timed, by faces. *RtS-pose*: vertices constant. *Full RtS*: "
+        "gradient of pose and vertices, a step in the pose; *both*: a step in both. DEODR draws one channel of front "
+        "faces on one thread, by its own classes, which always give the gradient of the vertices, or called at its "
+        "compiled functions; the others use all cores.",
         pose,
     ),
     "stages": (

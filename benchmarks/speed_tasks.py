@@ -38,7 +38,9 @@ RATE, VERTEX_RATE = 0.01, 1e-5
 MODES = ("pose", "full", "full, both")
 """Gradient of the pose, vertices constant; of pose and vertices, a step in the pose; the same, a step in both."""
 
-WARM_UP, ROUNDS = 2, 15
+WARM_UP, ROUNDS = 2, 7
+CONSECUTIVE = 3
+"""Calls timed in a turn, after one that is not: in a loop a method finds its own data in the caches, not others'."""
 
 
 def subdivided(name: str, folder: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -91,7 +93,6 @@ class Task:
     ):
         self.name, self.vertices, self.faces, self.side = name, vertices, faces, side
         self.layers, self.splatter = layers, splatter
-        self.capacity: int | None = None
         self.size, self.view = (side, side), camera()
         self.part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {"vertices": vertices}, shader)
         self.channels = slice(3, 4) if shader == "silhouette" else slice(0, 4)
@@ -108,18 +109,6 @@ class Task:
         other.target = other._target()
         return other
 
-    def limited(self) -> Task:
-        """The same with rows for a quarter of all cells, which must do for the samples of the start."""
-        other = copy.copy(self)
-        other.capacity = self.layers * self.side**2 // 4
-        part = self.posed(np.array(START, np.float32))
-        sampled = rts.sample(
-            part, self.view, self.size, splatter=self.splatter, layers=self.layers, capacity=other.capacity
-        )
-        if int(sampled.overflow):
-            raise ValueError(f"{self.name} has {sampled.overflow} samples beyond {other.capacity}")
-        return other
-
     def posed(self, pose: Any, vertices: Any = None) -> rts.Part:
         """The part at a pose (6,); its vertices replaced if others are given."""
         part = self.part.replace(transform=rts.rigid(pose))
@@ -128,15 +117,7 @@ class Task:
     def loss(self, pose: Any, vertices: Any, target: Any, sampler: str) -> Any:
         """Mean squared difference."""
         parts = self.posed(pose, vertices)
-        image = rts.render(
-            parts,
-            self.view,
-            self.size,
-            sampler=sampler,
-            splatter=self.splatter,
-            layers=self.layers,
-            capacity=self.capacity,
-        )
+        image = rts.render(parts, self.view, self.size, sampler=sampler, splatter=self.splatter, layers=self.layers)
         difference = image[..., self.channels] - target
         return (difference * difference).mean()
 
@@ -221,7 +202,7 @@ ENGINES = {"torch": torch_iteration, "jax": jax_iteration}
 def milliseconds(times: list[float]) -> dict:
     """Median and quartiles, of some times in seconds."""
     low, _, high = statistics.quantiles(times, n=4, method="inclusive") if len(times) > 1 else times * 3
-    return {"ms": 1e3 * statistics.median(times), "low": 1e3 * low, "high": 1e3 * high, "turns": len(times)}
+    return {"ms": 1e3 * statistics.median(times), "low": 1e3 * low, "high": 1e3 * high, "calls": len(times)}
 
 
 def in_turn(
@@ -230,26 +211,29 @@ def in_turn(
     done: Callable[[], None] = lambda: None,
     budget: float = float("inf"),
 ) -> dict[str, dict]:
-    """Times of each function, one call each in turn, after two calls to warm up.
+    """Times of each function, a few consecutive calls each in turn, after two turns to warm up.
 
-    The turns are shuffled every round, since what ran before decides what is in the caches.
+    The turns are shuffled every round, so that noise of the machine hits all alike.
 
     Args:
         functions: by name.
-        rounds: calls to time of each.
+        rounds: turns of each.
         done: called after each round.
-        budget: seconds after which a function, once timed five times, has no more turns.
+        budget: seconds after which a function, once it had two turns, has no more.
     """
     times: dict[str, list[float]] = {name: [] for name in functions}
     order, shuffle = list(functions), random.Random(0).shuffle
     for n in range(rounds + WARM_UP):
         shuffle(order)
         for name in order:
-            if len(times[name]) >= 5 and sum(times[name]) > budget:
+            if len(times[name]) >= 2 * CONSECUTIVE and sum(times[name]) > budget:
                 continue
-            start = time.perf_counter()
             functions[name]()
-            if n >= WARM_UP:
+            if n < WARM_UP:
+                continue
+            for _ in range(CONSECUTIVE):
+                start = time.perf_counter()
+                functions[name]()
                 times[name].append(time.perf_counter() - start)
         done()
     return {name: milliseconds(t) for name, t in times.items()}
