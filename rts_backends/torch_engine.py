@@ -44,6 +44,14 @@ def _exact(a: torch.Tensor, b: torch.Tensor) -> bool:
     return a.device.type == "cpu" and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
 
 
+def _compiled(*tensors: torch.Tensor) -> bool:
+    """Whether compiled code knows them: on the CPU, all of one dtype, single or double."""
+    return all(t.device.type == "cpu" for t in tensors) and {t.dtype for t in tensors} in (
+        {torch.float32},
+        {torch.float64},
+    )
+
+
 class _HostCall(torch.autograd.Function):
     """A host function without derivative, transparent to every torch transform."""
 
@@ -118,9 +126,7 @@ class TorchEngine:
 
     def rigid(self, pose: torch.Tensor, center: torch.Tensor) -> torch.Tensor | None:
         """By compiled code on the CPU."""
-        dtypes = {pose.dtype, center.dtype}
-        known = pose.device.type == "cpu" and dtypes in ({torch.float32}, {torch.float64})
-        if not known or torch.compiler.is_compiling():
+        if not _compiled(pose, center) or torch.compiler.is_compiling():
             return None
         from rts_backends import torch_rigid
 
@@ -134,16 +140,25 @@ class TorchEngine:
 
     def projective_map(self, rows: torch.Tensor, points: torch.Tensor) -> torch.Tensor | None:
         """By compiled code on the CPU; else None."""
-        dtypes = {rows.dtype, points.dtype}
-        if points.device.type != "cpu" or dtypes not in ({torch.float32}, {torch.float64}):
+        if not _compiled(rows, points):
             return None
-        from rts_backends import torch_projection
+        from rts_backends import torch_samples
 
-        return torch_projection.project(rows, points)
+        return torch_samples.project(rows, points)
+
+    def interpolate(
+        self, rows: torch.Tensor, ids: torch.Tensor, column: int, weights: torch.Tensor
+    ) -> torch.Tensor | None:
+        """By compiled code on the CPU; else None."""
+        if not _compiled(rows, weights):
+            return None
+        from rts_backends import torch_samples
+
+        return torch_samples.interpolate(rows, ids, column, weights)
 
     def take(self, rows: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
         """By compiled code on the CPU."""
-        if rows.device.type == "cpu" and rows.dtype in (torch.float32, torch.float64) and rows.ndim == 2:
+        if _compiled(rows) and rows.ndim == 2:
             from rts_backends import torch_rows
 
             return torch_rows.take(rows, index)

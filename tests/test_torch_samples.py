@@ -1,0 +1,147 @@
+"""Compiled projection and interpolation in torch: the same as in plain torch, in every transform."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+import rts  # noqa: E402
+from rts.arrays import interpolate, projective_map  # noqa: E402
+from rts_backends.torch_samples import specified_projection  # noqa: E402
+
+ROWS, COLUMN = 6, 2
+
+
+def maps(*batch, dtype=torch.float64, count=7):
+    rng = np.random.default_rng(0)
+    rows = rng.normal(size=(*batch, 4, 4))
+    rows[..., 2, 3] += 6
+    return torch.tensor(rows, dtype=dtype), torch.tensor(rng.normal(size=(*batch, count, 3)), dtype=dtype)
+
+
+def corners(*batch, dtype=torch.float64, count=7):
+    rng = np.random.default_rng(0)
+    sizes = (*batch, ROWS, 3), (*batch, count, 2)
+    return tuple(torch.tensor(rng.normal(size=size), dtype=dtype) for size in sizes)
+
+
+def ids(count):
+    return torch.tensor(np.random.default_rng(2).integers(0, ROWS, (count, COLUMN + 4)), dtype=torch.int32)
+
+
+def interpolated(rows, weights):
+    return interpolate(rows, ids(weights.shape[-2]), COLUMN, weights)
+
+
+def plainly_interpolated(rows, weights):
+    a, b, c = (rows[ids(weights.shape[-2])[:, COLUMN + i].long()] for i in range(3))
+    return c + weights[:, :1] * (a - c) + weights[:, 1:] * (b - c)
+
+
+@pytest.fixture(params=["projection", "interpolation"])
+def case(request):
+    """The compiled function, the same in plain torch, and what gives arguments."""
+    if request.param == "projection":
+        return projective_map, specified_projection, maps
+    return interpolated, plainly_interpolated, corners
+
+
+def weighted(f):
+    weights = torch.tensor(np.random.default_rng(1).normal(size=(7, 3)))
+    return lambda first, second: (f(first, second) ** 2 * weights).sum()
+
+
+@pytest.mark.parametrize("dtype, tolerance", [(torch.float32, 1e-5), (torch.float64, 1e-12)])
+def test_values_and_gradients_of_many(case, dtype, tolerance):
+    f, plain, given = case
+    args = given(dtype=dtype, count=20000)
+    torch.testing.assert_close(f(*args), plain(*args), rtol=tolerance, atol=tolerance)
+    weights = torch.rand(20000, 3, dtype=dtype)
+    found, expected = (torch.func.grad(lambda a, b, f=f: (f(a, b) * weights).sum(), (0, 1))(*args) for f in (f, plain))
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=100 * tolerance, atol=100 * tolerance * float(b.abs().max()))
+
+
+def test_both_modes_and_second_derivatives_by_finite_differences(case):
+    f, _, given = case
+    first, second = (x.requires_grad_(True) for x in given())
+    assert torch.autograd.gradcheck(f, (first, second), check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(f, (first, second))
+    for of_one, x in ((lambda a: f(a, second.detach()), first), (lambda b: f(first.detach(), b), second)):
+        assert torch.autograd.gradcheck(of_one, x, check_forward_ad=True, check_batched_forward_grad=True)
+        assert torch.autograd.gradgradcheck(of_one, x)
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        torch.func.grad,
+        torch.func.hessian,
+        lambda f: torch.func.jacfwd(torch.func.grad(f)),
+        lambda f: torch.func.jacrev(torch.func.jacfwd(f)),
+        torch.func.jacfwd,
+        lambda f: torch.func.jacfwd(torch.func.jacfwd(f)),
+    ],
+    ids=["grad", "hessian", "jacfwd grad", "jacrev jacfwd", "jacfwd", "jacfwd jacfwd"],
+)
+def test_transforms_agree_with_plain_torch(case, transform):
+    *functions, given = case
+    first, second = given()
+    for of_one, at in ((lambda g: lambda a: g(a, second), first), (lambda g: lambda b: g(first, b), second)):
+        found, expected = (transform(of_one(weighted(g)))(at) for g in functions)
+        torch.testing.assert_close(found, expected)
+
+
+def test_batches(case):
+    *functions, given = case
+    first, second = given(3)
+    one = given()
+    for batch, dims in (((first, second), (0, 0)), ((first, one[1]), (0, None)), ((one[0], second), (None, 0))):
+        for of in (lambda f: f, lambda f: torch.func.grad(weighted(f), (0, 1))):
+            found, expected = (torch.vmap(of(f), dims)(*batch) for f in functions)
+            torch.testing.assert_close(found, expected)
+
+
+def test_the_older_batches_of_gradients(case):
+    *functions, given = case
+    args = [x.requires_grad_(True) for x in given()]
+    along = torch.rand(4, 7, 3, dtype=torch.float64)
+    found, expected = (torch.autograd.grad(f(*args), args, along, is_grads_batched=True) for f in functions)
+    torch.testing.assert_close(found, expected)
+
+
+def test_batches_of_ids():
+    rows, weights = corners()
+    batch = torch.stack([ids(7), ids(7).flip(0)])
+    found = torch.vmap(lambda i: torch.func.grad(lambda r: interpolate(r, i, COLUMN, weights).square().sum())(rows))(
+        batch
+    )
+    for one, i in zip(found, batch, strict=True):
+        expected = torch.func.grad(lambda r, i=i: interpolate(r, i, COLUMN, weights).square().sum())(rows)
+        torch.testing.assert_close(one, expected)
+
+
+def test_points_without_an_image_are_finite_with_finite_gradients():
+    rows, points = maps()
+    points[0] = 0
+    rows[2, 3] = 0
+    rows, points = rows.requires_grad_(True), points.requires_grad_(True)
+    out = projective_map(rows, points)
+    out.sum().backward()
+    assert out.isfinite().all() and rows.grad.isfinite().all() and points.grad.isfinite().all()
+
+
+def test_samples_of_another_mesh_are_one_clear_error():
+    rows, weights = corners()
+    with pytest.raises(rts.InputError, match="samples refer to row 5 of an array of 3; sample this surface anew"):
+        interpolate(rows[:3], torch.full((7, 5), 5), COLUMN, weights)
+
+
+def test_gradients_do_not_depend_on_the_number_of_threads(case, monkeypatch):
+    f, _, given = case
+    args = given(dtype=torch.float32, count=50000)
+    found = []
+    for threads in ("1", "2"):
+        monkeypatch.setenv("RTS_NUM_THREADS", threads)
+        found.append(torch.func.grad(lambda a, b: f(a, b).square().mean(), (0, 1))(*args))
+    assert all(map(torch.equal, *found))
