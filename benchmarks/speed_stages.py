@@ -9,7 +9,7 @@ from typing import Any
 from unittest import mock
 
 import numpy as np
-from speed_tasks import RATE, START, WARM_UP, Task
+from speed_tasks import CONSECUTIVE, RATE, START, WARM_UP, Task
 
 import rts
 import rts.sampling
@@ -132,7 +132,7 @@ def stages(task: Task, mode: str, sampler: str, rounds: int) -> dict[str, float]
             optimizer.step()
 
     with mock.patch.object(rts.sampling, "lift", clock.timed("lift", rts.sampling.lift)):
-        found = [_one(clock, iteration) for _ in range(rounds + WARM_UP)][WARM_UP:]
+        found = [_one(clock, iteration) for _ in range(rounds * CONSECUTIVE + WARM_UP)][WARM_UP:]
     medians = {name: 1e3 * float(np.median([f.get(name, 0.0) for f in found])) for name in (*STAGES, "total")}
     return {"prepare": prepare, **medians}
 

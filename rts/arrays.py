@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rts.errors import EngineError, InputError
+from rts.errors import EngineError, InputError, PluginError
 from rts.protocols import Array, Engine, Tree
 from rts.records import STATIC_FIELDS, join_record, split_record
 
@@ -97,6 +97,7 @@ def is_constant(tree: Tree) -> bool:
 _ENGINES: dict[str, Engine] = {}
 _OWNERS: dict[type, Engine] = {}
 _BITS: dict[Any, int] = {}
+_WRAPS: dict[str, Any] = {}
 
 
 def _engine(name: str) -> Engine:
@@ -141,6 +142,20 @@ def engine_of(*trees: Tree) -> Engine:
     return next(iter(found.values())) if found else _engine("numpy")
 
 
+def _compilers() -> list[Callable[[Callable], Callable]]:
+    """The members `uncompiled` of engines whose framework has been imported."""
+    from rts.registry import plugins
+
+    names = [name for name in plugins("rts.engines") if sys.modules.get(name) is not None]
+    for name in names:
+        if name not in _WRAPS:
+            try:
+                _WRAPS[name] = getattr(_engine(name), "uncompiled", None)
+            except PluginError:  # It is an error where arrays of this engine are given.
+                _WRAPS[name] = None
+    return [_WRAPS[name] for name in names if _WRAPS[name] is not None]
+
+
 def uncompiled(f: _F) -> _F:
     """`f`, which what compiles Python code, as `torch.compile` does, is to call and not to look into.
 
@@ -150,13 +165,10 @@ def uncompiled(f: _F) -> _F:
 
     @functools.wraps(f)
     def call(*args: Any, **kwargs: Any) -> Any:
-        from rts.registry import plugins
-
-        for name in plugins("rts.engines"):
-            outside = getattr(_engine(name), "uncompiled", None) if name in sys.modules else None
-            if outside is not None:
-                return outside(f)(*args, **kwargs)
-        return f(*args, **kwargs)
+        outside = f
+        for wrap in _compilers():
+            outside = wrap(outside)
+        return outside(*args, **kwargs)
 
     return call  # pyright: ignore[reportReturnType]
 
@@ -268,10 +280,19 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
         ids: (N, I) integers.
         column: the first of the three.
         weights: (N, W) float, the first two of which count.
+
+    Raises:
+        InputError: these are no samples of the surface that the rows belong to.
     """
+    if ids.shape[1] < column + 3 or weights.shape[1] < 2 or ids.shape[0] != weights.shape[0]:
+        raise InputError(
+            f"samples have ids of shape {tuple(ids.shape)} and parameters of shape {tuple(weights.shape)}; expected "
+            f"(N, {column + 3}) and (N, 2), or more columns: sample this surface anew"
+        )
     if isinstance(rows, np.ndarray) and isinstance(ids, np.ndarray):
         from rts import interpolation
 
+        interpolation.check(rows, ids, column)
         return interpolation.interpolate(rows, ids, column, weights)
     found = offered("interpolate", rows, ids, column, weights)
     if found is not None:

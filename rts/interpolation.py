@@ -9,7 +9,18 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from rts.errors import InputError
 from rts.threads import parallel, read_all
+
+
+def check(rows: np.ndarray, ids: np.ndarray, column: int) -> None:
+    """Raise an InputError where ids name no row."""
+    named = ids[:, column : column + 3]
+    if not named.size:
+        return
+    for index in (named.max(), named.min()):
+        if not 0 <= index < len(rows):
+            raise InputError(f"samples refer to row {index} of an array of {len(rows)}; sample this surface anew")
 
 
 def interpolate(

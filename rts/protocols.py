@@ -183,7 +183,7 @@ class Sampled:
         xp, first = namespace(self.row), 0
         part = xp.astype(self.row >= 0, self.row.dtype) - 1
         for samples in self.samples[:-1]:
-            first += samples.ids.shape[0]
+            first += samples.ids.shape[-2]
             part = part + xp.astype(self.row >= first, self.row.dtype)
         return part
 

@@ -23,6 +23,10 @@ LITTLE_WORK = 100_000
 """Nanoseconds, below which a loop stays on the thread that asks for it: to ask another takes tens of thousands."""
 
 
+def _nothing() -> None:
+    pass
+
+
 class _Job:
     """Work that a helper is asked to join in; whoever claims it first, helper or caller, decides whether it does."""
 
@@ -35,6 +39,13 @@ class _Job:
     def claim(self) -> bool:
         """True for the first who asks."""
         return self._unclaimed.acquire(blocking=False)
+
+    def withdraw(self) -> bool:
+        """Claim it so that nobody does it, and let go of what it would work on; False where it has been claimed."""
+        mine = self.claim()
+        if mine:
+            self.work = _nothing
+        return mine
 
     def run(self) -> None:
         """Do it, and say so."""
@@ -140,11 +151,9 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
         share()
     finally:
         # Whatever happens, none is to be left that writes to arrays which the caller may give away.
-        for job in jobs:
-            if job.claim():
-                job.work = None
-            else:
-                job.wait()
+        begun = [job for job in jobs if not job.withdraw()]
+        for job in begun:
+            job.wait()
     for job in jobs:
         if job.error is not None:
             raise job.error

@@ -150,6 +150,8 @@ class TorchEngine:
         self, rows: torch.Tensor, ids: torch.Tensor, column: int, weights: torch.Tensor
     ) -> torch.Tensor | None:
         """By compiled code on the CPU; else None."""
+        if rows.dtype == torch.float64:
+            weights = weights.to(rows.dtype)
         if not _compiled(rows, weights):
             return None
         from rts_backends import torch_samples

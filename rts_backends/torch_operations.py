@@ -25,6 +25,7 @@ class Operation(NamedTuple):
     Attributes:
         specification: the function in torch.
         value: the result of the operands.
+        shape: of the result, from the operands.
         push: (operands, tangents, out), to fill `out` with the tangent along those of the first two, or None for zeros.
         pull: (operands, gradient, results), to fill the results, zeros at first, with the gradients of the first two;
             None where not wanted.
@@ -32,6 +33,7 @@ class Operation(NamedTuple):
 
     specification: Callable[..., Tensor]
     value: Callable[[Arrays], np.ndarray]
+    shape: Callable[[Arrays], tuple[int, ...]]
     push: Callable[[Arrays, Some, np.ndarray], None]
     pull: Callable[[Arrays, np.ndarray, Some], None]
 
@@ -118,8 +120,7 @@ class _Push(torch.autograd.Function):
         count = sum(present)
         arrays, tangents = _on_host(given[:-count]), iter(_on_host(given[-count:]))
         some = [next(tangents) if there else None for there in present]
-        like = operation.value(arrays)
-        out = np.empty((len(given[-1]), *like.shape), like.dtype)
+        out = np.empty((len(given[-1]), *operation.shape(arrays)), arrays[0].dtype)
         for i, result in enumerate(out):
             operation.push(arrays, [None if t is None else t[i] for t in some], result)
         return torch.from_numpy(out)

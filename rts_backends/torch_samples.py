@@ -5,14 +5,11 @@ Written in torch they take a dozen passes over the samples, and twice as many ba
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 import torch
 from torch import Tensor
 
 from rts import interpolation
-from rts.errors import InputError
 from rts_backends import projection_kernels
 from rts_backends.torch_operations import Arrays, Operation, Some
 from rts_backends.torch_rows import take
@@ -25,7 +22,9 @@ def project(rows: Tensor, points: Tensor) -> Tensor:
 
 def interpolate(rows: Tensor, ids: Tensor, column: int, weights: Tensor) -> Tensor:
     """`rts.arrays.interpolate`."""
-    return _interpolation(column)(rows, weights, ids)
+    if column not in _INTERPOLATIONS:
+        _INTERPOLATIONS[column] = _interpolation(column)
+    return _INTERPOLATIONS[column](rows, weights, ids)
 
 
 def _project(operands: Arrays) -> np.ndarray:
@@ -51,19 +50,26 @@ def specified_projection(rows: Tensor, points: Tensor) -> Tensor:
     return torch.stack([x / safe, y / safe, z], dim=1)
 
 
-_PROJECTION = Operation(specified_projection, _project, _project_push, _project_pull)
+_PROJECTION = Operation(
+    specified_projection, _project, lambda operands: operands[1].shape, _project_push, _project_pull
+)
 
 
-@lru_cache
+_INTERPOLATIONS: dict[int, Operation] = {}
+"""By their columns."""
+
+
 def _interpolation(column: int) -> Operation:
     """Of rows, weights and ids, three columns of which, from one on, name rows."""
 
     def value(operands: Arrays) -> np.ndarray:
         rows, weights, ids = operands
-        last = ids[:, column : column + 3].max(initial=-1)
-        if last >= len(rows):
-            raise InputError(f"samples refer to row {last} of an array of {len(rows)}; sample this surface anew")
+        interpolation.check(rows, ids, column)
         return interpolation.interpolate(rows, ids, column, weights)
+
+    def shape(operands: Arrays) -> tuple[int, ...]:
+        rows, weights, _ = operands
+        return len(weights), rows.shape[1]
 
     def push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
         rows, weights, ids = operands
@@ -78,4 +84,4 @@ def _interpolation(column: int) -> Operation:
         a, b, c = take(rows, index).reshape(-1, 3, rows.shape[1]).unbind(1)
         return c + weights[:, 0:1] * (a - c) + weights[:, 1:2] * (b - c)
 
-    return Operation(specification, value, push, pull)
+    return Operation(specification, value, shape, push, pull)

@@ -116,10 +116,6 @@ class Mesh:
         return gbuffer
 
     def _interpolate(self, rows: Array, samples: Samples, column: int) -> Array:
-        if isinstance(rows, np.ndarray) and isinstance(samples.ids, np.ndarray):
-            last = samples.ids[:, column : column + 3].max(initial=-1)
-            if last >= len(rows):
-                raise InputError(f"samples refer to row {last} of an array of {len(rows)}; sample this mesh anew")
         return interpolate(rows, samples.ids, column, samples.params)
 
     def vertex_normals(self, vertices: Array) -> Array:

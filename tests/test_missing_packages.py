@@ -409,3 +409,17 @@ def test_the_public_interface_follows_moved_vertices(public):
         part.theta["vertices"][:] *= np.float32([0.9, 1.0, 0.8])
         found = rts.render(part, CAMERAS["perspective"], SIZE, sampler=public)
         np.testing.assert_allclose(found, rts.render(part, CAMERAS["perspective"], SIZE, sampler="raster"), atol=1e-5)
+
+
+def test_a_broken_framework_that_something_has_imported_is_no_matter_for_numpy():
+    code = """
+        import sys, types
+        import numpy as np
+        import rts
+
+        sys.modules["jax"], sys.modules["torch"] = types.ModuleType("jax"), None
+        vertices = np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0)], np.float32)
+        part = rts.Part(rts.plugin("surfaces", "mesh")([(0, 1, 2)]), {"vertices": vertices})
+        assert rts.render(part, rts.Camera.look_at((0, 0, 3), (0, 0, 0)), (12, 15))[..., 3].max() > 0.9
+    """
+    subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=True, timeout=120)

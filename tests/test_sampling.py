@@ -221,7 +221,7 @@ def test_samples_of_another_mesh_are_refused():
     corners = np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0)], np.float32)
     large = rts.Part(mesh([(7, 8, 9)]), {"vertices": np.concatenate([np.zeros((7, 3), np.float32), corners])})
     small = rts.Part(mesh([(0, 1, 2)]), {"vertices": corners})
-    with pytest.raises(rts.InputError, match="samples refer to row 9 of an array of 3; sample this mesh anew"):
+    with pytest.raises(rts.InputError, match="samples refer to row 9 of an array of 3; sample this surface anew"):
         rts.render_samples(rts.sample(large, camera, (16, 16)), small, camera)
 
 

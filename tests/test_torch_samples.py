@@ -135,6 +135,17 @@ def test_samples_of_another_mesh_are_one_clear_error():
     rows, weights = corners()
     with pytest.raises(rts.InputError, match="samples refer to row 5 of an array of 3; sample this surface anew"):
         interpolate(rows[:3], torch.full((7, 5), 5), COLUMN, weights)
+    with pytest.raises(rts.InputError, match="row -1 of an array of 6"):
+        interpolate(rows, torch.full((7, 5), -1), COLUMN, weights)
+    with pytest.raises(rts.InputError, match=r"ids of shape \(7, 3\).*expected \(N, 5\)"):
+        interpolate(rows, torch.zeros((7, 3), dtype=torch.int32), COLUMN, weights)
+
+
+def test_double_vertices_take_compiled_code_with_single_weights():
+    rows, weights = corners()
+    found = interpolated(rows, weights.float())
+    assert found.dtype == torch.float64
+    torch.testing.assert_close(found, plainly_interpolated(rows, weights.float().double()), rtol=1e-14, atol=1e-14)
 
 
 def test_gradients_do_not_depend_on_the_number_of_threads(case, monkeypatch):
