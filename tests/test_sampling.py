@@ -250,3 +250,19 @@ def test_parts_are_interleaved_alike_on_the_host_and_in_array_code(target, monke
         for found, expected in compared:
             for name in ("part", "row", "depth"):
                 np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
+
+
+def test_the_parts_of_batched_samples_are_those_of_each():
+    jax = pytest.importorskip("jax")
+    vertices, faces = icosphere(1)
+    mesh = rts.plugin("surfaces", "mesh")(faces)
+    behind = Part(mesh, {"vertices": (vertices - (0.5, 0, 1)).astype(np.float32)})
+
+    def sampled(move):
+        return rts.sample([Part(mesh, {"vertices": vertices.astype(np.float32) + move}), behind], CAMERA, SIZE)
+
+    moves = jax.numpy.asarray([(0, 0, 0), (0.4, 0.2, 0)], dtype=np.float32)
+    batch = to_numpy(jax.vmap(sampled)(moves).part)
+    assert set(np.unique(batch)) == {-1, 0, 1}
+    for found, move in zip(batch, moves, strict=True):
+        np.testing.assert_array_equal(found, to_numpy(sampled(move).part))
