@@ -126,7 +126,7 @@ class TorchEngine:
 
     def rigid(self, pose: torch.Tensor, center: torch.Tensor) -> torch.Tensor | None:
         """By compiled code on the CPU."""
-        if not _compiled(pose, center) or torch.compiler.is_compiling():
+        if not _compiled(pose, center):
             return None
         from rts_backends import torch_rigid
 

@@ -1,4 +1,4 @@
-"""`rts.transforms.rigid` for autograd, compiled: some sixty operations on tensors of a few numbers take far longer."""
+"""`rts.transforms.rigid` in torch on the CPU, compiled: some sixty operations on a few numbers take far longer."""
 
 from __future__ import annotations
 
@@ -6,119 +6,48 @@ import math
 
 import numba
 import numpy as np
-import torch
 from torch import Tensor
 
 from rts.transforms import rigid_by_arrays
-from rts_backends.torch_functions import along, applied, filled, foreign, transformed
+from rts_backends.torch_operations import Arrays, Operation, Some
 
 SMALL = 1e-2
 """Squared angles below which series are exact to rounding."""
 
 
 def rigid(pose: Tensor, center: Tensor) -> Tensor:
-    """(4, 4) of a pose (6,) about a centre (3,), on the CPU."""
-    return applied(_Turn, pose, center) if transformed() else applied(_Rigid, pose, center)[0]
+    """(4, 4) of a pose (6,) about a centre (3,), of one dtype."""
+    return _RIGID(pose, center)
 
 
-def _computed(pose: Tensor, center: Tensor) -> tuple[Tensor, Tensor]:
-    """The matrix, and its Jacobian (16, 9)."""
+def _computed(operands: Arrays) -> tuple[np.ndarray, np.ndarray]:
+    """The matrix, and its Jacobian (16, 9), float64."""
     matrix, jacobian = np.empty((4, 4)), np.empty((16, 9))
-    numbers = (x.detach().numpy().astype(np.float64) for x in (pose, center))
-    _rigid(*numbers, matrix, jacobian)
-    return torch.from_numpy(matrix).to(pose.dtype), torch.from_numpy(jacobian).to(pose.dtype)
+    _rigid(*(x.astype(np.float64) for x in operands), matrix, jacobian)
+    return matrix, jacobian
 
 
-def _specified_slopes(pose: Tensor, center: Tensor) -> Tensor:
-    """The Jacobian in torch."""
-    return torch.func.jacrev(lambda x: rigid_by_arrays(x[:6], x[6:]).reshape(-1))(torch.cat([pose, center]))
+def _value(operands: Arrays) -> np.ndarray:
+    return _computed(operands)[0].astype(operands[0].dtype)
 
 
-def _pushed(pose: Tensor, center: Tensor, tangents: Tensor) -> Tensor:
-    """Tangents (T, 4, 4) along those (T, 9) of pose and centre, in torch."""
-    return (tangents @ _specified_slopes(pose, center).T).reshape(-1, 4, 4)
+def _shape(operands: Arrays) -> tuple[int, int]:
+    return 4, 4
 
 
-class _Turn(torch.autograd.Function):
-    """The matrix, for torch's transforms."""
-
-    @staticmethod
-    def forward(pose, center):
-        return _computed(pose, center)[0]
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
-
-    @staticmethod
-    def backward(ctx, *gradients):
-        pose, center = ctx.saved_tensors
-        slopes = applied(_Push, pose, center, torch.eye(9, dtype=pose.dtype))
-        found = slopes.reshape(9, 16) @ gradients[0].reshape(-1)
-        return found[:6], found[6:]
-
-    @staticmethod
-    def jvp(ctx, *tangents):
-        if foreign(*tangents):
-            return along(rigid_by_arrays, ctx.saved_tensors, tangents)
-        # A function, since what is computed here carries no derivative of a forward mode around this one.
-        joined = torch.cat(filled(ctx.saved_tensors, tangents))
-        return applied(_Push, *ctx.saved_tensors, joined[None])[0]
-
-    @staticmethod
-    def vmap(info, in_dims, pose, center):
-        return torch.vmap(rigid_by_arrays, in_dims)(pose, center), 0
+def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
+    pose, center = (np.zeros_like(x) if t is None else t for x, t in zip(operands, tangents, strict=True))
+    out[...] = (_computed(operands)[1] @ np.concatenate([pose, center])).reshape(4, 4)
 
 
-class _Push(torch.autograd.Function):
-    """Tangents of the matrix."""
-
-    @staticmethod
-    def forward(pose, center, tangents):
-        return (tangents.detach() @ _computed(pose, center)[1].T).reshape(-1, 4, 4)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        ctx.save_for_backward(*inputs)
-        ctx.save_for_forward(*inputs)
-
-    @staticmethod
-    def backward(ctx, *gradients):
-        return torch.func.vjp(_pushed, *ctx.saved_tensors)[1](gradients[0])
-
-    @staticmethod
-    def jvp(ctx, *tangents):
-        return along(_pushed, ctx.saved_tensors, tangents)
-
-    @staticmethod
-    def vmap(info, in_dims, pose, center, tangents):
-        if in_dims[0] is not None or in_dims[1] is not None:
-            return torch.vmap(_pushed, in_dims)(pose, center, tangents), 0
-        out = applied(_Push, pose, center, tangents.movedim(in_dims[2], 0).flatten(0, 1))
-        return out.unflatten(0, (info.batch_size, -1)), 0
+def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
+    found = g.reshape(-1) @ _computed(operands)[1]
+    for result, part in zip(results, (found[:6], found[6:]), strict=True):
+        if result is not None:
+            result[...] = part
 
 
-class _Rigid(torch.autograd.Function):
-    """The matrix and its Jacobian, whose own derivative is that of the specification; one call for plain autograd."""
-
-    @staticmethod
-    def forward(pose, center):
-        return _computed(pose, center)
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        ctx.save_for_backward(*inputs, output[1])
-        ctx.set_materialize_grads(False)
-
-    @staticmethod
-    def backward(ctx, *gradients):
-        g_matrix, g_jacobian = gradients
-        pose, center, jacobian = ctx.saved_tensors
-        found = torch.zeros_like(jacobian[0]) if g_matrix is None else g_matrix.reshape(-1) @ jacobian
-        if g_jacobian is not None:
-            found = found + torch.cat(torch.func.vjp(_specified_slopes, pose, center)[1](g_jacobian))
-        return found[:6], found[6:]
+_RIGID = Operation(rigid_by_arrays, _value, _shape, _push, _pull)
 
 
 @numba.njit(cache=True)
