@@ -8,6 +8,7 @@
 
 from __future__ import annotations
 
+import abc
 import tempfile
 from collections.abc import Callable
 
@@ -51,10 +52,27 @@ def rotation(r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return matrix, np.stack([turn @ matrix / square for turn in turns])
 
 
+class _Fit(abc.ABC):
+    """Iterations from the start on, by the loss and gradient of a pose (6,) that a peer gives."""
+
+    def __init__(self):
+        self.pose, self.adam = np.array(START), Adam(RATE)
+
+    @abc.abstractmethod
+    def value_and_gradient(self, pose: np.ndarray) -> tuple[float, np.ndarray]:
+        """Loss, and its gradient in the pose."""
+
+    def step(self) -> float:
+        """One iteration."""
+        loss, gradient = self.value_and_gradient(self.pose)
+        self.pose = self.adam.step(self.pose, gradient)
+        return loss
+
+
 # --------------------------------------------------------------------------------------------------------------- DEODR
 
 
-class DeodrScene:
+class DeodrScene(_Fit):
     """The task by DEODR's own classes, which always give the gradient of the vertices too.
 
     Args:
@@ -73,13 +91,7 @@ class DeodrScene:
         self.scene.set_light(None, 1.0)
         self.scene.set_mesh(self.mesh)
         self.scene.set_background_color([0.0])
-        self.pose, self.adam = np.array(START), Adam(RATE)
-
-    def step(self) -> float:
-        """One iteration."""
-        loss, gradient = self.value_and_gradient(self.pose)
-        self.pose = self.adam.step(self.pose, gradient)
-        return loss
+        super().__init__()
 
     def value_and_gradient(self, pose: np.ndarray) -> tuple[float, np.ndarray]:
         """Loss, and its gradient in the pose."""
@@ -95,7 +107,7 @@ class DeodrScene:
         return float((difference**2).mean()), gradient
 
 
-class Deodr:
+class Deodr(_Fit):
     """The task at DEODR's compiled functions.
 
     Args:
@@ -134,13 +146,7 @@ class Deodr:
             integer_pixel_centers=False,
         )
         self.image, self.depth = np.empty((task.side, task.side, 1)), np.empty((task.side, task.side))
-        self.pose, self.adam = np.array(START), Adam(RATE)
-
-    def step(self) -> float:
-        """One iteration."""
-        loss, gradient = self.value_and_gradient(self.pose)
-        self.pose = self.adam.step(self.pose, gradient)
-        return loss
+        super().__init__()
 
     def value_and_gradient(self, pose: np.ndarray) -> tuple[float, np.ndarray]:
         """Loss, and its gradient in the pose; that of the vertices is left in `vertex_gradient`."""
@@ -182,7 +188,7 @@ class Deodr:
 # ------------------------------------------------------------------------------------------------------------- Mitsuba
 
 
-class Mitsuba:
+class Mitsuba(_Fit):
     """The task in Mitsuba.
 
     Args:
@@ -204,13 +210,8 @@ class Mitsuba:
         self.parameters = mi.traverse(self.scene)
         self.vertices = mi.Point3f(task.vertices.T.astype(np.float32))
         self.target = mi.TensorXf(task.target)
-        self.full, self.pose, self.adam, self.seed = full, np.array(START), Adam(RATE), 0
-
-    def step(self) -> float:
-        """One iteration."""
-        loss, gradient = self.value_and_gradient(self.pose)
-        self.pose = self.adam.step(self.pose, gradient)
-        return loss
+        self.full, self.seed = full, 0
+        super().__init__()
 
     def value_and_gradient(self, pose: np.ndarray) -> tuple[float, np.ndarray]:
         """Loss, and its gradient in the pose; that of the vertices is left in `vertex_gradient`."""

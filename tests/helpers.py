@@ -5,6 +5,8 @@ import importlib.util
 import numpy as np
 import pytest
 
+import rts
+from rts import Camera, Part
 from rts.arrays import is_constant, map_leaves
 
 
@@ -174,3 +176,22 @@ def rigid(axis=(0.0, 1.0, 0.0), degrees=0.0, translation=(0.0, 0.0, 0.0)):
     transform[:3, :3] = rotation(axis, degrees)
     transform[:3, 3] = translation
     return transform
+
+
+# --------------------------------------------------------------------------------------------------- scenes
+
+SIZE = (20, 24)
+CAMERA = Camera.look_at((1, 1.5, 4), (0, 0, 0), fov_y=40, aspect=1.2)
+FRONT = Camera.orthographic((0, 0, 5), (0, 0, 0), height=4, aspect=1.2, near=1, far=9)
+
+
+def mesh_part(mesh, **options):
+    """A part of (vertices, faces); `theta` holds what else belongs to it, `indices` those of corners."""
+    vertices, faces = mesh
+    theta = {"vertices": vertices, **options.pop("theta", {})}
+    return Part(rts.plugin("surfaces", "mesh")(faces, options.pop("indices", None)), theta, **options)
+
+
+def show(parts, camera=CAMERA, size=SIZE, **options):
+    """The image, on the host."""
+    return to_numpy(rts.render(parts, camera, size, **options))

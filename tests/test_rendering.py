@@ -1,4 +1,4 @@
-"""Rendering from end to end, the mesh, the shaders, and what bad input is told."""
+"""Rendering from end to end, degenerate views, backgrounds, and what bad input is told."""
 
 import math
 from types import SimpleNamespace
@@ -7,38 +7,29 @@ import numpy as np
 import pytest
 from helpers import (
     ALL,
+    CAMERA,
     DIFFERENTIABLE,
-    TORCH,
+    FRONT,
+    SIZE,
     arrays,
     box,
     gradient,
     icosphere,
+    mesh_part,
     moved,
     quad,
     rigid,
+    show,
     soup,
     to_numpy,
 )
 
 import rts
-from rts import Camera, GBuffer, Part
+from rts import Camera, Part
 from rts.rendering import APRON
-from rts.shading import BlinnPhong, Depth, Lambert, Normals, Silhouette, Textured, Unlit, sample_texture
+from rts.shading import Textured
 
 Mesh = rts.plugin("surfaces", "mesh")
-SIZE = (20, 24)
-CAMERA = Camera.look_at((1, 1.5, 4), (0, 0, 0), fov_y=40, aspect=1.2)
-FRONT = Camera.orthographic((0, 0, 5), (0, 0, 0), height=4, aspect=1.2, near=1, far=9)
-
-
-def mesh_part(mesh, **options):
-    vertices, faces = mesh
-    theta = {"vertices": vertices, **options.pop("theta", {})}
-    return Part(Mesh(faces, options.pop("indices", None)), theta, **options)
-
-
-def show(parts, camera=CAMERA, size=SIZE, **options):
-    return to_numpy(rts.render(parts, camera, size, **options))
 
 
 # ------------------------------------------------------------------------------------------ the whole of it
@@ -240,361 +231,6 @@ def test_the_background_is_differentiable(target):
         arrays(target, np.array([0.2, 0.3, 0.4])),
     )
     np.testing.assert_allclose(found, (SIZE[0] * SIZE[1] / 2, 0, 0), atol=1e-3)
-
-
-# ------------------------------------------------------------------------------------------------------- mesh
-
-
-@pytest.mark.parametrize("target", ALL)
-def test_smooth_normals_of_a_sphere_are_its_radii(target):
-    vertices, faces = icosphere(3, 2.0)
-    normals = to_numpy(Mesh(faces).vertex_normals(arrays(target, vertices)))
-    np.testing.assert_allclose(normals, vertices / 2, atol=0.01)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-6)
-
-
-def test_smooth_normals_of_a_flat_sheet_and_of_a_lone_vertex():
-    vertices, faces = quad()
-    vertices = np.concatenate([vertices, [(5, 5, 5)]]).astype(np.float32)
-    normals = Mesh(faces).vertex_normals(vertices)
-    np.testing.assert_array_equal(normals, [(0, 0, 1)] * 4 + [(0, 0, 0)])
-
-
-def test_smooth_normals_follow_vertices_that_change_in_place():
-    vertices, faces = quad()
-    mesh = Mesh(faces)
-    mesh.vertex_normals(vertices)
-    vertices[:] = vertices[:, [2, 1, 0]]
-    np.testing.assert_allclose(mesh.vertex_normals(vertices), [(-1, 0, 0)] * 4)
-
-
-def test_given_normals_take_the_place_of_smooth_ones():
-    tilted = np.broadcast_to(np.float32((0.6, 0, 0.8)), (4, 3))
-    image = show(mesh_part(quad(-9, 9, -9, 9), shader="normals", theta={"normals": tilted}), FRONT)
-    np.testing.assert_allclose(image[..., :3], np.broadcast_to((0.8, 0.5, 0.9), (*SIZE, 3)), atol=1e-6)
-
-
-@pytest.mark.parametrize("target", ALL)
-def test_vertex_attributes_are_interpolated_linearly_in_space(target):
-    # A sheet that recedes: colour is the world coordinate, so each pixel shows where its ray meets the sheet.
-    vertices = np.array([(-2, -2, -3), (2, -2, 1), (2, 2, 1), (-2, 2, -3)], np.float32)
-    colors = np.clip((vertices + (2, 2, 3)) / 4, 0, 1)
-    part, camera = arrays(target, (mesh_part((vertices, quad()[1]), shader="unlit", theta={"colors": colors}), CAMERA))
-    image = show(part, camera, splatter="none")
-    rays = CAMERA.rays(SIZE)
-    # The sheet is z = x − 1.
-    depth = (rays.origins[..., 0] - 1 - rays.origins[..., 2]) / (rays.directions[..., 2] - rays.directions[..., 0])
-    points = rays.origins + depth[..., None] * rays.directions
-    inside = image[..., 3] == 1
-    assert inside.sum() > 100
-    np.testing.assert_allclose(image[inside][:, :3], (points[inside] + (2, 2, 3)) / 4, rtol=0, atol=1e-5)
-
-
-@pytest.mark.parametrize("target", ALL)
-def test_attributes_of_corners_are_read_through_their_own_indices(target):
-    vertices, faces = quad(-9, 9, -9, 9)
-    # One colour for each triangle; uv of the second triangle differ at the shared vertices.
-    part = mesh_part(
-        (vertices, faces),
-        indices={"colors": [(0, 0, 0), (1, 1, 1)], "heat": [(2, 2, 2), (0, 0, 0)], "uv": None},
-        theta={
-            "colors": np.array([(1.0, 0, 0), (0, 1.0, 0)]),
-            "heat": np.array([(0.25,), (0.5,), (0.75,)]),
-            "uv": np.zeros((4, 2)),
-        },
-        shader=heat_in_blue,
-    )
-    part, camera = arrays(target, (part, FRONT))
-    image = show(part, camera, (20, 20), splatter="none")
-    # FRONT stretches; the diagonal runs from the lower left to the upper right, triangle 0 is below it.
-    np.testing.assert_allclose(image[15, 15], (1, 0, 0.75, 1), atol=1e-6)
-    np.testing.assert_allclose(image[5, 5], (0, 1, 0.25, 1), atol=1e-6)
-
-
-def heat_in_blue(theta, gbuffer, camera):
-    xp = rts.arrays.namespace(gbuffer["position"])
-    color = gbuffer["color"]
-    one = xp.ones_like(color[:, :1])
-    return xp.concat([color[:, :2], gbuffer["heat"], one], axis=1)
-
-
-def test_attributes_of_vertices_need_no_indices_but_their_name():
-    part = mesh_part(
-        quad(-9, 9, -9, 9),
-        indices={"heat": None},
-        theta={"heat": np.full((4, 1), 0.5), "colors": np.zeros((4, 3))},
-        shader=heat_in_blue,
-    )
-    np.testing.assert_allclose(show(part, FRONT)[9, 9], (0, 0, 0.5, 1), atol=1e-6)
-
-
-class CountingMesh(Mesh):
-    def __init__(self, faces):
-        super().__init__(faces)
-        self.asked = 0
-
-    def _vertex_normals(self, vertices):
-        self.asked += 1
-        return super()._vertex_normals(vertices)
-
-
-@pytest.mark.parametrize("pose_only", [False, True], ids=["all differentiable", "only the transform differentiable"])
-@pytest.mark.parametrize("target", ALL)
-def test_normals_are_computed_only_for_a_shader_that_reads_them(target, pose_only):
-    vertices, faces = icosphere(1)
-    theta = {"vertices": vertices if pose_only else arrays(target, vertices)}
-    transform, camera = arrays(target, (np.eye(4), CAMERA))
-    for shader, asked in (("silhouette", 0), ("unlit", 0), ("depth", 0), ("lambert", 1)):
-        mesh = CountingMesh(faces)
-        rts.render(Part(mesh, theta, shader, transform), camera, SIZE)
-        assert (mesh.asked > 0) == asked, shader
-
-
-def test_a_deferred_attribute_is_computed_once_when_first_read():
-    calls = []
-    gbuffer = GBuffer(position=np.zeros((2, 3)))
-    gbuffer.defer("normal", lambda: calls.append(1) or np.ones((2, 3)))
-    assert "normal" in gbuffer and list(gbuffer) == ["position", "normal"] and calls == []
-    np.testing.assert_array_equal(gbuffer["normal"], gbuffer["normal"])
-    assert calls == [1]
-    with pytest.raises(rts.InputError, match="reads 'uv'.*'position', 'normal'"):
-        gbuffer["uv"]
-
-
-@pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_a_function_is_a_shader_and_its_theta_is_differentiable(target):
-    def tinted(theta, gbuffer, camera):
-        xp = rts.arrays.namespace(gbuffer["position"])
-        one = xp.ones_like(gbuffer["position"])
-        return xp.concat([one * theta["tint"] ** 2, one[:, :1]], axis=1)
-
-    mesh, camera = quad(-9, 9, -9, 9), arrays(target, FRONT)
-    part = mesh_part(mesh, shader=tinted)
-    found = gradient(
-        target,
-        lambda tint: rts.render(part.replace(theta={**part.theta, "tint": tint}), camera, SIZE)[..., 1].sum(),
-        arrays(target, np.array([0.1, 0.2, 0.3])),
-    )
-    np.testing.assert_allclose(found, (0, 2 * 0.2 * SIZE[0] * SIZE[1], 0), rtol=1e-5)
-
-
-# ---------------------------------------------------------------------------------------------------- texture
-
-TEXTURE = np.random.default_rng(0).random((3, 4, 3))
-
-
-def texel(i, j):
-    """(u, v) of the centre of texel row i, column j."""
-    return (j + 0.5) / 4, 1 - (i + 0.5) / 3
-
-
-@pytest.mark.parametrize("target", ALL)
-@pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
-def test_texel_centres_are_exact_and_v_points_up(target, wrap):
-    uv = np.array([texel(i, j) for i in range(3) for j in range(4)])
-    found = to_numpy(sample_texture(*arrays(target, (TEXTURE, uv)), wrap))
-    np.testing.assert_allclose(found.reshape(3, 4, 3), TEXTURE, atol=1e-6)
-
-
-def test_between_texels_lookup_is_bilinear():
-    uv = np.array([np.add(texel(1, 2), texel(1, 3)), np.add(texel(0, 1), texel(1, 1))]) / 2
-    quarter = np.array(texel(0, 0)) * 0.75 * 0.5 + np.array(texel(0, 1)) * 0.25 * 0.5
-    quarter += np.array(texel(1, 0)) * 0.75 * 0.5 + np.array(texel(1, 1)) * 0.25 * 0.5
-    found = sample_texture(TEXTURE, np.concatenate([uv, [quarter]]))
-    t = TEXTURE
-    np.testing.assert_allclose(found[0], (t[1, 2] + t[1, 3]) / 2)
-    np.testing.assert_allclose(found[1], (t[0, 1] + t[1, 1]) / 2)
-    np.testing.assert_allclose(found[2], 0.375 * (t[0, 0] + t[1, 0]) + 0.125 * (t[0, 1] + t[1, 1]))
-
-
-@pytest.mark.parametrize("target", ALL)
-@pytest.mark.parametrize(
-    "wrap, column",
-    [
-        ("repeat", [2, 3, 0, 1, 2, 3, 0, 1, 2, 3]),
-        ("mirror", [1, 0, 0, 1, 2, 3, 3, 2, 1, 0]),
-        ("clamp", [0, 0, 0, 1, 2, 3, 3, 3, 3, 3]),
-    ],
-)
-def test_wrap_modes_outside_the_unit_square(target, wrap, column):
-    # Columns −2 … 7 of a texture of four, and one whole turn farther out where that is the same.
-    uv = np.array([texel(1, j) for j in range(-2, 8)])
-    texture, there = arrays(target, (TEXTURE, uv))
-    np.testing.assert_allclose(to_numpy(sample_texture(texture, there, wrap)), TEXTURE[1, column], atol=1e-6)
-    # The same in v, on the transposed texture; rows count downwards, v upwards.
-    flipped = np.array([((1 + 0.5) / 3, 1 - (i + 0.5) / 4) for i in range(-2, 8)])
-    texture, there = arrays(target, (TEXTURE.transpose(1, 0, 2), flipped))
-    np.testing.assert_allclose(to_numpy(sample_texture(texture, there, wrap)), TEXTURE[1, column], atol=1e-6)
-    period = {"repeat": 3, "mirror": 2}.get(wrap)
-    if period:
-        texture, there = arrays(target, (TEXTURE, uv - 2 * period))
-        np.testing.assert_allclose(to_numpy(sample_texture(texture, there, wrap)), TEXTURE[1, column], atol=1e-5)
-
-
-def test_repeat_blends_the_two_ends_and_clamp_does_not():
-    uv = np.array([(0.0, texel(1, 0)[1])])
-    ends = (TEXTURE[1, 0] + TEXTURE[1, 3]) / 2
-    np.testing.assert_allclose(sample_texture(TEXTURE, uv, "repeat")[0], ends)
-    np.testing.assert_allclose(sample_texture(TEXTURE, uv, "clamp")[0], TEXTURE[1, 0])
-    np.testing.assert_allclose(sample_texture(TEXTURE, uv, "mirror")[0], TEXTURE[1, 0])
-
-
-@pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_texture_gradients_are_the_bilinear_weights_and_slopes(target):
-    uv = np.array([np.add(texel(1, 2), texel(1, 3))]) / 2
-    given = arrays(target, {"texture": TEXTURE, "uv": uv})
-    found = gradient(target, lambda t: sample_texture(t["texture"], t["uv"])[..., 0].sum(), given)
-    expected = np.zeros_like(TEXTURE)
-    expected[1, 2:, 0] = 0.5
-    np.testing.assert_allclose(found["texture"], expected, atol=1e-5)
-    np.testing.assert_allclose(found["uv"][0, 0], 4 * (TEXTURE[1, 3, 0] - TEXTURE[1, 2, 0]), rtol=1e-4)
-
-
-@pytest.mark.parametrize("channels, expected", [(1, (0.2, 0.2, 0.2, 1)), (3, (0.2, 0.4, 0.6, 1))])
-def test_textures_of_one_and_three_channels(channels, expected):
-    texture = np.ones((2, 2, channels)) * np.array([0.2, 0.4, 0.6])[:channels]
-    theta = {"texture": texture, "uv": np.zeros((4, 2))}
-    image = show(mesh_part(quad(-9, 9, -9, 9), theta=theta, shader="textured"), FRONT)
-    np.testing.assert_allclose(image[9, 9], expected, atol=1e-6)
-
-
-def test_a_textured_quad_is_its_texture_upright():
-    texture = np.random.default_rng(0).random((20, 24, 3))
-    uv = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
-    part = mesh_part(quad(-2.4, 2.4, -2, 2), theta={"texture": texture, "uv": uv}, shader="textured")
-    np.testing.assert_allclose(show(part, FRONT, (20, 24), splatter="none")[..., :3], texture, atol=1e-4)
-
-
-# ---------------------------------------------------------------------------------------------------- shaders
-
-
-def shade(shader, normal=(0, 0, 1), position=(0, 0, 0), camera=FRONT, **theta):
-    gbuffer = GBuffer(position=np.array([position], np.float64), normal=np.array([normal], np.float64))
-    arrays_ = {k: v if isinstance(v, dict) else np.asarray(v, np.float64) for k, v in theta.items()}
-    return shader(arrays_, gbuffer, camera)[0]
-
-
-def light(degrees=0.0, ambient=0.1, color=(0.5, 0.6, 0.7)):
-    """From the direction of +z turned towards +y."""
-    a = math.radians(degrees)
-    direction = 3.0 * np.array([0, math.sin(a), math.cos(a)])
-    return {"direction": direction, "color": np.array(color), "ambient": np.full(3, ambient)}
-
-
-@pytest.mark.parametrize("degrees", [0, 30, 60])
-def test_lambert_is_ambient_plus_diffuse_times_the_cosine(degrees):
-    found = shade(Lambert(), light=light(degrees), color=(0.8, 0.4, 0.2))
-    expected = np.array([0.8, 0.4, 0.2]) * (0.1 + math.cos(math.radians(degrees)) * np.array([0.5, 0.6, 0.7]))
-    np.testing.assert_allclose(found, [*expected, 1], atol=1e-12)
-
-
-def test_lambert_is_two_sided_and_dark_where_light_comes_from_behind():
-    np.testing.assert_allclose(shade(Lambert(), (0, 0, -2), light=light()), shade(Lambert(), light=light()))
-    np.testing.assert_allclose(shade(Lambert(), light=light(180))[:3], 0.1)
-
-
-def test_lambert_adds_several_lights_and_saturates_at_one():
-    both = {
-        "direction": np.array([(0, 0, 1), (0, 3.0, 0), (0, 0.6, 0.8)]),
-        "color": np.array([(0.1, 0, 0), (9, 9, 9), (0, 2, 0.5)]),
-        "ambient": np.zeros(3),
-    }
-    np.testing.assert_allclose(shade(Lambert(), light=both), (0.1, 1.0, 0.4, 1), atol=1e-12)
-
-
-def test_the_default_light_is_fixed_to_the_camera():
-    cosine = 0.81 / math.sqrt(0.3**2 + 0.5**2 + 0.81**2)
-    np.testing.assert_allclose(shade(Lambert())[:3], 0.2 + 0.8 * cosine)
-    turn = rigid((1, 2, 3), 70, (0.1, 0.2, 0.3))
-    turned = FRONT.within(np.linalg.inv(turn))
-    position, normal = moved(turn, np.array([(0.0, 0, 0)]))[0], turn[:3, :3] @ (0, 0.6, 0.8)
-    np.testing.assert_allclose(shade(Lambert(), normal, position, turned), shade(Lambert(), (0, 0.6, 0.8)))
-
-
-def test_blinn_phong_is_brightest_where_the_normal_halves_light_and_view():
-    lit = {
-        "light": light(60, 0.0, (1, 1, 1)),
-        "color": (0, 0, 0),
-        "specular": (0.9, 0.5, 0.1),
-        "shininess": 20.0,
-    }
-
-    def highlight(degrees):
-        a = math.radians(degrees)
-        return shade(BlinnPhong(), (0, math.sin(a), math.cos(a)), **lit)[:3]
-
-    np.testing.assert_allclose(highlight(30), (0.9, 0.5, 0.1), atol=1e-9)
-    for off in (10, 25):
-        expected = np.array([0.9, 0.5, 0.1]) * math.cos(math.radians(off)) ** 20
-        np.testing.assert_allclose(highlight(30 + off), expected, atol=1e-9)
-        np.testing.assert_allclose(highlight(30 - off), expected, atol=1e-9)
-
-
-def test_blinn_phong_without_specular_is_lambert():
-    for degrees in (0, 40, 130):
-        found = shade(BlinnPhong(), light=light(degrees), specular=(0, 0, 0))
-        np.testing.assert_allclose(found, shade(Lambert(), light=light(degrees)))
-
-
-@pytest.mark.parametrize("shininess", [0.0, 0.5, 1.0, 32.0])
-@pytest.mark.parametrize("degrees", [0, 89.999, 90, 120, 180])
-@pytest.mark.parametrize("target", TORCH)
-def test_blinn_phong_gradients_are_finite_at_grazing_light(target, degrees, shininess):
-    camera = arrays(target, FRONT)
-    given = arrays(
-        target,
-        {
-            "light": light(degrees),
-            "specular": np.full(3, 0.5),
-            "shininess": np.array(shininess),
-            "n": np.eye(3),
-        },
-    )
-
-    def f(tree):
-        gbuffer = GBuffer(position=0 * tree["n"], normal=tree["n"])
-        return BlinnPhong()({k: v for k, v in tree.items() if k != "n"}, gbuffer, camera).sum()
-
-    found = gradient(target, f, given)
-    for leaf in (*found["light"].values(), found["specular"], found["shininess"], found["n"]):
-        assert np.isfinite(leaf).all()
-
-
-@pytest.mark.parametrize("camera", [FRONT, Camera.look_at((0, 0, 5), (0, 0, 0), near=1, far=9)])
-def test_depth_is_linear_from_the_near_plane_to_the_far_plane(camera):
-    for z, expected in ((4, 0), (2, 0.25), (0, 0.5), (-4, 1), (-9, 1)):
-        found = shade(Depth(), position=(0.3, -0.2, z), camera=camera)
-        np.testing.assert_allclose(found, (expected, expected, expected, 1), atol=1e-9)
-
-
-def test_depth_range_sets_black_and_white():
-    np.testing.assert_allclose(shade(Depth(), position=(0, 0, 0), depth_range=(4, 8))[:3], 0.25)
-    np.testing.assert_allclose(shade(Depth(), position=(0, 0, 2), depth_range=(4, 8))[:3], 0)
-
-
-def test_normals_map_to_colours_about_one_half():
-    np.testing.assert_allclose(shade(Normals(), (0, 3, 0)), (0.5, 1, 0.5, 1))
-    np.testing.assert_allclose(shade(Normals(), (-0.6, 0, 0.8)), (0.2, 0.5, 0.9, 1))
-
-
-def test_silhouette_is_white():
-    np.testing.assert_array_equal(shade(Silhouette()), (1, 1, 1, 1))
-
-
-def test_unlit_multiplies_base_colour_and_factor_and_premultiplies_where_not_opaque():
-    position = np.zeros((1, 3))
-    gbuffer = GBuffer(position=position, color=np.array([[0.5, 0.6, 0.8, 0.5]]))
-    theta = {"color": np.array([0.5, 1.0, 0.25, 0.4])}
-    np.testing.assert_allclose(Unlit()(theta, gbuffer, FRONT)[0], (0.25, 0.6, 0.2, 1))
-    np.testing.assert_allclose(Unlit(opaque=False)(theta, gbuffer, FRONT)[0], (0.05, 0.12, 0.04, 0.2))
-    np.testing.assert_allclose(Unlit()({}, GBuffer(position=position), FRONT)[0], 1)
-
-
-def test_base_colour_is_the_texture_before_the_vertex_colours():
-    gbuffer = GBuffer(position=np.zeros((1, 3)), color=np.full((1, 3), 0.3), uv=np.full((1, 2), 0.5))
-    theta = {"texture": np.full((1, 1, 3), 0.7)}
-    np.testing.assert_allclose(Unlit()(theta, gbuffer, FRONT)[0, :3], 0.7)
-    np.testing.assert_allclose(Unlit()({}, gbuffer, FRONT)[0, :3], 0.3)
 
 
 # ----------------------------------------------------------------------------------------------------- errors
