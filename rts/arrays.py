@@ -98,6 +98,7 @@ _ENGINES: dict[str, Engine] = {}
 _OWNERS: dict[type, Engine] = {}
 _BITS: dict[Any, int] = {}
 _WRAPS: dict[str, Any] = {}
+"""By engines, their member `uncompiled`, or None."""
 
 
 def _engine(name: str) -> Engine:

@@ -115,7 +115,8 @@ class Splats:
     @property
     def mixed_arguments(self) -> tuple:
         """Arguments of the kernels of mixed targets."""
-        return self.positions, self.rgba, self.row, *self._numbers, *self.choices[1:4]
+        choices = self.choices
+        return self.positions, self.rgba, self.row, *self._numbers, choices.offsets, choices.columns, choices.ranges
 
     @property
     def _mixed_sums(self) -> tuple:

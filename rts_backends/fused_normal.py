@@ -94,7 +94,7 @@ def normal_equations(
     fields = (read_only(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
     bands = -(-len(target) // BAND)
     sums = np.zeros((bands, count + 1, count + 1))
-    given = splats.plain_arguments, splats.row, splats.choices[:6], tangents, tuple(fields), splats.border
+    given = splats.plain_arguments, splats.row, splats.choices, tangents, tuple(fields), splats.border
     parallel(_accumulate, bands, ALPHA if target.shape[2] == 1 else COLORS, *given, sums)
     total = sums.sum(axis=0) / max(target.size, 1)
     matrix = total[:count, :count]
@@ -107,7 +107,7 @@ def _any(tangents: np.ndarray) -> bool:
 
 
 @kernel
-def _accumulate(start, stop, planes, plain, row, lists, tangents, fields, border, sums):
+def _accumulate(start, stop, planes, plain, row, choices, tangents, fields, border, sums):
     """Products (B, T + 1, T + 1) of tangents and, last, residuals in bands [start, stop); the lower triangles."""
     positions, rgba, fronts, scale, peak, gamma = plain
     t_positions, t_rgba = tangents
@@ -121,7 +121,6 @@ def _accumulate(start, stop, planes, plain, row, lists, tangents, fields, border
     )
     products = np.empty((many + 1, channels * PITCH), positions.dtype)
     changes = np.empty((many, 3, 5), positions.dtype)
-    mixed, _, _, _, _, states = lists
     loaded, least = np.empty(3, np.int64), FLAT if t_rgba.shape[1] > 0 else BUSY
     for band in range(start, stop):
         top, bottom = band * BAND, min(height, (band + 1) * BAND)
@@ -130,7 +129,7 @@ def _accumulate(start, stop, planes, plain, row, lists, tangents, fields, border
             loaded[:] = -9
             for y in range(top, bottom):
                 at = y + border, left + border
-                changing = busy(states, *at, count, least) or busy(mixed, *at, count, 1)
+                changing = busy(choices.states, *at, count, least) or busy(choices.mixed, *at, count, 1)
                 if changing:
                     given = y + border, left + border - 1, count + 2
                     first = load_around(sources, loaded, positions, rgba, fronts, *given, scale, peak, gamma)
@@ -152,23 +151,24 @@ def _accumulate(start, stop, planes, plain, row, lists, tangents, fields, border
                                 add_tangent_row(to[SUM:] if k > 0 else to, s, tangent, v, count, planes)
                         tangent_row(to, value, layers, count, planes)
                     composite(value, layers, count)
-                    _mix(change, value, plain, row, lists[1:5], tangents, border, y, left, count, changes)
+                    _mix(change, value, plain, row, choices, tangents, border, y, left, count, changes)
                 else:
-                    fill(value, rgba, row[0, y + border, border:], states[y + border, border:], left, count)
+                    fill(value, rgba, row[0, y + border, border:], choices.states[y + border, border:], left, count)
                 _multiply(sums[band], products, change, value, fields, y, left, count, changing)
 
 
 @compiled
-def _mix(change, value, plain, row, lists, tangents, border, y, left, count, changes):
+def _mix(change, value, plain, row, choices, tangents, border, y, left, count, changes):
     """Values and tangents of the mixed targets of a row of a tile, in place of those of the stencil."""
     positions, rgba, _, scale, peak, gamma = plain
-    offsets, columns, choices, sums = lists
+    offsets, columns = choices.offsets, choices.columns
     one = value.dtype.type(1)
     for d in range(offsets[y + border], offsets[y + border + 1]):
         j = columns[d] - border - left
         if not 0 <= j < count:
             continue
-        total, given = sums[d], (positions, rgba, row, y + border, columns[d], choices[d], scale, peak, gamma)
+        total = choices.sums[d]
+        given = positions, rgba, row, y + border, columns[d], choices.ranges[d], scale, peak, gamma
         changes_of(changes, total, *given, *tangents)
         for c in range(4):
             back = total[1, c] + (one - total[1, 3]) * total[2, c]
