@@ -70,7 +70,7 @@ class Views:
         return namespace(*differences).stack(differences)
 
     def normal_equations(self, pose):
-        """See `rts.protocols.Residuals`: means over images of means over pixels."""
+        """See `rts.Residuals`: means over images of means over pixels."""
         found = [image.normal_equations(pose) for image in self.images]
         return tuple(sum(terms) / len(found) for terms in zip(*found, strict=True))
 

@@ -24,7 +24,7 @@ import numpy as np
 from scenes import camera, mesh
 
 import rts
-from rts.protocols import Proxy
+from rts.records import Proxy
 from rts.threads import thread_count
 from rts_backends.triangles import pixel_matrix
 

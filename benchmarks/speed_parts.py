@@ -27,7 +27,7 @@ class Capture:
     """A splatter that keeps what it is given, of all layers."""
 
     def splat(self, positions: Any, rgba: Any, row: Any) -> Any:
-        """See `rts.protocols.Splatter`."""
+        """See `rts.Splatter`."""
         self.given = positions, rgba, row
         return namespace(positions).zeros((*row.shape[1:], 4), dtype=positions.dtype)
 
@@ -98,7 +98,7 @@ class Unpruned:
         self._splatter = rts.plugin("rts.splatters", "auto")()
 
     def splat(self, positions: Any, rgba: Any, row: Any) -> Any:
-        """See `rts.protocols.Splatter`."""
+        """See `rts.Splatter`."""
         return self._splatter.splat(positions, rgba, row)
 
 

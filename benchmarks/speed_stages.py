@@ -66,7 +66,7 @@ class TimedSplatter:
         self.needed = clock.timed("choose hidden layers", splatter.needed)
 
     def splat(self, positions: Any, rgba: Any, row: Any) -> Any:
-        """See `rts.protocols.Splatter`."""
+        """See `rts.Splatter`."""
         positions = positions + 0  # Whose gradient arrives when the splatter's is done.
         positions.register_hook(self._leave)
         with self._clock.stage("splat"):
@@ -83,7 +83,7 @@ class TimedShader:
         self.opaque, self.reads, self._shader, self._clock = shader.opaque, shader.reads, shader, clock
 
     def __call__(self, theta: Any, gbuffer: Any, camera: Any) -> Any:
-        """See `rts.protocols.Shader`."""
+        """See `rts.Shader`."""
         with self._clock.stage("shade"):
             return self._shader(theta, gbuffer, camera)
 

@@ -9,34 +9,65 @@ from rts.camera import Camera
 from rts.choosing import explain
 from rts.errors import EngineError, InputError, LayersWarning, PluginError, RtsError
 from rts.fitting import Fit, fit
+from rts.gbuffer import GBuffer
 from rts.gradients import check_gradient, gradient_image
 from rts.image_residuals import ImageResiduals
+from rts.interfaces import (
+    Engine,
+    Evaluator,
+    Part,
+    RaySurface,
+    Residuals,
+    Sampler,
+    Shader,
+    Splatter,
+    Surface,
+    TriangleSurface,
+)
+from rts.operations.combine import combine
+from rts.operations.operation import Operation
+from rts.operations.rigid import rigid
 from rts.preparing import prepare
-from rts.protocols import Fragments, GBuffer, Part, Proxy, RayHits, Sampled, Samples
+from rts.records import ArraySpec, Fragments, Proxy, RayHits, Rays, Sampled, Samples, Splats
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples, sample
 from rts.sampling import TriangleSampler
 from rts.scenes import load, load_image, save_animation, save_image
-from rts.transforms import rigid
+from rts.splatting import exact_calibration
 
 __all__ = [
+    "ArraySpec",
     "Camera",
+    "Engine",
     "EngineError",
+    "Evaluator",
     "Fit",
     "Fragments",
     "GBuffer",
     "ImageResiduals",
     "InputError",
     "LayersWarning",
+    "Operation",
     "Part",
     "PluginError",
     "Proxy",
     "RayHits",
+    "RaySurface",
+    "Rays",
+    "Residuals",
     "RtsError",
     "Sampled",
+    "Sampler",
     "Samples",
+    "Shader",
+    "Splats",
+    "Splatter",
+    "Surface",
     "TriangleSampler",
+    "TriangleSurface",
     "check_gradient",
+    "combine",
+    "exact_calibration",
     "explain",
     "fit",
     "gradient_image",

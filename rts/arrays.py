@@ -10,8 +10,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from rts.errors import EngineError, InputError, PluginError
-from rts.protocols import Array, Engine, Tree
-from rts.records import STATIC_FIELDS, join_record, split_record
+from rts.interfaces import Engine, adapted
+from rts.records import STATIC_FIELDS, Array, Tree, join_record, split_record
 
 _F = TypeVar("_F", bound=Callable)
 CONSTANT_TYPES = (np.ndarray, np.generic, bool, int, float)
@@ -95,17 +95,26 @@ def is_constant(tree: Tree) -> bool:
 
 # Plain dictionaries rather than functools caches: torch.compile looks through the latter, and warns.
 _ENGINES: dict[str, Engine] = {}
-_OWNERS: dict[type, Engine] = {}
+OWNERS: dict[type, Engine] = {}
+"""Engines by the types of arrays that have been met; NumPy's own, which are constants beside any, are not in it."""
 _BITS: dict[Any, int] = {}
-_WRAPS: dict[str, Any] = {}
-"""By engines, their member `uncompiled`, or None."""
+_BROKEN: set[str] = set()
+"""Engines that do not load."""
 
 
-def _engine(name: str) -> Engine:
+def engine_named(name: str) -> Engine:
+    """The one object of an engine, which is loaded.
+
+    Raises:
+        PluginError: it cannot be loaded.
+    """
     from rts.registry import plugin
 
     if name not in _ENGINES:
-        _ENGINES[name] = plugin("rts.engines", name)()
+        engine = adapted(plugin("rts.engines", name)(), Engine)
+        if engine is None:
+            raise PluginError(f"the engine {name!r} is not an rts.Engine, nor has its methods; subclass it")
+        _ENGINES[name] = engine
     return _ENGINES[name]
 
 
@@ -113,8 +122,8 @@ def _owner(x: Any) -> Engine:
     from rts.registry import plugins
 
     for name in plugins("rts.engines"):
-        if name != "numpy" and name in sys.modules and _engine(name).owns(x):
-            return _engine(name)
+        if name != "numpy" and name in sys.modules and engine_named(name).owns(x):
+            return engine_named(name)
     raise EngineError(
         f"an array of type {type(x).__module__}.{type(x).__qualname__} belongs to no engine; "
         f"expected NumPy, {', '.join(n for n in plugins('rts.engines') if n != 'numpy')}"
@@ -127,34 +136,51 @@ def engine_of(*trees: Tree) -> Engine:
     Raises:
         EngineError: arrays of two engines, or of an unknown type.
     """
-    found: dict[str, Engine] = {}
-    for x in leaves(trees):
-        engine = _OWNERS.get(type(x))
+    found: Engine | None = None
+    collected: list[Any] = []
+    for tree in trees:
+        engine = OWNERS.get(type(tree))
+        if engine is None:
+            _collect(tree, collected)
+        elif found is None:
+            found = engine
+        elif engine is not found:
+            collected.append(tree)
+    for x in collected:
+        engine = OWNERS.get(type(x))
         if engine is None:
             if isinstance(x, CONSTANT_TYPES):
                 continue
-            engine = _OWNERS[type(x)] = _owner(x)
-        found[engine.name] = engine
-    if len(found) > 1:
-        raise EngineError(
-            f"arrays of {' and '.join(sorted(found))} met in one call; convert one side "
-            f"(NumPy arrays may stand beside either, as constants)"
-        )
-    return next(iter(found.values())) if found else _engine("numpy")
+            engine = OWNERS[type(x)] = _owner(x)
+        if found is not None and engine is not found:
+            raise EngineError(
+                f"arrays of {' and '.join(sorted((engine.name, found.name)))} met in one call; convert one side "
+                f"(NumPy arrays may stand beside either, as constants)"
+            )
+        found = engine
+    return found if found is not None else engine_named("numpy")
 
 
-def _compilers() -> list[Callable[[Callable], Callable]]:
-    """The members `uncompiled` of engines whose framework has been imported."""
-    from rts.registry import plugins
+_names: list[str] = []
 
-    names = [name for name in plugins("rts.engines") if sys.modules.get(name) is not None]
-    for name in names:
-        if name not in _WRAPS:
-            try:
-                _WRAPS[name] = getattr(_engine(name), "uncompiled", None)
-            except PluginError:  # It is an error where arrays of this engine are given.
-                _WRAPS[name] = None
-    return [_WRAPS[name] for name in names if _WRAPS[name] is not None]
+
+def _imported() -> list[Engine]:
+    """The engines whose framework has been imported."""
+    if not _names:
+        from rts.registry import plugins
+
+        _names.extend(plugins("rts.engines"))
+    found = []
+    for name in _names:
+        if sys.modules.get(name) is not None and name not in _BROKEN:
+            if name not in _ENGINES:
+                try:
+                    engine_named(name)
+                except PluginError:  # It is an error where arrays of this engine are given.
+                    _BROKEN.add(name)
+                    continue
+            found.append(_ENGINES[name])
+    return found
 
 
 def uncompiled(f: _F) -> _F:
@@ -167,8 +193,8 @@ def uncompiled(f: _F) -> _F:
     @functools.wraps(f)
     def call(*args: Any, **kwargs: Any) -> Any:
         outside = f
-        for wrap in _compilers():
-            outside = wrap(outside)
+        for engine in _imported():
+            outside = engine.uncompiled(outside)
         return outside(*args, **kwargs)
 
     return call  # pyright: ignore[reportReturnType]
@@ -176,7 +202,7 @@ def uncompiled(f: _F) -> _F:
 
 def is_traced(x: Array) -> bool:
     """Whether an array has a shape but not yet a value."""
-    return getattr(engine_of(x), "traced", lambda x: False)(x)
+    return engine_of(x).traced(x)
 
 
 def exemplar(*trees: Tree) -> Array | None:
@@ -196,8 +222,18 @@ def exemplar(*trees: Tree) -> Array | None:
 
 def namespace(*arrays: Array) -> Any:
     """The array-API namespace of these arrays."""
-    engine = _OWNERS.get(type(arrays[0])) if len(arrays) == 1 else None
+    engine = OWNERS.get(type(arrays[0])) if len(arrays) == 1 else None
     return (engine or engine_of(*arrays)).namespace
+
+
+def shape_of(x: Any) -> tuple[int, ...]:
+    """The shape of an array; () of anything else."""
+    return tuple(getattr(x, "shape", ()))
+
+
+def described(x: Any) -> str:
+    """What an error says of a value: "has shape (2, 3)" of an array, what it is of anything else."""
+    return f"has shape {shape_of(x)}" if hasattr(x, "shape") else f"is a {type(x).__name__}"
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:
@@ -237,84 +273,3 @@ def unit(x: Array, axis: int = -1) -> Array:
     square = xp.sum(x * x, axis=axis, keepdims=True)
     safe = xp.where(square > 0, square, xp.ones_like(square))
     return x / xp.sqrt(safe)
-
-
-def offered(name: str, *arguments: Any) -> Array | None:
-    """What an optional member of the arguments' engine gives for them; None where there is none, or it declines."""
-    known = getattr(engine_of([x for x in arguments if hasattr(x, "dtype")]), name, None)
-    return None if known is None else known(*arguments)
-
-
-# Elementwise, since matrix units of some devices round float32 products to fewer bits.
-
-
-def matmul(a: Array, b: Array) -> Array:
-    """Product of two small matrices in full precision."""
-    found = offered("matmul", a, b)
-    return found if found is not None else namespace(a, b).sum(a[:, :, None] * b[None, :, :], axis=1)
-
-
-def affine(row: Array, points: Array) -> Array:
-    """One coordinate (N,) of an affine map of points (N, 3): `row` is (4,), its last entry the offset."""
-    return points[..., 0] * row[0] + points[..., 1] * row[1] + points[..., 2] * row[2] + row[3]
-
-
-def affine_map(rows: Array, points: Array) -> Array:
-    """Points (N, 3) under an affine map of R rows (R, 4): (N, R)."""
-    found = offered("affine_map", rows, points)
-    if found is not None:
-        return found
-    return namespace(rows, points).stack([affine(rows[i, :], points) for i in range(rows.shape[0])], axis=-1)
-
-
-def take(rows: Array, index: Array) -> Array:
-    """(M, C): the rows of (V, C) that (M,) integers name."""
-    found = offered("take", rows, index)
-    return namespace(rows, index).take(rows, index, axis=0) if found is None else found
-
-
-def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
-    """(N, C): c + w₀ (a − c) + w₁ (b − c), for the rows a, b, c of (V, C) that three columns of `ids` name.
-
-    Args:
-        rows: (V, C) float.
-        ids: (N, I) integers.
-        column: the first of the three.
-        weights: (N, W) float, the first two of which count.
-
-    Raises:
-        InputError: these are no samples of the surface that the rows belong to.
-    """
-    if ids.shape[1] < column + 3 or weights.shape[1] < 2 or ids.shape[0] != weights.shape[0]:
-        raise InputError(
-            f"samples have ids of shape {tuple(ids.shape)} and parameters of shape {tuple(weights.shape)}; expected "
-            f"(N, {column + 3}) and (N, 2), or more columns: sample this surface anew"
-        )
-    if isinstance(rows, np.ndarray) and isinstance(ids, np.ndarray):
-        from rts import interpolation
-
-        interpolation.check(rows, ids, column)
-        return interpolation.interpolate(rows, ids, column, weights)
-    found = offered("interpolate", rows, ids, column, weights)
-    if found is not None:
-        return found
-    xp = namespace(rows, ids)
-    # One gather of all corners: its gradient fills one array of the size of the mesh, instead of three.
-    index = xp.reshape(ids[:, column : column + 3], (-1,))
-    corners = xp.reshape(take(rows, index), (-1, 3, rows.shape[1]))
-    a, b, c = corners[:, 0, :], corners[:, 1, :], corners[:, 2, :]
-    return c + weights[:, 0:1] * (a - c) + weights[:, 1:2] * (b - c)
-
-
-def projective_map(rows: Array, points: Array) -> Array:
-    """(N, 3): of four affine maps (4, 4) of points (N, 3), the first two over the third, and the fourth.
-
-    Where the third is zero there is no image; the result is finite.
-    """
-    found = offered("projective_map", rows, points)
-    if found is not None:
-        return found
-    divisor = affine_map(rows[2:3, :], points)
-    xp = namespace(divisor)
-    safe = xp.where(divisor == 0, xp.ones_like(divisor), divisor)
-    return xp.concat([affine_map(rows[:2, :], points) / safe, affine_map(rows[3:, :], points)], axis=1)

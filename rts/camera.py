@@ -16,8 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import affine, constants, engine_of, exemplar, is_constant, matmul, namespace, projective_map, promote
-from rts.protocols import Array, Rays
+from rts.arrays import constants, engine_of, exemplar, is_constant, namespace, promote
+from rts.operations.linear import affine, matmul
+from rts.operations.projection import projective_map
+from rts.records import Array, Rays
 from rts.transforms import (
     affine_matrix,
     check_range,
@@ -361,7 +363,18 @@ class Camera(NamedTuple):
         inverse = xp.linalg.inv(view)
         linear = xp.concat([inverse[:3, :3], xp.zeros_like(inverse[:3, :1])], axis=1)
         origins = xp.stack([affine(inverse[i, :], start) for i in range(3)], axis=-1)
-        return Rays(origins, xp.stack([affine(linear[i, :], step) for i in range(3)], axis=-1))
+        directions = xp.stack([affine(linear[i, :], step) for i in range(3)], axis=-1)
+        return Rays(origins, directions, self._spread(inverse, (height, width)))
+
+    def _spread(self, inverse: Array, size: tuple[int, int]) -> Array:
+        """See `Rays`; `inverse` is that of the view."""
+        xp, (inverse, p) = promote(inverse, self.projection)
+        # A pixel at clip w spans 4 w² / (height width) of what the first two columns of the projection span.
+        area = 4 / (size[0] * size[1] * xp.abs(p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
+        a, b, c = (inverse[:3, i] for i in range(3))
+        # Of a view that scales, in its local units; a geometric mean where it does so by axis.
+        scale = xp.abs(xp.sum(a * xp.linalg.cross(b, c))) ** (1 / 3)
+        return xp.sqrt(area) * scale * xp.stack([p[3, 3], -p[3, 2]])
 
 
 def _alike(view: Array, projection: Array) -> tuple[Array, Array]:

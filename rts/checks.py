@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from rts import registry
-from rts.arrays import engine_of, from_numbers, is_constant, leaves, namespace
+from rts.arrays import described, engine_of, from_numbers, is_constant, leaves, namespace, shape_of
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.protocols import Array, Part
+from rts.interfaces import Part, RaySurface, Sampler, Shader, Splatter, Surface, TriangleSurface, adapted
+from rts.records import Array
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}
 """Rough memory of a cell of a layer through sampling, shading and splatting in array code; compiled, it is less."""
@@ -50,32 +51,43 @@ def _check_part(index: int, part: Part) -> Part:
     strange = [key for key in part.theta if not isinstance(key, str)]
     if strange:
         raise InputError(f"theta of part {index} has the key {strange[0]!r}; expected names")
-    if not hasattr(part.surface, "evaluate") or isinstance(part.surface, type):
+    surface = adapted(part.surface, Surface, TriangleSurface, RaySurface)
+    if surface is None:
         raise InputError(f"the surface of part {index} is {part.surface!r}; expected an object such as a mesh")
-    part = part.replace(theta=from_numbers(part.theta), transform=from_numbers(part.transform))
-    shader = registry.instance("rts.shaders", part.shader)
-    if not callable(shader):
-        raise InputError(f"the shader of part {index} is {shader!r}; expected a name or a function")
-    if part.transform is not None:
-        check_matrix(f"the transform of part {index}", part.transform)
-    if hasattr(part.surface, "check"):
-        part.surface.check(part.theta)
-    return part.replace(shader=shader)
+    chosen = registry.instance("rts.shaders", part.shader)
+    shader = adapted(chosen, Shader)
+    if shader is None:
+        raise InputError(f"the shader of part {index} is {chosen!r}; expected a name or a function")
+    theta, transform = from_numbers(part.theta), from_numbers(part.transform)
+    if transform is not None:
+        check_matrix(f"the transform of part {index}", transform)
+    surface.check(theta)
+    return Part(surface, theta, shader, transform, part.cull)
 
 
-def check_plugin(group: str, chosen: Any, method: str) -> Any:
-    """A usable plugin from a name, a class or an object, which must have a method."""
-    found = registry.instance(group, chosen)
-    if not hasattr(found, method):
+def check_sampler(chosen: Any) -> Sampler:
+    """A usable sampler from a name, a class or an object."""
+    return _checked_plugin("rts.samplers", chosen, Sampler, "sample")
+
+
+def check_splatter(chosen: Any) -> Splatter:
+    """A usable splatter from a name, a class or an object."""
+    return _checked_plugin("rts.splatters", chosen, Splatter, "image")
+
+
+def _checked_plugin(group: str, chosen: Any, base: type, method: str) -> Any:
+    instance = registry.instance(group, chosen)
+    found = adapted(instance, base)
+    if found is None:
         kind = group.removeprefix("rts.").removesuffix("s")
-        raise InputError(f"the {kind} is {found!r}; expected a name or an object with a method {method!r}")
+        raise InputError(f"the {kind} is {instance!r}; expected a name or an object with a method {method!r}")
     return found
 
 
 def check_matrix(name: str, matrix: Any) -> None:
     """Refuse what is not (4, 4)."""
-    if tuple(getattr(matrix, "shape", ())) != (4, 4):
-        raise InputError(f"{name} has shape {tuple(getattr(matrix, 'shape', ()))}; expected a (4, 4) array")
+    if shape_of(matrix) != (4, 4):
+        raise InputError(f"{name} has shape {shape_of(matrix)}; expected a (4, 4) array")
 
 
 def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple[int, int]:
@@ -116,11 +128,11 @@ def check_background(background: Any, size: tuple[int, int]) -> Array | None:
     if background is None:
         return None
     background = from_numbers(background)
-    shape = tuple(getattr(background, "shape", ()))
-    if shape not in ((3,), (4,), (*size, 3), (*size, 4)):
-        given = f"has shape {shape}" if hasattr(background, "shape") else f"is {background!r}"
+    if shape_of(background) not in ((3,), (4,), (*size, 3), (*size, 4)):
         height, width = size
-        raise InputError(f"background {given}; expected (3,), (4,), ({height}, {width}, 3) or ({height}, {width}, 4)")
+        raise InputError(
+            f"background {described(background)}; expected (3,), (4,), ({height}, {width}, 3) or ({height}, {width}, 4)"
+        )
     check_floating("background", background)
     return background
 
@@ -133,10 +145,8 @@ def check_floating(name: str, value: Array) -> None:
 
 def check_shaded(rgba: Any, count: int, shader: Any) -> None:
     """Refuse what a shader should not have returned."""
-    shape = tuple(getattr(rgba, "shape", ()))
-    if shape != (count, 4):
-        given = f"shape {shape}" if hasattr(rgba, "shape") else f"a {type(rgba).__name__}"
-        raise InputError(f"the shader {shader!r} returned {given}; expected ({count}, 4)")
+    if shape_of(rgba) != (count, 4):
+        raise InputError(f"what the shader {shader!r} returned {described(rgba)}; expected ({count}, 4)")
 
 
 def differentiable(*trees: Any) -> bool:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rts import registry
 from rts.arrays import engine_of, is_constant
 from rts.camera import Camera
-from rts.checks import check_scene
+from rts.checks import check_sampler, check_scene
 from rts.errors import PluginError
-from rts.protocols import Part, Samples
-from rts.sampling import reads_of
+from rts.interfaces import Part, Sampler, TriangleSurface
+from rts.preparing import PreparedParts
+from rts.records import Samples
 
 STATIC_FACES = 4_000_000
 """From so many triangles on, rays at a structure that is kept are faster than drawing all (benchmarks/samplers.py)."""
@@ -30,14 +31,14 @@ class Choice(NamedTuple):
 def choose(part: Part, *, static: bool) -> Choice:
     """The sampler for a part whose triangles stay the same from call to call (`static`), or may not."""
     surface = part.surface
-    if not hasattr(surface, "proxy"):
+    if not isinstance(surface, TriangleSurface):
         return Choice("rays", f"{surface!r} intersects rays itself and has no triangles")
     if not static:
         reason = "triangles that may change each call are drawn at once, with nothing to build"
         return Choice("raster", f"{reason} (they count as unchanging where something is differentiated, but not they)")
-    if not hasattr(surface, "faces"):
-        return Choice("raster", f"{surface!r} does not say how many triangles it has (an attribute `faces`)")
-    faces = len(surface.faces)
+    faces = surface.face_count
+    if faces is None:
+        return Choice("raster", f"{surface!r} does not say how many triangles it has (`face_count`)")
     if faces < STATIC_FACES:
         return Choice("raster", f"{faces} triangles are drawn faster than rays find them (below {STATIC_FACES})")
     try:
@@ -49,27 +50,27 @@ def choose(part: Part, *, static: bool) -> Choice:
 
 def is_static(part: Part, camera: Camera) -> bool:
     """Whether something is differentiated, but not what the surface reads: so calls repeat, and triangles stay."""
-    constant = is_constant({name: part.theta[name] for name in reads_of(part)})
-    return constant and engine_of(part, camera).name != "numpy"
+    constant = is_constant([part.theta[name] for name in part.surface.reads(part.theta)])
+    return constant and engine_of(part, camera).differentiates
 
 
-def explain(parts: Part | Sequence[Part], camera: Camera) -> list[Choice]:
+def explain(parts: Part | Sequence[Part] | PreparedParts, camera: Camera) -> list[Choice]:
     """What `sampler="auto"` takes for each part of a scene, and why."""
-    parts, camera = check_scene(getattr(parts, "parts", parts), camera)
+    parts, camera = check_scene(parts.parts if isinstance(parts, PreparedParts) else parts, camera)
     return [choose(part, static=is_static(part, camera)) for part in parts]
 
 
-class Auto:
+class Auto(Sampler):
     """The sampler that suits each part."""
 
-    def of(self, part: Part, camera: Camera) -> Any:
-        """The sampler of a part."""
-        choice = choose(part, static=is_static(part, camera))
+    def suited(self, part: Part, camera: Camera | None) -> Sampler:
+        """See `rts.Sampler`."""
+        choice = choose(part, static=camera is None or is_static(part, camera))
         _log.debug("%s for %r: %s", choice.sampler, part.surface, choice.reason)
-        return registry.instance("rts.samplers", choice.sampler)
+        return check_sampler(choice.sampler)
 
     def sample(
         self, part: Part, camera: Camera, size: tuple[int, int], layers: int, *, capacity: int | None = None
     ) -> Samples:
-        """See `rts.protocols.Sampler`."""
-        return self.of(part, camera).sample(part, camera, size, layers, capacity=capacity)
+        """See `rts.Sampler`."""
+        return self.suited(part, camera).sample(part, camera, size, layers, capacity=capacity)

@@ -19,7 +19,7 @@ from typer.core import TyperGroup
 from rts import registry
 from rts.arrays import map_leaves
 from rts.errors import RtsError
-from rts.protocols import Part
+from rts.interfaces import Part
 
 EXAMPLES = """
 Examples:

@@ -11,10 +11,10 @@ import numpy as np
 
 from rts import registry
 from rts.framing import bounds_of, orbit
+from rts.interfaces import Part
+from rts.operations.rigid import rigid
 from rts.pose import PoseFit, fit_pose, posed, shrunk, silhouette_of, write_report
-from rts.protocols import Part
 from rts.rendering import render
-from rts.transforms import rigid
 
 SIZE = (320, 320)
 TRUE_ROTATION = (0.22, -0.38, 0.16)

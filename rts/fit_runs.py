@@ -10,7 +10,8 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rts.errors import InputError, RtsError
-from rts.protocols import Engine, Tree
+from rts.interfaces import Engine
+from rts.records import Tree
 
 Report = Callable[[int, Tree, float], Any]
 
@@ -61,12 +62,11 @@ class Run:
     def attempt(self, engine: Engine, call: Callable, *args: Any) -> Any:
         """`call(*args)`, computed; an InputError of a later step stops the fit."""
         # jax wraps errors of host functions in one of its own; the engine keeps the original.
-        take_error = getattr(engine, "take_error", lambda: None)
-        take_error()
+        engine.take_error()
         try:
             return engine.block(call(*args))
         except Exception as error:
-            original = error if isinstance(error, RtsError) else take_error()
+            original = error if isinstance(error, RtsError) else engine.take_error()
             if original is None:
                 raise
             if self.history and isinstance(original, InputError):

@@ -14,8 +14,9 @@ import numpy as np
 from rts.arrays import engine_of, is_constant, leaves, map_leaves
 from rts.errors import InputError
 from rts.fit_runs import Astray, Report, Run, progress_bar, require
+from rts.interfaces import Engine, Residuals, adapted
 from rts.least_squares import levenberg_marquardt, mean_square
-from rts.protocols import Array, Engine, Tree
+from rts.records import Array, Tree
 
 STEPS = {"adam": 200, "sgd": 200, "lm": 50}
 LEARNING_RATES = {"adam": 1e-2, "sgd": 1e-1}
@@ -62,7 +63,7 @@ def fit(
 
     Args:
         residuals: parameters → array of any shape, such as an image difference; see `ImageResiduals` for one that
-            "lm" takes less time and memory for, and `rts.protocols.Residuals` for what makes it so.
+            "lm" takes less time and memory for, and `rts.Residuals` for what makes it so.
         parameters: a torch or jax array, or nested dicts and lists of them; where to start.
         method: "adam" or "sgd" (torch.optim or optax, on the gradient of the loss), or "lm": Levenberg–Marquardt on the
             sum of squares, by the forward-mode Jacobian, for up to some hundred unknowns.
@@ -88,7 +89,8 @@ def fit(
     with progress_bar(progress, run.steps, method, run):
         try:
             if method == "lm":
-                own = getattr(residuals, "normal_equations", None)
+                known = adapted(residuals, Residuals)
+                own = known.normal_equations if known.sums_products else None
                 levenberg_marquardt(_checked(residuals, engine), parameters, engine, run, jit, own)
             else:
                 rate = LEARNING_RATES[method] if learning_rate is None else float(learning_rate)

@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.protocols import Part
+from rts.interfaces import Part
 
 MARGIN = 1.05
 """Radius of what the default view shows, over the radius of the object."""

@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import engine_of, from_numbers, is_constant, is_traced, leaves, map_leaves, namespace
+from rts.arrays import engine_of, from_numbers, is_constant, is_traced, leaves, map_leaves, namespace, shape_of
 from rts.camera import Camera
 from rts.checks import check_size
 from rts.errors import InputError
-from rts.protocols import Array, Engine, Part, Tree
+from rts.interfaces import Engine, Part, Splatter
+from rts.records import Array, Splats, Tree
 from rts.rendering import render
 from rts.scenes import decode_srgb
 
@@ -246,8 +247,8 @@ def _scalar(loss: Callable[[Array], Array], engine: Engine) -> Callable[[Array],
 
 
 def _kind(value: Any) -> str:
-    shape = f" of shape {tuple(value.shape)}" if hasattr(value, "shape") else ""
-    return f"a {type(value).__name__}{shape}"
+    shape = shape_of(value)
+    return f"a {type(value).__name__}{f' of shape {shape}' if shape else ''}"
 
 
 def _named(tree: Tree, name: str = "") -> Iterator[tuple[str, Array]]:
@@ -287,13 +288,14 @@ def _unit(engine: Engine, parameters: Tree, number: int, index: int) -> Tree:
 # ------------------------------------------------------------------------------------------- finite differences
 
 
-class _Probe:
+class _Probe(Splatter):
     """A splatter that shows where samples are on the image, and their colour."""
 
     def __init__(self, color: bool):
         self.color = color
 
-    def splat(self, positions: Array, rgba: Array, row: Array) -> Array:
+    def image(self, splats: Splats) -> Array:
+        positions, rgba, row = splats.positions, splats.rgba, splats.row
         xp = namespace(positions, rgba, row)
         values = rgba if self.color else xp.concat([positions[:, :2]] * 2, axis=1)
         index = xp.reshape(xp.where(row[0] >= 0, row[0], 0), (-1,))

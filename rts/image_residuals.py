@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rts.arrays import constants, engine_of, exemplar, from_numbers, namespace
+from rts.arrays import constants, described, engine_of, exemplar, from_numbers, namespace, shape_of
 from rts.camera import Camera
-from rts.checks import check_background, check_floating, check_plugin, check_scene, check_size
+from rts.checks import check_background, check_floating, check_scene, check_size, check_splatter
 from rts.errors import InputError
+from rts.interfaces import Engine, Part, Residuals, Splatter
 from rts.least_squares import flatten, normal_equations
 from rts.preparing import PreparedParts
-from rts.protocols import Array, Engine, Part, Tree
-from rts.rendering import APRON, render, sample, to_splats
+from rts.records import Array, Splats, Tree
+from rts.rendering import render, sample, to_splats
 
 Parts = Part | Sequence[Part] | PreparedParts
 Scene = Callable[[Tree], "Parts | tuple[Parts, Camera]"]
@@ -21,7 +22,7 @@ CHANNELS = {1: slice(3, 4), 3: slice(0, 3), 4: slice(0, 4)}
 """Which channels of an image a target has, by their number."""
 
 
-class ImageResiduals:
+class ImageResiduals(Residuals):
     """The difference between the render of a scene and a target, as a function of the scene's parameters.
 
     Usable wherever a function of parameters is, such as with `rts.fit`. Levenberg–Marquardt takes less time and memory
@@ -102,13 +103,13 @@ class ImageResiduals:
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
         """Mean square () of the n residuals, JᵀJ / n (U, U) and Jᵀr / n (U,) for the U numbers in the parameters."""
         engine = engine_of(parameters)
-        splatter = check_plugin("rts.splatters", self._splatter, "splat")
+        splatter = check_splatter(self._splatter)
         found = None
-        if hasattr(splatter, "normal_equations") and self._supersample == 1 and engine.name != "numpy":
+        if splatter.sums_products and self._supersample == 1 and engine.differentiates:
             found = self._swept(splatter, parameters, engine)
         return normal_equations(self, parameters, engine) if found is None else found
 
-    def _swept(self, splatter: Any, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
+    def _swept(self, splatter: Splatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
         """By the splatter; None where it cannot."""
         vector, unflatten = flatten(parameters)
         parts, camera = self.scene(parameters)
@@ -117,22 +118,20 @@ class ImageResiduals:
 
         def splats(v: Array) -> tuple[Array, Array]:
             parts, camera = _checked(*self.scene(unflatten(v)))
-            positions, rgba, _ = constants(to_splats(sampled, parts, camera, camera, v), engine, v)
+            moved = to_splats(sampled, parts, camera, camera, v)
+            positions, rgba = constants((moved.positions, moved.rgba), engine, v)
             # What is opaque has an alpha of one, whatever its colours.
             return positions, rgba if colored else engine.stop_gradient(rgba)
 
         (positions, rgba), (t_positions, t_rgba) = engine.jacobian(splats)(vector)
         target, weights, background = self._constants(vector)
         return splatter.normal_equations(
-            positions,
-            rgba,
-            constants(sampled.row, engine, vector),
+            Splats(positions, rgba, constants(sampled.row, engine, vector), border=sampled.apron),
             t_positions,
             t_rgba if colored else None,
             target,
             weights=weights,
             background=background,
-            border=APRON,
         )
 
     def _constants(self, like: Array) -> tuple[Array, Array | None, Array | None]:
@@ -157,17 +156,17 @@ def _checked(parts: Any, camera: Camera) -> tuple[list[Part], Camera]:
 
 
 def _all_opaque(parts: Any, camera: Camera) -> bool:
-    return all(getattr(part.shader, "opaque", False) for part in _checked(parts, camera)[0])
+    return all(part.shader.opaque for part in _checked(parts, camera)[0])
 
 
 def _checked_target(target: Any, size: tuple[int, int]) -> tuple[Array, int]:
     """The target, and its number of channels."""
     target = from_numbers(target)
-    shape = tuple(getattr(target, "shape", ()))
+    shape = shape_of(target)
     if shape[:2] != size or shape[2:] not in ((), *((c,) for c in CHANNELS)):
         height, width = size
         raise InputError(
-            f"target {_described(target, shape)}; expected ({height}, {width}) or ({height}, {width}, 1) to compare "
+            f"target {described(target)}; expected ({height}, {width}) or ({height}, {width}, 1) to compare "
             f"with alpha, ({height}, {width}, 3) with colours, or ({height}, {width}, 4) with both"
         )
     check_floating("target", target)
@@ -178,16 +177,11 @@ def _checked_weights(weights: Any, shape: tuple[int, ...], size: tuple[int, int]
     if weights is None:
         return None
     weights = from_numbers(weights)
-    given = tuple(getattr(weights, "shape", ()))
     allowed = dict.fromkeys((size, (*size, 1), tuple(shape)))
-    if given not in allowed:
-        raise InputError(f"weights {_described(weights, given)}; expected {' or '.join(map(str, allowed))}")
+    if shape_of(weights) not in allowed:
+        raise InputError(f"weights {described(weights)}; expected {' or '.join(map(str, allowed))}")
     xp = namespace(weights)
     if xp.isdtype(weights.dtype, "bool"):
         return xp.astype(weights, xp.float32)
     check_floating("weights", weights)
     return weights
-
-
-def _described(value: Any, shape: tuple[int, ...]) -> str:
-    return f"has shape {shape}" if hasattr(value, "shape") else f"is a {type(value).__name__}"

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.arrays import leaves
-from rts.protocols import Proxy, Tree
+from rts.records import Proxy, Tree
 
 KEPT = 2
 """Entries a surface and sampler: the newest, and the one before it, which is moved when a third is asked for."""

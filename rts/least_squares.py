@@ -11,7 +11,8 @@ import numpy as np
 from rts.arrays import leaves, map_leaves, namespace
 from rts.errors import InputError
 from rts.fit_runs import Run, require
-from rts.protocols import Array, Engine, Tree
+from rts.interfaces import Engine
+from rts.records import Array, Tree
 
 FIRST_DAMPING = 1e-3
 LARGEST_DAMPING = 1e12
@@ -47,7 +48,7 @@ def levenberg_marquardt(
         engine: of the parameters.
         run: what is kept.
         jit: compile.
-        own: the residuals' method `normal_equations`, where they have one; see `rts.protocols.Residuals`.
+        own: the residuals' method `normal_equations`, where they have one; see `rts.Residuals`.
     """
     vector, unflatten = flatten(parameters)
     linearize, loss_at = _least_squares(residuals, own, parameters, engine, run, jit)
@@ -83,7 +84,7 @@ def levenberg_marquardt(
 def normal_equations(
     residuals: Callable[[Tree], Array], parameters: Tree, engine: Engine
 ) -> tuple[Array, Array, Array]:
-    """Mean square of the n residuals, JᵀJ / n and Jᵀr / n, by the Jacobian; see `rts.protocols.Residuals`."""
+    """Mean square of the n residuals, JᵀJ / n and Jᵀr / n, by the Jacobian; see `rts.Residuals`."""
     xp = engine.namespace
     vector, unflatten = flatten(parameters)
     r, rows = engine.jacobian(lambda v: xp.reshape(residuals(unflatten(v)), (-1,)))(vector)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from rts.protocols import Fragments
+from rts.records import Fragments
 from rts.threads import parallel
 
 

@@ -8,11 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import registry
-from rts.arrays import constants, is_constant, leaves, map_leaves
+from rts.arrays import constants, engine_named, is_constant, leaves, map_leaves
 from rts.camera import Camera
+from rts.checks import check_sampler, check_scene
 from rts.errors import RtsError
-from rts.protocols import Engine, Part
-from rts.rendering import APRON, render
+from rts.interfaces import Engine, Part, RaySurface, TriangleSurface
+from rts.rendering import apron_of, render
 from rts.sampling import TriangleSampler
 
 SIZE = (14, 18)
@@ -20,6 +21,7 @@ CAMERA = Camera.look_at((0.9, 1.6, 3.2), (0, 0, 0), aspect=SIZE[1] / SIZE[0], pr
 """Sees an example, which lies about the origin and within two units of it; nothing is symmetric."""
 
 LAYERS = 2
+APRON = apron_of(None)
 CAPACITY = LAYERS * (SIZE[0] + 2 * APRON) * (SIZE[1] + 2 * APRON)
 """A row for every cell, so that engines that compile meet the same shapes again."""
 
@@ -54,7 +56,7 @@ def attempt(part: Part, sampler: Any, engine: str) -> np.ndarray:
         RtsError: the image shows nothing, is not that of the sampler `reference` (of triangles), or a value or
             derivative is not finite; or whatever rendering raises.
     """
-    chosen = registry.plugin("rts.engines", engine)()
+    chosen = engine_named(engine)
     theta = constants(map_leaves(_single, part.theta), chosen, None)
 
     def image(theta: Any) -> Any:
@@ -73,11 +75,10 @@ def attempt(part: Part, sampler: Any, engine: str) -> np.ndarray:
 
 def _is_of_triangles(part: Part, sampler: Any) -> bool:
     """Whether a sampler can only show the part's triangles, not what it intersects."""
-    if not hasattr(part.surface, "intersect"):
-        return hasattr(part.surface, "proxy")
-    return isinstance(
-        registry.instance("rts.samplers", sampler) if isinstance(sampler, str) else sampler, TriangleSampler
-    )
+    surface = check_scene(part, CAMERA)[0][0].surface
+    if not isinstance(surface, RaySurface):
+        return isinstance(surface, TriangleSurface)
+    return isinstance(check_sampler(sampler), TriangleSampler)
 
 
 def _check_image(found: np.ndarray, part: Part) -> None:

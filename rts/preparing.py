@@ -5,15 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rts import registry
-from rts.arrays import engine_of, map_leaves
 from rts.camera import Camera
-from rts.checks import check_plugin, check_scene
-from rts.choosing import Auto, choose
+from rts.checks import check_sampler, check_scene
 from rts.errors import InputError
-from rts.keeping import Entry
-from rts.protocols import Part
-from rts.sampling import TriangleSampler
+from rts.interfaces import Part
 
 
 class PreparedParts:
@@ -27,7 +22,7 @@ class PreparedParts:
         entries: what the sampler has built of each, or None where it builds nothing.
     """
 
-    def __init__(self, parts: Sequence[Part], samplers: Sequence[Any], entries: Sequence[Entry | None]):
+    def __init__(self, parts: Sequence[Part], samplers: Sequence[Any], entries: Sequence[Any]):
         self.parts, self.samplers, self.entries = tuple(parts), tuple(samplers), tuple(entries)
 
     def replace(self, index: int = 0, **changes: Any) -> PreparedParts:
@@ -65,24 +60,7 @@ def prepare(
     """
     identity = Camera.look_at((0, 0, 1), (0, 0, 0))
     checked, _ = check_scene(parts, identity if camera is None else camera)
-    chosen = check_plugin("rts.samplers", sampler, "sample")
-    samplers, entries = [], []
-    for part in checked:
-        own = chosen
-        if isinstance(chosen, Auto):
-            own = registry.instance("rts.samplers", choose(part, static=True).sampler)
-        samplers.append(own)
-        entries.append(_entry(part, own, camera, size) if isinstance(own, TriangleSampler) else None)
+    chosen = check_sampler(sampler)
+    samplers = [chosen.suited(part, None) for part in checked]
+    entries = [own.hold(part, camera, size) for own, part in zip(samplers, checked, strict=True)]
     return PreparedParts(checked, samplers, entries)
-
-
-def _entry(part: Part, sampler: TriangleSampler, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
-    surface = part.surface
-    if hasattr(surface, "proxy_key") and (camera is None or size is None):
-        raise InputError(f"the triangles of {surface!r} depend on the view; give camera and size")
-    inputs = surface.proxy_inputs(part.theta)
-    inputs = map_leaves(engine_of(inputs).to_numpy, inputs)
-    if camera is not None:
-        within = camera.within(part.transform)
-        camera = Camera(*(engine_of(m).to_numpy(m) for m in within))
-    return sampler.build(surface, inputs, camera, size)

@@ -13,22 +13,19 @@ import numpy as np
 
 from rts.arrays import engine_of, is_traced, namespace
 from rts.errors import InputError, LayersWarning
-from rts.protocols import ArraySpec, Part, Sampled, Samples
+from rts.interfaces import Needed, Part, Splatter
+from rts.records import ArraySpec, Sampled, Samples
 
 LAYER_LIMIT = 8
 """The largest number of layers that `layers="auto"` takes."""
 
-Needed = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""(K, H, W) covered (bool) and depth → which samples can reach the image (bool); on the host."""
 
-
-def needed_by(splatter: Any, parts: Sequence[Part]) -> Needed | None:
+def needed_by(splatter: Splatter, parts: Sequence[Part]) -> Needed | None:
     """What the splatter needs of a scene, or None where that is not known: all of it.
 
     Only where all samples are opaque and lie on pixel centres are hidden ones without effect.
     """
-    known = all(getattr(p.shader, "opaque", False) and getattr(p.surface, "centered", True) for p in parts)
-    if not known or not hasattr(splatter, "needed"):
+    if not splatter.prunes or not all(p.shader.opaque and p.surface.centered for p in parts):
         return None
 
     def needed(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -95,26 +92,22 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: Needed | None) ->
             LayersWarning,
             stacklevel=5,
         )
-    arrays = {name: getattr(sampled, name)[:kept, ...] for name in ("row", "depth")}
-    return replace(sampled, **arrays, overflow=sampled.overflow + missing)
+    return replace(
+        sampled, row=sampled.row[:kept, ...], depth=sampled.depth[:kept, ...], overflow=sampled.overflow + missing
+    )
 
 
 def prune(sampled: Sampled, needed: Needed) -> Sampled:
     """The scene without the samples that are not needed; one call to the host."""
     sizes = [s.ids.shape[0] for s in sampled.samples]
     offsets = np.cumsum([0, *sizes])
-    # Tables may have a row a sample: those parts keep their rows, though no cell refers to some of them.
-    fixed = [(a, a + n) for a, n, s in zip(offsets, sizes, sampled.samples, strict=False) if s.tables]
 
     def host(row: np.ndarray, depth: np.ndarray, *own_rows: np.ndarray) -> tuple[np.ndarray, ...]:
-        shown = np.zeros(offsets[-1], bool)
-        shown[row[needed(row >= 0, depth)]] = True
-        used = shown.copy()
-        for a, b in fixed:
-            used[a:b] = True
+        used = np.zeros(offsets[-1], bool)
+        used[row[needed(row >= 0, depth)]] = True
         # In their order, so that neighbours in the image stay neighbours in memory.
         indices = [np.flatnonzero(used[a:b]).astype(np.int32) for a, b in itertools.pairwise(offsets)]
-        numbers = [np.where(shown[a:b], np.cumsum(used[a:b]) - 1, -1) for a, b in itertools.pairwise(offsets)]
+        numbers = [np.where(used[a:b], np.cumsum(used[a:b]) - 1, -1) for a, b in itertools.pairwise(offsets)]
         rows = zip((np.concatenate(numbers), *numbers), (row, *own_rows), strict=True)
         renumbered = [np.where(r >= 0, n[r], -1).astype(np.int32) for n, r in rows]
         return *renumbered, *(i if len(i) else np.zeros(1, np.int32) for i in indices)

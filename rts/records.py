@@ -1,41 +1,65 @@
-"""Frozen dataclasses that every engine knows as pytrees, so that they may be arguments of its transforms."""
+"""What passes between the parts of the library, and what makes a class known to every engine as a pytree.
+
+Shapes use these letters: N packed samples, K layers front to back, H × W pixels (row 0 on top), V vertices,
+T triangles, I integers and P reals a sample, C channels. Conventions of space are in `rts.camera`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from operator import attrgetter
+from typing import Any, NamedTuple, TypeVar, dataclass_transform
+
+import numpy as np
+
+Array = Any
+"""An array of NumPy, torch or jax, or of an engine that a plugin brings."""
+
+Tree = Any
+"""Arrays in nested dicts, lists, tuples and records."""
+
+_Class = TypeVar("_Class", bound=type)
+
+# ------------------------------------------------------------------------------------------ records as pytrees
 
 STATIC_FIELDS: dict[type, tuple[str, ...]] = {}
 """The records that are pytrees, each with the names of its fields that are not arrays (engines register them)."""
 
-
 _ARRAY_FIELDS: dict[type, tuple[str, ...]] = {}
+_GETTERS: dict[type, tuple[Callable, Callable]] = {}
 
 
-def record(*, static: tuple[str, ...] = ()) -> Callable[[type], type]:
-    """Make a class a frozen dataclass that every engine knows as a pytree.
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(field,))
+def record(*, static: tuple[str, ...] = ()) -> Callable[[_Class], _Class]:
+    """Make a class a frozen dataclass that every engine knows as a pytree, to be an argument of its transforms.
 
     Args:
         static: the fields that are not arrays; jax compares them to decide whether to compile anew.
     """
 
-    def decorate(cls: type) -> type:
-        cls = dataclass(frozen=True, eq=False)(cls)
-        STATIC_FIELDS[cls] = static
-        _ARRAY_FIELDS[cls] = tuple(f.name for f in fields(cls) if f.name not in static)
-        return cls
+    def decorate(cls: _Class) -> _Class:
+        made = dataclass(frozen=True, eq=False)(cls)
+        STATIC_FIELDS[made] = static
+        _ARRAY_FIELDS[made] = tuple(f.name for f in fields(made) if f.name not in static)
+        _GETTERS[made] = _getter(_ARRAY_FIELDS[made]), _getter(static)
+        return made
 
     return decorate
 
 
+def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple]:
+    """The fields of these names, as a tuple."""
+    if not names:
+        return lambda value: ()
+    get = attrgetter(*names)
+    return get if len(names) > 1 else lambda value: (get(value),)
+
+
 def split_record(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """A record's array fields in order of declaration, and its static fields in that of `STATIC_FIELDS`."""
-    # Looked up beforehand, since records are taken apart dozens of times a render.
-    cls = type(value)
-    return tuple([getattr(value, n) for n in _ARRAY_FIELDS[cls]]), tuple(
-        [getattr(value, n) for n in STATIC_FIELDS[cls]]
-    )
+    arrays, static = _GETTERS[type(value)]
+    return arrays(value), static(value)
 
 
 def join_record(cls: type, arrays: tuple[Any, ...], static: tuple[Any, ...]) -> Any:
@@ -45,3 +69,179 @@ def join_record(cls: type, arrays: tuple[Any, ...], static: tuple[Any, ...]) -> 
         zip(_ARRAY_FIELDS[cls], arrays, strict=True), **dict(zip(STATIC_FIELDS[cls], static, strict=True))
     )
     return value
+
+
+# ------------------------------------------------------------------------------------------------- what passes
+
+
+class ArraySpec(NamedTuple):
+    """What a host function returns: the shape and dtype of one array.
+
+    Attributes:
+        shape: the shape, or the largest one where `packed`.
+        dtype: a NumPy dtype.
+        packed: the first axis counts samples and may come back shorter; an engine that needs fixed shapes pads it
+            with zeros.
+    """
+
+    shape: tuple[int, ...]
+    dtype: Any
+    packed: bool = False
+
+
+class Proxy(NamedTuple):
+    """Triangles that stand for a surface while it is sampled. Host arrays.
+
+    Attributes:
+        vertices: (V, 3) float32, local space.
+        faces: (T, 3) int32.
+        ids: (T, I) int32, handed on to the samples of the triangle; None means `faces`.
+        corner_params: (T, 3, P) float32, interpolated with the barycentrics; None means the barycentrics themselves.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    ids: np.ndarray | None = None
+    corner_params: np.ndarray | None = None
+
+
+class Fragments(NamedTuple):
+    """What a triangle sampler finds. Host arrays.
+
+    Attributes:
+        triangle_ids: (K, H, W) int32 front to back, −1 where a pixel has no such layer.
+        barycentrics: (K, H, W, 2) float32, the weights of the triangle's first two corners, perspective-correct.
+        depth: (K, H, W) float32, linear distance along the camera's axis; 0 where empty.
+    """
+
+    triangle_ids: np.ndarray
+    barycentrics: np.ndarray
+    depth: np.ndarray
+
+
+class Rays(NamedTuple):
+    """Rays through pixel centres: the point at camera depth z is `origins + z * directions`.
+
+    Attributes:
+        origins: (..., 3), on the plane of the camera's centre.
+        directions: (..., 3), scaled to advance one unit of depth.
+        spread: (2,), a pixel at camera depth z is `spread[0] + spread[1] * z` wide, in the units of the origins: the
+            side of a square of its area.
+    """
+
+    origins: Array
+    directions: Array
+    spread: Array
+
+
+class RayHits(NamedTuple):
+    """Where R rays meet a surface that intersects them itself, nearest first, K for each.
+
+    Attributes:
+        hit: (K, R) bool, whether there is such a hit; those of a ray come first.
+        distance: (K, R) the hit is at `origin + distance * direction`; any finite number where there is none.
+        params: (K, R, P) what `evaluate` finds in `Samples.params`; finite where there is no hit, too.
+        ids: (K, R, I) int32, or None for I = 0.
+    """
+
+    hit: Array
+    distance: Array
+    params: Array
+    ids: Array | None = None
+
+
+@record(static=("asked", "centered"))
+class Samples:
+    """Where the rays of one part meet its surface: the paper's U, packed.
+
+    Attributes:
+        ids: (N, I) int32.
+        params: (N, P) float32; θ's own dtype where they were found on the device.
+        row: (K, H, W) int32, the sample in each cell, or −1.
+        depth: (K, H, W) float32, linear camera depth; 0 where `row` is −1.
+        overflow: () int32, samples that did not fit into the capacity and were dropped, deepest layers first.
+        tables: further arrays of the surface, filled by its `refine`, that all samples share: what a sample has of its
+            own is in `ids` and `params`.
+        gbuffer: the evaluated G-buffer where the surface's θ is constant, else None.
+        asked: the entries that were asked for when `gbuffer` was evaluated; None for all.
+        centered: whether the samples reproject to the centres of their pixels.
+    """
+
+    ids: Array
+    params: Array
+    row: Array
+    depth: Array
+    overflow: Array
+    tables: Mapping[str, Array] = field(default_factory=dict)
+    gbuffer: Mapping[str, Array] | None = None
+    asked: tuple[str, ...] | None = None
+    centered: bool = True
+
+
+@record(static=("supersample", "apron"))
+class Sampled:
+    """A whole scene, sampled: what `rts.sample` returns and `rts.render_samples` takes.
+
+    The grid has an apron of cells around the image, so that what lies just outside can splat into it: here H and W are
+    the image's, times `supersample`, plus twice the apron.
+
+    Attributes:
+        samples: one `Samples` a part.
+        row: (K, H, W) int32, the sample in each cell, counted over all parts in order, or −1.
+        depth: (K, H, W) float32, linear camera depth; 0 where empty.
+        overflow: () int32, samples dropped for want of capacity, or beyond the limit of `layers="auto"`. Should be 0.
+        supersample: s, where each pixel has s² cells.
+        apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
+    """
+
+    samples: tuple[Samples, ...]
+    row: Array
+    depth: Array
+    overflow: Array
+    supersample: int = 1
+    apron: int = 2
+
+    @property
+    def part(self) -> Array:
+        """(K, H, W) int32, the part seen in each cell, or −1."""
+        from rts.arrays import namespace
+
+        xp, first = namespace(self.row), 0
+        part = xp.astype(self.row >= 0, self.row.dtype) - 1
+        for samples in self.samples[:-1]:
+            first += samples.ids.shape[-2]
+            part = part + xp.astype(self.row >= first, self.row.dtype)
+        return part
+
+
+@record(static=("border",))
+class Splats:
+    """Shaded samples in their cells: what a splatter takes.
+
+    A splatter ignores what it does not read. The optional fields say more about the scene, where whoever made the
+    splats knows it.
+
+    Attributes:
+        positions: (N, 3) pixel x, pixel y, linear depth; differentiable.
+        rgba: (N, 4) premultiplied, of the engine of the positions; differentiable.
+        row: (K, H, W) int32, the sample of each cell front to back, or −1; an array of the positions' engine.
+        part: (K, H, W) int32, the part of each sample, or −1; None where nobody has said.
+        facing: (N,) float, the cosine between a sample's normal and the direction to the viewer; or None.
+        settled: (H, W) bool, cells amid one colour, where nothing that moves changes the image; or None.
+        sentinel: () float, the depth that stands for empty layers, beyond all samples; None for one of the scene's
+            scale.
+        border: cells at each side that splat into the image but are no part of it.
+    """
+
+    positions: Array
+    rgba: Array
+    row: Array
+    part: Array | None = None
+    facing: Array | None = None
+    settled: Array | None = None
+    sentinel: Array | None = None
+    border: int = 0
+
+    def replace(self, **changes: Any) -> Splats:
+        """A copy with some fields changed."""
+        return replace(self, **changes)

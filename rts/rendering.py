@@ -2,36 +2,33 @@
 
 from __future__ import annotations
 
-import inspect
 import itertools
 import math
-import weakref
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from rts.arrays import affine_map, constants, engine_of, exemplar, is_constant, is_traced, namespace, uncompiled
+from rts.arrays import constants, engine_of, exemplar, is_constant, is_traced, namespace, uncompiled
 from rts.camera import Camera
 from rts.checks import (
     check_background,
     check_memory,
-    check_plugin,
+    check_sampler,
     check_scene,
     check_shaded,
     check_size,
+    check_splatter,
     differentiable,
 )
-from rts.choosing import Auto
 from rts.errors import InputError
+from rts.gbuffer import GBuffer
+from rts.interfaces import Engine, Needed, Part, Splatter
+from rts.operations.linear import affine_map
 from rts.preparing import PreparedParts
-from rts.protocols import Array, Engine, GBuffer, Part, Sampled, Samples
-from rts.pruning import Needed, as_needed, needed_by, prune
-from rts.sampling import merge, reads_of
-from rts.splatting import inside
-
-APRON = 2
-"""Cells sampled beyond the image's border on each side: the first splats into it, and pairing looks at the second."""
+from rts.pruning import as_needed, needed_by, prune
+from rts.records import Array, Sampled, Samples, Splats
+from rts.sampling import merge
 
 BAND = 2**20
 """Cells, over all layers, that a supersampled image may have before it is rendered in bands of rows."""
@@ -78,7 +75,7 @@ def render(
     scene = _Scene.of(parts, camera, sampler)
     size = check_size(size, layers, capacity, supersample)
     background = check_background(background, size)
-    splatter = check_plugin("rts.splatters", splatter, "splat")
+    splatter = check_splatter(splatter)
     options = dict(splatter=splatter, layers=layers, supersample=int(supersample), capacity=capacity)
     bands = _bands(*size, layers, supersample)
     if len(bands) == 1:
@@ -112,7 +109,7 @@ def sample(
     """
     scene = _Scene.of(parts, camera, sampler)
     size = check_size(size, layers, capacity, supersample)
-    splatter = None if splatter is None else check_plugin("rts.splatters", splatter, "splat")
+    splatter = None if splatter is None else check_splatter(splatter)
     options = dict(splatter=splatter, layers=layers, supersample=int(supersample), capacity=capacity)
     return _sampled(scene, scene.camera, size, **options)
 
@@ -139,7 +136,7 @@ class _Scene(NamedTuple):
         checked, camera = check_scene(prepared.parts if prepared else parts, camera)
         if prepared is not None:
             return cls(checked, camera, prepared.samplers, prepared.entries)
-        chosen = check_plugin("rts.samplers", sampler, "sample")
+        chosen = check_sampler(sampler)
         return cls(checked, camera, [chosen] * len(checked), [None] * len(checked))
 
 
@@ -148,7 +145,7 @@ def _sampled(
     camera: Camera,
     size: tuple[int, int],
     *,
-    splatter: Any,
+    splatter: Splatter | None,
     layers: int | str,
     supersample: int,
     capacity: int | None,
@@ -157,16 +154,17 @@ def _sampled(
     parts, _, samplers, entries = scene
     height, width = supersample * size[0], supersample * size[1]
     check_memory(height, width, _planned(layers), gradient=differentiable(parts, camera))
-    grid = height + 2 * APRON, width + 2 * APRON
+    apron = apron_of(splatter)
+    grid = height + 2 * apron, width + 2 * apron
     # Every part is sampled by the one engine, and by the very views that samples are projected with.
-    wide = camera.with_apron((height, width), APRON)
+    wide = camera.with_apron((height, width), apron)
     wide = constants(wide, engine_of(parts, camera), exemplar(parts, camera))
 
     def taken(count: int, needed: Needed | None) -> Sampled:
         samples = []
         for part, chosen, entry in zip(parts, samplers, entries, strict=True):
             known = {} if entry is None else {"entry": entry}
-            if needed is not None and len(parts) == 1 and getattr(chosen, "prunes", False):
+            if needed is not None and len(parts) == 1 and chosen.prunes:
                 known["needed"] = needed
             samples.append(chosen.sample(part, wide.within(part.transform), grid, count, capacity=capacity, **known))
         sampled = merge(samples, count)
@@ -174,10 +172,10 @@ def _sampled(
         done = needed is None or "needed" in known or is_traced(sampled.row)
         return sampled if done else prune(sampled, needed)
 
-    samplers = [c.of(p, camera) if isinstance(c, Auto) else c for p, c in zip(parts, samplers, strict=True)]
+    samplers = [chosen.suited(part, camera) for part, chosen in zip(parts, samplers, strict=True)]
     needed = None if splatter is None else needed_by(splatter, parts)
     sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)
-    return replace(sampled, supersample=supersample)
+    return replace(sampled, supersample=supersample, apron=apron)
 
 
 @uncompiled
@@ -207,9 +205,22 @@ def render_samples(
         raise InputError(
             f"{len(scene.parts)} parts were given for the samples of {len(sampled.samples)}; pass the same parts"
         )
-    fine = sampled.supersample
-    background = check_background(background, tuple((n - 2 * APRON) // fine for n in sampled.row.shape[1:]))
-    return _finished(sampled, scene, check_plugin("rts.splatters", splatter, "splat"), background)
+    fine, apron, splatter = sampled.supersample, sampled.apron, check_splatter(splatter)
+    if apron < apron_of(splatter):
+        raise InputError(
+            f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
+            f"{apron_of(splatter)}; give it to rts.sample, too"
+        )
+    background = check_background(background, tuple((n - 2 * apron) // fine for n in sampled.row.shape[1:]))
+    return _finished(sampled, scene, splatter, background)
+
+
+def apron_of(splatter: Splatter | None) -> int:
+    """Cells to sample beyond the image's border on each side: from those within reach a sample shows in it.
+
+    One more, since pairing looks at a cell beside them.
+    """
+    return (Splatter if splatter is None else splatter).reach + 1
 
 
 def _finished(sampled: Sampled, scene: _Scene, splatter: Any, background: Any) -> Array:
@@ -233,28 +244,23 @@ def _splatted(
         splatter: a splatter.
         beside: what else the engine has to suit.
     """
-    grid, fine = tuple(sampled.row.shape[1:]), sampled.supersample
-    size = grid[0] - 2 * APRON, grid[1] - 2 * APRON
-    splats = to_splats(sampled, parts, camera, window, beside)
-    crops = _takes_border(splatter)
-    image = splatter.splat(*splats, border=APRON) if crops else inside(splatter.splat(*splats), APRON)
+    fine = sampled.supersample
+    image = splatter.cropped(to_splats(sampled, parts, camera, window, beside))
     if fine > 1:
-        xp = namespace(image)
+        xp, size = namespace(image), image.shape[:2]
         image = xp.mean(xp.reshape(image, (size[0] // fine, fine, size[1] // fine, fine, 4)), axis=(1, 3))
     return image
 
 
-def to_splats(
-    sampled: Sampled, parts: Sequence[Part], camera: Camera, window: Camera, beside: Any = None
-) -> tuple[Array, Array, Array]:
-    """Positions (N, 3), rgba (N, 4) and row (K, H, W) of what was sampled, apron included, as splatters take them.
+def to_splats(sampled: Sampled, parts: Sequence[Part], camera: Camera, window: Camera, beside: Any = None) -> Splats:
+    """What was sampled, as splatters take it, with the apron as border.
 
     The arguments are those of `_splatted`.
     """
-    grid = tuple(sampled.row.shape[1:])
+    grid, apron = tuple(sampled.row.shape[1:]), sampled.apron
     scene = parts, camera, window, sampled, beside
     engine, like = engine_of(scene), exemplar(scene)
-    wide = window.with_apron((grid[0] - 2 * APRON, grid[1] - 2 * APRON), APRON)
+    wide = window.with_apron((grid[0] - 2 * apron, grid[1] - 2 * apron), apron)
     wide = wide._replace(view=constants(wide.view, engine, like))
     camera = constants(camera, engine, like)
     if not engine.owns(sampled.row):
@@ -264,29 +270,17 @@ def to_splats(
     for part, samples in zip(parts, sampled.samples, strict=True):
         transform = constants(part.transform, engine, like)
         local = _evaluate(part, samples, engine, like)
-        rest = {name: value for name, value in part.theta.items() if name not in reads_of(part)}
+        reads = part.surface.reads(part.theta)
+        rest = {name: value for name, value in part.theta.items() if name not in reads}
         read = _to_world(_readable(local, samples, engine), transform)
         rgba = part.shader({**part.theta, **constants(rest, engine, like)}, read, camera)
         check_shaded(rgba, local["position"].shape[0], part.shader)
         positions.append(wide.within(transform).project(local["position"], grid))
         colors.append(constants(rgba, engine, like))
     if len(parts) == 1:
-        return positions[0], colors[0], sampled.row
+        return Splats(positions[0], colors[0], sampled.row, border=apron)
     xp = namespace(sampled.row)
-    return xp.concat(positions), xp.concat(colors), sampled.row
-
-
-_TAKE_BORDER: weakref.WeakKeyDictionary[type, bool] = weakref.WeakKeyDictionary()
-
-
-def _takes_border(splatter: Any) -> bool:
-    """Whether a splatter crops the image itself."""
-    kind = type(splatter)
-    if not hasattr(kind, "splat") or "splat" in getattr(splatter, "__dict__", ()):  # A function of this object alone.
-        return "border" in inspect.signature(splatter.splat).parameters
-    if kind not in _TAKE_BORDER:
-        _TAKE_BORDER[kind] = "border" in inspect.signature(kind.splat).parameters
-    return _TAKE_BORDER[kind]
+    return Splats(xp.concat(positions), xp.concat(colors), sampled.row, border=apron)
 
 
 def _planned(layers: int | str) -> int:
@@ -306,9 +300,9 @@ def _bands(height: int, width: int, layers: int | str, supersample: int) -> list
 
 def _evaluate(part: Part, samples: Samples, engine: Engine, like: Array | None) -> GBuffer:
     """The part's G-buffer in local space."""
-    reads = {name: part.theta[name] for name in reads_of(part)}
+    reads = {name: part.theta[name] for name in part.surface.reads(part.theta)}
     if samples.gbuffer is not None and is_constant(reads):
-        wanted = getattr(part.shader, "reads", None)
+        wanted = part.shader.reads
         if samples.asked is None or (wanted is not None and set(wanted) <= set(samples.asked)):
             return GBuffer(samples.gbuffer)
     gbuffer = part.surface.evaluate(constants(reads, engine, like), samples)
@@ -317,13 +311,12 @@ def _evaluate(part: Part, samples: Samples, engine: Engine, like: Array | None) 
 
 def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
     """The attributes as shaders may read them: in rows that no cell refers to a derivative must be finite, too."""
-    fill = getattr(engine, "fill_unused", None)
-    if fill is None:
+    if not engine.padded(samples.row):
         return gbuffer
     found = GBuffer()
     found.like = gbuffer["position"]
     for name in gbuffer:
-        found.defer(name, lambda name=name: fill(gbuffer[name], samples.row))
+        found.defer(name, lambda name=name: engine.fill_unused(gbuffer[name], samples.row))
     return found
 
 

@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
-import array_api_compat
 import numpy as np
 
-from rts.arrays import engine_of, exemplar, is_constant, is_traced, leaves, map_leaves, namespace
+from rts.arrays import CONSTANT_TYPES, engine_of, exemplar, is_constant, leaves, map_leaves, namespace
 from rts.camera import Camera
 from rts.errors import InputError
+from rts.interfaces import Needed, Part, Sampler, Surface, TriangleSurface
 from rts.keeping import Entry, Keeper, fingerprint, same_faces
-from rts.protocols import Array, ArraySpec, Fragments, Part, Proxy, Rays, Sampled, Samples, Tree
+from rts.records import Array, ArraySpec, Fragments, Proxy, Rays, Sampled, Samples, Tree
 
 
-class TriangleSampler(abc.ABC):
+class TriangleSampler(Sampler):
     """Base class of samplers that know only triangles: `sample` for any surface that gives a proxy.
 
-    A sampler implements `rasterize`; also `prepare`, where something is worth building once for a proxy, and
-    `update(prepared, proxy) -> prepared`, where that can follow moved vertices more cheaply. What was prepared is kept
-    (`rts.keeping`) until the proxy's inputs change.
+    What was prepared is kept (`rts.keeping`) until the proxy's inputs change.
+
+    Attributes:
+        builds: whether something is worth building once for a proxy; True where there is a `prepare`.
     """
 
-    update: Callable[[Any, Proxy], Any] | None = None
+    DECLARES = True
+    FLAGS = {"prepare": "builds"}
+    builds: bool = False
     prunes = True
     _keeper: Keeper
 
@@ -39,6 +43,10 @@ class TriangleSampler(abc.ABC):
         """What `rasterize` needs of the proxy: an acceleration structure, device buffers. Default the proxy itself."""
         return proxy
 
+    def update(self, prepared: Any, proxy: Proxy) -> Any:
+        """What was prepared, in place, for moved vertices of the same faces; None where it has to be made anew."""
+        return None
+
     @abc.abstractmethod
     def rasterize(self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """The `layers` nearest triangles of every pixel, at its centre, between the near and the far plane.
@@ -51,31 +59,43 @@ class TriangleSampler(abc.ABC):
             cull: "none", or "back": ignore triangles whose normal (counter-clockwise winding) faces away.
         """
 
-    def build(self, surface: Any, inputs: Tree, camera: Any, size: Any) -> Entry:
+    def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
+        """See `Sampler`: the proxy of a part, and what is prepared of it."""
+        surface = _of_triangles(part.surface)
+        if surface.depends_on_view and (camera is None or size is None):
+            raise InputError(f"the triangles of {surface!r} depend on the view; give camera and size")
+        inputs = surface.proxy_inputs(part.theta)
+        inputs = map_leaves(engine_of(inputs).to_numpy, inputs)
+        if camera is not None:
+            camera = Camera(*(engine_of(m).to_numpy(m) for m in camera.within(part.transform)))
+        return self._built(surface, inputs, camera, size)
+
+    def _built(self, surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Entry:
         """A copy of the surface's proxy for host inputs, checked, and what this sampler prepares of it."""
         proxy = _checked_proxy(surface, inputs, camera, size)
         # A copy, since the arrays given may be changed in place, or lent for the length of one call only.
         proxy = proxy._replace(vertices=proxy.vertices.copy())
         return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None)
 
-    def _entry(self, surface: Any, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
+    def _entry(self, surface: TriangleSurface, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
         """The same, kept from call to call where that pays."""
-        if type(self).prepare is TriangleSampler.prepare and getattr(surface, "proxy_is_cheap", False):
+        if surface.proxy_is_cheap and not self.builds:
             proxy = _checked_proxy(surface, inputs, camera, size)
             return Entry(proxy, self.prepare(proxy))
-        beside = surface.proxy_key(inputs, camera, size) if hasattr(surface, "proxy_key") else None
+        beside = surface.proxy_key(inputs, camera, size) if surface.depends_on_view else None
 
         def follow(old: Entry) -> Entry | None:
-            if self.update is None:
+            if old.prepared is None:
                 return None
             proxy = _checked_proxy(surface, inputs, camera, size)
-            if old.prepared is None or not same_faces(old.proxy, proxy):
+            if not same_faces(old.proxy, proxy):
                 return None
             proxy = proxy._replace(vertices=proxy.vertices.copy())
-            return Entry(proxy, self.update(old.prepared, proxy))
+            updated = self.update(old.prepared, proxy)
+            return None if updated is None else Entry(proxy, updated)
 
         key = (fingerprint(inputs), beside)
-        return self._keeper.get(surface, key, lambda: self.build(surface, inputs, camera, size), follow)
+        return self._keeper.get(surface.given, key, lambda: self._built(surface, inputs, camera, size), follow)
 
     def sample(
         self,
@@ -85,10 +105,10 @@ class TriangleSampler(abc.ABC):
         layers: int,
         *,
         capacity: int | None = None,
-        needed: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
+        needed: Needed | None = None,
         entry: Entry | None = None,
     ) -> Samples:
-        """See `rts.protocols.Sampler`. One call to the host does everything.
+        """See `rts.Sampler`. One call to the host does everything.
 
         Args:
             part: see there.
@@ -96,90 +116,151 @@ class TriangleSampler(abc.ABC):
             size: see there.
             layers: see there.
             capacity: see there.
-            needed: see there.
-            entry: to be used without a look at the surface's inputs; see `rts.prepare`.
+            needed: which samples to keep, or None for all.
+            entry: what `hold` gave, to be used without a look at the surface's inputs.
         """
-        surface, theta = part.surface, part.theta
-        if not hasattr(surface, "proxy"):
-            raise InputError(
-                f"{surface!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
-            )
+        surface, theta = _of_triangles(part.surface), part.theta
         engine = engine_of(theta, camera)
-        inputs = surface.proxy_inputs(theta) if entry is None or hasattr(surface, "refine") else None
-        host_theta = {name: theta[name] for name in reads_of(part)}
-        if engine.name == "numpy" or not is_constant(host_theta):
-            host_theta = None
-
-        rows = layers * size[0] * size[1] if capacity is None else capacity
-        packed = capacity is None
-        table_specs = surface.table_specs(rows) if hasattr(surface, "table_specs") else {}
-        like = exemplar(theta, camera)
-        real = np.float64 if like is not None and namespace(like).finfo(like.dtype).bits == 64 else np.float32
-        gbuffer_specs = _gbuffer_specs(part, host_theta, ArraySpec((rows,), real, packed))
-        specs = (
-            ArraySpec((rows, surface.sample_widths[0]), np.int32, packed),
-            ArraySpec((rows, surface.sample_widths[1]), np.float32, packed),
-            ArraySpec((layers, *size), np.int32),
-            ArraySpec((layers, *size), np.float32),
-            ArraySpec((), np.int32),
-            *table_specs.values(),
-            *gbuffer_specs.values(),
-        )
+        shape = _Shape(layers, size, capacity)
+        inputs = surface.proxy_inputs(_stopped(theta)) if entry is None or surface.refines else None
+        reads = {name: theta[name] for name in surface.reads(theta)}
+        host_theta = reads if engine.differentiates and is_constant(reads) else None
+        tables = dict(surface.table_specs(shape.rows, capacity))
+        attributes = _attribute_specs(part, host_theta, shape, exemplar(theta, camera))
 
         def host(view: np.ndarray, projection: np.ndarray, *host_leaves: np.ndarray) -> tuple[np.ndarray, ...]:
             it = iter(host_leaves)
             host_inputs = map_leaves(lambda _: next(it), inputs)
             host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
             check_camera(host_camera)
-            with self._keeper.lock:
-                found = entry or self._entry(surface, host_inputs, host_camera, size)
-                if len(found.proxy.faces):
-                    fragments = self.rasterize(found.prepared, host_camera, size, layers, part.cull)
-                    _check_fragments(fragments, (layers, *size), len(found.proxy.faces), self)
-                else:
-                    fragments = _no_fragments((layers, *size))
-            covered = fragments.triangle_ids >= 0
-            kept = covered if needed is None else needed(covered, fragments.depth)
-            samples = lift(fragments, found.proxy, capacity, kept)
-            if hasattr(surface, "refine"):
-                samples = surface.refine(host_inputs, samples, _sample_rays(samples, host_camera, size))
-            gbuffer = surface.evaluate(host_theta, samples) if host_theta is not None else {}
+            found = self._found(surface, part.cull, host_inputs, host_camera, shape, tables, needed, entry)
+            gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
             return (
-                samples.ids,
-                samples.params,
-                samples.row,
-                samples.depth,
-                samples.overflow,
-                *(np.asarray(samples.tables[name], spec.dtype) for name, spec in table_specs.items()),
-                *(np.asarray(gbuffer[name], spec.dtype) for name, spec in gbuffer_specs.items()),
+                found.ids,
+                found.params,
+                found.row,
+                found.depth,
+                found.overflow,
+                *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
+                *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
             )
 
+        specs = *shape.specs(surface.sample_widths), *tables.values(), *attributes.values()
         results = engine.call_host(host, specs, camera.view, camera.projection, *leaves(inputs))
-        tables = results[5 : 5 + len(table_specs)]
-        gbuffer = results[5 + len(table_specs) :]
+        rest = 5 + len(tables)
         return Samples(
             *results[:5],
-            tables=dict(zip(table_specs, tables, strict=True)),
-            gbuffer=dict(zip(gbuffer_specs, gbuffer, strict=True)) if host_theta is not None else None,
-            asked=getattr(part.shader, "reads", None),
-            centered=getattr(surface, "centered", True),
+            tables=dict(zip(tables, results[5:rest], strict=True)),
+            gbuffer=dict(zip(attributes, results[rest:], strict=True)) if host_theta is not None else None,
+            asked=part.shader.reads,
+            centered=surface.centered,
+        )
+
+    def _found(
+        self,
+        surface: TriangleSurface,
+        cull: str,
+        inputs: Tree,
+        camera: Camera,
+        shape: _Shape,
+        tables: Mapping[str, ArraySpec],
+        needed: Needed | None,
+        entry: Entry | None,
+    ) -> Samples:
+        """The samples that are to be kept, on the host."""
+        grid = shape.layers, *shape.size
+        with self._keeper.lock:
+            found = entry or self._entry(surface, inputs, camera, shape.size)
+            if len(found.proxy.faces):
+                fragments = self.rasterize(found.prepared, camera, shape.size, shape.layers, cull)
+                _check_fragments(fragments, grid, len(found.proxy.faces), self)
+            else:
+                fragments = _no_fragments(grid)
+        covered = fragments.triangle_ids >= 0
+        if not surface.refines:
+            kept = covered if needed is None else needed(covered, fragments.depth)
+            return lift(fragments, found.proxy, shape.capacity, kept)
+        # Which samples are needed is asked with their final depths.
+        from rts.settling import check_refined, repack, settle
+
+        lifted = lift(fragments, found.proxy, None, covered)
+        lifted = replace(lifted, tables={name: np.zeros(spec.shape, spec.dtype) for name, spec in tables.items()})
+        rays = _sample_rays(lifted, camera, shape.size)
+        refined = check_refined(surface.refine(inputs, lifted, rays), lifted, surface)
+        settled = settle(refined, camera, rays.spread)
+        covered = settled.row >= 0
+        kept = covered if needed is None else needed(covered, settled.depth)
+        return repack(settled, kept, shape.capacity)
+
+
+class _Shape(NamedTuple):
+    """How many samples there may be.
+
+    Attributes:
+        layers: K.
+        size: (height, width).
+        capacity: rows to allot, or None for as many as there are.
+    """
+
+    layers: int
+    size: tuple[int, int]
+    capacity: int | None
+
+    @property
+    def rows(self) -> int:
+        """The largest number of samples."""
+        return self.layers * self.size[0] * self.size[1] if self.capacity is None else self.capacity
+
+    def row_spec(self, dtype: Any, *widths: int) -> ArraySpec:
+        """Of an array with a row a sample."""
+        return ArraySpec((self.rows, *widths), dtype, self.capacity is None)
+
+    def specs(self, widths: tuple[int, int]) -> tuple[ArraySpec, ...]:
+        """Of ids, params, row, depth and overflow."""
+        grid = self.layers, *self.size
+        return (
+            self.row_spec(np.int32, widths[0]),
+            self.row_spec(np.float32, widths[1]),
+            ArraySpec(grid, np.int32),
+            ArraySpec(grid, np.float32),
+            ArraySpec((), np.int32),
         )
 
 
-def reads_of(part: Part) -> tuple[str, ...]:
-    """The entries of a part's θ that its surface evaluates; the others are its shader's."""
-    return part.surface.reads(part.theta) if hasattr(part.surface, "reads") else tuple(part.theta)
+def _of_triangles(surface: Surface) -> TriangleSurface:
+    """The surface, which must be one of triangles."""
+    if not isinstance(surface, TriangleSurface):
+        raise InputError(
+            f"{surface!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
+        )
+    return surface
 
 
-def _checked_proxy(surface: Any, inputs: Tree, camera: Any, size: Any) -> Proxy:
+def _stopped(theta: Mapping[str, Tree]) -> dict[str, Tree]:
+    """θ without derivatives: what is made of it for sampling keeps no graph."""
+    return {name: map_leaves(_stop, value) for name, value in theta.items()}
+
+
+def _stop(x: Any) -> Any:
+    return x if isinstance(x, CONSTANT_TYPES) else engine_of(x).stop_gradient(x)
+
+
+def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
+    """A table of as many rows as there have to be."""
+    if spec.packed or len(table) == spec.shape[0]:
+        return table
+    return np.concatenate([table, np.zeros((spec.shape[0] - len(table), *table.shape[1:]), table.dtype)])
+
+
+def _checked_proxy(surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Proxy:
     proxy = surface.proxy(inputs, camera, size)
-    if not getattr(surface, "proxy_is_cheap", False):
+    if not surface.proxy_is_cheap:
         proxy = _packed_proxy(proxy, surface)
     check_proxy(proxy, surface)
     return proxy
 
 
-def _packed_proxy(proxy: Any, surface: Any) -> Proxy:
+def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
     """The proxy with contiguous arrays of the right dtypes; triangles that would be read out of bounds are refused."""
     if not isinstance(proxy, Proxy):
         raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected an rts.Proxy")
@@ -195,7 +276,7 @@ def _packed_proxy(proxy: Any, surface: Any) -> Proxy:
             f"the proxy of {surface!r} has faces from {faces.min()} to {faces.max()}, but {len(vertices)} vertices"
         )
     widths = faces.shape[1] if proxy.ids is None else np.shape(proxy.ids)[1]
-    if not hasattr(surface, "refine") and widths != surface.sample_widths[0]:
+    if not surface.refines and widths != surface.sample_widths[0]:
         raise InputError(
             f"the proxy of {surface!r} has {widths} ids a triangle, but sample_widths says {surface.sample_widths[0]}"
         )
@@ -210,17 +291,18 @@ def _packed_proxy(proxy: Any, surface: Any) -> Proxy:
     )
 
 
-def _gbuffer_specs(part: Part, host_theta: Mapping | None, row_spec: ArraySpec) -> dict[str, ArraySpec]:
+def _attribute_specs(part: Part, host_theta: Mapping | None, shape: _Shape, like: Array | None) -> dict[str, ArraySpec]:
     """The attributes to evaluate on the host for a surface that is constant: those its shader reads."""
     if host_theta is None:
         return {}
+    real = np.float64 if like is not None and namespace(like).finfo(like.dtype).bits == 64 else np.float32
     i, p = part.surface.sample_widths
     none = np.full((1, 1, 1), -1, np.int32)
     one = Samples(np.zeros((1, i), np.int32), np.zeros((1, p), np.float32), none, none, np.int32(0))
     gbuffer = part.surface.evaluate(host_theta, one)
-    names = getattr(part.shader, "reads", None)
+    names = part.shader.reads
     names = list(gbuffer) if names is None else ["position", *(n for n in names if n in gbuffer)]
-    return {n: row_spec._replace(shape=row_spec.shape + gbuffer[n].shape[1:]) for n in dict.fromkeys(names)}
+    return {n: shape.row_spec(real, *gbuffer[n].shape[1:]) for n in dict.fromkeys(names)}
 
 
 def _no_fragments(shape: tuple[int, int, int]) -> Fragments:
@@ -263,7 +345,7 @@ def _sample_rays(samples: Samples, camera: Camera, size: tuple[int, int]) -> Ray
     flat = samples.row.reshape(-1)
     cells = np.flatnonzero(flat >= 0)
     pixel[flat[cells]] = cells % (size[0] * size[1])
-    return Rays(rays.origins.reshape(-1, 3)[pixel], rays.directions.reshape(-1, 3)[pixel])
+    return rays._replace(origins=rays.origins.reshape(-1, 3)[pixel], directions=rays.directions.reshape(-1, 3)[pixel])
 
 
 def merge(samples: Sequence[Samples], layers: int) -> Sampled:
@@ -276,11 +358,7 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         return Sampled(tuple(samples), only.row, only.depth, overflow)
     given = *(s.row for s in samples), *(s.depth for s in samples)
     on_host, elsewhere = partial(_interleaved_on_the_host, layers), partial(_interleaved, layers)
-    if is_traced(given[0]):
-        part, row, depth = engine_of(given).on_cpu(on_host, elsewhere, *given)
-    else:
-        on_cpu = "cpu" in str(array_api_compat.device(given[0])).lower()
-        part, row, depth = on_host(*given) if on_cpu else elsewhere(*given)
+    part, row, depth = engine_of(given).by_host(on_host, elsewhere, *given)
     xp, start = namespace(row), 0
     for i, s in enumerate(samples):
         row = xp.where(part == i, row + start, row) if start else row

@@ -19,10 +19,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rts.arrays import engine_of, is_constant, namespace, unit
+from rts.arrays import described, engine_of, is_constant, namespace, shape_of, unit
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.protocols import Array, GBuffer, Tree
+from rts.gbuffer import GBuffer
+from rts.interfaces import Shader
+from rts.records import Array, Tree
 
 WRAPS = ("repeat", "mirror", "clamp")
 DEFAULT_AMBIENT, DEFAULT_DIFFUSE = 0.2, 0.8
@@ -32,40 +34,40 @@ DEFAULT_SPECULAR, DEFAULT_SHININESS = 0.3, 32.0
 
 
 @dataclass(frozen=True)
-class Silhouette:
+class Silhouette(Shader):
     """White where there is a surface."""
 
     opaque = True
     reads = ()
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
-        """See `rts.protocols.Shader`."""
+        """See `rts.Shader`."""
         like = gbuffer.like
         xp = namespace(like)
         return xp.broadcast_to(xp.ones_like(like[:1, :1]), (like.shape[0], 4))
 
 
 @dataclass(frozen=True)
-class Normals:
+class Normals(Shader):
     """World-space unit normals, mapped from [−1, 1] to [0, 1]."""
 
     opaque = True
     reads = ("normal",)
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
-        """See `rts.protocols.Shader`."""
+        """See `rts.Shader`."""
         return _opaque(unit(gbuffer["normal"]) * 0.5 + 0.5)
 
 
 @dataclass(frozen=True)
-class Depth:
+class Depth(Shader):
     """Linear depth, from 0 at the near plane (or θ["depth_range"][0]) to 1 at the far plane."""
 
     opaque = True
     reads = ()
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
-        """See `rts.protocols.Shader`."""
+        """See `rts.Shader`."""
         position = gbuffer["position"]
         xp = namespace(position)
         depth = camera.project(position, (1, 1))[:, 2]
@@ -78,7 +80,7 @@ class Depth:
 
 
 @dataclass(frozen=True)
-class Unlit:
+class Unlit(Shader):
     """The base colour.
 
     Attributes:
@@ -99,7 +101,7 @@ class Unlit:
             raise InputError(f"wrap is {self.wrap!r}; expected one of {', '.join(WRAPS)}")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
-        """See `rts.protocols.Shader`."""
+        """See `rts.Shader`."""
         color, alpha = self.base_color(theta, gbuffer)
         return self.premultiplied(color, alpha)
 
@@ -118,7 +120,7 @@ class Unlit:
         color, alpha = color[:, :3], color[:, 3:4] if base.shape[1] == 4 else one
         if "color" in theta:
             factor = theta["color"]
-            _check_shape("['color']", factor, "(3,) or (4,)", _shape(factor) in ((3,), (4,)))
+            _check_shape("['color']", factor, "(3,) or (4,)", shape_of(factor) in ((3,), (4,)))
             color = color * factor[:3]
             alpha = alpha * factor[3] if factor.shape[0] == 4 else alpha
         return color, alpha
@@ -138,7 +140,7 @@ class Textured(Unlit):
         return ("uv",)
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
-        """See `rts.protocols.Shader`."""
+        """See `rts.Shader`."""
         if "texture" not in theta:
             raise InputError(f"the textured shader needs theta['texture'] (h, w, C); theta has {sorted(theta)}")
         gbuffer["uv"]  # Its absence is an error here, not a reason for white.
@@ -155,7 +157,7 @@ class Lambert(Unlit):
         return ("normal", "color", "uv")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
-        """See `rts.protocols.Shader`."""
+        """See `rts.Shader`."""
         color, alpha = self.base_color(theta, gbuffer)
         normal = _turned(unit(gbuffer["normal"]), _towards(gbuffer, camera))
         xp = namespace(color)
@@ -176,7 +178,7 @@ class BlinnPhong(Unlit):
         return ("normal", "color", "uv")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
-        """See `rts.protocols.Shader`."""
+        """See `rts.Shader`."""
         color, alpha = self.base_color(theta, gbuffer)
         normal, toward = facing_normals(gbuffer, camera)
         xp = namespace(color)
@@ -260,7 +262,7 @@ def _light(theta: Mapping[str, Tree], camera: Camera) -> dict[str, Array]:
         if name not in LIGHT_ENTRIES:
             raise InputError(f"theta['light'] has an entry {name!r}; expected {', '.join(LIGHT_ENTRIES)}")
         if name != "ambient":
-            shape = _shape(value)
+            shape = shape_of(value)
             _check_shape(f"['light'][{name!r}]", value, "(3,) or (L, 3)", len(shape) in (1, 2) and shape[-1] == 3)
     given = dict(given)
     r = camera.view[:3, :3]
@@ -273,15 +275,10 @@ def _light(theta: Mapping[str, Tree], camera: Camera) -> dict[str, Array]:
     return given
 
 
-def _shape(value: Any) -> tuple[int, ...]:
-    return tuple(getattr(value, "shape", ()))
-
-
 def _check_shape(entry: str, value: Any, expected: str, ok: bool) -> None:
     """Refuse what is not an array of the expected shape."""
     if not ok:
-        given = f"has shape {_shape(value)}" if hasattr(value, "shape") else f"is a {type(value).__name__}"
-        raise InputError(f"theta{entry} {given}; expected an array of shape {expected}")
+        raise InputError(f"theta{entry} {described(value)}; expected an array of shape {expected}")
 
 
 def _each(light: dict[str, Array]) -> tuple[list[Array], list[Array]]:

@@ -22,9 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import constants, engine_of, exemplar, from_numbers, namespace
+from rts.arrays import constants, engine_of, exemplar, from_numbers, namespace, shape_of
 from rts.errors import InputError
-from rts.protocols import Array
+from rts.interfaces import Splatter
+from rts.records import Array, Splats
 
 SIGMA, EPSILON = 0.5, 0.05
 CONTINUED = 0.5
@@ -36,12 +37,12 @@ OFFSETS = (-1, 0, 1)
 NEIGHBOURS = [(u, v) for v in OFFSETS for u in OFFSETS]
 
 
-class Plain:
+class Plain(Splatter):
     """No splatting: the layers composited front to back. Has no derivative at occlusion boundaries."""
 
-    def splat(self, positions: Array, rgba: Array, row: Array) -> Array:
-        """See `rts.protocols.Splatter`."""
-        positions, rgba, row = check_splats(positions, rgba, row)
+    def image(self, splats: Splats) -> Array:
+        """See `rts.Splatter`."""
+        positions, rgba, row = splats.positions, splats.rgba, splats.row
         if rgba.shape[0] == 0:
             return _nothing(rgba, row)
         xp = namespace(rgba)
@@ -53,12 +54,12 @@ class Plain:
         return image
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """See `rts.protocols.Splatter`: what is opaque hides all that is behind it."""
+        """See `rts.Splatter`: what is opaque hides all that is behind it."""
         return _fronts(covered)
 
 
 @dataclass(frozen=True)
-class Kernel(abc.ABC):
+class Kernel(Splatter):
     """What the splatters share: a Gaussian over 3 × 3 cells.
 
     Attributes:
@@ -81,23 +82,18 @@ class Kernel(abc.ABC):
         if self.calibration is not None and not (_is_real(self.calibration) and self.calibration > 0):
             raise InputError(f"calibration is {self.calibration}; expected a positive number, or None for the exact")
 
-    def splat(self, positions: Array, rgba: Array, row: Array, border: int = 0) -> Array:
-        """See `rts.protocols.Splatter`."""
-        positions, rgba, row = check_splats(positions, rgba, row)
-        if rgba.shape[0] == 0:
-            return inside(_nothing(rgba, row), border)
-        return self.image(positions, rgba, row, border)
-
-    def image(self, positions: Array, rgba: Array, row: Array, border: int) -> Array:
-        """`splat` of at least one sample."""
-        return inside(self.accumulate(positions, rgba, row), border)
+    def image(self, splats: Splats) -> Array:
+        """See `rts.Splatter`."""
+        if splats.rgba.shape[0] == 0:
+            return _nothing(splats.rgba, splats.row)
+        return self.accumulate(splats.positions, splats.rgba, splats.row)
 
     @abc.abstractmethod
     def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
         """The image of all cells, of at least one sample."""
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """See `rts.protocols.Splatter`: fronts, and the hidden layers around targets that are not `plain`."""
+        """See `rts.Splatter`: fronts, and the hidden layers around targets that are not `plain`."""
         if len(covered) == 1 or not covered.any():
             return covered
         cells = _bordered(np.where(covered, 0, -1)) >= 0
@@ -135,13 +131,22 @@ def _is_real(value: Any) -> bool:
     return isinstance(value, Real) and math.isfinite(value)
 
 
-def exact_calibration(sigma: float) -> float:
-    """The γ with which a linear ramp of colour that moves has its true derivative: σ² (1 + 2e) / 2e, e = exp(−1/2σ²).
+def exact_calibration(sigma: float, reach: int = 1) -> float:
+    """The factor γ on splats' offsets with which a linear ramp of colour that moves has its true derivative.
 
-    Without it, the first moment 1/γ of the kernel's derivative (0.852 for σ = 0.5) is the share that is delivered.
+    For weights exp(−‖c + (u, v) − P‖² / 2σ²), normalised for samples on centres, of a splat at P in the cell with the
+    centre c, whose offset is to be multiplied: P' = c + γ (P − c). Without γ the first moment of the kernel's
+    derivative, 1/γ (0.852 for σ = 0.5), is the share that is delivered.
+
+    Args:
+        sigma: σ, pixels.
+        reach: cells on each side that the kernel covers: 1 for 3 × 3, 2 for 5 × 5.
+
+    Returns:
+        γ = σ² Σ e / Σ u² e, e = exp(−u² / 2σ²) over −reach ≤ u ≤ reach.
     """
-    e = math.exp(-1 / (2 * sigma**2))
-    return sigma**2 * (1 + 2 * e) / (2 * e)
+    e = [math.exp(-(u**2) / (2 * sigma**2)) for u in range(1, reach + 1)]
+    return sigma**2 * (1 + 2 * sum(e)) / (2 * sum(u**2 * x for u, x in enumerate(e, start=1)))
 
 
 @dataclass(frozen=True)
@@ -315,11 +320,11 @@ class _Layers(_Depths):
         ]
 
 
-def check_splats(positions: Array, rgba: Array, row: Array) -> tuple[Array, Array, Array]:
-    """The three as arrays of one engine; wrong shapes and dtypes are refused."""
+def check_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Splats:
+    """Splats of arrays, or of lists, all of one engine; wrong shapes and dtypes are refused."""
     given = tuple(from_numbers(x) for x in (positions, rgba))
     row = np.asarray(row, np.int32) if isinstance(row, (list, tuple)) else row
-    shapes = [tuple(getattr(x, "shape", ())) for x in (*given, row)]
+    shapes = [shape_of(x) for x in (*given, row)]
     ok = len(shapes[0]) == 2 and shapes[0][1] == 3 and shapes[1] == (shapes[0][0], 4) and len(shapes[2]) == 3
     if not ok or shapes[2][0] < 1:
         raise InputError(
@@ -329,7 +334,7 @@ def check_splats(positions: Array, rgba: Array, row: Array) -> tuple[Array, Arra
     if not namespace(row).isdtype(row.dtype, "signed integer"):
         raise InputError(f"row has dtype {row.dtype}; expected signed integers, -1 where a cell is empty")
     positions, rgba, row = constants((*given, row), engine_of(given, row), exemplar(given))
-    return positions, rgba, row
+    return Splats(positions, rgba, row, border=border)
 
 
 def inside(image: Array, border: int) -> Array:

@@ -1,4 +1,4 @@
-"""(4, 4) matrices, differentiable in their arguments: views, projections, rigid poses.
+"""(4, 4) matrices, differentiable in their arguments: views and projections.
 
 Conventions of space are in `rts.camera`. Arguments may be torch or jax arrays, NumPy arrays or numbers.
 """
@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import is_constant, matmul, namespace, offered, promote, unit
+from rts.arrays import is_constant, namespace, promote, unit
 from rts.errors import InputError
-from rts.protocols import Array
+from rts.operations.linear import matmul
+from rts.records import Array
 
 
 def matrix_of(xp: Any, rows: list[list[Any]], like: Array) -> Array:
@@ -132,46 +133,3 @@ def look_at(eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0)) -> Array:
     right = unit(xp.linalg.cross(up, back))
     linear = xp.stack([right, xp.linalg.cross(back, right), back])
     return affine_matrix(linear, -matmul(linear, eye[:, None])[:, 0])
-
-
-def rigid(pose: Any, center: Any = (0.0, 0.0, 0.0)) -> Array:
-    """World-from-local transform of a rigid pose; differentiable everywhere, at zero rotation too.
-
-    Args:
-        pose: (6,) rotation vector (axis times angle, radians) about `center`, then translation.
-        center: (3,) local space.
-
-    Returns:
-        (4, 4), usable as `Part.transform`.
-    """
-    if isinstance(pose, (list, tuple)) and is_constant(pose):
-        pose = np.asarray(pose, np.float64)
-    shape = tuple(getattr(pose, "shape", ()))
-    if shape != (6,):
-        raise InputError(f"pose has shape {shape}; expected (6,): rotation vector, translation")
-    _, (pose, center) = promote(pose, center)
-    found = offered("rigid", pose, center)
-    return rigid_by_arrays(pose, center) if found is None else found
-
-
-def rigid_by_arrays(pose: Array, center: Array) -> Array:
-    """`rigid` of arrays (6,) and (3,), in array-API code."""
-    xp = namespace(pose, center)
-    x, y, z = pose[0], pose[1], pose[2]
-    square = x * x + y * y + z * z
-    # Below a tenth of a radian the series is exact to rounding; the square root is kept away from zero, where its
-    # derivative is infinite.
-    small = square < 1e-2
-    angle = xp.sqrt(xp.where(small, xp.ones_like(square), square))
-    a = xp.where(small, 1 - square / 6 * (1 - square / 20 * (1 - square / 42)), xp.sin(angle) / angle)
-    b = xp.where(small, 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56)), (1 - xp.cos(angle)) / angle**2)
-    one = xp.ones_like(square)
-    rotation = xp.stack(
-        [
-            xp.stack([one - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y]),
-            xp.stack([b * x * y + a * z, one - b * (x * x + z * z), b * y * z - a * x]),
-            xp.stack([b * x * z - a * y, b * y * z + a * x, one - b * (x * x + y * y)]),
-        ]
-    )
-    moved = center + pose[3:] - xp.sum(rotation * center, axis=1)
-    return affine_matrix(rotation, moved)

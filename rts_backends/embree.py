@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.camera import Camera
-from rts.protocols import Fragments, Proxy
+from rts.records import Fragments, Proxy
 from rts.sampling import TriangleSampler
 from rts.threads import parallel
 from rts_backends import embree_library, embree_public

@@ -14,7 +14,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from rts.camera import Camera
-from rts.protocols import Fragments, Proxy
+from rts.records import Fragments, Proxy
 from rts.threads import parallel
 from rts_backends.neighbours import corner_lists, look, places
 from rts_backends.triangles import facing, pixel_matrix

@@ -5,15 +5,16 @@ What fits is float32 or float64 in the memory of the host. Second derivatives ar
 
 from __future__ import annotations
 
-from functools import partial
-from typing import ClassVar
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 
 from rts import splatting
 from rts.arrays import engine_of
-from rts.protocols import Array
-from rts_backends.fused_kernels import Settings, Splats
+from rts.operations.operation import Arrays, Operation, Some
+from rts.records import Array, Splats
+from rts_backends.fused_kernels import Cells, Choices, Settings
 
 
 class _Fused(splatting.Kernel):
@@ -21,46 +22,36 @@ class _Fused(splatting.Kernel):
 
     kind: ClassVar[str]
 
-    def image(self, positions: Array, rgba: Array, row: Array, border: int) -> Array:
+    def image(self, splats: Splats) -> Array:
         """See `rts.splatting.Kernel`."""
-        specification = partial(super().image, border=border)
-        settings = Settings(self.kind, self.sigma, self.epsilon, self.gamma, border)
-        engine = engine_of(positions, rgba, row).name
-        if engine == "torch":
-            from rts_backends import fused_torch
+        return self.cropped(splats if splats.border == 0 else replace(splats, border=0))
 
-            if fused_torch.fits(positions, rgba, row):
-                return fused_torch.splat(settings, specification, positions, rgba, row)
-        elif engine == "jax":
-            from rts_backends import fused_jax
+    def cropped(self, splats: Splats) -> Array:
+        """See `rts.Splatter`."""
+        if splats.rgba.shape[0] == 0:
+            return splatting.inside(super().image(splats), splats.border)
+        return IMAGE(splats.positions, splats.rgba, splats.row, settings=self._settings(splats.border))
 
-            if fused_jax.fits(positions, rgba):
-                return fused_jax.splat(settings, positions, rgba, row)
-        elif engine == "numpy" and positions.dtype == rgba.dtype and positions.dtype in (np.float32, np.float64):
-            return Splats(settings, positions, rgba, row).image()
-        return specification(positions, rgba, row)
+    def _settings(self, border: int) -> Settings:
+        return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border)
 
     def normal_equations(
         self,
-        positions: Array,
-        rgba: Array,
-        row: Array,
+        splats: Splats,
         t_positions: Array,
         t_rgba: Array | None,
         target: Array,
         weights: Array | None = None,
         background: Array | None = None,
-        border: int = 0,
     ) -> tuple[Array, Array, Array] | None:
-        """See `rts.protocols.Splatter`."""
+        """See `rts.Splatter`."""
         from rts_backends import fused_normal
 
-        settings = Settings(self.kind, self.sigma, self.epsilon, self.gamma, border)
-        given = positions, rgba, row, t_positions, t_rgba, target, weights, background
-        return fused_normal.equations(settings, engine_of(given), *given)
+        given = splats.positions, splats.rgba, splats.row, t_positions, t_rgba, target, weights, background
+        return fused_normal.equations(self._settings(splats.border), engine_of(given), *given)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """See `rts.protocols.Splatter`."""
+        """See `rts.Splatter`."""
         if self.kind == "single" or depth.dtype not in (np.float32, np.float64):
             return super().needed(covered, depth)
         from rts_backends import fused_pruning
@@ -84,3 +75,51 @@ class Visible(_Fused, splatting.Visible):
     """`rts.splatting.Visible`."""
 
     kind = "visible"
+
+
+# ---------------------------------------------------------------------------------------------------- the operation
+
+_SPECIFICATIONS = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}
+
+
+def _specification(positions: Array, rgba: Array, row: Array, *, settings: Settings) -> Array:
+    kernel = _SPECIFICATIONS[settings.kind](settings.sigma, settings.epsilon, settings.gamma)
+    return splatting.inside(kernel.accumulate(positions, rgba, row), settings.border)
+
+
+def _shape(positions: tuple, rgba: tuple, row: tuple, *, settings: Settings) -> tuple[int, ...]:
+    return *(max(0, n - 2 * settings.border) for n in row[1:]), 4
+
+
+def _forward(operands: Arrays, out: np.ndarray, *, settings: Settings) -> Choices | None:
+    cells = Cells(settings, *operands)
+    cells.image(out)
+    return cells.choices if out.size else None
+
+
+def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, settings: Settings, kept: Choices | None) -> None:
+    Cells(settings, *operands, kept).jvp(*tangents, out)
+
+
+def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings, kept: Choices | None) -> None:
+    Cells(settings, *operands, kept).vjp(g, *results)
+
+
+def _used(operands: Arrays) -> int:
+    return max(1, int(operands[2].max(initial=0)) + 1)
+
+
+_OPTIONS: dict[str, Any] = {"differentiable": 2, "packed": (0, 1), "used": _used, "even": (1,)}
+IMAGE = Operation(
+    "rts.image",
+    _specification,
+    (2, 2, 3),
+    _shape,
+    _forward,
+    _push,
+    _pull,
+    keeps=True,
+    sweeps=True,
+    **_OPTIONS,
+)
+"""The image (H, W, 4) of positions (N, 3), rgba (N, 4) and row (K, H, W), without the settings' border."""

@@ -2,7 +2,7 @@
 
 Every target collects from its nine sources, and in the reverse direction every source from its nine targets, each in
 one fixed order: results do not depend on the number of threads. Most targets are plain (`fused_stencil`); what is
-decided for the others, the mixed ones (`fused_mixed`), is decided once and kept in `Splats`.
+decided for the others, the mixed ones (`fused_mixed`), is decided once and kept in `Cells`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Choices(NamedTuple):
     repeated: bool
 
 
-class Splats:
+class Cells:
     """Samples in their cells, to be splatted, pulled back and pushed forward.
 
     Args:
@@ -153,80 +153,62 @@ class Splats:
             parallel(choosing.choose, height, *arrays, *given, work=500 * len(columns))
         return Choices(marks, offsets, columns, ranges, sums, states, repeated)
 
-    @property
-    def _size(self) -> tuple[int, int]:
-        """Of the image."""
-        height, width = (max(0, n - 2 * self.border) for n in self.row.shape[1:])
-        return height, width
-
-    def image(self) -> np.ndarray:
-        """(H, W, 4) premultiplied, H and W less than those of the cells by both borders."""
-        image = np.empty((*self._size, 4), self.positions.dtype)
-        if image.size:
-            given = *self.plain_arguments, self.choices.states, self.border
-            parallel(stencil.forward, len(image), *given, image, work=self._plain_work)
-            if len(self.choices.columns):
-                parallel(mixed.forward, len(image), *self._mixed_sums, self.border, image, work=self._mixed_work // 10)
-        return image
-
-    def vjp(
-        self, g: np.ndarray, wanted: tuple[bool, bool] = (True, True)
-    ) -> tuple[np.ndarray | None, np.ndarray | None]:
-        """Gradients of positions (N, 3) and rgba (N, 4) from the image's (H, W, 4); None where not wanted."""
-        _, height, _ = self.row.shape
-        if self.row.size and self.choices.repeated:
-            return self._vjp_of_repeated(g, wanted)
-        found = tuple(
-            np.zeros((len(x) if wish else 0, x.shape[1]), x.dtype)
-            for x, wish in zip((self.positions, self.rgba), wanted, strict=True)
-        )
-        if self.row.size:
-            g = read_only(g)
-            parallel(
-                stencil.pull,
-                height,
-                *self.plain_arguments,
-                self.choices.states,
-                self.border,
-                g,
-                *found,
-                work=self._plain_work,
-            )
-            if count := len(self.choices.columns):
-                adjoints = np.empty((count, 3, 5), g.dtype)
-                parallel(mixed.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=self._mixed_work // 5)
-                parallel(mixed.pull, height, *self.mixed_arguments, adjoints, *found, work=self._mixed_work)
-        return found[0] if wanted[0] else None, found[1] if wanted[1] else None
-
-    def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None) -> np.ndarray:
-        """Tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4); None for zeros."""
-        count = next(len(t) for t in (t_positions, t_rgba) if t is not None)
-        out = np.empty((count, *self._size, 4), self.positions.dtype)
+    def image(self, out: np.ndarray) -> None:
+        """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""
         if out.size:
-            tangents = tuple(
-                read_only(np.empty((count, 0, size), out.dtype) if t is None else t)
-                for t, size in ((t_positions, 3), (t_rgba, 4))
-            )
-            parallel(
-                stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.choices.states, self.border, out
-            )
+            given = *self.plain_arguments, self.choices.states, self.border
+            parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
             if len(self.choices.columns):
-                work = self._mixed_work * count
-                given = *self.mixed_arguments, self.choices.sums, tangents, self.border
-                parallel(mixed.push, out.shape[1], *given, out, work=work)
-        return out
+                parallel(mixed.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10)
 
-    def _vjp_of_repeated(self, g: np.ndarray, wanted: tuple[bool, bool]) -> tuple[np.ndarray | None, np.ndarray | None]:
+    def vjp(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
+        """Fill the gradients of positions (N, 3) and rgba (N, 4), zeros or None, from the image's (H, W, 4)."""
+        _, height, _ = self.row.shape
+        if not self.row.size:
+            return
+        if self.choices.repeated:
+            self._vjp_of_repeated(g, g_positions, g_rgba)
+            return
+        kind = self.positions.dtype
+        found = (
+            np.empty((0, 3), kind) if g_positions is None else g_positions,
+            np.empty((0, 4), kind) if g_rgba is None else g_rgba,
+        )
+        g = read_only(g)
+        plain = *self.plain_arguments, self.choices.states, self.border
+        parallel(stencil.pull, height, *plain, g, *found, work=self._plain_work)
+        if count := len(self.choices.columns):
+            adjoints = np.empty((count, 3, 5), g.dtype)
+            parallel(mixed.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=self._mixed_work // 5)
+            parallel(mixed.pull, height, *self.mixed_arguments, adjoints, *found, work=self._mixed_work)
+
+    def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
+        """Fill tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4), or None."""
+        if not out.size:
+            return
+        tangents = tuple(
+            read_only(np.empty((len(out), 0, size), out.dtype) if t is None else t)
+            for t, size in ((t_positions, 3), (t_rgba, 4))
+        )
+        parallel(stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.choices.states, self.border, out)
+        if len(self.choices.columns):
+            given = *self.mixed_arguments, self.choices.sums, tangents, self.border
+            parallel(mixed.push, out.shape[1], *given, out, work=self._mixed_work * len(out))
+
+    def _vjp_of_repeated(self, g: np.ndarray, *results: np.ndarray | None) -> None:
         """`vjp` with a copy of the sample for each cell, whose gradients are then added in the order of the cells."""
         covered = self.row >= 0
         index = self.row[covered]
         own = np.full(self.row.shape, -1, np.int32)
         own[covered] = np.arange(len(index), dtype=np.int32)
-        copy = object.__new__(Splats)
+        copy = object.__new__(Cells)
         copy.__dict__.update(self.__dict__, choices=self.choices._replace(repeated=False), row=read_only(own))
         copy.positions, copy.rgba = read_only(self.positions[index]), read_only(self.rgba[index])
-        g_positions, g_rgba = copy.vjp(g, wanted)
-        return _collected(g_positions, index, self.positions), _collected(g_rgba, index, self.rgba)
+        found = [None if x is None else np.zeros((len(index), x.shape[1]), x.dtype) for x in results]
+        copy.vjp(g, *found)
+        for result, values in zip(results, found, strict=True):
+            if result is not None:
+                np.add.at(result, index, values)
 
 
 @lru_cache
@@ -246,12 +228,3 @@ def _reach(settings: Settings) -> float:
         middle = (low + high) / 2
         low, high = (middle, high) if least(middle) >= 1 else (low, middle)
     return 0.9 * low  # Weights are rounded.
-
-
-def _collected(values: np.ndarray | None, index: np.ndarray, like: np.ndarray) -> np.ndarray | None:
-    """Sums of the rows of `values` that share an index."""
-    if values is None:
-        return None
-    total = np.zeros_like(like)
-    np.add.at(total, index, values)
-    return total

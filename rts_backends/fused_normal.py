@@ -12,9 +12,10 @@ from typing import Any
 import numba
 import numpy as np
 
-from rts.protocols import Array, ArraySpec, Engine
+from rts.interfaces import Engine
+from rts.records import Array, ArraySpec
 from rts.threads import parallel, read_only
-from rts_backends.fused_kernels import Settings, Splats
+from rts_backends.fused_kernels import Cells, Settings
 from rts_backends.fused_mixed import changes_of
 from rts_backends.fused_rows import (
     PITCH,
@@ -51,8 +52,8 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
     """
     positions, rgba, _, t_positions = given[:4]
     kind = {32: np.float32, 64: np.float64}.get(engine.namespace.finfo(positions.dtype).bits)
-    on_device = engine.name == "torch" and any(x is not None and x.device.type != "cpu" for x in given)
-    if kind is None or rgba.dtype != positions.dtype or on_device:
+    there = [x for x in given if x is not None]
+    if kind is None or rgba.dtype != positions.dtype or not engine.on_host(*there):
         return None
     present = [x is not None for x in given]
 
@@ -61,16 +62,16 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
         whole: list[Any] = [next(it) if there else None for there in present]
         positions, rgba, row, *rest = whole
         used = int(row.max(initial=-1)) + 1  # Under `jit` there may be many more.
-        splats = Splats(settings, positions[:used], rgba[:used], row)
-        return tuple(np.asarray(x, kind) for x in normal_equations(splats, *rest))
+        cells = Cells(settings, positions[:used], rgba[:used], row)
+        return tuple(np.asarray(x, kind) for x in normal_equations(cells, *rest))
 
     count = t_positions.shape[0]
     specs = ArraySpec((), kind), ArraySpec((count, count), kind), ArraySpec((count,), kind)
-    return engine.call_host(host, specs, *(x for x in given if x is not None))
+    return engine.call_host(host, specs, *there)
 
 
 def normal_equations(
-    splats: Splats,
+    cells: Cells,
     t_positions: np.ndarray,
     t_rgba: np.ndarray | None,
     target: np.ndarray,
@@ -80,21 +81,21 @@ def normal_equations(
     """Mean square of the n residuals weight · (image − target), JᵀJ / n and Jᵀr / n, float64.
 
     Args:
-        splats: the samples.
+        cells: the samples.
         t_positions: (T, N, 2), or more columns, tangents of their positions along T directions.
         t_rgba: (T, N, 4) of their colours; None for zeros.
         target: (H, W, C), of alpha (C = 1), colours (3) or both (4).
         weights: (H, W, 1) or (H, W, C), or None.
         background: (H, W, 4), what the image is composited onto, or None.
     """
-    count, dtype = len(t_positions), splats.positions.dtype
+    count, dtype = len(t_positions), cells.positions.dtype
     if t_rgba is None or not _any(t_rgba):
         t_rgba = np.empty((count, 0, 4), dtype)
     tangents = read_only(t_positions, dtype), read_only(t_rgba, dtype)
     fields = (read_only(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
     bands = -(-len(target) // BAND)
     sums = np.zeros((bands, count + 1, count + 1))
-    given = splats.plain_arguments, splats.row, splats.choices, tangents, tuple(fields), splats.border
+    given = cells.plain_arguments, cells.row, cells.choices, tangents, tuple(fields), cells.border
     parallel(_accumulate, bands, ALPHA if target.shape[2] == 1 else COLORS, *given, sums)
     total = sums.sum(axis=0) / max(target.size, 1)
     matrix = total[:count, :count]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -12,9 +12,10 @@ import numpy as np
 from jax.core import Tracer
 
 from rts.errors import RtsError
-from rts.protocols import ArraySpec, Tree
-from rts.records import STATIC_FIELDS, join_record, split_record
-from rts_backends import jax_host, jax_samples
+from rts.interfaces import Engine
+from rts.operations.operation import Operation
+from rts.records import STATIC_FIELDS, ArraySpec, Tree, join_record, split_record
+from rts_backends import jax_host, jax_operations
 
 for _cls in STATIC_FIELDS:
     jax.tree_util.register_pytree_node(
@@ -34,7 +35,7 @@ def _pad(x: np.ndarray, rows: int) -> np.ndarray:
     return np.concatenate([x, np.zeros((rows - x.shape[0], *x.shape[1:]), x.dtype)])
 
 
-class JaxEngine:
+class JaxEngine(Engine):
     """Engine of jax arrays."""
 
     name = "jax"
@@ -57,7 +58,7 @@ class JaxEngine:
             array = array.astype(np.int32)
         return jnp.asarray(array)
 
-    def call_host(self, fn: Callable, specs: tuple[ArraySpec, ...], *args: Any) -> tuple[jax.Array, ...]:
+    def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[jax.Array, ...]:
         """Call `fn`; packed rows are padded to a bucket where values are known, to the largest shape under a trace."""
         # Under grad and jvp this yields the plain value; only jit and vmap leave a tracer.
         args = tuple(jax.lax.stop_gradient(a) if isinstance(a, jax.Array) else a for a in args)
@@ -91,18 +92,27 @@ class JaxEngine:
             self._used[key] = weakref.ref(x, lambda _: self._used.pop(key, None)), used
         return x
 
-    def _used_of(self, x: jax.Array) -> jax.Array | np.int32:
-        """How many rows of (N, ·) are used, as far as is known."""
-        known = self._used.get(id(x))
-        return known[1] if known is not None and known[0]() is x else np.int32(x.shape[0])
+    def _used_of(self, packed: Sequence[jax.Array]) -> jax.Array | np.int32:
+        """How many rows of arrays (N, ·), which belong together, are used, as far as is known of any."""
+        for x in packed:
+            known = self._used.get(id(x))
+            if known is not None and known[0]() is x:
+                return known[1]
+        return np.int32(packed[0].shape[0] if packed else 0)
 
     def traced(self, x: jax.Array) -> bool:
         """Whether `x` is a tracer."""
         return isinstance(x, Tracer)
 
-    def on_cpu(self, f: Callable, otherwise: Callable, *args: jax.Array) -> tuple[jax.Array, ...]:
-        """`f` of tracers in programs for the CPU, and `otherwise` of them on other devices; the results are alike."""
-        return jax.lax.platform_dependent(*args, cpu=f, default=otherwise)
+    def on_host(self, *arrays: jax.Array) -> bool:
+        """Whether all are on CPUs; of a tracer that is not known yet, and taken to be so."""
+        return all(isinstance(x, Tracer) or all(d.platform == "cpu" for d in x.devices()) for x in arrays)
+
+    def by_host(self, f: Callable, otherwise: Callable, *arrays: jax.Array) -> tuple[jax.Array, ...]:
+        """In a traced program, as its device turns out to be."""
+        if any(isinstance(x, Tracer) for x in arrays):
+            return jax.lax.platform_dependent(*arrays, cpu=f, default=otherwise)
+        return super().by_host(f, otherwise, *arrays)
 
     def take_error(self) -> RtsError | None:
         """What the latest host call under a trace raised, once; jax replaces it by an error of its own."""
@@ -113,20 +123,17 @@ class JaxEngine:
         """`jax.lax.stop_gradient`."""
         return jax.lax.stop_gradient(x)
 
-    def projective_map(self, rows: jax.Array, points: jax.Array) -> jax.Array | None:
-        """By compiled code, on CPUs, of what is float32 or float64; else None."""
-        if rows.dtype != points.dtype or rows.dtype not in (np.float32, np.float64):
-            return None
-        used = self._used_of(points)
-        return self._note(jax_samples.project(rows, points, used), used)
+    def apply(self, operation: Operation, operands: Sequence[jax.Array], params: Mapping[str, Any]) -> jax.Array:
+        """By compiled code, on CPUs, of floats of one dtype, float32 or float64."""
+        if not jax_operations.fits(operation, operands):
+            return operation.specification(*operands, **params)
+        used = self._used_of([operands[i] for i in operation.packed])
+        result = jax_operations.apply(operation, operands, params, used)
+        return self._note(result, used) if operation.packed_result else result
 
-    def interpolate(self, rows: jax.Array, ids: jax.Array, column: int, weights: jax.Array) -> jax.Array | None:
-        """By compiled code, on CPUs, of what is float32 or float64; else None."""
-        dtype = jnp.result_type(rows, weights)
-        if rows.dtype != dtype or dtype not in (np.float32, np.float64):
-            return None
-        used = self._used_of(ids)
-        return self._note(jax_samples.interpolate(rows, weights.astype(dtype), ids, used, column), used)
+    def padded(self, x: jax.Array) -> bool:
+        """Always, perhaps: to a bucket, or to the capacity."""
+        return True
 
     def fill_unused(self, x: jax.Array, row: jax.Array) -> jax.Array:
         """As part of what reads it; ones where no cell refers to any row."""

@@ -1,19 +1,24 @@
-"""Functions of packed samples as jax primitives: eager, `jit`, `grad`, `jvp`, `vmap` and what is made of them.
+"""Operations as jax primitives: eager, `jit`, `grad`, `jvp`, `vmap` and what is made of them.
 
-Three primitives a function: its value, its pushforward and its pullback. Each of the last two is linear in the
+Three primitives an operation: its value, its pushforward and its pullback. Each of the last two is linear in the
 tangents or the gradients, and the transpose of the other; their derivatives by the operands, which are second
-derivatives of the function, are taken of its specification. So is everything on devices other than the CPU.
+derivatives of the operation, are taken of its specification. So is everything on devices other than the CPU.
 
 Tangents and gradients have a leading axis T, of as many as one sweep takes. Before that, `vmap` gives those operands
-that differ by item an axis B.
+that differ by item an axis B. After the operands of an operation come two numbers where they are of use: how many rows
+are in use, and a note of what its value has kept for the derivatives.
 """
 
 from __future__ import annotations
 
+import collections
 import functools
 import inspect
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+import itertools
+import secrets
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,79 +28,119 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxlib.mlir.dialects import stablehlo as hlo
 
+from rts.operations.operation import Arrays, Operation
+from rts.threads import read_only
 from rts_backends import jax_host
+from rts_backends.jax_host import clear
 
-Wanted = tuple[bool, bool]
-"""Whether the first, and whether the second operand has a tangent or wants a gradient."""
+Wanted = tuple[bool, ...]
+"""Which of the differentiable operands have a tangent or want a gradient."""
 
 # Rules whose results are kept for the next equation alike do not see what operands come from.
 _SEEING_OPERANDS = {"cacheable": False} if "cacheable" in inspect.signature(mlir.register_lowering).parameters else {}
 
-Arrays = Sequence[np.ndarray]
-Some = Sequence[np.ndarray | None]
+MOST_KEPT = 1 << 24
+"""Bytes of what values leave to derivatives that are kept."""
 
 
-class Kernels(NamedTuple):
-    """A function on the host. Results are arrays to be filled, each whole; parameters are handed on as keywords.
-
-    Attributes:
-        value: (operands, result), and where there is a note, that as a third.
-        push: (operands, tangents of the first two with axis T or None for zeros, result with axis T).
-        pull: (operands, gradients with axis T, gradients of the first two with axis T or None where not wanted).
-    """
-
-    value: Callable[..., None]
-    push: Callable[..., None]
-    pull: Callable[..., None]
-
-
-class Differentiable:
-    """A function of arrays, in the first two of which it is differentiable; all floats of one dtype.
+def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[str, Any], used: Any) -> jax.Array:
+    """The result of an operation whose operands fit.
 
     Args:
-        name: of the primitives.
-        ranks: of the operands; the result has that of a gradient of either less the axis T.
-        shape: of the result, from the shapes of the operands and the parameters.
-        kernels: by which it is computed on the host.
-        specification: the function in jax, of operands and parameters.
-        even: operands whose rows are often all alike; where a program says so, kernels are given one row of them.
-        noted: whether `value` also leaves a note () int32, which `push` and `pull` of the same operands are given as
-            the last of these: it may tell them what has been worked out already.
+        operation: the operation.
+        operands: its operands.
+        params: its parameters.
+        used: how many rows of packed operands are in use, () int32.
+    """
+    if operation not in _bound:
+        _bound[operation] = _Differentiable(operation, _name(operation), params)
+    own = () if not _Differentiable.told(operation) else (used,)
+    return _bound[operation](*operands, *own, **params)
+
+
+def fits(operation: Operation, operands: Sequence[jax.Array]) -> bool:
+    """Whether the arrays are of the kernels' dtypes; on what device they are, a traced function cannot know."""
+    return operation.fits([x.dtype for x in operands])
+
+
+class _Kept:
+    """The latest of what values have left to derivatives, by a number for each."""
+
+    def __init__(self):
+        # Not from 0: a number that some other process has given is to name nothing here.
+        self._numbers, self._found = itertools.count(secrets.randbits(30)), collections.OrderedDict()
+        self._lock, self._bytes = threading.Lock(), 0
+
+    def add(self, kept: Any) -> int:
+        """The number of an object."""
+        with self._lock:
+            number = next(self._numbers) % 2**31
+            self._found[number] = kept
+            self._bytes += _size(kept)
+            while self._bytes > MOST_KEPT:
+                self._bytes -= _size(self._found.popitem(last=False)[1])
+        return number
+
+    def get(self, number: int) -> Any:
+        """The object of a number, if it is still known, or None."""
+        with self._lock:
+            return self._found.get(number)
+
+
+def _size(kept: Any) -> int:
+    """Bytes of the arrays in a tuple, or of one array."""
+    return sum(x.nbytes for x in (kept if isinstance(kept, tuple) else (kept,)) if isinstance(x, np.ndarray))
+
+
+_kept = _Kept()
+
+
+class _Differentiable:
+    """An operation as a function of jax arrays.
+
+    Args:
+        operation: the operation.
+        name: of its primitives.
+        params: some parameters; the number of axes of its result does not depend on them.
     """
 
-    def __init__(
-        self,
-        name: str,
-        ranks: tuple[int, ...],
-        shape: Callable[..., tuple],
-        kernels: Kernels,
-        specification: Callable,
-        even: tuple[int, ...] = (),
-        noted: bool = False,
-    ):
-        self.kernels, self._specification, self.rank = kernels, specification, len(shape(*((1,) * r for r in ranks)))
-        self._inputs, self.count = len(ranks), len(ranks) + noted
-        inputs, count = self._inputs, self.count
+    def __init__(self, operation: Operation, name: str, params: Mapping[str, Any]):
+        self.operation, self.varied = operation, operation.differentiable
+        self.rank = len(operation.shape(*((1,) * r for r in operation.ranks), **params))
+        self._inputs = len(operation.ranks)
+        self._told = self.told(operation)
+        given = self._inputs + self._told
+        count = self.count = given + operation.keeps
+        varied, shape, inputs = self.varied, operation.shape, self._inputs
 
         def pulled(*shapes: tuple, wanted: Wanted, **_: Any) -> list[tuple]:
-            return [(shapes[count][0], *x) for x, wish in zip(shapes[:2], wanted, strict=True) if wish]
+            return [(shapes[count][0], *x) for x, wish in zip(shapes[:varied], wanted, strict=True) if wish]
 
         def pushed(*shapes: tuple, wanted: Wanted, **params: Any) -> list[tuple]:
             return [(shapes[count][0], *shape(*shapes[:inputs], **params))]
 
         def valued(*shapes: tuple, **params: Any) -> list[tuple]:
-            return [shape(*shapes, **params), *[()] * noted]
+            return [shape(*shapes[:inputs], **params), *[()] * operation.keeps]
 
-        self._value = _Operation(name, ranks, inputs, valued, self._host_value, self._plain, even, noted)
+        even, noted = operation.even, operation.keeps
+        ranks = *operation.ranks, *[0] * self._told
+        self._value = _Operation(name, ranks, given, valued, self._host_value, self._plain, even, noted)
         ranks = *ranks, *[0] * noted
-        swept, given = (*ranks, *(r + 1 for r in ranks[:2])), (*ranks, self.rank + 1)
-        self._push = _Operation(f"{name}_push", swept, count, pushed, self._host_push, self._specified_push, even)
-        self._pull = _Operation(f"{name}_pull", given, count, pulled, self._host_pull, self._specified_pull, even)
+        swept, backward = (*ranks, *(r + 1 for r in ranks[:varied])), (*ranks, self.rank + 1)
+        self._push = _Operation(
+            f"{name}_push", swept, count, pushed, self._host_push, self._specified_push, even, some=True
+        )
+        self._pull = _Operation(f"{name}_pull", backward, count, pulled, self._host_pull, self._specified_pull, even)
         ad.primitive_jvps[self._value.primitive] = self._value_jvp
         ad.primitive_jvps[self._push.primitive] = self._push_jvp
         ad.primitive_jvps[self._pull.primitive] = self._pull_jvp
         ad.primitive_transposes[self._push.primitive] = self._push_transpose
         ad.primitive_transposes[self._pull.primitive] = self._pull_transpose
+
+    @staticmethod
+    def told(operation: Operation) -> bool:
+        """Whether its functions are told how many rows are in use."""
+        return bool(operation.packed) and operation.used is None
 
     def __call__(self, *operands: jax.Array, **params: Any) -> jax.Array:
         """The result."""
@@ -103,20 +148,64 @@ class Differentiable:
 
     # ------------------------------------------------------------------------------------------ by compiled kernels
 
-    def _host_value(self, operands: Arrays, results: Arrays, **params: Any) -> None:
-        self.kernels.value(operands, *results, **params)
+    def _in_use(self, given: Arrays) -> tuple[list[np.ndarray], int, Any]:
+        """The operands, of packed ones the rows in use; their number; and what the value has kept."""
+        operands = [read_only(x) for x in given[: self._inputs]]
+        operation, used = self.operation, 0
+        if operation.packed:
+            used = int(given[self._inputs]) if self._told else operation.used(operands)
+            for i in operation.packed:
+                x = operands[i]
+                # Of even operands there may be but one row.
+                one = i in operation.even and len(x) == 1
+                operands[i] = np.broadcast_to(x, (used, *x.shape[1:])) if one else x[:used]
+        kept = _kept.get(int(given[self.count - 1])) if operation.keeps and len(given) >= self.count else None
+        return operands, used, kept
 
-    def _host_push(self, operands: Arrays, results: Arrays, wanted: Wanted, **params: Any) -> None:
-        self.kernels.push(operands[: self.count], _spread(operands[self.count :], wanted), results[0], **params)
+    def _host_value(self, given: Arrays, results: Arrays, **params: Any) -> None:
+        operands, used, _ = self._in_use(given)
+        out = results[0]
+        if self.operation.packed_result:
+            out = out[:used]
+            clear(results[0][used:])
+        kept = self.operation.forward(operands, out, **params)
+        if self.operation.keeps:
+            results[1][...] = -1 if kept is None else _kept.add(kept)
 
-    def _host_pull(self, operands: Arrays, results: Arrays, wanted: Wanted, **params: Any) -> None:
-        self.kernels.pull(operands[: self.count], operands[-1], _spread(results, wanted), **params)
+    def _host_push(self, given: Arrays, results: Arrays, wanted: Wanted, **params: Any) -> None:
+        operands, used, kept = self._in_use(given)
+        tangents: list[Any] = _spread(given[self.count :], wanted)
+        for i in self.operation.packed:
+            if i < self.varied and tangents[i] is not None:
+                tangents[i] = tangents[i][:, :used]
+        out = results[0]
+        if self.operation.packed_result:
+            out = out[:, :used]
+            for result in results[0]:
+                clear(result[used:])
+        self.operation.push_on_host(operands, tangents, out, kept, params)
+
+    def _host_pull(self, given: Arrays, results: Arrays, wanted: Wanted, **params: Any) -> None:
+        operands, used, kept = self._in_use(given)
+        places = _spread(results, wanted)
+        for t, g in enumerate(given[-1]):
+            found: list[Any] = [None if x is None else x[t, ...] for x in places]
+            for i, x in enumerate(found):
+                if x is None:
+                    continue
+                if i in self.operation.packed:
+                    clear(x[used:])
+                    x[:used] = 0
+                    found[i] = x[:used]
+                else:
+                    clear(x)
+            self.operation.pull_on_host(operands, g[:used] if self.operation.packed_result else g, found, kept, params)
 
     # --------------------------------------------------------------------------------------------- by specification
 
     def _plain(self, *operands: jax.Array, **params: Any) -> list[jax.Array]:
-        note = [jnp.zeros((), np.int32)] * (self.count - self._inputs)
-        return [self._specification(*operands, **params), *note]
+        note = [jnp.zeros((), np.int32)] * self.operation.keeps
+        return [self.operation.specification(*operands[: self._inputs], **params), *note]
 
     def _specified_push(self, *operands: jax.Array, wanted: Wanted, **params: Any) -> list[jax.Array]:
         function, given = self._among(wanted, operands[: self.count], params)
@@ -128,18 +217,19 @@ class Differentiable:
 
     def _among(self, wanted: Wanted, operands: Sequence, params: dict) -> tuple[Callable, list[jax.Array]]:
         """The specification as a function of the wanted operands, and these."""
+        n = self.varied
 
         def function(*given: jax.Array) -> jax.Array:
-            both = (x if g is None else g for x, g in zip(operands[:2], _spread(given, wanted), strict=True))
-            return self._specification(*both, *operands[2 : self._inputs], **params)
+            varied = (x if g is None else g for x, g in zip(operands[:n], _spread(given, wanted), strict=True))
+            return self.operation.specification(*varied, *operands[n : self._inputs], **params)
 
-        return function, [x for x, wish in zip(operands[:2], wanted, strict=True) if wish]
+        return function, [x for x, wish in zip(operands[:n], wanted, strict=True) if wish]
 
     # -------------------------------------------------------------------------------------------------- derivatives
 
     def _value_jvp(self, primals: Sequence, tangents: Sequence, **params: Any) -> tuple[list, list]:
         found = self._value(*primals, **params)
-        given, wanted = _present(tangents[:2])
+        given, wanted = _present(tangents[: self.varied])
         if not given:
             return found, _zeros(found)
         at = 1 if found[0].ndim > self.rank else 0
@@ -166,21 +256,23 @@ class Differentiable:
             along = linear if along is None else [a + b for a, b in zip(along, linear, strict=True)]
         return found, _zeros(found) if along is None else along
 
-    @staticmethod
-    def _along_operands(operation: _Operation, primals: Sequence, tangents: Sequence, params: dict) -> list | None:
-        """Derivatives of an operation's results along tangents of the first two operands, by specification; or None."""
-        _, moved = _present(tangents[:2])
+    def _along_operands(
+        self, operation: _Operation, primals: Sequence, tangents: Sequence, params: dict
+    ) -> list | None:
+        """Derivatives of an operation's results along tangents of the varied operands, by specification; or None."""
+        n = self.varied
+        _, moved = _present(tangents[:n])
         if not any(moved):
             return None
-        fixed = [x for x, m in zip(primals[:2], moved, strict=True) if not m]
+        fixed = [x for x, m in zip(primals[:n], moved, strict=True) if not m]
 
         def function(*given: jax.Array) -> list[jax.Array]:
             it, rest = iter(given), iter(fixed)
             both = [next(it) if m else next(rest) for m in moved]
-            return _whole(operation, tuple(params.items()))(*both, *primals[2:])
+            return _whole(operation, tuple(params.items()))(*both, *primals[n:])
 
-        varied = [x for x, m in zip(primals[:2], moved, strict=True) if m]
-        along = [t for t, m in zip(tangents[:2], moved, strict=True) if m]
+        varied = [x for x, m in zip(primals[:n], moved, strict=True) if m]
+        along = [t for t, m in zip(tangents[:n], moved, strict=True) if m]
         return jax.jvp(function, tuple(varied), tuple(along))[1]
 
     def _push_transpose(self, gradients: Sequence, *operands: Any, wanted: Wanted, **params: Any) -> list:
@@ -209,8 +301,9 @@ class _Operation:
         shapes: of the results without it, from the shapes of the operands without it and the parameters.
         host: fills the results for one item.
         specified: the same by specification.
-        even: see `Differentiable`.
+        even: see `Operation`.
         noted: whether the last result is a note.
+        some: whether of the operands after the samples there are only those that a parameter `wanted` says.
     """
 
     def __init__(
@@ -223,9 +316,11 @@ class _Operation:
         specified: Callable,
         even: tuple[int, ...],
         noted: bool = False,
+        some: bool = False,
     ):
         self.name, self.ranks, self.samples, self._even, self._noted = name, ranks, samples, even, noted
         self._shapes, self._host, self._specified = shapes, host, specified
+        self._some = some
         self.primitive = primitive = Primitive(f"rts_{name}")
         primitive.multiple_results = True
         primitive.def_impl(self._eager)
@@ -249,7 +344,7 @@ class _Operation:
     def _own_ranks(self, params: dict) -> list[int]:
         """Ranks of those operands that there are: tangents may be of one alone."""
         samples, rest = self.ranks[: self.samples], self.ranks[self.samples :]
-        if len(rest) == 2:
+        if self._some:
             rest = (r for r, wish in zip(rest, params["wanted"], strict=True) if wish)
         return [*samples, *rest]
 
@@ -389,11 +484,20 @@ def _zeros(like: Sequence[jax.Array]) -> list:
     return [ad.Zero(ShapedArray(x.shape, x.dtype).to_tangent_aval()) for x in like]
 
 
-def _present(tangents: Sequence, wanted: Wanted = (True, True)) -> tuple[list, Wanted]:
+def _present(tangents: Sequence, wanted: Wanted | None = None) -> tuple[list, Wanted]:
     """Tangents that are not zeros, and of what they are."""
-    places = _spread(tangents, wanted)
+    places = tangents if wanted is None else _spread(tangents, wanted)
     given = tuple(t is not None and not _is_zero(t) for t in places)
-    return [t for t, g in zip(places, given, strict=True) if g], (given[0], given[1])
+    return [t for t, g in zip(places, given, strict=True) if g], given
+
+
+_bound: dict[Operation, _Differentiable] = {}
+
+
+def _name(operation: Operation) -> str:
+    """Of its primitives: one of its own for each, if several are named alike, as when a notebook's cell is run anew."""
+    same = sum(1 for other in _bound if other.name == operation.name)
+    return f"{operation.name}~{same}" if same else operation.name
 
 
 def _summed(x: jax.Array, rank: int) -> jax.Array:

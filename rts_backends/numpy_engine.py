@@ -2,56 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from array_api_compat import numpy as array_api
 
-from rts.errors import EngineError
-from rts.protocols import Array, ArraySpec, Tree
+from rts.interfaces import Engine
+from rts.operations.operation import Operation
+from rts.records import Array, ArraySpec
+from rts.threads import read_only
 
 
-def _forward_only(*_: Any) -> Any:
-    raise EngineError("NumPy has no derivatives; pass torch or jax arrays for what is to be differentiated")
-
-
-class NumpyEngine:
+class NumpyEngine(Engine):
     """Engine of plain NumPy arrays."""
 
     name = "numpy"
     namespace = array_api
-    value_and_grad = staticmethod(_forward_only)
-    jvp = staticmethod(_forward_only)
-    jacobian = staticmethod(_forward_only)
-    optimizer = staticmethod(_forward_only)
+    differentiates = False
 
     def owns(self, x: Any) -> bool:
         """Whether `x` is a NumPy array."""
         return isinstance(x, np.ndarray)
 
     def constant(self, value: Any, like: Array | None = None) -> np.ndarray:
-        """`value` as an array, floats in the dtype of `like`."""
+        """`value` as an array, floats in the dtype of `like`, else as they are."""
         array = np.asarray(value)
         return array.astype(like.dtype) if like is not None and np.issubdtype(array.dtype, np.floating) else array
 
-    def call_host(self, fn: Callable, specs: tuple[ArraySpec, ...], *args: Array) -> tuple[np.ndarray, ...]:
+    def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Array) -> tuple[np.ndarray, ...]:
         """Call `fn`: everything is on the host already."""
         return fn(*args)
 
-    def matmul(self, a: Array, b: Array) -> Array:
-        """As one product."""
-        return a @ b
+    def apply(self, operation: Operation, operands: Sequence[np.ndarray], params: Mapping[str, Any]) -> np.ndarray:
+        """By compiled code, of floats of one dtype, float32 or float64."""
+        if not operation.fits([x.dtype for x in operands]):
+            return operation.specification(*operands, **params)
+        return operation.value_on_host([read_only(x) for x in operands], dict(params))[0]
+
+    def on_host(self, *arrays: np.ndarray) -> bool:
+        """Always."""
+        return True
+
+    def exact_products(self, *arrays: np.ndarray) -> bool:
+        """Always."""
+        return True
 
     def stop_gradient(self, x: Array) -> Array:
         """`x` itself."""
         return x
 
-    def affine_map(self, rows: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """As one product."""
-        return points @ rows[:, :3].T + rows[:, 3]
-
-    def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> np.ndarray:
+    def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> Array:
         """Sums of the rows of `values` that share a segment."""
         return np.stack([np.bincount(segments, weights=v, minlength=count) for v in values.T], axis=-1).astype(
             values.dtype
@@ -60,15 +61,3 @@ class NumpyEngine:
     def to_numpy(self, x: Array) -> np.ndarray:
         """`x` itself."""
         return np.asarray(x)
-
-    def block(self, x: Tree) -> Tree:
-        """Nothing to wait for."""
-        return x
-
-    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Array]) -> np.ndarray:
-        """The value of `f(make())`."""
-        return f(make())
-
-    def jit(self, f: Callable) -> Callable:
-        """`f` itself."""
-        return f

@@ -17,7 +17,7 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.protocols import Fragments, Proxy
+from rts.records import Fragments, Proxy
 from rts.sampling import TriangleSampler
 from rts.threads import parallel
 from rts_backends.neighbours import corner_lists, places, settle

@@ -18,7 +18,7 @@ import numba
 import numpy as np
 
 from rts.camera import Camera
-from rts.protocols import Fragments, Proxy
+from rts.records import Fragments, Proxy
 from rts.sampling import TriangleSampler
 from rts.threads import parallel
 from rts_backends.triangles import facing, owns, pixel_matrix, to_corner

@@ -7,19 +7,20 @@ import numpy as np
 from rts.arrays import constants, engine_of, exemplar, map_leaves, namespace
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.protocols import ArraySpec, Part, Samples
+from rts.interfaces import Part, RaySurface, Sampler
+from rts.records import ArraySpec, Samples
 from rts.sampling import check_camera
 
 
-class Rays:
+class Rays(Sampler):
     """Casts a ray through every pixel's centre, on the device, so that a traced function may hold the surface."""
 
     def sample(
         self, part: Part, camera: Camera, size: tuple[int, int], layers: int, *, capacity: int | None = None
     ) -> Samples:
-        """See `rts.protocols.Sampler`."""
+        """See `rts.Sampler`."""
         surface = part.surface
-        if not hasattr(surface, "intersect"):
+        if not isinstance(surface, RaySurface):
             raise InputError(
                 f"{surface!r} does not intersect rays itself; use a sampler of triangles, such as 'raster'"
             )

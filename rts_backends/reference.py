@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.camera import Camera
-from rts.protocols import Fragments, Proxy
+from rts.records import Fragments, Proxy
 from rts.sampling import TriangleSampler
 
 CANDIDATES_AT_ONCE = 1 << 20

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,10 @@ from array_api_compat import torch as array_api
 from torch.utils import _pytree
 
 from rts.arrays import leaves, map_leaves
-from rts.protocols import ArraySpec, Tree
-from rts.records import STATIC_FIELDS, join_record, split_record
+from rts.interfaces import Engine
+from rts.operations.operation import Operation
+from rts.records import STATIC_FIELDS, ArraySpec, Tree, join_record, split_record
+from rts_backends import torch_operations
 from rts_backends.torch_functions import applied, transformed
 
 for _cls in STATIC_FIELDS:
@@ -37,19 +39,6 @@ def _to_host(x: torch.Tensor) -> np.ndarray:
     """The value as NumPy; half precision, of which NumPy knows only one kind, as float32."""
     x = x.detach().cpu()
     return (x.float() if x.dtype in (torch.bfloat16, torch.float16) else x).numpy()
-
-
-def _exact(a: torch.Tensor, b: torch.Tensor) -> bool:
-    """Whether torch multiplies matrices in their own precision: on the CPU, but for `torch.autocast`."""
-    return a.device.type == "cpu" and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
-
-
-def _compiled(*tensors: torch.Tensor) -> bool:
-    """Whether compiled code knows them: on the CPU, all of one dtype, single or double."""
-    return all(t.device.type == "cpu" for t in tensors) and {t.dtype for t in tensors} in (
-        {torch.float32},
-        {torch.float64},
-    )
 
 
 class _HostCall(torch.autograd.Function):
@@ -89,7 +78,7 @@ class _HostCall(torch.autograd.Function):
         return tuple(outputs), (0,) * len(outputs)
 
 
-class TorchEngine:
+class TorchEngine(Engine):
     """Engine of torch tensors."""
 
     name = "torch"
@@ -106,7 +95,7 @@ class TorchEngine:
             return tensor
         return tensor.to(torch.float64 if like is not None and like.dtype == torch.float64 else torch.float32)
 
-    def call_host(self, fn: Callable, specs: tuple[ArraySpec, ...], *args: Any) -> tuple[torch.Tensor, ...]:
+    def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[torch.Tensor, ...]:
         """Call `fn` on NumPy views or copies of `args`; under vmap once an item, packed rows padded alike."""
         if torch.compiler.is_compiling():
             return torch.compiler.disable(applied)(_HostCall, fn, specs, *args)
@@ -120,56 +109,25 @@ class TorchEngine:
         """`x` detached."""
         return x.detach()
 
-    def matmul(self, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor | None:
-        """As one product on the CPU; elsewhere elementwise, since matrix units may round float32 to fewer bits."""
-        return a @ b if _exact(a, b) else None
+    def apply(self, operation: Operation, operands: Sequence[torch.Tensor], params: Mapping[str, Any]) -> torch.Tensor:
+        """By compiled code, of tensors in the memory of the host whose floats are of one dtype, single or double."""
+        return torch_operations.apply(operation, operands, params)
 
-    def rigid(self, pose: torch.Tensor, center: torch.Tensor) -> torch.Tensor | None:
-        """By compiled code on the CPU."""
-        if not _compiled(pose, center):
-            return None
-        from rts_backends import torch_rigid
+    def on_host(self, *arrays: torch.Tensor) -> bool:
+        """Whether all are in the memory of the host."""
+        return all(x.device.type == "cpu" for x in arrays)
 
-        return torch_rigid.rigid(pose, center)
+    def exact_products(self, *arrays: torch.Tensor) -> bool:
+        """On the CPU, but for `torch.autocast`, and of one dtype."""
+        a, b = arrays
+        return a.device.type == b.device.type == "cpu" and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
 
-    def affine_map(self, rows: torch.Tensor, points: torch.Tensor) -> torch.Tensor:
-        """As one product on the CPU; elsewhere elementwise, since matrix units may round float32 to fewer bits."""
-        if _exact(rows, points):
-            return torch.addmm(rows[:, 3], points, rows[:, :3].T)
-        return (points[:, None, :] * rows[None, :, :3]).sum(dim=-1) + rows[:, 3]
-
-    def projective_map(self, rows: torch.Tensor, points: torch.Tensor) -> torch.Tensor | None:
-        """By compiled code on the CPU; else None."""
-        if not _compiled(rows, points):
-            return None
-        from rts_backends import torch_samples
-
-        return torch_samples.project(rows, points)
-
-    def interpolate(
-        self, rows: torch.Tensor, ids: torch.Tensor, column: int, weights: torch.Tensor
-    ) -> torch.Tensor | None:
-        """By compiled code on the CPU; else None."""
-        if rows.dtype == torch.float64:
-            weights = weights.to(rows.dtype)
-        if not _compiled(rows, weights):
-            return None
-        from rts_backends import torch_samples
-
-        return torch_samples.interpolate(rows, ids, column, weights)
-
-    def take(self, rows: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-        """By compiled code on the CPU."""
-        if _compiled(rows) and rows.ndim == 2:
-            from rts_backends import torch_rows
-
-            return torch_rows.take(rows, index)
-        return torch.index_select(rows, 0, index)
+    def padded(self, x: torch.Tensor) -> bool:
+        """Under `torch.vmap`, whose items have as many rows as the largest."""
+        return torch._C._functorch.maybe_current_level() is not None
 
     def fill_unused(self, x: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
-        """`x` itself, save under `torch.vmap`, whose items have as many rows as the largest."""
-        if torch._C._functorch.maybe_current_level() is None:
-            return x
+        """By selection; ones where no cell refers to any row."""
         used = row.max() + 1
         index = torch.arange(x.shape[0], device=x.device).reshape(-1, *[1] * (x.ndim - 1))
         return torch.where(index < used, x, torch.where(used > 0, x[:1], torch.ones_like(x[:1])))
@@ -231,10 +189,6 @@ class TorchEngine:
             return torch.func.vmap(lambda t: torch.func.jvp(f, (vector,), (t,)), out_dims=(None, 0))(along)
 
         return call
-
-    def jit(self, f: Callable) -> Callable:
-        """`f` itself: eager torch is what the rest of the engine is made for."""
-        return f
 
     def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
         """`torch.optim.Adam` or `torch.optim.SGD` on private copies of the parameters."""

@@ -1,204 +1,269 @@
-"""Functions of tensors on the host whose values and first derivatives are compiled.
+"""Operations as torch functions: autograd, `torch.func` transforms, forward mode and `torch.compile`.
 
-Autograd, `torch.func` and forward mode take the derivatives by compiled code; derivatives of these, and batches of
-`vmap` other than of tangents, are of the specification, which is the same function in torch.
+Three functions: the value, its pullback and its pushforward. Each is the derivative of the one before by compiled code;
+the derivatives of the last two, which are second derivatives of the value, are taken of the specification.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from rts.operations.operation import Operation
+from rts.threads import read_only
 from rts_backends.torch_functions import along, applied, foreign
 
-Arrays = Sequence[np.ndarray]
-Some = Sequence[np.ndarray | None]
+_DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
+_INTEGERS = {torch.int32, torch.int64, torch.int16, torch.int8, torch.uint8, torch.bool}
 
 
-class Operation(NamedTuple):
-    """A function of tensors, in the first two of which it is differentiable; all floats are of one dtype.
+def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str, Any]) -> Tensor:
+    """The result of an operation."""
+    if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
+        return operation.specification(*operands, **params)
+    return applied(_Value, _Call(operation, params), *operands)
 
-    Attributes:
-        specification: the function in torch.
-        value: the result of the operands.
-        shape: of the result, from the operands.
-        push: (operands, tangents, out), to fill `out` with the tangent along those of the first two, or None for zeros.
-        pull: (operands, gradient, results), to fill the results, zeros at first, with the gradients of the first two;
-            None where not wanted.
+
+class _Specifying(threading.local):
+    """Whether a specification is being differentiated: torch does not nest functions of its transforms in one another,
+    so operations in it are array code, too."""
+
+    on = False
+
+
+_specifying = _Specifying()
+
+
+def _fits(operands: Sequence[Tensor]) -> bool:
+    """Whether compiled code knows them: on the host, the floats all of one dtype, single or double."""
+    real = operands[0].dtype
+    if real not in _DTYPES:
+        return False
+    for x in operands:
+        if x.device.type != "cpu" or (x.dtype != real and x.dtype not in _INTEGERS):
+            return False
+    return True
+
+
+class _Call:
+    """What is to be computed, and what its value leaves to the derivatives.
+
+    The operands themselves are torch's to keep, or not, as under `torch.utils.checkpoint`. Under `vmap` each item has a
+    call of its own.
     """
 
-    specification: Callable[..., Tensor]
-    value: Callable[[Arrays], np.ndarray]
-    shape: Callable[[Arrays], tuple[int, ...]]
-    push: Callable[[Arrays, Some, np.ndarray], None]
-    pull: Callable[[Arrays, np.ndarray, Some], None]
+    __slots__ = ("count", "kept", "operation", "params")
 
-    def __call__(self, *operands: Tensor) -> Tensor:
-        """The result."""
-        if torch.compiler.is_compiling():
-            return self.specification(*operands)
-        return applied(_Value, self, *operands)
+    def __init__(self, operation: Operation, params: Mapping[str, Any]):
+        self.operation, self.params = operation, params
+        self.count, self.kept = operation.differentiable, None
 
-    def pulled(self, wanted: Sequence[bool]) -> Callable[..., tuple[Tensor, ...]]:
-        """The specification's pullback as a function of operands and gradient; no rows of what is not wanted."""
+    def another(self) -> _Call:
+        """The same, at other operands."""
+        return _Call(self.operation, self.params)
+
+    def split(self, given: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
+        """Of operands those that have derivatives, and the others."""
+        return given[: self.count], given[self.count :]
+
+    def specification(self, *fixed: Tensor) -> Callable[..., Tensor]:
+        """As a function of the differentiable operands."""
+
+        def specified(*varied: Tensor) -> Tensor:
+            before, _specifying.on = _specifying.on, True
+            try:
+                return self.operation.specification(*varied, *fixed, **self.params)
+            finally:
+                _specifying.on = before
+
+        return specified
+
+    def pulled(self, wanted: Sequence[bool], fixed: Sequence[Tensor]) -> Callable[..., tuple[Tensor, ...]]:
+        """The specification's pullback as a function of the differentiable operands and the gradient.
+
+        It has no rows of what is not wanted.
+        """
 
         def pull(*given: Tensor) -> tuple[Tensor, ...]:
-            (first, second, *rest), g = given[:-1], given[-1]
-            found = torch.func.vjp(lambda a, b: self.specification(a, b, *rest), first, second)[1](g)
+            found = torch.func.vjp(self.specification(*fixed), *given[:-1])[1](given[-1])
             return tuple(x if wish else x[:0] for x, wish in zip(found, wanted, strict=True))
 
         return pull
 
-    def pushed(self, present: Sequence[bool]) -> Callable[..., Tensor]:
-        """The specification's pushforward as a function of operands and those tangents (T, ·) that there are."""
+    def pushed(self, present: Sequence[bool], fixed: Sequence[Tensor]) -> Callable[..., Tensor]:
+        """The specification's pushforward as a function of the differentiable operands and those tangents (T, ·)."""
 
         def push(*given: Tensor) -> Tensor:
-            (first, second, *rest), tangents = given[: -sum(present)], given[-sum(present) :]
+            varied, tangents = self.split(given)
 
             def one(*moves: Tensor) -> Tensor:
-                it = iter(moves)
-                changes = [next(it) if there else None for there in present]
-                return along(lambda a, b: self.specification(a, b, *rest), (first, second), changes)
+                return along(self.specification(*fixed), varied, _spread(moves, present))
 
             return torch.stack([one(*moves) for moves in zip(*tangents, strict=True)])
 
         return push
 
 
-def _on_host(tensors: Sequence[Tensor]) -> list[np.ndarray]:
-    return [t.detach().numpy() for t in tensors]
+def _spread(given: Sequence[Tensor], present: Sequence[bool]) -> list[Tensor | None]:
+    """Those given in the places where they are present, None in the others."""
+    it = iter(given)
+    return [next(it) if there else None for there in present]
+
+
+def _host(tensors: Sequence[Tensor]) -> list[np.ndarray]:
+    return [read_only(t.detach().numpy()) for t in tensors]
+
+
+def _items(info: Any, in_dims: Sequence, args: Sequence) -> list[tuple]:
+    """Arguments of each item of a batch."""
+    return [
+        tuple(a if d is None else a.select(d, b) for a, d in zip(args, in_dims, strict=True))
+        for b in range(info.batch_size)
+    ]
 
 
 class _Value(torch.autograd.Function):
     """The result."""
 
     @staticmethod
-    def forward(operation, *operands):
-        return torch.from_numpy(operation.value(_on_host(operands)))
+    def forward(call, *operands):
+        out, call.kept = call.operation.value_on_host(_host(operands), call.params)
+        return torch.from_numpy(out)
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.operation, *operands = inputs
+        ctx.call, *operands = inputs
         ctx.save_for_backward(*operands)
         ctx.save_for_forward(*operands)
 
     @staticmethod
     def backward(ctx, *gradients):
-        wanted, operands = ctx.needs_input_grad[1:3], ctx.saved_tensors
+        call, operands = ctx.call, ctx.saved_tensors
+        wanted = ctx.needs_input_grad[1 : 1 + call.count]
         if foreign(*gradients):
-            found = ctx.operation.pulled(wanted)(*operands, gradients[0])
+            varied, fixed = call.split(operands)
+            found = call.pulled(wanted, fixed)(*varied, gradients[0])
         else:
-            found = applied(_Pull, ctx.operation, wanted, *operands, gradients[0])
+            found = applied(_Pull, call, wanted, *operands, gradients[0])
         found = (x if wish else None for x, wish in zip(found, wanted, strict=True))
-        return None, *found, *[None] * (len(operands) - 2)
+        return None, *found, *[None] * (len(operands) - call.count)
 
     @staticmethod
     def jvp(ctx, *given):
-        tangents, operands = given[1:3], ctx.saved_tensors
-        present = [t is not None for t in tangents]
+        call, operands = ctx.call, ctx.saved_tensors
+        tangents = given[1 : 1 + call.count]
+        present = tuple(t is not None for t in tangents)
         if not any(present):
             return None
         there = [t[None] for t in tangents if t is not None]
         if foreign(*tangents):
-            return ctx.operation.pushed(present)(*operands, *there)[0]
-        return applied(_Push, ctx.operation, present, *operands, *there)[0]
+            varied, fixed = call.split(operands)
+            return call.pushed(present, fixed)(*varied, *there)[0]
+        return applied(_Push, call, present, *operands, *there)[0]
 
     @staticmethod
-    def vmap(info, in_dims, operation, *operands):
-        return torch.vmap(operation.specification, in_dims[1:])(*operands), 0
+    def vmap(info, in_dims, call, *operands):
+        items = _items(info, in_dims[1:], operands)
+        return torch.stack([applied(_Value, call.another(), *item) for item in items]), 0
 
 
-class _Push(torch.autograd.Function):
-    """Tangents (T, ·) of the result."""
+class _Pull(torch.autograd.Function):
+    """Gradients of the differentiable operands from that of the result; of no rows where not wanted."""
 
     @staticmethod
-    def forward(operation, present, *given):
-        count = sum(present)
-        arrays, tangents = _on_host(given[:-count]), iter(_on_host(given[-count:]))
-        some = [next(tangents) if there else None for there in present]
-        out = np.empty((len(given[-1]), *operation.shape(arrays)), arrays[0].dtype)
-        for i, result in enumerate(out):
-            operation.push(arrays, [None if t is None else t[i] for t in some], result)
-        return torch.from_numpy(out)
+    def forward(call, wanted, *given):
+        *operands, g = _host(given)
+        found = [
+            np.zeros((len(x) if wish else 0, *x.shape[1:]), x.dtype) for x, wish in zip(operands, wanted, strict=False)
+        ]
+        results = [x if wish else None for x, wish in zip(found, wanted, strict=True)]
+        call.operation.pull_on_host(operands, g, results, call.kept, call.params)
+        return tuple(map(torch.from_numpy, found))
 
     @staticmethod
     def setup_context(ctx, inputs, output):
-        ctx.operation, ctx.present, *given = inputs
+        ctx.call, ctx.wanted, *given = inputs
         ctx.save_for_backward(*given)
         ctx.save_for_forward(*given)
 
     @staticmethod
     def _differentiable(ctx):
-        """The specification's pushforward of what has a derivative, and that; all but the operands after the second."""
-        given, count = ctx.saved_tensors, sum(ctx.present)
-        fixed, push = given[2:-count], ctx.operation.pushed(ctx.present)
-        return lambda a, b, *tangents: push(a, b, *fixed, *tangents), (*given[:2], *given[-count:])
+        """The specification's pullback of what has a derivative, and that; and the number of other operands."""
+        *operands, g = ctx.saved_tensors
+        varied, fixed = ctx.call.split(operands)
+        return ctx.call.pulled(ctx.wanted, fixed), (*varied, g), len(fixed)
 
     @staticmethod
     def backward(ctx, *gradients):
-        push, primals = _Push._differentiable(ctx)
-        first, second, *tangents = torch.func.vjp(push, *primals)[1](gradients[0])
-        return None, None, first, second, *[None] * (len(ctx.saved_tensors) - len(primals)), *tangents
+        pull, primals, fixed = _Pull._differentiable(ctx)
+        *found, g = torch.func.vjp(pull, *primals)[1](gradients)
+        return None, None, *found, *[None] * fixed, g
 
     @staticmethod
     def jvp(ctx, *given):
-        push, primals = _Push._differentiable(ctx)
-        return along(push, primals, (*given[2:4], *given[-sum(ctx.present) :]))
+        pull, primals, _ = _Pull._differentiable(ctx)
+        return along(pull, primals, (*given[2 : 2 + ctx.call.count], given[-1]))
 
     @staticmethod
-    def vmap(info, in_dims, operation, present, *given):
+    def vmap(info, in_dims, call, wanted, *given):
+        same = all(d is None for d in in_dims[2:-1])
+        items = [
+            applied(_Pull, call if same else call.another(), wanted, *item) for item in _items(info, in_dims[2:], given)
+        ]
+        return tuple(torch.stack(x) for x in zip(*items, strict=True)), (0,) * len(wanted)
+
+
+class _Push(torch.autograd.Function):
+    """Tangents (T, ·) of the result along those of the differentiable operands that are present."""
+
+    @staticmethod
+    def forward(call, present, *given):
+        count = sum(present)
+        operands, tangents = _host(given[:-count]), _host(given[-count:])
+        shape = call.operation.shape(*(x.shape for x in operands), **call.params)
+        out = np.empty((len(tangents[0]), *shape), operands[0].dtype)
+        call.operation.push_on_host(operands, _spread(tangents, present), out, call.kept, call.params)
+        return torch.from_numpy(out)
+
+    @staticmethod
+    def setup_context(ctx, inputs, output):
+        ctx.call, ctx.present, *given = inputs
+        ctx.save_for_backward(*given)
+        ctx.save_for_forward(*given)
+
+    @staticmethod
+    def _differentiable(ctx):
+        """The specification's pushforward of what has a derivative, and that; and the number of other operands."""
+        given, count = ctx.saved_tensors, sum(ctx.present)
+        varied, fixed = ctx.call.split(given[:-count])
+        return ctx.call.pushed(ctx.present, fixed), (*varied, *given[-count:]), len(fixed)
+
+    @staticmethod
+    def backward(ctx, *gradients):
+        push, primals, fixed = _Push._differentiable(ctx)
+        found, n = torch.func.vjp(push, *primals)[1](gradients[0]), ctx.call.count
+        return None, None, *found[:n], *[None] * fixed, *found[n:]
+
+    @staticmethod
+    def jvp(ctx, *given):
+        push, primals, _ = _Push._differentiable(ctx)
+        return along(push, primals, (*given[2 : 2 + ctx.call.count], *given[-sum(ctx.present) :]))
+
+    @staticmethod
+    def vmap(info, in_dims, call, present, *given):
         count, dims = sum(present), in_dims[2:]
         if any(d is not None for d in dims[:-count]):
-            return torch.vmap(operation.pushed(present), dims)(*given), 0
+            items = _items(info, dims, given)
+            return torch.stack([applied(_Push, call.another(), present, *item) for item in items]), 0
         # The batch is more tangents of the same operands: one sweep for all.
         folded = (
             (t.expand(info.batch_size, *t.shape) if d is None else t.movedim(d, 0)).flatten(0, 1)
             for t, d in zip(given[-count:], dims[-count:], strict=True)
         )
-        out = applied(_Push, operation, present, *given[:-count], *folded)
+        out = applied(_Push, call, present, *given[:-count], *folded)
         return out.unflatten(0, (info.batch_size, -1)), 0
-
-
-class _Pull(torch.autograd.Function):
-    """Gradients of the first two operands from that of the result; of no rows where not wanted."""
-
-    @staticmethod
-    def forward(operation, wanted, *given):
-        *arrays, g = _on_host(given)
-        found = [
-            np.zeros((len(x) if wish else 0, *x.shape[1:]), x.dtype) for x, wish in zip(arrays, wanted, strict=False)
-        ]
-        operation.pull(arrays, g, [x if wish else None for x, wish in zip(found, wanted, strict=True)])
-        return tuple(map(torch.from_numpy, found))
-
-    @staticmethod
-    def setup_context(ctx, inputs, output):
-        ctx.operation, ctx.wanted, *given = inputs
-        ctx.save_for_backward(*given)
-        ctx.save_for_forward(*given)
-
-    @staticmethod
-    def _differentiable(ctx):
-        """The specification's pullback of what has a derivative, and that."""
-        first, second, *fixed, g = ctx.saved_tensors
-        pull = ctx.operation.pulled(ctx.wanted)
-        return lambda a, b, h: pull(a, b, *fixed, h), (first, second, g)
-
-    @staticmethod
-    def backward(ctx, *gradients):
-        pull, primals = _Pull._differentiable(ctx)
-        first, second, g = torch.func.vjp(pull, *primals)[1](gradients)
-        return None, None, first, second, *[None] * (len(ctx.saved_tensors) - 3), g
-
-    @staticmethod
-    def jvp(ctx, *given):
-        pull, primals = _Pull._differentiable(ctx)
-        return along(pull, primals, (*given[2:4], given[-1]))
-
-    @staticmethod
-    def vmap(info, in_dims, operation, wanted, *given):
-        return torch.vmap(operation.pulled(wanted), in_dims[2:])(*given), (0, 0)

@@ -9,17 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import engine_of, interpolate, is_constant, namespace, unit
+from rts.arrays import described, engine_of, is_constant, namespace, shape_of, unit
 from rts.errors import InputError
+from rts.gbuffer import GBuffer
+from rts.interfaces import Part, TriangleSurface
 from rts.keeping import fingerprint
-from rts.protocols import Array, GBuffer, Part, Proxy, Samples, Tree
+from rts.operations.combine import interpolate
+from rts.records import Array, Proxy, Samples, Tree
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv")
 WIDTHS = {"vertices": (3,), "normals": (3,), "uv": (2,), "colors": (1, 3, 4)}
 
 
-class Mesh:
+class Mesh(TriangleSurface):
     """A triangle mesh.
 
     θ["vertices"] (V, 3) are the positions. Attributes are further entries of θ, each (A, C): "normals", "colors" and
@@ -52,6 +55,11 @@ class Mesh:
         self.sample_widths = (self._ids.shape[1], 2)
         self._normals: tuple[tuple, np.ndarray] | None = None
 
+    @property
+    def face_count(self) -> int:
+        """T."""
+        return len(self.faces)
+
     def __repr__(self) -> str:
         return f"Mesh({len(self.faces)} faces)"
 
@@ -76,9 +84,9 @@ class Mesh:
             if name not in theta:
                 raise InputError(f"theta of a mesh has no {name!r}; it has {sorted(theta)}")
             value, rows = theta[name], self._extents[self._columns.get(name, 0) // 3]
-            if not hasattr(value, "shape"):
-                raise InputError(f"theta[{name!r}] of a mesh is a {type(value).__name__}; expected an array")
-            shape, widths = tuple(value.shape), WIDTHS.get(name)
+            shape, widths = shape_of(value), WIDTHS.get(name)
+            if not shape:
+                raise InputError(f"theta[{name!r}] of a mesh {described(value)}; expected an array")
             if len(shape) != 2 or (widths and shape[1] not in widths):
                 expected = " or ".join(map(str, widths or "C"))
                 raise InputError(f"theta[{name!r}] of a mesh has shape {shape}; expected (rows, {expected})")

@@ -11,7 +11,7 @@ import pytest
 from analytic import Ellipsoid
 
 import rts
-from rts import Fragments, GBuffer, InputError, Part, PluginError, RayHits, pairs
+from rts import Fragments, GBuffer, InputError, Part, PluginError, RayHits, Splats, pairs
 from rts.arrays import engine_of, namespace
 from rts.registry import instance
 from rts.shading import Unlit
@@ -588,15 +588,17 @@ class OddMulti(Multi):
         object.__setattr__(self, "given", given)
         object.__setattr__(self, "made", made)
 
-    def splat(self, positions, rgba, row):
-        image = super().splat(*self.given(positions, rgba, row))
-        return self.made(image, positions, rgba, row)
+    def image(self, splats):
+        given = splats.positions, splats.rgba, splats.row
+        return self.made(super().image(Splats(*self.given(*given))), *given)
 
 
-class Careless(OddMulti):
+class Careless:
+    """Has a `splat` of its own, which looks at nothing before it works."""
+
     def splat(self, positions, rgba, row):
         positions[:, 2], rgba[:, 3], row.shape[2], positions[: len(rgba)] + rgba[:, :3]
-        return super().splat(positions, rgba, row)
+        return Multi().splat(positions, rgba, row)
 
 
 def from_centres(positions, rgba, row):
@@ -618,10 +620,10 @@ class Frugal(OddMulti):
 class Cutting(OddMulti):
     """What lies in the border does not splat at all."""
 
-    def splat(self, positions, rgba, row, border=0):
-        middle = np.zeros(row.shape[1:], bool)
+    def cropped(self, splats):
+        middle, border = np.zeros(splats.row.shape[1:], bool), splats.border
         middle[border : len(middle) - border, border : middle.shape[1] - border] = True
-        return inside(super().splat(positions, rgba, np.where(middle, row, -1)), border)
+        return inside(super().image(splats.replace(row=np.where(middle, splats.row, -1))), border)
 
 
 SPLATTERS = {

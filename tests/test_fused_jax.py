@@ -17,7 +17,7 @@ from rts_backends.fused_kernels import Splats
 
 jax = pytest.importorskip("jax")
 torch = pytest.importorskip("torch")
-fused_jax = pytest.importorskip("rts_backends.fused_jax")
+jax_operations = pytest.importorskip("rts_backends.jax_operations")
 jnp = jax.numpy
 
 MODES = {"eager": lambda f: f, "jit": jax.jit}
@@ -256,7 +256,7 @@ def test_what_the_image_decides_is_not_decided_again(mode, monkeypatch):
         expected.append(MODES[mode](f)(x).block_until_ready())
         assert len(decided) == times
     # Nor is it needed: what is no longer known is decided anew.
-    monkeypatch.setattr(fused_jax, "MOST_KEPT", 0)
+    monkeypatch.setattr(jax_operations, "MOST_KEPT", 0)
     for f, x, known in zip((gradient, along, several), given, expected, strict=True):
         decided.clear()
         np.testing.assert_array_equal(MODES[mode](f)(x), known)

@@ -10,7 +10,7 @@ from helpers import ALL, DIFFERENTIABLE, arrays, box, derivative, gradient, icos
 import rts
 from rts import pruning, splatting
 from rts.arrays import map_leaves
-from rts.protocols import ArraySpec
+from rts.records import ArraySpec
 from rts.rendering import sample
 
 MESH = rts.plugin("rts.surfaces", "mesh")

@@ -7,7 +7,7 @@ from helpers import DIFFERENTIABLE, arrays, icosphere, to_numpy
 import rts
 from rts import Camera, Fragments, GBuffer, Part, Proxy, Samples
 from rts.arrays import namespace
-from rts.protocols import ArraySpec
+from rts.records import ArraySpec
 from rts.sampling import lift, merge
 
 CAMERA = Camera.look_at((0.3, 0.5, 4), (0, 0, 0), fov_y=40, near=1, far=10)

@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from rts import registry
+from rts import arrays, registry
 from rts.arrays import constants, map_leaves
 from rts.errors import PluginError
-from rts.protocols import Engine, Tree
+from rts.interfaces import Engine
+from rts.records import Tree
 from rts.testing.conformance import claim, claim_close, claim_finite, no_error
 
 ENGINES = registry.plugins("rts.engines")
@@ -22,7 +23,7 @@ DIFFERENTIABLE = [name for name in ENGINES if name != "numpy"]
 def engine_named(name: str) -> Engine:
     """The engine, or a skip with the reason where it is not installed."""
     try:
-        engine = registry.plugin("rts.engines", name)()
+        engine = arrays.engine_named(name)
         importlib.import_module(name)
     except (PluginError, ImportError) as error:
         pytest.skip(str(error))
@@ -34,7 +35,7 @@ def installed() -> list[Engine]:
     engines = []
     for name in DIFFERENTIABLE:
         try:
-            engines.append(registry.plugin("rts.engines", name)())
+            engines.append(arrays.engine_named(name))
         except PluginError:
             continue
     if not engines:

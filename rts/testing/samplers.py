@@ -11,9 +11,11 @@ import pytest
 from rts import registry
 from rts.arrays import leaves
 from rts.camera import Camera
+from rts.checks import check_sampler
 from rts.gbuffer import GBuffer
-from rts.protocols import Part, Sampled
-from rts.rendering import APRON
+from rts.interfaces import Part, TriangleSurface
+from rts.pairs import APRON
+from rts.records import Sampled
 from rts.testing import engines, scenes
 from rts.testing.conformance import Conformance, claim, no_error, refusal
 from rts.testing.engines import DIFFERENTIABLE, ENGINES, engine_named, joined, split
@@ -67,7 +69,7 @@ class SamplerConformance(Conformance):
 
     def test_it_agrees_with_the_reference(self, sampler: Any, parts: list[Part]) -> None:
         """The same triangles inside, at most one in a hundred pixels different at silhouettes, depth to 1e-5."""
-        triangles = [p for p in parts if hasattr(p.surface, "proxy")]
+        triangles = [p for p in parts if is_of_triangles(p)]
         if not triangles:
             pytest.skip("no triangles to compare with the reference")
         silhouettes = Silhouettes()
@@ -163,8 +165,8 @@ class SamplerConformance(Conformance):
 
     def test_it_leaves_out_what_is_not_needed(self, sampler: Any, parts: list[Part]) -> None:
         """Where it says that it prunes: fronts alone, if `needed` keeps these."""
-        chosen = registry.instance("rts.samplers", sampler)
-        if not getattr(chosen, "prunes", False):
+        chosen = check_sampler(sampler)
+        if not chosen.prunes:
             pytest.skip("the sampler does not prune")
 
         def fronts(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -172,6 +174,7 @@ class SamplerConformance(Conformance):
             return covered & (np.arange(len(covered)) == 0)[:, None, None]
 
         part = parts[0]
+        part = scenes.checked(part)
         whole = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2)
         found = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2, needed=fronts)
         claim((np.asarray(found.row)[1] < 0).all(), "samples that are not needed are kept")
@@ -242,7 +245,7 @@ class SamplerConformance(Conformance):
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_awkward_views_are_finite(self, sampler: Any, parts: list[Part], engine: str) -> None:
         """From inside, cut by the near plane, edge-on: a finite image and gradient."""
-        triangles = [scenes.flat()] if hasattr(parts[0].surface, "proxy") else []
+        triangles = [scenes.flat()] if is_of_triangles(parts[0]) else []
         for part in [parts[0], *triangles]:
             claim_awkward_views_are_finite(part, sampler, engine_named(engine))
 
@@ -290,7 +293,7 @@ def reference(part: Part, camera: Camera, layers: int = scenes.LAYERS) -> Expect
 def again(part: Part, camera: Camera, sampler: Any) -> Expected:
     """The samples of a new object of the sampler's class, or of the reference where none can be made."""
     new = _new(sampler)
-    if new is None and hasattr(part.surface, "proxy"):
+    if new is None and is_of_triangles(part):
         return reference(part, camera)
     sampled = scenes.find(part, camera, sampler if new is None else new)
     return Expected(sampled, _edges(sampled), "a new object of the sampler's class")
@@ -298,7 +301,7 @@ def again(part: Part, camera: Camera, sampler: Any) -> Expected:
 
 def right(part: Part, camera: Camera, sampler: Any) -> Expected:
     """The samples of the reference, or for a surface without triangles those of a new object of the sampler."""
-    return reference(part, camera) if hasattr(part.surface, "proxy") else again(part, camera, sampler)
+    return reference(part, camera) if is_of_triangles(part) else again(part, camera, sampler)
 
 
 def _new(sampler: Any) -> Any:
@@ -326,6 +329,11 @@ def claim_like(found: Sampled, expected: Expected, what: str) -> Silhouettes:
     off = _off(found, sampled) & ~different
     claim(not off.any(), f"{what}: the depth of {off.sum()} samples is not that of {source}, by more than 1e-5 of it")
     return Silhouettes(int(edge.sum()), int((different & edge).sum()))
+
+
+def is_of_triangles(part: Part) -> bool:
+    """Whether the part's surface gives triangles."""
+    return isinstance(scenes.checked(part).surface, TriangleSurface)
 
 
 def _edges(sampled: Sampled) -> np.ndarray:

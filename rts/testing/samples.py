@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from rts.camera import Camera
-from rts.protocols import Part, Sampled
-from rts.rendering import APRON
+from rts.interfaces import Part
+from rts.pairs import APRON
+from rts.records import Sampled
 from rts.testing.conformance import claim
 from rts.testing.scenes import GRID, SIZE
 

@@ -8,9 +8,11 @@ import numpy as np
 
 from rts import pairs, registry
 from rts.camera import Camera
-from rts.pairs import CAPACITY, LAYERS, SIZE
-from rts.protocols import Array, Part, Sampled
-from rts.rendering import APRON, render, render_samples, sample
+from rts.checks import check_scene
+from rts.interfaces import Part
+from rts.pairs import APRON, CAPACITY, LAYERS, SIZE
+from rts.records import Array, Sampled
+from rts.rendering import render, render_samples, sample
 from rts.testing.conformance import claim
 from rts.testing.engines import single
 
@@ -62,6 +64,11 @@ def ball(**options: Any) -> Part:
 def flat() -> Part:
     """A square in the plane x = 0, which the camera on the z-axis sees edge-on."""
     return mesh([(0, -1, -1), (0, 1, -1), (0, 1, 1), (0, -1, 1)], [(0, 1, 2), (0, 2, 3)])
+
+
+def checked(part: Part) -> Part:
+    """The part as samplers and the core see it."""
+    return check_scene(part, CAMERA)[0][0]
 
 
 def find(part: Part, camera: Camera = CAMERA, sampler: Any = "auto", layers: int = LAYERS, **options: Any) -> Sampled:

@@ -10,7 +10,8 @@ import pytest
 from rts import registry
 from rts.arrays import constants, engine_of, map_leaves
 from rts.gbuffer import GBuffer
-from rts.protocols import Engine, Tree
+from rts.interfaces import Engine, Shader, adapted
+from rts.records import Tree
 from rts.testing import engines, scenes
 from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
 from rts.testing.engines import DIFFERENTIABLE, engine_named, names, split
@@ -65,14 +66,14 @@ class ShaderConformance(Conformance):
 
     def test_opaque_is_true(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
         """A shader that promises to be opaque has alpha 1, exactly."""
-        if not getattr(_instance(shader), "opaque", False):
+        if not _instance(shader).opaque:
             pytest.skip("the shader does not promise to be opaque")
         alpha = _shaded(shader, theta, gbuffer)[:, 3]
         claim((alpha == 1).all(), f"the shader promises to be opaque; alpha is {alpha.min():.3g} somewhere")
 
     def test_it_reads_what_it_says(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
         """With only position and the entries that it names, it gives the same."""
-        reads = getattr(_instance(shader), "reads", None)
+        reads = _instance(shader).reads
         if reads is None:
             pytest.skip("the shader does not say what it reads")
         fewer = {name: value for name, value in gbuffer.items() if name in ("position", *reads)}
@@ -174,8 +175,10 @@ def awkward(gbuffer: dict) -> dict:
     return gbuffer
 
 
-def _instance(shader: Any) -> Any:
-    return registry.instance("rts.shaders", shader)
+def _instance(shader: Any) -> Shader:
+    found = adapted(registry.instance("rts.shaders", shader), Shader)
+    claim(found is not None, f"the shader is {shader!r}; expected a name, an object or a function")
+    return found
 
 
 def _call(shader: Any, inputs: dict, engine: Engine | None) -> Any:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 
-from rts import registry
+from rts.checks import check_splatter
+from rts.interfaces import Splatter
+from rts.records import Splats
 from rts.testing import engines
 from rts.testing.conformance import Conformance, claim, claim_close, no_error, refusal
 from rts.testing.engines import DIFFERENTIABLE, ENGINES, engine_named
@@ -17,14 +18,6 @@ from rts.testing.engines import DIFFERENTIABLE, ENGINES, engine_named
 HEIGHT, WIDTH, LAYERS = 8, 9, 2
 CELLS = HEIGHT * WIDTH * LAYERS
 TOLERANCE = 1e-5
-
-
-class Splats(NamedTuple):
-    """The arguments of `splat`."""
-
-    positions: np.ndarray
-    rgba: np.ndarray
-    row: np.ndarray
 
 
 class SplatterConformance(Conformance):
@@ -48,10 +41,12 @@ class SplatterConformance(Conformance):
         color = np.array([0.2, 0.5, 0.9, 1.0], np.float32)
         for layers in (1, 2):
             splats = everywhere(layers)
-            image = _splat(splatter, splats._replace(rgba=np.broadcast_to(color, splats.rgba.shape)))
+            image = _splat(splatter, splats.replace(rgba=np.broadcast_to(color, splats.rgba.shape)))
             claim(image.shape == (HEIGHT, WIDTH, 4), f"the image is {image.shape}; expected {(HEIGHT, WIDTH, 4)}")
-            inside = np.broadcast_to(color, (HEIGHT - 2, WIDTH - 2, 4))
-            claim_close(image[1:-1, 1:-1], inside, TOLERANCE, f"a constant colour of {layers} layers")
+            r = _instance(splatter).reach
+            inside = image[r : HEIGHT - r, r : WIDTH - r]
+            expected = np.broadcast_to(color, inside.shape)
+            claim_close(inside, expected, TOLERANCE, f"a constant colour of {layers} layers")
 
     def test_the_front_layer_hides_those_behind(self, splatter: Any) -> None:
         """Where it is opaque and covers everything."""
@@ -59,20 +54,21 @@ class SplatterConformance(Conformance):
         rgba = splats.rgba.copy()
         rgba[splats.row[0].ravel()] = [1, 0, 0, 1]
         rgba[splats.row[1].ravel()] = [0, 1, 0, 1]
-        image = _splat(splatter, splats._replace(rgba=rgba))[1:-1, 1:-1]
+        r = _instance(splatter).reach
+        image = _splat(splatter, splats.replace(rgba=rgba))[r : HEIGHT - r, r : WIDTH - r]
         claim_close(image, np.broadcast_to([1, 0, 0, 1], image.shape), TOLERANCE, "the color of a covered surface")
 
     def test_empty_cells_stay_empty(self, splatter: Any) -> None:
-        """An image of zeros where no cell, or none nearby, has a sample: row −1 is no sample."""
+        """An image of zeros where no cell within reach has a sample: row −1 is no sample."""
         splats = everywhere(LAYERS)
-        image = _splat(splatter, splats._replace(row=np.full_like(splats.row, -1)))
+        image = _splat(splatter, splats.replace(row=np.full_like(splats.row, -1)))
         claim((image == 0).all(), "an image without samples is not zero; row −1 means that there is none")
         row = np.full_like(splats.row, -1)
         row[:, 2, 3] = splats.row[:, 2, 3]
-        image = _splat(splatter, splats._replace(row=row))
-        far = np.ones((HEIGHT, WIDTH), bool)
-        far[1:4, 2:5] = False
-        claim((image[far] == 0).all(), "a sample reaches beyond the cells beside its own")
+        image = _splat(splatter, splats.replace(row=row))
+        far, r = np.ones((HEIGHT, WIDTH), bool), _instance(splatter).reach
+        far[max(0, 2 - r) : 3 + r, max(0, 3 - r) : 4 + r] = False
+        claim((image[far] == 0).all(), f"a sample reaches beyond the cells that `reach` says, {r} on each side")
         claim(image[2, 3, 3] > 0.5, "a sample does not show in its own cell")
 
     def test_colors_stay_premultiplied(self, splatter: Any) -> None:
@@ -102,7 +98,7 @@ class SplatterConformance(Conformance):
     def test_what_it_does_not_need_has_no_effect(self, splatter: Any) -> None:
         """`needed`, where there is one: without other samples the image and its derivative are the same."""
         chosen = _instance(splatter)
-        if not hasattr(chosen, "needed"):
+        if not chosen.prunes:
             pytest.skip("the splatter does not say which samples it needs")
         splats = steps()
         covered = splats.row >= 0
@@ -110,7 +106,7 @@ class SplatterConformance(Conformance):
         kept = np.asarray(chosen.needed(covered, depth))
         claim(kept.shape == covered.shape and kept.dtype == bool, f"needed gave {kept.shape} {kept.dtype}")
         claim(not (kept & ~covered).any(), "needed asks for samples that are not there")
-        pruned = splats._replace(row=np.where(kept, splats.row, -1).astype(np.int32))
+        pruned = splats.replace(row=np.where(kept, splats.row, -1).astype(np.int32))
         claim_close(_splat(splatter, pruned), _splat(splatter, splats), TOLERANCE, "the image of needed samples")
         for engine in map(engine_named, DIFFERENTIABLE[:1]):
             along = np.random.default_rng(0).normal(size=splats.positions.shape).astype(np.float32)
@@ -118,13 +114,10 @@ class SplatterConformance(Conformance):
             claim_close(found, expected, 1e-4, "the derivative of needed samples")
 
     def test_cells_of_the_border_only_splat(self, splatter: Any) -> None:
-        """`border`, where `splat` takes it: the image of all cells, cropped."""
-        chosen = _instance(splatter)
-        if "border" not in inspect.signature(chosen.splat).parameters:
-            pytest.skip("the splatter leaves cropping to others")
+        """`cropped`: the image of all cells, without the border."""
         whole = _splat(splatter, scattered())
         for border in (1, 2):
-            image = np.asarray(chosen.splat(*scattered(), border=border))
+            image = np.asarray(_instance(splatter).cropped(scattered().replace(border=border)))
             expected = whole[border : HEIGHT - border, border : WIDTH - border]
             claim(image.shape == expected.shape, f"with border={border} it is {image.shape}; not {expected.shape}")
             claim_close(image, expected, TOLERANCE, f"the image with border={border}")
@@ -151,14 +144,14 @@ class SplatterConformance(Conformance):
         chosen = engine_named(engine)
         for splats in (everywhere(LAYERS), scattered()):
             with no_error(f"splatting in {engine}"):
-                image = chosen.to_numpy(_instance(splatter).splat(*engines.on(chosen, splats)))
+                image = chosen.to_numpy(_instance(splatter).cropped(engines.on(chosen, splats)))
             claim_close(image, _splat(splatter, splats), TOLERANCE, f"the image in {engine}")
 
     def test_engines_agree(self, splatter: Any) -> None:
         """On the image, its gradient, and its derivative along a direction; both modes are one derivative."""
         splats = scattered()
-        f = _of_positions_and_colors(splatter, splats.row)
-        engines.claim_engines_agree(f, [*splats[:2]], np.asarray(f([*splats[:2]])), "the image")
+        f, given = _of_positions_and_colors(splatter, splats.row), [splats.positions, splats.rgba]
+        engines.claim_engines_agree(f, given, np.asarray(f(given)), "the image")
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_rows_of_no_cell_have_no_gradient(self, splatter: Any, engine: str) -> None:
@@ -167,7 +160,7 @@ class SplatterConformance(Conformance):
         for row in (splats.row, np.full_like(splats.row, -1)):
             f = _of_positions_and_colors(splatter, row)
             weights = np.random.default_rng(0).standard_normal((HEIGHT, WIDTH, 4))
-            at, w = engines.on(chosen, ([*splats[:2]], weights))
+            at, w = engines.on(chosen, ([splats.positions, splats.rgba], weights))
             _, gradient = chosen.value_and_grad(lambda x, f=f, w=w: chosen.namespace.sum(f(x) * w))(at)
             unused = np.setdiff1d(np.arange(CELLS), row)
             for what, g in zip(("positions", "colours"), engines.host(chosen, gradient), strict=True):
@@ -179,13 +172,13 @@ class SplatterConformance(Conformance):
         """An `rts.InputError` that says what was expected."""
         splats = scattered()
         wrong = {
-            "positions of two coordinates": splats._replace(positions=splats.positions[:, :2]),
-            "colours without alpha": splats._replace(rgba=splats.rgba[:, :3]),
-            "fewer colours than positions": splats._replace(rgba=splats.rgba[:-1]),
-            "row without layers": splats._replace(row=splats.row[0]),
+            "positions of two coordinates": splats.replace(positions=splats.positions[:, :2]),
+            "colours without alpha": splats.replace(rgba=splats.rgba[:, :3]),
+            "fewer colours than positions": splats.replace(rgba=splats.rgba[:-1]),
+            "row without layers": splats.replace(row=splats.row[0]),
         }
         for what, given in wrong.items():
-            claim(refusal(lambda given=given: _instance(splatter).splat(*given), what), f"{what} is accepted")
+            claim(refusal(lambda given=given: _direct(splatter, given), what), f"{what} is accepted")
 
 
 # ------------------------------------------------------------------------------------------------ samples
@@ -232,27 +225,32 @@ def square() -> Splats:
     splats = everywhere(LAYERS)
     row = np.full_like(splats.row, -1)
     row[0, 2:5, 3:6] = splats.row[0, 2:5, 3:6]
-    return splats._replace(row=row)
+    return splats.replace(row=row)
 
 
 def _numbered(layers: int) -> np.ndarray:
     return np.arange(layers * HEIGHT * WIDTH, dtype=np.int32).reshape(layers, HEIGHT, WIDTH)
 
 
-def _instance(splatter: Any) -> Any:
-    return registry.instance("rts.splatters", splatter)
+def _instance(splatter: Any) -> Splatter:
+    return check_splatter(splatter)
 
 
 def _splat(splatter: Any, splats: Splats) -> np.ndarray:
-    return np.asarray(_instance(splatter).splat(*splats))
+    return np.asarray(_instance(splatter).cropped(splats))
+
+
+def _direct(splatter: Any, splats: Splats) -> Any:
+    """By a call of the plugin's own `splat` with arrays."""
+    return _instance(splatter).given.splat(splats.positions, splats.rgba, splats.row)
 
 
 def _of_positions_and_colors(splatter: Any, row: np.ndarray) -> Callable[[list], Any]:
-    return lambda x: _instance(splatter).splat(x[0], x[1], row)
+    return lambda x: _direct(splatter, Splats(x[0], x[1], row))
 
 
 def _along(engine: Any, splatter: Any, splats: Splats, along: np.ndarray) -> np.ndarray:
     """The image's derivative when positions move along a direction."""
-    rgba, row = engines.on(engine, splats[1:])
+    rgba, row = engines.on(engine, (splats.rgba, splats.row))
     at, d = engines.on(engine, ([splats.positions], [along]))
-    return engine.to_numpy(engine.jvp(lambda x: _instance(splatter).splat(x[0], rgba, row), at, d)[1])
+    return engine.to_numpy(engine.jvp(lambda x: _instance(splatter).cropped(Splats(x[0], rgba, row)), at, d)[1])

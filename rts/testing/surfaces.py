@@ -10,7 +10,8 @@ import pytest
 from rts.arrays import engine_of, map_leaves
 from rts.camera import Camera
 from rts.gbuffer import GBuffer
-from rts.protocols import Part, Proxy, Samples, Tree
+from rts.interfaces import Part, TriangleSurface
+from rts.records import Proxy, Samples, Tree
 from rts.testing import engines, scenes
 from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
 from rts.testing.engines import DIFFERENTIABLE, claim_slope, engine_named, installed, joined, split
@@ -89,10 +90,10 @@ class SurfaceConformance(Conformance):
 
     def test_triangles_have_their_corners_on_the_surface(self, part: Part) -> None:
         """What `proxy` says of a corner evaluates to that corner, and normals face the triangles' outside."""
-        surface, proxy = part.surface, _proxy(part, scenes.CAMERA)
+        surface, proxy = scenes.checked(part).surface, _proxy(part, scenes.CAMERA)
         first = _at_corner(proxy, 0)
         widths = first.ids.shape[1], first.params.shape[1]
-        if hasattr(surface, "refine") and (widths != tuple(surface.sample_widths) or hasattr(surface, "table_specs")):
+        if surface.refines and (widths != tuple(surface.sample_widths) or surface.table_specs(1, 1)):
             pytest.skip("refine makes samples of what the triangles carry")
         corners = proxy.vertices[proxy.faces].astype(np.float64)
         outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -104,10 +105,10 @@ class SurfaceConformance(Conformance):
             claim(inward.mean() < 0.05, f"{inward.mean():.0%} of the normals face the inside of the triangles")
 
     def test_triangles_depend_on_the_view_only_with_a_key(self, part: Part) -> None:
-        """They are kept from view to view unless `proxy_key` says otherwise."""
-        if hasattr(part.surface, "proxy_key"):
-            pytest.skip("the surface has a proxy_key")
+        """They are kept from view to view unless `depends_on_view` says otherwise, as where there is a `proxy_key`."""
         one, other = (_proxy(part, camera).vertices for camera in (scenes.CAMERA, scenes.AXES[0]))
+        if scenes.checked(part).surface.depends_on_view:
+            pytest.skip("the surface says that its triangles depend on the view")
         claim(np.array_equal(one, other), "the triangles differ from camera to camera, but there is no proxy_key")
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
@@ -188,7 +189,7 @@ class SurfaceConformance(Conformance):
 
     def test_wrong_theta_is_refused_in_one_line(self, part: Part, sampler: Any) -> None:
         """An `rts.InputError` that says what to do, wherever an entry is missing or has a wrong shape."""
-        reads = part.surface.reads(part.theta) if hasattr(part.surface, "reads") else tuple(part.theta)
+        reads = scenes.checked(part).surface.reads(part.theta)
         part = part.replace(shader="silhouette")
 
         def refused(theta: Tree, what: str) -> str | None:
@@ -215,8 +216,8 @@ def _evaluated(part: Part, theta: Tree, samples: Samples) -> dict[str, np.ndarra
 
 def _proxy(part: Part, camera: Camera) -> Proxy:
     """The surface's triangles, or a skip."""
-    surface = part.surface
-    if not hasattr(surface, "proxy"):
+    surface = scenes.checked(part).surface
+    if not isinstance(surface, TriangleSurface):
         pytest.skip("the surface has no triangles")
     inputs = map_leaves(np.asarray, surface.proxy_inputs(_single(part.theta)))
     return surface.proxy(inputs, camera, scenes.SIZE)

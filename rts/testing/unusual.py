@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rts.camera import Camera
-from rts.protocols import Engine, Part
+from rts.interfaces import Engine, Part
 from rts.testing import engines, scenes
 from rts.testing.conformance import claim, claim_finite, no_error
 from rts.testing.engines import joined, split

@@ -1,4 +1,4 @@
-"""`rts.transforms.rigid` in torch on the CPU, compiled: some sixty operations on a few numbers take far longer."""
+"""The matrix of a rigid pose and its Jacobian, compiled: some sixty operations on a few numbers take far longer."""
 
 from __future__ import annotations
 
@@ -6,48 +6,16 @@ import math
 
 import numba
 import numpy as np
-from torch import Tensor
-
-from rts.transforms import rigid_by_arrays
-from rts_backends.torch_operations import Arrays, Operation, Some
 
 SMALL = 1e-2
 """Squared angles below which series are exact to rounding."""
 
 
-def rigid(pose: Tensor, center: Tensor) -> Tensor:
-    """(4, 4) of a pose (6,) about a centre (3,), of one dtype."""
-    return _RIGID(pose, center)
-
-
-def _computed(operands: Arrays) -> tuple[np.ndarray, np.ndarray]:
-    """The matrix, and its Jacobian (16, 9), float64."""
+def rigid(pose: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(4, 4) of a pose (6,) about a centre (3,), and its derivatives (16, 9) by both; float64."""
     matrix, jacobian = np.empty((4, 4)), np.empty((16, 9))
-    _rigid(*(x.astype(np.float64) for x in operands), matrix, jacobian)
+    _rigid(pose.astype(np.float64), center.astype(np.float64), matrix, jacobian)
     return matrix, jacobian
-
-
-def _value(operands: Arrays) -> np.ndarray:
-    return _computed(operands)[0].astype(operands[0].dtype)
-
-
-def _shape(operands: Arrays) -> tuple[int, int]:
-    return 4, 4
-
-
-def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
-    pose, center = (np.zeros_like(x) if t is None else t for x, t in zip(operands, tangents, strict=True))
-    out[...] = (_computed(operands)[1] @ np.concatenate([pose, center])).reshape(4, 4)
-
-
-def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
-    found = g.reshape(-1) @ _computed(operands)[1]
-    for result, part in zip(results, (found[:6], found[6:]), strict=True):
-        if result is not None:
-            result[...] = part
-
-
-_RIGID = Operation(rigid_by_arrays, _value, _shape, _push, _pull)
 
 
 @numba.njit(cache=True)

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 import rts
-from rts.arrays import projective_map, take
-from rts.transforms import rigid_by_arrays
+from rts.operations.projection import projective_map
+from rts.operations.take import take
+from rts.operations.rigid import RIGID
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("numba")
@@ -27,14 +28,14 @@ def test_value_and_derivatives_are_those_of_the_array_code(pose):
     given = [x.clone().requires_grad_(True) for x in (pose, center)]
     found = rts.rigid(*given)
     assert type(found.grad_fn).__name__ == "_ValueBackward"
-    torch.testing.assert_close(found, rigid_by_arrays(pose, center), rtol=0, atol=1e-14)
+    torch.testing.assert_close(found, RIGID.specification(pose, center), rtol=0, atol=1e-14)
     g = torch.tensor(np.random.default_rng(0).normal(size=(4, 4)))
     gradients = torch.autograd.grad(found, given, g, create_graph=True)
-    expected = torch.func.vjp(rigid_by_arrays, pose, center)[1](g)
+    expected = torch.func.vjp(RIGID.specification, pose, center)[1](g)
     torch.testing.assert_close(gradients, expected, rtol=1e-12, atol=1e-12)
     # The second derivative, of a sum of all first ones.
     second = torch.autograd.grad(sum(x.sum() for x in gradients), given)
-    of_first = lambda p, c: sum(x.sum() for x in torch.func.vjp(rigid_by_arrays, p, c)[1](g))  # noqa: E731
+    of_first = lambda p, c: sum(x.sum() for x in torch.func.vjp(RIGID.specification, p, c)[1](g))  # noqa: E731
     torch.testing.assert_close(second, torch.func.grad(of_first, (0, 1))(pose, center), rtol=1e-10, atol=1e-10)
 
 
@@ -43,13 +44,13 @@ def test_float32_stays_float32():
     matrix = rts.rigid(pose)
     matrix.sum().backward()
     assert matrix.dtype == pose.grad.dtype == torch.float32
-    torch.testing.assert_close(matrix, rigid_by_arrays(pose.detach(), torch.zeros(3)), rtol=0, atol=1e-6)
+    torch.testing.assert_close(matrix, RIGID.specification(pose.detach(), torch.zeros(3)), rtol=0, atol=1e-6)
 
 
 def test_transforms_of_torch_look_inside():
     pose = torch.tensor(POSES["above it"], dtype=torch.float64)
     tangent = torch.ones(6, dtype=torch.float64)
-    expected = torch.func.jvp(lambda p: rigid_by_arrays(p, torch.zeros(3, dtype=p.dtype)), (pose,), (tangent,))
+    expected = torch.func.jvp(lambda p: RIGID.specification(p, torch.zeros(3, dtype=p.dtype)), (pose,), (tangent,))
     torch.testing.assert_close(torch.func.jvp(rts.rigid, (pose,), (tangent,)), expected)
     with torch.autograd.forward_ad.dual_level():
         dual = torch.autograd.forward_ad.make_dual(pose, tangent)
@@ -73,7 +74,7 @@ def test_transforms_of_torch_look_inside():
 @pytest.mark.parametrize("pose", [POSES["tiny"], POSES["above it"]], ids=["tiny", "turned"])
 def test_transforms_give_the_derivatives_of_the_array_code(pose, transform):
     given = torch.tensor([*pose, *CENTER], dtype=torch.float64)
-    found, expected = (transform(lambda x, f=f: f(x[:6], x[6:]))(given) for f in (rts.rigid, rigid_by_arrays))
+    found, expected = (transform(lambda x, f=f: f(x[:6], x[6:]))(given) for f in (rts.rigid, RIGID.specification))
     torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
@@ -82,7 +83,7 @@ def test_batches_of_derivatives():
     center = torch.tensor(CENTER, dtype=torch.float64)
     for derivative in (torch.func.jacfwd, torch.func.jacrev, torch.func.hessian):
         found, expected = (
-            torch.func.vmap(derivative(lambda p, f=f: f(p, center)))(poses) for f in (rts.rigid, rigid_by_arrays)
+            torch.func.vmap(derivative(lambda p, f=f: f(p, center)))(poses) for f in (rts.rigid, RIGID.specification)
         )
         torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 

@@ -5,9 +5,10 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+
 import rts  # noqa: E402
-from rts.arrays import interpolate, projective_map  # noqa: E402
-from rts_backends.torch_samples import specified_projection  # noqa: E402
+from rts.operations.combine import interpolate  # noqa: E402
+from rts.operations.projection import projective_map  # noqa: E402
 
 ROWS, COLUMN = 6, 2
 
@@ -17,6 +18,12 @@ def maps(*batch, dtype=torch.float64, count=7):
     rows = rng.normal(size=(*batch, 4, 4))
     rows[..., 2, 3] += 6
     return torch.tensor(rows, dtype=dtype), torch.tensor(rng.normal(size=(*batch, count, 3)), dtype=dtype)
+
+
+def specified_projection(rows, points):
+    x, y, w, z = torch.addmm(rows[:, 3], points, rows[:, :3].T).unbind(1)
+    safe = torch.where(w == 0, torch.ones_like(w), w)
+    return torch.stack([x / safe, y / safe, z], dim=1)
 
 
 def corners(*batch, dtype=torch.float64, count=7):

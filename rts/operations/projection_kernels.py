@@ -9,7 +9,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from rts.threads import parallel, read_all
+from rts.threads import parallel, read_only
 
 CHUNK = 4096
 """Points whose sums are taken together; fixed, so that results do not depend on the number of threads."""
@@ -17,7 +17,7 @@ CHUNK = 4096
 
 def project(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
     """Fill `out` (N, 3)."""
-    parallel(_project, len(out), *read_all(rows, points), out, work=4 * len(out))
+    parallel(_project, len(out), rows, points, out, work=4 * len(out))
 
 
 def push(
@@ -26,15 +26,18 @@ def push(
     """Fill `out` (N, 3) with the tangent along those of rows (4, 4) and points (N, 3), or None for zeros."""
     turn = np.zeros_like(rows) if t_rows is None else t_rows
     move = np.empty((0, 3), points.dtype) if t_points is None else t_points
-    parallel(_push, len(out), *read_all(rows, points, turn, move), out, work=8 * len(out))
+    parallel(_push, len(out), rows, points, read_only(turn), read_only(move), out, work=8 * len(out))
 
 
-def pull(rows: np.ndarray, points: np.ndarray, g: np.ndarray, g_points: np.ndarray | None) -> np.ndarray:
-    """The gradient of rows (4, 4) from that of the result (N, 3); fills that of the points (N, 3) if there is one."""
+def pull(
+    rows: np.ndarray, points: np.ndarray, g: np.ndarray, g_rows: np.ndarray | None, g_points: np.ndarray | None
+) -> None:
+    """From the gradient of the result (N, 3) fill those of rows (4, 4) and points (N, 3), where they are wanted."""
     sums = np.empty((-(-len(points) // CHUNK), 4, 4))
     g_points = np.empty((0, 3), points.dtype) if g_points is None else g_points
-    parallel(_pull, len(sums), *read_all(rows, points, g), sums, g_points, work=5 * len(points))
-    return sums.sum(axis=0).astype(rows.dtype)
+    parallel(_pull, len(sums), rows, points, read_only(g), sums, g_points, work=5 * len(points))
+    if g_rows is not None:
+        g_rows[...] = sums.sum(axis=0)
 
 
 @numba.njit(cache=True, nogil=True)

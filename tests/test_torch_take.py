@@ -5,7 +5,8 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from rts.arrays import take  # noqa: E402
+import rts  # noqa: E402
+from rts.operations.take import take  # noqa: E402
 
 INDEX = torch.tensor([3, 0, 3, 1, 4, 3], dtype=torch.int32)
 
@@ -66,5 +67,5 @@ def test_gradients_are_the_same_each_time():
 
 
 def test_an_index_out_of_bounds_is_an_error():
-    with pytest.raises(IndexError):
+    with pytest.raises(rts.InputError, match="rows from 5 to 5 were asked for; expected 0 to 4"):
         take(rows(), torch.tensor([5]))

@@ -1,0 +1,113 @@
+"""Sums of rows with weights: what every surface does that is linear in its control points."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.arrays import constants, engine_of, exemplar, namespace
+from rts.errors import InputError
+from rts.operations.operation import Arrays, Operation, Some
+from rts.operations.take import take
+from rts.records import Array
+
+
+def combine(rows: Array, ids: Array, weights: Array) -> Array:
+    """(N, C): Σᵢ wᵢ rowᵢ, differentiable in rows and weights.
+
+    Args:
+        rows: (V, C) float, such as control points.
+        ids: (N, I) integers, rows by number. Where fewer count, any row with a weight of zero.
+        weights: (N, I) float.
+
+    Raises:
+        InputError: shapes that do not fit, or ids of no row.
+    """
+    shapes = [tuple(x.shape) for x in (rows, ids, weights)]
+    if len(shapes[0]) != 2 or len(shapes[1]) != 2 or shapes[1] != shapes[2] or not shapes[1][1]:
+        given = ", ".join(map(str, shapes))
+        raise InputError(f"rows, ids and weights have shapes {given}; expected (V, C), (N, I), (N, I)")
+    return COMBINE(*_alike(rows, weights), ids, column=0, count=shapes[1][1], affine=False)
+
+
+def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
+    """(N, C): c + w₀ (a − c) + w₁ (b − c), for the rows a, b, c of (V, C) that three columns of `ids` name.
+
+    This is `combine` of three rows, whose last weight is what the others lack of one.
+
+    Args:
+        rows: (V, C) float.
+        ids: (N, I) integers.
+        column: the first of the three.
+        weights: (N, W) float, the first two of which count.
+
+    Raises:
+        InputError: these are no samples of the surface that the rows belong to.
+    """
+    if ids.shape[1] < column + 3 or weights.shape[1] < 2 or ids.shape[0] != weights.shape[0]:
+        raise InputError(
+            f"samples have ids of shape {tuple(ids.shape)} and parameters of shape {tuple(weights.shape)}; expected "
+            f"(N, {column + 3}) and (N, 2), or more columns: sample this surface anew"
+        )
+    return COMBINE(*_alike(rows, weights), ids, column=column, count=3, affine=True)
+
+
+def _alike(rows: Array, weights: Array) -> tuple[Array, Array]:
+    """Both in one engine, the weights at least as wide as the rows."""
+    if weights.dtype == rows.dtype:
+        return rows, weights
+    engine = engine_of(rows, weights)
+    rows, weights = constants((rows, weights), engine, exemplar(rows, weights))
+    xp = engine.namespace
+    narrow = xp.finfo(weights.dtype).bits < xp.finfo(rows.dtype).bits
+    return rows, xp.astype(weights, rows.dtype) if narrow else weights
+
+
+def _specification(rows: Array, weights: Array, ids: Array, *, column: int, count: int, affine: bool) -> Array:
+    xp = namespace(rows, ids)
+    # One gather of all rows: its gradient fills one array of their size, instead of one for each column.
+    index = xp.reshape(ids[:, column : column + count], (-1,))
+    found = xp.reshape(take(rows, index), (-1, count, rows.shape[1]))
+    if not affine:
+        return sum(weights[:, i : i + 1] * found[:, i, :] for i in range(count))
+    last = total = found[:, count - 1, :]
+    for i in range(count - 1):
+        total = total + weights[:, i : i + 1] * (found[:, i, :] - last)
+    return total
+
+
+def _shape(rows: tuple[int, ...], weights: tuple[int, ...], ids: tuple[int, ...], **_: object) -> tuple[int, ...]:
+    return weights[0], rows[1]
+
+
+def _forward(operands: Arrays, out: np.ndarray, **params: object) -> None:
+    from rts.operations import combine_kernels
+
+    combine_kernels.forward(*operands, out, **params)
+
+
+def _push(operands: Arrays, tangents: Some, out: np.ndarray, **params: object) -> None:
+    from rts.operations import combine_kernels
+
+    combine_kernels.push(*operands, *tangents, out, **params)
+
+
+def _pull(operands: Arrays, g: np.ndarray, results: Some, **params: object) -> None:
+    from rts.operations import combine_kernels
+
+    combine_kernels.pull(*operands, g, *results, **params)
+
+
+COMBINE = Operation(
+    "rts.combine",
+    _specification,
+    ranks=(2, 2, 2),
+    shape=_shape,
+    forward=_forward,
+    push=_push,
+    pull=_pull,
+    differentiable=2,
+    packed=(1, 2),
+    packed_result=True,
+)
+"""Of rows, weights and ids; parameters are the first of the columns of ids, their number, and whether the last weight
+is what the others lack of one."""

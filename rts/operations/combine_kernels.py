@@ -1,0 +1,218 @@
+"""Sums of rows with weights and their derivatives, compiled for arrays on the host. It imports numba.
+
+Columns of `ids` (N, I), `count` from `column` on, name rows of (V, C); of weights (N, W) the first `count` count. Where
+`affine`, the weight of the last row is what the others lack of one: last + Σ wᵢ (rowᵢ − last). Triangles, of three rows,
+have loops of their own. Gradients are added up in the order of the samples.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from rts.errors import InputError
+from rts.threads import parallel, read_only
+
+
+def check(rows: np.ndarray, ids: np.ndarray, column: int, count: int) -> None:
+    """Raise an InputError where ids name no row."""
+    named = ids[:, column : column + count]
+    if not named.size:
+        return
+    for index in (named.max(), named.min()):
+        if not 0 <= index < len(rows):
+            raise InputError(f"samples refer to row {index} of an array of {len(rows)}; sample this surface anew")
+
+
+def forward(
+    rows: np.ndarray, weights: np.ndarray, ids: np.ndarray, out: np.ndarray, column: int, count: int, affine: bool
+) -> None:
+    """Fill `out` (N, C)."""
+    check(rows, ids, column, count)
+    _combine(rows, weights, ids, out, column, count, affine)
+
+
+def _combine(rows, weights, ids, out, column, count, affine):
+    if affine and count == 3:
+        parallel(_interpolate, len(ids), rows, ids, column, weights, out, work=8 * len(ids))
+    else:
+        parallel(_sum, len(ids), rows, ids, column, count, affine, weights, out, work=3 * count * len(ids))
+
+
+def push(
+    rows: np.ndarray,
+    weights: np.ndarray,
+    ids: np.ndarray,
+    t_rows: np.ndarray | None,
+    t_weights: np.ndarray | None,
+    out: np.ndarray,
+    column: int,
+    count: int,
+    affine: bool,
+) -> None:
+    """Fill `out` (N, C) with the tangent along those of rows (V, C) and weights (N, W), or None for zeros."""
+    if t_rows is None:
+        out[...] = 0
+    else:
+        _combine(read_only(t_rows), weights, ids, out, column, count, affine)
+    if t_weights is None:
+        return
+    t_weights = read_only(t_weights)
+    if affine and count == 3:
+        parallel(_add_weighted, len(ids), rows, ids, column, t_weights, out)
+    else:
+        parallel(_add_sum, len(ids), rows, ids, column, count, affine, t_weights, out, work=3 * count * len(ids))
+
+
+def pull(
+    rows: np.ndarray,
+    weights: np.ndarray,
+    ids: np.ndarray,
+    g: np.ndarray,
+    g_rows: np.ndarray | None,
+    g_weights: np.ndarray | None,
+    column: int,
+    count: int,
+    affine: bool,
+) -> None:
+    """From the gradient of the result (N, C) add to that of rows (V, C), and fill that of weights (N, W)."""
+    g = read_only(g)
+    if g_rows is not None:
+        if affine and count == 3:
+            _scatter(ids, column, weights, g, g_rows)
+        else:
+            _scatter_sum(ids, column, count, affine, weights, g, g_rows)
+    if g_weights is not None:
+        if affine and count == 3:
+            parallel(_weigh, len(ids), rows, ids, column, g, g_weights)
+        else:
+            parallel(_weigh_sum, len(ids), rows, ids, column, count, affine, g, g_weights, work=3 * count * len(ids))
+
+
+# ------------------------------------------------------------------------------------------------- of any number
+
+
+@numba.njit
+def _all_known(ids, n, column, count, rows):
+    known = True
+    for i in range(column, column + count):
+        known &= 0 <= ids[n, i] < rows
+    return known
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum(start, stop, rows, ids, column, count, affine, weights, out):
+    for n in range(start, stop):
+        if not _all_known(ids, n, column, count, len(rows)):
+            out[n] = np.nan
+            continue
+        last = ids[n, column + count - 1]
+        for c in range(rows.shape[1]):
+            out[n, c] = rows[last, c] if affine else weights[n, 0] * rows[ids[n, column], c]
+        for i in range(0 if affine else 1, count - 1 if affine else count):
+            w, r = weights[n, i], ids[n, column + i]
+            for c in range(rows.shape[1]):
+                out[n, c] += w * (rows[r, c] - rows[last, c] if affine else rows[r, c])
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_sum(start, stop, rows, ids, column, count, affine, weights, out):
+    for n in range(start, stop):
+        if not _all_known(ids, n, column, count, len(rows)):
+            out[n] = np.nan
+            continue
+        last = ids[n, column + count - 1]
+        for i in range(count - 1 if affine else count):
+            w, r = weights[n, i], ids[n, column + i]
+            for c in range(rows.shape[1]):
+                out[n, c] += w * (rows[r, c] - rows[last, c] if affine else rows[r, c])
+
+
+@numba.njit(cache=True, nogil=True)
+def _scatter_sum(ids, column, count, affine, weights, g, g_rows):
+    one = g.dtype.type(1)
+    for n in range(len(ids)):
+        if not _all_known(ids, n, column, count, len(g_rows)):
+            continue
+        rest = one
+        for i in range(count):
+            w = weights[n, i] if not affine or i < count - 1 else rest
+            rest -= w
+            for c in range(g.shape[1]):
+                g_rows[ids[n, column + i], c] += w * g[n, c]
+
+
+@numba.njit(cache=True, nogil=True)
+def _weigh_sum(start, stop, rows, ids, column, count, affine, g, g_weights):
+    for n in range(start, stop):
+        g_weights[n] = 0
+        if not _all_known(ids, n, column, count, len(rows)):
+            continue
+        last = ids[n, column + count - 1]
+        for i in range(count - 1 if affine else count):
+            total = g.dtype.type(0)
+            r = ids[n, column + i]
+            for c in range(g.shape[1]):
+                total += g[n, c] * (rows[r, c] - rows[last, c] if affine else rows[r, c])
+            g_weights[n, i] = total
+
+
+# ---------------------------------------------------------------------------------------------------- of triangles
+
+
+@numba.njit
+def _known(a, b, c, count):
+    return 0 <= a < count and 0 <= b < count and 0 <= c < count
+
+
+@numba.njit(cache=True, nogil=True)
+def _interpolate(start, stop, rows, ids, column, weights, out):
+    for n in range(start, stop):
+        a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
+        if not _known(a, b, c, len(rows)):
+            out[n] = np.nan
+            continue
+        for i in range(rows.shape[1]):
+            last = rows[c, i]
+            out[n, i] = last + weights[n, 0] * (rows[a, i] - last) + weights[n, 1] * (rows[b, i] - last)
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_weighted(start, stop, rows, ids, column, weights, out):
+    for n in range(start, stop):
+        a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
+        if not _known(a, b, c, len(rows)):
+            out[n] = np.nan
+            continue
+        for i in range(rows.shape[1]):
+            last = rows[c, i]
+            out[n, i] += weights[n, 0] * (rows[a, i] - last) + weights[n, 1] * (rows[b, i] - last)
+
+
+@numba.njit(cache=True, nogil=True)
+def _scatter(ids, column, weights, g, g_rows):
+    one = g.dtype.type(1)
+    for n in range(len(ids)):
+        a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
+        if not _known(a, b, c, len(g_rows)):
+            continue
+        u, v = weights[n, 0], weights[n, 1]
+        w = one - u - v
+        for i in range(g.shape[1]):
+            x = g[n, i]
+            if x != 0:
+                g_rows[a, i] += u * x
+                g_rows[b, i] += v * x
+                g_rows[c, i] += w * x
+
+
+@numba.njit(cache=True, nogil=True)
+def _weigh(start, stop, rows, ids, column, g, g_weights):
+    for n in range(start, stop):
+        a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
+        u = v = g.dtype.type(0)
+        if _known(a, b, c, len(rows)):
+            for i in range(g.shape[1]):
+                u += g[n, i] * (rows[a, i] - rows[c, i])
+                v += g[n, i] * (rows[b, i] - rows[c, i])
+        g_weights[n, 0], g_weights[n, 1], g_weights[n, 2:] = u, v, 0

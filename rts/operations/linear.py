@@ -1,0 +1,62 @@
+"""Affine maps of points, and products of small matrices, in full precision.
+
+Matrix units of some devices round float32 products to fewer bits: there all is elementwise.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rts.arrays import engine_of, namespace
+from rts.operations.operation import Arrays, Operation, Some
+from rts.records import Array
+
+
+def matmul(a: Array, b: Array) -> Array:
+    """Product of two small matrices."""
+    engine = engine_of(a, b)
+    if engine.exact_products(a, b):
+        return a @ b
+    return engine.namespace.sum(a[:, :, None] * b[None, :, :], axis=1)
+
+
+def affine(row: Array, points: Array) -> Array:
+    """One coordinate (N,) of an affine map of points (N, 3): `row` is (4,), its last entry the offset."""
+    return points[..., 0] * row[0] + points[..., 1] * row[1] + points[..., 2] * row[2] + row[3]
+
+
+def affine_map(rows: Array, points: Array) -> Array:
+    """Points (N, 3) under an affine map of R rows (R, 4): (N, R)."""
+    return AFFINE(rows, points)
+
+
+def _specification(rows: Array, points: Array) -> Array:
+    return namespace(rows, points).stack([affine(rows[i, :], points) for i in range(rows.shape[0])], axis=-1)
+
+
+def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:
+    return points[0], rows[0]
+
+
+def _forward(operands: Arrays, out: np.ndarray) -> None:
+    from rts.operations import linear_kernels
+
+    linear_kernels.affine(*operands, out)
+
+
+def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
+    from rts.operations import linear_kernels
+
+    linear_kernels.affine_push(*operands, *tangents, out)
+
+
+def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
+    from rts.operations import linear_kernels
+
+    linear_kernels.affine_pull(*operands, g, *results)
+
+
+_PACKED: dict[str, Any] = {"differentiable": 2, "packed": (1,), "packed_result": True}
+AFFINE = Operation("rts.affine", _specification, (2, 2), _shape, _forward, _push, _pull, **_PACKED)

@@ -1,0 +1,77 @@
+"""Affine maps of points (N, 3) by rows (R, 4) and their derivatives: NumPy in and out, one compiled pass each."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from rts.operations.projection_kernels import CHUNK
+from rts.threads import parallel, read_only
+
+
+def affine(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:
+    """Fill `out` (N, R)."""
+    parallel(_affine, len(out), rows, points, out, work=len(rows) * len(out))
+
+
+def affine_push(
+    rows: np.ndarray, points: np.ndarray, t_rows: np.ndarray | None, t_points: np.ndarray | None, out: np.ndarray
+) -> None:
+    """Fill `out` (N, R) with the tangent along those of rows and points, or None for zeros."""
+    if t_rows is None:
+        out[...] = 0
+    else:
+        affine(read_only(t_rows), points, out)
+    if t_points is not None:
+        parallel(_add_moved, len(out), rows, read_only(t_points), out, work=len(rows) * len(out))
+
+
+def affine_pull(
+    rows: np.ndarray, points: np.ndarray, g: np.ndarray, g_rows: np.ndarray | None, g_points: np.ndarray | None
+) -> None:
+    """From the gradient of the result (N, R) fill those of rows and points, where they are wanted."""
+    g = read_only(g)
+    if g_rows is not None:
+        sums = np.zeros((-(-len(points) // CHUNK), *rows.shape))
+        parallel(_pull_rows, len(sums), points, g, sums, work=2 * g.size)
+        g_rows[...] = sums.sum(axis=0)
+    if g_points is not None:
+        parallel(_pull_points, len(points), rows, g, g_points, work=g.size)
+
+
+@numba.njit(cache=True, nogil=True)
+def _affine(start, stop, rows, points, out):
+    for n in range(start, stop):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        for r in range(len(rows)):
+            out[n, r] = x * rows[r, 0] + y * rows[r, 1] + z * rows[r, 2] + rows[r, 3]
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_moved(start, stop, rows, move, out):
+    for n in range(start, stop):
+        x, y, z = move[n, 0], move[n, 1], move[n, 2]
+        for r in range(len(rows)):
+            out[n, r] += x * rows[r, 0] + y * rows[r, 1] + z * rows[r, 2]
+
+
+@numba.njit(cache=True, nogil=True)
+def _pull_rows(start, stop, points, g, sums):
+    for chunk in range(start, stop):
+        total = sums[chunk]
+        for n in range(chunk * CHUNK, min(len(points), (chunk + 1) * CHUNK)):
+            for r in range(g.shape[1]):
+                h = g[n, r]
+                for i in range(3):
+                    total[r, i] += h * points[n, i]
+                total[r, 3] += h
+
+
+@numba.njit(cache=True, nogil=True)
+def _pull_points(start, stop, rows, g, g_points):
+    for n in range(start, stop):
+        for i in range(3):
+            total = g.dtype.type(0)
+            for r in range(len(rows)):
+                total += g[n, r] * rows[r, i]
+            g_points[n, i] = total

@@ -1,0 +1,108 @@
+"""One idea, one record: a function of arrays, its specification, and its compiled value and derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rts.arrays import OWNERS, constants, engine_of, exemplar
+from rts.records import Array
+
+Arrays = Sequence[np.ndarray]
+"""Operands on the host, C-contiguous and read-only."""
+
+Some = Sequence[np.ndarray | None]
+"""An array for each operand that has a derivative, or None where it is zero or not wanted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Operation:
+    """A function of arrays that every engine can differentiate, in forward and reverse mode, and to second order.
+
+    Where arrays are on the host, and their floats all of one dtype, float32 or float64, its value and first derivatives
+    are computed by `forward`, `push` and `pull`. Everywhere else, and for second derivatives, by `specification`. Under
+    `vmap` items are computed one after another. An operation is called with its operands, and parameters by name:
+    hashable values that are no arrays and are handed on to all of its functions.
+
+    Args of the functions on the host: `operands` (Arrays) are NumPy; `out` and `results` are to be filled in place.
+
+    Attributes:
+        name: unique, such as "my_package.warp"; compiled programs are kept by it.
+        specification: (*operands, **params) → the result, in array code.
+        ranks: of the operands; their number of axes.
+        shape: (*shapes of the operands, **params) → the shape of the result; of the floats' dtype.
+        forward: (operands, out, **params), the value into `out`. See `keeps`.
+        push: (operands, tangents, out, **params), the derivative along tangents of the first operands (JVP); at least
+            one is not None. See `sweeps`.
+        pull: (operands, gradient, results, **params), the gradients of the first operands from that of the result
+            (VJP), into `results`, which are zeros, or None where not wanted.
+        differentiable: the first so many operands have derivatives; they are floats.
+        packed: operands with a row a sample, of which engines may have allotted more than are used. The functions are
+            given the rows in use; the others have gradients of zero.
+        packed_result: whether the result has a row a sample likewise.
+        used: (operands) → how many rows of the packed operands are used; None for as many as the engine knows of.
+        even: packed operands whose rows are often all alike, which a compiling engine may make use of.
+        keeps: whether `forward` returns an object that helps the derivatives at the same operands: `push` and `pull`
+            then take a keyword `kept`, that object or, where it is known no longer, None.
+        sweeps: whether `push` takes tangents (T, ·) of T directions at once, and `out` (T, ·); else it is called for
+            each.
+    """
+
+    name: str
+    specification: Callable[..., Array]
+    ranks: tuple[int, ...]
+    shape: Callable[..., tuple[int, ...]]
+    forward: Callable[..., Any]
+    push: Callable[..., None]
+    pull: Callable[..., None]
+    differentiable: int = 1
+    packed: tuple[int, ...] = ()
+    packed_result: bool = False
+    used: Callable[[Arrays], int] | None = None
+    even: tuple[int, ...] = ()
+    keeps: bool = False
+    sweeps: bool = False
+
+    def __call__(self, *operands: Array, **params: Any) -> Array:
+        """The result, in the engine of the operands; NumPy arrays beside those of another are constants."""
+        owner = None
+        for x in operands:
+            known = OWNERS.get(type(x))
+            if known is None or (owner is not None and known is not owner):
+                break
+            owner = known
+        else:
+            if owner is not None:
+                return owner.apply(self, operands, params)
+        owner = engine_of(*operands)
+        return owner.apply(self, constants(operands, owner, exemplar(operands)), params)
+
+    def fits(self, dtypes: Sequence[np.dtype]) -> bool:
+        """Whether operands of these NumPy dtypes are of the kind that the functions on the host know."""
+        first = dtypes[0]
+        if first not in (np.float32, np.float64):
+            return False
+        return all(d == first or d.kind in "iub" for d in dtypes)
+
+    # What binders of engines call, with operands of NumPy.
+
+    def value_on_host(self, operands: Arrays, params: dict[str, Any]) -> tuple[np.ndarray, Any]:
+        """The result, and what is kept."""
+        out = np.empty(self.shape(*(x.shape for x in operands), **params), operands[0].dtype)
+        return out, self.forward(operands, out, **params)
+
+    def push_on_host(self, operands: Arrays, tangents: Some, out: np.ndarray, kept: Any, params: dict) -> None:
+        """Fill `out` (T, ·) with the derivatives along tangents (T, ·)."""
+        options = {**params, "kept": kept} if self.keeps else params
+        if self.sweeps:
+            self.push(operands, tangents, out, **options)
+            return
+        for i, result in enumerate(out):
+            self.push(operands, [None if t is None else t[i] for t in tangents], result, **options)
+
+    def pull_on_host(self, operands: Arrays, g: np.ndarray, results: Some, kept: Any, params: dict) -> None:
+        """Fill `results`, zeros, with the gradients from that of the result."""
+        self.pull(operands, g, results, **({**params, "kept": kept} if self.keeps else params))

@@ -1,0 +1,61 @@
+"""Perspective projection of points."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.arrays import namespace
+from rts.operations.linear import affine
+from rts.operations.operation import Arrays, Operation, Some
+from rts.records import Array
+
+
+def projective_map(rows: Array, points: Array) -> Array:
+    """(N, 3): of four affine maps (4, 4) of points (N, 3), the first two over the third, and the fourth.
+
+    Where the third is zero there is no image; the result is finite.
+    """
+    return PROJECTION(rows, points)
+
+
+def _specification(rows: Array, points: Array) -> Array:
+    x, y, w, z = (affine(rows[i, :], points) for i in range(4))
+    xp = namespace(w)
+    safe = xp.where(w == 0, xp.ones_like(w), w)
+    return xp.stack([x / safe, y / safe, z], axis=1)
+
+
+def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:
+    return points
+
+
+def _forward(operands: Arrays, out: np.ndarray) -> None:
+    from rts.operations import projection_kernels
+
+    projection_kernels.project(*operands, out)
+
+
+def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
+    from rts.operations import projection_kernels
+
+    projection_kernels.push(*operands, *tangents, out)
+
+
+def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
+    from rts.operations import projection_kernels
+
+    projection_kernels.pull(*operands, g, *results)
+
+
+PROJECTION = Operation(
+    "rts.projection",
+    _specification,
+    ranks=(2, 2),
+    shape=_shape,
+    forward=_forward,
+    push=_push,
+    pull=_pull,
+    differentiable=2,
+    packed=(1,),
+    packed_result=True,
+)

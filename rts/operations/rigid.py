@@ -1,0 +1,84 @@
+"""Rigid poses: the matrix of a rotation vector and a translation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rts.arrays import is_constant, namespace, promote, shape_of
+from rts.errors import InputError
+from rts.operations.operation import Arrays, Operation, Some
+from rts.records import Array
+from rts.transforms import affine_matrix
+
+
+def rigid(pose: Any, center: Any = (0.0, 0.0, 0.0)) -> Array:
+    """World-from-local transform of a rigid pose; differentiable everywhere, at zero rotation too.
+
+    Args:
+        pose: (6,) rotation vector (axis times angle, radians) about `center`, then translation.
+        center: (3,) local space.
+
+    Returns:
+        (4, 4), usable as `Part.transform`.
+    """
+    if isinstance(pose, (list, tuple)) and is_constant(pose):
+        pose = np.asarray(pose, np.float64)
+    shape = shape_of(pose)
+    if shape != (6,):
+        raise InputError(f"pose has shape {shape}; expected (6,): rotation vector, translation")
+    _, (pose, center) = promote(pose, center)
+    return RIGID(pose, center)
+
+
+def _specification(pose: Array, center: Array) -> Array:
+    xp = namespace(pose, center)
+    x, y, z = pose[0], pose[1], pose[2]
+    square = x * x + y * y + z * z
+    # Below a tenth of a radian the series is exact to rounding; the square root is kept away from zero, where its
+    # derivative is infinite.
+    small = square < 1e-2
+    angle = xp.sqrt(xp.where(small, xp.ones_like(square), square))
+    a = xp.where(small, 1 - square / 6 * (1 - square / 20 * (1 - square / 42)), xp.sin(angle) / angle)
+    b = xp.where(small, 0.5 - square / 24 * (1 - square / 30 * (1 - square / 56)), (1 - xp.cos(angle)) / angle**2)
+    one = xp.ones_like(square)
+    rotation = xp.stack(
+        [
+            xp.stack([one - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y]),
+            xp.stack([b * x * y + a * z, one - b * (x * x + z * z), b * y * z - a * x]),
+            xp.stack([b * x * z - a * y, b * y * z + a * x, one - b * (x * x + y * y)]),
+        ]
+    )
+    moved = center + pose[3:] - xp.sum(rotation * center, axis=1)
+    return affine_matrix(rotation, moved)
+
+
+def _shape(pose: tuple[int, ...], center: tuple[int, ...]) -> tuple[int, ...]:
+    return 4, 4
+
+
+def _computed(operands: Arrays) -> tuple[np.ndarray, np.ndarray]:
+    """The matrix, and its Jacobian (16, 9), float64."""
+    from rts.operations import rigid_kernels
+
+    return rigid_kernels.rigid(*operands)
+
+
+def _forward(operands: Arrays, out: np.ndarray) -> None:
+    out[...] = _computed(operands)[0]
+
+
+def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
+    pose, center = (np.zeros_like(x) if t is None else t for x, t in zip(operands, tangents, strict=True))
+    out[...] = (_computed(operands)[1] @ np.concatenate([pose, center])).reshape(4, 4)
+
+
+def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
+    found = g.reshape(-1) @ _computed(operands)[1]
+    for result, part in zip(results, (found[:6], found[6:]), strict=True):
+        if result is not None:
+            result[...] = part
+
+
+RIGID = Operation("rts.rigid", _specification, (1, 1), _shape, _forward, _push, _pull, differentiable=2)

@@ -1,0 +1,47 @@
+"""Rows of an array by index."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rts.arrays import namespace
+from rts.errors import InputError
+from rts.operations.operation import Arrays, Operation, Some
+from rts.records import Array
+
+
+def take(rows: Array, index: Array) -> Array:
+    """(M, C): the rows of (V, C) that (M,) integers name. Gradients are added up in the order of the index."""
+    return TAKE(rows, index)
+
+
+def _specification(rows: Array, index: Array) -> Array:
+    return namespace(rows, index).take(rows, index, axis=0)
+
+
+def _shape(rows: tuple[int, ...], index: tuple[int, ...]) -> tuple[int, ...]:
+    return index[0], rows[1]
+
+
+def _forward(operands: Arrays, out: np.ndarray) -> None:
+    rows, index = operands
+    if len(index) and not 0 <= index.min() <= index.max() < len(rows):
+        raise InputError(f"rows from {index.min()} to {index.max()} were asked for; expected 0 to {len(rows) - 1}")
+    np.take(rows, index, axis=0, out=out, mode="clip")
+
+
+def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
+    np.take(tangents[0], operands[1], axis=0, out=out, mode="clip")
+
+
+def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
+    from rts.operations import take_kernels
+
+    if results[0] is not None:
+        take_kernels.add(np.ascontiguousarray(g), operands[1], results[0])
+
+
+_PACKED: dict[str, Any] = {"packed": (1,), "packed_result": True}
+TAKE = Operation("rts.take", _specification, (2, 1), _shape, _forward, _push, _pull, **_PACKED)
