@@ -195,9 +195,9 @@ SLOW = ("toy",)
 """Samplers that take a hundred times longer than others."""
 
 CULLED = ", culled"
-JIT_ALL = "mesh"
-JIT_ARRAYS = ("heightfield", "scene")
-"""Scenes that are compiled as a whole with all splatters, and with one of those in array code: these take seconds."""
+JIT_LAYERS = ("mesh", "silhouette", "split uv")
+JIT_SPLATTERS = {"mesh": (*NAMED, *IN_ARRAY_CODE), "heightfield": (DEFAULT, "Visible")}
+"""Scenes that are compiled as a whole for every K, and for more splatters than the default: each takes seconds."""
 
 
 class Ellipsoid:
@@ -543,9 +543,9 @@ def _has_time(config: Config) -> bool:
         return True
     if config.sampler != "auto" or config.scene.endswith(CULLED):
         return default and first and config.engine.key != "jax jit"
-    if config.engine.key != "jax jit" or default:
+    if config.engine.key != "jax jit" or (default and config.scene in JIT_LAYERS):
         return True
-    return first and (config.scene == JIT_ALL or (config.scene in JIT_ARRAYS and config.splatter == "Visible"))
+    return first and config.splatter in JIT_SPLATTERS.get(config.scene, (DEFAULT,))
 
 
 def record_results(output: Path) -> None:

@@ -13,7 +13,7 @@ from rts import registry
 from rts.arrays import described, engine_of, from_numbers, is_constant, leaves, namespace, shape_of
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.interfaces import Part, RaySurface, Sampler, Shader, Splatter, Surface, TriangleSurface, adapted
+from rts.interfaces import Part, Sampler, Shader, Splatter, adapted, as_surface
 from rts.records import Array
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}
@@ -51,7 +51,7 @@ def _check_part(index: int, part: Part) -> Part:
     strange = [key for key in part.theta if not isinstance(key, str)]
     if strange:
         raise InputError(f"theta of part {index} has the key {strange[0]!r}; expected names")
-    surface = adapted(part.surface, Surface, TriangleSurface, RaySurface)
+    surface = as_surface(part.surface)
     if surface is None:
         raise InputError(f"the surface of part {index} is {part.surface!r}; expected an object such as a mesh")
     chosen = registry.instance("rts.shaders", part.shader)

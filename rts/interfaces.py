@@ -49,11 +49,6 @@ class Plugin(abc.ABC):  # noqa: B024
                 if own and not any(flag in c.__dict__ for c in derived):
                     setattr(cls, flag, True)
 
-    @property
-    def given(self) -> Any:
-        """What the user gave: the plugin itself or, of a wrapper, the object in it. Caches go by it."""
-        return self
-
 
 # ----------------------------------------------------------------------------------------------------- surfaces
 
@@ -152,7 +147,8 @@ class TriangleSurface(Surface):
         Args:
             inputs: what `proxy_inputs` gave, on the host.
             samples: ids (N, I), params (N, P) and the depth (K, H, W) of cells, a row for each covered cell. Its tables
-                are those of `table_specs`, zeros of the largest shape, to be filled, or replaced by shorter ones.
+                are those of `table_specs`, zeros of the largest shape, to be filled, or replaced by shorter ones; those
+                `by_sample` have N rows.
             rays: origins and directions (N, 3), of each row.
 
         Returns:
@@ -542,30 +538,28 @@ class Part:
 class _Wrapped:
     """An object that has the members of a base without being of it. It passes for the object, too."""
 
-    given: Any = None
-
     def __init__(self, given: Any):
-        object.__setattr__(self, "given", given)
+        object.__setattr__(self, "_given", given)
 
     @property
     def __class__(self) -> type:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Of the object, so that `isinstance` knows it by its own class as by the base's."""
-        return type(self.given)
+        return type(self._given)
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self.given, name)
+        return getattr(self._given, name)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        setattr(self.given, name, value)
+        setattr(self._given, name, value)
 
     def __repr__(self) -> str:
-        return repr(self.given)
+        return repr(self._given)
 
     def __eq__(self, other: Any) -> bool:
-        return self.given == (other.given if isinstance(other, Plugin) else other)
+        return self._given == unwrapped(other)
 
     def __hash__(self) -> int:
-        return hash(self.given)
+        return hash(self._given)
 
 
 class _WrappedSplatter(_Wrapped):
@@ -574,8 +568,18 @@ class _WrappedSplatter(_Wrapped):
     def image(self, splats: Splats) -> Array:
         """See `Splatter`."""
         if self._of_splats:
-            return self.given.image(splats)
-        return self.given.splat(splats.positions, splats.rgba, splats.row)
+            return self._given.image(splats)
+        return self._given.splat(splats.positions, splats.rgba, splats.row)
+
+
+def unwrapped(plugin: Any) -> Any:
+    """What the user gave: the plugin itself or, of a wrapper, the object in it. Caches go by it."""
+    return plugin._given if issubclass(type(plugin), _Wrapped) else plugin
+
+
+def as_surface(given: Any) -> Any:
+    """A surface with all members of its bases, or None where it is none; see `adapted`."""
+    return adapted(given, Surface, TriangleSurface, RaySurface)
 
 
 _known: set[type] = set()
@@ -609,20 +613,21 @@ def adapted(given: Any, *bases: type[Plugin]) -> Any:
     fitting = tuple(base for base in reversed(bases) if base.__abstractmethods__ <= present)
     if bases[0] not in fitting or isinstance(given, type):
         return None
-    if (kind, present) not in _wrappers:
+    key = kind, fitting, present
+    if key not in _wrappers:
         _check_names(kind, fitting)
-        _wrappers[kind, present] = _wrapper(given, fitting, present)
-    return _wrappers[kind, present](given)
+        _wrappers[key] = _wrapper(given, fitting, present)
+    return _wrappers[key](given)
 
 
 def _wrapper(given: Any, bases: tuple[type[Plugin], ...], present: frozenset[str]) -> type:
     """The class of wrappers for objects of a class that have these members."""
     outer = _WrappedSplatter if bases[-1] is Splatter else _Wrapped
     own = present - {"__call__", "splat", "image"}
-    namespace: dict[str, Any] = {name: property(lambda self, get=attrgetter(name): get(self.given)) for name in own}
+    namespace: dict[str, Any] = {name: property(lambda self, get=attrgetter(name): get(self._given)) for name in own}
     namespace["_of_splats"] = outer is _WrappedSplatter and "splat" not in present
     if "__call__" in present:
-        namespace["__call__"] = lambda self, *args, **kwargs: self.given(*args, **kwargs)
+        namespace["__call__"] = lambda self, *args, **kwargs: self._given(*args, **kwargs)
     for method, flag in (pair for base in bases for pair in base.FLAGS.items() if pair[1] not in present):
         namespace[flag] = method in present
     return type(type(given).__name__, (outer, *bases), namespace)

@@ -131,8 +131,10 @@ def _selected(samples: Samples, row: Any, index: Any) -> Samples:
     """Some of the rows of the samples of a part."""
     xp = namespace(index)
     gbuffer = samples.gbuffer
+    tables = samples.tables.items()
     return replace(
         samples,
+        tables={k: xp.take(v, index, axis=0) if k in samples.by_sample else v for k, v in tables},
         ids=xp.take(samples.ids, index, axis=0),
         params=xp.take(samples.params, index, axis=0),
         gbuffer=None if gbuffer is None else {k: xp.take(v, index, axis=0) for k, v in gbuffer.items()},

@@ -82,11 +82,13 @@ class ArraySpec(NamedTuple):
         dtype: a NumPy dtype.
         packed: the first axis counts samples and may come back shorter; an engine that needs fixed shapes pads it
             with zeros.
+        by_sample: of a table of a surface: it has a row for each sample, which goes where the sample goes.
     """
 
     shape: tuple[int, ...]
     dtype: Any
     packed: bool = False
+    by_sample: bool = False
 
 
 class Proxy(NamedTuple):
@@ -150,7 +152,7 @@ class RayHits(NamedTuple):
     ids: Array | None = None
 
 
-@record(static=("asked", "centered"))
+@record(static=("asked", "centered", "by_sample"))
 class Samples:
     """Where the rays of one part meet its surface: the paper's U, packed.
 
@@ -160,11 +162,11 @@ class Samples:
         row: (K, H, W) int32, the sample in each cell, or −1.
         depth: (K, H, W) float32, linear camera depth; 0 where `row` is −1.
         overflow: () int32, samples that did not fit into the capacity and were dropped, deepest layers first.
-        tables: further arrays of the surface, filled by its `refine`, that all samples share: what a sample has of its
-            own is in `ids` and `params`.
+        tables: further arrays of the surface, filled by its `refine`.
         gbuffer: the evaluated G-buffer where the surface's θ is constant, else None.
         asked: the entries that were asked for when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their pixels.
+        by_sample: the tables that have a row for each sample; the others belong to all.
     """
 
     ids: Array
@@ -176,6 +178,7 @@ class Samples:
     gbuffer: Mapping[str, Array] | None = None
     asked: tuple[str, ...] | None = None
     centered: bool = True
+    by_sample: tuple[str, ...] = ()
 
 
 @record(static=("supersample", "apron"))

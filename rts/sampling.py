@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, Self
 
@@ -13,9 +12,19 @@ import numpy as np
 from rts.arrays import CONSTANT_TYPES, engine_of, exemplar, is_constant, leaves, map_leaves, namespace
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.interfaces import Needed, Part, Sampler, Surface, TriangleSurface
+from rts.interfaces import (
+    Needed,
+    Part,
+    Sampler,
+    Shader,
+    Surface,
+    TriangleSurface,
+    adapted,
+    as_surface,
+    unwrapped,
+)
 from rts.keeping import Entry, Keeper, fingerprint, same_faces
-from rts.records import Array, ArraySpec, Fragments, Proxy, Rays, Sampled, Samples, Tree
+from rts.records import Array, ArraySpec, Fragments, Proxy, Sampled, Samples, Tree
 
 
 class TriangleSampler(Sampler):
@@ -25,11 +34,13 @@ class TriangleSampler(Sampler):
 
     Attributes:
         builds: whether something is worth building once for a proxy; True where there is a `prepare`.
+        follows: whether what was prepared can follow moved vertices; True where there is an `update`.
     """
 
     DECLARES = True
-    FLAGS = {"prepare": "builds"}
+    FLAGS = {"prepare": "builds", "update": "follows"}
     builds: bool = False
+    follows: bool = False
     prunes = True
     _keeper: Keeper
 
@@ -85,7 +96,7 @@ class TriangleSampler(Sampler):
         beside = surface.proxy_key(inputs, camera, size) if surface.depends_on_view else None
 
         def follow(old: Entry) -> Entry | None:
-            if old.prepared is None:
+            if not self.follows or old.prepared is None:
                 return None
             proxy = _checked_proxy(surface, inputs, camera, size)
             if not same_faces(old.proxy, proxy):
@@ -95,7 +106,7 @@ class TriangleSampler(Sampler):
             return None if updated is None else Entry(proxy, updated)
 
         key = (fingerprint(inputs), beside)
-        return self._keeper.get(surface.given, key, lambda: self._built(surface, inputs, camera, size), follow)
+        return self._keeper.get(unwrapped(surface), key, lambda: self._built(surface, inputs, camera, size), follow)
 
     def sample(
         self,
@@ -126,7 +137,9 @@ class TriangleSampler(Sampler):
         reads = {name: theta[name] for name in surface.reads(theta)}
         host_theta = reads if engine.differentiates and is_constant(reads) else None
         tables = dict(surface.table_specs(shape.rows, capacity))
-        attributes = _attribute_specs(part, host_theta, shape, exemplar(theta, camera))
+        shader = adapted(part.shader, Shader)
+        asked = None if shader is None else shader.reads
+        attributes = _attribute_specs(surface, asked, host_theta, shape, exemplar(theta, camera))
 
         def host(view: np.ndarray, projection: np.ndarray, *host_leaves: np.ndarray) -> tuple[np.ndarray, ...]:
             it = iter(host_leaves)
@@ -152,8 +165,9 @@ class TriangleSampler(Sampler):
             *results[:5],
             tables=dict(zip(tables, results[5:rest], strict=True)),
             gbuffer=dict(zip(attributes, results[rest:], strict=True)) if host_theta is not None else None,
-            asked=part.shader.reads,
+            asked=asked,
             centered=surface.centered,
+            by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
         )
 
     def _found(
@@ -180,14 +194,12 @@ class TriangleSampler(Sampler):
         if not surface.refines:
             kept = covered if needed is None else needed(covered, fragments.depth)
             return lift(fragments, found.proxy, shape.capacity, kept)
-        # Which samples are needed is asked with their final depths.
-        from rts.settling import check_refined, repack, settle
+        from rts.settling import refined, repack, settle
 
         lifted = lift(fragments, found.proxy, None, covered)
-        lifted = replace(lifted, tables={name: np.zeros(spec.shape, spec.dtype) for name, spec in tables.items()})
-        rays = _sample_rays(lifted, camera, shape.size)
-        refined = check_refined(surface.refine(inputs, lifted, rays), lifted, surface)
-        settled = settle(refined, camera, rays.spread)
+        moved, rays = refined(surface, inputs, lifted, camera, shape.size, tables)
+        settled = settle(moved, camera, rays.spread)
+        # Which samples are needed is asked with their final depths.
         covered = settled.row >= 0
         kept = covered if needed is None else needed(covered, settled.depth)
         return repack(settled, kept, shape.capacity)
@@ -227,11 +239,12 @@ class _Shape(NamedTuple):
         )
 
 
-def _of_triangles(surface: Surface) -> TriangleSurface:
+def _of_triangles(given: Any) -> TriangleSurface:
     """The surface, which must be one of triangles."""
+    surface = as_surface(given)
     if not isinstance(surface, TriangleSurface):
         raise InputError(
-            f"{surface!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
+            f"{given!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
         )
     return surface
 
@@ -291,17 +304,18 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
     )
 
 
-def _attribute_specs(part: Part, host_theta: Mapping | None, shape: _Shape, like: Array | None) -> dict[str, ArraySpec]:
+def _attribute_specs(
+    surface: Surface, asked: Sequence[str] | None, host_theta: Mapping | None, shape: _Shape, like: Array | None
+) -> dict[str, ArraySpec]:
     """The attributes to evaluate on the host for a surface that is constant: those its shader reads."""
     if host_theta is None:
         return {}
     real = np.float64 if like is not None and namespace(like).finfo(like.dtype).bits == 64 else np.float32
-    i, p = part.surface.sample_widths
+    i, p = surface.sample_widths
     none = np.full((1, 1, 1), -1, np.int32)
     one = Samples(np.zeros((1, i), np.int32), np.zeros((1, p), np.float32), none, none, np.int32(0))
-    gbuffer = part.surface.evaluate(host_theta, one)
-    names = part.shader.reads
-    names = list(gbuffer) if names is None else ["position", *(n for n in names if n in gbuffer)]
+    gbuffer = surface.evaluate(host_theta, one)
+    names = list(gbuffer) if asked is None else ["position", *(n for n in asked if n in gbuffer)]
     return {n: shape.row_spec(real, *gbuffer[n].shape[1:]) for n in dict.fromkeys(names)}
 
 
@@ -336,16 +350,6 @@ def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None, kept: 
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
     ids, params, row, depth, total = lifting.pack(fragments, kept, table, corner_params, capacity or 0)
     return Samples(ids, params, row, depth, np.asarray(max(0, total - len(ids)), np.int32))
-
-
-def _sample_rays(samples: Samples, camera: Camera, size: tuple[int, int]) -> Rays:
-    """The ray of each packed sample (N, 3); samples that no cell refers to get the first pixel's."""
-    rays = camera.rays(size)
-    pixel = np.zeros(len(samples.ids), np.int64)
-    flat = samples.row.reshape(-1)
-    cells = np.flatnonzero(flat >= 0)
-    pixel[flat[cells]] = cells % (size[0] * size[1])
-    return rays._replace(origins=rays.origins.reshape(-1, 3)[pixel], directions=rays.directions.reshape(-1, 3)[pixel])
 
 
 def merge(samples: Sequence[Samples], layers: int) -> Sampled:

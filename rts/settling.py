@@ -5,6 +5,8 @@ Refining moves depths: layers come out of order, two of them meet at one root, a
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numba
@@ -12,11 +14,49 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.records import Samples
+from rts.interfaces import TriangleSurface
+from rts.records import ArraySpec, Rays, Samples, Tree
 from rts.threads import parallel, read_only
 
 SAME_ROOT_PIXELS, SAME_ROOT = 1e-2, 1e-6
 """Layers whose depths differ by less, in widths of a pixel and relative to the depth, are one root found twice."""
+
+
+def refined(
+    surface: TriangleSurface,
+    inputs: Tree,
+    lifted: Samples,
+    camera: Camera,
+    size: tuple[int, int],
+    tables: Mapping[str, ArraySpec],
+) -> tuple[Samples, Rays]:
+    """What `refine` of a surface makes of samples on its triangles, checked; and their rays.
+
+    Args:
+        surface: the surface.
+        inputs: of its proxy, on the host.
+        lifted: the samples, a row for each covered cell.
+        camera: host matrices.
+        size: (height, width).
+        tables: what the surface's `table_specs` allots.
+    """
+    by_sample = tuple(name for name, spec in tables.items() if spec.by_sample)
+    allotted = {
+        name: np.zeros((len(lifted.ids) if name in by_sample else spec.shape[0], *spec.shape[1:]), spec.dtype)
+        for name, spec in tables.items()
+    }
+    lifted, rays = replace(lifted, tables=allotted, by_sample=by_sample), _rays_of(lifted, camera, size)
+    return _checked(surface.refine(inputs, lifted, rays), lifted, surface), rays
+
+
+def _rays_of(samples: Samples, camera: Camera, size: tuple[int, int]) -> Rays:
+    """The ray of each packed sample (N, 3); samples that no cell refers to get the first pixel's."""
+    rays = camera.rays(size)
+    pixel = np.zeros(len(samples.ids), np.int64)
+    flat = samples.row.reshape(-1)
+    cells = np.flatnonzero(flat >= 0)
+    pixel[flat[cells]] = cells % (size[0] * size[1])
+    return rays._replace(origins=rays.origins.reshape(-1, 3)[pixel], directions=rays.directions.reshape(-1, 3)[pixel])
 
 
 def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
@@ -34,7 +74,7 @@ def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
     limits = np.array([*_planes(camera), SAME_ROOT_PIXELS * spread[0], SAME_ROOT_PIXELS * spread[1] + SAME_ROOT])
     given = read_only(samples.row, np.int32), read_only(samples.depth, np.float32)
     parallel(_settle, row.shape[1], *given, limits, row, depth, work=10 * row.size)
-    return Samples(samples.ids, samples.params, row, depth, samples.overflow, samples.tables)
+    return replace(samples, row=row, depth=depth)
 
 
 def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
@@ -49,14 +89,25 @@ def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
     rows = max(1, len(index)) if capacity is None else capacity
     number = np.full(samples.row.shape, -1, np.int32)
     number[kept] = np.where(np.arange(len(index)) < rows, np.arange(len(index)), -1)
-    ids, params = (np.zeros((rows, x.shape[1]), x.dtype) for x in (samples.ids, samples.params))
-    ids[: len(index)], params[: len(index)] = samples.ids[index[:rows]], samples.params[index[:rows]]
-    depth = np.where(number >= 0, samples.depth, np.float32(0))
-    overflow = np.asarray(samples.overflow + max(0, len(index) - rows), np.int32)
-    return Samples(ids, params, number, depth, overflow, samples.tables)
+    index, overflow = index[:rows], np.asarray(samples.overflow + max(0, len(index) - rows), np.int32)
+
+    def packed(x: np.ndarray) -> np.ndarray:
+        found = np.zeros((rows, *x.shape[1:]), x.dtype)
+        found[: len(index)] = x[index]
+        return found
+
+    return replace(
+        samples,
+        ids=packed(samples.ids),
+        params=packed(samples.params),
+        row=number,
+        depth=np.where(number >= 0, samples.depth, np.float32(0)),
+        overflow=overflow,
+        tables={name: packed(x) if name in samples.by_sample else x for name, x in samples.tables.items()},
+    )
 
 
-def check_refined(found: Any, given: Samples, surface: Any) -> Samples:
+def _checked(found: Any, given: Samples, surface: TriangleSurface) -> Samples:
     """What `refine` of a surface gave, with arrays of the right dtypes; refused where it breaks its contract."""
     who = f"refine of {surface!r}"
     if not isinstance(found, Samples):
@@ -83,16 +134,21 @@ def check_refined(found: Any, given: Samples, surface: Any) -> Samples:
         count = (~np.isfinite(used).all(axis=1)).sum()
         raise InputError(f"{who} gave {count} samples whose params are not finite; set their rows to −1")
     overflow = np.asarray(found.overflow, np.int32)
-    return Samples(ids, params, row, depth, overflow, _checked_tables(found.tables, given.tables, who))
+    tables = _checked_tables(found.tables, given, who)
+    return replace(given, ids=ids, params=params, row=row, depth=depth, overflow=overflow, tables=tables)
 
 
-def _checked_tables(found: Any, given: Any, who: str) -> dict[str, np.ndarray]:
+def _checked_tables(found: Any, given: Samples, who: str) -> dict[str, np.ndarray]:
     """Tables that fit into those that were allotted."""
     tables = {}
-    for name, allotted in given.items():
+    for name, allotted in given.tables.items():
         if name not in found:
             raise InputError(f"{who} gave no table {name!r}, which table_specs declares")
         table = np.asarray(found[name], allotted.dtype)
+        if name in given.by_sample and len(table) != len(given.ids):
+            raise InputError(
+                f"{who} gave a table {name!r} of {len(table)} rows; expected {len(given.ids)}, one a sample"
+            )
         if table.shape[1:] != allotted.shape[1:] or len(table) > len(allotted):
             raise InputError(
                 f"{who} gave a table {name!r} of shape {table.shape}, where table_specs allots {allotted.shape}; drop "

@@ -149,6 +149,33 @@ class JaxEngine(Engine):
         """The value on the host."""
         return np.asarray(x)
 
+    def repeat(
+        self, body: Callable[[Tree], Tree], going: Callable[[Tree], jax.Array], state: Tree, most: int
+    ) -> Tree:
+        """A loop of Python's as long as values are known, which compiles nothing; else `jax.lax.while_loop`."""
+        for count in range(most):
+            on = going(state)
+            if isinstance(on, Tracer):
+                return self._looped(body, going, state, most - count)
+            if not bool(on):
+                break
+            state = body(state)
+        return state
+
+    @staticmethod
+    def _looped(body: Callable, going: Callable, state: Tree, most: int) -> Tree:
+        def step(counted: tuple) -> tuple:
+            count, state = counted
+            return count + 1, body(state)
+
+        def on(counted: tuple) -> jax.Array:
+            count, state = counted
+            return (count < most) & going(state)
+
+        # Of one dtype throughout, as a loop asks: numbers among them may be weakly typed.
+        state = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
+        return jax.lax.while_loop(on, step, (jnp.int32(0), state))[1]
+
     def block(self, x: Tree) -> Tree:
         """Wait for the arrays."""
         return jax.block_until_ready(x)

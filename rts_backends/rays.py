@@ -7,7 +7,7 @@ import numpy as np
 from rts.arrays import constants, engine_of, exemplar, map_leaves, namespace
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.interfaces import Part, RaySurface, Sampler
+from rts.interfaces import Part, RaySurface, Sampler, as_surface
 from rts.records import ArraySpec, Samples
 from rts.sampling import check_camera
 
@@ -19,10 +19,10 @@ class Rays(Sampler):
         self, part: Part, camera: Camera, size: tuple[int, int], layers: int, *, capacity: int | None = None
     ) -> Samples:
         """See `rts.Sampler`."""
-        surface = part.surface
+        surface = as_surface(part.surface)
         if not isinstance(surface, RaySurface):
             raise InputError(
-                f"{surface!r} does not intersect rays itself; use a sampler of triangles, such as 'raster'"
+                f"{part.surface!r} does not intersect rays itself; use a sampler of triangles, such as 'raster'"
             )
         if part.cull != "none":
             raise InputError(f"cull is {part.cull!r}, but the sampler 'rays' has no triangles to cull; expected 'none'")

@@ -143,6 +143,26 @@ class TorchEngine(Engine):
         """The value on the host."""
         return _to_host(x)
 
+    def repeat(
+        self,
+        body: Callable[[Tree], Tree],
+        going: Callable[[Tree], torch.Tensor],
+        state: Tree,
+        most: int,
+    ) -> Tree:
+        """A loop of Python's; under `torch.vmap` as long as any item goes on, the others staying as they are."""
+        for _ in range(most):
+            on = going(state)
+            whole = on
+            while torch._C._functorch.is_functorch_wrapped_tensor(whole):
+                whole = torch._C._functorch.get_unwrapped(whole)
+            if not bool(whole.any()):
+                break
+            new = iter(list(leaves(body(state))))
+            batched = whole.ndim > 0
+            state = map_leaves(lambda x, on=on, b=batched: torch.where(on, next(new), x) if b else next(new), state)  # noqa: B023
+        return state
+
     def block(self, x: Tree) -> Tree:
         """Wait for the devices that hold the tensors."""
         for device in {leaf.device for leaf in leaves(x) if isinstance(leaf, torch.Tensor)}:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch._C._functorch import is_legacy_batchedtensor
@@ -34,6 +35,16 @@ def transformed() -> bool:
 def foreign(*tensors: Tensor | None) -> bool:
     """Whether any is a batch of `torch.autograd.grad(..., is_grads_batched=True)`, which no function can look into."""
     return any(t is not None and is_legacy_batchedtensor(t) for t in tensors)
+
+
+def on_host(x: Tensor) -> np.ndarray:
+    """The value of a tensor in the memory of the host, without a copy."""
+    x = x.detach()
+    # Zeros that torch's forward mode makes up have no memory.
+    return np.zeros(tuple(x.shape), _NUMPY[x.dtype]) if x._is_zerotensor() else x.numpy()
+
+
+_NUMPY = {torch.float32: np.float32, torch.float64: np.float64}
 
 
 def filled(primals: Sequence[Tensor], tangents: Sequence[Tensor | None]) -> tuple[Tensor, ...]:

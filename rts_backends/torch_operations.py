@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rts.operations.operation import Operation
 from rts.threads import read_only
-from rts_backends.torch_functions import along, applied, foreign
+from rts_backends.torch_functions import along, applied, foreign, on_host
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
 _INTEGERS = {torch.int32, torch.int64, torch.int16, torch.int8, torch.uint8, torch.bool}
@@ -30,8 +30,10 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
 
 
 class _Specifying(threading.local):
-    """Whether a specification is being differentiated: torch does not nest functions of its transforms in one another,
-    so operations in it are array code, too."""
+    """Whether a specification is being differentiated.
+
+    Operations in it are array code, too: torch does not nest its transforms in functions of one another.
+    """
 
     on = False
 
@@ -116,7 +118,7 @@ def _spread(given: Sequence[Tensor], present: Sequence[bool]) -> list[Tensor | N
 
 
 def _host(tensors: Sequence[Tensor]) -> list[np.ndarray]:
-    return [read_only(t.detach().numpy()) for t in tensors]
+    return [read_only(on_host(t)) for t in tensors]
 
 
 def _items(info: Any, in_dims: Sequence, args: Sequence) -> list[tuple]:

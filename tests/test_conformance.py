@@ -17,6 +17,7 @@ from rts.registry import instance
 from rts.shading import Unlit
 from rts.splatting import Multi, Plain, inside
 from rts.testing import (
+    EngineConformance,
     SamplerConformance,
     ShaderConformance,
     SplatterConformance,
@@ -110,6 +111,24 @@ class TestRays(SamplerConformance):
     @pytest.fixture
     def parts(self):
         return [ellipsoid(), ellipsoid().replace(transform=np.diag([1, 1.2, 0.8, 1]).astype(np.float32))]
+
+
+class TestNumpyEngine(EngineConformance):
+    @pytest.fixture
+    def engine(self):
+        return "numpy"
+
+
+class TestTorchEngine(EngineConformance):
+    @pytest.fixture
+    def engine(self):
+        return "torch"
+
+
+class TestJaxEngine(EngineConformance):
+    @pytest.fixture
+    def engine(self):
+        return "jax"
 
 
 class ShaderOfBuiltIn(ShaderConformance):
@@ -305,7 +324,7 @@ class Forgetful(Raster):
         if not hasattr(self, "kept"):
             self.kept = {}
         if surface not in self.kept:
-            self.kept[surface] = self.build(surface, inputs, camera, size)
+            self.kept[surface] = self._built(surface, inputs, camera, size)
         return self.kept[surface]
 
 
@@ -451,6 +470,24 @@ class Refined(OddMesh):
         return replace(samples, depth=np.full_like(samples.depth, 2))
 
 
+class Renumbered(OddMesh):
+    def refine(self, inputs, samples, rays):
+        return replace(samples, row=np.where(samples.row > 0, samples.row - 1, samples.row))
+
+
+class Lost(OddMesh):
+    def refine(self, inputs, samples, rays):
+        return replace(samples, depth=samples.depth * np.float32(np.nan))
+
+
+class Shy(Ellipsoid):
+    """Does not see what is nearer to a ray's origin than a twentieth."""
+
+    def intersect(self, theta, origins, directions, layers):
+        hits = super().intersect(theta, origins + 0.05 * directions, directions, layers)
+        return hits._replace(distance=hits.distance + 0.05)
+
+
 class Stale(OddMesh):
     def proxy(self, inputs, camera, size):
         if not hasattr(self, "kept"):
@@ -507,7 +544,8 @@ SURFACES = {
         "another depth": Refined(),
     },
     "layers_are_front_to_back": {"farthest first": SwappedHits()},
-    "background_is_empty": {"depth": Refined()},
+    "refine_keeps_samples_on_their_rays": {"another depth": Refined(), "rows renumbered": Renumbered(), "NaN": Lost()},
+    "rays_from_before_a_hit_find_it": {"nothing near": Shy()},
     "two_renders_are_the_same": {"a counter": Counting(), "kept for ever": Stale()},
     "the_g_buffer_has_a_row_for_each_sample": {
         "widths": WrongWidths(),

@@ -13,7 +13,7 @@ from test_fused import KINDS, SETTINGS, cells, compiled, noise, specification
 
 import rts
 from rts_backends import jax_host
-from rts_backends.fused_kernels import Splats
+from rts_backends.fused_kernels import Cells
 
 jax = pytest.importorskip("jax")
 torch = pytest.importorskip("torch")
@@ -45,13 +45,14 @@ def calls(monkeypatch):
 
     def listen(name, method):
         def call(self, *args):
-            found.append((name, *args[1:]) if name == "vjp" else (name,))
+            wanted = tuple(x is not None for x in args[1:])
+            found.append((name, wanted) if name == "vjp" else (name,))
             return method(self, *args)
 
         return call
 
     for name in ("image", "vjp", "jvp"):
-        monkeypatch.setattr(Splats, name, listen(name, getattr(Splats, name)))
+        monkeypatch.setattr(Cells, name, listen(name, getattr(Cells, name)))
     return found
 
 
@@ -237,15 +238,15 @@ def test_colors_that_are_all_alike_are_not_written_out():
 def test_what_the_image_decides_is_not_decided_again(mode, monkeypatch):
     decided = []
 
-    class Listening(type(Splats.choices)):
+    class Listening(type(Cells.choices)):
         def __get__(self, instance, owner=None):
             if instance is not None and "choices" not in instance.__dict__:
                 decided.append(1)
             return super().__get__(instance, owner)
 
-    listening = Listening(Splats.choices.func)
-    listening.__set_name__(Splats, "choices")
-    monkeypatch.setattr(Splats, "choices", listening)
+    listening = Listening(Cells.choices.func)
+    listening.__set_name__(Cells, "choices")
+    monkeypatch.setattr(Cells, "choices", listening)
     ours = Smooth(KINDS["visible"](), jnp.asarray, 3)
     gradient, along = jax.grad(ours.loss), lambda x: jax.jvp(ours.image, (x,), (x + 1,))[1]
     several = jax.vmap(jax.grad(ours.loss))

@@ -15,7 +15,7 @@ from rts.arrays import engine_of
 from rts.errors import InputError
 from rts.least_squares import normal_equations
 from rts_backends import fused, fused_normal
-from rts_backends.fused_kernels import Settings, Splats
+from rts_backends.fused_kernels import Cells, Settings
 
 SIZE = (26, 31)
 CAMERA = rts.Camera.look_at((0.7, 0.9, 3.2), (0, 0, 0), fov_y=45, aspect=31 / 26)
@@ -247,9 +247,9 @@ def test_half_precision_is_done_by_the_jacobian(monkeypatch):
     row = torch.zeros((1, 3, 3), dtype=torch.int32)
     tangents = torch.zeros((2, 5, 3), dtype=torch.bfloat16)
     goal = torch.zeros((3, 3, 1))
-    assert fused.Visible().normal_equations(*splats, row, tangents, None, goal) is None
+    assert fused.Visible().normal_equations(rts.Splats(*splats, row), tangents, None, goal) is None
     elsewhere = [x.float().to("meta") for x in (*splats, row, tangents)]
-    assert fused.Visible().normal_equations(*elsewhere, None, goal) is None
+    assert fused.Visible().normal_equations(rts.Splats(*elsewhere[:3]), elsewhere[3], None, goal) is None
     assert not sweeps
 
 
@@ -268,7 +268,7 @@ def splats_of(kind, layers=2, size=(40, 150), dtype=np.float64, seed=0):
     tangents = rng.normal(size=(3, len(k), 3)), rng.normal(size=(3, len(k), 4))
     kernel = {"single": fused.Single, "multi": fused.Multi, "visible": fused.Visible}[kind]()
     settings = Settings(kind, kernel.sigma, kernel.epsilon, kernel.gamma, 2)
-    splats = Splats(settings, positions.astype(dtype), rgba.astype(dtype), row)
+    splats = Cells(settings, positions.astype(dtype), rgba.astype(dtype), row)
     return splats, *(t.astype(dtype) for t in tangents)
 
 

@@ -38,7 +38,7 @@ def counting(name):
             self.prepared.append((lambda: built) if isinstance(built, tuple) else weakref.ref(built))
             return built
 
-    if Counting.update is not None:
+    if Counting.follows:
 
         def update(self, prepared, proxy):
             self.updated += 1

@@ -164,8 +164,8 @@ def test_tables_with_a_row_a_sample_stay_in_step():
     class Tabled(MESH):
         """A mesh that evaluates from a table of its own instead of the barycentrics."""
 
-        def table_specs(self, rows):
-            return {"weights": ArraySpec((rows, 2), np.float32, packed=True)}
+        def table_specs(self, rows, capacity):
+            return {"weights": ArraySpec((rows, 2), np.float32, packed=True, by_sample=True)}
 
         def refine(self, inputs, samples, rays):
             return replace(samples, tables={"weights": samples.params.copy()}, params=samples.params * 0)

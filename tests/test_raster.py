@@ -25,7 +25,7 @@ def cast(vertices, faces, camera, size, layers, cull, near=NEAR, far=FAR):
     """Fragments by intersecting every pixel's ray with every triangle (Möller and Trumbore 1997)."""
     a, b, c = np.moveaxis(vertices[faces].astype(np.float64), 1, 0)
     rays = camera.rays(size)
-    origins, directions = (x.reshape(-1, 1, 3) for x in rays)
+    origins, directions = (x.reshape(-1, 1, 3) for x in rays[:2])
     p = np.cross(directions, c - a)
     determinant = (p * (b - a)).sum(-1)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -26,7 +26,7 @@ from helpers import (
 
 import rts
 from rts import Camera, Part
-from rts.rendering import APRON
+from rts.pairs import APRON
 from rts.shading import Textured
 
 Mesh = rts.plugin("surfaces", "mesh")

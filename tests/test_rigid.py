@@ -5,8 +5,8 @@ import pytest
 
 import rts
 from rts.operations.projection import projective_map
-from rts.operations.take import take
 from rts.operations.rigid import RIGID
+from rts.operations.take import take
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("numba")

@@ -85,9 +85,9 @@ def test_gradients_shade_each_band_again_instead_of_keeping_it(narrow_bands):
     calls = []
 
     class Counting(Visible):
-        def splat(self, positions, rgba, row):
-            calls.append(row.shape)
-            return super().splat(positions, rgba, row)
+        def image(self, splats):
+            calls.append(splats.row.shape)
+            return super().image(splats)
 
     bands = len(rendering._bands(*SIZE, 2, 3))
     gradient(TORCH[0], lambda v: image(v, 3, splatter=Counting()).sum(), arrays(TORCH[0], CORNERS))

@@ -1,160 +1,434 @@
-"""Derivatives by every engine that is installed, on the host."""
+"""What every engine must do."""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 
-from rts import arrays, registry
-from rts.arrays import constants, map_leaves
-from rts.errors import PluginError
+from rts import arrays
+from rts.arrays import engine_of, leaves, map_leaves
+from rts.errors import EngineError
 from rts.interfaces import Engine
-from rts.records import Tree
-from rts.testing.conformance import claim, claim_close, claim_finite, no_error
+from rts.operations.combine import combine, interpolate
+from rts.operations.linear import affine_map, matmul
+from rts.operations.projection import projective_map
+from rts.operations.rigid import rigid
+from rts.operations.take import take
+from rts.records import ArraySpec, Samples
+from rts.testing import derivatives, scenes
+from rts.testing.conformance import Conformance, claim, claim_close, no_error
 
-ENGINES = registry.plugins("rts.engines")
-DIFFERENTIABLE = [name for name in ENGINES if name != "numpy"]
-
-
-def engine_named(name: str) -> Engine:
-    """The engine, or a skip with the reason where it is not installed."""
-    try:
-        engine = arrays.engine_named(name)
-        importlib.import_module(name)
-    except (PluginError, ImportError) as error:
-        pytest.skip(str(error))
-    return engine
+N = 6
+TOLERANCE = 1e-5
 
 
-def installed() -> list[Engine]:
-    """The engines with derivatives; skips where there is none."""
-    engines = []
-    for name in DIFFERENTIABLE:
-        try:
-            engines.append(arrays.engine_named(name))
-        except PluginError:
-            continue
-    if not engines:
-        pytest.skip(f"none of {', '.join(DIFFERENTIABLE)} is installed")
-    return engines
+def _numbers(*shape: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32)
 
 
-def single(x: Any) -> Any:
-    """Floats as float32, everything else as it is."""
-    x = np.asarray(x)
-    return x.astype(np.float32) if np.issubdtype(x.dtype, np.floating) else x
+IDS = np.array([(0, 2, 1), (3, 3, 0), (1, 2, 3), (2, 0, 1), (0, 1, 3), (3, 2, 2)], np.int32)
+WITH_DIVISOR = _numbers(4, 4)
+WITH_DIVISOR[2, 3] += 6
+
+OPERATIONS: dict[str, tuple[Callable, list[np.ndarray]]] = {
+    "matmul": (matmul, [_numbers(4, 4), _numbers(4, 4, seed=1)]),
+    "affine_map": (affine_map, [_numbers(4, 4), _numbers(N, 3, seed=1)]),
+    "projective_map": (projective_map, [WITH_DIVISOR, _numbers(N, 3, seed=1)]),
+    "take": (lambda rows: take(rows, _index(rows)), [_numbers(4, 3)]),
+    "interpolate": (lambda rows, w: interpolate(rows, _ids(rows), 0, w), [_numbers(4, 3), _numbers(N, 2, seed=1)]),
+    "combine": (lambda rows, w: combine(rows, _ids(rows), w), [_numbers(4, 3), _numbers(N, 3, seed=1)]),
+    "rigid": (rigid, [_numbers(6), _numbers(3, seed=1)]),
+}
+"""The library's own operations, and operands."""
+
+NAMESPACE: dict[str, Callable] = {
+    "arithmetic": lambda xp, x: (x * x + 2 - x / 3) ** 2,
+    "where": lambda xp, x: xp.where(x > 0, x, xp.zeros_like(x)),
+    "sum and mean": lambda xp, x: xp.sum(x, axis=0) + xp.mean(x),
+    "stack and concat": lambda xp, x: xp.concat([xp.stack([x[:, 0], x[:, 1]], axis=-1), x], axis=1),
+    "reshape": lambda xp, x: xp.reshape(x, (-1, 2)),
+    "broadcast_to": lambda xp, x: xp.broadcast_to(x[:1, :], (3, 4)),
+    "functions": lambda xp, x: xp.exp(x) + xp.sin(x) * xp.cos(x) + xp.sqrt(xp.abs(x) + 1) + xp.floor(x),
+    "clip, minimum, maximum": lambda xp, x: xp.clip(x, -0.5, 0.5) + xp.minimum(x, 0 * x) - xp.maximum(x, 0 * x),
+    "cross": lambda xp, x: xp.linalg.cross(x[:, :3], x[:, 1:]),
+    "inverse": lambda xp, x: xp.linalg.inv(x[:4, :] @ xp.linalg.matrix_transpose(x[:4, :]) + 4 * _eye(xp, x)),
+    "argsort": lambda xp, x: xp.take_along_axis(x, xp.argsort(x, axis=0, stable=True), axis=0),
+    "any and all": lambda xp, x: xp.astype(xp.any(x > 0, axis=0) & ~xp.all(x > 0, axis=0), x.dtype),
+}
+"""Of what the core and plugins use of the array API, each as a function of x (6, 4)."""
 
 
-def on(engine: Engine, tree: Tree) -> Tree:
-    """A tree of NumPy arrays as arrays of the engine, floats in float32."""
-    return map_leaves(lambda x: engine.constant(single(x)), tree)
+class EngineConformance(Conformance):
+    """Checks of an engine.
 
-
-def host(engine: Engine, tree: Tree) -> Tree:
-    """A tree of the engine's arrays as NumPy arrays."""
-    return map_leaves(lambda x: x if isinstance(x, np.ndarray) else engine.to_numpy(x), tree)
-
-
-def split(tree: Tree) -> tuple[list[np.ndarray], Callable[[Sequence[Any]], Tree]]:
-    """The floating leaves of a tree of NumPy arrays, and the tree with others in their place."""
-    found: list[np.ndarray] = []
-
-    def collect(x: Any) -> Any:
-        x = np.asarray(x)
-        if np.issubdtype(x.dtype, np.floating):
-            found.append(x)
-        return x
-
-    tree = map_leaves(collect, tree)
-
-    def join(values: Sequence[Any]) -> Tree:
-        it = iter(values)
-        return map_leaves(lambda x: next(it) if np.issubdtype(x.dtype, np.floating) else x, tree)
-
-    return found, join
-
-
-def names(tree: Tree) -> list[str]:
-    """Where the leaves that `split` finds are."""
-    return [f"theta[{key!r}]" for key in sorted(tree) for _ in split(tree[key])[0]]
-
-
-def joined(engine: Engine, join: Callable, values: Sequence[Any]) -> Tree:
-    """The tree of `split` with these values, everything else as constants of the engine."""
-    return constants(join(values), engine, None)
-
-
-def directions(values: Sequence[np.ndarray], seed: int = 1) -> list[np.ndarray]:
-    """A random direction in the space of some arrays."""
-    rng = np.random.default_rng(seed)
-    return [rng.standard_normal(v.shape) for v in values]
-
-
-def claim_slope(gradient: np.ndarray, along: np.ndarray, slope: float, what: str) -> None:
-    """Fail unless a float32 gradient explains a difference, which was found along a direction in float64."""
-    found = float(np.sum(gradient * along))
-    scale = max(abs(slope), np.linalg.norm(gradient) * np.linalg.norm(along) / np.sqrt(along.size), 1e-4)
-    claim(
-        abs(found - slope) <= 2e-3 * scale,
-        f"{what} is {found:.6g}, but {slope:.6g} by finite differences; is something detached, or taken elsewhere?",
-    )
-
-
-class Derivatives(NamedTuple):
-    """A function's value, the gradient of its product with given weights, and its derivative along a direction."""
-
-    value: np.ndarray
-    gradient: list[np.ndarray]
-    along: np.ndarray
-
-
-def derivatives(engine: Engine, f: Callable, at: list, along: list, weights: np.ndarray) -> Derivatives:
-    """Both modes of differentiation of a function of a list of arrays, in float32, on the host."""
-    at, along, weights = on(engine, at), on(engine, along), on(engine, weights)
-    xp = engine.namespace
-    _, gradient = engine.value_and_grad(lambda x: xp.sum(f(x) * weights))(at)
-    value, slope = engine.jvp(f, at, along)
-    return Derivatives(*host(engine, (value, gradient, slope)))
-
-
-def claim_consistent(found: Derivatives, along: list, weights: np.ndarray, what: str) -> None:
-    """Fail unless forward and reverse mode agree: ⟨w, J d⟩ = ⟨Jᵀ w, d⟩."""
-    claim_finite(found, f"{what} or its derivative")
-    forward = float(np.sum(weights * found.along))
-    reverse = float(sum(np.sum(g * d) for g, d in zip(found.gradient, along, strict=True)))
-    scale = max(np.linalg.norm(found.along) * np.linalg.norm(weights), 1e-6)
-    claim(
-        abs(forward - reverse) <= 1e-4 * scale,
-        f"forward mode gives {forward:.6g} for the derivative of {what}, reverse mode {reverse:.6g}",
-    )
-
-
-def claim_engines_agree(f: Callable, at: list, value: np.ndarray, what: str) -> None:
-    """Fail unless every installed engine gives this value and the same derivatives, in both modes.
-
-    Args:
-        f: from a list of arrays to an array, in any engine.
-        at: NumPy arrays.
-        value: of `f`, by NumPy.
-        what: is computed.
+    Override the fixture `engine`: the name of a registered one, or an object. Checks of derivatives are skipped where
+    it says that it does not differentiate.
     """
-    weights = np.random.default_rng(0).standard_normal(value.shape)
-    along, first = directions(at), None
-    for engine in installed():
-        with no_error(f"{what} in {engine.name}"):
-            found = derivatives(engine, f, at, along, weights)
-        claim_close(found.value, value, 1e-5, f"{what} in {engine.name}, against NumPy,")
-        claim_consistent(found, along, weights, f"{what} in {engine.name}")
-        first = first or found
-        pairs = zip([found.along, *found.gradient], [first.along, *first.gradient], strict=True)
-        for here, there in pairs:
-            scale = 1e-4 * max(np.linalg.norm(there), 1e-3)
-            claim(
-                np.linalg.norm(here - there) <= scale,
-                f"the derivative of {what} in {engine.name} differs from the other engine's by "
-                f"{np.linalg.norm(here - there):.3g}, its norm is {np.linalg.norm(there):.3g}",
+
+    @pytest.fixture
+    def engine(self) -> Any:
+        """Name or object of the engine."""
+        raise NotImplementedError("override the fixture 'engine' with the engine, or its name")
+
+    # ------------------------------------------------------------------------------------------- arrays
+
+    def test_it_owns_its_arrays_alone(self, engine: Any) -> None:
+        """Those that `constant` gives, and no lists, numbers or arrays of others."""
+        chosen = _instance(engine)
+        claim(chosen.owns(chosen.constant(np.ones(3))), "it does not own the array that `constant` gives")
+        strangers = [1.0, [1.0], None, *([] if chosen.name == "numpy" else [np.ones(3)])]
+        for x in strangers:
+            claim(not chosen.owns(x), f"it owns a {type(x).__name__}")
+
+    def test_constants_keep_their_values(self, engine: Any) -> None:
+        """Floats in the dtype of `like`, else float32 (NumPy: as they are); integers and booleans as such."""
+        chosen = _instance(engine)
+        single = chosen.constant(np.ones(2, np.float32))
+        for value in (np.array([1.5, -2.0]), np.arange(6, dtype=np.int32).reshape(2, 3), np.array([True, False]), 0.5):
+            found = chosen.constant(value, single)
+            host = chosen.to_numpy(found)
+            claim(np.array_equal(host, value), f"the constant of {value!r} is {host!r}")
+            kind = np.asarray(value).dtype.kind
+            claim(host.dtype.kind == kind, f"the constant of {value!r} has dtype {host.dtype}")
+            claim(kind != "f" or host.dtype == np.float32, f"beside float32, {value!r} became {host.dtype}")
+        backwards = np.arange(12.0).reshape(3, 4)[::-1, ::2]
+        claim_close(chosen.to_numpy(chosen.constant(backwards)), backwards, 0, "the constant of a strided array")
+
+    def test_a_constant_is_a_copy_or_not_written_to(self, engine: Any) -> None:
+        """What is computed from a constant does not change the array that it was made of."""
+        chosen, given = _instance(engine), np.ones(4, np.float32)
+        x = chosen.constant(given)
+        chosen.block(x * 2 + 1)
+        claim((given == 1).all(), "the array that a constant was made of has changed")
+
+    @pytest.mark.parametrize("name", NAMESPACE)
+    def test_its_namespace_is_that_of_the_array_api(self, engine: Any, name: str) -> None:
+        """With NumPy's results."""
+        chosen, x, f = _instance(engine), _numbers(N, 4, seed=4), NAMESPACE[name]
+        from array_api_compat import numpy as xp
+
+        with owning(chosen), no_error(f"{name} in the namespace of {chosen.name}"):
+            found = chosen.to_numpy(f(chosen.namespace, chosen.constant(x)))
+        claim_close(found, f(xp, x), TOLERANCE, name)
+
+    # ------------------------------------------------------------------------------------------ the host
+
+    def test_host_functions_are_called_with_numpy(self, engine: Any) -> None:
+        """And their results are the engine's, with values, shapes and dtypes, compiled or not."""
+        chosen = _instance(engine)
+
+        def host(x: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, ...]:
+            claim(isinstance(x, np.ndarray) and isinstance(ids, np.ndarray), "a host function gets other than NumPy")
+            return (np.asarray(x) * 2).astype(np.float32), np.asarray(ids.sum(), np.int32), x[:2].astype(np.float32)
+
+        specs = ArraySpec((N, 3), np.float32), ArraySpec((), np.int32), ArraySpec((N, 3), np.float32, packed=True)
+        x, ids = chosen.constant(_numbers(N, 3)), chosen.constant(IDS)
+        for how, call in (("", chosen.call_host), (", compiled", chosen.jit(lambda *a: chosen.call_host(*a)))):
+            f = (
+                (lambda x, i, c=call: c(host, specs, x, i))
+                if not how
+                else chosen.jit(lambda x, i: chosen.call_host(host, specs, x, i))
             )
+            with owning(chosen), no_error(f"a host function{how}"):
+                twice, total, packed = (chosen.to_numpy(r) for r in f(x, ids))
+            claim_close(twice, 2 * _numbers(N, 3), 0, f"the result of a host function{how}")
+            claim(total.dtype.kind == "i" and total == IDS.sum(), f"an integer result{how} is {total!r}")
+            claim_close(packed[:2], _numbers(N, 3)[:2], 0, f"a packed result{how}")
+            claim((packed[2:] == 0).all(), f"a packed result{how} is not padded with zeros")
+
+    def test_host_functions_have_no_derivative(self, engine: Any) -> None:
+        """And let those of others pass."""
+        chosen = _differentiating(engine)
+        xp, spec = chosen.namespace, ArraySpec((N, 3), np.float32)
+
+        def f(x: Any) -> Any:
+            (constant,) = chosen.call_host(lambda v: (np.asarray(v) * 2,), (spec,), x)
+            return xp.sum(constant * x)
+
+        with owning(chosen), no_error("the gradient through a host function"):
+            gradient = chosen.to_numpy(chosen.value_and_grad(f)(chosen.constant(_numbers(N, 3)))[1])
+            along = chosen.jvp(f, chosen.constant(_numbers(N, 3)), chosen.constant(np.ones((N, 3))))[1]
+        claim_close(gradient, 2 * _numbers(N, 3), TOLERANCE, "the gradient of c x, c from the host,")
+        claim_close(chosen.to_numpy(along), 2 * _numbers(N, 3).sum(), 1e-4, "its derivative in forward mode")
+
+    def test_what_is_decided_by_the_device_is_the_same(self, engine: Any) -> None:
+        """`by_host` gives one of its functions' results, compiled or not."""
+        chosen = _instance(engine)
+        for how, call in _both_ways(chosen, lambda x: chosen.by_host(lambda v: (v * 2,), lambda v: (v + v,), x)[0]):
+            with owning(chosen), no_error(f"by_host{how}"):
+                found = chosen.to_numpy(call(chosen.constant(_numbers(N))))
+            claim_close(found, 2 * _numbers(N), 0, f"the result of by_host{how}")
+
+    # ------------------------------------------------------------------------------------------- sums, loops
+
+    def test_segments_are_summed(self, engine: Any) -> None:
+        """(count, C), zero where there is none; and so are derivatives."""
+        chosen, values, segments = _instance(engine), _numbers(N, 3), np.array([1, 1, 3, 0, 1, 3])
+        expected = np.zeros((5, 3), np.float32)
+        np.add.at(expected, segments, values)
+        found = chosen.to_numpy(chosen.segment_sum(chosen.constant(values), segments, 5))
+        claim_close(found, expected, TOLERANCE, "segment_sum")
+        if chosen.differentiates:
+            weights = chosen.constant(_numbers(5, 3, seed=2))
+            f = lambda v: chosen.namespace.sum(chosen.segment_sum(v, segments, 5) * weights)  # noqa: E731
+            gradient = chosen.to_numpy(chosen.value_and_grad(f)(chosen.constant(values))[1])
+            claim_close(gradient, _numbers(5, 3, seed=2)[segments], TOLERANCE, "the gradient of segment_sum")
+
+    def test_loops_end_early(self, engine: Any) -> None:
+        """`repeat` stops as soon as nothing goes on, or after the most times, compiled or not."""
+        chosen = _instance(engine)
+        xp = chosen.namespace
+
+        def halved(most: int) -> Callable:
+            def f(x: Any) -> Any:
+                state = {"x": x, "count": x[:1] * 0}
+                body = lambda s: {"x": s["x"] / 2, "count": s["count"] + 1}  # noqa: E731
+                state = chosen.repeat(body, lambda s: xp.any(s["x"] > 1), state, most)
+                return xp.concat([state["x"], state["count"]])
+
+            return f
+
+        for most, expected in ((50, [1.0, 0.125, 3]), (2, [2.0, 0.25, 2])):
+            for how, call in _both_ways(chosen, halved(most)):
+                with owning(chosen), no_error(f"repeat{how}"):
+                    found = chosen.to_numpy(call(chosen.constant(np.array([8.0, 1.0], np.float32))))
+                claim_close(found, np.array(expected), 0, f"what repeat of at most {most} times{how} gives")
+
+    def test_unused_rows_are_filled(self, engine: Any) -> None:
+        """With the first row, where no cell of `row` names them; all that are named stay."""
+        chosen, x = _instance(engine), _numbers(N, 3)
+        row = np.array([[[0, 2, -1], [1, -1, -1]]], np.int32)
+        with owning(chosen):
+            if not chosen.padded(chosen.constant(row)):
+                pytest.skip("outside of transforms it allots no more rows than are used")
+            found = chosen.to_numpy(chosen.fill_unused(chosen.constant(x), chosen.constant(row)))
+        claim_close(found, np.concatenate([x[:3], x[[0, 0, 0]]]), 0, "fill_unused")
+
+    def test_compiled_functions_are_the_same(self, engine: Any) -> None:
+        """`jit` of a function of a record gives what the function gives; `block` gives back what it is given."""
+        chosen = _instance(engine)
+        xp = chosen.namespace
+
+        def f(samples: Samples) -> Any:
+            return xp.sum(samples.params, axis=1) + xp.astype(samples.ids[:, 0], samples.params.dtype)
+
+        samples = Samples(IDS, _numbers(N, 2), np.zeros((1, 1, 1), np.int32), _numbers(1, 1, 1), np.int32(0))
+        with owning(chosen), no_error("a compiled function of rts.Samples"):
+            given = map_leaves(chosen.constant, samples)
+            found = chosen.block(chosen.jit(f)(given))
+        claim_close(chosen.to_numpy(found), samples.params.sum(1) + IDS[:, 0], TOLERANCE, "a compiled function")
+
+    # -------------------------------------------------------------------------------------- derivatives
+
+    def test_without_derivatives_it_says_so(self, engine: Any) -> None:
+        """An engine that does not differentiate raises an `rts.EngineError`."""
+        chosen = _instance(engine)
+        if chosen.differentiates:
+            pytest.skip("it differentiates")
+        calls = {
+            "value_and_grad": lambda: chosen.value_and_grad(lambda x: x)(chosen.constant(1.0)),
+            "jvp": lambda: chosen.jvp(lambda x: x, chosen.constant(1.0), chosen.constant(1.0)),
+            "jacobian": lambda: chosen.jacobian(lambda x: x)(chosen.constant(np.ones(1))),
+            "optimizer": lambda: chosen.optimizer("adam", 0.1, chosen.constant(1.0)),
+        }
+        for name, call in calls.items():
+            try:
+                call()
+            except EngineError:
+                continue
+            except Exception as error:
+                raise AssertionError(f"{name} raises {type(error).__name__}; expected an rts.EngineError") from error
+            claim(False, f"{name} raises nothing, though the engine says that it does not differentiate")
+
+    def test_gradients_are_those_of_closed_forms(self, engine: Any) -> None:
+        """Of nested parameters; zero where a parameter is not used."""
+        chosen = _differentiating(engine)
+        xp = chosen.namespace
+        tree = {"a": _numbers(3), "b": [_numbers(2, seed=1), _numbers(4, seed=2)]}
+        with owning(chosen):
+            value, gradient = chosen.value_and_grad(lambda t: xp.sum(t["a"] ** 2) + 3 * xp.sum(t["b"][0]))(
+                map_leaves(chosen.constant, tree)
+            )
+            found = derivatives.host(chosen, gradient)
+        claim_close(chosen.to_numpy(value), (tree["a"] ** 2).sum() + 3 * tree["b"][0].sum(), TOLERANCE, "the value")
+        claim_close(found["a"], 2 * tree["a"], TOLERANCE, "the gradient of a square")
+        claim_close(found["b"][0], np.full(2, 3.0), TOLERANCE, "the gradient of a multiple")
+        claim_close(found["b"][1], np.zeros(4), 0, "the gradient in what is not used")
+
+    def test_forward_mode_can_be_differentiated(self, engine: Any) -> None:
+        """`jvp` of x³ along d, and the gradient of that in a factor that the function closes over."""
+        chosen = _differentiating(engine)
+        xp, x, d = chosen.namespace, _numbers(4), _numbers(4, seed=1)
+        at, along = chosen.constant(x), chosen.constant(d)
+        with owning(chosen), no_error("the gradient of a derivative in forward mode"):
+            value, slope = chosen.jvp(lambda v: v**3, at, along)
+            second = chosen.value_and_grad(lambda k: xp.sum(chosen.jvp(lambda v: k * v**3, at, along)[1]))(
+                chosen.constant(np.float32(2))
+            )[1]
+        claim_close(chosen.to_numpy(value), x**3, TOLERANCE, "the value")
+        claim_close(chosen.to_numpy(slope), 3 * x**2 * d, TOLERANCE, "the derivative of x³")
+        claim_close(chosen.to_numpy(second), (3 * x**2 * d).sum(), TOLERANCE, "the gradient of a derivative")
+
+    def test_jacobians_have_a_row_an_unknown(self, engine: Any) -> None:
+        """Of a function with two results."""
+        chosen = _differentiating(engine)
+        xp, x = chosen.namespace, _numbers(3)
+        with owning(chosen), no_error("jacobian"):
+            values, rows = chosen.jacobian(lambda v: (v**2, xp.sum(v)))(chosen.constant(x))
+            values, rows = derivatives.host(chosen, (values, rows))
+        claim_close(values[0], x**2, TOLERANCE, "the first value of a function")
+        claim_close(rows[0], np.diag(2 * x), TOLERANCE, "the Jacobian of squares")
+        claim_close(rows[1], np.ones(3), TOLERANCE, "the Jacobian of a sum")
+
+    def test_stop_gradient_stops_it(self, engine: Any) -> None:
+        """In both modes, and leaves the value."""
+        chosen = _differentiating(engine)
+        xp, x = chosen.namespace, chosen.constant(_numbers(4))
+        f = lambda v: xp.sum(chosen.stop_gradient(v) * v)  # noqa: E731
+        with owning(chosen):
+            value, gradient = chosen.value_and_grad(f)(x)
+            along = chosen.jvp(f, x, chosen.constant(np.ones(4)))[1]
+        claim_close(chosen.to_numpy(value), (_numbers(4) ** 2).sum(), TOLERANCE, "the value")
+        claim_close(chosen.to_numpy(gradient), _numbers(4), TOLERANCE, "the gradient of stop(x) x")
+        claim_close(chosen.to_numpy(along), _numbers(4).sum(), TOLERANCE, "its derivative in forward mode")
+
+    def test_checkpoints_have_the_same_gradient(self, engine: Any) -> None:
+        """`checkpoint(make, f)` is `f(make())`, for its gradient, too."""
+        chosen = _differentiating(engine)
+        xp, x = chosen.namespace, chosen.constant(_numbers(4))
+        constant = chosen.constant(_numbers(4, seed=1))
+        f = lambda v: chosen.checkpoint(lambda: constant, lambda c: xp.sum(c * v**2))  # noqa: E731
+        with owning(chosen), no_error("the gradient of a checkpoint"):
+            value, gradient = chosen.value_and_grad(f)(x)
+        expected = _numbers(4, seed=1)
+        claim_close(chosen.to_numpy(value), (expected * _numbers(4) ** 2).sum(), TOLERANCE, "the value")
+        claim_close(chosen.to_numpy(gradient), 2 * expected * _numbers(4), TOLERANCE, "the gradient of a checkpoint")
+
+    def test_optimizers_step(self, engine: Any) -> None:
+        """SGD by the rate times the gradient, Adam first by the rate; both leave what they are given alone."""
+        chosen = _differentiating(engine)
+        given = {"x": _numbers(3), "y": [_numbers(2, seed=1)]}
+        slopes = map_leaves(lambda v: np.sign(v) * 2, given)
+        with owning(chosen):
+            for name, expected in (("sgd", lambda v: v - 0.2 * np.sign(v)), ("adam", lambda v: v - 0.1 * np.sign(v))):
+                parameters = map_leaves(chosen.constant, given)
+                step = chosen.optimizer(name, 0.1, parameters)
+                found = derivatives.host(chosen, step(parameters, map_leaves(chosen.constant, slopes)))
+                for x, v in zip(leaves(found), leaves(given), strict=True):
+                    claim_close(x, expected(v), 1e-4, f"the first step of {name}")
+                for x, v in zip(leaves(derivatives.host(chosen, parameters)), leaves(given), strict=True):
+                    claim_close(x, v, 0, f"what {name} was given")
+
+    # --------------------------------------------------------------------------------------- operations
+
+    @pytest.mark.parametrize("name", OPERATIONS)
+    def test_operations_are_their_specification(self, engine: Any, name: str) -> None:
+        """The value of each, compiled or not; their derivatives in both modes; and the derivative of a gradient."""
+        chosen, (f, operands) = _instance(engine), OPERATIONS[name]
+        expected = np.asarray(f(*operands))
+        for how, call in _both_ways(chosen, lambda *x: f(*x)):
+            with owning(chosen), no_error(f"{name}{how}"):
+                found = chosen.to_numpy(call(*map(chosen.constant, operands)))
+            claim_close(found, expected, TOLERANCE, f"{name}{how}")
+        if not chosen.differentiates:
+            return
+        weights, along = _numbers(*expected.shape, seed=3), derivatives.directions(operands)
+        with owning(chosen), no_error(f"the derivatives of {name}"):
+            both = derivatives.derivatives(chosen, lambda x: f(*x), operands, along, weights)
+            curvature = _curvature(chosen, f, operands, along, weights)
+        derivatives.claim_consistent(both, along, weights, name)
+        wide = [x.astype(np.float64) for x in operands]
+        ends = [f(*(x + s * 1e-6 * d for x, d in zip(wide, along, strict=True))) for s in (1, -1)]
+        slope = float(np.sum((ends[0] - ends[1]) / 2e-6 * weights))
+        derivatives.claim_slope(both.along * weights, np.ones_like(weights), slope, f"the derivative of {name}")
+        middle = f(*wide)
+        second = [f(*(x + s * 1e-3 * d for x, d in zip(wide, along, strict=True))) for s in (1, -1)]
+        expected = float(np.sum((second[0] - 2 * middle + second[1]) / 1e-6 * weights))
+        scale = max(abs(expected), 0.1)
+        claim(
+            abs(curvature - expected) <= 1e-2 * scale,
+            f"the second derivative of {name} is {curvature:.4g}, but {expected:.4g} by differences",
+        )
+
+    # ----------------------------------------------------------------------------------------- a render
+
+    def test_a_render_is_numpys(self, engine: Any) -> None:
+        """The image of a shaded ball; and forward and reverse mode are one derivative."""
+        chosen = _instance(engine)
+        part = scenes.ball(transform=np.asarray(rigid([0.2, 0.3, 0.1, 0.05, 0.1, 0.0]), np.float32))
+        expected = scenes.render(part, scenes.CAMERA, scenes.SIZE, sampler="reference")
+        values, join = derivatives.split(part.theta)
+
+        def image(x: list) -> Any:
+            moved = part.replace(theta=join(x))
+            return scenes.render(moved, scenes.CAMERA, scenes.SIZE, sampler="reference", capacity=scenes.CAPACITY)
+
+        with owning(chosen), no_error(f"a render in {chosen.name}"):
+            found = chosen.to_numpy(image([chosen.constant(v) for v in values]))
+            claim_close(found, expected, 1e-4, "the image of a ball")
+            if chosen.differentiates:
+                weights, along = _numbers(*expected.shape, seed=5), derivatives.directions(values)
+                both = derivatives.derivatives(chosen, image, values, along, weights)
+                derivatives.claim_consistent(both, along, weights, "the image of a ball")
+                claim(any(np.abs(g).max() > 1e-3 for g in both.gradient), "the image has no gradient in theta")
+
+
+def _curvature(engine: Engine, f: Callable, operands: list, along: list, weights: np.ndarray) -> float:
+    """The derivative of ⟨∇, d⟩ along d, ∇ the gradient of ⟨weights, f⟩."""
+    xp, w = engine.namespace, engine.constant(weights)
+    d = [engine.constant(x.astype(np.float32)) for x in along]
+
+    def slope(t: Any) -> Any:
+        moved = [engine.constant(x) + t * v for x, v in zip(operands, d, strict=True)]
+        return engine.jvp(
+            lambda s: xp.sum(f(*(m + s * v for m, v in zip(moved, d, strict=True))) * w), 0 * t, 0 * t + 1
+        )[1]
+
+    return float(engine.to_numpy(engine.value_and_grad(slope)(engine.constant(np.float32(0)))[1]))
+
+
+@contextlib.contextmanager
+def owning(engine: Engine) -> Iterator[None]:
+    """Have the core take this object for the engine of its arrays, as long as it lasts."""
+    kinds = {type(engine.constant(np.ones(1)))} - {np.ndarray}
+    before = {kind: arrays.OWNERS.get(kind) for kind in kinds}
+    arrays.OWNERS.update(dict.fromkeys(kinds, engine))
+    try:
+        yield
+    finally:
+        for kind, owner in before.items():
+            if owner is None:
+                del arrays.OWNERS[kind]
+            else:
+                arrays.OWNERS[kind] = owner
+
+
+def _both_ways(engine: Engine, f: Callable) -> list[tuple[str, Callable]]:
+    return [("", f), (", compiled,", engine.jit(f))]
+
+
+def _instance(engine: Any) -> Engine:
+    return derivatives.engine_named(engine) if isinstance(engine, str) else engine
+
+
+def _differentiating(engine: Any) -> Engine:
+    chosen = _instance(engine)
+    if not chosen.differentiates:
+        pytest.skip("the engine says that it does not differentiate")
+    return chosen
+
+
+def _ids(like: Any) -> Any:
+    return engine_of(like).constant(IDS)
+
+
+def _index(like: Any) -> Any:
+    return engine_of(like).constant(IDS[:, 0])
+
+
+def _eye(xp: Any, like: Any) -> Any:
+    return engine_of(like).constant(np.eye(4), like)

@@ -16,9 +16,9 @@ from rts.gbuffer import GBuffer
 from rts.interfaces import Part, TriangleSurface
 from rts.pairs import APRON
 from rts.records import Sampled
-from rts.testing import engines, scenes
+from rts.testing import derivatives, scenes
 from rts.testing.conformance import Conformance, claim, no_error, refusal
-from rts.testing.engines import DIFFERENTIABLE, ENGINES, engine_named, joined, split
+from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, engine_named, joined, split
 from rts.testing.samples import claim_empty_where_empty, claim_ordered, claim_reprojected
 from rts.testing.unusual import claim_awkward_views_are_finite, claim_unseen_is_nothing
 
@@ -201,10 +201,10 @@ class SamplerConformance(Conformance):
                 theta = joined(chosen, join, x)
                 return scenes.find(part.replace(theta=theta), sampler=sampler, capacity=scenes.CAPACITY)
 
-            at = engines.on(chosen, values)
+            at = derivatives.on(chosen, values)
             for how, f in (("", sampled), (", compiled", chosen.jit(sampled))):
                 with no_error(f"sampling in {engine}{how}"):
-                    found = engines.host(chosen, f(at))
+                    found = derivatives.host(chosen, f(at))
                 claim(found.row.shape == expected.row.shape, f"in {engine}{how}, row has shape {found.row.shape}")
                 same = (found.row >= 0) == (expected.row >= 0)
                 same &= np.abs(found.depth - expected.depth) <= 1e-4 * expected.depth
@@ -218,7 +218,7 @@ class SamplerConformance(Conformance):
         def image(x: list) -> Any:
             return scenes.shown(part.replace(theta=join(x)), sampler=sampler)
 
-        engines.claim_engines_agree(image, values, image([engines.single(v) for v in values]), "the image")
+        derivatives.claim_engines_agree(image, values, image([derivatives.single(v) for v in values]), "the image")
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_samples_carry_no_derivative(self, sampler: Any, parts: list[Part], engine: str) -> None:
@@ -231,7 +231,7 @@ class SamplerConformance(Conformance):
             samples = scenes.find(part, sampler=sampler, capacity=scenes.CAPACITY).samples[0]
             return xp.sum(samples.params) + xp.sum(samples.depth)
 
-        gradient = engines.host(chosen, chosen.value_and_grad(total)(engines.on(chosen, values))[1])
+        gradient = derivatives.host(chosen, chosen.value_and_grad(total)(derivatives.on(chosen, values))[1])
         claim(all((g == 0).all() for g in gradient), f"in {engine}, samples have a gradient in θ; stop it")
 
     # ------------------------------------------------------------------------------------ unusual scenes

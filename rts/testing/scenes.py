@@ -14,7 +14,7 @@ from rts.pairs import APRON, CAPACITY, LAYERS, SIZE
 from rts.records import Array, Sampled
 from rts.rendering import render, render_samples, sample
 from rts.testing.conformance import claim
-from rts.testing.engines import single
+from rts.testing.derivatives import single
 
 GRID = SIZE[0] + 2 * APRON, SIZE[1] + 2 * APRON
 

@@ -12,9 +12,9 @@ from rts.arrays import constants, engine_of, map_leaves
 from rts.gbuffer import GBuffer
 from rts.interfaces import Engine, Shader, adapted
 from rts.records import Tree
-from rts.testing import engines, scenes
+from rts.testing import derivatives, scenes
 from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
-from rts.testing.engines import DIFFERENTIABLE, engine_named, names, split
+from rts.testing.derivatives import DIFFERENTIABLE, engine_named, names, split
 
 ROWS = 64
 STEP = 1e-6
@@ -90,8 +90,8 @@ class ShaderConformance(Conformance):
         def f(x: list) -> Any:
             return _call(shader, join(x), None)
 
-        expected = f([engines.single(v) for v in values])
-        engines.claim_engines_agree(f, values, expected, "the colour")
+        expected = f([derivatives.single(v) for v in values])
+        derivatives.claim_engines_agree(f, values, expected, "the colour")
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_gradients_are_finite_differences(self, shader: Any, theta: Tree, gbuffer: dict, engine: str) -> None:
@@ -106,19 +106,19 @@ class ShaderConformance(Conformance):
         def value(x: list) -> float:
             return float(np.sum(_call(shader, {"theta": join(x), "gbuffer": wide}, None) * weights))
 
-        on_device = engines.on(chosen, (gbuffer, weights))
+        on_device = derivatives.on(chosen, (gbuffer, weights))
 
         def product(x: list) -> Any:
             rgba = _call(shader, {"theta": join(x), "gbuffer": on_device[0]}, chosen)
             return chosen.namespace.sum(rgba * on_device[1])
 
-        gradient = engines.host(chosen, chosen.value_and_grad(product)(engines.on(chosen, values))[1])
-        for i, along in enumerate(engines.directions(values)):
+        gradient = derivatives.host(chosen, chosen.value_and_grad(product)(derivatives.on(chosen, values))[1])
+        for i, along in enumerate(derivatives.directions(values)):
             ends = []
             for step in (STEP, -STEP):
                 ends.append(value([v + step * along if i == j else v for j, v in enumerate(values)]))
             what = f"the derivative of the colour in {names(theta)[i]}, in {engine},"
-            engines.claim_slope(gradient[i], along, (ends[0] - ends[1]) / (2 * STEP), what)
+            derivatives.claim_slope(gradient[i], along, (ends[0] - ends[1]) / (2 * STEP), what)
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_awkward_samples_have_finite_gradients(self, shader: Any, theta: Tree, gbuffer: dict, engine: str) -> None:
@@ -129,7 +129,7 @@ class ShaderConformance(Conformance):
         def f(x: list) -> Any:
             return _call(shader, join(x), chosen)
 
-        found = engines.derivatives(chosen, f, values, engines.directions(values), np.ones((ROWS, 4)))
+        found = derivatives.derivatives(chosen, f, values, derivatives.directions(values), np.ones((ROWS, 4)))
         claim_finite(found, f"in {engine}, the colour of awkward samples or its derivative")
 
     # ------------------------------------------------------------------------------------------- errors
@@ -189,5 +189,5 @@ def _call(shader: Any, inputs: dict, engine: Engine | None) -> Any:
 
 
 def _shaded(shader: Any, theta: Tree, gbuffer: dict) -> np.ndarray:
-    single = map_leaves(engines.single, theta)
+    single = map_leaves(derivatives.single, theta)
     return np.asarray(_call(shader, {"theta": single, "gbuffer": gbuffer}, None))

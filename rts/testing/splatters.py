@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from rts.checks import check_splatter
-from rts.interfaces import Splatter
+from rts.interfaces import Splatter, unwrapped
 from rts.records import Splats
-from rts.testing import engines
+from rts.testing import derivatives
 from rts.testing.conformance import Conformance, claim, claim_close, no_error, refusal
-from rts.testing.engines import DIFFERENTIABLE, ENGINES, engine_named
+from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, engine_named
 
 HEIGHT, WIDTH, LAYERS = 8, 9, 2
 CELLS = HEIGHT * WIDTH * LAYERS
@@ -144,14 +144,14 @@ class SplatterConformance(Conformance):
         chosen = engine_named(engine)
         for splats in (everywhere(LAYERS), scattered()):
             with no_error(f"splatting in {engine}"):
-                image = chosen.to_numpy(_instance(splatter).cropped(engines.on(chosen, splats)))
+                image = chosen.to_numpy(_instance(splatter).cropped(derivatives.on(chosen, splats)))
             claim_close(image, _splat(splatter, splats), TOLERANCE, f"the image in {engine}")
 
     def test_engines_agree(self, splatter: Any) -> None:
         """On the image, its gradient, and its derivative along a direction; both modes are one derivative."""
         splats = scattered()
         f, given = _of_positions_and_colors(splatter, splats.row), [splats.positions, splats.rgba]
-        engines.claim_engines_agree(f, given, np.asarray(f(given)), "the image")
+        derivatives.claim_engines_agree(f, given, np.asarray(f(given)), "the image")
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_rows_of_no_cell_have_no_gradient(self, splatter: Any, engine: str) -> None:
@@ -160,10 +160,10 @@ class SplatterConformance(Conformance):
         for row in (splats.row, np.full_like(splats.row, -1)):
             f = _of_positions_and_colors(splatter, row)
             weights = np.random.default_rng(0).standard_normal((HEIGHT, WIDTH, 4))
-            at, w = engines.on(chosen, ([splats.positions, splats.rgba], weights))
+            at, w = derivatives.on(chosen, ([splats.positions, splats.rgba], weights))
             _, gradient = chosen.value_and_grad(lambda x, f=f, w=w: chosen.namespace.sum(f(x) * w))(at)
             unused = np.setdiff1d(np.arange(CELLS), row)
-            for what, g in zip(("positions", "colours"), engines.host(chosen, gradient), strict=True):
+            for what, g in zip(("positions", "colours"), derivatives.host(chosen, gradient), strict=True):
                 claim((g[unused] == 0).all(), f"in {engine}, the gradient of the {what} of padded rows is not zero")
 
     # ------------------------------------------------------------------------------------------- errors
@@ -242,7 +242,7 @@ def _splat(splatter: Any, splats: Splats) -> np.ndarray:
 
 def _direct(splatter: Any, splats: Splats) -> Any:
     """By a call of the plugin's own `splat` with arrays."""
-    return _instance(splatter).given.splat(splats.positions, splats.rgba, splats.row)
+    return unwrapped(_instance(splatter)).splat(splats.positions, splats.rgba, splats.row)
 
 
 def _of_positions_and_colors(splatter: Any, row: np.ndarray) -> Callable[[list], Any]:
@@ -251,6 +251,6 @@ def _of_positions_and_colors(splatter: Any, row: np.ndarray) -> Callable[[list],
 
 def _along(engine: Any, splatter: Any, splats: Splats, along: np.ndarray) -> np.ndarray:
     """The image's derivative when positions move along a direction."""
-    rgba, row = engines.on(engine, (splats.rgba, splats.row))
-    at, d = engines.on(engine, ([splats.positions], [along]))
+    rgba, row = derivatives.on(engine, (splats.rgba, splats.row))
+    at, d = derivatives.on(engine, ([splats.positions], [along]))
     return engine.to_numpy(engine.jvp(lambda x: _instance(splatter).cropped(Splats(x[0], rgba, row)), at, d)[1])

@@ -10,12 +10,13 @@ import pytest
 from rts.arrays import engine_of, map_leaves
 from rts.camera import Camera
 from rts.gbuffer import GBuffer
-from rts.interfaces import Part, TriangleSurface
+from rts.interfaces import Part, RaySurface, TriangleSurface
 from rts.records import Proxy, Samples, Tree
-from rts.testing import engines, scenes
+from rts.testing import derivatives, scenes
 from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
-from rts.testing.engines import DIFFERENTIABLE, claim_slope, engine_named, installed, joined, split
-from rts.testing.samples import claim_empty_where_empty, claim_ordered, claim_reprojected
+from rts.testing.derivatives import DIFFERENTIABLE, claim_slope, engine_named, installed, joined, split
+from rts.testing.refining import claim_found_again, claim_refined
+from rts.testing.samples import claim_ordered, claim_reprojected
 from rts.testing.unusual import claim_awkward_views_are_finite, claim_unseen_is_nothing
 
 STEP = 1e-5
@@ -50,10 +51,21 @@ class SurfaceConformance(Conformance):
         for view, camera in scenes.VIEWS.items():
             claim_ordered(scenes.find(part, camera, sampler), view)
 
-    def test_background_is_empty(self, part: Part, sampler: Any) -> None:
-        """Row −1 and depth 0 where nothing is seen, and no row twice."""
+    def test_refine_keeps_samples_on_their_rays(self, part: Part) -> None:
+        """What `refine` does to each sample: a point of the surface on its ray, at its depth, or a row of −1."""
+        surface = scenes.checked(part).surface
+        if not (isinstance(surface, TriangleSurface) and surface.refines):
+            pytest.skip("the surface has no refine")
         for view, camera in scenes.VIEWS.items():
-            claim_empty_where_empty(scenes.find(part, camera, sampler), view)
+            claim_refined(part, surface, camera, view)
+
+    def test_rays_from_before_a_hit_find_it(self, part: Part) -> None:
+        """`intersect` from just short of each hit gives that hit: a tracer that steps through the surface fails."""
+        surface = scenes.checked(part).surface
+        if not isinstance(surface, RaySurface):
+            pytest.skip("the surface does not intersect rays itself")
+        for view, camera in scenes.VIEWS.items():
+            claim_found_again(part, surface, camera, view)
 
     def test_two_renders_are_the_same(self, part: Part, sampler: Any) -> None:
         """To the last bit, whatever was rendered between, and when arrays change in place."""
@@ -75,7 +87,7 @@ class SurfaceConformance(Conformance):
 
     def test_the_g_buffer_has_a_row_for_each_sample(self, part: Part, sampler: Any) -> None:
         """(N, C) of finite numbers in θ's dtype, also where a sample is only padding: all zeros."""
-        samples = map_leaves(engines.single, scenes.find(part, sampler=sampler).samples[0])
+        samples = map_leaves(derivatives.single, scenes.find(part, sampler=sampler).samples[0])
         widths, declared = (samples.ids.shape[1], samples.params.shape[1]), tuple(part.surface.sample_widths)
         claim(widths == declared, f"samples have ids and params of widths {widths}; sample_widths says {declared}")
         for kind, some in (("found", samples), ("padding", map_leaves(np.zeros_like, samples))):
@@ -116,10 +128,10 @@ class SurfaceConformance(Conformance):
         """It looks at no value of θ, and uses nothing but the namespace of θ."""
         chosen, (values, join) = engine_named(engine), split(part.theta)
         sampled = scenes.frozen(part, sampler=sampler).samples[0]
-        samples = engines.on(chosen, sampled)
+        samples = derivatives.on(chosen, sampled)
         with no_error(f"evaluate compiled by {engine}"):
             evaluate = chosen.jit(lambda x: part.surface.evaluate(joined(chosen, join, x), samples)["position"])
-            found = chosen.to_numpy(evaluate(engines.on(chosen, values)))
+            found = chosen.to_numpy(evaluate(derivatives.on(chosen, values)))
         expected = _evaluated(part, _single(part.theta), sampled)["position"]
         claim_close(found, expected, 1e-5, f"position compiled by {engine}")
 
@@ -131,23 +143,23 @@ class SurfaceConformance(Conformance):
         chosen, (values, join) = engine_named(engine), split(part.theta)
         values = [v.astype(np.float64) for v in values]
         sampled = scenes.frozen(part, sampler=sampler).samples[0]
-        samples, at = engines.on(chosen, sampled), engines.on(chosen, values)
+        samples, at = derivatives.on(chosen, sampled), derivatives.on(chosen, values)
         rng = np.random.default_rng(0)
         for name, value in _evaluated(part, part.theta, sampled).items():
             weights = rng.standard_normal(value.shape) / np.sqrt(value.size)
-            on_device = chosen.constant(engines.single(weights))
+            on_device = chosen.constant(derivatives.single(weights))
 
             def product(x: list, name: str = name, weights: Any = on_device) -> Any:
                 entry = part.surface.evaluate(joined(chosen, join, x), samples)[name]
                 return engine_of(entry).namespace.sum(entry * weights)
 
-            gradient = engines.host(chosen, chosen.value_and_grad(product)(at)[1])
-            for i, along in enumerate(engines.directions(values)):
+            gradient = derivatives.host(chosen, chosen.value_and_grad(product)(at)[1])
+            for i, along in enumerate(derivatives.directions(values)):
                 ends = []
                 for step in (STEP, -STEP):
                     moved = [v + step * along if i == j else v for j, v in enumerate(values)]
                     ends.append(np.sum(_evaluated(part, join(moved), sampled)[name] * weights))
-                what = f"the derivative of {name!r} in {engines.names(part.theta)[i]}, in {engine},"
+                what = f"the derivative of {name!r} in {derivatives.names(part.theta)[i]}, in {engine},"
                 claim_slope(gradient[i], along, (ends[0] - ends[1]) / (2 * STEP), what)
 
     def test_engines_agree(self, part: Part, sampler: Any) -> None:
@@ -158,7 +170,7 @@ class SurfaceConformance(Conformance):
         def image(x: list) -> Any:
             return scenes.shown_at(sampled, part.replace(theta=join(x)))
 
-        engines.claim_engines_agree(image, values, image([engines.single(v) for v in values]), "the image")
+        derivatives.claim_engines_agree(image, values, image([derivatives.single(v) for v in values]), "the image")
 
     def test_the_image_depends_on_the_surface(self, part: Part, sampler: Any) -> None:
         """Its gradient is not zero at the outline, in at least one entry of θ."""
@@ -169,9 +181,9 @@ class SurfaceConformance(Conformance):
 
             def product(x: list, engine: Any = engine) -> Any:
                 image = scenes.shown_at(sampled, part.replace(theta=join(x), shader="silhouette"))
-                return engine.namespace.sum(image * engine.constant(engines.single(weights)))
+                return engine.namespace.sum(image * engine.constant(derivatives.single(weights)))
 
-            gradient = engines.host(engine, engine.value_and_grad(product)(engines.on(engine, values))[1])
+            gradient = derivatives.host(engine, engine.value_and_grad(product)(derivatives.on(engine, values))[1])
             largest = max(np.abs(g).max(initial=0) for g in gradient)
             claim(largest > 1e-6, f"in {engine.name} the silhouette has no gradient in θ; is something detached?")
 
@@ -204,7 +216,7 @@ class SurfaceConformance(Conformance):
 
 
 def _single(theta: Tree) -> Tree:
-    return map_leaves(engines.single, theta)
+    return map_leaves(derivatives.single, theta)
 
 
 def _evaluated(part: Part, theta: Tree, samples: Samples) -> dict[str, np.ndarray]:

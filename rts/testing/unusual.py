@@ -8,22 +8,22 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.interfaces import Engine, Part
-from rts.testing import engines, scenes
+from rts.testing import derivatives, scenes
 from rts.testing.conformance import claim, claim_finite, no_error
-from rts.testing.engines import joined, split
+from rts.testing.derivatives import joined, split
 
 
 def image_and_gradient(part: Part, camera: Camera, sampler: Any, engine: Engine) -> tuple[np.ndarray, list]:
     """A picture, and the gradient of its weighted sum in θ."""
     values, join = split(part.theta)
-    weights = engine.constant(engines.single(np.random.default_rng(0).random((*scenes.SIZE, 4))))
+    weights = engine.constant(derivatives.single(np.random.default_rng(0).random((*scenes.SIZE, 4))))
 
     def shown(x: list) -> Any:
         return scenes.shown(part.replace(theta=joined(engine, join, x)), camera, sampler)
 
-    at = engines.on(engine, values)
+    at = derivatives.on(engine, values)
     _, gradient = engine.value_and_grad(lambda x: engine.namespace.sum(shown(x) * weights))(at)
-    return engine.to_numpy(shown(at)), engines.host(engine, gradient)
+    return engine.to_numpy(shown(at)), derivatives.host(engine, gradient)
 
 
 def claim_unseen_is_nothing(part: Part, sampler: Any, engine: Engine) -> None:

@@ -9,7 +9,8 @@ class Toy(rts.TriangleSampler):
     """Slow, and short."""
 
     def rasterize(self, prepared, camera, size, layers, cull):
-        origins, directions = camera.rays(size)
+        rays = camera.rays(size)
+        origins, directions = rays.origins, rays.directions
         clip = camera.projection @ camera.view
         depths = np.full((layers, *size), np.inf)
         ids = np.full((layers, *size), -1, np.int32)

@@ -1,0 +1,58 @@
+"""The gradient of a function of points, such as the normal of an implicit surface."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from rts.arrays import engine_of
+from rts.errors import InputError
+from rts.records import Array
+
+STEP = 6e-6
+"""Of central differences in float64, as a share of the largest coordinate: the cube root of its precision."""
+
+
+def gradient(f: Callable[[Array], Array], points: Array) -> Array:
+    """The gradient (N, 3) of a function of points, each value of which depends on its own point alone.
+
+    By three derivatives in forward mode, differentiable in turn in the points and in what `f` closes over; NumPy has no
+    derivatives, and takes central differences in float64.
+
+    Args:
+        f: points (N, 3) → (N,), in array code.
+        points: (N, 3) float.
+
+    Raises:
+        InputError: `f` gives another shape.
+    """
+    engine = engine_of(points)
+    if not engine.differentiates:
+        return _differences(f, points)
+    xp, zero = engine.namespace, engine.namespace.zeros_like(points)
+    columns = []
+    for i in range(points.shape[1]):
+        along = xp.concat([zero[:, :i], xp.ones_like(points[:, :1]), zero[:, i + 1 :]], axis=1)
+        value, slope = engine.jvp(f, points, along)
+        _check(value, points)
+        columns.append(slope)
+    return xp.stack(columns, axis=-1)
+
+
+def _differences(f: Callable[[Array], Array], points: np.ndarray) -> np.ndarray:
+    wide = np.asarray(points, np.float64)
+    step = STEP * max(1.0, float(np.abs(wide).max(initial=0.0)))
+    columns = []
+    for move in step * np.eye(points.shape[1]):
+        above, below = np.asarray(f(wide + move), np.float64), np.asarray(f(wide - move), np.float64)
+        _check(above, points)
+        columns.append((above - below) / (2 * step))
+    return np.stack(columns, axis=-1).astype(points.dtype)
+
+
+def _check(value: Array, points: Array) -> None:
+    if tuple(value.shape) != (points.shape[0],):
+        raise InputError(
+            f"f gave shape {tuple(value.shape)} for {points.shape[0]} points; expected ({points.shape[0]},)"
+        )

@@ -1,0 +1,160 @@
+"""Derivatives by every engine that is installed, on the host."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from rts import arrays, registry
+from rts.arrays import constants, map_leaves
+from rts.errors import PluginError
+from rts.interfaces import Engine
+from rts.records import Tree
+from rts.testing.conformance import claim, claim_close, claim_finite, no_error
+
+ENGINES = registry.plugins("rts.engines")
+DIFFERENTIABLE = [name for name in ENGINES if name != "numpy"]
+
+
+def engine_named(name: str) -> Engine:
+    """The engine, or a skip with the reason where it is not installed."""
+    try:
+        engine = arrays.engine_named(name)
+        importlib.import_module(name)
+    except (PluginError, ImportError) as error:
+        pytest.skip(str(error))
+    return engine
+
+
+def installed() -> list[Engine]:
+    """The engines with derivatives; skips where there is none."""
+    engines = []
+    for name in DIFFERENTIABLE:
+        try:
+            engines.append(arrays.engine_named(name))
+        except PluginError:
+            continue
+    if not engines:
+        pytest.skip(f"none of {', '.join(DIFFERENTIABLE)} is installed")
+    return engines
+
+
+def single(x: Any) -> Any:
+    """Floats as float32, everything else as it is."""
+    x = np.asarray(x)
+    return x.astype(np.float32) if np.issubdtype(x.dtype, np.floating) else x
+
+
+def on(engine: Engine, tree: Tree) -> Tree:
+    """A tree of NumPy arrays as arrays of the engine, floats in float32."""
+    return map_leaves(lambda x: engine.constant(single(x)), tree)
+
+
+def host(engine: Engine, tree: Tree) -> Tree:
+    """A tree of the engine's arrays as NumPy arrays."""
+    return map_leaves(lambda x: x if isinstance(x, np.ndarray) else engine.to_numpy(x), tree)
+
+
+def split(tree: Tree) -> tuple[list[np.ndarray], Callable[[Sequence[Any]], Tree]]:
+    """The floating leaves of a tree of NumPy arrays, and the tree with others in their place."""
+    found: list[np.ndarray] = []
+
+    def collect(x: Any) -> Any:
+        x = np.asarray(x)
+        if np.issubdtype(x.dtype, np.floating):
+            found.append(x)
+        return x
+
+    tree = map_leaves(collect, tree)
+
+    def join(values: Sequence[Any]) -> Tree:
+        it = iter(values)
+        return map_leaves(lambda x: next(it) if np.issubdtype(x.dtype, np.floating) else x, tree)
+
+    return found, join
+
+
+def names(tree: Tree) -> list[str]:
+    """Where the leaves that `split` finds are."""
+    return [f"theta[{key!r}]" for key in sorted(tree) for _ in split(tree[key])[0]]
+
+
+def joined(engine: Engine, join: Callable, values: Sequence[Any]) -> Tree:
+    """The tree of `split` with these values, everything else as constants of the engine."""
+    return constants(join(values), engine, None)
+
+
+def directions(values: Sequence[np.ndarray], seed: int = 1) -> list[np.ndarray]:
+    """A random direction in the space of some arrays."""
+    rng = np.random.default_rng(seed)
+    return [rng.standard_normal(v.shape) for v in values]
+
+
+def claim_slope(gradient: np.ndarray, along: np.ndarray, slope: float, what: str) -> None:
+    """Fail unless a float32 gradient explains a difference, which was found along a direction in float64."""
+    found = float(np.sum(gradient * along))
+    scale = max(abs(slope), np.linalg.norm(gradient) * np.linalg.norm(along) / np.sqrt(along.size), 1e-4)
+    claim(
+        abs(found - slope) <= 2e-3 * scale,
+        f"{what} is {found:.6g}, but {slope:.6g} by finite differences; is something detached, or taken elsewhere?",
+    )
+
+
+class Derivatives(NamedTuple):
+    """A function's value, the gradient of its product with given weights, and its derivative along a direction."""
+
+    value: np.ndarray
+    gradient: list[np.ndarray]
+    along: np.ndarray
+
+
+def derivatives(engine: Engine, f: Callable, at: list, along: list, weights: np.ndarray) -> Derivatives:
+    """Both modes of differentiation of a function of a list of arrays, in float32, on the host."""
+    at, along, weights = on(engine, at), on(engine, along), on(engine, weights)
+    xp = engine.namespace
+    _, gradient = engine.value_and_grad(lambda x: xp.sum(f(x) * weights))(at)
+    value, slope = engine.jvp(f, at, along)
+    return Derivatives(*host(engine, (value, gradient, slope)))
+
+
+def claim_consistent(found: Derivatives, along: list, weights: np.ndarray, what: str) -> None:
+    """Fail unless forward and reverse mode agree: ⟨w, J d⟩ = ⟨Jᵀ w, d⟩."""
+    claim_finite(found, f"{what} or its derivative")
+    forward = float(np.sum(weights * found.along))
+    reverse = float(sum(np.sum(g * d) for g, d in zip(found.gradient, along, strict=True)))
+    scale = max(np.linalg.norm(found.along) * np.linalg.norm(weights), 1e-6)
+    claim(
+        abs(forward - reverse) <= 1e-4 * scale,
+        f"forward mode gives {forward:.6g} for the derivative of {what}, reverse mode {reverse:.6g}",
+    )
+
+
+def claim_engines_agree(f: Callable, at: list, value: np.ndarray, what: str) -> None:
+    """Fail unless every installed engine gives this value and the same derivatives, in both modes.
+
+    Args:
+        f: from a list of arrays to an array, in any engine.
+        at: NumPy arrays.
+        value: of `f`, by NumPy.
+        what: is computed.
+    """
+    weights = np.random.default_rng(0).standard_normal(value.shape)
+    along, first = directions(at), None
+    for engine in installed():
+        with no_error(f"{what} in {engine.name}"):
+            found = derivatives(engine, f, at, along, weights)
+        claim_close(found.value, value, 1e-5, f"{what} in {engine.name}, against NumPy,")
+        claim_consistent(found, along, weights, f"{what} in {engine.name}")
+        first = first or found
+        pairs = zip([found.along, *found.gradient], [first.along, *first.gradient], strict=True)
+        for here, there in pairs:
+            scale = 1e-4 * max(np.linalg.norm(there), 1e-3)
+            claim(
+                np.linalg.norm(here - there) <= scale,
+                f"the derivative of {what} in {engine.name} differs from the other engine's by "
+                f"{np.linalg.norm(here - there):.3g}, its norm is {np.linalg.norm(there):.3g}",
+            )

@@ -1,0 +1,81 @@
+"""Claims about surfaces that find their points themselves: by `refine`, or by intersecting rays."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts import registry
+from rts.arrays import map_leaves
+from rts.camera import Camera
+from rts.errors import InputError
+from rts.interfaces import Part, RaySurface, TriangleSurface
+from rts.sampling import lift
+from rts.settling import refined
+from rts.testing import derivatives
+from rts.testing.conformance import claim, claim_finite
+from rts.testing.samples import FEW, REPROJECTION, RESIDUAL
+from rts.testing.scenes import GRID, LAYERS
+
+SHORT = 2e-3
+"""How far before a hit the second ray begins, in units of depth."""
+
+MISSED = 0.01
+"""The share of hits that may be missed by the second ray, where rays touch the surface."""
+
+
+def claim_refined(part: Part, surface: TriangleSurface, camera: Camera, view: str) -> None:
+    """Fail unless `refine` leaves each sample on its ray, at its depth, or drops it."""
+    sampler = registry.instance("rts.samplers", "reference")
+    local = Camera(*(np.asarray(m, np.float64) for m in camera.within(part.transform)))
+    inputs = map_leaves(np.asarray, surface.proxy_inputs(map_leaves(derivatives.single, part.theta)))
+    proxy = surface.proxy(inputs, local, GRID)
+    fragments = sampler.rasterize(proxy, local, GRID, LAYERS, part.cull)
+    lifted = lift(fragments, proxy)
+    try:
+        found, rays = refined(surface, inputs, lifted, local, GRID, surface.table_specs(len(lifted.ids), None))
+    except InputError as error:
+        raise AssertionError(f"{view}: {error}") from error
+    cells = found.row >= 0
+    row, depth = found.row[cells], found.depth[cells].astype(np.float64)
+    if not len(row):
+        return
+    position = np.asarray(surface.evaluate(part.theta, found)["position"], np.float64)[row]
+    claim_finite(position, f"{view}: the surface where refine has put samples")
+    point = rays.origins[row] + depth[:, None] * rays.directions[row]
+    width = rays.spread[0] + rays.spread[1] * depth
+    off = np.linalg.norm(position - point, axis=1) / width
+    allowed = FEW if surface.centered else 1.0
+    claim(
+        off.max() <= RESIDUAL and np.mean(off > REPROJECTION) <= allowed,
+        f"{view}: refine leaves samples up to {off.max():.3g} px, {np.median(off):.3g} px in the middle, from the "
+        f"point of their ray at their depth; move params and depth together, or set rows to −1 where a ray misses",
+    )
+
+
+def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str) -> None:
+    """Fail unless rays that begin just short of hits hit there again."""
+    theta = map_leaves(derivatives.single, part.theta)
+    local = camera.within(part.transform)
+    rays = local.rays(GRID)
+    near = float(local.depth_range()[0])
+    directions = rays.directions.reshape(-1, 3).astype(np.float32)
+    origins = (rays.origins.reshape(-1, 3) + near * directions).astype(np.float32)
+    hits = surface.intersect(theta, origins, directions, LAYERS)
+    hit, distance = np.asarray(hits.hit), np.asarray(hits.distance)
+    missed, total, worst = 0, 0, 0.0
+    for k in range(len(hit)):
+        # Not where another hit lies between.
+        apart = distance[k] - (distance[k - 1] if k else 0) > 2 * SHORT
+        chosen = np.flatnonzero(hit[k] & apart)
+        if not len(chosen):
+            continue
+        start = origins[chosen] + (distance[k, chosen] - SHORT)[:, None] * directions[chosen]
+        again = surface.intersect(theta, start.astype(np.float32), directions[chosen], 1)
+        off = np.abs(np.where(np.asarray(again.hit)[0], np.asarray(again.distance)[0] - SHORT, np.inf))
+        missed, total = missed + int((off > SHORT / 2).sum()), total + len(chosen)
+        worst = max(worst, float(off.max()))
+    claim(
+        missed <= MISSED * total,
+        f"{view}: from {SHORT:g} before them, intersect misses {missed} of {total} hits; does it step through the "
+        f"surface, or leave out what is near the origin of a ray?",
+    )
