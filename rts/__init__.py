@@ -4,7 +4,7 @@ Find where camera rays meet a surface with any ordinary renderer; evaluate the s
 differentiate only that.
 """
 
-from rts.arrays import namespace
+from rts.arrays import engine_of, namespace
 from rts.camera import Camera
 from rts.choosing import explain
 from rts.errors import EngineError, InputError, LayersWarning, PluginError, RtsError
@@ -25,6 +25,7 @@ from rts.interfaces import (
     TriangleSurface,
 )
 from rts.operations.combine import combine
+from rts.operations.gradient import gradient
 from rts.operations.operation import Operation
 from rts.operations.rigid import rigid
 from rts.preparing import prepare
@@ -67,9 +68,11 @@ __all__ = [
     "TriangleSurface",
     "check_gradient",
     "combine",
+    "engine_of",
     "exact_calibration",
     "explain",
     "fit",
+    "gradient",
     "gradient_image",
     "load",
     "load_image",

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import functools
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
 
 from rts.errors import EngineError, InputError, PluginError
 from rts.interfaces import Engine, adapted
-from rts.records import STATIC_FIELDS, Array, Tree, join_record, split_record
+from rts.records import STATIC_FIELDS, Array, Tree, join_record, record_arrays, split_record
 
 _F = TypeVar("_F", bound=Callable)
 CONSTANT_TYPES = (np.ndarray, np.generic, bool, int, float)
@@ -19,28 +19,29 @@ CONSTANT_TYPES = (np.ndarray, np.generic, bool, int, float)
 
 def leaves(tree: Tree) -> Iterator[Any]:
     """The leaves of nested dicts, lists, tuples and records, in a fixed order; None has none."""
-    found: list[Any] = []
-    _collect(tree, found)
-    return iter(found)
+    return iter(_collected(tree))
 
 
-def _collect(tree: Tree, found: list[Any]) -> None:
-    kind = _KINDS.get(type(tree)) or _kind(tree)
-    if kind == _LEAF:
-        found.append(tree)
-    elif kind == _RECORD:
-        _collect(split_record(tree)[0], found)
-    elif kind == _SEQUENCE:
-        for item in tree:
-            _collect(item, found)
-    elif kind == _MAPPING:
-        for key in sorted(tree):
-            _collect(tree[key], found)
+def _collected(tree: Tree) -> list[Any]:
+    """The same as a list. One loop, since it is asked for dozens of times a render."""
+    found, rest = [], [tree]
+    while rest:
+        x = rest.pop()
+        kind = _KINDS.get(type(x)) or _kind(x)
+        if kind == _LEAF:
+            found.append(x)
+        elif kind == _RECORD:
+            rest.extend(record_arrays(x)[::-1])
+        elif kind == _SEQUENCE:
+            rest.extend(x[::-1])
+        elif kind == _MAPPING:
+            rest.extend([x[key] for key in sorted(x, reverse=True)])
+    return found
 
 
 _LEAF, _NOTHING, _RECORD, _SEQUENCE, _MAPPING = range(1, 6)
 _KINDS: dict[type, int] = {}
-"""What trees of a type are. Looked up, since it is asked hundreds of times a render."""
+"""What trees of a type are."""
 
 
 def _kind(tree: Tree) -> int:
@@ -50,7 +51,7 @@ def _kind(tree: Tree) -> int:
         kind = _RECORD
     elif isinstance(tree, (list, tuple)):
         kind = _SEQUENCE
-    elif isinstance(tree, dict) or (not hasattr(tree, "dtype") and isinstance(tree, Mapping)):
+    elif isinstance(tree, Mapping):
         kind = _MAPPING
     else:
         kind = _LEAF
@@ -67,18 +68,30 @@ def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
         arrays, static = split_record(tree)
         return join_record(type(tree), map_leaves(fn, arrays), static)
     if kind == _SEQUENCE:
-        items = [map_leaves(fn, item) for item in tree]
-        return type(tree)(*items) if hasattr(tree, "_fields") else type(tree)(items)
+        items = []
+        for item in tree:
+            items.append(fn(item) if _KINDS.get(type(item)) == _LEAF else map_leaves(fn, item))
+        return type(tree)(*items) if _is_named(tree) else type(tree)(items)
     if kind == _MAPPING:
         return {key: map_leaves(fn, tree[key]) for key in sorted(tree)}
     return None
 
 
+def _is_named(tree: Tree) -> bool:
+    """Whether a sequence is a named tuple."""
+    return hasattr(tree, "_fields")
+
+
 def from_numbers(tree: Tree) -> Tree:
     """The same tree with every list or tuple that holds only numbers, nested or not, as a float32 array."""
+    if type(tree) is np.ndarray or type(tree) in OWNERS:
+        return tree
     if isinstance(tree, Mapping):
-        return {key: from_numbers(value) for key, value in tree.items()}
-    if isinstance(tree, (list, tuple)) and not hasattr(tree, "_fields"):
+        found = {}
+        for key, value in tree.items():
+            found[key] = value if type(value) is np.ndarray or type(value) in OWNERS else from_numbers(value)
+        return found
+    if isinstance(tree, (list, tuple)) and not _is_named(tree):
         if tree and all(isinstance(x, (bool, int, float)) for x in leaves(tree)):
             try:
                 return np.asarray(tree, np.float32)
@@ -90,7 +103,12 @@ def from_numbers(tree: Tree) -> Tree:
 
 def is_constant(tree: Tree) -> bool:
     """Whether every leaf is NumPy or a Python number: never differentiated."""
-    return all(isinstance(x, CONSTANT_TYPES) for x in leaves(tree))
+    if type(tree) in OWNERS:
+        return False
+    for x in _collected(tree):
+        if type(x) in OWNERS or not isinstance(x, CONSTANT_TYPES):
+            return False
+    return True
 
 
 # Plain dictionaries rather than functools caches: torch.compile looks through the latter, and warns.
@@ -137,28 +155,39 @@ def engine_of(*trees: Tree) -> Engine:
         EngineError: arrays of two engines, or of an unknown type.
     """
     found: Engine | None = None
-    collected: list[Any] = []
-    for tree in trees:
-        engine = OWNERS.get(type(tree))
+    for x in trees:
+        engine = OWNERS.get(type(x))
         if engine is None:
-            _collect(tree, collected)
-        elif found is None:
-            found = engine
-        elif engine is not found:
-            collected.append(tree)
-    for x in collected:
+            if type(x) is np.ndarray:
+                continue
+            return _engine_of_leaves(_collected(trees))
+        if found is not None and engine is not found:
+            return _engine_of_leaves(trees)
+        found = engine
+    return found if found is not None else _ENGINES.get("numpy") or engine_named("numpy")
+
+
+def _engine_of_leaves(found: Sequence[Any]) -> Engine:
+    only: Engine | None = None
+    for x in found:
         engine = OWNERS.get(type(x))
         if engine is None:
             if isinstance(x, CONSTANT_TYPES):
                 continue
             engine = OWNERS[type(x)] = _owner(x)
-        if found is not None and engine is not found:
+        if only is not None and engine is not only:
             raise EngineError(
-                f"arrays of {' and '.join(sorted((engine.name, found.name)))} met in one call; convert one side "
+                f"arrays of {' and '.join(sorted((engine.name, only.name)))} met in one call; convert one side "
                 f"(NumPy arrays may stand beside either, as constants)"
             )
-        found = engine
-    return found if found is not None else engine_named("numpy")
+        only = engine
+    return only if only is not None else _ENGINES.get("numpy") or engine_named("numpy")
+
+
+def suiting(*trees: Tree) -> tuple[Engine, Array | None]:
+    """The engine of these trees, and their exemplar."""
+    found = _collected(trees)
+    return _engine_of_leaves(found), _widest(found)
 
 
 _names: list[str] = []
@@ -207,8 +236,12 @@ def is_traced(x: Array) -> bool:
 
 def exemplar(*trees: Tree) -> Array | None:
     """The widest floating array of an engine other than NumPy, which sets dtype and device for constants, or None."""
+    return _widest(_collected(trees))
+
+
+def _widest(found: Sequence[Any]) -> Array | None:
     widest, bits = None, 0
-    for x in leaves(trees):
+    for x in found:
         if isinstance(x, CONSTANT_TYPES):
             continue
         own = _BITS.get(x.dtype)
@@ -223,7 +256,7 @@ def exemplar(*trees: Tree) -> Array | None:
 def namespace(*arrays: Array) -> Any:
     """The array-API namespace of these arrays."""
     engine = OWNERS.get(type(arrays[0])) if len(arrays) == 1 else None
-    return (engine or engine_of(*arrays)).namespace
+    return (engine_of(*arrays) if engine is None else engine).namespace
 
 
 def shape_of(x: Any) -> tuple[int, ...]:
@@ -233,12 +266,21 @@ def shape_of(x: Any) -> tuple[int, ...]:
 
 def described(x: Any) -> str:
     """What an error says of a value: "has shape (2, 3)" of an array, what it is of anything else."""
-    return f"has shape {shape_of(x)}" if hasattr(x, "shape") else f"is a {type(x).__name__}"
+    shape = shape_of(x)
+    return f"has shape {shape}" if shape else f"is a {type(x).__name__}"
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:
     """The same tree with every NumPy array and number as a constant of the engine."""
-    return map_leaves(lambda x: engine.constant(x, like) if isinstance(x, CONSTANT_TYPES) else x, tree)
+    if tree is None or type(tree) in OWNERS:
+        return tree
+    if type(tree) is np.ndarray:
+        return engine.constant(tree, like)
+
+    def constant(x: Any) -> Array:
+        return x if type(x) in OWNERS or not isinstance(x, CONSTANT_TYPES) else engine.constant(x, like)
+
+    return map_leaves(constant, tree)
 
 
 def promote(*values: Any) -> tuple[Any, list[Array]]:
@@ -246,6 +288,12 @@ def promote(*values: Any) -> tuple[Any, list[Array]]:
 
     Where all are NumPy or numbers the result is float64.
     """
+    owner = OWNERS.get(type(values[0]))
+    for v in values:
+        if owner is None or OWNERS.get(type(v)) is not owner:
+            break
+    else:
+        return owner.namespace, list(values)
     values_ = [
         np.asarray(v, dtype=np.float64) if isinstance(v, (list, tuple)) and is_constant(v) else v for v in values
     ]

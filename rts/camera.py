@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import constants, engine_of, exemplar, is_constant, namespace, promote
+from rts.arrays import constants, engine_of, is_constant, namespace, promote
 from rts.operations.linear import affine, matmul
 from rts.operations.projection import projective_map
 from rts.records import Array, Rays
@@ -317,11 +317,11 @@ class Camera(NamedTuple):
         from_clip = np.array([[x, 0, 0, x], [0, -y, 0, y], [0, 0, 0, 1], [0, 0, 0, 0]])
         depth = np.zeros((4, 4))
         depth[3, 2] = -1
-        from_clip, depth = constants((from_clip, depth), engine_of(p), p)
+        engine, own = engine_of(p), engine_of(self.view)
         # Of what is constant, in NumPy.
-        rows = constants(matmul(from_clip, p) + depth, engine_of(self.view), exemplar(self.view))
-        rows = matmul(rows, self.view)
-        return projective_map(rows, constants(points, engine_of(rows, points), exemplar(rows, points)))
+        rows = matmul(engine.constant(from_clip, p), p) + engine.constant(depth, p)
+        rows = matmul(constants(rows, own, None if is_constant(self.view) else self.view), self.view)
+        return projective_map(rows, points)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rts import registry
-from rts.arrays import described, engine_of, from_numbers, is_constant, leaves, namespace, shape_of
+from rts.arrays import described, from_numbers, namespace, shape_of
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.interfaces import Part, Sampler, Shader, Splatter, adapted, as_surface
@@ -32,7 +32,7 @@ MEMORY = _memory()
 
 
 def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Part], Camera]:
-    """Checked parts, with their shaders looked up and plain numbers made arrays."""
+    """Checked parts, with their shaders looked up and plain numbers made arrays; that all suit one engine is not."""
     parts = list(parts) if isinstance(parts, Sequence) else [parts]
     if not parts or not all(isinstance(p, Part) for p in parts):
         kinds = ", ".join(type(p).__name__ for p in parts) or "nothing"
@@ -42,9 +42,7 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Part
     camera = Camera(*from_numbers(tuple(camera)))
     for name, matrix in zip(camera._fields, camera, strict=True):
         check_matrix(f"the camera's {name}", matrix)
-    checked = [_check_part(index, part) for index, part in enumerate(parts)]
-    engine_of(checked, camera)
-    return checked, camera
+    return [_check_part(index, part) for index, part in enumerate(parts)], camera
 
 
 def _check_part(index: int, part: Part) -> Part:
@@ -147,8 +145,3 @@ def check_shaded(rgba: Any, count: int, shader: Any) -> None:
     """Refuse what a shader should not have returned."""
     if shape_of(rgba) != (count, 4):
         raise InputError(f"what the shader {shader!r} returned {described(rgba)}; expected ({count}, 4)")
-
-
-def differentiable(*trees: Any) -> bool:
-    """Whether any array could carry a derivative."""
-    return any(not is_constant(x) for x in leaves(trees))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rts.arrays import constants, described, engine_of, exemplar, from_numbers, namespace, shape_of
+from rts.arrays import constants, described, engine_of, exemplar, from_numbers, namespace, shape_of, suiting
 from rts.camera import Camera
 from rts.checks import check_background, check_floating, check_scene, check_size, check_splatter
 from rts.errors import InputError
@@ -118,7 +118,7 @@ class ImageResiduals(Residuals):
 
         def splats(v: Array) -> tuple[Array, Array]:
             parts, camera = _checked(*self.scene(unflatten(v)))
-            moved = to_splats(sampled, parts, camera, camera, v)
+            moved = to_splats(sampled, parts, camera, camera, *suiting(parts, camera, sampled, v))
             positions, rgba = constants((moved.positions, moved.rgba), engine, v)
             # What is opaque has an alpha of one, whatever its colours.
             return positions, rgba if colored else engine.stop_gradient(rgba)

@@ -175,7 +175,7 @@ def _read_with_trimesh(path: Path, extension: str) -> list[Piece]:
     if folder.problem:
         raise folder.problem
     if not pieces:
-        points = sum(len(getattr(g, "vertices", ())) for g in scene.geometry.values())
+        points = sum(len(_known(g, "vertices", ())) for g in scene.geometry.values())
         what = f"{points} points but no faces" if points else "no geometry"
         raise InputError(f"{path} holds {what}; expected a mesh with triangles or polygons")
     return pieces
@@ -208,11 +208,11 @@ def _visual(mesh: Any, faces: np.ndarray, gltf: bool) -> tuple[dict, np.ndarray 
         if "color" in visual.vertex_attributes:
             attributes["colors"] = (_unit_range(visual.vertex_attributes["color"]), faces)
         material = visual.material
-        image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+        image = _known(material, "baseColorTexture") or _known(material, "image")
         texture = None if image is None else pixels(image)
-        if getattr(material, "baseColorFactor", None) is not None:
+        if _known(material, "baseColorFactor") is not None:
             color = _unit_range(material.baseColorFactor)
-        if gltf and getattr(material, "alphaMode", None) in (None, "OPAQUE"):
+        if gltf and _known(material, "alphaMode") in (None, "OPAQUE"):
             texture, color = (None if x is None else x[..., :3] for x in (texture, color))
     elif visual.kind == "vertex":
         attributes["colors"] = (_unit_range(visual.vertex_colors), faces)
@@ -220,6 +220,11 @@ def _visual(mesh: Any, faces: np.ndarray, gltf: bool) -> tuple[dict, np.ndarray 
         one_a_face = np.repeat(np.arange(len(faces))[:, None], 3, axis=1)
         attributes["colors"] = (_unit_range(visual.face_colors), one_a_face)
     return attributes, texture, color
+
+
+def _known(thing: Any, name: str, default: Any = None) -> Any:
+    """What trimesh's classes, which are of many kinds, may have: an attribute, or the default."""
+    return getattr(thing, name, default)
 
 
 def _unit_range(colors: Any) -> np.ndarray:

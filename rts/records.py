@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar, dataclass_transform
 
 import numpy as np
@@ -27,7 +26,6 @@ STATIC_FIELDS: dict[type, tuple[str, ...]] = {}
 """The records that are pytrees, each with the names of its fields that are not arrays (engines register them)."""
 
 _ARRAY_FIELDS: dict[type, tuple[str, ...]] = {}
-_GETTERS: dict[type, tuple[Callable, Callable]] = {}
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(field,))
@@ -42,24 +40,21 @@ def record(*, static: tuple[str, ...] = ()) -> Callable[[_Class], _Class]:
         made = dataclass(frozen=True, eq=False)(cls)
         STATIC_FIELDS[made] = static
         _ARRAY_FIELDS[made] = tuple(f.name for f in fields(made) if f.name not in static)
-        _GETTERS[made] = _getter(_ARRAY_FIELDS[made]), _getter(static)
         return made
 
     return decorate
 
 
-def _getter(names: tuple[str, ...]) -> Callable[[Any], tuple]:
-    """The fields of these names, as a tuple."""
-    if not names:
-        return lambda value: ()
-    get = attrgetter(*names)
-    return get if len(names) > 1 else lambda value: (get(value),)
+def record_arrays(value: Any) -> list[Any]:
+    """A record's array fields in order of declaration."""
+    found = value.__dict__
+    return [found[name] for name in _ARRAY_FIELDS[type(value)]]
 
 
 def split_record(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """A record's array fields in order of declaration, and its static fields in that of `STATIC_FIELDS`."""
-    arrays, static = _GETTERS[type(value)]
-    return arrays(value), static(value)
+    found = value.__dict__
+    return tuple(record_arrays(value)), tuple([found[name] for name in STATIC_FIELDS[type(value)]])
 
 
 def join_record(cls: type, arrays: tuple[Any, ...], static: tuple[Any, ...]) -> Any:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from rts.arrays import constants, engine_of, exemplar, is_constant, is_traced, namespace, uncompiled
+from rts.arrays import constants, engine_of, is_constant, is_traced, namespace, suiting, uncompiled
 from rts.camera import Camera
 from rts.checks import (
     check_background,
@@ -19,7 +19,6 @@ from rts.checks import (
     check_shaded,
     check_size,
     check_splatter,
-    differentiable,
 )
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
@@ -78,15 +77,15 @@ def render(
     splatter = check_splatter(splatter)
     options = dict(splatter=splatter, layers=layers, supersample=int(supersample), capacity=capacity)
     bands = _bands(*size, layers, supersample)
+    suited = scene.suited if is_constant(background) else suiting(scene.parts, scene.camera, background)
     if len(bands) == 1:
-        return _finished(_sampled(scene, scene.camera, size, **options), scene, splatter, background)
-    engine, like = engine_of(*scene[:2], background), exemplar(*scene[:2], background)
+        return _finished(_sampled(scene, scene.camera, size, **options), scene, suited, splatter, background)
     images = []
     for top, rows in bands:
         window = scene.camera.window(size, (top, 0), (rows, size[1]))
         take = partial(_sampled, scene, window, (rows, size[1]), **options)
-        images.append(engine.checkpoint(take, lambda s, w=window: _splatted(s, *scene[:2], w, splatter)))
-    image, background = constants((namespace(*images).concat(images), background), engine, like)
+        images.append(suited[0].checkpoint(take, lambda s, w=window: _splatted(s, scene, w, suited, splatter)))
+    image, background = constants((namespace(*images).concat(images), background), *suited)
     return image if background is None else _over_background(image, background)
 
 
@@ -122,12 +121,14 @@ class _Scene(NamedTuple):
         camera: of the whole image.
         samplers: of each part.
         entries: what each sampler has built for its part, or None.
+        suited: the engine of parts and camera, and an array that sets dtype and device of its constants, or None.
     """
 
     parts: list[Part]
     camera: Camera
     samplers: Sequence[Any]
     entries: Sequence[Any]
+    suited: tuple[Engine, Array | None]
 
     @classmethod
     def of(cls, parts: Part | Sequence[Part] | PreparedParts, camera: Camera, sampler: Any) -> _Scene:
@@ -135,9 +136,9 @@ class _Scene(NamedTuple):
         prepared = parts if isinstance(parts, PreparedParts) else None
         checked, camera = check_scene(prepared.parts if prepared else parts, camera)
         if prepared is not None:
-            return cls(checked, camera, prepared.samplers, prepared.entries)
+            return cls(checked, camera, prepared.samplers, prepared.entries, suiting(checked, camera))
         chosen = check_sampler(sampler)
-        return cls(checked, camera, [chosen] * len(checked), [None] * len(checked))
+        return cls(checked, camera, [chosen] * len(checked), [None] * len(checked), suiting(checked, camera))
 
 
 def _sampled(
@@ -151,14 +152,14 @@ def _sampled(
     capacity: int | None,
 ) -> Sampled:
     """The samples of a window of the image, through the camera of this window."""
-    parts, _, samplers, entries = scene
+    parts, _, samplers, entries, suited = scene
     height, width = supersample * size[0], supersample * size[1]
-    check_memory(height, width, _planned(layers), gradient=differentiable(parts, camera))
+    check_memory(height, width, _planned(layers), gradient=suited[1] is not None)
     apron = apron_of(splatter)
     grid = height + 2 * apron, width + 2 * apron
     # Every part is sampled by the one engine, and by the very views that samples are projected with.
     wide = camera.with_apron((height, width), apron)
-    wide = constants(wide, engine_of(parts, camera), exemplar(parts, camera))
+    wide = constants(wide, *suited)
 
     def taken(count: int, needed: Needed | None) -> Sampled:
         samples = []
@@ -212,7 +213,8 @@ def render_samples(
             f"{apron_of(splatter)}; give it to rts.sample, too"
         )
     background = check_background(background, tuple((n - 2 * apron) // fine for n in sampled.row.shape[1:]))
-    return _finished(sampled, scene, splatter, background)
+    suited = suiting(scene.parts, scene.camera, sampled, background)
+    return _finished(sampled, scene, suited, splatter, background)
 
 
 def apron_of(splatter: Splatter | None) -> int:
@@ -223,43 +225,46 @@ def apron_of(splatter: Splatter | None) -> int:
     return (Splatter if splatter is None else splatter).reach + 1
 
 
-def _finished(sampled: Sampled, scene: _Scene, splatter: Any, background: Any) -> Array:
+def _finished(sampled: Sampled, scene: _Scene, suited: tuple, splatter: Splatter, background: Any) -> Array:
     """The image of all samples over its background."""
-    image = _splatted(sampled, *scene[:2], scene.camera, splatter, background)
+    image = _splatted(sampled, scene, scene.camera, suited, splatter)
     if background is None:
         return image
     return _over_background(image, constants(background, engine_of(image), image))
 
 
-def _splatted(
-    sampled: Sampled, parts: Sequence[Part], camera: Camera, window: Camera, splatter: Any, beside: Any = None
-) -> Array:
+def _splatted(sampled: Sampled, scene: _Scene, window: Camera, suited: tuple, splatter: Splatter) -> Array:
     """The image (H, W, 4) of what was sampled through a window of the camera's image.
 
     Args:
         sampled: the samples.
-        parts: checked parts.
-        camera: of the whole image, which shaders see.
+        scene: checked; shaders see the camera of the whole image.
         window: the camera of the samples.
+        suited: the engine to compute with, and an array that sets dtype and device of its constants, or None.
         splatter: a splatter.
-        beside: what else the engine has to suit.
     """
     fine = sampled.supersample
-    image = splatter.cropped(to_splats(sampled, parts, camera, window, beside))
+    image = splatter.cropped(to_splats(sampled, scene.parts, scene.camera, window, *suited))
     if fine > 1:
         xp, size = namespace(image), image.shape[:2]
         image = xp.mean(xp.reshape(image, (size[0] // fine, fine, size[1] // fine, fine, 4)), axis=(1, 3))
     return image
 
 
-def to_splats(sampled: Sampled, parts: Sequence[Part], camera: Camera, window: Camera, beside: Any = None) -> Splats:
+def to_splats(
+    sampled: Sampled, parts: Sequence[Part], camera: Camera, window: Camera, engine: Engine, like: Array | None
+) -> Splats:
     """What was sampled, as splatters take it, with the apron as border.
 
-    The arguments are those of `_splatted`.
+    Args:
+        sampled: the samples.
+        parts: checked parts.
+        camera: of the whole image, which shaders see.
+        window: the camera of the samples.
+        engine: to compute with.
+        like: sets dtype and device of its constants, or None.
     """
     grid, apron = tuple(sampled.row.shape[1:]), sampled.apron
-    scene = parts, camera, window, sampled, beside
-    engine, like = engine_of(scene), exemplar(scene)
     wide = window.with_apron((grid[0] - 2 * apron, grid[1] - 2 * apron), apron)
     wide = wide._replace(view=constants(wide.view, engine, like))
     camera = constants(camera, engine, like)
@@ -269,11 +274,10 @@ def to_splats(sampled: Sampled, parts: Sequence[Part], camera: Camera, window: C
     positions, colors = [], []
     for part, samples in zip(parts, sampled.samples, strict=True):
         transform = constants(part.transform, engine, like)
-        local = _evaluate(part, samples, engine, like)
         reads = part.surface.reads(part.theta)
-        rest = {name: value for name, value in part.theta.items() if name not in reads}
-        read = _to_world(_readable(local, samples, engine), transform)
-        rgba = part.shader({**part.theta, **constants(rest, engine, like)}, read, camera)
+        local = _evaluate(part, reads, samples, engine, like)
+        theta = {k: v if k in reads else constants(v, engine, like) for k, v in part.theta.items()}
+        rgba = part.shader(theta, _to_world(_readable(local, samples, engine), transform), camera)
         check_shaded(rgba, local["position"].shape[0], part.shader)
         positions.append(wide.within(transform).project(local["position"], grid))
         colors.append(constants(rgba, engine, like))
@@ -298,14 +302,14 @@ def _bands(height: int, width: int, layers: int | str, supersample: int) -> list
     return [(top, end - top) for top, end in itertools.pairwise(edges)]
 
 
-def _evaluate(part: Part, samples: Samples, engine: Engine, like: Array | None) -> GBuffer:
-    """The part's G-buffer in local space."""
-    reads = {name: part.theta[name] for name in part.surface.reads(part.theta)}
-    if samples.gbuffer is not None and is_constant(reads):
+def _evaluate(part: Part, reads: Sequence[str], samples: Samples, engine: Engine, like: Array | None) -> GBuffer:
+    """The part's G-buffer in local space, of the entries of θ that its surface reads."""
+    theta = {name: part.theta[name] for name in reads}
+    if samples.gbuffer is not None and is_constant(theta):
         wanted = part.shader.reads
         if samples.asked is None or (wanted is not None and set(wanted) <= set(samples.asked)):
             return GBuffer(samples.gbuffer)
-    gbuffer = part.surface.evaluate(constants(reads, engine, like), samples)
+    gbuffer = part.surface.evaluate(constants(theta, engine, like), samples)
     return gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer)
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import abc
+import functools
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from rts.arrays import CONSTANT_TYPES, engine_of, exemplar, is_constant, leaves, map_leaves, namespace
+from rts.arrays import CONSTANT_TYPES, engine_of, is_constant, leaves, map_leaves, namespace, suiting
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.interfaces import (
@@ -131,7 +132,7 @@ class TriangleSampler(Sampler):
             entry: what `hold` gave, to be used without a look at the surface's inputs.
         """
         surface, theta = _of_triangles(part.surface), part.theta
-        engine = engine_of(theta, camera)
+        engine, like = suiting(theta, camera)
         shape = _Shape(layers, size, capacity)
         inputs = surface.proxy_inputs(_stopped(theta)) if entry is None or surface.refines else None
         reads = {name: theta[name] for name in surface.reads(theta)}
@@ -139,7 +140,7 @@ class TriangleSampler(Sampler):
         tables = dict(surface.table_specs(shape.rows, capacity))
         shader = adapted(part.shader, Shader)
         asked = None if shader is None else shader.reads
-        attributes = _attribute_specs(surface, asked, host_theta, shape, exemplar(theta, camera))
+        attributes = _attribute_specs(surface, asked, host_theta, shape, like)
 
         def host(view: np.ndarray, projection: np.ndarray, *host_leaves: np.ndarray) -> tuple[np.ndarray, ...]:
             it = iter(host_leaves)
@@ -251,7 +252,10 @@ def _of_triangles(given: Any) -> TriangleSurface:
 
 def _stopped(theta: Mapping[str, Tree]) -> dict[str, Tree]:
     """θ without derivatives: what is made of it for sampling keeps no graph."""
-    return {name: map_leaves(_stop, value) for name, value in theta.items()}
+    stopped = {}
+    for name, value in theta.items():
+        stopped[name] = value if type(value) is np.ndarray else map_leaves(_stop, value)
+    return stopped
 
 
 def _stop(x: Any) -> Any:
@@ -311,6 +315,8 @@ def _attribute_specs(
     if host_theta is None:
         return {}
     real = np.float64 if like is not None and namespace(like).finfo(like.dtype).bits == 64 else np.float32
+    if asked is not None and not asked:
+        return {"position": shape.row_spec(real, 3)}
     i, p = surface.sample_widths
     none = np.full((1, 1, 1), -1, np.int32)
     one = Samples(np.zeros((1, i), np.int32), np.zeros((1, p), np.float32), none, none, np.int32(0))
@@ -325,13 +331,18 @@ def _no_fragments(shape: tuple[int, int, int]) -> Fragments:
 
 def _check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sampler: Any) -> None:
     """Refuse what `rasterize` of a sampler should not have returned."""
-    expected = shape, (*shape, 2), shape
-    given = tuple(np.shape(x) for x in fragments) if isinstance(fragments, Fragments) else type(fragments).__name__
-    if given != expected:
+    if isinstance(fragments, Fragments):
+        ids, barycentrics, depth = fragments
+        fits = np.shape(ids) == np.shape(depth) == shape and np.shape(barycentrics) == (*shape, 2)
+    else:
+        fits = False
+    if not fits:
+        given = tuple(np.shape(x) for x in fragments) if isinstance(fragments, Fragments) else type(fragments).__name__
         raise InputError(
-            f"rasterize of {type(sampler).__name__} returned {given}; expected rts.Fragments of {expected}"
+            f"rasterize of {type(sampler).__name__} returned {given}; expected rts.Fragments of "
+            f"{(shape, (*shape, 2), shape)}"
         )
-    last = int(np.max(fragments.triangle_ids))
+    last = int(np.asarray(fragments.triangle_ids).max())
     if last >= faces:
         raise InputError(f"rasterize of {type(sampler).__name__} returned triangle {last} of {faces}")
 
@@ -405,17 +416,27 @@ def check_camera(camera: Camera) -> None:
         if not np.isfinite(matrix).all():
             raise InputError(f"the camera's {name} matrix holds NaN or infinity; check how it was made")
     # Most are far from singular; singular values take longer.
-    if not min(_spread(camera.view[:3, :3]), _spread(camera.projection)) > WELL_CONDITIONED:
+    well = _spread(camera.view[:3, :3]) > WELL_CONDITIONED
+    if not (well and _spread_of_projection(camera.projection.tobytes()) > WELL_CONDITIONED):
         _check_invertible(camera)
-    if not np.array_equal(camera.view[3], [0, 0, 0, 1]):
+    if camera.view[3].tolist() != [0, 0, 0, 1]:
         raise InputError(
             f"the last row of the camera's view times the part's transform is {camera.view[3].tolist()}; "
             f"expected 0, 0, 0, 1"
         )
 
 
-def _spread(matrix: np.ndarray) -> float:
-    """The square of the determinant over that of the rows' lengths: 1 for orthogonal rows, 0 for dependent ones."""
+def _spread(m: np.ndarray) -> float:
+    """The square of a (3, 3) determinant over that of the rows' lengths: 1 for orthogonal rows, 0 for dependent."""
+    a, b, c, d, e, f, g, h, i = m.ravel().tolist()  # Few numbers: NumPy would take far longer.
+    square = (a * a + b * b + c * c) * (d * d + e * e + f * f) * (g * g + h * h + i * i)
+    return (a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) ** 2 / square if square > 0 else 0.0
+
+
+@functools.lru_cache(maxsize=64)
+def _spread_of_projection(data: bytes) -> float:
+    """The same of the bytes of a (4, 4) float64 matrix, which often is that of the call before."""
+    matrix = np.frombuffer(data).reshape(4, 4)
     square = float((matrix * matrix).sum(axis=1).prod())
     return float(np.linalg.det(matrix)) ** 2 / square if square > 0 else 0.0
 

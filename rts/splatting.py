@@ -107,7 +107,7 @@ class Kernel(Splatter):
     def plain(self, depths: _Depths, margin: float) -> Array:
         """Targets (H, W) at which only front layers count, however depths are rounded within a margin."""
 
-    @property
+    @functools.cached_property
     def gamma(self) -> float:
         """The calibration as a number."""
         return exact_calibration(self.sigma) if self.calibration is None else self.calibration

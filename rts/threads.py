@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import sys
 import threading
 from collections.abc import Callable
 from queue import SimpleQueue
@@ -97,7 +98,7 @@ def _forget() -> None:
     _helpers = _Helpers()
 
 
-if hasattr(os, "register_at_fork"):
+if sys.platform != "win32":
     os.register_at_fork(after_in_child=_forget)
 
 
@@ -106,7 +107,7 @@ def thread_count() -> int:
     wanted = os.environ.get("RTS_NUM_THREADS", "")
     if wanted.isdigit() and int(wanted) > 0:
         return int(wanted)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
@@ -130,11 +131,10 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
         *args: handed on.
         work: nanoseconds that it takes on one thread, roughly.
     """
-    threads = thread_count()
-    tasks = min(count, threads * TASKS_PER_THREAD)
-    if threads == 1 or tasks <= 1 or work < LITTLE_WORK:
+    if work < LITTLE_WORK or count <= 1 or (threads := thread_count()) == 1:
         kernel(0, count, *args)
         return
+    tasks = min(count, threads * TASKS_PER_THREAD)
     bounds = [count * i // tasks for i in range(tasks + 1)]
     numbers = itertools.count()
 

@@ -90,9 +90,7 @@ class Cells:
             raise InputError(f"row refers to sample {row.max()} of {len(positions)}; expected indices below that")
         self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
         self.visible, self.border = settings.kind == "visible", settings.border
-        scale = 1 / (2 * settings.sigma**2)
-        peak = math.sqrt(1 + settings.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
-        self._numbers = tuple(positions.dtype.type(x) for x in (scale, peak, settings.gamma))
+        self._numbers = tuple(map(positions.dtype.type, _scale_and_peak(settings) + (settings.gamma,)))
         self._reach = positions.dtype.type(_reach(settings))
         if choices is not None:
             self.choices = choices
@@ -209,6 +207,13 @@ class Cells:
         for result, values in zip(results, found, strict=True):
             if result is not None:
                 np.add.at(result, index, values)
+
+
+@lru_cache
+def _scale_and_peak(settings: Settings) -> tuple[float, float]:
+    """The exponent's factor, and the weight of a splat on its cell's centre along one axis."""
+    scale = 1 / (2 * settings.sigma**2)
+    return scale, math.sqrt(1 + settings.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
 
 
 @lru_cache

@@ -149,9 +149,7 @@ class JaxEngine(Engine):
         """The value on the host."""
         return np.asarray(x)
 
-    def repeat(
-        self, body: Callable[[Tree], Tree], going: Callable[[Tree], jax.Array], state: Tree, most: int
-    ) -> Tree:
+    def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], jax.Array], state: Tree, most: int) -> Tree:
         """A loop of Python's as long as values are known, which compiles nothing; else `jax.lax.while_loop`."""
         for count in range(most):
             on = going(state)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ from rts.interfaces import Engine
 from rts.operations.operation import Operation
 from rts.records import Array, ArraySpec
 from rts.threads import read_only
+
+_DTYPE = attrgetter("dtype")
 
 
 class NumpyEngine(Engine):
@@ -28,17 +31,21 @@ class NumpyEngine(Engine):
     def constant(self, value: Any, like: Array | None = None) -> np.ndarray:
         """`value` as an array, floats in the dtype of `like`, else as they are."""
         array = np.asarray(value)
-        return array.astype(like.dtype) if like is not None and np.issubdtype(array.dtype, np.floating) else array
+        return array.astype(like.dtype) if like is not None and array.dtype.kind == "f" else array
 
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Array) -> tuple[np.ndarray, ...]:
         """Call `fn`: everything is on the host already."""
         return fn(*args)
 
     def apply(self, operation: Operation, operands: Sequence[np.ndarray], params: Mapping[str, Any]) -> np.ndarray:
-        """By compiled code, of floats of one dtype, float32 or float64."""
-        if not operation.fits([x.dtype for x in operands]):
-            return operation.specification(*operands, **params)
-        return operation.value_on_host([read_only(x) for x in operands], dict(params))[0]
+        """By compiled code, of float32 and float64; where both meet, in the wider one."""
+        dtypes = list(map(_DTYPE, operands))
+        if not operation.fits(dtypes):
+            widest = np.result_type(*(d for d in dtypes if d.kind == "f"))
+            operands = [x.astype(widest) if x.dtype.kind == "f" else x for x in operands]
+            if not operation.fits(list(map(_DTYPE, operands))):
+                return operation.specification(*operands, **params)
+        return operation.value_on_host(list(map(read_only, operands)), dict(params))[0]
 
     def on_host(self, *arrays: np.ndarray) -> bool:
         """Always."""

@@ -46,9 +46,12 @@ class _HostCall(torch.autograd.Function):
 
     @staticmethod
     def forward(fn, specs, *args):
-        device = next((a.device for a in args if isinstance(a, torch.Tensor)), None)
-        results = fn(*(_to_host(a) if isinstance(a, torch.Tensor) else a for a in args))
-        return tuple(_tensor(r, device) for r in results)
+        device, given = None, []
+        for a in args:
+            tensor = isinstance(a, torch.Tensor)
+            device = a.device if tensor and device is None else device
+            given.append(_to_host(a) if tensor else a)
+        return tuple([_tensor(r, device) for r in fn(*given)])
 
     @staticmethod
     def setup_context(ctx, inputs, output):

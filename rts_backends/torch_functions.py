@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch._C._functorch import is_legacy_batchedtensor
-from torch._functorch.utils import unwrap_dead_wrappers
+from torch._C._functorch import is_legacy_batchedtensor, unwrap_if_dead
 from torch.autograd import forward_ad
 from torch.utils import _pytree
 
@@ -21,7 +20,8 @@ def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
     """
     if torch._C._are_functorch_transforms_active():
         return function.apply(*args)
-    args = unwrap_dead_wrappers(args)
+    # What torch does with all arguments, in one loop.
+    args = [unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
     return super(torch.autograd.Function, function).apply(*args)  # pyright: ignore[reportAttributeAccessIssue]
 
 
@@ -34,7 +34,10 @@ def transformed() -> bool:
 
 def foreign(*tensors: Tensor | None) -> bool:
     """Whether any is a batch of `torch.autograd.grad(..., is_grads_batched=True)`, which no function can look into."""
-    return any(t is not None and is_legacy_batchedtensor(t) for t in tensors)
+    for t in tensors:
+        if t is not None and is_legacy_batchedtensor(t):
+            return True
+    return False
 
 
 def on_host(x: Tensor) -> np.ndarray:

@@ -54,6 +54,7 @@ class Mesh(TriangleSurface):
         self._extents = [int(t.max()) + 1 for t in self._tables]
         self.sample_widths = (self._ids.shape[1], 2)
         self._normals: tuple[tuple, np.ndarray] | None = None
+        self._reads: dict[tuple, tuple[str, ...]] = {}
 
     @property
     def face_count(self) -> int:
@@ -98,12 +99,16 @@ class Mesh(TriangleSurface):
                     f"check the indices (they count from 0)"
                 )
 
-    def _attributes(self, theta: Mapping[str, Tree]) -> list[str]:
-        return [name for name in self._columns if name in theta or name not in VERTEX_ATTRIBUTES]
+    def _attributes(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
+        return self.reads(theta)[1:]
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
         """The entries of θ that `evaluate` needs."""
-        return ("vertices", *self._attributes(theta))
+        names = tuple(theta)
+        if names not in self._reads:
+            known = (name for name in self._columns if name in theta or name not in VERTEX_ATTRIBUTES)
+            self._reads[names] = ("vertices", *known)
+        return self._reads[names]
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Array:
         """The vertices."""

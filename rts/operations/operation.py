@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
-from rts.arrays import OWNERS, constants, engine_of, exemplar
+from rts.arrays import OWNERS, constants, engine_of, suiting
 from rts.records import Array
+
+_SHAPE = attrgetter("shape")
 
 Arrays = Sequence[np.ndarray]
 """Operands on the host, C-contiguous and read-only."""
@@ -68,30 +71,31 @@ class Operation:
 
     def __call__(self, *operands: Array, **params: Any) -> Array:
         """The result, in the engine of the operands; NumPy arrays beside those of another are constants."""
-        owner = None
+        kind = type(operands[0])
         for x in operands:
-            known = OWNERS.get(type(x))
-            if known is None or (owner is not None and known is not owner):
+            if type(x) is not kind:
                 break
-            owner = known
         else:
-            if owner is not None:
-                return owner.apply(self, operands, params)
-        owner = engine_of(*operands)
-        return owner.apply(self, constants(operands, owner, exemplar(operands)), params)
+            if kind in OWNERS or kind is np.ndarray:
+                return engine_of(operands[0]).apply(self, operands, params)
+        engine, like = suiting(operands)
+        return engine.apply(self, constants(operands, engine, like), params)
 
     def fits(self, dtypes: Sequence[np.dtype]) -> bool:
         """Whether operands of these NumPy dtypes are of the kind that the functions on the host know."""
         first = dtypes[0]
-        if first not in (np.float32, np.float64):
+        if first != np.float32 and first != np.float64:
             return False
-        return all(d == first or d.kind in "iub" for d in dtypes)
+        for dtype in dtypes:
+            if dtype != first and dtype.kind not in "iub":
+                return False
+        return True
 
     # What binders of engines call, with operands of NumPy.
 
     def value_on_host(self, operands: Arrays, params: dict[str, Any]) -> tuple[np.ndarray, Any]:
         """The result, and what is kept."""
-        out = np.empty(self.shape(*(x.shape for x in operands), **params), operands[0].dtype)
+        out = np.empty(self.shape(*map(_SHAPE, operands), **params), operands[0].dtype)
         return out, self.forward(operands, out, **params)
 
     def push_on_host(self, operands: Arrays, tangents: Some, out: np.ndarray, kept: Any, params: dict) -> None:

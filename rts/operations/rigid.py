@@ -6,14 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import is_constant, namespace, promote, shape_of
+from rts.arrays import engine_of, is_constant, namespace, promote, shape_of
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
 from rts.records import Array
 from rts.transforms import affine_matrix
 
+ORIGIN = 0.0, 0.0, 0.0
 
-def rigid(pose: Any, center: Any = (0.0, 0.0, 0.0)) -> Array:
+
+def rigid(pose: Any, center: Any = ORIGIN) -> Array:
     """World-from-local transform of a rigid pose; differentiable everywhere, at zero rotation too.
 
     Args:
@@ -28,6 +30,8 @@ def rigid(pose: Any, center: Any = (0.0, 0.0, 0.0)) -> Array:
     shape = shape_of(pose)
     if shape != (6,):
         raise InputError(f"pose has shape {shape}; expected (6,): rotation vector, translation")
+    if center is ORIGIN:
+        center = engine_of(pose).constant(np.zeros(3), pose)
     _, (pose, center) = promote(pose, center)
     return RIGID(pose, center)
 

@@ -1,0 +1,419 @@
+"""The bases of plugins: defaults, flags that follow from methods, objects of other classes, misspelt members."""
+
+import gc
+import weakref
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from analytic import Ellipsoid
+from helpers import CAMERA, DIFFERENTIABLE, FRONT, SIZE, arrays, gradient, icosphere, mesh_part, quad, show, to_numpy
+
+import rts
+from rts import splatting
+from rts.interfaces import Shader, adapted, as_surface, unwrapped
+
+MESH = rts.plugin("surfaces", "mesh")
+RASTER = rts.plugin("samplers", "raster")
+BALL = {"center": np.zeros(3, np.float32), "radii": np.full(3, 0.8, np.float32)}
+
+
+# -------------------------------------------------------------------------------------------- flags and defaults
+
+
+def test_class_variables_follow_from_the_methods_of_a_class():
+    class Refining(MESH):
+        def refine(self, inputs, samples, rays):
+            return samples
+
+    class Silent(Refining):
+        refines = False
+
+    class Mixin:
+        def needed(self, covered, depth):
+            return covered
+
+    class Mixed(Mixin, splatting.Plain):
+        pass
+
+    assert not MESH.refines and Refining.refines and not Silent.refines
+    assert type("Below", (Refining,), {}).refines and not type("BelowSilent", (Silent,), {}).refines
+    assert splatting.Multi.prunes and Mixed.prunes and not rts.Splatter.prunes
+    assert not RASTER.builds and rts.plugin("samplers", "embree").builds and not RASTER.follows
+
+
+def test_a_class_may_be_both_of_triangles_and_of_rays():
+    class Both(Ellipsoid, rts.TriangleSurface, rts.RaySurface):
+        """An ellipsoid whose triangles are refined to what the rays meet."""
+
+        def __init__(self):
+            self.vertices, self.faces = icosphere(2)
+
+        def proxy_inputs(self, theta):
+            return {"center": theta["center"], "radii": theta["radii"]}
+
+        def proxy(self, inputs, camera, size):
+            vertices = (inputs["center"] + 1.1 * inputs["radii"] * self.vertices).astype(np.float32)
+            return rts.Proxy(vertices, self.faces, np.zeros((len(self.faces), 0), np.int32), vertices[self.faces])
+
+        def refine(self, inputs, samples, rays):
+            hits = self.intersect(inputs, rays.origins, rays.directions, 2)
+            row, depth, params = samples.row.copy(), samples.depth.copy(), samples.params.copy()
+            for k, cells in enumerate(samples.row):
+                index = cells[cells >= 0]
+                row[k][cells >= 0] = np.where(hits.hit[k, index], index, -1)
+                depth[k][cells >= 0] = hits.distance[k, index]
+                params[index] = hits.params[k, index]
+            return rts.Samples(samples.ids, params, row, depth, samples.overflow)
+
+    part = rts.Part(Both(), BALL, "normals")
+    by_rays, by_triangles = (show(part, sampler=sampler, splatter="single") for sampler in ("rays", "raster"))
+    assert by_rays[..., 3].sum() > 30
+    np.testing.assert_allclose(by_triangles, by_rays, atol=2e-5)
+
+
+# ---------------------------------------------------------------------------------------- objects of any class
+
+
+def test_a_duck_typed_surface_is_drawn_and_its_structures_are_kept():
+    built = []
+
+    class Counting(rts.plugin("samplers", "embree")):
+        def prepare(self, proxy):
+            built.append(len(proxy.faces))
+            return super().prepare(proxy)
+
+    class Duck:
+        """A mesh that inherits from nothing."""
+
+        sample_widths = (3, 2)
+
+        def __init__(self, faces):
+            self.mesh = MESH(faces)
+
+        def evaluate(self, theta, samples):
+            return self.mesh.evaluate(theta, samples)
+
+        def proxy_inputs(self, theta):
+            return theta["vertices"]
+
+        def proxy(self, inputs, camera, size):
+            return self.mesh.proxy(inputs, camera, size)
+
+    vertices, faces = icosphere(1)
+    surface, sampler = Duck(faces), Counting()
+    part = rts.Part(surface, {"vertices": vertices}, "silhouette")
+    found = [show(part, sampler=sampler) for _ in range(3)]
+    np.testing.assert_array_equal(found[0], found[2])
+    np.testing.assert_array_equal(found[0], show(mesh_part((vertices, faces)), sampler="embree"))
+    assert built == [len(faces)], "what was built is not kept by the object that the user holds"
+    kept = weakref.ref(surface)
+    del surface, part
+    gc.collect()
+    assert kept() is None, "a wrapper keeps a surface alive"
+
+
+def test_a_wrapper_passes_for_the_object_in_it():
+    duck = Ellipsoid()
+    duck.note = 3
+    wrapped = as_surface(duck)
+    assert isinstance(wrapped, Ellipsoid) and isinstance(wrapped, rts.RaySurface)
+    assert not isinstance(wrapped, rts.TriangleSurface)
+    assert wrapped.note == 3 and repr(wrapped) == repr(duck) and hash(wrapped) == hash(duck) and wrapped == duck
+    assert unwrapped(wrapped) is duck and unwrapped(duck) is duck
+    assert wrapped.centered and wrapped.reads(BALL) == ("center", "radii") and wrapped.sample_widths == (0, 3)
+    wrapped.note = 4
+    assert duck.note == 4
+
+
+def test_functions_are_shaders_with_the_promises_that_they_make():
+    def plain(theta, gbuffer, camera):
+        return rts.plugin("shaders", "normals")()(theta, gbuffer, camera)
+
+    def promising(theta, gbuffer, camera):
+        return plain(theta, gbuffer, camera)
+
+    promising.opaque, promising.reads = True, ("normal",)
+    one, other = adapted(plain, Shader), adapted(promising, Shader)
+    assert (one.opaque, one.reads) == (False, None) and (other.opaque, other.reads) == (True, ("normal",))
+    part = mesh_part(icosphere(1))
+    expected = show(part.replace(shader="normals"))
+    for shader in (plain, promising):
+        np.testing.assert_array_equal(show(part.replace(shader=shader)), expected)
+
+
+def test_a_splatter_may_be_an_object_with_an_image_or_a_splat():
+    known, part = splatting.Visible(), mesh_part(icosphere(1))
+    expected = show(part, splatter=known)
+    for duck in (SimpleNamespace(image=known.image), SimpleNamespace(splat=known.splat)):
+        np.testing.assert_array_equal(show(part, splatter=duck), expected)
+
+
+def test_what_lacks_a_required_member_is_refused():
+    part = mesh_part(icosphere(0))
+    with pytest.raises(rts.InputError, match="the surface of part 0 is .*; expected an object such as a mesh"):
+        show(part.replace(surface=SimpleNamespace(proxy=None)))
+    with pytest.raises(rts.InputError, match="the splatter is .*method 'image'"):
+        show(part, splatter=SimpleNamespace(needed=None))
+    with pytest.raises(rts.InputError, match="the sampler is .*method 'sample'"):
+        show(part, sampler=SimpleNamespace(rasterize=None))
+
+
+# ------------------------------------------------------------------------------------------- misspelt members
+
+
+def method(*_):
+    return None
+
+
+MISSPELT = [
+    (MESH, "refines_", "refine"),
+    (MESH, "proxykey", "proxy_key"),
+    (MESH, "table_spec", "table_specs"),
+    (MESH, "refime", "refine"),
+    (RASTER, "prepares", "prepare"),
+    (RASTER, "updates", "update"),
+    (splatting.Plain, "normal_equation", "normal_equations"),
+]
+
+
+@pytest.mark.parametrize("base, name, meant", [m for m in MISSPELT if m[1] != "refines_"], ids=str)
+def test_a_method_that_is_one_letter_off_is_refused_when_first_used(base, name, meant):
+    own = {name: lambda self, *args: None, "__init__": base.__init__}
+    kind = type("Misspelt", (base,), own)
+    part, options = mesh_part(icosphere(0)), {}
+    if base is MESH:
+        part = part.replace(surface=kind(icosphere(0)[1]))
+    else:
+        options["sampler" if base is RASTER else "splatter"] = kind()
+    with pytest.raises(rts.PluginError, match=rf"Misspelt has a function '{name}'.*did you mean '{meant}'"):
+        show(part, **options)
+
+
+def test_a_duck_typed_class_is_read_as_closely():
+    class Duck(Ellipsoid):
+        def read(self, theta):
+            return ("center",)
+
+    with pytest.raises(rts.PluginError, match="Duck has a function 'read'.*did you mean 'reads' of RaySurface"):
+        show(rts.Part(Duck(), BALL), sampler="rays")
+
+
+@pytest.mark.parametrize("name", ["center", "examples", "tessellate", "refined_by_hand", "keys"])
+def test_any_other_name_is_the_plugin_s_own(name):
+    class Own(MESH):
+        pass
+
+    setattr(Own, name, method)
+    vertices, faces = icosphere(1)
+    assert show(rts.Part(Own(faces), {"vertices": vertices}))[..., 3].any()
+
+
+def test_a_name_like_that_of_a_member_that_is_there_is_the_plugin_s_own():
+    class Own(MESH):
+        def checks(self):
+            return None
+
+    vertices, faces = icosphere(1)  # A mesh has a `check`.
+    assert show(rts.Part(Own(faces), {"vertices": vertices}))[..., 3].any()
+
+
+def test_a_splatter_that_overrides_the_direct_call_is_told_what_to_write():
+    class Old(splatting.Multi):
+        def splat(self, positions, rgba, row):
+            return super().splat(positions, rgba, row)
+
+    with pytest.raises(
+        rts.PluginError, match=r"Old overrides 'splat', which is for direct calls; write 'image\(splats\)'"
+    ):
+        show(mesh_part(icosphere(0)), splatter=Old())
+
+
+# ------------------------------------------------------------------------------------- the seam of the splatters
+
+
+class Far(rts.Splatter):
+    """Shifts everything by its reach, so that what lies so far beyond the image shows in it."""
+
+    def __init__(self, reach):
+        self.reach = reach
+
+    def image(self, splats):
+        self.seen = splats
+        image, r = splatting.Plain().image(splats), self.reach
+        xp = rts.namespace(image)
+        return xp.concat([xp.zeros_like(image[:, :r, :]), image[:, : image.shape[1] - r, :]], axis=1)
+
+
+@pytest.mark.parametrize("reach", [1, 2, 4])
+def test_the_apron_is_as_wide_as_a_splatter_reaches(reach):
+    part, splatter = mesh_part(quad(-9, 9, -9, 9)), Far(reach)
+    assert (show(part, FRONT, splatter=splatter)[..., 3] == 1).all()
+    assert splatter.seen.border == reach + 1
+    sampled = rts.sample(part, FRONT, SIZE, splatter=splatter)
+    assert sampled.apron == reach + 1 and sampled.row.shape[1:] == tuple(n + 2 * reach + 2 for n in SIZE)
+    np.testing.assert_array_equal(
+        rts.render_samples(sampled, part, FRONT, splatter=splatter), show(part, FRONT, splatter=splatter)
+    )
+    np.testing.assert_array_equal(
+        rts.render_samples(sampled, part, FRONT, splatter="visible"), show(part, FRONT, splatter="visible")
+    )
+
+
+def test_samples_with_too_narrow_an_apron_are_refused():
+    part = mesh_part(quad())
+    sampled = rts.sample(part, FRONT, SIZE)
+    with pytest.raises(
+        rts.InputError, match="an apron of 2 cells, and .* which reaches 3, needs 4; give it to rts.sample"
+    ):
+        rts.render_samples(sampled, part, FRONT, splatter=Far(3))
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_row_is_an_array_of_the_engine_of_the_positions(target):
+    seen = []
+
+    class Looking(splatting.Plain):
+        def image(self, splats):
+            seen.append([type(x).__module__.split(".")[0] for x in (splats.positions, splats.rgba, splats.row)])
+            return super().image(splats)
+
+    part = mesh_part(icosphere(1))
+    moved = part.replace(transform=arrays(target, np.eye(4)))
+    sampled = rts.sample(part, CAMERA, SIZE)  # NumPy's, though what is rendered is not.
+    rts.render(moved, CAMERA, SIZE, splatter=Looking())
+    rts.render_samples(sampled, moved, CAMERA, splatter=Looking())
+    Looking().splat(arrays(target, np.ones((1, 3))), np.ones((1, 4), np.float32), [[[0]]])
+    assert all(len(set(kinds)) == 1 and kinds[0] != "numpy" for kinds in seen) and len(seen) == 3
+
+
+class Gaussian5(rts.Splatter):
+    """A 5 × 5 Gaussian of fronts, as the guide to plugins writes it."""
+
+    reach, sigma = 2, 0.8
+
+    def __init__(self, calibrated=True):
+        self.gamma = rts.exact_calibration(self.sigma, self.reach) if calibrated else 1.0
+
+    def image(self, splats):
+        xp, engine = rts.namespace(splats.positions), rts.engine_of(splats.positions)
+        row = splats.row[0]
+        height, width = row.shape
+        index = xp.reshape(xp.where(row >= 0, row, 0), (-1,))
+        position = xp.reshape(xp.take(splats.positions, index, axis=0), (height, width, 3))
+        rgba = xp.reshape(xp.take(splats.rgba, index, axis=0), (height, width, 4))
+        rgba = xp.where((row >= 0)[..., None], xp.concat([rgba, xp.ones_like(rgba[..., :1])], axis=-1), 0.0)
+        center = engine.constant(np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1) + 0.5, position)
+        off = self.gamma * (position[..., :2] - center)
+        scale, offsets = 1 / (2 * self.sigma**2), range(-self.reach, self.reach + 1)
+        peak = 1.001 / sum(np.exp(-(u * u) * scale).item() for u in offsets) ** 2
+        total = 0.0
+        for u in offsets:
+            for v in offsets:
+                weight = peak * xp.exp(-((u - off[..., 0]) ** 2 + (v - off[..., 1]) ** 2) * scale)
+                total = total + _shifted(xp, weight[..., None] * rgba, u, v)
+        return total[..., :4] / xp.clip(total[..., 4:], 1.0, None)
+
+
+def _shifted(xp, image, u, v):
+    for axis, by in ((0, v), (1, u)):
+        if by:
+            at = (slice(None),) * axis
+            new, kept = (
+                xp.zeros_like(image[(*at, slice(None, abs(by)))]),
+                slice(None, -by) if by > 0 else slice(-by, None),
+            )
+            image = xp.concat([new, image[(*at, kept)]] if by > 0 else [image[(*at, kept)], new], axis=axis)
+    return image
+
+
+@pytest.mark.parametrize("sigma, reach", [(0.5, 1), (0.7, 1), (0.8, 2), (1.5, 3)])
+def test_the_calibration_of_any_gaussian_is_that_of_its_first_moment(sigma, reach):
+    u = np.arange(-reach, reach + 1)
+    weights = np.exp(-(u**2) / (2 * sigma**2))
+    # The derivative of the weights when the splat moves has the first moment Σ u² w / σ², of weights that sum to one.
+    moment = (u**2 * weights).sum() / weights.sum() / sigma**2
+    assert rts.exact_calibration(sigma, reach) == pytest.approx(1 / moment, rel=1e-12)
+
+
+@pytest.mark.parametrize("calibrated, gain", [(True, 1.0), (False, None)])
+def test_a_ramp_that_moves_under_a_stranger_s_gaussian_has_its_true_derivative(calibrated, gain):
+    height, width = 9, 15
+    y, x = np.mgrid[:height, :width] + 0.5
+    positions = np.stack([x, y, np.full_like(x, 3.0)], -1).reshape(-1, 3)
+    ramp = 0.2 + 0.04 * positions[:, :1]
+    rgba = np.concatenate([ramp, ramp, ramp, np.ones_like(ramp)], axis=1)
+    row = np.arange(height * width, dtype=np.int32).reshape(1, height, width)
+    target = DIFFERENTIABLE[0]
+    given, cells, weights = arrays(
+        target, (positions, row, np.eye(height * width)[4 * width + 7].reshape(height, width))
+    )
+    splatter = Gaussian5(calibrated)
+    value = lambda p: (splatter.splat(p, arrays(target, rgba), cells)[..., 0] * weights).sum()  # noqa: E731
+    slope = gradient(target, value, given)[:, 0].sum()
+    expected = -0.04 * (1.0 if calibrated else 1 / rts.exact_calibration(0.8, 2))
+    assert slope == pytest.approx(expected, rel=2e-3)
+
+
+def test_a_stranger_s_gaussian_gives_silhouettes_a_gradient():
+    target = DIFFERENTIABLE[0]
+    part = mesh_part(icosphere(1))
+
+    def seen(move):
+        xp = rts.namespace(move)
+        zero, one = xp.zeros_like(move[0]), xp.ones_like(move[0])
+        rows = [
+            [one, zero, zero, move[0]],
+            [zero, one, zero, move[1]],
+            [zero, zero, one, zero],
+            [zero, zero, zero, one],
+        ]
+        transform = xp.stack([xp.stack(r) for r in rows])
+        image = rts.render(part.replace(transform=transform), CAMERA, SIZE, splatter=Gaussian5())
+        return image[:, 16:, 3].sum()
+
+    assert gradient(target, seen, arrays(target, np.zeros(2)))[0] > 1
+    assert np.isfinite(to_numpy(rts.render(part, CAMERA, SIZE, splatter=Gaussian5()))).all()
+
+
+# ------------------------------------------------------------------------------------------------- what is sampled
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_theta_goes_to_proxy_inputs_without_derivatives(target):
+    seen = []
+
+    class Watching(MESH):
+        def proxy_inputs(self, theta):
+            seen.append(theta["vertices"])
+            return theta["vertices"] * 1
+
+    vertices, faces = icosphere(1)
+    surface = Watching(faces)
+
+    def total(v):
+        return rts.render(rts.Part(surface, {"vertices": v}), CAMERA, SIZE).sum()
+
+    found = gradient(target, total, arrays(target, vertices))
+    assert np.abs(found).max() > 0
+    if target.startswith("torch"):
+        assert not any(x.requires_grad for x in seen)
+
+
+@pytest.mark.parametrize("camera", ["perspective", "orthographic"])
+def test_the_spread_of_rays_is_the_width_of_a_pixel(camera):
+    cameras = {
+        "perspective": rts.Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=40, aspect=1.2),
+        "orthographic": rts.Camera.orthographic((0, 0, 3), (0, 0, 0), height=4, aspect=1.2),
+    }
+    chosen, (height, width) = cameras[camera], SIZE
+    rays = chosen.rays(SIZE)
+    for z in (0.5, 2.0, 7.0):
+        points = rays.origins + z * rays.directions
+        across = np.linalg.norm(points[3, 8] - points[3, 7])
+        np.testing.assert_allclose(rays.spread[0] + rays.spread[1] * z, across, rtol=1e-9)
+    doubled = chosen.within(np.diag([2.0, 2.0, 2.0, 1.0])).rays(
+        SIZE
+    )  # In local units, of which two are one of the world.
+    np.testing.assert_allclose(doubled.spread, rays.spread / 2, rtol=1e-12)
+    assert height / width == pytest.approx(1 / 1.2)

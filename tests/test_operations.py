@@ -1,0 +1,310 @@
+"""Operations: the library's and a stranger's, in every engine, against closed forms and the specification."""
+
+import numpy as np
+import pytest
+from helpers import ALL, DIFFERENTIABLE, arrays, derivative, finite_difference, gradient, relative_error, to_numpy
+
+import rts
+from rts.operations.combine import COMBINE, combine, interpolate
+from rts.operations.linear import affine_map, matmul
+from rts.operations.projection import projective_map
+from rts.operations.take import take
+
+RNG = np.random.default_rng(0)
+
+
+# --------------------------------------------------------------------------------------- the library's, by closed form
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_combine_is_a_sum_of_rows_with_weights(target):
+    rows, weights = RNG.normal(size=(7, 4)), RNG.normal(size=(50, 16))
+    ids = RNG.integers(0, 7, (50, 16)).astype(np.int32)
+    found = combine(*arrays(target, (rows, ids, weights)))
+    np.testing.assert_allclose(to_numpy(found), (weights[..., None] * rows[ids]).sum(1), rtol=0, atol=2e-5)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_combine_has_the_derivatives_of_a_bilinear_map(target):
+    rows, weights, g = RNG.normal(size=(7, 3)), RNG.normal(size=(50, 5)), RNG.normal(size=(50, 3))
+    ids = RNG.integers(0, 7, (50, 5)).astype(np.int32)
+    index, factors = arrays(target, (ids, g))
+    total = lambda x: (combine(x[0], index, x[1]) * factors).sum()  # noqa: E731
+    g_rows, g_weights = gradient(target, total, list(arrays(target, (rows, weights))))
+    expected = np.zeros_like(rows)
+    np.add.at(expected, ids, weights[..., None] * g[:, None, :])
+    np.testing.assert_allclose(g_rows, expected, rtol=0, atol=5e-5)
+    np.testing.assert_allclose(g_weights, (rows[ids] * g[:, None, :]).sum(-1), rtol=0, atol=2e-5)
+    moves = [RNG.normal(size=x.shape) for x in (rows, weights)]
+    given = list(arrays(target, (rows, weights)))
+    along = derivative(target, lambda x: combine(x[0], index, x[1]), given, list(arrays(target, moves)))[1]
+    expected = (moves[1][..., None] * rows[ids] + weights[..., None] * moves[0][ids]).sum(1)
+    np.testing.assert_allclose(along, expected, rtol=0, atol=5e-5)
+
+
+def test_interpolation_is_combine_with_the_weight_that_the_others_lack_of_one():
+    rows, weights = RNG.normal(size=(7, 3)), RNG.random((40, 2))
+    ids = RNG.integers(0, 7, (40, 6)).astype(np.int32)
+    whole = np.concatenate([weights, 1 - weights.sum(1, keepdims=True)], 1)
+    found = interpolate(rows, ids, 3, weights)
+    np.testing.assert_allclose(found, combine(rows, ids[:, 3:], whole), rtol=1e-12, atol=1e-12)
+    # The loops for any number of rows agree with those for triangles.
+    from rts.operations import combine_kernels
+
+    general, special = np.empty_like(found), np.empty_like(found)
+    combine_kernels.parallel(
+        combine_kernels._sum, 40, *combine_kernels_read(rows, ids), 3, 3, True, *combine_kernels_read(weights), general
+    )
+    combine_kernels.forward(*combine_kernels_read(rows, weights, ids), special, 3, 3, True)
+    np.testing.assert_allclose(general, special, rtol=1e-12)
+
+
+def combine_kernels_read(*given):
+    from rts.threads import read_only
+
+    return [read_only(x) for x in given]
+
+
+@pytest.mark.parametrize("affine", [False, True])
+def test_the_adjoint_of_combine_is_its_transpose(affine):
+    from rts.operations import combine_kernels
+
+    rows, weights = combine_kernels_read(RNG.normal(size=(9, 4)), RNG.normal(size=(60, 6)))
+    (ids,) = combine_kernels_read(RNG.integers(0, 9, (60, 8)).astype(np.int32))
+    params = {"column": 2, "count": 5, "affine": affine}
+    t_rows, t_weights, g = RNG.normal(size=rows.shape), RNG.normal(size=weights.shape), RNG.normal(size=(60, 4))
+    out, g_rows, g_weights = np.empty((60, 4)), np.zeros_like(rows), np.zeros_like(weights)
+    combine_kernels.push(rows, weights, ids, t_rows, t_weights, out, **params)
+    combine_kernels.pull(rows, weights, ids, g, g_rows, g_weights, **params)
+    np.testing.assert_allclose((out * g).sum(), (g_rows * t_rows).sum() + (g_weights * t_weights).sum(), rtol=1e-12)
+    step = 1e-6
+    ends = []
+    for s in (step, -step):
+        end = np.empty((60, 4))
+        combine_kernels.forward(*combine_kernels_read(rows + s * t_rows, weights + s * t_weights, ids), end, **params)
+        ends.append(end)
+    np.testing.assert_allclose(out, (ends[0] - ends[1]) / (2 * step), rtol=1e-6, atol=1e-7)
+    specified = COMBINE.specification(rows, weights, ids, **params)
+    found = np.empty((60, 4))
+    combine_kernels.forward(rows, weights, ids, found, **params)
+    np.testing.assert_allclose(found, specified, rtol=1e-12, atol=1e-12)
+
+
+def test_combine_refuses_what_does_not_fit_in_one_line():
+    rows, ids, weights = np.ones((4, 3)), np.zeros((5, 2), np.int32), np.ones((5, 2))
+    with pytest.raises(
+        rts.InputError, match=r"shapes \(4, 3\), \(5, 2\), \(5, 1\); expected \(V, C\), \(N, I\), \(N, I\)"
+    ):
+        combine(rows, ids, weights[:, :1])
+    for target in ALL:
+        with pytest.raises(rts.InputError, match="samples refer to row 9 of an array of 4; sample this surface anew"):
+            to_numpy(combine(*arrays(target, (rows, ids + 9, weights))))
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_maps_and_products_are_those_of_linear_algebra(target):
+    rows, points = RNG.normal(size=(5, 4)), RNG.normal(size=(30, 3))
+    a, b = RNG.normal(size=(4, 4)), RNG.normal(size=(4, 4))
+    given = arrays(target, (rows, points, a, b))
+    np.testing.assert_allclose(to_numpy(affine_map(*given[:2])), points @ rows[:, :3].T + rows[:, 3], atol=1e-5)
+    np.testing.assert_allclose(to_numpy(matmul(*given[2:])), a @ b, atol=1e-5)
+
+
+def test_arrays_of_numpy_beside_those_of_another_engine_are_constants():
+    torch = pytest.importorskip("torch")
+    points = torch.rand(5, 3, requires_grad=True)
+    rows = RNG.normal(size=(4, 4))
+    rows[2, 3] += 6
+    out = projective_map(rows, points)
+    assert isinstance(out, torch.Tensor) and out.dtype == torch.float32
+    out.sum().backward()
+    assert points.grad.abs().sum() > 0
+    assert isinstance(affine_map(torch.rand(4, 4), points.detach().numpy()), torch.Tensor)
+
+
+# ----------------------------------------------------------------------------------------------------- a stranger's
+
+
+def specification(x, scale, *, power):
+    xp = rts.namespace(x, scale)
+    return scale * xp.tanh(x / scale) ** power
+
+
+CALLS = []
+
+
+def forward(operands, out, *, power):
+    x, scale = operands
+    CALLS.append(("forward", len(x)))
+    kept = np.tanh(x / scale)
+    out[...] = scale * kept**power
+    return kept
+
+
+def slopes(operands, power, kept):
+    x, scale = operands
+    t = np.tanh(x / scale) if kept is None else kept
+    by_x = power * t ** (power - 1) * (1 - t * t)
+    return by_x, t**power - by_x * x / scale
+
+
+def push(operands, tangents, out, *, power, kept):
+    CALLS.append(("push", kept is not None))
+    by_x, by_scale = slopes(operands, power, kept)
+    dx, dscale = tangents
+    out[...] = 0 if dx is None else by_x * dx
+    if dscale is not None:
+        out += by_scale * dscale
+
+
+def pull(operands, g, results, *, power, kept):
+    CALLS.append(("pull", kept is not None))
+    by_x, by_scale = slopes(operands, power, kept)
+    if results[0] is not None:
+        results[0][...] = by_x * g
+    if results[1] is not None:
+        results[1][...] = (by_scale * g).sum(axis=0)
+
+
+CLAMP = rts.Operation(
+    "tests.clamp",
+    specification,
+    ranks=(2, 1),
+    shape=lambda x, scale, power: x,
+    forward=forward,
+    push=push,
+    pull=pull,
+    differentiable=2,
+    packed=(0,),
+    packed_result=True,
+    keeps=True,
+)
+
+
+@pytest.fixture
+def calls():
+    CALLS.clear()
+    return CALLS
+
+
+def operands():
+    return [RNG.normal(size=(6, 3)), RNG.uniform(0.8, 1.5, 3)]
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_a_stranger_s_operation_runs_its_own_code_in_every_engine(target, calls):
+    given = operands()
+    found = to_numpy(CLAMP(*arrays(target, given), power=3))
+    np.testing.assert_allclose(found, given[1] * np.tanh(given[0] / given[1]) ** 3, rtol=0, atol=1e-5)
+    assert calls == [("forward", 6)]
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_its_derivatives_are_its_own_in_both_modes_and_see_what_was_kept(target, calls):
+    given, g = operands(), RNG.normal(size=(6, 3))
+    value = lambda x: (CLAMP.specification(*x, power=2) * g).sum()  # noqa: E731
+    expected = finite_difference(value, given)
+    factors = arrays(target, g)
+    at = list(arrays(target, given))
+    found = gradient(target, lambda x: (CLAMP(*x, power=2) * factors).sum(), at)
+    assert all(relative_error(a, b) < 1e-4 for a, b in zip(found, expected, strict=True))
+    assert ("pull", True) in calls
+    move = [RNG.normal(size=x.shape) for x in given]
+    along = derivative(target, lambda x: (CLAMP(*x, power=2) * factors).sum(), at, list(arrays(target, move)))[1]
+    assert along == pytest.approx(sum((a * b).sum() for a, b in zip(expected, move, strict=True)), rel=1e-3)
+    assert ("push", True) in calls
+
+
+def test_torch_checks_it_to_second_order():
+    torch = pytest.importorskip("torch")
+    given = [torch.tensor(x, requires_grad=True) for x in operands()]
+    f = lambda x, s: CLAMP(x, s, power=2)  # noqa: E731
+    assert torch.autograd.gradcheck(f, given, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(f, given)
+    batch = torch.rand(4, 6, 3, dtype=torch.float64)
+    found = torch.vmap(f, (0, None))(batch, given[1])
+    torch.testing.assert_close(found, torch.stack([f(x, given[1]) for x in batch]))
+    slopes = torch.vmap(torch.func.grad(lambda x: f(x, given[1]).sum()))(batch)
+    torch.testing.assert_close(slopes, torch.stack([torch.func.grad(lambda x: f(x, given[1]).sum())(x) for x in batch]))
+
+
+def test_jax_compiles_batches_and_differentiates_it_twice(calls):
+    jax = pytest.importorskip("jax")
+    x, scale = arrays("jax", operands())
+    f = lambda x, s: CLAMP(x, s, power=2)  # noqa: E731
+    plain = lambda x, s: specification(x, s, power=2)  # noqa: E731
+    total = lambda f: lambda x, s: (f(x, s) ** 2).sum()  # noqa: E731
+    for transform in (
+        lambda f: jax.jit(f),
+        lambda f: jax.jit(jax.grad(total(f), (0, 1))),
+        lambda f: jax.jit(jax.jacfwd(f, (0, 1))),
+        lambda f: jax.hessian(total(f), (0, 1)),
+    ):
+        found, expected = (jax.tree.leaves(transform(g)(x, scale)) for g in (f, plain))
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_allclose(a, b, rtol=0, atol=2e-5 * float(np.abs(b).max()) + 1e-6)
+    batch = jax.numpy.stack([x, 2 * x])
+    np.testing.assert_allclose(
+        jax.vmap(f, (0, None))(batch, scale), jax.vmap(plain, (0, None))(batch, scale), atol=1e-5
+    )
+    assert {name for name, _ in calls} == {"forward", "push", "pull"}
+
+
+def test_other_dtypes_are_left_to_its_specification(calls):
+    torch = pytest.importorskip("torch")
+    x, scale = (torch.tensor(v, dtype=torch.bfloat16) for v in operands())
+    assert CLAMP(x, scale, power=2).dtype == torch.bfloat16
+    assert CLAMP(x.float().to("meta"), scale.float().to("meta"), power=2).device.type == "meta"
+    assert not calls
+
+
+def test_operations_of_one_name_do_not_take_each_other_s_place():
+    jax = pytest.importorskip("jax")
+    from dataclasses import replace
+
+    def doubled(operands, out, *, power):
+        forward(operands, out, power=power)
+        out *= 2
+
+    x, scale = arrays("jax", operands())
+    other = replace(CLAMP, forward=doubled, keeps=False)
+    one, two = (jax.jit(lambda x, s, f=f: f(x, s, power=2))(x, scale) for f in (CLAMP, other))
+    np.testing.assert_allclose(two, 2 * one, rtol=1e-6)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_take_adds_gradients_of_rows_that_are_taken_twice(target):
+    index = np.array([2, 0, 2, 2], np.int32)
+    found = gradient(target, lambda r: take(r, arrays(target, index)).sum(), arrays(target, np.ones((4, 2))))
+    np.testing.assert_array_equal(found[:, 0], [1, 0, 3, 0])
+
+
+# ------------------------------------------------------------------------------------- gradients of functions of points
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_the_gradient_of_a_function_of_points_is_that_of_its_closed_form(target):
+    points = RNG.normal(size=(9, 3)).astype(np.float32)
+    xp_points = arrays(target, points)
+    f = lambda p: p[:, 0] ** 2 * p[:, 1] + 3 * p[:, 2]  # noqa: E731
+    expected = np.stack([2 * points[:, 0] * points[:, 1], points[:, 0] ** 2, np.full(9, 3.0)], -1)
+    np.testing.assert_allclose(to_numpy(rts.gradient(f, xp_points)), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_it_is_differentiable_in_what_the_function_closes_over_and_in_the_points(target):
+    points = RNG.normal(size=(9, 3)).astype(np.float32)
+    given = {"k": np.array(2.0, np.float32), "p": points}
+
+    def total(t):
+        return (rts.gradient(lambda p: t["k"] * (p**3).sum(-1), t["p"]) ** 2).sum()
+
+    found = gradient(target, total, arrays(target, given))
+    # The gradient is 3 k p², its square 9 k² p⁴.
+    np.testing.assert_allclose(found["k"], 18 * 2.0 * (points**4).sum(), rtol=1e-4)
+    np.testing.assert_allclose(found["p"], 36 * 4.0 * points**3, rtol=1e-3, atol=1e-3)
+
+
+def test_a_function_that_gives_another_shape_is_refused():
+    with pytest.raises(rts.InputError, match=r"f gave shape \(4, 3\) for 4 points; expected \(4,\)"):
+        rts.gradient(lambda p: p, np.ones((4, 3)))
