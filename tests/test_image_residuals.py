@@ -280,7 +280,10 @@ def test_sweeps_are_products_of_pushed_tangents(kind, channels, colored):
         splats, t_positions, t_rgba = splats_of(kind, layers)
         t_rgba = t_rgba if colored else None
         chosen = slice(3, 4) if channels == 1 else slice(0, channels)
-        image, rows = splats.image()[..., chosen], splats.jvp(t_positions, t_rgba)[..., chosen]
+        image, rows = np.empty((36, 146, 4)), np.empty((3, 36, 146, 4))
+        splats.image(image)
+        splats.jvp(t_positions, t_rgba, rows)
+        image, rows = image[..., chosen], rows[..., chosen]
         goal = np.random.default_rng(1).random(image.shape)
         r, rows = (image - goal).ravel(), rows.reshape(3, -1)
         found = fused_normal.normal_equations(splats, t_positions, t_rgba, goal, None, None)
