@@ -5,12 +5,15 @@ those of its backward pass; C functions do not count. Prints totals and the func
 
     python benchmarks/python_calls.py
     python benchmarks/python_calls.py --against HEAD~1     # the same of another commit
+
+Kernels run on one thread, since it is chance which others join in.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 from collections import Counter
@@ -18,6 +21,8 @@ from collections.abc import Callable
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
+
+os.environ["RTS_NUM_THREADS"] = "1"
 
 from compare_commits import check_origin, environment, folder_of, isolate, sides_of
 from rich.console import Console

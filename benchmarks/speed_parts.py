@@ -23,13 +23,13 @@ BUDGET = 2.0
 # ----------------------------------------------------------------------------------------------------------- splatters
 
 
-class Capture:
+class Capture(rts.Splatter):
     """A splatter that keeps what it is given, of all layers."""
 
-    def splat(self, positions: Any, rgba: Any, row: Any) -> Any:
+    def image(self, splats: rts.Splats) -> Any:
         """See `rts.Splatter`."""
-        self.given = positions, rgba, row
-        return namespace(positions).zeros((*row.shape[1:], 4), dtype=positions.dtype)
+        self.given = splats.positions, splats.rgba, splats.row
+        return namespace(splats.positions).zeros((*splats.row.shape[1:], 4), dtype=splats.positions.dtype)
 
 
 def splats(task: Task, layers: int) -> tuple[np.ndarray, ...]:
@@ -91,15 +91,19 @@ def splat_rows(tasks: Iterable[Task], layers: tuple[int, ...], rounds: int, done
 # ------------------------------------------------------------------------------------------------------------- pruning
 
 
-class Unpruned:
+class Unpruned(rts.Splatter):
     """The default splatter, which does not say what it needs."""
 
     def __init__(self) -> None:
         self._splatter = rts.plugin("rts.splatters", "auto")()
 
-    def splat(self, positions: Any, rgba: Any, row: Any) -> Any:
+    def image(self, splats: rts.Splats) -> Any:
         """See `rts.Splatter`."""
-        return self._splatter.splat(positions, rgba, row)
+        return self._splatter.image(splats)
+
+    def cropped(self, splats: rts.Splats) -> Any:
+        """See `rts.Splatter`."""
+        return self._splatter.cropped(splats)
 
 
 def pruning_rows(tasks: Iterable[Task], engines: tuple[str, ...], rounds: int, done: Callable[[], None]) -> list[dict]:

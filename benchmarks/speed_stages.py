@@ -58,25 +58,31 @@ class Clock:
         return call
 
 
-class TimedSplatter:
+class TimedSplatter(rts.Splatter):
     """A splatter that is timed, forwards and backwards."""
+
+    prunes = True
 
     def __init__(self, splatter: Any, clock: Clock):
         self._splatter, self._clock = splatter, clock
         self.needed = clock.timed("choose hidden layers", splatter.needed)
 
-    def splat(self, positions: Any, rgba: Any, row: Any) -> Any:
+    def image(self, splats: rts.Splats) -> Any:
         """See `rts.Splatter`."""
-        positions = positions + 0  # Whose gradient arrives when the splatter's is done.
+        return self._splatter.image(splats)
+
+    def cropped(self, splats: rts.Splats) -> Any:
+        """See `rts.Splatter`."""
+        positions = splats.positions + 0  # Whose gradient arrives when the splatter's is done.
         positions.register_hook(self._leave)
         with self._clock.stage("splat"):
-            return self._splatter.splat(positions, rgba, row)
+            return self._splatter.cropped(splats.replace(positions=positions))
 
     def _leave(self, _: Any) -> None:
         self._clock.left_splat = time.perf_counter()
 
 
-class TimedShader:
+class TimedShader(rts.Shader):
     """A shader that is timed."""
 
     def __init__(self, shader: Any, clock: Clock):

@@ -25,12 +25,13 @@ from rts.splatting import Plain, Visible
 SIZE, TEXELS, TRAINING, HELD_OUT, STEPS, BATCHES, RATE = (128, 128), 256, 16, 6, 120, 4, 0.03
 
 
-class Sharp:
+class Sharp(rts.Splatter):
     """The image of `none` with the derivative of `visible`."""
 
-    def splat(self, positions: torch.Tensor, rgba: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
-        soft = Visible().splat(positions, rgba, row)
-        return soft + (Plain().splat(positions, rgba, row) - soft).detach()
+    def image(self, splats: rts.Splats) -> torch.Tensor:
+        """See `rts.Splatter`."""
+        soft = Visible().image(splats)
+        return soft + (Plain().image(splats) - soft).detach()
 
 
 def views(count: int, seed: int) -> list[rts.Camera]:

@@ -259,15 +259,18 @@ def namespace(*arrays: Array) -> Any:
     return (engine_of(*arrays) if engine is None else engine).namespace
 
 
+def _shape(x: Any) -> Any:
+    return getattr(x, "shape", None)
+
+
 def shape_of(x: Any) -> tuple[int, ...]:
     """The shape of an array; () of anything else."""
-    return tuple(getattr(x, "shape", ()))
+    return tuple(_shape(x) or ())
 
 
 def described(x: Any) -> str:
     """What an error says of a value: "has shape (2, 3)" of an array, what it is of anything else."""
-    shape = shape_of(x)
-    return f"has shape {shape}" if shape else f"is a {type(x).__name__}"
+    return f"is a {type(x).__name__}" if _shape(x) is None else f"has shape {shape_of(x)}"
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:

@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from rts.camera import Camera
     from rts.operations.operation import Operation
 
-Needed = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""(K, H, W) covered (bool) and depth → which samples can reach the image (bool); on the host."""
-
 
 class Plugin(abc.ABC):  # noqa: B024
     """What all bases share: class variables that follow from the methods of a class.
@@ -161,9 +158,10 @@ class TriangleSurface(Surface):
         """The `Samples.tables` that `refine` fills.
 
         Args:
-            rows: the largest number of samples.
-            capacity: the number of rows that is allotted where shapes have to be known, as in `jax.jit`; None where
-                tables may have any length, and their specs are to be packed.
+            rows: the largest number of samples that `refine` may be given: every cell of every layer.
+            capacity: the number of rows that is allotted for samples where shapes have to be known, as in `jax.jit`;
+                None where tables may have any length, and their specs are to be packed. The core sees to the rows of
+                tables `by_sample`.
         """
         return {}
 
@@ -186,11 +184,22 @@ class RaySurface(Surface):
 # ----------------------------------------------------------------------------------------------------- samplers
 
 
+class Needed(Plugin):
+    """Which samples can reach the image; on the host. Any function of that signature will do."""
+
+    @abc.abstractmethod
+    def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W)."""
+
+    def ran_out(self, cells: int) -> None:
+        """Told of how many cells had K layers of triangles, of which fewer were left when they were refined."""
+
+
 class Sampler(Plugin):
     """Finds where rays meet one part: the step without derivative.
 
     Attributes:
-        prunes: whether `sample` also takes `needed`, a `Needed` or None: which samples to keep.
+        prunes: whether `sample` also takes `needed`, a `Needed`, a function or None: which samples to keep.
     """
 
     prunes: bool = False

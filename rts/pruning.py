@@ -20,7 +20,7 @@ LAYER_LIMIT = 8
 """The largest number of layers that `layers="auto"` takes."""
 
 
-def needed_by(splatter: Splatter, parts: Sequence[Part]) -> Needed | None:
+def needed_by(splatter: Splatter, parts: Sequence[Part]) -> Callable[[np.ndarray, np.ndarray], np.ndarray] | None:
     """What the splatter needs of a scene, or None where that is not known: all of it.
 
     Only where all samples are opaque and lie on pixel centres are hidden ones without effect.
@@ -38,16 +38,18 @@ def needed_by(splatter: Splatter, parts: Sequence[Part]) -> Needed | None:
     return needed
 
 
-class Inspection:
-    """A `Needed` that takes note of how many layers there are where hidden ones count.
+class Inspection(Needed):
+    """Takes note of how many layers there are where hidden ones count.
 
     Attributes:
         most: the largest number of layers in a cell that needs more than its front, at least 1; None before a call.
         beyond: (L,) number of such cells that have an l-th layer.
+        short: number of cells whose layers ran out as they were refined: there may be more behind.
     """
 
-    def __init__(self, needed: Needed | None):
+    def __init__(self, needed: Callable[[np.ndarray, np.ndarray], np.ndarray] | None):
         self._needed, self._lock = needed, threading.Lock()
+        self.short = 0
         self.most: int | None = None
         self.beyond = np.zeros(0, np.int64)
 
@@ -62,6 +64,11 @@ class Inspection:
             self.beyond = counted
             self.most = int(np.flatnonzero(counted).max()) + 1
         return kept
+
+    def ran_out(self, cells: int) -> None:
+        """See `Needed`."""
+        with self._lock:
+            self.short += cells
 
 
 def as_needed(taken: Callable[[int, Needed], Sampled], needed: Needed | None) -> Sampled:
@@ -80,7 +87,7 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: Needed | None) ->
             traced, deaf = "the values that decide are traced", "the sampler did not ask which samples are needed"
             why = traced if is_traced(sampled.row) else deaf
             raise InputError(f'layers is "auto", but {why}; give a number of layers')
-        if inspection.most < count or count > LAYER_LIMIT:
+        if (inspection.most < count and not inspection.short) or count > LAYER_LIMIT:
             break
         count *= 2
     kept = min(inspection.most, LAYER_LIMIT)

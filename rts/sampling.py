@@ -137,7 +137,7 @@ class TriangleSampler(Sampler):
         inputs = surface.proxy_inputs(_stopped(theta)) if entry is None or surface.refines else None
         reads = {name: theta[name] for name in surface.reads(theta)}
         host_theta = reads if engine.differentiates and is_constant(reads) else None
-        tables = dict(surface.table_specs(shape.rows, capacity))
+        tables = shape.tables(surface)
         shader = adapted(part.shader, Shader)
         asked = None if shader is None else shader.reads
         attributes = _attribute_specs(surface, asked, host_theta, shape, like)
@@ -201,8 +201,10 @@ class TriangleSampler(Sampler):
         moved, rays = refined(surface, inputs, lifted, camera, shape.size, tables)
         settled = settle(moved, camera, rays.spread)
         # Which samples are needed is asked with their final depths.
-        covered = settled.row >= 0
-        kept = covered if needed is None else needed(covered, settled.depth)
+        left = kept = settled.row >= 0
+        if needed is not None:
+            adapted(needed, Needed).ran_out(int((covered[-1] & ~left[-1]).sum()))
+            kept = needed(left, settled.depth)
         return repack(settled, kept, shape.capacity)
 
 
@@ -227,6 +229,14 @@ class _Shape(NamedTuple):
     def row_spec(self, dtype: Any, *widths: int) -> ArraySpec:
         """Of an array with a row a sample."""
         return ArraySpec((self.rows, *widths), dtype, self.capacity is None)
+
+    def tables(self, surface: TriangleSurface) -> dict[str, ArraySpec]:
+        """Of what a surface's `refine` fills."""
+        specs = dict(surface.table_specs(self.layers * self.size[0] * self.size[1], self.capacity))
+        for name, spec in specs.items():
+            if spec.by_sample:
+                specs[name] = self.row_spec(spec.dtype, *spec.shape[1:])._replace(by_sample=True)
+        return specs
 
     def specs(self, widths: tuple[int, int]) -> tuple[ArraySpec, ...]:
         """Of ids, params, row, depth and overflow."""

@@ -46,7 +46,8 @@ def refined(
         for name, spec in tables.items()
     }
     lifted, rays = replace(lifted, tables=allotted, by_sample=by_sample), _rays_of(lifted, camera, size)
-    return _checked(surface.refine(inputs, lifted, rays), lifted, surface), rays
+    # A copy of the rows, which tells what has been written to them.
+    return _checked(surface.refine(inputs, replace(lifted, row=lifted.row.copy()), rays), lifted, surface), rays
 
 
 def _rays_of(samples: Samples, camera: Camera, size: tuple[int, int]) -> Rays:
@@ -65,13 +66,15 @@ def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
     Args:
         samples: what a surface's `refine` gave; rows that are −1 are no samples.
         camera: host matrices.
-        spread: of `Rays`.
+        spread: of `Rays`, local units.
 
     Returns:
         Samples with another `row` and `depth`. What lies before the near or beyond the far plane is gone.
     """
     row, depth = np.empty_like(samples.row), np.empty_like(samples.depth)
-    limits = np.array([*_planes(camera), SAME_ROOT_PIXELS * spread[0], SAME_ROOT_PIXELS * spread[1] + SAME_ROOT])
+    # Depths are the camera's; of the view's units there are so many in one of the surface's.
+    near, slope = SAME_ROOT_PIXELS * np.abs(np.linalg.det(camera.view[:3, :3])) ** (1 / 3) * spread
+    limits = np.array([*_planes(camera), near, slope + SAME_ROOT])
     given = read_only(samples.row, np.int32), read_only(samples.depth, np.float32)
     parallel(_settle, row.shape[1], *given, limits, row, depth, work=10 * row.size)
     return replace(samples, row=row, depth=depth)
@@ -112,19 +115,16 @@ def _checked(found: Any, given: Samples, surface: TriangleSurface) -> Samples:
     who = f"refine of {surface!r}"
     if not isinstance(found, Samples):
         raise InputError(f"{who} gave a {type(found).__name__}; expected rts.Samples")
-    rows, widths = len(given.ids), surface.sample_widths
-    ids, params = np.ascontiguousarray(found.ids, np.int32), np.ascontiguousarray(found.params, np.float32)
-    row, depth = np.asarray(found.row, np.int32), np.asarray(found.depth, np.float32)
-    for name, array, shape in (
-        ("ids", ids, (rows, widths[0])),
-        ("params", params, (rows, widths[1])),
-        ("row", row, given.row.shape),
-        ("depth", depth, given.row.shape),
-    ):
-        if array.shape != shape:
-            raise InputError(f"{who} gave {name} of shape {array.shape}; expected {shape}")
+    rows, grid, (i, p) = len(given.ids), given.row.shape, surface.sample_widths
+    ids = _array(f"{who} gave ids", found.ids, (rows, i), np.integer, np.int32)
+    params = _array(f"{who} gave params", found.params, (rows, p), np.floating, np.float32)
+    row = _array(f"{who} gave row", found.row, grid, np.integer, np.int32)
+    depth = _array(f"{who} gave depth", found.depth, grid, np.floating, np.float32)
+    overflow = _array(f"{who} gave overflow", found.overflow, (), np.integer, np.int32)
     if ((row != given.row) & (row != -1)).any():
         raise InputError(f"{who} gave another number to a row; expected what it was given, or −1 to drop a sample")
+    if overflow < given.overflow:
+        raise InputError(f"{who} gave an overflow of {overflow}; expected at least the {given.overflow} it was given")
     covered = row >= 0
     bad = covered & ~np.isfinite(depth)
     if bad.any():
@@ -133,17 +133,30 @@ def _checked(found: Any, given: Samples, surface: TriangleSurface) -> Samples:
     if not np.isfinite(used).all():
         count = (~np.isfinite(used).all(axis=1)).sum()
         raise InputError(f"{who} gave {count} samples whose params are not finite; set their rows to −1")
-    overflow = np.asarray(found.overflow, np.int32)
     tables = _checked_tables(found.tables, given, who)
     return replace(given, ids=ids, params=params, row=row, depth=depth, overflow=overflow, tables=tables)
 
 
+def _array(what: str, value: Any, shape: tuple[int, ...], kind: type, dtype: Any) -> np.ndarray:
+    """A value as an array of a dtype, refused where it has another shape, or is of another kind."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what} that is no array ({error}); expected shape {shape}") from error
+    if array.shape != shape or not np.issubdtype(array.dtype, kind):
+        raise InputError(
+            f"{what} of shape {array.shape} and dtype {array.dtype}; expected {shape} of {np.dtype(dtype)}"
+        )
+    with np.errstate(over="ignore"):  # Infinite then, which is refused where it is used.
+        return np.ascontiguousarray(array, dtype) if array.ndim else array.astype(dtype)
+
+
 def _checked_tables(found: Any, given: Samples, who: str) -> dict[str, np.ndarray]:
     """Tables that fit into those that were allotted."""
+    if set(found) != set(given.tables):
+        raise InputError(f"{who} gave the tables {sorted(found)}; table_specs declares {sorted(given.tables)}")
     tables = {}
     for name, allotted in given.tables.items():
-        if name not in found:
-            raise InputError(f"{who} gave no table {name!r}, which table_specs declares")
         table = np.asarray(found[name], allotted.dtype)
         if name in given.by_sample and len(table) != len(given.ids):
             raise InputError(

@@ -97,7 +97,7 @@ def directions(values: Sequence[np.ndarray], seed: int = 1) -> list[np.ndarray]:
 def claim_slope(gradient: np.ndarray, along: np.ndarray, slope: float, what: str) -> None:
     """Fail unless a float32 gradient explains a difference, which was found along a direction in float64."""
     found = float(np.sum(gradient * along))
-    scale = max(abs(slope), np.linalg.norm(gradient) * np.linalg.norm(along) / np.sqrt(along.size), 1e-4)
+    scale = max(abs(slope), np.linalg.norm(gradient) * np.linalg.norm(along) / np.sqrt(along.size), 1e-3)
     claim(
         abs(found - slope) <= 2e-3 * scale,
         f"{what} is {found:.6g}, but {slope:.6g} by finite differences; is something detached, or taken elsewhere?",

@@ -1,0 +1,294 @@
+"""Surfaces that are not their triangles: Bézier patches, refined by Newton's method, and a torus, sphere-traced."""
+
+from dataclasses import replace
+
+import numpy as np
+
+import rts
+from rts.arrays import unit
+from rts.checks import described
+
+
+class Bezier(rts.TriangleSurface):
+    """Bicubic patches of θ["points"] (m, 3); a sample is the 16 control points of its patch, and (u, v) in it.
+
+    Triangles are coarse on purpose: refinement moves depths, swaps layers, leads two of them to one root, and misses.
+    """
+
+    sample_widths = (16, 2)
+    steps = 24
+    met = 1e-4
+    """Pixels that a sample may be off its ray."""
+
+    def __init__(self, indices, squares=3):
+        """Of patches (n, 16), whose points go first along v, then along u; `squares` along each side of a patch."""
+        self.indices, self.squares = np.asarray(indices, np.int32), squares
+
+    def check(self, theta):
+        points, least = theta.get("points"), int(self.indices.max()) + 1
+        shape = tuple(getattr(points, "shape", ()))
+        if len(shape) != 2 or shape[0] < least or shape[1] != 3:
+            raise rts.InputError(f"theta['points'] {described(points)}; expected (m, 3), m at least {least}")
+
+    def reads(self, theta):
+        return ("points",)
+
+    def evaluate(self, theta, samples):
+        (a, da), (b, db) = (bernstein(samples.params[:, i]) for i in range(2))
+        points, ids = theta["points"], samples.ids
+        gbuffer = rts.GBuffer(position=rts.combine(points, ids, products(a, b)))
+
+        def normal():
+            along_u, along_v = (rts.combine(points, ids, products(*w)) for w in ((da, b), (a, db)))
+            return unit(rts.namespace(along_u).linalg.cross(along_u, along_v))
+
+        gbuffer.defer("normal", normal)
+        return gbuffer
+
+    def proxy_inputs(self, theta):
+        return theta["points"]
+
+    def proxy(self, inputs, camera, size):
+        r, patches = self.squares, len(self.indices)
+        grid = np.linspace(0, 1, r + 1)
+        params = np.stack(np.meshgrid(grid, grid, indexing="ij"), axis=-1).reshape(-1, 2)
+        ids = np.repeat(self.indices, len(params), axis=0)
+        index = np.arange((r + 1) ** 2, dtype=np.int32).reshape(r + 1, r + 1)
+        a, b, c, d = (x.reshape(-1) for x in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+        faces = np.stack([np.stack(t, axis=-1) for t in ((a, b, c), (a, c, d))], axis=1).reshape(-1, 3)
+        every = (faces + (len(params) * np.arange(patches, dtype=np.int32))[:, None, None]).reshape(-1, 3)
+        return rts.Proxy(
+            points_at(inputs, ids, np.tile(params, (patches, 1)))[0].astype(np.float32),
+            every,
+            np.repeat(self.indices, len(faces), axis=0),
+            np.tile(params.astype(np.float32)[faces], (patches, 1, 1)),
+        )
+
+    def refine(self, inputs, samples, rays):
+        """(u, v) and the depth of each sample by Newton's method along its ray, within the patch."""
+        cells = samples.row >= 0
+        depth, params = np.ones(len(samples.ids)), samples.params.astype(np.float64)
+        depth[samples.row[cells]] = samples.depth[cells]
+        for _ in range(self.steps):
+            point, along_u, along_v = points_at(inputs, samples.ids, params)
+            off = point - rays.origins - depth[:, None] * rays.directions
+            columns = np.stack([along_u, along_v, -rays.directions], axis=-1)
+            determinant = np.linalg.det(columns)
+            columns[np.abs(determinant) < 1e-12] = np.eye(3)
+            step = np.linalg.solve(columns, -off[..., None])[..., 0]
+            params = np.clip(params + np.clip(step[:, :2], -0.3, 0.3), 0, 1)
+            depth = depth + np.clip(step[:, 2], -0.5, 0.5)
+        off = points_at(inputs, samples.ids, params)[0] - rays.origins - depth[:, None] * rays.directions
+        met = np.linalg.norm(off, axis=1) < self.met * np.abs(rays.spread[0] + rays.spread[1] * depth)
+        row = np.where(cells & met[samples.row], samples.row, -1)
+        return replace(samples, params=params, row=row, depth=np.where(row >= 0, depth[row], 0))
+
+    @classmethod
+    def example(cls):
+        """A sheet folded twice, two patches long, and a third patch that crosses it almost in its tangent plane."""
+        fold = [(-0.9, 0.5), (0.5, 0.95), (1.5, 0.5), (0.2, 0.15), (-1.1, -0.2), (-0.9, -0.9), (0.9, -0.5)]
+        wave = np.array([0.1, -0.15, 0.2, 0.0])
+        across = list(zip(np.linspace(-0.8, 0.8, 4), wave, strict=True))
+        sheet = [(x + 0.1 * y, y, z + w) for x, z in fold for y, w in across]
+        third = [(x, 0.9 * y, 0.55 - 0.12 * x * x + 0.2 * w) for x in np.linspace(-0.7, 0.8, 4) for y, w in across]
+        indices = [np.arange(first, first + 16) for first in (0, 12, 28)]
+        return rts.Part(cls(indices), {"points": np.array(sheet + third, np.float32)}, "normals")
+
+
+def bernstein(t):
+    """The four cubic Bernstein polynomials, and their derivatives."""
+    s = 1 - t
+    return (s**3, 3 * s * s * t, 3 * s * t * t, t**3), (-3 * s * s, 3 * s * (s - 2 * t), 3 * t * (2 * s - t), 3 * t * t)
+
+
+def products(a, b):
+    """(N, 16) weights of a patch's points from those along u and along v."""
+    return rts.namespace(a[0]).stack([x * y for x in a for y in b], axis=-1)
+
+
+def points_at(points, ids, params):
+    """Points of patches and their derivatives in u and v, (N, 3) each, in float64."""
+    (a, da), (b, db) = (bernstein(params[:, i].astype(np.float64)) for i in range(2))
+    corners = points.astype(np.float64)[ids]
+    return tuple(np.einsum("ni,nic->nc", products(*w), corners) for w in ((a, b), (da, b), (a, db)))
+
+
+class Sheets(rts.TriangleSurface):
+    """Squares that face +z, at the heights θ["heights"] (L,); a sample is the number of its sheet, and x and y."""
+
+    sample_widths = (1, 2)
+
+    def __init__(self, refining=lambda samples, rays: samples):
+        """`refining` is what `refine` does."""
+        self.refining = refining
+
+    def proxy_inputs(self, theta):
+        return theta["heights"]
+
+    def proxy(self, inputs, camera, size):
+        corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], np.float32)
+        vertices = np.concatenate([np.insert(corners, 2, z, axis=1) for z in inputs])
+        faces = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
+        sheet = np.repeat(np.arange(len(inputs), dtype=np.int32), 2)[:, None]
+        return rts.Proxy(
+            vertices, np.tile(faces, (len(inputs), 1)) + 4 * sheet, sheet, np.tile(corners[faces], (len(inputs), 1, 1))
+        )
+
+    def refine(self, inputs, samples, rays):
+        return self.refining(samples, rays)
+
+    def evaluate(self, theta, samples):
+        return self.at(theta, samples.params, samples.ids[:, 0])
+
+    @staticmethod
+    def at(theta, xy, sheet):
+        xp = rts.namespace(theta["heights"], xy)
+        z = xp.take(theta["heights"], sheet, axis=0)
+        return rts.GBuffer(position=xp.stack([xp.astype(xy[:, 0], z.dtype), xp.astype(xy[:, 1], z.dtype), z], axis=-1))
+
+
+class Crowded(Sheets):
+    """Sheets whose samples find x and y in a table that has room for some: a sample is its sheet and its entry."""
+
+    sample_widths = (2, 0)
+
+    def __init__(self, room):
+        self.room = room
+
+    def table_specs(self, rows, capacity):
+        return {"places": rts.ArraySpec((self.room, 2), np.float32, packed=capacity is None)}
+
+    def refine(self, inputs, samples, rays):
+        entry = np.arange(len(samples.ids), dtype=np.int32)[:, None]
+        row = np.where(samples.row < self.room, samples.row, -1)
+        return replace(
+            samples,
+            ids=np.concatenate([samples.ids, np.minimum(entry, self.room - 1)], axis=1),
+            params=samples.params[:, :0],
+            row=row,
+            overflow=samples.overflow + ((samples.row >= 0) & (row < 0)).sum(),
+            tables={"places": samples.params[: self.room]},
+        )
+
+    def evaluate(self, theta, samples):
+        places = samples.tables["places"]
+        return self.at(theta, rts.namespace(places).take(places, samples.ids[:, 1], axis=0), samples.ids[:, 0])
+
+
+class Torus(rts.RaySurface):
+    """θ["radii"] (2,): of the circle in the plane y = 0, and of the tube around it.
+
+    A sample is the cosine and sine of its angle about the axis, and of that about the circle.
+    """
+
+    sample_widths = (0, 4)
+    most = 400
+    least = 1e-3
+    """Step near the surface, which rays that touch it for less than this may miss."""
+
+    def check(self, theta):
+        if tuple(getattr(theta.get("radii"), "shape", ())) != (2,):
+            raise rts.InputError(f"theta['radii'] {described(theta.get('radii'))}; expected (2,)")
+
+    def reads(self, theta):
+        return ("radii",)
+
+    def evaluate(self, theta, samples):
+        xp, (large, small) = rts.namespace(theta["radii"], samples.params), (theta["radii"][i] for i in range(2))
+        about_axis, about_circle = samples.params[:, :2], samples.params[:, 2:]
+        out = large + small * about_circle[:, 0]
+        position = xp.stack([out * about_axis[:, 0], small * about_circle[:, 1], out * about_axis[:, 1]], axis=-1)
+        gbuffer = rts.GBuffer(position=position)
+
+        def normal():
+            radial = about_circle[:, 0]
+            parts = radial * about_axis[:, 0], about_circle[:, 1], radial * about_axis[:, 1]
+            return xp.astype(xp.stack(parts, axis=-1), position.dtype)
+
+        gbuffer.defer("normal", normal)
+        return gbuffer
+
+    def intersect(self, theta, origins, directions, layers):
+        """Steps as long as the surface is far, over it where it is near; each change of sign holds one hit."""
+        xp, radii = rts.namespace(origins), theta["radii"]
+
+        def value(t):
+            return distance(radii, origins + t[..., None] * directions)
+
+        length = xp.sqrt(xp.sum(directions * directions, axis=-1))
+        last = leaving(origins, directions, radii[0] + radii[1] + self.least)
+        zero = xp.zeros_like(length)
+        none = xp.stack([zero] * layers)
+
+        def going(state):
+            return (state["count"] < layers) & (state["t"] < last)
+
+        def body(state):
+            t, before, count = state["t"], state["value"], state["count"]
+            further = t + xp.where(going(state), xp.clip(xp.abs(before), self.least, None) / length, 0.0)
+            after = value(further)
+            crossed = going(state) & ((after > 0) != (before > 0))
+            here = xp.stack([crossed & (count == k) for k in range(layers)])
+            return {
+                "t": further,
+                "value": after,
+                "count": count + xp.astype(crossed, count.dtype),
+                "low": xp.where(here, t, state["low"]),
+                "high": xp.where(here, further, state["high"]),
+            }
+
+        state = {
+            "t": zero,
+            "value": value(zero),
+            "count": xp.zeros_like(zero, dtype=xp.int32),
+            "low": none,
+            "high": none,
+        }
+        state = rts.engine_of(origins).repeat(body, lambda s: xp.any(going(s)), state, self.most)
+        hits = xp.stack([state["count"] > k for k in range(layers)])
+        t = root(value, state["low"], state["high"])
+        point = origins + t[..., None] * directions
+        about_axis = unit(xp.stack([point[..., 0], point[..., 2]], axis=-1))
+        out = point[..., 0] * about_axis[..., 0] + point[..., 2] * about_axis[..., 1] - radii[0]
+        about_circle = unit(xp.stack([out, point[..., 1]], axis=-1))
+        return rts.RayHits(hits, t, xp.concat([about_axis, about_circle], axis=-1))
+
+    @classmethod
+    def example(cls):
+        return rts.Part(cls(), {"radii": np.array([0.9, 0.35], np.float32)}, "normals")
+
+
+def distance(radii, points):
+    """The signed distance of points (..., 3) to a torus, negative inside."""
+    xp = rts.namespace(radii, points)
+
+    def length(a, b):  # Its derivative is finite at zero, too.
+        square = a * a + b * b
+        positive = square > 0
+        return xp.where(positive, xp.sqrt(xp.where(positive, square, 1.0)), 0.0)
+
+    return length(length(points[..., 0], points[..., 2]) - radii[0], points[..., 1]) - radii[1]
+
+
+def leaving(origins, directions, radius):
+    """Where rays leave a ball about the origin, in units of their directions; 0 for those that do not meet it."""
+    xp = rts.namespace(origins)
+    a, b, c = (xp.sum(x * y, axis=-1) for x, y in ((directions,) * 2, (origins, directions), (origins,) * 2))
+    square = b * b - a * (c - radius * radius)
+    return xp.where(square > 0, (xp.sqrt(xp.where(square > 0, square, 1.0)) - b) / a, 0.0)
+
+
+def root(f, low, high, steps=6):
+    """Where a function changes its sign between two arguments, by the method of Illinois; `low` where they are one."""
+    xp = rts.namespace(low)
+    below, above = f(low), f(high)
+    for _ in range(steps):
+        slope = above - below
+        middle = low - below * (high - low) / xp.where(slope == 0, 1.0, slope)
+        middle = xp.minimum(xp.maximum(middle, low), high)
+        value = f(middle)
+        first = (value > 0) == (below > 0)
+        # The end that stays counts half, lest it stay for ever.
+        low, high = xp.where(first, middle, low), xp.where(first, high, middle)
+        below, above = xp.where(first, value, 0.5 * below), xp.where(first, 0.5 * above, value)
+    return xp.where(xp.abs(above) < xp.abs(below), high, low)
