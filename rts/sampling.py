@@ -76,7 +76,7 @@ class TriangleSampler(Sampler):
         surface = _of_triangles(part.surface)
         if surface.depends_on_view and (camera is None or size is None):
             raise InputError(f"the triangles of {surface!r} depend on the view; give camera and size")
-        inputs = surface.proxy_inputs(part.theta)
+        inputs = surface.proxy_inputs(_stopped(part.theta))
         inputs = map_leaves(engine_of(inputs).to_numpy, inputs)
         if camera is not None:
             camera = Camera(*(engine_of(m).to_numpy(m) for m in camera.within(part.transform)))

@@ -15,6 +15,7 @@ from rts.gbuffer import GBuffer
 from rts.interfaces import Part, TriangleSurface
 from rts.keeping import fingerprint
 from rts.operations.combine import interpolate
+from rts.operations.take import take
 from rts.records import Array, Proxy, Samples, Tree
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
@@ -143,7 +144,7 @@ class Mesh(TriangleSurface):
     def _vertex_normals(self, vertices: Array) -> Array:
         xp, engine = namespace(vertices), engine_of(vertices)
         faces = engine.constant(self.faces, vertices)
-        a, b, c = (xp.take(vertices, faces[:, i], axis=0) for i in range(3))
+        a, b, c = (take(vertices, faces[:, i]) for i in range(3))
         face_normals = xp.linalg.cross(b - a, c - a)
         segments = self.faces.T.reshape(-1)
         return unit(engine.segment_sum(xp.concat([face_normals] * 3), segments, vertices.shape[0]))
