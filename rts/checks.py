@@ -52,6 +52,8 @@ def _check_part(index: int, part: Part) -> Part:
     surface = as_surface(part.surface)
     if surface is None:
         raise InputError(f"the surface of part {index} is {part.surface!r}; expected an object such as a mesh")
+    if min(surface.sample_widths) < 0:
+        raise InputError(f"{surface!r} has no sample_widths; expected (I, P), the integers and reals of a sample")
     chosen = registry.instance("rts.shaders", part.shader)
     shader = adapted(chosen, Shader)
     if shader is None:
@@ -60,6 +62,9 @@ def _check_part(index: int, part: Part) -> Part:
     if transform is not None:
         check_matrix(f"the transform of part {index}", transform)
     surface.check(theta)
+    reads = surface.reads(theta)
+    if isinstance(reads, str) or not set(reads) <= set(theta):
+        raise InputError(f"reads of {surface!r} gave {reads!r}; expected names of entries of theta: {sorted(theta)}")
     return Part(surface, theta, shader, transform, part.cull)
 
 

@@ -74,7 +74,7 @@ class Surface(Evaluator):
         centered: whether samples lie on the rays through pixel centres.
     """
 
-    sample_widths: tuple[int, int]
+    sample_widths: tuple[int, int] = (-1, -1)
     centered: bool = True
 
     def check(self, theta: Mapping[str, Tree]) -> None:

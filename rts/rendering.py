@@ -9,7 +9,17 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from rts.arrays import constants, engine_of, is_constant, is_traced, namespace, suiting, uncompiled
+from rts.arrays import (
+    constants,
+    described,
+    engine_of,
+    is_constant,
+    is_traced,
+    namespace,
+    shape_of,
+    suiting,
+    uncompiled,
+)
 from rts.camera import Camera
 from rts.checks import (
     check_background,
@@ -245,6 +255,9 @@ def _splatted(sampled: Sampled, scene: _Scene, window: Camera, suited: tuple, sp
     """
     fine = sampled.supersample
     image = splatter.cropped(to_splats(sampled, scene.parts, scene.camera, window, *suited))
+    expected = *(n - 2 * sampled.apron for n in sampled.row.shape[1:]), 4
+    if shape_of(image) != expected:
+        raise InputError(f"the image of {splatter!r} {described(image)}; expected {expected} without the border")
     if fine > 1:
         xp, size = namespace(image), image.shape[:2]
         image = xp.mean(xp.reshape(image, (size[0] // fine, fine, size[1] // fine, fine, 4)), axis=(1, 3))
@@ -310,7 +323,11 @@ def _evaluate(part: Part, reads: Sequence[str], samples: Samples, engine: Engine
         if samples.asked is None or (wanted is not None and set(wanted) <= set(samples.asked)):
             return GBuffer(samples.gbuffer)
     gbuffer = part.surface.evaluate(constants(theta, engine, like), samples)
-    return gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer)
+    gbuffer = gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer)
+    if shape_of(gbuffer["position"]) != (samples.ids.shape[0], 3):
+        position = described(gbuffer["position"])
+        raise InputError(f"'position' of {part.surface!r} {position}; expected ({samples.ids.shape[0]}, 3)")
+    return gbuffer
 
 
 def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:

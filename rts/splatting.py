@@ -145,6 +145,10 @@ def exact_calibration(sigma: float, reach: int = 1) -> float:
     Returns:
         γ = σ² Σ e / Σ u² e, e = exp(−u² / 2σ²) over −reach ≤ u ≤ reach.
     """
+    if not (_is_real(sigma) and sigma > 0) or not (isinstance(reach, int) and reach >= 1):
+        raise InputError(
+            f"sigma is {sigma!r} and reach {reach!r}; expected a positive number and an integer of at least 1"
+        )
     e = [math.exp(-(u**2) / (2 * sigma**2)) for u in range(1, reach + 1)]
     return sigma**2 * (1 + 2 * sum(e)) / (2 * sum(u**2 * x for u, x in enumerate(e, start=1)))
 

@@ -41,7 +41,7 @@ class NumpyEngine(Engine):
         """By compiled code, of float32 and float64; where both meet, in the wider one."""
         dtypes = list(map(_DTYPE, operands))
         if not operation.fits(dtypes):
-            widest = np.result_type(*(d for d in dtypes if d.kind == "f"))
+            widest = np.result_type(np.float32, *(d for d in dtypes if d.kind == "f"))
             operands = [x.astype(widest) if x.dtype.kind == "f" else x for x in operands]
             if not operation.fits(list(map(_DTYPE, operands))):
                 return operation.specification(*operands, **params)

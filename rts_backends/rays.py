@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from rts.arrays import constants, engine_of, exemplar, map_leaves, namespace
+from rts.arrays import constants, engine_of, exemplar, map_leaves, namespace, shape_of
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.interfaces import Part, RaySurface, Sampler, as_surface
-from rts.records import ArraySpec, Samples
+from rts.records import ArraySpec, RayHits, Samples
 from rts.sampling import check_camera
 
 
@@ -36,7 +38,7 @@ class Rays(Sampler):
         rays = camera.rays(size)
         directions = xp.reshape(rays.directions, (-1, 3))
         origins = xp.reshape(rays.origins, (-1, 3)) + near * directions
-        hits = surface.intersect(theta, origins, directions, layers)
+        hits = _checked_hits(surface.intersect(theta, origins, directions, layers), surface, layers, size)
         depth = near + hits.distance
         hit = xp.reshape(hits.hit & (hits.distance >= 0) & (depth <= far), (layers, *size))
 
@@ -62,6 +64,22 @@ class Rays(Sampler):
             ids = xp.take(xp.reshape(hits.ids, (cells, width_i)), index, axis=0)
         depth = xp.where(row >= 0, xp.reshape(depth, (layers, *size)), 0.0)
         return Samples(ids, params, row, depth, overflow)
+
+
+def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, int]) -> RayHits:
+    """What `intersect` of a surface gave, which must have the right shapes."""
+    if not isinstance(hits, RayHits):
+        raise InputError(f"intersect of {surface!r} gave a {type(hits).__name__}; expected rts.RayHits")
+    grid, (i, p) = (layers, size[0] * size[1]), surface.sample_widths
+    given = tuple(map(shape_of, (hits.hit, hits.distance, hits.params, *([] if hits.ids is None else [hits.ids]))))
+    expected = grid, grid, (*grid, p), *([] if hits.ids is None and i == 0 else [(*grid, i)])
+    if given != expected:
+        raise InputError(
+            f"intersect of {surface!r} gave shapes {given}; expected {expected}: hit, distance, params, ids"
+        )
+    if not namespace(hits.hit).isdtype(hits.hit.dtype, "bool"):
+        raise InputError(f"intersect of {surface!r} gave hit of dtype {hits.hit.dtype}; expected bool")
+    return hits
 
 
 def _checked(*matrices: np.ndarray) -> tuple[np.ndarray]:

@@ -488,6 +488,30 @@ class Shy(Ellipsoid):
         return hits._replace(distance=hits.distance + 0.05)
 
 
+class Empty(Ellipsoid):
+    """Gives NaN where nothing is hit."""
+
+    def intersect(self, theta, origins, directions, layers):
+        hits = super().intersect(theta, origins, directions, layers)
+        return hits._replace(distance=np.where(hits.hit, hits.distance, np.nan))
+
+
+class OneSided(Ellipsoid):
+    """Gives but the first hit."""
+
+    def intersect(self, theta, origins, directions, layers):
+        hits = super().intersect(theta, origins, directions, layers)
+        return hits._replace(hit=hits.hit & (np.arange(layers) == 0)[:, None])
+
+
+class Holed(Ellipsoid):
+    """Misses what comes from the right."""
+
+    def intersect(self, theta, origins, directions, layers):
+        hits = super().intersect(theta, origins, directions, layers)
+        return hits._replace(hit=hits.hit & (directions[:, 0] > -0.1))
+
+
 class Stale(OddMesh):
     def proxy(self, inputs, camera, size):
         if not hasattr(self, "kept"):
@@ -545,7 +569,8 @@ SURFACES = {
     },
     "layers_are_front_to_back": {"farthest first": SwappedHits()},
     "refine_keeps_samples_on_their_rays": {"another depth": Refined(), "rows renumbered": Renumbered(), "NaN": Lost()},
-    "rays_from_before_a_hit_find_it": {"nothing near": Shy()},
+    "rays_from_before_a_hit_find_it": {"nothing near": Shy(), "NaN where nothing is hit": Empty()},
+    "rays_from_behind_hit_the_same_places": {"no second hits": OneSided(), "a hole": Holed()},
     "two_renders_are_the_same": {"a counter": Counting(), "kept for ever": Stale()},
     "the_g_buffer_has_a_row_for_each_sample": {
         "widths": WrongWidths(),

@@ -23,6 +23,8 @@ def combine(rows: Array, ids: Array, weights: Array) -> Array:
         InputError: shapes that do not fit, or ids of no row.
     """
     shapes = [tuple(x.shape) for x in (rows, ids, weights)]
+    if not engine_of(ids).namespace.isdtype(ids.dtype, "integral"):
+        raise InputError(f"ids have dtype {ids.dtype}; expected integers that name rows")
     if len(shapes[0]) != 2 or len(shapes[1]) != 2 or shapes[1] != shapes[2] or not shapes[1][1]:
         given = ", ".join(map(str, shapes))
         raise InputError(f"rows, ids and weights have shapes {given}; expected (V, C), (N, I), (N, I)")

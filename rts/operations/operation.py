@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import OWNERS, constants, engine_of, suiting
+from rts.arrays import OWNERS, constants, engine_of, from_numbers, suiting
+from rts.errors import InputError
 from rts.records import Array
 
-_SHAPE = attrgetter("shape")
+_SHAPE, _NDIM = attrgetter("shape"), attrgetter("ndim")
 
 Arrays = Sequence[np.ndarray]
 """Operands on the host, C-contiguous and read-only."""
@@ -33,7 +34,7 @@ class Operation:
     Args of the functions on the host: `operands` (Arrays) are NumPy; `out` and `results` are to be filled in place.
 
     Attributes:
-        name: unique, such as "my_package.warp"; compiled programs are kept by it.
+        name: unique, such as "my_package.warp"; programs that jax keeps on disk find it by this name.
         specification: (*operands, **params) → the result, in array code.
         ranks: of the operands; their number of axes.
         shape: (*shapes of the operands, **params) → the shape of the result; of the floats' dtype.
@@ -44,7 +45,8 @@ class Operation:
             (VJP), into `results`, which are zeros, or None where not wanted.
         differentiable: the first so many operands have derivatives; they are floats.
         packed: operands with a row a sample, of which engines may have allotted more than are used. The functions are
-            given the rows in use; the others have gradients of zero.
+            given the rows in use, as far as the engine knows: of what comes straight from sampling or from another
+            operation. The others are zero in the result, and have gradients of zero.
         packed_result: whether the result has a row a sample likewise.
         used: (operands) → how many rows of the packed operands are used; None for as many as the engine knows of.
         even: packed operands whose rows are often all alike, which a compiling engine may make use of.
@@ -69,8 +71,31 @@ class Operation:
     keeps: bool = False
     sweeps: bool = False
 
+    def __post_init__(self):
+        count = len(self.ranks)
+        if not (isinstance(self.name, str) and self.name):
+            raise InputError(f"an operation is named {self.name!r}; expected a name such as 'my_package.warp'")
+        if not 1 <= self.differentiable <= count:
+            raise InputError(
+                f"the operation {self.name} has {count} operands, by its ranks, of which the first "
+                f"{self.differentiable} are to have derivatives; expected from 1 to {count}"
+            )
+        for i in (*self.packed, *self.even):
+            if not 0 <= i < count or self.ranks[i] < 1:
+                raise InputError(
+                    f"the operation {self.name} has no operand {i} of packed rows; its ranks are {self.ranks}"
+                )
+
     def __call__(self, *operands: Array, **params: Any) -> Array:
-        """The result, in the engine of the operands; NumPy arrays beside those of another are constants."""
+        """The result, in the engine of the operands; NumPy arrays beside those of another are constants.
+
+        Raises:
+            InputError: operands of another number, or with another number of axes.
+        """
+        if len(operands) != len(self.ranks):
+            raise InputError(
+                f"the operation {self.name} takes {len(self.ranks)} operands; it was given {len(operands)}"
+            )
         kind = type(operands[0])
         for x in operands:
             if type(x) is not kind:
@@ -78,6 +103,7 @@ class Operation:
         else:
             if kind in OWNERS or kind is np.ndarray:
                 return engine_of(operands[0]).apply(self, operands, params)
+        operands = tuple([from_numbers(x) for x in operands])
         engine, like = suiting(operands)
         return engine.apply(self, constants(operands, engine, like), params)
 
@@ -95,6 +121,9 @@ class Operation:
 
     def value_on_host(self, operands: Arrays, params: dict[str, Any]) -> tuple[np.ndarray, Any]:
         """The result, and what is kept."""
+        if tuple(map(_NDIM, operands)) != self.ranks:
+            shapes = ", ".join(str(x.shape) for x in operands)
+            raise InputError(f"the operation {self.name} was given shapes {shapes}; expected ranks {self.ranks}")
         out = np.empty(self.shape(*map(_SHAPE, operands), **params), operands[0].dtype)
         return out, self.forward(operands, out, **params)
 

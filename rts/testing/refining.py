@@ -16,6 +16,12 @@ from rts.testing.conformance import claim, claim_finite
 from rts.testing.samples import FEW, REPROJECTION, RESIDUAL
 from rts.testing.scenes import GRID, LAYERS
 
+DEEP = 5
+"""Layers of rays that are shot in both directions."""
+
+BEYOND, NOWHERE = 6.0, 1e3
+"""How far behind the last hit such a ray begins, beyond all there is; and the distance that stands for no hit."""
+
 SHORT = 2e-3
 """How far before a hit the second ray begins, in units of depth."""
 
@@ -62,6 +68,7 @@ def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str
     origins = (rays.origins.reshape(-1, 3) + near * directions).astype(np.float32)
     hits = surface.intersect(theta, origins, directions, LAYERS)
     hit, distance = np.asarray(hits.hit), np.asarray(hits.distance)
+    claim_finite((distance, np.asarray(hits.params)), f"{view}: what intersect gives, also where nothing is hit,")
     missed, total, worst = 0, 0, 0.0
     for k in range(len(hit)):
         # Not where another hit lies between.
@@ -78,4 +85,28 @@ def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str
         missed <= MISSED * total,
         f"{view}: from {SHORT:g} before them, intersect misses {missed} of {total} hits; does it step through the "
         f"surface, or leave out what is near the origin of a ray?",
+    )
+
+
+def claim_found_from_behind(part: Part, surface: RaySurface, camera: Camera, view: str) -> None:
+    """Fail unless rays that come from behind hit at the same places."""
+    theta = map_leaves(derivatives.single, part.theta)
+    local = camera.within(part.transform)
+    rays = local.rays(GRID)
+    directions = rays.directions.reshape(-1, 3).astype(np.float32)
+    origins = (rays.origins.reshape(-1, 3) + float(local.depth_range()[0]) * directions).astype(np.float32)
+    hits = surface.intersect(theta, origins, directions, DEEP)
+    hit, distance = np.asarray(hits.hit), np.where(hits.hit, hits.distance, -np.inf)
+    # Those that have hit all there is.
+    chosen = np.flatnonzero(hit[0] & ~hit[-1])
+    last = distance.max(axis=0)[chosen] + BEYOND
+    back = surface.intersect(theta, origins[chosen] + last[:, None] * directions[chosen], -directions[chosen], DEEP)
+    there = np.where(hit[:, chosen], distance[:, chosen], NOWHERE)
+    again = np.where(np.asarray(back.hit), last - np.asarray(back.distance), NOWHERE)
+    again = np.where(again < 0, NOWHERE, again)  # Before the near plane, where the first rays began.
+    wrong = (np.abs(np.sort(there, axis=0) - np.sort(again, axis=0)) > 1e-2).any(axis=0)
+    claim(
+        wrong.sum() <= FEW * len(wrong),
+        f"{view}: {wrong.sum()} of {len(wrong)} rays hit other places when they come from behind; does intersect miss "
+        f"some?",
     )

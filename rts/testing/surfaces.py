@@ -15,7 +15,7 @@ from rts.records import Proxy, Samples, Tree
 from rts.testing import derivatives, scenes
 from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
 from rts.testing.derivatives import DIFFERENTIABLE, claim_slope, engine_named, installed, joined, split
-from rts.testing.refining import claim_found_again, claim_refined
+from rts.testing.refining import claim_found_again, claim_found_from_behind, claim_refined
 from rts.testing.samples import claim_ordered, claim_reprojected
 from rts.testing.unusual import claim_awkward_views_are_finite, claim_unseen_is_nothing
 
@@ -66,6 +66,14 @@ class SurfaceConformance(Conformance):
             pytest.skip("the surface does not intersect rays itself")
         for view, camera in scenes.VIEWS.items():
             claim_found_again(part, surface, camera, view)
+
+    def test_rays_from_behind_hit_the_same_places(self, part: Part) -> None:
+        """`intersect` finds all hits of a ray, whichever way it goes."""
+        surface = scenes.checked(part).surface
+        if not isinstance(surface, RaySurface):
+            pytest.skip("the surface does not intersect rays itself")
+        for view, camera in scenes.VIEWS.items():
+            claim_found_from_behind(part, surface, camera, view)
 
     def test_two_renders_are_the_same(self, part: Part, sampler: Any) -> None:
         """To the last bit, whatever was rendered between, and when arrays change in place."""
