@@ -9,8 +9,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from rts.adapting import adapted
 from rts.errors import EngineError, InputError, PluginError
-from rts.interfaces import Engine, adapted
+from rts.interfaces import Engine
 from rts.records import STATIC_FIELDS, Array, Tree, join_record, record_arrays, split_record
 
 _F = TypeVar("_F", bound=Callable)

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from rts import registry
+from rts.adapting import adapted, as_surface
 from rts.arrays import described, from_numbers, namespace, shape_of
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.interfaces import Part, Sampler, Shader, Splatter, adapted, as_surface
+from rts.interfaces import Part, Sampler, Shader, Splatter
 from rts.records import Array
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}

@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.adapting import adapted
 from rts.arrays import engine_of, is_constant, leaves, map_leaves
 from rts.errors import InputError
 from rts.fit_runs import Astray, Report, Run, progress_bar, require
-from rts.interfaces import Engine, Residuals, adapted
+from rts.interfaces import Engine, Residuals
 from rts.least_squares import levenberg_marquardt, mean_square
 from rts.records import Array, Tree
 

@@ -1,6 +1,6 @@
 """What plugins implement: a base class for each kind, with every optional member, its default and its contract.
 
-A plugin subclasses its base, or is any object with the required members: such are wrapped once, by `adapted`.
+A plugin subclasses its base, or is any object with the required members: such are wrapped (`rts.adapting`).
 Shapes use the letters of `rts.records`; conventions of space are in `rts.camera`.
 """
 
@@ -9,13 +9,11 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
-from operator import attrgetter
-from types import FunctionType
 from typing import TYPE_CHECKING, Any, ClassVar, final
 
 import numpy as np
 
-from rts.errors import EngineError, InputError, PluginError, RtsError
+from rts.errors import EngineError, InputError, RtsError
 from rts.gbuffer import GBuffer
 from rts.records import Array, ArraySpec, Proxy, RayHits, Rays, Samples, Splats, Tree, record
 
@@ -539,153 +537,3 @@ class Part:
     def replace(self, **changes: Any) -> Part:
         """A copy with some fields changed."""
         return replace(self, **changes)
-
-
-# ---------------------------------------------------------------------------------------- objects of any class
-
-
-class _Wrapped:
-    """An object that has the members of a base without being of it. It passes for the object, too."""
-
-    def __init__(self, given: Any):
-        object.__setattr__(self, "_given", given)
-
-    @property
-    def __class__(self) -> type:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Of the object, so that `isinstance` knows it by its own class as by the base's."""
-        return type(self._given)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._given, name)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        setattr(self._given, name, value)
-
-    def __repr__(self) -> str:
-        return repr(self._given)
-
-    def __eq__(self, other: Any) -> bool:
-        return self._given == unwrapped(other)
-
-    def __hash__(self) -> int:
-        return hash(self._given)
-
-
-class _WrappedSplatter(_Wrapped):
-    """A splatter that may have `splat(positions, rgba, row)` in place of `image`."""
-
-    def image(self, splats: Splats) -> Array:
-        """See `Splatter`."""
-        if self._of_splats:
-            return self._given.image(splats)
-        return self._given.splat(splats.positions, splats.rgba, splats.row)
-
-
-def unwrapped(plugin: Any) -> Any:
-    """What the user gave: the plugin itself or, of a wrapper, the object in it. Caches go by it."""
-    return plugin._given if issubclass(type(plugin), _Wrapped) else plugin
-
-
-def as_surface(given: Any) -> Any:
-    """A surface with all members of its bases, or None where it is none; see `adapted`."""
-    return adapted(given, Surface, TriangleSurface, RaySurface)
-
-
-_known: set[type] = set()
-_wrappers: dict[tuple, type] = {}
-
-
-def adapted(given: Any, *bases: type[Plugin]) -> Any:
-    """A plugin as an object of its base: as it is, or wrapped where its class is not one of theirs.
-
-    Args:
-        given: the plugin: an object, or a function where the base has nothing but `__call__`.
-        *bases: the first is what it must be; the others what it may be besides.
-
-    Returns:
-        The plugin, or None where it lacks what the first base requires.
-
-    Raises:
-        PluginError: a function of its class is named almost like an optional member.
-    """
-    kind = type(given)
-    if kind in _known:
-        return given
-    if isinstance(given, bases[0]):
-        _check_names(kind, tuple(b for b in bases if issubclass(kind, b)))
-        _known.add(kind)
-        return given
-    present = frozenset(name for base in bases for name in _members(base) if hasattr(given, name))
-    if bases[0] is Splatter and "splat" in present:
-        present |= {"image"}
-    # The most special first, as Python wants them.
-    fitting = tuple(base for base in reversed(bases) if base.__abstractmethods__ <= present)
-    if bases[0] not in fitting or isinstance(given, type):
-        return None
-    key = kind, fitting, present
-    if key not in _wrappers:
-        _check_names(kind, fitting)
-        _wrappers[key] = _wrapper(given, fitting, present)
-    return _wrappers[key](given)
-
-
-def _wrapper(given: Any, bases: tuple[type[Plugin], ...], present: frozenset[str]) -> type:
-    """The class of wrappers for objects of a class that have these members."""
-    outer = _WrappedSplatter if bases[-1] is Splatter else _Wrapped
-    own = present - {"__call__", "splat", "image"}
-    namespace: dict[str, Any] = {name: property(lambda self, get=attrgetter(name): get(self._given)) for name in own}
-    namespace["_of_splats"] = outer is _WrappedSplatter and "splat" not in present
-    if "__call__" in present:
-        namespace["__call__"] = lambda self, *args, **kwargs: self._given(*args, **kwargs)
-    for method, flag in (pair for base in bases for pair in base.FLAGS.items() if pair[1] not in present):
-        namespace[flag] = method in present
-    return type(type(given).__name__, (outer, *bases), namespace)
-
-
-def _members(base: type[Plugin]) -> list[str]:
-    """What a base declares: names of methods and class variables."""
-    names = [n for c in base.__mro__ if c not in (Plugin, abc.ABC, object) for n in c.__dict__]
-    return [n for n in dict.fromkeys(names) if not n.startswith("_") and n != "FLAGS"] + ["__call__"]
-
-
-def _check_names(kind: type, bases: tuple[type[Plugin], ...]) -> None:
-    """Refuse a class with a function whose name is one letter from an optional method of its bases, which it lacks."""
-    declared = {c for base in bases for c in base.__mro__}
-    # Bases of the library that are themselves subclasses, as that of samplers of triangles, declare members, too.
-    declared |= {c for c in kind.__mro__ if c.__dict__.get("DECLARES", False)}
-    required = {name for c in declared for name in c.__dict__.get("__abstractmethods__", ())}
-    optional = {
-        name
-        for c in declared - {Plugin, abc.ABC, object}
-        for name, value in c.__dict__.items()
-        if isinstance(value, FunctionType) and not name.startswith("_") and name not in required
-    }
-    own = {
-        name: c
-        for c in kind.__mro__
-        if c not in declared
-        for name, v in c.__dict__.items()
-        if isinstance(v, FunctionType)
-    }
-    for name, where in own.items():
-        for member in sorted(optional - own.keys()):
-            if name not in optional and name not in required and _one_edit(name, member):
-                raise PluginError(
-                    f"{where.__qualname__} has a function {name!r}, which nothing calls; did you mean {member!r} of "
-                    f"{bases[0].__name__}? Rename it to that, or to something less alike"
-                )
-    final = own.get("splat")
-    if Splatter in bases and final is not None and issubclass(kind, Splatter):
-        raise PluginError(
-            f"{final.__qualname__} overrides 'splat', which is for direct calls; write 'image(splats)', which gives "
-            f"(H, W, 4) for an rts.Splats"
-        )
-
-
-def _one_edit(a: str, b: str) -> bool:
-    """Whether one character added, left out or exchanged makes one name of the other."""
-    if abs(len(a) - len(b)) > 1 or a == b:
-        return False
-    short, long = sorted((a, b), key=len)
-    start = next((i for i, c in enumerate(short) if c != long[i]), len(short))
-    return short[start + (len(short) == len(long)) :] == long[start + 1 :]

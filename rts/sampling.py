@@ -10,20 +10,11 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
+from rts.adapting import adapted, as_surface, unwrapped
 from rts.arrays import CONSTANT_TYPES, engine_of, is_constant, leaves, map_leaves, namespace, suiting
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.interfaces import (
-    Needed,
-    Part,
-    Sampler,
-    Shader,
-    Surface,
-    TriangleSurface,
-    adapted,
-    as_surface,
-    unwrapped,
-)
+from rts.interfaces import Needed, Part, Sampler, Shader, Surface, TriangleSurface
 from rts.keeping import Entry, Keeper, fingerprint, same_faces
 from rts.records import Array, ArraySpec, Fragments, Proxy, Sampled, Samples, Tree
 

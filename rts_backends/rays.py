@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from rts.adapting import as_surface
 from rts.arrays import constants, engine_of, exemplar, map_leaves, namespace, shape_of
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.interfaces import Part, RaySurface, Sampler, as_surface
+from rts.interfaces import Part, RaySurface, Sampler
 from rts.records import ArraySpec, RayHits, Samples
 from rts.sampling import check_camera
 

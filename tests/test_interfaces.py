@@ -11,7 +11,8 @@ from helpers import CAMERA, DIFFERENTIABLE, FRONT, SIZE, arrays, gradient, icosp
 
 import rts
 from rts import splatting
-from rts.interfaces import Shader, adapted, as_surface, unwrapped
+from rts.adapting import adapted, as_surface, unwrapped
+from rts.interfaces import Shader
 
 MESH = rts.plugin("surfaces", "mesh")
 RASTER = rts.plugin("samplers", "raster")
@@ -417,3 +418,12 @@ def test_the_spread_of_rays_is_the_width_of_a_pixel(camera):
     )  # In local units, of which two are one of the world.
     np.testing.assert_allclose(doubled.spread, rays.spread / 2, rtol=1e-12)
     assert height / width == pytest.approx(1 / 1.2)
+
+
+def test_a_plugin_of_another_kind_is_refused():
+    part = mesh_part(icosphere(0))
+    show(part, sampler=RASTER(), splatter=splatting.Plain())  # Known by now, each as what it is.
+    with pytest.raises(rts.InputError, match="the splatter is .*method 'image'"):
+        show(part, splatter=RASTER())
+    with pytest.raises(rts.InputError, match="the sampler is .*method 'sample'"):
+        show(part, sampler=splatting.Plain())

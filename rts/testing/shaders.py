@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from rts import registry
+from rts.adapting import adapted
 from rts.arrays import constants, engine_of, map_leaves
 from rts.gbuffer import GBuffer
-from rts.interfaces import Engine, Shader, adapted
+from rts.interfaces import Engine, Shader
 from rts.records import Tree
 from rts.testing import derivatives, scenes
 from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rts.adapting import unwrapped
 from rts.checks import check_splatter
-from rts.interfaces import Splatter, unwrapped
+from rts.interfaces import Splatter
 from rts.records import Splats
 from rts.testing import derivatives
 from rts.testing.conformance import Conformance, claim, claim_close, no_error, refusal
