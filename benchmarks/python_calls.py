@@ -24,7 +24,7 @@ from typing import Any
 
 os.environ["RTS_NUM_THREADS"] = "1"
 
-from compare_commits import check_origin, environment, folder_of, isolate, sides_of
+from commit_installs import check_origin, environment, folder_of, isolate, sides_of
 from rich.console import Console
 from rich.table import Table
 

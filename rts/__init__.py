@@ -4,6 +4,7 @@ Find where camera rays meet a surface with any ordinary renderer; evaluate the s
 differentiate only that.
 """
 
+from rts.adapting import unwrapped
 from rts.arrays import engine_of, namespace
 from rts.camera import Camera
 from rts.choosing import explain
@@ -86,4 +87,5 @@ __all__ = [
     "sample",
     "save_animation",
     "save_image",
+    "unwrapped",
 ]

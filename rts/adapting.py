@@ -24,7 +24,12 @@ class _Wrapped:
         return type(self._given)
 
     def __getattr__(self, name: str) -> Any:
+        if name == "_given":  # Of a copy that is being made.
+            raise AttributeError(name)
         return getattr(self._given, name)
+
+    def __reduce__(self) -> tuple:
+        return adapted, (self._given, *self._bases)
 
     def __setattr__(self, name: str, value: Any) -> None:
         setattr(self._given, name, value)
@@ -40,12 +45,10 @@ class _Wrapped:
 
 
 class _WrappedSplatter(_Wrapped):
-    """A splatter that may have `splat(positions, rgba, row)` in place of `image`."""
+    """A splatter that has `splat(positions, rgba, row)` in place of `image`."""
 
     def image(self, splats: Splats) -> Array:
         """See `Splatter`."""
-        if self._of_splats:
-            return self._given.image(splats)
         return self._given.splat(splats.positions, splats.rgba, splats.row)
 
 
@@ -58,6 +61,9 @@ def as_surface(given: Any) -> Any:
     """A surface with all members of its bases, or None where it is none; see `adapted`."""
     return adapted(given, Surface, TriangleSurface, RaySurface)
 
+
+FINAL = {"splat"}
+"""What a base keeps for itself."""
 
 _known: set[tuple[type, type]] = set()
 _wrappers: dict[tuple, type] = {}
@@ -80,34 +86,37 @@ def adapted(given: Any, *bases: type[Plugin]) -> Any:
     if (kind, bases[0]) in _known:
         return given
     if isinstance(given, bases[0]):
+        for base in bases[1:]:
+            if not issubclass(kind, base) and all(hasattr(kind, name) for name in base.__abstractmethods__):
+                raise PluginError(f"{kind.__qualname__} has the methods of rts.{base.__name__}; subclass that")
         _check_names(kind, tuple(b for b in bases if issubclass(kind, b)))
         _known.add((kind, bases[0]))
         return given
     present = frozenset(name for base in bases for name in _members(base) if hasattr(given, name))
-    if bases[0] is Splatter and "splat" in present:
+    by_arrays = bases[0] is Splatter and "splat" in present and "image" not in present
+    if by_arrays:
         present |= {"image"}
     # The most special first, as Python wants them.
     fitting = tuple(base for base in reversed(bases) if base.__abstractmethods__ <= present)
     if bases[0] not in fitting or isinstance(given, type):
         return None
-    key = kind, fitting, present
+    key = kind, fitting, present, by_arrays
     if key not in _wrappers:
         _check_names(kind, fitting)
-        _wrappers[key] = _wrapper(given, fitting, present)
+        _wrappers[key] = _wrapper(kind, fitting, present, _WrappedSplatter if by_arrays else _Wrapped)
+        _wrappers[key]._bases = bases
     return _wrappers[key](given)
 
 
-def _wrapper(given: Any, bases: tuple[type[Plugin], ...], present: frozenset[str]) -> type:
+def _wrapper(kind: type, bases: tuple[type[Plugin], ...], present: frozenset[str], outer: type) -> type:
     """The class of wrappers for objects of a class that have these members."""
-    outer = _WrappedSplatter if bases[-1] is Splatter else _Wrapped
-    own = present - {"__call__", "splat", "image"}
+    own = present - {"__call__", "splat"} - outer.__dict__.keys()
     namespace: dict[str, Any] = {name: property(lambda self, get=attrgetter(name): get(self._given)) for name in own}
-    namespace["_of_splats"] = outer is _WrappedSplatter and "splat" not in present
     if "__call__" in present:
         namespace["__call__"] = lambda self, *args, **kwargs: self._given(*args, **kwargs)
     for method, flag in (pair for base in bases for pair in base.FLAGS.items() if pair[1] not in present):
         namespace[flag] = method in present
-    return type(type(given).__name__, (outer, *bases), namespace)
+    return type(kind.__name__, (outer, *bases), namespace)
 
 
 def _members(base: type[Plugin]) -> list[str]:
@@ -126,23 +135,21 @@ def _check_names(kind: type, bases: tuple[type[Plugin], ...]) -> None:
         name
         for c in declared - {Plugin, abc.ABC, object}
         for name, value in c.__dict__.items()
-        if isinstance(value, FunctionType) and not name.startswith("_") and name not in required
+        if isinstance(value, FunctionType) and not name.startswith("_") and name not in required | FINAL
     }
-    own = {
-        name: c
-        for c in kind.__mro__
-        if c not in declared
-        for name, v in c.__dict__.items()
-        if isinstance(v, FunctionType)
-    }
-    for name, where in own.items():
-        for member in sorted(optional - own.keys()):
-            if name not in optional and name not in required and _one_edit(name, member):
+    foreign = [c for c in kind.__mro__ if c not in declared]
+    there = {n: c for c in foreign for n, value in c.__dict__.items() if isinstance(value, FunctionType)}
+    package = kind.__module__.partition(".")[0]
+    for name, where in there.items():
+        if name in optional | required or where.__module__.partition(".")[0] != package:
+            continue
+        for member in sorted(optional - there.keys()):
+            if _one_edit(name, member):
                 raise PluginError(
-                    f"{where.__qualname__} has a function {name!r}, which nothing calls; did you mean {member!r} of "
+                    f"{where.__qualname__} has a function {name!r}, which rts never calls; did you mean {member!r} of "
                     f"{bases[0].__name__}? Rename it to that, or to something less alike"
                 )
-    final = own.get("splat")
+    final = there.get("splat")
     if Splatter in bases and final is not None and issubclass(kind, Splatter):
         raise PluginError(
             f"{final.__qualname__} overrides 'splat', which is for direct calls; write 'image(splats)', which gives "

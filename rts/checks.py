@@ -74,9 +74,18 @@ def check_sampler(chosen: Any) -> Sampler:
     return _checked_plugin("rts.samplers", chosen, Sampler, "sample")
 
 
+def suited_sampler(chosen: Sampler, part: Part, camera: Camera | None) -> Sampler:
+    """The sampler that a sampler takes for a part."""
+    own = chosen.suited(part, camera)
+    return own if own is chosen else check_sampler(own)
+
+
 def check_splatter(chosen: Any) -> Splatter:
     """A usable splatter from a name, a class or an object."""
-    return _checked_plugin("rts.splatters", chosen, Splatter, "image")
+    found = _checked_plugin("rts.splatters", chosen, Splatter, "image")
+    if not (isinstance(found.reach, int) and found.reach >= 1):
+        raise InputError(f"reach of {found!r} is {found.reach!r}; expected cells, an integer of at least 1")
+    return found
 
 
 def _checked_plugin(group: str, chosen: Any, base: type, method: str) -> Any:

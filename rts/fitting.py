@@ -91,6 +91,8 @@ def fit(
         try:
             if method == "lm":
                 known = adapted(residuals, Residuals)
+                if known is None:
+                    raise InputError(f"residuals is {residuals!r}; expected a function of the parameters")
                 own = known.normal_equations if known.sums_products else None
                 levenberg_marquardt(_checked(residuals, engine), parameters, engine, run, jit, own)
             else:

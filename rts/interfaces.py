@@ -445,7 +445,8 @@ class Engine(Plugin):
     def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], Array], state: Tree, most: int) -> Tree:
         """`state = body(state)` as long as `going(state)` () bool holds, at most so many times.
 
-        Without derivatives, and a loop in compiled programs, too, where unrolling takes minutes to compile.
+        Without derivatives, and a loop in compiled programs, too, where unrolling takes minutes to compile. What `body`
+        closes over has to be without derivatives by itself (`stop_gradient`), as θ is where rays are intersected.
 
         Args:
             body: tree of arrays → the same tree of other values; shapes and dtypes stay.

@@ -68,7 +68,7 @@ def attempt(part: Part, sampler: Any, engine: str) -> np.ndarray:
         raise RtsError("the image is empty or not finite; an example lies about the origin, within two units of it")
     if _is_of_triangles(part, sampler):
         _check_image(found, part)
-    if not is_constant(theta):
+    if chosen.differentiates and not is_constant(theta):
         _check_gradient(chosen, image, theta)
     return found
 

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import registry
+from rts.arrays import engine_named
 from rts.camera import Camera
 from rts.errors import InputError, PluginError
 from rts.fitting import fit
@@ -62,8 +63,10 @@ class PoseFit(NamedTuple):
 
 def available_engine() -> str:
     """The name of an engine with derivatives that is installed, torch before jax."""
-    for name in ("torch", "jax"):
-        if importlib.util.find_spec(name) is not None:
+    preferred = ["torch", "jax"]
+    others = [name for name in registry.plugins("rts.engines") if name not in preferred]
+    for name in (*preferred, *others):
+        if importlib.util.find_spec(name) is not None and engine_named(name).differentiates:
             return name
     raise PluginError("fitting needs torch or jax: pip install 'rts[torch]' (or 'rts[jax]')")
 

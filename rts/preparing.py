@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from rts.camera import Camera
-from rts.checks import check_sampler, check_scene
+from rts.checks import check_sampler, check_scene, suited_sampler
 from rts.errors import InputError
 from rts.interfaces import Part
 
@@ -61,6 +61,6 @@ def prepare(
     identity = Camera.look_at((0, 0, 1), (0, 0, 0))
     checked, _ = check_scene(parts, identity if camera is None else camera)
     chosen = check_sampler(sampler)
-    samplers = [chosen.suited(part, None) for part in checked]
+    samplers = [suited_sampler(chosen, part, None) for part in checked]
     entries = [own.hold(part, camera, size) for own, part in zip(samplers, checked, strict=True)]
     return PreparedParts(checked, samplers, entries)

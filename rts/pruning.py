@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rts.adapting import adapted
 from rts.arrays import engine_of, is_traced, namespace
 from rts.errors import InputError, LayersWarning
 from rts.interfaces import Needed, Part, Splatter
@@ -69,6 +70,21 @@ class Inspection(Needed):
         """See `Needed`."""
         with self._lock:
             self.short += cells
+
+
+class Everything(Needed):
+    """Keeps all samples of one part of several, which are pruned once they are merged; hands on what ran out."""
+
+    def __init__(self, needed: Callable[[np.ndarray, np.ndarray], np.ndarray]):
+        self._needed: Needed = adapted(needed, Needed)
+
+    def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """See `Needed`."""
+        return covered
+
+    def ran_out(self, cells: int) -> None:
+        """See `Needed`."""
+        self._needed.ran_out(cells)
 
 
 def as_needed(taken: Callable[[int, Needed], Sampled], needed: Needed | None) -> Sampled:

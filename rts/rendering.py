@@ -29,13 +29,14 @@ from rts.checks import (
     check_shaded,
     check_size,
     check_splatter,
+    suited_sampler,
 )
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Engine, Needed, Part, Splatter
 from rts.operations.linear import affine_map
 from rts.preparing import PreparedParts
-from rts.pruning import as_needed, needed_by, prune
+from rts.pruning import Everything, as_needed, needed_by, prune
 from rts.records import Array, Sampled, Samples, Splats
 from rts.sampling import merge
 
@@ -175,15 +176,15 @@ def _sampled(
         samples = []
         for part, chosen, entry in zip(parts, samplers, entries, strict=True):
             known = {} if entry is None else {"entry": entry}
-            if needed is not None and len(parts) == 1 and chosen.prunes:
-                known["needed"] = needed
+            if needed is not None and chosen.prunes:
+                known["needed"] = needed if len(parts) == 1 else Everything(needed)
             samples.append(chosen.sample(part, wide.within(part.transform), grid, count, capacity=capacity, **known))
         sampled = merge(samples, count)
         # What is traced has the shape of the worst case, with or without them.
-        done = needed is None or "needed" in known or is_traced(sampled.row)
+        done = needed is None or (len(parts) == 1 and "needed" in known) or is_traced(sampled.row)
         return sampled if done else prune(sampled, needed)
 
-    samplers = [chosen.suited(part, camera) for part, chosen in zip(parts, samplers, strict=True)]
+    samplers = [suited_sampler(chosen, part, camera) for part, chosen in zip(parts, samplers, strict=True)]
     needed = None if splatter is None else needed_by(splatter, parts)
     sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)
     return replace(sampled, supersample=supersample, apron=apron)
@@ -294,10 +295,14 @@ def to_splats(
         check_shaded(rgba, local["position"].shape[0], part.shader)
         positions.append(wide.within(transform).project(local["position"], grid))
         colors.append(constants(rgba, engine, like))
+    row = sampled.row
+    if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
+        # A shader may close over arrays of an engine that the scene has none of.
+        positions, colors, row = constants((positions, colors, row), *suiting(positions, colors))
     if len(parts) == 1:
-        return Splats(positions[0], colors[0], sampled.row, border=apron)
-    xp = namespace(sampled.row)
-    return Splats(xp.concat(positions), xp.concat(colors), sampled.row, border=apron)
+        return Splats(positions[0], colors[0], row, border=apron)
+    xp = namespace(row)
+    return Splats(xp.concat(positions), xp.concat(colors), row, border=apron)
 
 
 def _planned(layers: int | str) -> int:

@@ -128,7 +128,7 @@ class TriangleSampler(Sampler):
         inputs = surface.proxy_inputs(_stopped(theta)) if entry is None or surface.refines else None
         reads = {name: theta[name] for name in surface.reads(theta)}
         host_theta = reads if engine.differentiates and is_constant(reads) else None
-        tables = shape.tables(surface)
+        tables = shape.tables(surface) if surface.refines else {}
         shader = adapted(part.shader, Shader)
         asked = None if shader is None else shader.reads
         attributes = _attribute_specs(surface, asked, host_theta, shape, like)

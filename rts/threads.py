@@ -112,7 +112,7 @@ def thread_count() -> int:
 
 def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
     """A contiguous view, copied only if it has to be; always read-only, so that kernels are compiled but once."""
-    view = np.ascontiguousarray(x, dtype).view()
+    view = np.asarray(x, dtype, order="C").view()
     view.flags.writeable = False
     return view
 

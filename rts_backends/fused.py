@@ -5,7 +5,6 @@ What fits is float32 or float64 in the memory of the host. Second derivatives ar
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -24,10 +23,14 @@ class _Fused(splatting.Kernel):
 
     def image(self, splats: Splats) -> Array:
         """See `rts.splatting.Kernel`."""
-        return self.cropped(splats if splats.border == 0 else replace(splats, border=0))
+        if splats.rgba.shape[0] == 0:
+            return super().image(splats)
+        return IMAGE(splats.positions, splats.rgba, splats.row, settings=self._settings(0))
 
     def cropped(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
+        if type(self).image is not _Fused.image:  # A subclass has one of its own.
+            return super().cropped(splats)
         if splats.rgba.shape[0] == 0:
             return splatting.inside(super().image(splats), splats.border)
         return IMAGE(splats.positions, splats.rgba, splats.row, settings=self._settings(splats.border))
@@ -45,6 +48,8 @@ class _Fused(splatting.Kernel):
         background: Array | None = None,
     ) -> tuple[Array, Array, Array] | None:
         """See `rts.Splatter`."""
+        if type(self).image is not _Fused.image:
+            return None
         from rts_backends import fused_normal
 
         given = splats.positions, splats.rgba, splats.row, t_positions, t_rgba, target, weights, background

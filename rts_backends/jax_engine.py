@@ -151,13 +151,14 @@ class JaxEngine(Engine):
 
     def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], jax.Array], state: Tree, most: int) -> Tree:
         """A loop of Python's as long as values are known, which compiles nothing; else `jax.lax.while_loop`."""
+        state = jax.lax.stop_gradient(state)
         for count in range(most):
             on = going(state)
             if isinstance(on, Tracer):
-                return self._looped(body, going, state, most - count)
+                return jax.lax.stop_gradient(self._looped(body, going, state, most - count))
             if not bool(on):
                 break
-            state = body(state)
+            state = jax.lax.stop_gradient(body(state))
         return state
 
     @staticmethod

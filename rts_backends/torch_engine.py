@@ -154,6 +154,13 @@ class TorchEngine(Engine):
         most: int,
     ) -> Tree:
         """A loop of Python's; under `torch.vmap` as long as any item goes on, the others staying as they are."""
+        with torch.no_grad():
+            return map_leaves(
+                self.stop_gradient, self._repeated(body, going, map_leaves(self.stop_gradient, state), most)
+            )
+
+    @staticmethod
+    def _repeated(body: Callable, going: Callable, state: Tree, most: int) -> Tree:
         for _ in range(most):
             on = going(state)
             whole = on

@@ -765,6 +765,11 @@ ODD_ENGINES = {
             repeat=lambda self, body, going, state, most: [state := body(state) for _ in range(most)][-1]
         )
     },
+    "loops_have_no_derivative": {
+        "has one": engine_with(
+            repeat=lambda self, body, going, state, most: type(self)._repeated(body, going, state, most)
+        )
+    },
     "unused_rows_are_filled": {
         "left": engine_with(padded=lambda self, x: True, fill_unused=lambda self, x, row: x),
     },

@@ -432,9 +432,7 @@ def test_one_sweep_pushes_all_columns_of_a_jacobian(smooth, monkeypatch):
     calls = []
     for name in ("image", "vjp", "jvp"):
         method = getattr(Cells, name)
-        monkeypatch.setattr(
-            Cells, name, lambda *args, name=name, method=method: (calls.append(name), method(*args))[1]
-        )
+        monkeypatch.setattr(Cells, name, lambda *args, name=name, method=method: (calls.append(name), method(*args))[1])
     f.jacfwd(lambda x: image(fused.Visible(), x))(x)
     assert sorted(calls) == ["image", "jvp"]
     calls.clear()

@@ -308,3 +308,78 @@ def test_it_is_differentiable_in_what_the_function_closes_over_and_in_the_points
 def test_a_function_that_gives_another_shape_is_refused():
     with pytest.raises(rts.InputError, match=r"f gave shape \(4, 3\) for 4 points; expected \(4,\)"):
         rts.gradient(lambda p: p, np.ones((4, 3)))
+
+
+# ------------------------------------------------------------------------------------------------- operands of any kind
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_an_operand_may_be_a_number(target):
+    scaled = rts.Operation(
+        "tests.scaled",
+        lambda x, k: x * k,
+        ranks=[2, 0],
+        shape=lambda x, k: x,
+        forward=lambda operands, out: np.multiply(*operands, out=out) is None,
+        push=lambda operands, tangents, out: (
+            out.__setitem__(..., 0 if tangents[0] is None else tangents[0] * operands[1])
+            or (out.__iadd__(operands[0] * tangents[1]) if tangents[1] is not None else None)
+        ),
+        pull=lambda operands, g, results: [
+            r.__setitem__(..., v)
+            for r, v in zip(results, (g * operands[1], (g * operands[0]).sum()), strict=True)
+            if r is not None
+        ],
+        differentiable=2,
+    )
+    x = RNG.normal(size=(4, 2))
+    given = list(arrays(target, (x, np.array(3.0))))
+    np.testing.assert_allclose(to_numpy(scaled(*given)), 3 * x, atol=1e-5)
+    if target != "numpy":
+        g_x, g_k = gradient(target, lambda v: scaled(*v).sum(), given)
+        np.testing.assert_allclose(g_x, 3.0, rtol=1e-6)
+        assert g_k == pytest.approx(x.sum(), rel=1e-4) and g_k.shape == ()
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_operands_of_another_rank_are_refused(target):
+    for call in (
+        lambda: take(*arrays(target, (np.ones((2, 4, 3)), np.array([1, 0])))),
+        lambda: projective_map(*arrays(target, (np.eye(4), np.ones(3)))),
+    ):
+        with pytest.raises(rts.InputError, match="the operation rts.* was given shapes .*; expected ranks"):
+            call()
+    with pytest.raises(rts.InputError, match="the operation tests.clamp takes 2 operands; it was given 1"):
+        CLAMP(*arrays(target, (np.ones((2, 3)),)), power=2)
+
+
+def test_what_is_no_operation_is_refused_when_it_is_made():
+    from dataclasses import replace
+
+    for change, words in (
+        ({"name": ""}, "an operation is named ''"),
+        ({"differentiable": 3}, "has 2 operands, by its ranks, of which the first 3"),
+        ({"packed": (2,)}, "has no operand 2 of packed rows"),
+    ):
+        with pytest.raises(rts.InputError, match=words):
+            replace(CLAMP, **change)
+
+
+def test_a_camera_of_numpy_and_of_another_engine_projects():
+    torch = pytest.importorskip("torch")
+    camera = rts.Camera.look_at((0, 0, 3), (0, 0, 0))
+    points = RNG.normal(size=(5, 3))
+    expected = camera.project(points, (8, 9))
+    for mixed in (
+        camera._replace(projection=torch.tensor(camera.projection)),
+        camera._replace(view=torch.tensor(camera.view)),
+    ):
+        for given in (points, torch.tensor(points)):
+            np.testing.assert_allclose(to_numpy(mixed.project(given, (8, 9))), expected, rtol=1e-10)
+
+
+def test_the_gradient_of_numpy_suits_scenes_of_any_size():
+    for size in (1e-5, 1.0, 1e5):
+        points = size * np.array([[0.6, 0.8, 0.0]])
+        found = rts.gradient(lambda p: np.sqrt((p * p).sum(-1)), points)
+        np.testing.assert_allclose(found, [[0.6, 0.8, 0.0]], atol=1e-6)

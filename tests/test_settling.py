@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import ALL, DIFFERENTIABLE, FRONT, arrays, finite_difference, gradient, to_numpy
+from helpers import ALL, DIFFERENTIABLE, FRONT, arrays, finite_difference, gradient, rigid, to_numpy
 from throwaway import Bezier, Crowded, Sheets, Torus, distance
 
 import rts
@@ -352,6 +352,10 @@ def test_as_many_layers_as_count_are_taken_where_refine_leaves_fewer(heights):
     part = sheets(moved_to(heights))
     found, expected = (layers_of(part, layers=k) for k in ("auto", 3))
     assert [n for n in found if n] == [n for n in expected if n]
+    # And where it is one part of several.
+    beside = part.replace(transform=rigid(translation=(100, 0, 0)))
+    several = [rts.sample([part, beside], FRONT, SIZE, layers=k, splatter="visible") for k in ("auto", 3)]
+    assert (several[0].row >= 0).sum() == (several[1].row >= 0).sum() > 0
 
 
 def test_rows_that_refine_renumbers_in_place_are_refused():

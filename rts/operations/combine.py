@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.arrays import constants, engine_of, exemplar, namespace
+from rts.arrays import constants, engine_of, exemplar, from_numbers, namespace, shape_of
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
 from rts.operations.take import take
@@ -22,7 +22,11 @@ def combine(rows: Array, ids: Array, weights: Array) -> Array:
     Raises:
         InputError: shapes that do not fit, or ids of no row.
     """
-    shapes = [tuple(x.shape) for x in (rows, ids, weights)]
+    rows, weights = from_numbers(rows), from_numbers(weights)
+    shapes = [shape_of(x) for x in (rows, ids, weights)]
+    for name, x in (("rows", rows), ("weights", weights)):
+        if not engine_of(x).namespace.isdtype(x.dtype, "real floating"):
+            raise InputError(f"{name} have dtype {x.dtype}; expected floating numbers")
     if not engine_of(ids).namespace.isdtype(ids.dtype, "integral"):
         raise InputError(f"ids have dtype {ids.dtype}; expected integers that name rows")
     if len(shapes[0]) != 2 or len(shapes[1]) != 2 or shapes[1] != shapes[2] or not shapes[1][1]:

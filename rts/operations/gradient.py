@@ -42,7 +42,7 @@ def gradient(f: Callable[[Array], Array], points: Array) -> Array:
 
 def _differences(f: Callable[[Array], Array], points: np.ndarray) -> np.ndarray:
     wide = np.asarray(points, np.float64)
-    step = STEP * max(1.0, float(np.abs(wide).max(initial=0.0)))
+    step = STEP * (float(np.abs(wide).max(initial=0.0)) or 1.0)
     columns = []
     for move in step * np.eye(points.shape[1]):
         above, below = np.asarray(f(wide + move), np.float64), np.asarray(f(wide - move), np.float64)

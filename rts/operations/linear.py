@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import engine_of, namespace
+from rts.arrays import constants, engine_of, exemplar, namespace
 from rts.operations.operation import Arrays, Operation, Some
 from rts.records import Array
 
@@ -17,6 +17,8 @@ from rts.records import Array
 def matmul(a: Array, b: Array) -> Array:
     """Product of two small matrices."""
     engine = engine_of(a, b)
+    if type(a) is not type(b):
+        a, b = constants((a, b), engine, exemplar(a, b))
     if engine.exact_products(a, b):
         return a @ b
     return engine.namespace.sum(a[:, :, None] * b[None, :, :], axis=1)

@@ -13,7 +13,7 @@ from rts.arrays import OWNERS, constants, engine_of, from_numbers, suiting
 from rts.errors import InputError
 from rts.records import Array
 
-_SHAPE, _NDIM = attrgetter("shape"), attrgetter("ndim")
+_SHAPE = attrgetter("shape")
 
 Arrays = Sequence[np.ndarray]
 """Operands on the host, C-contiguous and read-only."""
@@ -72,6 +72,7 @@ class Operation:
     sweeps: bool = False
 
     def __post_init__(self):
+        object.__setattr__(self, "ranks", tuple(self.ranks))
         count = len(self.ranks)
         if not (isinstance(self.name, str) and self.name):
             raise InputError(f"an operation is named {self.name!r}; expected a name such as 'my_package.warp'")
@@ -102,10 +103,19 @@ class Operation:
                 break
         else:
             if kind in OWNERS or kind is np.ndarray:
+                self._check_ranks(operands)
                 return engine_of(operands[0]).apply(self, operands, params)
         operands = tuple([from_numbers(x) for x in operands])
         engine, like = suiting(operands)
-        return engine.apply(self, constants(operands, engine, like), params)
+        operands = constants(operands, engine, like)
+        self._check_ranks(operands)
+        return engine.apply(self, operands, params)
+
+    def _check_ranks(self, operands: Sequence[Array]) -> None:
+        for x, rank in zip(operands, self.ranks, strict=True):
+            if x.ndim != rank:
+                shapes = ", ".join(str(tuple(x.shape)) for x in operands)
+                raise InputError(f"the operation {self.name} was given shapes {shapes}; expected ranks {self.ranks}")
 
     def fits(self, dtypes: Sequence[np.dtype]) -> bool:
         """Whether operands of these NumPy dtypes are of the kind that the functions on the host know."""
@@ -121,9 +131,6 @@ class Operation:
 
     def value_on_host(self, operands: Arrays, params: dict[str, Any]) -> tuple[np.ndarray, Any]:
         """The result, and what is kept."""
-        if tuple(map(_NDIM, operands)) != self.ranks:
-            shapes = ", ".join(str(x.shape) for x in operands)
-            raise InputError(f"the operation {self.name} was given shapes {shapes}; expected ranks {self.ranks}")
         out = np.empty(self.shape(*map(_SHAPE, operands), **params), operands[0].dtype)
         return out, self.forward(operands, out, **params)
 

@@ -30,14 +30,24 @@ def engine_named(name: str) -> Engine:
     return engine
 
 
+def differentiating(name: str) -> Engine:
+    """The engine, or a skip with the reason where it is not installed, or does not differentiate."""
+    engine = engine_named(name)
+    if not engine.differentiates:
+        pytest.skip(f"the engine {name} does not differentiate")
+    return engine
+
+
 def installed() -> list[Engine]:
     """The engines with derivatives; skips where there is none."""
     engines = []
     for name in DIFFERENTIABLE:
         try:
-            engines.append(arrays.engine_named(name))
+            engine = arrays.engine_named(name)
         except PluginError:
             continue
+        if engine.differentiates:
+            engines.append(engine)
     if not engines:
         pytest.skip(f"none of {', '.join(DIFFERENTIABLE)} is installed")
     return engines

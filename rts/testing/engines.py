@@ -5,11 +5,13 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
 
 from rts import arrays
+from rts.adapting import adapted
 from rts.arrays import engine_of, leaves, map_leaves
 from rts.errors import EngineError
 from rts.interfaces import Engine
@@ -120,12 +122,7 @@ class EngineConformance(Conformance):
 
         specs = ArraySpec((N, 3), np.float32), ArraySpec((), np.int32), ArraySpec((N, 3), np.float32, packed=True)
         x, ids = chosen.constant(_numbers(N, 3)), chosen.constant(IDS)
-        for how, call in (("", chosen.call_host), (", compiled", chosen.jit(lambda *a: chosen.call_host(*a)))):
-            f = (
-                (lambda x, i, c=call: c(host, specs, x, i))
-                if not how
-                else chosen.jit(lambda x, i: chosen.call_host(host, specs, x, i))
-            )
+        for how, f in _both_ways(chosen, lambda x, i: chosen.call_host(host, specs, x, i)):
             with owning(chosen), no_error(f"a host function{how}"):
                 twice, total, packed = (chosen.to_numpy(r) for r in f(x, ids))
             claim_close(twice, 2 * _numbers(N, 3), 0, f"the result of a host function{how}")
@@ -190,6 +187,20 @@ class EngineConformance(Conformance):
                 with owning(chosen), no_error(f"repeat{how}"):
                     found = chosen.to_numpy(call(chosen.constant(np.array([8.0, 1.0], np.float32))))
                 claim_close(found, np.array(expected), 0, f"what repeat of at most {most} times{how} gives")
+
+    def test_loops_have_no_derivative(self, engine: Any) -> None:
+        """What `repeat` makes of a state is a constant, in both modes, compiled or not."""
+        chosen = _differentiating(engine)
+        xp, x = chosen.namespace, chosen.constant(np.array([8.0, 1.0], np.float32))
+
+        def f(v: Any) -> Any:
+            halved = chosen.repeat(lambda s: s / 2, lambda s: xp.any(s > 1), v, 50)
+            return xp.sum(halved * v)
+
+        for how, gradient in _both_ways(chosen, lambda v: chosen.value_and_grad(f)(v)[1]):
+            with owning(chosen), no_error(f"the gradient of what repeat gives{how}"):
+                found = chosen.to_numpy(gradient(x))
+            claim_close(found, np.array([1.0, 0.125]), 0, f"the gradient of repeat(x) x{how}")
 
     def test_unused_rows_are_filled(self, engine: Any) -> None:
         """With the first row, where no cell of `row` names them; all that are named stay."""
@@ -322,7 +333,8 @@ class EngineConformance(Conformance):
     def test_operations_are_their_specification(self, engine: Any, name: str) -> None:
         """The value of each, compiled or not; their derivatives in both modes; and the derivative of a gradient."""
         chosen, (f, operands) = _instance(engine), OPERATIONS[name]
-        expected = np.asarray(f(*operands))
+        with mock.patch.object(type(arrays.engine_named("numpy")), "apply", Engine.apply):
+            expected = np.asarray(f(*operands))  # By specification.
         for how, call in _both_ways(chosen, lambda *x: f(*x)):
             with owning(chosen), no_error(f"{name}{how}"):
                 found = chosen.to_numpy(call(*map(chosen.constant, operands)))
@@ -405,7 +417,9 @@ def _both_ways(engine: Engine, f: Callable) -> list[tuple[str, Callable]]:
 
 
 def _instance(engine: Any) -> Engine:
-    return derivatives.engine_named(engine) if isinstance(engine, str) else engine
+    found = derivatives.engine_named(engine) if isinstance(engine, str) else adapted(engine, Engine)
+    claim(found is not None, f"the engine is {engine!r}; expected a name, or an object with the methods of rts.Engine")
+    return found
 
 
 def _differentiating(engine: Any) -> Engine:

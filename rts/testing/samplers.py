@@ -18,7 +18,7 @@ from rts.pairs import APRON
 from rts.records import Sampled
 from rts.testing import derivatives, scenes
 from rts.testing.conformance import Conformance, claim, no_error, refusal
-from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, engine_named, joined, split
+from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_named, joined, split
 from rts.testing.samples import claim_empty_where_empty, claim_ordered, claim_reprojected
 from rts.testing.unusual import claim_awkward_views_are_finite, claim_unseen_is_nothing
 
@@ -223,7 +223,7 @@ class SamplerConformance(Conformance):
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_samples_carry_no_derivative(self, sampler: Any, parts: list[Part], engine: str) -> None:
         """Parameters and depth are constants, whatever they were computed from."""
-        chosen, (values, join) = engine_named(engine), split(parts[0].theta)
+        chosen, (values, join) = differentiating(engine), split(parts[0].theta)
         xp = chosen.namespace
 
         def total(x: list) -> Any:
@@ -240,14 +240,14 @@ class SamplerConformance(Conformance):
     def test_unseen_parts_give_nothing_and_no_gradient(self, sampler: Any, parts: list[Part], engine: str) -> None:
         """Behind the camera or beside the image: an empty image and a gradient of zero."""
         for part in parts[:1]:
-            claim_unseen_is_nothing(part, sampler, engine_named(engine))
+            claim_unseen_is_nothing(part, sampler, differentiating(engine))
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_awkward_views_are_finite(self, sampler: Any, parts: list[Part], engine: str) -> None:
         """From inside, cut by the near plane, edge-on: a finite image and gradient."""
         triangles = [scenes.flat()] if is_of_triangles(parts[0]) else []
         for part in [parts[0], *triangles]:
-            claim_awkward_views_are_finite(part, sampler, engine_named(engine))
+            claim_awkward_views_are_finite(part, sampler, differentiating(engine))
 
 
 class Expected(NamedTuple):

@@ -15,7 +15,7 @@ from rts.interfaces import Engine, Shader
 from rts.records import Tree
 from rts.testing import derivatives, scenes
 from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
-from rts.testing.derivatives import DIFFERENTIABLE, engine_named, names, split
+from rts.testing.derivatives import DIFFERENTIABLE, differentiating, names, split
 
 ROWS = 64
 STEP = 1e-6
@@ -97,7 +97,7 @@ class ShaderConformance(Conformance):
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_gradients_are_finite_differences(self, shader: Any, theta: Tree, gbuffer: dict, engine: str) -> None:
         """In every entry of θ."""
-        chosen, (values, join) = engine_named(engine), split(theta)
+        chosen, (values, join) = differentiating(engine), split(theta)
         values = [v.astype(np.float64) for v in values]
         if not values:
             pytest.skip("the shader is given no θ")
@@ -124,7 +124,7 @@ class ShaderConformance(Conformance):
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_awkward_samples_have_finite_gradients(self, shader: Any, theta: Tree, gbuffer: dict, engine: str) -> None:
         """Normals of zero, seen edge-on or from behind, uv far outside, black, positions at the camera."""
-        chosen = engine_named(engine)
+        chosen = differentiating(engine)
         values, join = split({"theta": theta, "gbuffer": awkward(gbuffer)})
 
         def f(x: list) -> Any:

@@ -14,7 +14,7 @@ from rts.interfaces import Splatter
 from rts.records import Splats
 from rts.testing import derivatives
 from rts.testing.conformance import Conformance, claim, claim_close, no_error, refusal
-from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, engine_named
+from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating
 
 HEIGHT, WIDTH, LAYERS = 8, 9, 2
 CELLS = HEIGHT * WIDTH * LAYERS
@@ -110,7 +110,7 @@ class SplatterConformance(Conformance):
         claim(not (kept & ~covered).any(), "needed asks for samples that are not there")
         pruned = splats.replace(row=np.where(kept, splats.row, -1).astype(np.int32))
         claim_close(_splat(splatter, pruned), _splat(splatter, splats), TOLERANCE, "the image of needed samples")
-        for engine in map(engine_named, DIFFERENTIABLE[:1]):
+        for engine in map(differentiating, DIFFERENTIABLE[:1]):
             along = np.random.default_rng(0).normal(size=splats.positions.shape).astype(np.float32)
             found, expected = (_along(engine, splatter, s, along) for s in (pruned, splats))
             claim_close(found, expected, 1e-4, "the derivative of needed samples")
@@ -131,7 +131,7 @@ class SplatterConformance(Conformance):
         """The derivative of a square that moves to the right, and down, has the right sign at its edges."""
         if not self.moves_edges:
             pytest.skip("the splatter deliberately has no derivative at edges")
-        chosen, splats = engine_named(engine), square()
+        chosen, splats = differentiating(engine), square()
         for axis, ahead, astern in ((0, (3, 6), (3, 2)), (1, (5, 4), (1, 4))):
             along = np.zeros_like(splats.positions)
             along[:, axis] = 1
@@ -143,7 +143,7 @@ class SplatterConformance(Conformance):
     @pytest.mark.parametrize("engine", ENGINES)
     def test_every_engine_gives_the_same_image(self, splatter: Any, engine: str) -> None:
         """To 1e-5."""
-        chosen = engine_named(engine)
+        chosen = differentiating(engine)
         for splats in (everywhere(LAYERS), scattered()):
             with no_error(f"splatting in {engine}"):
                 image = chosen.to_numpy(_instance(splatter).cropped(derivatives.on(chosen, splats)))
@@ -158,7 +158,7 @@ class SplatterConformance(Conformance):
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_rows_of_no_cell_have_no_gradient(self, splatter: Any, engine: str) -> None:
         """Nor have any where nothing is seen; none is NaN."""
-        chosen, splats = engine_named(engine), scattered()
+        chosen, splats = differentiating(engine), scattered()
         for row in (splats.row, np.full_like(splats.row, -1)):
             f = _of_positions_and_colors(splatter, row)
             weights = np.random.default_rng(0).standard_normal((HEIGHT, WIDTH, 4))
@@ -243,8 +243,10 @@ def _splat(splatter: Any, splats: Splats) -> np.ndarray:
 
 
 def _direct(splatter: Any, splats: Splats) -> Any:
-    """By a call of the plugin's own `splat` with arrays."""
-    return unwrapped(_instance(splatter)).splat(splats.positions, splats.rgba, splats.row)
+    """By a direct call with arrays: the plugin's own, where it has one."""
+    found = _instance(splatter)
+    own = unwrapped(found)
+    return (own if hasattr(own, "splat") else found).splat(splats.positions, splats.rgba, splats.row)
 
 
 def _of_positions_and_colors(splatter: Any, row: np.ndarray) -> Callable[[list], Any]:

@@ -14,7 +14,7 @@ from rts.interfaces import Part, RaySurface, TriangleSurface
 from rts.records import Proxy, Samples, Tree
 from rts.testing import derivatives, scenes
 from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
-from rts.testing.derivatives import DIFFERENTIABLE, claim_slope, engine_named, installed, joined, split
+from rts.testing.derivatives import DIFFERENTIABLE, claim_slope, differentiating, installed, joined, split
 from rts.testing.refining import claim_found_again, claim_found_from_behind, claim_refined
 from rts.testing.samples import claim_ordered, claim_reprojected
 from rts.testing.unusual import claim_awkward_views_are_finite, claim_unseen_is_nothing
@@ -134,7 +134,7 @@ class SurfaceConformance(Conformance):
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_evaluate_can_be_compiled(self, part: Part, sampler: Any, engine: str) -> None:
         """It looks at no value of θ, and uses nothing but the namespace of θ."""
-        chosen, (values, join) = engine_named(engine), split(part.theta)
+        chosen, (values, join) = differentiating(engine), split(part.theta)
         sampled = scenes.frozen(part, sampler=sampler).samples[0]
         samples = derivatives.on(chosen, sampled)
         with no_error(f"evaluate compiled by {engine}"):
@@ -148,7 +148,7 @@ class SurfaceConformance(Conformance):
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_gradients_at_frozen_samples_are_finite_differences(self, part: Part, sampler: Any, engine: str) -> None:
         """Of every entry of the G-buffer, in every entry of θ."""
-        chosen, (values, join) = engine_named(engine), split(part.theta)
+        chosen, (values, join) = differentiating(engine), split(part.theta)
         values = [v.astype(np.float64) for v in values]
         sampled = scenes.frozen(part, sampler=sampler).samples[0]
         samples, at = derivatives.on(chosen, sampled), derivatives.on(chosen, values)
@@ -200,12 +200,12 @@ class SurfaceConformance(Conformance):
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_unseen_it_gives_nothing_and_no_gradient(self, part: Part, sampler: Any, engine: str) -> None:
         """Behind the camera or beside the image: an empty image and a gradient of zero."""
-        claim_unseen_is_nothing(part, sampler, engine_named(engine))
+        claim_unseen_is_nothing(part, sampler, differentiating(engine))
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_awkward_views_are_finite(self, part: Part, sampler: Any, engine: str) -> None:
         """From inside, cut by the near plane, and along the axes: a finite image and gradient."""
-        claim_awkward_views_are_finite(part, sampler, engine_named(engine))
+        claim_awkward_views_are_finite(part, sampler, differentiating(engine))
 
     def test_wrong_theta_is_refused_in_one_line(self, part: Part, sampler: Any) -> None:
         """An `rts.InputError` that says what to do, wherever an entry is missing or has a wrong shape."""

@@ -8,7 +8,7 @@ import rts
 
 
 @dataclasses.dataclass(frozen=True)
-class Heightfield:
+class Heightfield(rts.TriangleSurface):
     """θ["heights"] (R, C) are the control heights, rows along z and columns along x, at least four of each."""
 
     sample_widths = (0, 2)  # A sample has no integers; its parameters are u along x and v along z, counted in patches.
