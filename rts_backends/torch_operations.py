@@ -88,12 +88,12 @@ class _Call:
     def pulled(self, wanted: Sequence[bool], fixed: Sequence[Tensor]) -> Callable[..., tuple[Tensor, ...]]:
         """The specification's pullback as a function of the differentiable operands and the gradient.
 
-        It has no rows of what is not wanted.
+        It is empty where one is not wanted.
         """
 
         def pull(*given: Tensor) -> tuple[Tensor, ...]:
             found = torch.func.vjp(self.specification(*fixed), *given[:-1])[1](given[-1])
-            return tuple(x if wish else x[:0] for x, wish in zip(found, wanted, strict=True))
+            return tuple(x if wish else x.new_empty(0) for x, wish in zip(found, wanted, strict=True))
 
         return pull
 
@@ -175,14 +175,12 @@ class _Value(torch.autograd.Function):
 
 
 class _Pull(torch.autograd.Function):
-    """Gradients of the differentiable operands from that of the result; of no rows where not wanted."""
+    """Gradients of the differentiable operands from that of the result; empty where not wanted."""
 
     @staticmethod
     def forward(call, wanted, *given):
         *operands, g = _host(given)
-        found = [
-            np.zeros((len(x) if wish else 0, *x.shape[1:]), x.dtype) for x, wish in zip(operands, wanted, strict=False)
-        ]
+        found = [np.zeros(x.shape if wish else 0, x.dtype) for x, wish in zip(operands, wanted, strict=False)]
         results = [x if wish else None for x, wish in zip(found, wanted, strict=True)]
         call.operation.pull_on_host(operands, g, results, call.kept, call.params)
         return tuple(map(torch.from_numpy, found))

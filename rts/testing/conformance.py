@@ -1,4 +1,4 @@
-"""What the four classes of the kit share: what is collected, and how a claim fails."""
+"""What the classes of the kit share: what is collected, and how a claim fails."""
 
 from __future__ import annotations
 
