@@ -9,6 +9,7 @@ from rts.arrays import map_leaves
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.interfaces import Part, RaySurface, TriangleSurface
+from rts.records import Tree
 from rts.sampling import lift
 from rts.settling import refined
 from rts.testing import derivatives
@@ -58,14 +59,18 @@ def claim_refined(part: Part, surface: TriangleSurface, camera: Camera, view: st
     )
 
 
-def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str) -> None:
-    """Fail unless rays that begin just short of hits hit there again."""
-    theta = map_leaves(derivatives.single, part.theta)
+def _rays_of(part: Part, camera: Camera) -> tuple[Tree, np.ndarray, np.ndarray]:
+    """θ in float32, and origins on the near plane and directions (R, 3) of a part's rays, local space."""
     local = camera.within(part.transform)
     rays = local.rays(GRID)
-    near = float(local.depth_range()[0])
     directions = rays.directions.reshape(-1, 3).astype(np.float32)
-    origins = (rays.origins.reshape(-1, 3) + near * directions).astype(np.float32)
+    origins = (rays.origins.reshape(-1, 3) + float(local.depth_range()[0]) * directions).astype(np.float32)
+    return map_leaves(derivatives.single, part.theta), origins, directions
+
+
+def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str) -> None:
+    """Fail unless rays that begin just short of hits hit there again."""
+    theta, origins, directions = _rays_of(part, camera)
     hits = surface.intersect(theta, origins, directions, LAYERS)
     hit, distance = np.asarray(hits.hit), np.asarray(hits.distance)
     claim_finite((distance, np.asarray(hits.params)), f"{view}: what intersect gives, also where nothing is hit,")
@@ -90,11 +95,7 @@ def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str
 
 def claim_found_from_behind(part: Part, surface: RaySurface, camera: Camera, view: str) -> None:
     """Fail unless rays that come from behind hit at the same places."""
-    theta = map_leaves(derivatives.single, part.theta)
-    local = camera.within(part.transform)
-    rays = local.rays(GRID)
-    directions = rays.directions.reshape(-1, 3).astype(np.float32)
-    origins = (rays.origins.reshape(-1, 3) + float(local.depth_range()[0]) * directions).astype(np.float32)
+    theta, origins, directions = _rays_of(part, camera)
     hits = surface.intersect(theta, origins, directions, DEEP)
     hit, distance = np.asarray(hits.hit), np.where(hits.hit, hits.distance, -np.inf)
     # Those that have hit all there is.
