@@ -38,13 +38,9 @@ class NumpyEngine(Engine):
         return fn(*args)
 
     def apply(self, operation: Operation, operands: Sequence[np.ndarray], params: Mapping[str, Any]) -> np.ndarray:
-        """By compiled code, of float32 and float64; where both meet, in the wider one."""
-        dtypes = list(map(_DTYPE, operands))
-        if not operation.fits(dtypes):
-            widest = np.result_type(np.float32, *(d for d in dtypes if d.kind == "f"))
-            operands = [x.astype(widest) if x.dtype.kind == "f" else x for x in operands]
-            if not operation.fits(list(map(_DTYPE, operands))):
-                return operation.specification(*operands, **params)
+        """By compiled code, of floats of one dtype, float32 or float64."""
+        if not operation.fits(list(map(_DTYPE, operands))):
+            return operation.specification(*operands, **params)
         return operation.value_on_host(list(map(read_only, operands)), dict(params))[0]
 
     def on_host(self, *arrays: np.ndarray) -> bool:

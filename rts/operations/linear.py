@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import constants, engine_of, exemplar, namespace
+from rts.arrays import constants, engine_of, exemplar
 from rts.operations.operation import Arrays, Operation, Some
 from rts.records import Array
 
@@ -34,8 +34,12 @@ def affine_map(rows: Array, points: Array) -> Array:
     return AFFINE(rows, points)
 
 
-def _specification(rows: Array, points: Array) -> Array:
-    return namespace(rows, points).stack([affine(rows[i, :], points) for i in range(rows.shape[0])], axis=-1)
+def specified_affine_map(rows: Array, points: Array) -> Array:
+    """`affine_map` in array code."""
+    engine = engine_of(rows, points)
+    if engine.exact_products(rows, points):
+        return points @ rows[:, :3].T + rows[:, 3]
+    return engine.namespace.stack([affine(rows[i, :], points) for i in range(rows.shape[0])], axis=-1)
 
 
 def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:
@@ -61,4 +65,4 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
 
 
 _PACKED: dict[str, Any] = {"differentiable": 2, "packed": (1,), "packed_result": True}
-AFFINE = Operation("rts.affine", _specification, (2, 2), _shape, _forward, _push, _pull, **_PACKED)
+AFFINE = Operation("rts.affine", specified_affine_map, (2, 2), _shape, _forward, _push, _pull, **_PACKED)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.arrays import namespace
-from rts.operations.linear import affine
+from rts.operations.linear import specified_affine_map
 from rts.operations.operation import Arrays, Operation, Some
 from rts.records import Array
 
@@ -19,10 +19,11 @@ def projective_map(rows: Array, points: Array) -> Array:
 
 
 def _specification(rows: Array, points: Array) -> Array:
-    x, y, w, z = (affine(rows[i, :], points) for i in range(4))
-    xp = namespace(w)
-    safe = xp.where(w == 0, xp.ones_like(w), w)
-    return xp.stack([x / safe, y / safe, z], axis=1)
+    divisor = specified_affine_map(rows[2:3, :], points)
+    xp = namespace(divisor)
+    safe = xp.where(divisor == 0, xp.ones_like(divisor), divisor)
+    depth = specified_affine_map(rows[3:, :], points)
+    return xp.concat([specified_affine_map(rows[:2, :], points) / safe, depth], axis=1)
 
 
 def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:
