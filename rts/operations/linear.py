@@ -31,7 +31,13 @@ def affine(row: Array, points: Array) -> Array:
 
 def affine_map(rows: Array, points: Array) -> Array:
     """Points (N, 3) under an affine map of R rows (R, 4): (N, R)."""
-    return AFFINE(rows, points)
+    return specified_affine_map(rows, points) if is_plain_product(rows, points) else AFFINE(rows, points)
+
+
+def is_plain_product(*arrays: Array) -> bool:
+    """Whether a product of whole matrices is all it takes: it is exact, and nobody differentiates it."""
+    engine = engine_of(*arrays)
+    return not engine.differentiates and engine.exact_products(*arrays)
 
 
 def specified_affine_map(rows: Array, points: Array) -> Array:

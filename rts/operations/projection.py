@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.arrays import namespace
-from rts.operations.linear import specified_affine_map
+from rts.operations.linear import is_plain_product, specified_affine_map
 from rts.operations.operation import Arrays, Operation, Some
 from rts.records import Array
 
@@ -15,7 +15,7 @@ def projective_map(rows: Array, points: Array) -> Array:
 
     Where the third is zero there is no image; the result is finite.
     """
-    return PROJECTION(rows, points)
+    return _specification(rows, points) if is_plain_product(rows, points) else PROJECTION(rows, points)
 
 
 def _specification(rows: Array, points: Array) -> Array:
