@@ -31,7 +31,10 @@ def affine(row: Array, points: Array) -> Array:
 
 def affine_map(rows: Array, points: Array) -> Array:
     """Points (N, 3) under an affine map of R rows (R, 4): (N, R)."""
-    return specified_affine_map(rows, points) if is_plain_product(rows, points) else AFFINE(rows, points)
+    if is_plain_product(rows, points):
+        AFFINE.check_ranks((rows, points))
+        return specified_affine_map(rows, points)
+    return AFFINE(rows, points)
 
 
 def is_plain_product(*arrays: Array) -> bool:

@@ -103,15 +103,16 @@ class Operation:
                 break
         else:
             if kind in OWNERS or kind is np.ndarray:
-                self._check_ranks(operands)
+                self.check_ranks(operands)
                 return engine_of(operands[0]).apply(self, operands, params)
         operands = tuple([from_numbers(x) for x in operands])
         engine, like = suiting(operands)
         operands = constants(operands, engine, like)
-        self._check_ranks(operands)
+        self.check_ranks(operands)
         return engine.apply(self, operands, params)
 
-    def _check_ranks(self, operands: Sequence[Array]) -> None:
+    def check_ranks(self, operands: Sequence[Array]) -> None:
+        """Raise an InputError for operands with another number of axes."""
         for x, rank in zip(operands, self.ranks, strict=True):
             if x.ndim != rank:
                 shapes = ", ".join(str(tuple(x.shape)) for x in operands)

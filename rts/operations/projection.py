@@ -15,7 +15,10 @@ def projective_map(rows: Array, points: Array) -> Array:
 
     Where the third is zero there is no image; the result is finite.
     """
-    return _specification(rows, points) if is_plain_product(rows, points) else PROJECTION(rows, points)
+    if is_plain_product(rows, points):
+        PROJECTION.check_ranks((rows, points))
+        return _specification(rows, points)
+    return PROJECTION(rows, points)
 
 
 def _specification(rows: Array, points: Array) -> Array:
