@@ -15,7 +15,7 @@ import numpy as np
 from scenes import DATA, DISTANCE, bunny_and_square, camera, pixel, rotation_xy, translation
 
 import rts
-from rts.arrays import constants, engine_of, exemplar
+from rts.engines import constants, engine_of, exemplar
 
 SIZE = 256
 CARD_DEPTH = 4.3

@@ -22,7 +22,7 @@ import numpy as np
 from scenes import DISTANCE, camera, mesh, supersampled
 
 import rts
-from rts.arrays import namespace
+from rts.engines import namespace
 
 SIZE = (128, 128)
 MESHES = ("teapot", "bunny", "nefertiti")

@@ -5,26 +5,15 @@ differentiate only that.
 """
 
 from rts.adapting import unwrapped
-from rts.arrays import engine_of, namespace
 from rts.camera import Camera
 from rts.choosing import explain
+from rts.engines import Engine, engine_of, namespace
 from rts.errors import EngineError, InputError, LayersWarning, PluginError, RtsError
 from rts.fitting import Fit, fit
 from rts.gbuffer import GBuffer
 from rts.gradients import check_gradient, gradient_image
 from rts.image_residuals import ImageResiduals
-from rts.interfaces import (
-    Engine,
-    Evaluator,
-    Part,
-    RaySurface,
-    Residuals,
-    Sampler,
-    Shader,
-    Splatter,
-    Surface,
-    TriangleSurface,
-)
+from rts.interfaces import Evaluator, Part, RaySurface, Residuals, Sampler, Shader, Splatter, Surface, TriangleSurface
 from rts.operations.combine import combine
 from rts.operations.gradient import gradient
 from rts.operations.operation import Operation

@@ -3,13 +3,38 @@
 from __future__ import annotations
 
 import abc
+from collections.abc import Callable, Mapping
 from operator import attrgetter
 from types import FunctionType
-from typing import Any
+from typing import Any, ClassVar
 
 from rts.errors import PluginError
-from rts.interfaces import Plugin, RaySurface, Splatter, Surface, TriangleSurface
-from rts.records import Array, Splats
+
+
+class Plugin(abc.ABC):  # noqa: B024
+    """What all bases share: class variables that follow from the methods of a class.
+
+    Attributes:
+        FLAGS: method → class variable, which is True in a subclass that has such a method of its own, unless it says
+            otherwise.
+        STAND_INS: method → the name of another that an object of a foreign class may have in its place, and a function
+            `(object, ...)` that does by it what the method is to do. A base that has both keeps the other for itself.
+        DECLARES: of a base of plugins in another module than this one: its methods are members of plugins, too.
+    """
+
+    FLAGS: ClassVar[Mapping[str, str]] = {}
+    STAND_INS: ClassVar[Mapping[str, tuple[str, Callable]]] = {}
+    DECLARES: ClassVar[bool] = False
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Set the class variables."""
+        super().__init_subclass__(**options)
+        for base in cls.__mro__:
+            for method, flag in base.__dict__.get("FLAGS", {}).items():
+                derived = cls.__mro__[: cls.__mro__.index(base)]
+                own = any(method in c.__dict__ for c in derived)
+                if own and not any(flag in c.__dict__ for c in derived):
+                    setattr(cls, flag, True)
 
 
 class _Wrapped:
@@ -44,26 +69,10 @@ class _Wrapped:
         return hash(self._given)
 
 
-class _WrappedSplatter(_Wrapped):
-    """A splatter that has `splat(positions, rgba, row)` in place of `image`."""
-
-    def image(self, splats: Splats) -> Array:
-        """See `Splatter`."""
-        return self._given.splat(splats.positions, splats.rgba, splats.row)
-
-
 def unwrapped(plugin: Any) -> Any:
     """What the user gave: the plugin itself or, of a wrapper, the object in it. Caches go by it."""
     return plugin._given if issubclass(type(plugin), _Wrapped) else plugin
 
-
-def as_surface(given: Any) -> Any:
-    """A surface with all members of its bases, or None where it is none; see `adapted`."""
-    return adapted(given, Surface, TriangleSurface, RaySurface)
-
-
-FINAL = {"splat"}
-"""What a base keeps for itself."""
 
 _known: set[tuple[type, type]] = set()
 _wrappers: dict[tuple, type] = {}
@@ -93,30 +102,43 @@ def adapted(given: Any, *bases: type[Plugin]) -> Any:
         _known.add((kind, bases[0]))
         return given
     present = frozenset(name for base in bases for name in _members(base) if hasattr(given, name))
-    by_arrays = bases[0] is Splatter and "splat" in present and "image" not in present
-    if by_arrays:
-        present |= {"image"}
+    stood_in = {
+        method: by
+        for base in bases
+        for method, (other, by) in base.STAND_INS.items()
+        if other in present and method not in present
+    }
+    present |= frozenset(stood_in)
     # The most special first, as Python wants them.
     fitting = tuple(base for base in reversed(bases) if base.__abstractmethods__ <= present)
     if bases[0] not in fitting or isinstance(given, type):
         return None
-    key = kind, fitting, present, by_arrays
+    key = kind, fitting, present
     if key not in _wrappers:
         _check_names(kind, fitting)
-        _wrappers[key] = _wrapper(kind, fitting, present, _WrappedSplatter if by_arrays else _Wrapped)
+        _wrappers[key] = _wrapper(kind, fitting, present, stood_in)
         _wrappers[key]._bases = bases
     return _wrappers[key](given)
 
 
-def _wrapper(kind: type, bases: tuple[type[Plugin], ...], present: frozenset[str], outer: type) -> type:
-    """The class of wrappers for objects of a class that have these members."""
-    own = present - {"__call__", "splat"} - outer.__dict__.keys()
+def _wrapper(
+    kind: type, bases: tuple[type[Plugin], ...], present: frozenset[str], stood_in: Mapping[str, Callable]
+) -> type:
+    """The class of wrappers for objects of a class that have these members, some of them by others of its own."""
+    own = present - {"__call__"} - stood_in.keys() - {name for base in bases for name in _final(base)}
     namespace: dict[str, Any] = {name: property(lambda self, get=attrgetter(name): get(self._given)) for name in own}
+    for method, by in stood_in.items():
+        namespace[method] = lambda self, *args, by=by: by(self._given, *args)
     if "__call__" in present:
         namespace["__call__"] = lambda self, *args, **kwargs: self._given(*args, **kwargs)
     for method, flag in (pair for base in bases for pair in base.FLAGS.items() if pair[1] not in present):
         namespace[flag] = method in present
-    return type(kind.__name__, (outer, *bases), namespace)
+    return type(kind.__name__, (_Wrapped, *bases), namespace)
+
+
+def _final(base: type[Plugin]) -> set[str]:
+    """The methods that a base keeps for itself, which it marks by `typing.final`."""
+    return {name for c in base.__mro__ for name, value in c.__dict__.items() if getattr(value, "__final__", False)}
 
 
 def _members(base: type[Plugin]) -> list[str]:
@@ -135,7 +157,10 @@ def _check_names(kind: type, bases: tuple[type[Plugin], ...]) -> None:
         name
         for c in declared - {Plugin, abc.ABC, object}
         for name, value in c.__dict__.items()
-        if isinstance(value, FunctionType) and not name.startswith("_") and name not in required | FINAL
+        if isinstance(value, FunctionType)
+        and not name.startswith("_")
+        and name not in required
+        and not getattr(value, "__final__", False)
     }
     foreign = [c for c in kind.__mro__ if c not in declared]
     there = {n: c for c in foreign for n, value in c.__dict__.items() if isinstance(value, FunctionType)}
@@ -149,12 +174,13 @@ def _check_names(kind: type, bases: tuple[type[Plugin], ...]) -> None:
                     f"{where.__qualname__} has a function {name!r}, which rts never calls; did you mean {member!r} of "
                     f"{bases[0].__name__}? Rename it to that, or to something less alike"
                 )
-    final = there.get("splat")
-    if Splatter in bases and final is not None and issubclass(kind, Splatter):
-        raise PluginError(
-            f"{final.__qualname__} overrides 'splat', which is for direct calls; write 'image(splats)', which gives "
-            f"(H, W, 4) for an rts.Splats"
-        )
+    for base in (b for b in bases if issubclass(kind, b)):
+        for method, (other, _) in base.STAND_INS.items():
+            if other in there:
+                raise PluginError(
+                    f"{there[other].__qualname__} overrides {other!r}, which is for direct calls; write {method!r} "
+                    f"instead, as rts.{base.__name__} says"
+                )
 
 
 def _one_edit(a: str, b: str) -> bool:

@@ -16,10 +16,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import constants, engine_of, is_constant, namespace, promote
+from rts.arrays import promote
+from rts.engines import constants, engine_of, is_constant, namespace
 from rts.operations.linear import affine, matmul
 from rts.operations.projection import projective_map
-from rts.records import Array, Rays
+from rts.records import Rays
 from rts.transforms import (
     affine_matrix,
     check_range,
@@ -30,6 +31,7 @@ from rts.transforms import (
     perspective,
     scaled_rows,
 )
+from rts.trees import Array
 
 NEAR_OVER_DISTANCE = 1e-2
 FAR_OVER_DISTANCE = 1e2

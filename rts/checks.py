@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from rts import registry
-from rts.adapting import adapted, as_surface
-from rts.arrays import described, from_numbers, namespace, shape_of
+from rts.adapting import adapted
+from rts.arrays import described, from_numbers, shape_of
 from rts.camera import Camera
+from rts.engines import namespace
 from rts.errors import InputError
-from rts.interfaces import Part, Sampler, Shader, Splatter
-from rts.records import Array
+from rts.interfaces import Part, Sampler, Shader, Splatter, as_surface
+from rts.trees import Array
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}
 """Rough memory of a cell of a layer through sampling, shading and splatting in array code; compiled, it is less."""

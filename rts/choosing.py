@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from rts import registry
-from rts.arrays import engine_of, is_constant
 from rts.camera import Camera
 from rts.checks import check_sampler, check_scene
+from rts.engines import engine_of, is_constant
 from rts.errors import PluginError
 from rts.interfaces import Part, Sampler, TriangleSurface
 from rts.preparing import PreparedParts

@@ -17,9 +17,9 @@ from rich.markup import escape
 from typer.core import TyperGroup
 
 from rts import registry
-from rts.arrays import map_leaves
 from rts.errors import RtsError
 from rts.interfaces import Part
+from rts.trees import map_leaves
 
 EXAMPLES = """
 Examples:

@@ -9,9 +9,9 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+from rts.engines import Engine
 from rts.errors import InputError, RtsError
-from rts.interfaces import Engine
-from rts.records import Tree
+from rts.trees import Tree
 
 Report = Callable[[int, Tree, float], Any]
 

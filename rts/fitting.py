@@ -12,12 +12,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.adapting import adapted
-from rts.arrays import engine_of, is_constant, leaves, map_leaves
+from rts.engines import Engine, engine_of, is_constant
 from rts.errors import InputError
 from rts.fit_runs import Astray, Report, Run, progress_bar, require
-from rts.interfaces import Engine, Residuals
+from rts.interfaces import Residuals
 from rts.least_squares import levenberg_marquardt, mean_square
-from rts.records import Array, Tree
+from rts.trees import Array, Tree, leaves, map_leaves
 
 STEPS = {"adam": 200, "sgd": 200, "lm": 50}
 LEARNING_RATES = {"adam": 1e-2, "sgd": 1e-1}

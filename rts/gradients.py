@@ -10,14 +10,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import engine_of, from_numbers, is_constant, is_traced, leaves, map_leaves, namespace, shape_of
+from rts.arrays import from_numbers, shape_of
 from rts.camera import Camera
 from rts.checks import check_size
+from rts.engines import Engine, engine_of, is_constant, is_traced, namespace
 from rts.errors import InputError
-from rts.interfaces import Engine, Part, Splatter
-from rts.records import Array, Splats, Tree
+from rts.interfaces import Part, Splatter
+from rts.records import Splats
 from rts.rendering import render
 from rts.scenes import decode_srgb
+from rts.trees import Array, Tree, leaves, map_leaves
 
 Scene = Callable[[Tree], tuple[Part | Sequence[Part], Camera]]
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rts.arrays import constants, described, engine_of, exemplar, from_numbers, namespace, shape_of, suiting
+from rts.arrays import described, from_numbers, shape_of
 from rts.camera import Camera
 from rts.checks import check_background, check_floating, check_scene, check_size, check_splatter
+from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting
 from rts.errors import InputError
-from rts.interfaces import Engine, Part, Residuals, Splatter
+from rts.interfaces import Part, Residuals, Splatter
 from rts.least_squares import flatten, normal_equations
 from rts.preparing import PreparedParts
-from rts.records import Array, Splats, Tree
+from rts.records import Splats
 from rts.rendering import render, sample, to_splats
+from rts.trees import Array, Tree
 
 Parts = Part | Sequence[Part] | PreparedParts
 Scene = Callable[[Tree], "Parts | tuple[Parts, Camera]"]

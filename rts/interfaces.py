@@ -7,45 +7,25 @@ Shapes use the letters of `rts.records`; conventions of space are in `rts.camera
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar, final
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 
-from rts.errors import EngineError, InputError, RtsError
+from rts.adapting import Plugin, adapted
+from rts.arrays import from_numbers, shape_of, without_border
+from rts.engines import constants, engine_of, exemplar, namespace
+from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.records import Array, ArraySpec, Proxy, RayHits, Rays, Samples, Splats, Tree, record
+from rts.records import ArraySpec, Proxy, RayHits, Rays, Samples, Splats
+from rts.trees import Array, Tree, record
 
 if TYPE_CHECKING:
     from rts.camera import Camera
-    from rts.operations.operation import Operation
 
 
-class Plugin(abc.ABC):  # noqa: B024
-    """What all bases share: class variables that follow from the methods of a class.
-
-    Attributes:
-        FLAGS: method → class variable, which is True in a subclass that has such a method of its own, unless it says
-            otherwise.
-        DECLARES: of a base of plugins in another module than this one: its methods are members of plugins, too.
-    """
-
-    FLAGS: ClassVar[Mapping[str, str]] = {}
-    DECLARES: ClassVar[bool] = False
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        """Set the class variables."""
-        super().__init_subclass__(**options)
-        for base in cls.__mro__:
-            for method, flag in base.__dict__.get("FLAGS", {}).items():
-                derived = cls.__mro__[: cls.__mro__.index(base)]
-                own = any(method in c.__dict__ for c in derived)
-                if own and not any(flag in c.__dict__ for c in derived):
-                    setattr(cls, flag, True)
-
-
-# ----------------------------------------------------------------------------------------------------- surfaces
+# ------------------------------------------------------------------------------------------------------------ surfaces
 
 
 class Evaluator(Plugin):
@@ -179,7 +159,12 @@ class RaySurface(Surface):
         """
 
 
-# ----------------------------------------------------------------------------------------------------- samplers
+def as_surface(given: Any) -> Any:
+    """A surface with all members of its bases, or None where it is none; see `rts.adapting.adapted`."""
+    return adapted(given, Surface, TriangleSurface, RaySurface)
+
+
+# ------------------------------------------------------------------------------------------------------------ samplers
 
 
 class Needed(Plugin):
@@ -230,7 +215,7 @@ class Sampler(Plugin):
         return None
 
 
-# ------------------------------------------------------------------------------------------ shaders, splatters
+# -------------------------------------------------------------------------------------------------- shaders, splatters
 
 
 class Shader(Plugin):
@@ -249,6 +234,11 @@ class Shader(Plugin):
         """(N, 4) premultiplied linear RGBA from the part's θ and its G-buffer in world space."""
 
 
+def _image_of_arrays(given: Any, splats: Splats) -> Array:
+    """`image` of an object that has only `splat(positions, rgba, row)`."""
+    return given.splat(splats.positions, splats.rgba, splats.row)
+
+
 class Splatter(Plugin):
     """Turns shaded samples into an image that has derivatives at occlusion boundaries.
 
@@ -259,6 +249,7 @@ class Splatter(Plugin):
     """
 
     FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}
+    STAND_INS = {"image": ("splat", _image_of_arrays)}
 
     reach: int = 1
     prunes: bool = False
@@ -270,9 +261,7 @@ class Splatter(Plugin):
 
     def cropped(self, splats: Splats) -> Array:
         """The image without the border: (H − 2 border, W − 2 border, 4). To be overridden only to save a copy."""
-        from rts.splatting import inside
-
-        return inside(self.image(splats), splats.border)
+        return without_border(self.image(splats), splats.border)
 
     @final
     def splat(self, positions: Array, rgba: Array, row: Array, border: int = 0) -> Array:
@@ -287,9 +276,7 @@ class Splatter(Plugin):
         Returns:
             (H − 2 border, W − 2 border, 4) premultiplied RGBA.
         """
-        from rts.splatting import check_splats
-
-        return self.cropped(check_splats(positions, rgba, row, border))
+        return self.cropped(_checked_splats(positions, rgba, row, border))
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """The samples that can reach the image, in value or derivative, where all are opaque and on pixel centres.
@@ -330,7 +317,24 @@ class Splatter(Plugin):
         return None
 
 
-# ------------------------------------------------------------------------------------------------------ fitting
+def _checked_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Splats:
+    """Splats of arrays, or of lists, all of one engine; wrong shapes and dtypes are refused."""
+    given = tuple(from_numbers(x) for x in (positions, rgba))
+    row = np.asarray(row, np.int32) if isinstance(row, (list, tuple)) else row
+    shapes = [shape_of(x) for x in (*given, row)]
+    ok = len(shapes[0]) == 2 and shapes[0][1] == 3 and shapes[1] == (shapes[0][0], 4) and len(shapes[2]) == 3
+    if not ok or shapes[2][0] < 1:
+        raise InputError(
+            f"positions, rgba and row have shapes {shapes[0]}, {shapes[1]}, {shapes[2]}; "
+            f"expected (N, 3), (N, 4), (K, H, W)"
+        )
+    if not namespace(row).isdtype(row.dtype, "signed integer"):
+        raise InputError(f"row has dtype {row.dtype}; expected signed integers, -1 where a cell is empty")
+    positions, rgba, row = constants((*given, row), engine_of(given, row), exemplar(given))
+    return Splats(positions, rgba, row, border=border)
+
+
+# ------------------------------------------------------------------------------------------------------------- fitting
 
 
 class Residuals(Plugin):
@@ -350,165 +354,13 @@ class Residuals(Plugin):
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
         """Mean square () of the n residuals r, JᵀJ / n (U, U) and Jᵀr / n (U,) for their Jacobian J.
 
-        U counts the numbers in the parameters, in the order of `rts.arrays.leaves`. All are arrays of the parameters'
+        U counts the numbers in the parameters, in the order of `rts.trees.leaves`. All are arrays of the parameters'
         engine, which may be traced. With it, Levenberg–Marquardt makes no Jacobian of its own.
         """
         raise NotImplementedError
 
 
-# ------------------------------------------------------------------------------------------------------ engines
-
-
-class Engine(Plugin):
-    """An array framework, chosen by the type of the arrays, never a global setting.
-
-    The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the user
-    has imported that module.
-
-    Attributes:
-        name: of the entry point.
-        namespace: the array-API namespace of its arrays.
-        differentiates: whether it has derivatives: `value_and_grad`, `jvp`, `jacobian` and `optimizer`.
-    """
-
-    name: ClassVar[str]
-    namespace: ClassVar[Any]
-    differentiates: ClassVar[bool] = True
-
-    @abc.abstractmethod
-    def owns(self, x: Any) -> bool:
-        """Whether this is an array of the framework, traced ones included."""
-
-    @abc.abstractmethod
-    def constant(self, value: Any, like: Array | None = None) -> Array:
-        """An array with no derivative on the device of `like`; floats take the dtype of `like`, or are float32."""
-
-    @abc.abstractmethod
-    def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Array) -> tuple[Array, ...]:
-        """Call `fn` on NumPy copies of `args`; the results carry no derivative and live where `args` do.
-
-        Args:
-            fn: host arrays → as many host arrays as there are specs.
-            specs: of the results.
-            *args: arrays.
-        """
-
-    @abc.abstractmethod
-    def stop_gradient(self, x: Array) -> Array:
-        """The same values without derivatives."""
-
-    @abc.abstractmethod
-    def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> Array:
-        """(count, C) sums of the rows of `values` (M, C) that share a segment (M,)."""
-
-    @abc.abstractmethod
-    def to_numpy(self, x: Array) -> np.ndarray:
-        """The value on the host; not for traced arrays."""
-
-    # ----------------------------------------------------------------------------- how arrays are computed with
-
-    def apply(self, operation: Operation, operands: Sequence[Array], params: Mapping[str, Any]) -> Array:
-        """The result of an operation; by its compiled functions where the engine can. Default its specification."""
-        return operation.specification(*operands, **params)
-
-    def on_host(self, *arrays: Array) -> bool:
-        """Whether compiled code for the host may work on these arrays, in place of array code."""
-        return False
-
-    def by_host(self, f: Callable, otherwise: Callable, *arrays: Array) -> tuple[Array, ...]:
-        """`f` of arrays for which `on_host` holds, `otherwise` of others; the results are alike.
-
-        Engines that trace decide when the compiled program knows its device.
-        """
-        return f(*arrays) if self.on_host(*arrays) else otherwise(*arrays)
-
-    def exact_products(self, *arrays: Array) -> bool:
-        """Whether matrix products of these keep their precision; matrix units of some devices round float32."""
-        return False
-
-    def traced(self, x: Array) -> bool:
-        """Whether an array has a shape but not yet a value."""
-        return False
-
-    def padded(self, x: Array) -> bool:
-        """Whether packed arrays like this one may have rows that nobody uses."""
-        return False
-
-    def fill_unused(self, x: Array, row: Array) -> Array:
-        """Packed x (N, ·) with its first row for those that no cell of `row` (K, H, W) names; asked where `padded`."""
-        return x
-
-    def block(self, x: Tree) -> Tree:
-        """Wait until the arrays are computed."""
-        return x
-
-    def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], Array], state: Tree, most: int) -> Tree:
-        """`state = body(state)` as long as `going(state)` () bool holds, at most so many times.
-
-        Without derivatives, and a loop in compiled programs, too, where unrolling takes minutes to compile. What `body`
-        closes over has to be without derivatives by itself (`stop_gradient`), as θ is where rays are intersected.
-
-        Args:
-            body: tree of arrays → the same tree of other values; shapes and dtypes stay.
-            going: tree → () bool, such as whether any is not done.
-            state: arrays of this engine.
-            most: the largest number of times.
-        """
-        for _ in range(most):
-            if not bool(going(state)):
-                break
-            state = body(state)
-        return state
-
-    # ---------------------------------------------------------------------------------------------- derivatives
-
-    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Array]) -> Array:
-        """`f(make())`, done again for its gradient instead of keeping what it went through; `make` has no derivative.
-
-        What `make` gives may be kept where it could not be made again as it was.
-        """
-        return f(make())
-
-    def value_and_grad(self, f: Callable) -> Callable:
-        """`f(tree) -> scalar` to `tree -> (value, gradient tree)`."""
-        raise self._no_derivatives()
-
-    def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[Array, Array]:
-        """The value of `f` and its derivative along `tangent`, differentiable in turn in what `f` closes over."""
-        raise self._no_derivatives()
-
-    def jacobian(self, f: Callable) -> Callable:
-        """`f(vector) -> arrays` to `vector -> (values, derivatives)`, a row for each unknown, by forward mode."""
-        raise self._no_derivatives()
-
-    def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
-        """A step function `(parameters, gradient) -> parameters` with its own state; "adam" or "sgd"."""
-        raise self._no_derivatives()
-
-    def _no_derivatives(self) -> EngineError:
-        if not self.differentiates:
-            return EngineError(
-                f"{self.name} arrays have no derivatives; pass arrays of an engine that has, such as torch or jax, for "
-                f"what is to be differentiated"
-            )
-        return EngineError(f"the engine {self.name} lacks this function, though it says that it differentiates")
-
-    # ---------------------------------------------------------------------------------------------- compilation
-
-    def jit(self, f: Callable) -> Callable:
-        """Compile where the framework can, else return `f`."""
-        return f
-
-    def uncompiled(self, f: Callable) -> Callable:
-        """`f`, which what compiles Python code is to call as it is, and not to look into."""
-        return f
-
-    def take_error(self) -> RtsError | None:
-        """The last error raised inside a host call, once, where the framework wraps such errors in its own."""
-        return None
-
-
-# -------------------------------------------------------------------------------------------------------- parts
+# --------------------------------------------------------------------------------------------------------------- parts
 
 
 @record(static=("surface", "shader", "cull"))

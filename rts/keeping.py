@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import leaves
-from rts.records import Proxy, Tree
+from rts.records import Proxy
+from rts.trees import Tree, leaves
 
 KEPT = 2
 """Entries a surface and sampler: the newest, and the one before it, which is moved when a third is asked for."""

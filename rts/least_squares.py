@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import leaves, map_leaves, namespace
+from rts.engines import Engine, namespace
 from rts.errors import InputError
 from rts.fit_runs import Run, require
-from rts.interfaces import Engine
-from rts.records import Array, Tree
+from rts.trees import Array, Tree, leaves, map_leaves
 
 FIRST_DAMPING = 1e-3
 LARGEST_DAMPING = 1e12

@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import registry
-from rts.arrays import constants, engine_named, is_constant, leaves, map_leaves
 from rts.camera import Camera
 from rts.checks import check_sampler, check_scene
+from rts.engines import Engine, constants, engine_named, is_constant
 from rts.errors import RtsError
-from rts.interfaces import Engine, Part, RaySurface, TriangleSurface
+from rts.interfaces import Part, RaySurface, TriangleSurface
 from rts.rendering import apron_of, render
 from rts.sampling import TriangleSampler
+from rts.trees import leaves, map_leaves
 
 SIZE = (14, 18)
 CAMERA = Camera.look_at((0.9, 1.6, 3.2), (0, 0, 0), aspect=SIZE[1] / SIZE[0], principal_point=(0.1, -0.05))

@@ -11,18 +11,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import registry
-from rts.arrays import engine_named
 from rts.camera import Camera
+from rts.engines import Engine, engine_named
 from rts.errors import InputError, PluginError
 from rts.fitting import fit
 from rts.framing import Bounds
 from rts.image_residuals import ImageResiduals
-from rts.interfaces import Engine, Part
+from rts.interfaces import Part
 from rts.operations.linear import matmul
 from rts.operations.rigid import rigid
-from rts.records import Array
 from rts.rendering import render
 from rts.scenes import save_animation, save_image
+from rts.trees import Array
 
 LARGEST_SIDE = 256
 """Pixels of the longer side of the image that is fitted."""

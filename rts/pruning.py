@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rts.adapting import adapted
-from rts.arrays import engine_of, is_traced, namespace
+from rts.engines import engine_of, is_traced, namespace
 from rts.errors import InputError, LayersWarning
 from rts.interfaces import Needed, Part, Splatter
 from rts.records import ArraySpec, Sampled, Samples

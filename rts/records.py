@@ -1,4 +1,4 @@
-"""What passes between the parts of the library, and what makes a class known to every engine as a pytree.
+"""What passes between the parts of the library.
 
 Shapes use these letters: N packed samples, K layers front to back, H × W pixels (row 0 on top), V vertices,
 T triangles, I integers and P reals a sample, C channels. Conventions of space are in `rts.camera`.
@@ -6,67 +6,14 @@ T triangles, I integers and P reals a sample, C channels. Conventions of space a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
-from typing import Any, NamedTuple, TypeVar, dataclass_transform
+from collections.abc import Mapping
+from dataclasses import field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
-Array = Any
-"""An array of NumPy, torch or jax, or of an engine that a plugin brings."""
-
-Tree = Any
-"""Arrays in nested dicts, lists, tuples and records."""
-
-_Class = TypeVar("_Class", bound=type)
-
-# ------------------------------------------------------------------------------------------ records as pytrees
-
-STATIC_FIELDS: dict[type, tuple[str, ...]] = {}
-"""The records that are pytrees, each with the names of its fields that are not arrays (engines register them)."""
-
-_ARRAY_FIELDS: dict[type, tuple[str, ...]] = {}
-
-
-@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(field,))
-def record(*, static: tuple[str, ...] = ()) -> Callable[[_Class], _Class]:
-    """Make a class a frozen dataclass that every engine knows as a pytree, to be an argument of its transforms.
-
-    Args:
-        static: the fields that are not arrays; jax compares them to decide whether to compile anew.
-    """
-
-    def decorate(cls: _Class) -> _Class:
-        made = dataclass(frozen=True, eq=False)(cls)
-        STATIC_FIELDS[made] = static
-        _ARRAY_FIELDS[made] = tuple(f.name for f in fields(made) if f.name not in static)
-        return made
-
-    return decorate
-
-
-def record_arrays(value: Any) -> list[Any]:
-    """A record's array fields in order of declaration."""
-    found = value.__dict__
-    return [found[name] for name in _ARRAY_FIELDS[type(value)]]
-
-
-def split_record(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-    """A record's array fields in order of declaration, and its static fields in that of `STATIC_FIELDS`."""
-    found = value.__dict__
-    return tuple(record_arrays(value)), tuple([found[name] for name in STATIC_FIELDS[type(value)]])
-
-
-def join_record(cls: type, arrays: tuple[Any, ...], static: tuple[Any, ...]) -> Any:
-    """The inverse of `split_record`; runs no check, since frameworks put placeholders into the fields."""
-    value = object.__new__(cls)
-    value.__dict__.update(
-        zip(_ARRAY_FIELDS[cls], arrays, strict=True), **dict(zip(STATIC_FIELDS[cls], static, strict=True))
-    )
-    return value
-
-
-# ------------------------------------------------------------------------------------------------- what passes
+from rts.engines import namespace
+from rts.trees import Array, record
 
 
 class ArraySpec(NamedTuple):
@@ -202,8 +149,6 @@ class Sampled:
     @property
     def part(self) -> Array:
         """(K, H, W) int32, the part seen in each cell, or −1."""
-        from rts.arrays import namespace
-
         xp, first = namespace(self.row), 0
         part = xp.astype(self.row >= 0, self.row.dtype) - 1
         for samples in self.samples[:-1]:

@@ -9,17 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from rts.arrays import (
-    constants,
-    described,
-    engine_of,
-    is_constant,
-    is_traced,
-    namespace,
-    shape_of,
-    suiting,
-    uncompiled,
-)
+from rts.arrays import described, shape_of
 from rts.camera import Camera
 from rts.checks import (
     check_background,
@@ -31,14 +21,16 @@ from rts.checks import (
     check_splatter,
     suited_sampler,
 )
+from rts.engines import Engine, constants, engine_of, is_constant, is_traced, namespace, suiting, uncompiled
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.interfaces import Engine, Needed, Part, Splatter
+from rts.interfaces import Needed, Part, Splatter
 from rts.operations.linear import affine_map
 from rts.preparing import PreparedParts
 from rts.pruning import Everything, as_needed, needed_by, prune
-from rts.records import Array, Sampled, Samples, Splats
+from rts.records import Sampled, Samples, Splats
 from rts.sampling import merge
+from rts.trees import Array
 
 BAND = 2**20
 """Cells, over all layers, that a supersampled image may have before it is rendered in bands of rows."""

@@ -10,13 +10,14 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from rts.adapting import adapted, as_surface, unwrapped
-from rts.arrays import CONSTANT_TYPES, engine_of, is_constant, leaves, map_leaves, namespace, suiting
+from rts.adapting import adapted, unwrapped
 from rts.camera import Camera
+from rts.engines import CONSTANT_TYPES, engine_of, is_constant, namespace, suiting
 from rts.errors import InputError
-from rts.interfaces import Needed, Part, Sampler, Shader, Surface, TriangleSurface
+from rts.interfaces import Needed, Part, Sampler, Shader, Surface, TriangleSurface, as_surface
 from rts.keeping import Entry, Keeper, fingerprint, same_faces
-from rts.records import Array, ArraySpec, Fragments, Proxy, Sampled, Samples, Tree
+from rts.records import ArraySpec, Fragments, Proxy, Sampled, Samples
+from rts.trees import Array, Tree, leaves, map_leaves
 
 
 class TriangleSampler(Sampler):

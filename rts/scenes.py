@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 
 from rts import registry
-from rts.arrays import engine_of
+from rts.engines import engine_of
 from rts.errors import InputError, PluginError
 from rts.interfaces import Part
 from rts.model_files import Piece, read_image, read_pieces
 from rts.paths import as_path, output_file
-from rts.records import Array
 from rts.shading import Lambert, Textured
+from rts.trees import Array
 
 
 def load(path: Any, *, merge: bool = False, weld: bool = True) -> list[Part]:

@@ -15,8 +15,9 @@ import numpy as np
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.interfaces import TriangleSurface
-from rts.records import ArraySpec, Rays, Samples, Tree
+from rts.records import ArraySpec, Rays, Samples
 from rts.threads import parallel, read_only
+from rts.trees import Tree
 
 SAME_ROOT_PIXELS, SAME_ROOT = 1e-2, 1e-6
 """Layers whose depths differ by less, in widths of a pixel and relative to the depth, are one root found twice."""

@@ -19,12 +19,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rts.arrays import described, engine_of, is_constant, namespace, shape_of, unit
+from rts.arrays import described, shape_of, unit
 from rts.camera import Camera
+from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Shader
-from rts.records import Array, Tree
+from rts.trees import Array, Tree
 
 WRAPS = ("repeat", "mirror", "clamp")
 DEFAULT_AMBIENT, DEFAULT_DIFFUSE = 0.2, 0.8

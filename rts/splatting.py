@@ -22,10 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import constants, engine_of, exemplar, from_numbers, namespace, shape_of
+from rts.engines import engine_of, namespace
 from rts.errors import InputError
 from rts.interfaces import Splatter
-from rts.records import Array, Splats
+from rts.records import Splats
+from rts.trees import Array
 
 SIGMA, EPSILON = 0.5, 0.05
 CONTINUED = 0.5
@@ -322,29 +323,6 @@ class _Layers(_Depths):
             self.at(color * (wx[u] * wy[v])[..., None], u, v)
             for color, (wx, wy) in zip(self._color, self._weights, strict=True)
         ]
-
-
-def check_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Splats:
-    """Splats of arrays, or of lists, all of one engine; wrong shapes and dtypes are refused."""
-    given = tuple(from_numbers(x) for x in (positions, rgba))
-    row = np.asarray(row, np.int32) if isinstance(row, (list, tuple)) else row
-    shapes = [shape_of(x) for x in (*given, row)]
-    ok = len(shapes[0]) == 2 and shapes[0][1] == 3 and shapes[1] == (shapes[0][0], 4) and len(shapes[2]) == 3
-    if not ok or shapes[2][0] < 1:
-        raise InputError(
-            f"positions, rgba and row have shapes {shapes[0]}, {shapes[1]}, {shapes[2]}; "
-            f"expected (N, 3), (N, 4), (K, H, W)"
-        )
-    if not namespace(row).isdtype(row.dtype, "signed integer"):
-        raise InputError(f"row has dtype {row.dtype}; expected signed integers, -1 where a cell is empty")
-    positions, rgba, row = constants((*given, row), engine_of(given, row), exemplar(given))
-    return Splats(positions, rgba, row, border=border)
-
-
-def inside(image: Array, border: int) -> Array:
-    """An image (H, W, C) without so many rows and columns at each side."""
-    height, width = image.shape[:2]
-    return image[border : height - border, border : width - border, ...] if border else image
 
 
 def _nothing(rgba: Array, row: Array) -> Array:

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import is_constant, namespace, promote, unit
+from rts.arrays import promote, unit
+from rts.engines import is_constant, namespace
 from rts.errors import InputError
 from rts.operations.linear import matmul
-from rts.records import Array
+from rts.trees import Array
 
 
 def matrix_of(xp: Any, rows: list[list[Any]], like: Array) -> Array:

@@ -10,9 +10,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from rts import splatting
-from rts.arrays import engine_of
+from rts.arrays import without_border
+from rts.engines import engine_of
 from rts.operations.operation import Arrays, Operation, Some
-from rts.records import Array, Splats
+from rts.records import Splats
+from rts.trees import Array
 from rts_backends.fused_kernels import Cells, Choices, Settings
 
 
@@ -32,7 +34,7 @@ class _Fused(splatting.Kernel):
         if type(self).image is not _Fused.image:  # A subclass has one of its own.
             return super().cropped(splats)
         if splats.rgba.shape[0] == 0:
-            return splatting.inside(super().image(splats), splats.border)
+            return without_border(super().image(splats), splats.border)
         return IMAGE(splats.positions, splats.rgba, splats.row, settings=self._settings(splats.border))
 
     def _settings(self, border: int) -> Settings:
@@ -89,7 +91,7 @@ _SPECIFICATIONS = {"single": splatting.Single, "multi": splatting.Multi, "visibl
 
 def _specification(positions: Array, rgba: Array, row: Array, *, settings: Settings) -> Array:
     kernel = _SPECIFICATIONS[settings.kind](settings.sigma, settings.epsilon, settings.gamma)
-    return splatting.inside(kernel.accumulate(positions, rgba, row), settings.border)
+    return without_border(kernel.accumulate(positions, rgba, row), settings.border)
 
 
 def _shape(positions: tuple, rgba: tuple, row: tuple, *, settings: Settings) -> tuple[int, ...]:

@@ -12,9 +12,10 @@ from typing import Any
 import numba
 import numpy as np
 
-from rts.interfaces import Engine
-from rts.records import Array, ArraySpec
+from rts.engines import Engine
+from rts.records import ArraySpec
 from rts.threads import parallel, read_only
+from rts.trees import Array
 from rts_backends.fused_kernels import Cells, Settings
 from rts_backends.fused_mixed import changes_of
 from rts_backends.fused_rows import (

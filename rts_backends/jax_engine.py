@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from rts.engines import Engine
 from rts.errors import RtsError
-from rts.interfaces import Engine
 from rts.operations.operation import Operation
-from rts.records import STATIC_FIELDS, ArraySpec, Tree, join_record, split_record
+from rts.records import ArraySpec
+from rts.trees import STATIC_FIELDS, Tree, join_record, split_record
 from rts_backends import jax_host, jax_operations
 
 for _cls in STATIC_FIELDS:

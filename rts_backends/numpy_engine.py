@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from array_api_compat import numpy as array_api
 
-from rts.interfaces import Engine
+from rts.engines import Engine
 from rts.operations.operation import Operation
-from rts.records import Array, ArraySpec
+from rts.records import ArraySpec
 from rts.threads import read_only
+from rts.trees import Array
 
 _DTYPE = attrgetter("dtype")
 

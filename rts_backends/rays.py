@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from rts.adapting import as_surface
-from rts.arrays import constants, engine_of, exemplar, map_leaves, namespace, shape_of
+from rts.arrays import shape_of
 from rts.camera import Camera
+from rts.engines import constants, engine_of, exemplar, namespace
 from rts.errors import InputError
-from rts.interfaces import Part, RaySurface, Sampler
+from rts.interfaces import Part, RaySurface, Sampler, as_surface
 from rts.records import ArraySpec, RayHits, Samples
 from rts.sampling import check_camera
+from rts.trees import map_leaves
 
 
 class Rays(Sampler):

@@ -11,10 +11,10 @@ import torch.utils.checkpoint
 from array_api_compat import torch as array_api
 from torch.utils import _pytree
 
-from rts.arrays import leaves, map_leaves
-from rts.interfaces import Engine
+from rts.engines import Engine
 from rts.operations.operation import Operation
-from rts.records import STATIC_FIELDS, ArraySpec, Tree, join_record, split_record
+from rts.records import ArraySpec
+from rts.trees import STATIC_FIELDS, Tree, join_record, leaves, map_leaves, split_record
 from rts_backends import torch_operations
 from rts_backends.torch_functions import applied, transformed
 

@@ -9,14 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import described, engine_of, is_constant, namespace, shape_of, unit
+from rts.arrays import described, shape_of, unit
+from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part, TriangleSurface
 from rts.keeping import fingerprint
 from rts.operations.combine import interpolate
 from rts.operations.take import take
-from rts.records import Array, Proxy, Samples, Tree
+from rts.records import Proxy, Samples
+from rts.trees import Array, Tree
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv")

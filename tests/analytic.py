@@ -1,7 +1,8 @@
 """A surface that intersects rays itself: an axis-aligned ellipsoid."""
 
 from rts import GBuffer, RayHits
-from rts.arrays import namespace, unit
+from rts.arrays import unit
+from rts.engines import namespace
 
 
 class Ellipsoid:

@@ -7,7 +7,8 @@ import pytest
 
 import rts
 from rts import Camera, Part
-from rts.arrays import is_constant, map_leaves
+from rts.engines import is_constant
+from rts.trees import map_leaves
 
 
 def _torch_targets():

@@ -12,10 +12,11 @@ from analytic import Ellipsoid
 
 import rts
 from rts import Fragments, GBuffer, InputError, Part, PluginError, RayHits, Splats, pairs
-from rts.arrays import engine_of, namespace
+from rts.arrays import without_border
+from rts.engines import engine_of, namespace
 from rts.registry import instance
 from rts.shading import Unlit
-from rts.splatting import Multi, Plain, inside
+from rts.splatting import Multi, Plain
 from rts.testing import (
     EngineConformance,
     SamplerConformance,
@@ -686,7 +687,7 @@ class Cutting(OddMulti):
     def cropped(self, splats):
         middle, border = np.zeros(splats.row.shape[1:], bool), splats.border
         middle[border : len(middle) - border, border : middle.shape[1] - border] = True
-        return inside(super().image(splats.replace(row=np.where(middle, splats.row, -1))), border)
+        return without_border(super().image(splats.replace(row=np.where(middle, splats.row, -1))), border)
 
 
 SPLATTERS = {
@@ -780,7 +781,7 @@ ODD_ENGINES = {
             value_and_grad=lambda self, f: (
                 lambda tree: (
                     (found := super(type(self), self).value_and_grad(f)(tree))[0],
-                    rts.arrays.map_leaves(lambda x: 2 * x, found[1]),
+                    rts.trees.map_leaves(lambda x: 2 * x, found[1]),
                 )
             )
         )

@@ -20,7 +20,7 @@ from helpers import (
 
 import rts
 from rts import Camera, Part
-from rts.arrays import leaves, map_leaves
+from rts.trees import leaves, map_leaves
 
 Mesh = rts.plugin("surfaces", "mesh")
 SIZE = (24, 32)

@@ -22,7 +22,7 @@ def card(parameters):
 
 
 def arrays_like(x, value):
-    return rts.arrays.engine_of(x).constant(value, x)
+    return rts.engines.engine_of(x).constant(value, x)
 
 
 def parameters_of(target):

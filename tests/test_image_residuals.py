@@ -11,7 +11,7 @@ from helpers import DIFFERENTIABLE, arrays, box, icosphere, quad, soup, to_numpy
 import rts
 import rts.least_squares
 from rts import splatting
-from rts.arrays import engine_of
+from rts.engines import engine_of
 from rts.errors import InputError
 from rts.least_squares import normal_equations
 from rts_backends import fused, fused_normal

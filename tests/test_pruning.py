@@ -9,9 +9,9 @@ from helpers import ALL, DIFFERENTIABLE, arrays, box, derivative, gradient, icos
 
 import rts
 from rts import pruning, splatting
-from rts.arrays import map_leaves
 from rts.records import ArraySpec
 from rts.rendering import sample
+from rts.trees import map_leaves
 
 MESH = rts.plugin("rts.surfaces", "mesh")
 CAMERA = rts.Camera.look_at((0.3, 0.4, 4.0), (0, 0, 0), fov_y=50)

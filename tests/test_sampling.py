@@ -6,7 +6,7 @@ from helpers import DIFFERENTIABLE, arrays, icosphere, to_numpy
 
 import rts
 from rts import Camera, Fragments, GBuffer, Part, Proxy, Samples
-from rts.arrays import engine_of, namespace
+from rts.engines import engine_of, namespace
 from rts.records import ArraySpec
 from rts.sampling import lift, merge
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.arrays import constants, engine_of, exemplar, from_numbers, namespace, shape_of
+from rts.arrays import from_numbers, shape_of
+from rts.engines import constants, engine_of, exemplar, namespace
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
 from rts.operations.take import take
-from rts.records import Array
+from rts.trees import Array
 
 
 def combine(rows: Array, ids: Array, weights: Array) -> Array:

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rts.arrays import engine_of
+from rts.engines import engine_of
 from rts.errors import InputError
-from rts.records import Array
+from rts.trees import Array
 
 STEP = 6e-6
 """Of central differences in float64, as a share of the largest coordinate: the cube root of its precision."""

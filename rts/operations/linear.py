@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import constants, engine_of, exemplar
+from rts.engines import constants, engine_of, exemplar
 from rts.operations.operation import Arrays, Operation, Some
-from rts.records import Array
+from rts.trees import Array
 
 
 def matmul(a: Array, b: Array) -> Array:

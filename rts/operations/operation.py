@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import OWNERS, constants, engine_of, from_numbers, suiting
+from rts.arrays import from_numbers
+from rts.engines import OWNERS, constants, engine_of, suiting
 from rts.errors import InputError
-from rts.records import Array
+from rts.trees import Array
 
 _SHAPE = attrgetter("shape")
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.arrays import namespace
+from rts.engines import namespace
 from rts.operations.linear import is_plain_product, specified_affine_map
 from rts.operations.operation import Arrays, Operation, Some
-from rts.records import Array
+from rts.trees import Array
 
 
 def projective_map(rows: Array, points: Array) -> Array:

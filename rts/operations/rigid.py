@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import engine_of, is_constant, namespace, promote, shape_of
+from rts.arrays import promote, shape_of
+from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
-from rts.records import Array
 from rts.transforms import affine_matrix
+from rts.trees import Array
 
 ORIGIN = 0.0, 0.0, 0.0
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import namespace
+from rts.engines import namespace
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
-from rts.records import Array
+from rts.trees import Array
 
 
 def take(rows: Array, index: Array) -> Array:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import leaves
 from rts.errors import RtsError
+from rts.trees import leaves
 
 
 class Conformance:

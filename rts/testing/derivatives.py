@@ -9,21 +9,20 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from rts import arrays, registry
-from rts.arrays import constants, map_leaves
+from rts import registry
+from rts.engines import Engine, constants, engine_named
 from rts.errors import PluginError
-from rts.interfaces import Engine
-from rts.records import Tree
 from rts.testing.conformance import claim, claim_close, claim_finite, no_error
+from rts.trees import Tree, map_leaves
 
 ENGINES = registry.plugins("rts.engines")
 DIFFERENTIABLE = [name for name in ENGINES if name != "numpy"]
 
 
-def engine_named(name: str) -> Engine:
+def engine_or_skip(name: str) -> Engine:
     """The engine, or a skip with the reason where it is not installed."""
     try:
-        engine = arrays.engine_named(name)
+        engine = engine_named(name)
         importlib.import_module(name)
     except (PluginError, ImportError) as error:
         pytest.skip(str(error))
@@ -32,7 +31,7 @@ def engine_named(name: str) -> Engine:
 
 def differentiating(name: str) -> Engine:
     """The engine, or a skip with the reason where it is not installed, or does not differentiate."""
-    engine = engine_named(name)
+    engine = engine_or_skip(name)
     if not engine.differentiates:
         pytest.skip(f"the engine {name} does not differentiate")
     return engine
@@ -43,7 +42,7 @@ def installed() -> list[Engine]:
     engines = []
     for name in DIFFERENTIABLE:
         try:
-            engine = arrays.engine_named(name)
+            engine = engine_named(name)
         except PluginError:
             continue
         if engine.differentiates:

@@ -5,17 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from rts import registry
-from rts.arrays import map_leaves
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.interfaces import Part, RaySurface, TriangleSurface
-from rts.records import Tree
 from rts.sampling import lift
 from rts.settling import refined
 from rts.testing import derivatives
 from rts.testing.conformance import claim, claim_finite
 from rts.testing.samples import FEW, REPROJECTION, RESIDUAL
 from rts.testing.scenes import GRID, LAYERS
+from rts.trees import Tree, map_leaves
 
 DEEP = 5
 """Layers of rays that are shot in both directions."""

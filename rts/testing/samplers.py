@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from rts import registry
-from rts.arrays import leaves
 from rts.camera import Camera
 from rts.checks import check_sampler
 from rts.gbuffer import GBuffer
@@ -18,9 +17,10 @@ from rts.pairs import APRON
 from rts.records import Sampled
 from rts.testing import derivatives, scenes
 from rts.testing.conformance import Conformance, claim, no_error, refusal
-from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_named, joined, split
+from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_or_skip, joined, split
 from rts.testing.samples import claim_empty_where_empty, claim_ordered, claim_reprojected
 from rts.testing.unusual import claim_awkward_views_are_finite, claim_unseen_is_nothing
+from rts.trees import leaves
 
 DEEPER = 4
 """Layers of the reference beyond those compared, which tell where a silhouette is."""
@@ -192,7 +192,7 @@ class SamplerConformance(Conformance):
     @pytest.mark.parametrize("engine", ENGINES)
     def test_every_engine_finds_the_same_samples(self, sampler: Any, parts: list[Part], engine: str) -> None:
         """Also inside a compiled function."""
-        chosen = engine_named(engine)
+        chosen = engine_or_skip(engine)
         for part in parts[:2]:
             values, join = split(part.theta)
             expected = scenes.frozen(part, sampler=sampler)

@@ -11,10 +11,11 @@ from rts.camera import Camera
 from rts.checks import check_scene
 from rts.interfaces import Part
 from rts.pairs import APRON, CAPACITY, LAYERS, SIZE
-from rts.records import Array, Sampled
+from rts.records import Sampled
 from rts.rendering import render, render_samples, sample
 from rts.testing.conformance import claim
 from rts.testing.derivatives import single
+from rts.trees import Array
 
 GRID = SIZE[0] + 2 * APRON, SIZE[1] + 2 * APRON
 

@@ -9,13 +9,13 @@ import pytest
 
 from rts import registry
 from rts.adapting import adapted
-from rts.arrays import constants, engine_of, map_leaves
+from rts.engines import Engine, constants, engine_of
 from rts.gbuffer import GBuffer
-from rts.interfaces import Engine, Shader
-from rts.records import Tree
+from rts.interfaces import Shader
 from rts.testing import derivatives, scenes
 from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
 from rts.testing.derivatives import DIFFERENTIABLE, differentiating, names, split
+from rts.trees import Tree, map_leaves
 
 ROWS = 64
 STEP = 1e-6

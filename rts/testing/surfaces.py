@@ -7,17 +7,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rts.arrays import engine_of, map_leaves
 from rts.camera import Camera
+from rts.engines import engine_of
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part, RaySurface, TriangleSurface
-from rts.records import Proxy, Samples, Tree
+from rts.records import Proxy, Samples
 from rts.testing import derivatives, scenes
 from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
 from rts.testing.derivatives import DIFFERENTIABLE, claim_slope, differentiating, installed, joined, split
 from rts.testing.refining import claim_found_again, claim_found_from_behind, claim_refined
 from rts.testing.samples import claim_ordered, claim_reprojected
 from rts.testing.unusual import claim_awkward_views_are_finite, claim_unseen_is_nothing
+from rts.trees import Tree, map_leaves
 
 STEP = 1e-5
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from rts.camera import Camera
-from rts.interfaces import Engine, Part
+from rts.engines import Engine
+from rts.interfaces import Part
 from rts.testing import derivatives, scenes
 from rts.testing.conformance import claim, claim_finite, no_error
 from rts.testing.derivatives import joined, split

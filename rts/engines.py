@@ -1,0 +1,338 @@
+"""The base class of engines, which are the array frameworks; and which engine owns an array."""
+
+from __future__ import annotations
+
+import abc
+import functools
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+import numpy as np
+
+from rts import registry
+from rts.adapting import Plugin, adapted
+from rts.errors import EngineError, PluginError, RtsError
+from rts.trees import Array, Tree, collected, map_leaves
+
+if TYPE_CHECKING:
+    from rts.operations.operation import Operation
+    from rts.records import ArraySpec
+
+
+class Engine(Plugin):
+    """An array framework, chosen by the type of the arrays, never a global setting.
+
+    The entry point's name must be the name of the framework's top-level module: an engine is only loaded once the user
+    has imported that module.
+
+    Attributes:
+        name: of the entry point.
+        namespace: the array-API namespace of its arrays.
+        differentiates: whether it has derivatives: `value_and_grad`, `jvp`, `jacobian` and `optimizer`.
+    """
+
+    name: ClassVar[str]
+    namespace: ClassVar[Any]
+    differentiates: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def owns(self, x: Any) -> bool:
+        """Whether this is an array of the framework, traced ones included."""
+
+    @abc.abstractmethod
+    def constant(self, value: Any, like: Array | None = None) -> Array:
+        """An array with no derivative on the device of `like`; floats take the dtype of `like`, or are float32."""
+
+    @abc.abstractmethod
+    def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Array) -> tuple[Array, ...]:
+        """Call `fn` on NumPy copies of `args`; the results carry no derivative and live where `args` do.
+
+        Args:
+            fn: host arrays → as many host arrays as there are specs.
+            specs: of the results.
+            *args: arrays.
+        """
+
+    @abc.abstractmethod
+    def stop_gradient(self, x: Array) -> Array:
+        """The same values without derivatives."""
+
+    @abc.abstractmethod
+    def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> Array:
+        """(count, C) sums of the rows of `values` (M, C) that share a segment (M,)."""
+
+    @abc.abstractmethod
+    def to_numpy(self, x: Array) -> np.ndarray:
+        """The value on the host; not for traced arrays."""
+
+    # ----------------------------------------------------------------------------- how arrays are computed with
+
+    def apply(self, operation: Operation, operands: Sequence[Array], params: Mapping[str, Any]) -> Array:
+        """The result of an operation; by its compiled functions where the engine can. Default its specification."""
+        return operation.specification(*operands, **params)
+
+    def on_host(self, *arrays: Array) -> bool:
+        """Whether compiled code for the host may work on these arrays, in place of array code."""
+        return False
+
+    def by_host(self, f: Callable, otherwise: Callable, *arrays: Array) -> tuple[Array, ...]:
+        """`f` of arrays for which `on_host` holds, `otherwise` of others; the results are alike.
+
+        Engines that trace decide when the compiled program knows its device.
+        """
+        return f(*arrays) if self.on_host(*arrays) else otherwise(*arrays)
+
+    def exact_products(self, *arrays: Array) -> bool:
+        """Whether matrix products of these keep their precision; matrix units of some devices round float32."""
+        return False
+
+    def traced(self, x: Array) -> bool:
+        """Whether an array has a shape but not yet a value."""
+        return False
+
+    def padded(self, x: Array) -> bool:
+        """Whether packed arrays like this one may have rows that nobody uses."""
+        return False
+
+    def fill_unused(self, x: Array, row: Array) -> Array:
+        """Packed x (N, ·) with its first row for those that no cell of `row` (K, H, W) names; asked where `padded`."""
+        return x
+
+    def block(self, x: Tree) -> Tree:
+        """Wait until the arrays are computed."""
+        return x
+
+    def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], Array], state: Tree, most: int) -> Tree:
+        """`state = body(state)` as long as `going(state)` () bool holds, at most so many times.
+
+        Without derivatives, and a loop in compiled programs, too, where unrolling takes minutes to compile. What `body`
+        closes over has to be without derivatives by itself (`stop_gradient`), as θ is where rays are intersected.
+
+        Args:
+            body: tree of arrays → the same tree of other values; shapes and dtypes stay.
+            going: tree → () bool, such as whether any is not done.
+            state: arrays of this engine.
+            most: the largest number of times.
+        """
+        for _ in range(most):
+            if not bool(going(state)):
+                break
+            state = body(state)
+        return state
+
+    # ---------------------------------------------------------------------------------------------- derivatives
+
+    def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Array]) -> Array:
+        """`f(make())`, done again for its gradient instead of keeping what it went through; `make` has no derivative.
+
+        What `make` gives may be kept where it could not be made again as it was.
+        """
+        return f(make())
+
+    def value_and_grad(self, f: Callable) -> Callable:
+        """`f(tree) -> scalar` to `tree -> (value, gradient tree)`."""
+        raise self._no_derivatives()
+
+    def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[Array, Array]:
+        """The value of `f` and its derivative along `tangent`, differentiable in turn in what `f` closes over."""
+        raise self._no_derivatives()
+
+    def jacobian(self, f: Callable) -> Callable:
+        """`f(vector) -> arrays` to `vector -> (values, derivatives)`, a row for each unknown, by forward mode."""
+        raise self._no_derivatives()
+
+    def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
+        """A step function `(parameters, gradient) -> parameters` with its own state; "adam" or "sgd"."""
+        raise self._no_derivatives()
+
+    def _no_derivatives(self) -> EngineError:
+        if not self.differentiates:
+            return EngineError(
+                f"{self.name} arrays have no derivatives; pass arrays of an engine that has, such as torch or jax, for "
+                f"what is to be differentiated"
+            )
+        return EngineError(f"the engine {self.name} lacks this function, though it says that it differentiates")
+
+    # ---------------------------------------------------------------------------------------------- compilation
+
+    def jit(self, f: Callable) -> Callable:
+        """Compile where the framework can, else return `f`."""
+        return f
+
+    def uncompiled(self, f: Callable) -> Callable:
+        """`f`, which what compiles Python code is to call as it is, and not to look into."""
+        return f
+
+    def take_error(self) -> RtsError | None:
+        """The last error raised inside a host call, once, where the framework wraps such errors in its own."""
+        return None
+
+
+_F = TypeVar("_F", bound=Callable)
+CONSTANT_TYPES = (np.ndarray, np.generic, bool, int, float)
+
+
+def is_constant(tree: Tree) -> bool:
+    """Whether every leaf is NumPy or a Python number: never differentiated."""
+    if type(tree) in OWNERS:
+        return False
+    for x in collected(tree):
+        if type(x) in OWNERS or not isinstance(x, CONSTANT_TYPES):
+            return False
+    return True
+
+
+# Plain dictionaries rather than functools caches: torch.compile looks through the latter, and warns.
+_ENGINES: dict[str, Engine] = {}
+OWNERS: dict[type, Engine] = {}
+"""Engines by the types of arrays that have been met; NumPy's own, which are constants beside any, are not in it."""
+_BITS: dict[Any, int] = {}
+_BROKEN: set[str] = set()
+"""Engines that do not load."""
+
+
+def engine_named(name: str) -> Engine:
+    """The one object of an engine, which is loaded.
+
+    Raises:
+        PluginError: it cannot be loaded.
+    """
+    if name not in _ENGINES:
+        engine = adapted(registry.plugin("rts.engines", name)(), Engine)
+        if engine is None:
+            raise PluginError(f"the engine {name!r} is not an rts.Engine, nor has its methods; subclass it")
+        _ENGINES[name] = engine
+    return _ENGINES[name]
+
+
+def _owner(x: Any) -> Engine:
+    for name in registry.plugins("rts.engines"):
+        if name != "numpy" and name in sys.modules and engine_named(name).owns(x):
+            return engine_named(name)
+    raise EngineError(
+        f"an array of type {type(x).__module__}.{type(x).__qualname__} belongs to no engine; "
+        f"expected NumPy, {', '.join(n for n in registry.plugins('rts.engines') if n != 'numpy')}"
+    )
+
+
+def engine_of(*trees: Tree) -> Engine:
+    """The engine of the arrays in these trees; NumPy arrays and Python numbers are constants beside any.
+
+    Raises:
+        EngineError: arrays of two engines, or of an unknown type.
+    """
+    found: Engine | None = None
+    for x in trees:
+        engine = OWNERS.get(type(x))
+        if engine is None:
+            if type(x) is np.ndarray:
+                continue
+            return _engine_of_leaves(collected(trees))
+        if found is not None and engine is not found:
+            return _engine_of_leaves(trees)
+        found = engine
+    return found if found is not None else _ENGINES.get("numpy") or engine_named("numpy")
+
+
+def _engine_of_leaves(found: Sequence[Any]) -> Engine:
+    only: Engine | None = None
+    for x in found:
+        engine = OWNERS.get(type(x))
+        if engine is None:
+            if isinstance(x, CONSTANT_TYPES):
+                continue
+            engine = OWNERS[type(x)] = _owner(x)
+        if only is not None and engine is not only:
+            raise EngineError(
+                f"arrays of {' and '.join(sorted((engine.name, only.name)))} met in one call; convert one side "
+                f"(NumPy arrays may stand beside either, as constants)"
+            )
+        only = engine
+    return only if only is not None else _ENGINES.get("numpy") or engine_named("numpy")
+
+
+def suiting(*trees: Tree) -> tuple[Engine, Array | None]:
+    """The engine of these trees, and their exemplar."""
+    found = collected(trees)
+    return _engine_of_leaves(found), _widest(found)
+
+
+_names: list[str] = []
+
+
+def _imported() -> list[Engine]:
+    """The engines whose framework has been imported."""
+    if not _names:
+        _names.extend(registry.plugins("rts.engines"))
+    found = []
+    for name in _names:
+        if sys.modules.get(name) is not None and name not in _BROKEN:
+            if name not in _ENGINES:
+                try:
+                    engine_named(name)
+                except PluginError:  # It is an error where arrays of this engine are given.
+                    _BROKEN.add(name)
+                    continue
+            found.append(_ENGINES[name])
+    return found
+
+
+def uncompiled(f: _F) -> _F:
+    """`f`, which what compiles Python code, as `torch.compile` does, is to call and not to look into.
+
+    Such a compiler would follow it through checks, caches and plugins, for most of a minute, and sees little of the
+    work, which is compiled already.
+    """
+
+    @functools.wraps(f)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        outside = f
+        for engine in _imported():
+            outside = engine.uncompiled(outside)
+        return outside(*args, **kwargs)
+
+    return call  # pyright: ignore[reportReturnType]
+
+
+def is_traced(x: Array) -> bool:
+    """Whether an array has a shape but not yet a value."""
+    return engine_of(x).traced(x)
+
+
+def exemplar(*trees: Tree) -> Array | None:
+    """The widest floating array of an engine other than NumPy, which sets dtype and device for constants, or None."""
+    return _widest(collected(trees))
+
+
+def _widest(found: Sequence[Any]) -> Array | None:
+    widest, bits = None, 0
+    for x in found:
+        if isinstance(x, CONSTANT_TYPES):
+            continue
+        own = _BITS.get(x.dtype)
+        if own is None:
+            xp = namespace(x)
+            own = _BITS[x.dtype] = xp.finfo(x.dtype).bits if xp.isdtype(x.dtype, "real floating") else 0
+        if own > bits:
+            widest, bits = x, own
+    return widest
+
+
+def namespace(*arrays: Array) -> Any:
+    """The array-API namespace of these arrays."""
+    engine = OWNERS.get(type(arrays[0])) if len(arrays) == 1 else None
+    return (engine_of(*arrays) if engine is None else engine).namespace
+
+
+def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:
+    """The same tree with every NumPy array and number as a constant of the engine."""
+    if tree is None or type(tree) in OWNERS:
+        return tree
+    if type(tree) is np.ndarray:
+        return engine.constant(tree, like)
+
+    def constant(x: Any) -> Array:
+        return x if type(x) in OWNERS or not isinstance(x, CONSTANT_TYPES) else engine.constant(x, like)
+
+    return map_leaves(constant, tree)

@@ -1,0 +1,127 @@
+"""Trees of arrays: nested dicts, lists, tuples and records; their leaves, and what makes a class a record."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, TypeVar, dataclass_transform
+
+Array = Any
+"""An array of NumPy, torch or jax, or of an engine that a plugin brings."""
+
+Tree = Any
+"""Arrays in nested dicts, lists, tuples and records."""
+
+_Class = TypeVar("_Class", bound=type)
+
+
+STATIC_FIELDS: dict[type, tuple[str, ...]] = {}
+"""The records that are pytrees, each with the names of its fields that are not arrays (engines register them)."""
+
+_ARRAY_FIELDS: dict[type, tuple[str, ...]] = {}
+
+
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(field,))
+def record(*, static: tuple[str, ...] = ()) -> Callable[[_Class], _Class]:
+    """Make a class a frozen dataclass that every engine knows as a pytree, to be an argument of its transforms.
+
+    Args:
+        static: the fields that are not arrays; jax compares them to decide whether to compile anew.
+    """
+
+    def decorate(cls: _Class) -> _Class:
+        made = dataclass(frozen=True, eq=False)(cls)
+        STATIC_FIELDS[made] = static
+        _ARRAY_FIELDS[made] = tuple(f.name for f in fields(made) if f.name not in static)
+        return made
+
+    return decorate
+
+
+def record_arrays(value: Any) -> list[Any]:
+    """A record's array fields in order of declaration."""
+    found = value.__dict__
+    return [found[name] for name in _ARRAY_FIELDS[type(value)]]
+
+
+def split_record(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """A record's array fields in order of declaration, and its static fields in that of `STATIC_FIELDS`."""
+    found = value.__dict__
+    return tuple(record_arrays(value)), tuple([found[name] for name in STATIC_FIELDS[type(value)]])
+
+
+def join_record(cls: type, arrays: tuple[Any, ...], static: tuple[Any, ...]) -> Any:
+    """The inverse of `split_record`; runs no check, since frameworks put placeholders into the fields."""
+    value = object.__new__(cls)
+    value.__dict__.update(
+        zip(_ARRAY_FIELDS[cls], arrays, strict=True), **dict(zip(STATIC_FIELDS[cls], static, strict=True))
+    )
+    return value
+
+
+# ------------------------------------------------------------------------------------------------------------- leaves
+
+
+def leaves(tree: Tree) -> Iterator[Any]:
+    """The leaves of nested dicts, lists, tuples and records, in a fixed order; None has none."""
+    return iter(collected(tree))
+
+
+def collected(tree: Tree) -> list[Any]:
+    """`leaves` as a list. One loop, since it is asked for dozens of times a render."""
+    found, rest = [], [tree]
+    while rest:
+        x = rest.pop()
+        kind = _KINDS.get(type(x)) or _kind(x)
+        if kind == _LEAF:
+            found.append(x)
+        elif kind == _RECORD:
+            rest.extend(record_arrays(x)[::-1])
+        elif kind == _SEQUENCE:
+            rest.extend(x[::-1])
+        elif kind == _MAPPING:
+            rest.extend([x[key] for key in sorted(x, reverse=True)])
+    return found
+
+
+_LEAF, _NOTHING, _RECORD, _SEQUENCE, _MAPPING = range(1, 6)
+_KINDS: dict[type, int] = {}
+"""What trees of a type are."""
+
+
+def _kind(tree: Tree) -> int:
+    if tree is None:
+        kind = _NOTHING
+    elif type(tree) in STATIC_FIELDS:
+        kind = _RECORD
+    elif isinstance(tree, (list, tuple)):
+        kind = _SEQUENCE
+    elif isinstance(tree, Mapping):
+        kind = _MAPPING
+    else:
+        kind = _LEAF
+    _KINDS[type(tree)] = kind
+    return kind
+
+
+def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
+    """A copy of a tree with `fn` applied to each leaf, visited in the order of `leaves`."""
+    kind = _KINDS.get(type(tree)) or _kind(tree)
+    if kind == _LEAF:
+        return fn(tree)
+    if kind == _RECORD:
+        arrays, static = split_record(tree)
+        return join_record(type(tree), map_leaves(fn, arrays), static)
+    if kind == _SEQUENCE:
+        items = []
+        for item in tree:
+            items.append(fn(item) if _KINDS.get(type(item)) == _LEAF else map_leaves(fn, item))
+        return type(tree)(*items) if is_named(tree) else type(tree)(items)
+    if kind == _MAPPING:
+        return {key: map_leaves(fn, tree[key]) for key in sorted(tree)}
+    return None
+
+
+def is_named(tree: Tree) -> bool:
+    """Whether a sequence is a named tuple."""
+    return hasattr(tree, "_fields")
