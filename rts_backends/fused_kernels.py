@@ -14,7 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.errors import InputError
-from rts.splatting import CONTINUED, LEAST_EPSILON, OFFSETS
+from rts.splatting.kernel import LEAST_EPSILON
+from rts.splatting.layers import OFFSETS
+from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only
 from rts_backends import fused_choices as choosing
 from rts_backends import fused_mixed as mixed

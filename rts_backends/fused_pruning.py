@@ -5,7 +5,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from rts.splatting import CONTINUED, LEAST_EPSILON, TIE
+from rts.splatting.kernel import LEAST_EPSILON, TIE
+from rts.splatting.visible import CONTINUED
 from rts.threads import parallel
 
 HALO = 3

@@ -1,0 +1,10 @@
+"""The splatters in array-API code: the specification of the method, for any engine and device.
+
+Those that are registered by name (`rts_backends.fused`) are these, with compiled code where arrays are the host's.
+"""
+
+from rts.splatting.kernel import Kernel, exact_calibration
+from rts.splatting.single_and_multi import Multi, Plain, Single
+from rts.splatting.visible import Visible
+
+__all__ = ["Kernel", "Multi", "Plain", "Single", "Visible", "exact_calibration"]

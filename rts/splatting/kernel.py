@@ -1,0 +1,129 @@
+"""The kernel of the splatters (paper §3.3): which cells a sample goes to, and with what weight.
+
+A splat belongs to the cell (y, x) that its sample was cast through; its targets are that cell's 3 × 3 neighbours,
+whatever its computed position. With c = (x + 0.5, y + 0.5) the cell's centre, P the splat's differentiable position
+and (u, v) ∈ {−1, 0, 1}², the weight is
+
+    w(u, v) = (1 + ε) / W · exp(−‖c + (u, v) − P‖² / 2σ²),    W = Σ exp(−‖(u, v)‖² / 2σ²).
+
+The paper's W depends on P. Where samples lie on pixel centres the value and the first derivative agree; second
+derivatives (a Hessian) do not.
+"""
+
+from __future__ import annotations
+
+import abc
+import functools
+import math
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from rts.engines import engine_of, namespace
+from rts.errors import InputError
+from rts.interfaces import Splatter
+from rts.records import Splats
+from rts.splatting.layers import NEIGHBOURS, OFFSETS, Depths, bordered, nothing
+from rts.trees import Array
+
+SIGMA, EPSILON = 0.5, 0.05
+LEAST_SIGMA, LARGEST_SIGMA = 0.1, 1e3
+TIE, LEAST_EPSILON = 1e-5, 1e-4
+"""Depths so near, relative to the farthest, may be ordered by rounding; and an ε that outweighs rounding of weights."""
+
+
+@dataclass(frozen=True)
+class Kernel(Splatter):
+    """What the splatters share: a Gaussian over 3 × 3 cells.
+
+    Attributes:
+        sigma: standard deviation, pixels. Below 0.45 little of the kernel reaches the neighbouring cells, and most of
+            the derivative at edges is lost.
+        epsilon: excess of the weights' sum over one, so that the interior is always normalised.
+        calibration: factor γ on a splat's offset from its cell's centre, P' = c + γ (P − c): nothing to the image of
+            samples on pixel centres, but a factor on its derivative. None for the γ of `exact_calibration`.
+    """
+
+    sigma: float = SIGMA
+    epsilon: float = EPSILON
+    calibration: float | None = 1.0
+
+    def __post_init__(self):
+        if not (_is_real(self.sigma) and LEAST_SIGMA <= self.sigma <= LARGEST_SIGMA):
+            raise InputError(f"sigma is {self.sigma}; expected pixels, from {LEAST_SIGMA} to {LARGEST_SIGMA:g}")
+        if not (_is_real(self.epsilon) and self.epsilon >= 0):
+            raise InputError(f"epsilon is {self.epsilon}; expected a number of at least 0")
+        if self.calibration is not None and not (_is_real(self.calibration) and self.calibration > 0):
+            raise InputError(f"calibration is {self.calibration}; expected a positive number, or None for the exact")
+
+    def image(self, splats: Splats) -> Array:
+        """See `rts.Splatter`."""
+        if splats.rgba.shape[0] == 0:
+            return nothing(splats.rgba, splats.row)
+        return self.accumulate(splats.positions, splats.rgba, splats.row)
+
+    @abc.abstractmethod
+    def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
+        """The image of all cells, of at least one sample."""
+
+    def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """See `rts.Splatter`: fronts, and the hidden layers around targets that are not `plain`."""
+        if len(covered) == 1 or not covered.any():
+            return covered
+        cells = bordered(np.where(covered, 0, -1)) >= 0
+        depths = Depths(list(np.where(cells, bordered(depth), 0)), cells)
+        margin = TIE * float(np.abs(depth[covered]).max())
+        mixed = np.pad(~self.plain(depths, margin), 1)
+        shows = np.logical_or.reduce([depths.at(mixed, u, v) for u, v in NEIGHBOURS])
+        return covered & np.where(np.arange(len(covered))[:, None, None] > 0, shows, True)
+
+    @abc.abstractmethod
+    def plain(self, depths: Depths, margin: float) -> Array:
+        """Targets (H, W) at which only front layers count, however depths are rounded within a margin."""
+
+    @functools.cached_property
+    def gamma(self) -> float:
+        """The calibration as a number."""
+        return exact_calibration(self.sigma) if self.calibration is None else self.calibration
+
+    def weights(self, position: Array) -> tuple[dict[int, Array], dict[int, Array]]:
+        """Weights of cells (h, w, ·), the first being cell (−1, −1): by target offset u, and by v; w = x[u] · y[v]."""
+        xp = namespace(position)
+        height, width = position.shape[:2]
+        constant = engine_of(position).constant
+        rx = self.gamma * (position[..., 0] - constant(np.arange(width) - 0.5, position))
+        ry = self.gamma * (position[..., 1] - constant(np.arange(height) - 0.5, position)[:, None])
+        scale = 1 / (2 * self.sigma**2)
+        peak = math.sqrt(1 + self.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
+        return (
+            {u: peak * xp.exp(-((u - rx) ** 2) * scale) for u in OFFSETS},
+            {v: peak * xp.exp(-((v - ry) ** 2) * scale) for v in OFFSETS},
+        )
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value, Real) and math.isfinite(value)
+
+
+def exact_calibration(sigma: float, reach: int = 1) -> float:
+    """The factor γ on splats' offsets with which a linear ramp of colour that moves has its true derivative.
+
+    For weights exp(−‖c + (u, v) − P‖² / 2σ²), normalised for samples on centres, of a splat at P in the cell with the
+    centre c, whose offset is to be multiplied: P' = c + γ (P − c). Without γ the first moment of the kernel's
+    derivative, 1/γ (0.852 for σ = 0.5), is the share that is delivered.
+
+    Args:
+        sigma: σ, pixels.
+        reach: cells on each side that the kernel covers: 1 for 3 × 3, 2 for 5 × 5.
+
+    Returns:
+        γ = σ² Σ e / Σ u² e, e = exp(−u² / 2σ²) over −reach ≤ u ≤ reach.
+    """
+    if not (_is_real(sigma) and sigma > 0) or not (isinstance(reach, int) and reach >= 1):
+        raise InputError(
+            f"sigma is {sigma!r} and reach {reach!r}; expected a positive number and an integer of at least 1"
+        )
+    e = [math.exp(-(u**2) / (2 * sigma**2)) for u in range(1, reach + 1)]
+    return sigma**2 * (1 + 2 * sum(e)) / (2 * sum(u**2 * x for u, x in enumerate(e, start=1)))

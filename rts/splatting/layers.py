@@ -1,0 +1,162 @@
+"""The layers of an image as its targets see them: depths, pairing, accumulation, compositing."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rts.engines import namespace
+from rts.trees import Array
+
+OFFSETS = (-1, 0, 1)
+NEIGHBOURS = [(u, v) for v in OFFSETS for u in OFFSETS]
+
+
+class Depths:
+    """Depths of an image with a border of one empty cell, as seen from targets; (u, v) leads from source to target."""
+
+    def __init__(self, depth: list[Array], covered: Array):
+        """Depths of each layer (h, w), finite, and where they are covered (K, h, w), both with the border."""
+        self.xp = namespace(covered, depth[0])
+        self.size = covered.shape[1] - 2, covered.shape[2] - 2
+        self._covered = covered[0]
+        self._depth = _beyond(depth, covered)
+        front = self._depth[0][None], self.xp.where(self._covered, 0, -1)[None]
+        self._front = bordered(front[0])[0], bordered(front[1])[0] >= 0
+        self.target = self.source(0, 0)
+
+    def source(self, u: int, v: int) -> list[Array]:
+        """Depths of the sources' layers, K times (H, W)."""
+        return [self.at(z, u, v) for z in self._depth]
+
+    def covers(self, u: int, v: int) -> Array:
+        """Whether the sources have any layer."""
+        return self.at(self._covered, u, v)
+
+    def pairing(self, u: int, v: int) -> tuple[Array, Array]:
+        """The number s of `Multi`, and what the depths that it pairs are off, (H, W) both."""
+        source = self.source(u, v)
+        a, best_a = _first_minimum([self.xp.abs(z - self.target[0]) for z in source], self.xp)
+        b, best_b = _first_minimum([self.xp.abs(z - source[0]) for z in self.target], self.xp)
+        return self.xp.where(best_b < best_a, -b, a), self.xp.minimum(best_a, best_b)
+
+    def fronts_pair(self, u: int, v: int, margin: float) -> tuple[Array, Array]:
+        """Whether fronts are nearer, by a margin, than any pair with a hidden layer; and the smallest distance."""
+        source, xp = self.source(u, v), self.xp
+        front, hidden = xp.abs(source[0] - self.target[0]), xp.full_like(source[0], xp.inf)
+        for p, q in zip(source[1:], self.target[1:], strict=True):
+            hidden = xp.minimum(hidden, xp.minimum(xp.abs(p - self.target[0]), xp.abs(q - source[0])))
+        return front + margin < hidden, xp.minimum(front, hidden)
+
+    def continues(self, u: int, v: int, limit: Array) -> Array:
+        """Whether the front of the source or of the target is nearer than a limit to where the other's line leads."""
+        xp = self.xp
+        source, target = self.at(self._depth[0], u, v), self.target[0]
+        found = xp.zeros_like(target, dtype=xp.bool)
+        for end, start, steps in ((source, target, -1), (target, source, 2)):
+            before, covered = (self.at(x, steps * u, steps * v, border=2) for x in self._front)
+            found = found | (covered & (xp.abs(end - (2 * start - before)) < limit))
+        return found
+
+    def at(self, cells: Array, u: int, v: int, border: int = 1) -> Array:
+        """For each target, the cell from which (u, v) leads to it; (u, v) reaches as far as the border is wide."""
+        top, left = border - v, border - u
+        return cells[top : top + self.size[0], left : left + self.size[1], ...]
+
+
+class Layers(Depths):
+    """`Depths` with weights and colours."""
+
+    def __init__(self, weights: Callable[[Array], Any], positions: Array, rgba: Array, row: Array):
+        """Layers of packed samples (`rts.Splats`); `weights` is that of `rts.splatting.Kernel`."""
+        cells = bordered(row)
+        position = [unpack(positions, cells[k]) for k in range(row.shape[0])]
+        super().__init__([p[..., 2] for p in position], cells >= 0)
+        self._color = [_weighted(unpack(rgba, c), (c >= 0)[..., None]) for c in (cells[k] for k in range(row.shape[0]))]
+        self._weights = [weights(p) for p in position]
+
+    def splats(self, u: int, v: int) -> list[Array]:
+        """What the sources' layers give, K times (H, W, 5): weighted colours and the weight."""
+        return [
+            self.at(color * (wx[u] * wy[v])[..., None], u, v)
+            for color, (wx, wy) in zip(self._color, self._weights, strict=True)
+        ]
+
+
+def nothing(rgba: Array, row: Array) -> Array:
+    """The image (H, W, 4) of no samples: zeros."""
+    xp = namespace(rgba, row)
+    return xp.stack([xp.zeros_like(row[0], dtype=rgba.dtype)] * 4, axis=-1)
+
+
+def unpack(values: Array, cells: Array) -> Array:
+    """(h, w, C) of packed values (N, C); an empty cell gets those of row 0, to be masked."""
+    xp = namespace(values, cells)
+    index = xp.reshape(xp.where(cells >= 0, cells, 0), (-1,))
+    return xp.reshape(xp.take(values, index, axis=0), (*cells.shape, values.shape[1]))
+
+
+def bordered(row: Array) -> Array:
+    """`row` with a border of one cell of −1."""
+    xp = namespace(row)
+    side = xp.full_like(row[:, :, :1], -1)
+    row = xp.concat([side, row, side], axis=2)
+    end = xp.full_like(row[:, :1, :], -1)
+    return xp.concat([end, row, end], axis=1)
+
+
+def _weighted(rgba: Array, covered: Array) -> Array:
+    """(h, w, 5): colour, and 1 to count the weights; zero where not covered."""
+    xp = namespace(rgba)
+    return xp.where(covered, xp.concat([rgba, xp.ones_like(rgba[..., :1])], axis=-1), 0.0)
+
+
+def normalised(total: Array, xp: Any) -> Array:
+    """Accumulated colours over their weights, which are taken as at least one (paper eq. 3)."""
+    return total[..., :4] / xp.clip(total[..., 4:], 1.0, None)
+
+
+def _beyond(depth: list[Array], covered: Array) -> list[Array]:
+    """Depths of each layer; an empty cell lies beyond everything, at a distance of the scene's own scale."""
+    xp = namespace(covered, depth[0])
+    depth = [xp.where(covered[k], z, 0.0) for k, z in enumerate(depth)]
+    farthest = 2 * xp.max(xp.abs(xp.stack(depth)))
+    return [xp.where(covered[k], z, xp.where(farthest > 0, farthest, 1.0)) for k, z in enumerate(depth)]
+
+
+def all_of(conditions: list[Array]) -> Array:
+    """Where all of some conditions hold."""
+    return functools.reduce(operator.and_, conditions)
+
+
+def fronts(covered: np.ndarray) -> np.ndarray:
+    """(K, H, W) bool: the first layer."""
+    return covered & (np.arange(len(covered)) == 0)[:, None, None]
+
+
+def _first_minimum(values: list[Array], xp: Any) -> tuple[Array, Array]:
+    """Index and value of the first smallest of some images."""
+    best, index = values[0], xp.zeros_like(values[0], dtype=xp.int32)
+    for k, value in enumerate(values[1:], start=1):
+        smaller = value < best
+        best, index = xp.where(smaller, value, best), xp.where(smaller, k, index)
+    return index, best
+
+
+def nearest(source: list[Array], depth: Array, s: Array, xp: Any) -> Array:
+    """Index of each source's layer beyond s that is nearest to a depth; K where it has none."""
+    best, index = xp.full_like(depth, xp.inf), xp.full_like(s, len(source))
+    for k, z in enumerate(source[1:], start=1):
+        distance = xp.abs(z - depth)
+        nearer = (k > s) & (distance < best)
+        best, index = xp.where(nearer, distance, best), xp.where(nearer, k, index)
+    return index
+
+
+def over(front: Array, back: Array) -> Array:
+    """Premultiplied compositing (Porter and Duff 1984)."""
+    return front + (1 - front[..., 3:]) * back

@@ -1,0 +1,79 @@
+"""The splatters of the paper: one layer (`Single`), several in three buffers (`Multi`); and none (`Plain`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rts.engines import namespace
+from rts.interfaces import Splatter
+from rts.records import Splats
+from rts.splatting.kernel import LEAST_EPSILON, Kernel
+from rts.splatting.layers import NEIGHBOURS, Depths, Layers, all_of, fronts, normalised, nothing, over, unpack
+from rts.trees import Array
+
+
+class Plain(Splatter):
+    """No splatting: the layers composited front to back. Has no derivative at occlusion boundaries."""
+
+    def image(self, splats: Splats) -> Array:
+        """See `rts.Splatter`."""
+        positions, rgba, row = splats.positions, splats.rgba, splats.row
+        if rgba.shape[0] == 0:
+            return nothing(rgba, row)
+        xp = namespace(rgba)
+        # Nothing, but it keeps the image connected to the positions, whose derivative it is to say is zero.
+        image = 0 * xp.sum(positions)
+        for k in reversed(range(row.shape[0])):
+            layer = xp.where((row[k] >= 0)[..., None], unpack(rgba, row[k]), 0.0)
+            image = over(layer, image)
+        return image
+
+    def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """See `rts.Splatter`: what is opaque hides all that is behind it."""
+        return fronts(covered)
+
+
+@dataclass(frozen=True)
+class Single(Kernel):
+    """One layer, occlusion ignored (paper eq. 1–3): only the front layer of `row` is splatted."""
+
+    def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
+        """See `Kernel`."""
+        layers = Layers(self.weights, positions, rgba, row[:1])
+        total = sum(layers.splats(u, v)[0] for u, v in NEIGHBOURS)
+        return normalised(total, namespace(rgba))
+
+    def plain(self, depths: Depths, margin: float) -> Array:
+        """See `Kernel`: everywhere."""
+        return depths.covers(0, 0) | True
+
+
+@dataclass(frozen=True)
+class Multi(Kernel):
+    """Three accumulation buffers (paper §3.3.2): in front of the target, at its surface, and behind it.
+
+    Layers of the source p and the target q are paired on linear depth z: with A_l = |z_p[l] − z_q[0]| and
+    B_l = |z_q[l] − z_p[0]|, s = −argmin B where min B < min A, else argmin A. Layer l of p is in front where l < s, at
+    the surface where l = s, behind where l > s. The B test catches a source whose front layer continues a hidden layer
+    of the target. Back faces of a closed surface pair with what lies behind them: cull them (`Part.cull`).
+    """
+
+    def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
+        """See `Kernel`."""
+        xp = namespace(positions, rgba, row)
+        layers = Layers(self.weights, positions, rgba, row)
+        buffers = [0.0, 0.0, 0.0]
+        for u, v in NEIGHBOURS:
+            s, _ = layers.pairing(u, v)
+            for k, splats in enumerate(layers.splats(u, v)):
+                for i, chosen in enumerate((s > k, s == k, s < k)):
+                    buffers[i] = buffers[i] + xp.where(chosen[..., None], splats, 0.0)
+        front, surface, behind = (normalised(b, xp) for b in buffers)
+        return over(front, over(surface, behind))
+
+    def plain(self, depths: Depths, margin: float) -> Array:
+        """See `Kernel`: where the surface fills the target, all that is behind it is covered."""
+        full = self.epsilon >= LEAST_EPSILON
+        return full & all_of([depths.covers(*n) & depths.fronts_pair(*n, margin)[0] for n in NEIGHBOURS])
