@@ -137,7 +137,7 @@ def stages(task: Task, mode: str, sampler: str, rounds: int) -> dict[str, float]
         with clock.stage("Adam"):
             optimizer.step()
 
-    with mock.patch.object(rts.sampling, "lift", clock.timed("lift", rts.sampling.lift)):
+    with mock.patch.object(rts.sampling.triangle_sampler, "lift", clock.timed("lift", rts.sampling.packing.lift)):
         found = [_one(clock, iteration) for _ in range(rounds * CONSECUTIVE + WARM_UP)][WARM_UP:]
     medians = {name: 1e3 * float(np.median([f.get(name, 0.0) for f in found])) for name in (*STAGES, "total")}
     return {"prepare": prepare, **medians}

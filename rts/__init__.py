@@ -6,7 +6,6 @@ differentiate only that.
 
 from rts.adapting import unwrapped
 from rts.camera import Camera
-from rts.choosing import explain
 from rts.engines import Engine, engine_of, namespace
 from rts.errors import EngineError, InputError, LayersWarning, PluginError, RtsError
 from rts.fitting import Fit, fit
@@ -18,11 +17,12 @@ from rts.operations.combine import combine
 from rts.operations.gradient import gradient
 from rts.operations.operation import Operation
 from rts.operations.rigid import rigid
-from rts.preparing import prepare
 from rts.records import ArraySpec, Fragments, Proxy, RayHits, Rays, Sampled, Samples, Splats
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples, sample
-from rts.sampling import TriangleSampler
+from rts.sampling.auto import explain
+from rts.sampling.prepared import prepare
+from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scenes import load, load_image, save_animation, save_image
 from rts.splatting import exact_calibration
 

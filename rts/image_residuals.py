@@ -12,9 +12,9 @@ from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiti
 from rts.errors import InputError
 from rts.interfaces import Part, Residuals, Splatter
 from rts.least_squares import flatten, normal_equations
-from rts.preparing import PreparedParts
 from rts.records import Splats
 from rts.rendering import render, sample, to_splats
+from rts.sampling.prepared import PreparedParts
 from rts.trees import Array, Tree
 
 Parts = Part | Sequence[Part] | PreparedParts

@@ -14,7 +14,7 @@ from rts.engines import Engine, constants, engine_named, is_constant
 from rts.errors import RtsError
 from rts.interfaces import Part, RaySurface, TriangleSurface
 from rts.rendering import apron_of, render
-from rts.sampling import TriangleSampler
+from rts.sampling.triangle_sampler import TriangleSampler
 from rts.trees import leaves, map_leaves
 
 SIZE = (14, 18)

@@ -26,10 +26,10 @@ from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Needed, Part, Splatter
 from rts.operations.linear import affine_map
-from rts.preparing import PreparedParts
-from rts.pruning import Everything, as_needed, needed_by, prune
 from rts.records import Sampled, Samples, Splats
-from rts.sampling import merge
+from rts.sampling.merging import merge
+from rts.sampling.prepared import PreparedParts
+from rts.sampling.pruning import Everything, as_needed, needed_by, prune
 from rts.trees import Array
 
 BAND = 2**20

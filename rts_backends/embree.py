@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.records import Fragments, Proxy
-from rts.sampling import TriangleSampler
+from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel
 from rts_backends import embree_library, embree_public
 from rts_backends.embree_kernels import TILE, cast, keep_nearest_address

@@ -18,7 +18,7 @@ import numpy as np
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.records import Fragments, Proxy
-from rts.sampling import TriangleSampler
+from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel
 from rts_backends.neighbours import corner_lists, places, settle
 from rts_backends.opengl_worker import LESS, Worker

@@ -19,7 +19,7 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.records import Fragments, Proxy
-from rts.sampling import TriangleSampler
+from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel
 from rts_backends.triangles import facing, owns, pixel_matrix, to_corner
 

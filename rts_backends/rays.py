@@ -12,7 +12,7 @@ from rts.engines import constants, engine_of, exemplar, namespace
 from rts.errors import InputError
 from rts.interfaces import Part, RaySurface, Sampler, as_surface
 from rts.records import ArraySpec, RayHits, Samples
-from rts.sampling import check_camera
+from rts.sampling.validation import check_camera
 from rts.trees import map_leaves
 
 

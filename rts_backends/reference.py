@@ -6,7 +6,7 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.records import Fragments, Proxy
-from rts.sampling import TriangleSampler
+from rts.sampling.triangle_sampler import TriangleSampler
 
 CANDIDATES_AT_ONCE = 1 << 20
 

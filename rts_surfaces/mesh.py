@@ -14,10 +14,10 @@ from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part, TriangleSurface
-from rts.keeping import fingerprint
 from rts.operations.combine import interpolate
 from rts.operations.take import take
 from rts.records import Proxy, Samples
+from rts.sampling.cache import fingerprint
 from rts.trees import Array, Tree
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}

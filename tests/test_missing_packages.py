@@ -82,8 +82,8 @@ def test_without_embreex_the_rest_works_and_auto_passes_embree_by():
         "embreex",
         """
         error(lambda: rts.render(part, camera, size, sampler="embree"))
-        from rts import choosing
-        choosing.STATIC_FACES = 1
+        from rts.sampling import auto
+        auto.STATIC_FACES = 1
         (choice,) = rts.explain(part.replace(transform=rts.rigid(pose)), camera)
         print(choice.sampler, "since", choice.reason)
         agrees(rts.render(rts.prepare(part), camera, size))

@@ -10,8 +10,9 @@ from analytic import Ellipsoid
 from helpers import arrays, icosphere, soup, to_numpy
 
 import rts
-from rts import Camera, GBuffer, InputError, Part, PluginError, Proxy, TriangleSampler, keeping, registry
-from rts.keeping import KEPT, fingerprint
+from rts import Camera, GBuffer, InputError, Part, PluginError, Proxy, TriangleSampler, registry
+from rts.sampling import cache
+from rts.sampling.cache import KEPT, fingerprint
 
 CAMERA = Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=50, aspect=1.25)
 SIZE = (16, 20)
@@ -335,7 +336,7 @@ def test_a_prepared_part_is_not_looked_at_again(name, monkeypatch):
     def refuse(*_):
         raise AssertionError("looked at the surface's inputs")
 
-    monkeypatch.setattr("rts.sampling.fingerprint", refuse)
+    monkeypatch.setattr("rts.sampling.triangle_sampler.fingerprint", refuse)
     monkeypatch.setattr(Mesh, "proxy", refuse)
     for pose, image in zip(poses(5), expected, strict=True):
         found = rts.render(handle.replace(transform=rts.rigid(pose)), CAMERA, SIZE)
@@ -474,7 +475,7 @@ def test_a_handle_of_such_triangles_needs_a_camera_and_a_size():
 @pytest.fixture
 def few(monkeypatch):
     """As if eighty triangles were many."""
-    monkeypatch.setattr("rts.choosing.STATIC_FACES", 80)
+    monkeypatch.setattr("rts.sampling.auto.STATIC_FACES", 80)
 
 
 def differentiable_camera():
@@ -598,7 +599,7 @@ def test_equal_bytes_have_equal_fingerprints_wherever_they_lie():
     read_only = data.copy()
     read_only.flags.writeable = False
     assert fingerprint(read_only) == fingerprint(data)
-    assert keeping.fingerprint([data, {"b": 2 * data, "a": data}]) == fingerprint([data, {"a": data, "b": 2 * data}])
+    assert cache.fingerprint([data, {"b": 2 * data, "a": data}]) == fingerprint([data, {"a": data, "b": 2 * data}])
 
 
 def test_fingerprints_of_many_small_changes_do_not_collide():

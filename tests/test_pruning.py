@@ -8,9 +8,10 @@ from analytic import Ellipsoid
 from helpers import ALL, DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere, quad, soup, to_numpy
 
 import rts
-from rts import pruning, splatting
+from rts import splatting
 from rts.records import ArraySpec
 from rts.rendering import sample
+from rts.sampling import pruning
 from rts.trees import map_leaves
 
 MESH = rts.plugin("rts.surfaces", "mesh")

@@ -8,7 +8,8 @@ import rts
 from rts import Camera, Fragments, GBuffer, Part, Proxy, Samples
 from rts.engines import engine_of, namespace
 from rts.records import ArraySpec
-from rts.sampling import lift, merge
+from rts.sampling.merging import merge
+from rts.sampling.packing import lift
 
 CAMERA = Camera.look_at((0.3, 0.5, 4), (0, 0, 0), fov_y=40, near=1, far=10)
 SIZE = (20, 24)

@@ -8,8 +8,9 @@ from helpers import ALL, DIFFERENTIABLE, FRONT, arrays, finite_difference, gradi
 from throwaway import Bezier, Crowded, Sheets, Torus, distance
 
 import rts
-from rts import Samples, settling, splatting
-from rts.sampling import lift
+from rts import Samples, splatting
+from rts.sampling import packing, settling
+from rts.sampling.packing import lift
 from rts.testing import SurfaceConformance
 from rts.testing.derivatives import claim_slope, directions
 
@@ -149,7 +150,7 @@ def test_settling_is_what_one_does_by_hand(view, shape):
 
 def test_rows_are_numbered_layer_by_layer_in_the_order_of_cells():
     given = made([[[4, -1, 2]], [[0, 3, 1]]], np.ones((2, 1, 3)))
-    found = settling.repack(given, given.row >= 0, None)
+    found = packing.repack(given, given.row >= 0, None)
     np.testing.assert_array_equal(found.row, [[[0, -1, 1]], [[2, 3, 4]]])
     np.testing.assert_array_equal(found.ids, given.ids[[4, 2, 0, 3, 1]])
     np.testing.assert_array_equal(found.params, given.params[[4, 2, 0, 3, 1]])
@@ -158,7 +159,7 @@ def test_rows_are_numbered_layer_by_layer_in_the_order_of_cells():
 
 def test_the_deepest_layers_have_no_room_first_and_are_counted():
     given = made(np.arange(9).reshape(3, 1, 3), np.ones((3, 1, 3)))
-    found = settling.repack(replace(given, overflow=np.int32(5)), given.row >= 0, 4)
+    found = packing.repack(replace(given, overflow=np.int32(5)), given.row >= 0, 4)
     np.testing.assert_array_equal(found.row, [[[0, 1, 2]], [[3, -1, -1]], [[-1, -1, -1]]])
     np.testing.assert_array_equal(found.depth, np.where(found.row >= 0, 1, 0))
     assert found.overflow == 5 + 5 and found.overflow.dtype == np.int32 and found.overflow.shape == ()
@@ -169,16 +170,16 @@ def test_tables_by_sample_go_with_their_samples_and_others_stay():
     tables = {"own": np.arange(6.0).reshape(3, 2), "all": np.arange(7)}
     given = made([[[2, 0]], [[1, -1]]], np.ones((2, 1, 2)), tables=tables, by_sample=("own",))
     kept = np.array([[[True, False]], [[True, False]]])
-    found = settling.repack(given, kept, None)
+    found = packing.repack(given, kept, None)
     np.testing.assert_array_equal(found.tables["own"], tables["own"][[2, 1]])
     assert found.tables["all"] is tables["all"]
-    found = settling.repack(given, kept, 4)
+    found = packing.repack(given, kept, 4)
     np.testing.assert_array_equal(found.tables["own"], [*tables["own"][[2, 1]], (0, 0), (0, 0)])
 
 
 def test_there_is_a_row_of_zeros_where_nothing_is_kept():
     given = made([[[0]], [[1]]], np.ones((2, 1, 1)))
-    found = settling.repack(given, np.zeros((2, 1, 1), bool), None)
+    found = packing.repack(given, np.zeros((2, 1, 1), bool), None)
     assert (found.row == -1).all() and not found.depth.any()
     np.testing.assert_array_equal(found.ids, np.zeros((1, 2)))
 
@@ -192,7 +193,7 @@ def test_packing_is_what_one_does_by_hand():
         given = replace(given, tables={"t": rng.random((len(given.ids), 2))}, by_sample=("t",), overflow=np.int32(3))
         kept = (row >= 0) & (rng.random(shape) < 0.8)
         for capacity in (None, 1, 5, 200):
-            found = settling.repack(given, kept, capacity)
+            found = packing.repack(given, kept, capacity)
             rows, old, lost = repacked_by_hand(given, kept, capacity)
             np.testing.assert_array_equal(found.row, rows)
             np.testing.assert_array_equal(found.depth, np.where(rows >= 0, given.depth, 0))

@@ -8,8 +8,8 @@ from rts import registry
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.interfaces import Part, RaySurface, TriangleSurface
-from rts.sampling import lift
-from rts.settling import refined
+from rts.sampling.packing import lift
+from rts.sampling.settling import refined
 from rts.testing import derivatives
 from rts.testing.conformance import claim, claim_finite
 from rts.testing.samples import FEW, REPROJECTION, RESIDUAL

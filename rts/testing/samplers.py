@@ -26,7 +26,7 @@ DEEPER = 4
 """Layers of the reference beyond those compared, which tell where a silhouette is."""
 
 SCALES = 1, 0.9, 0.8, 0.7, 0.8
-"""Of θ, call after call: more than are kept (`rts.keeping.KEPT`), and one that is."""
+"""Of θ, call after call: more than are kept (`rts.sampling.cache.KEPT`), and one that is."""
 
 
 class Elsewhere:

@@ -1,11 +1,9 @@
-"""The step without derivative: from surfaces to packed samples, on the host."""
+"""Samplers that know only triangles: from any surface's triangles to packed samples, on the host."""
 
 from __future__ import annotations
 
 import abc
-import functools
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -15,15 +13,18 @@ from rts.camera import Camera
 from rts.engines import CONSTANT_TYPES, engine_of, is_constant, namespace, suiting
 from rts.errors import InputError
 from rts.interfaces import Needed, Part, Sampler, Shader, Surface, TriangleSurface, as_surface
-from rts.keeping import Entry, Keeper, fingerprint, same_faces
-from rts.records import ArraySpec, Fragments, Proxy, Sampled, Samples
+from rts.records import ArraySpec, Fragments, Proxy, Samples
+from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
+from rts.sampling.packing import lift, repack
+from rts.sampling.settling import refined, settle
+from rts.sampling.validation import check_camera, check_fragments, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
 
 
 class TriangleSampler(Sampler):
     """Base class of samplers that know only triangles: `sample` for any surface that gives a proxy.
 
-    What was prepared is kept (`rts.keeping`) until the proxy's inputs change.
+    What was prepared is kept (`rts.sampling.cache`) until the proxy's inputs change.
 
     Attributes:
         builds: whether something is worth building once for a proxy; True where there is a `prepare`.
@@ -76,7 +77,7 @@ class TriangleSampler(Sampler):
 
     def _built(self, surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Entry:
         """A copy of the surface's proxy for host inputs, checked, and what this sampler prepares of it."""
-        proxy = _checked_proxy(surface, inputs, camera, size)
+        proxy = checked_proxy(surface, inputs, camera, size)
         # A copy, since the arrays given may be changed in place, or lent for the length of one call only.
         proxy = proxy._replace(vertices=proxy.vertices.copy())
         return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None)
@@ -84,14 +85,14 @@ class TriangleSampler(Sampler):
     def _entry(self, surface: TriangleSurface, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
         """The same, kept from call to call where that pays."""
         if surface.proxy_is_cheap and not self.builds:
-            proxy = _checked_proxy(surface, inputs, camera, size)
+            proxy = checked_proxy(surface, inputs, camera, size)
             return Entry(proxy, self.prepare(proxy))
         beside = surface.proxy_key(inputs, camera, size) if surface.depends_on_view else None
 
         def follow(old: Entry) -> Entry | None:
             if not self.follows or old.prepared is None:
                 return None
-            proxy = _checked_proxy(surface, inputs, camera, size)
+            proxy = checked_proxy(surface, inputs, camera, size)
             if not same_faces(old.proxy, proxy):
                 return None
             proxy = proxy._replace(vertices=proxy.vertices.copy())
@@ -180,15 +181,13 @@ class TriangleSampler(Sampler):
             found = entry or self._entry(surface, inputs, camera, shape.size)
             if len(found.proxy.faces):
                 fragments = self.rasterize(found.prepared, camera, shape.size, shape.layers, cull)
-                _check_fragments(fragments, grid, len(found.proxy.faces), self)
+                check_fragments(fragments, grid, len(found.proxy.faces), self)
             else:
                 fragments = _no_fragments(grid)
         covered = fragments.triangle_ids >= 0
         if not surface.refines:
             kept = covered if needed is None else needed(covered, fragments.depth)
             return lift(fragments, found.proxy, shape.capacity, kept)
-        from rts.settling import refined, repack, settle
-
         lifted = lift(fragments, found.proxy, None, covered)
         moved, rays = refined(surface, inputs, lifted, camera, shape.size, tables)
         settled = settle(moved, camera, rays.spread)
@@ -271,45 +270,6 @@ def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
     return np.concatenate([table, np.zeros((spec.shape[0] - len(table), *table.shape[1:]), table.dtype)])
 
 
-def _checked_proxy(surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Proxy:
-    proxy = surface.proxy(inputs, camera, size)
-    if not surface.proxy_is_cheap:
-        proxy = _packed_proxy(proxy, surface)
-    check_proxy(proxy, surface)
-    return proxy
-
-
-def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
-    """The proxy with contiguous arrays of the right dtypes; triangles that would be read out of bounds are refused."""
-    if not isinstance(proxy, Proxy):
-        raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected an rts.Proxy")
-    vertices, faces = np.asarray(proxy.vertices), np.asarray(proxy.faces)
-    for name, array, kind in (("vertices", vertices, np.floating), ("faces", faces, np.integer)):
-        if array.ndim != 2 or array.shape[1] != 3 or not np.issubdtype(array.dtype, kind):
-            raise InputError(
-                f"the proxy of {surface!r} has {name} of shape {array.shape} and dtype {array.dtype}; "
-                f"expected (rows, 3) of {'float32' if kind is np.floating else 'int32'}"
-            )
-    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise InputError(
-            f"the proxy of {surface!r} has faces from {faces.min()} to {faces.max()}, but {len(vertices)} vertices"
-        )
-    widths = faces.shape[1] if proxy.ids is None else np.shape(proxy.ids)[1]
-    if not surface.refines and widths != surface.sample_widths[0]:
-        raise InputError(
-            f"the proxy of {surface!r} has {widths} ids a triangle, but sample_widths says {surface.sample_widths[0]}"
-        )
-    for name, array in (("ids", proxy.ids), ("corner_params", proxy.corner_params)):
-        if array is not None and len(array) < len(faces):
-            raise InputError(
-                f"the proxy of {surface!r} has {len(faces)} faces, but {name} of shape {np.shape(array)}; "
-                f"expected a row a face"
-            )
-    return proxy._replace(
-        vertices=np.ascontiguousarray(vertices, np.float32), faces=np.ascontiguousarray(faces, np.int32)
-    )
-
-
 def _attribute_specs(
     surface: Surface, asked: Sequence[str] | None, host_theta: Mapping | None, shape: _Shape, like: Array | None
 ) -> dict[str, ArraySpec]:
@@ -329,140 +289,3 @@ def _attribute_specs(
 
 def _no_fragments(shape: tuple[int, int, int]) -> Fragments:
     return Fragments(np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32))
-
-
-def _check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sampler: Any) -> None:
-    """Refuse what `rasterize` of a sampler should not have returned."""
-    if isinstance(fragments, Fragments):
-        ids, barycentrics, depth = fragments
-        fits = np.shape(ids) == np.shape(depth) == shape and np.shape(barycentrics) == (*shape, 2)
-    else:
-        fits = False
-    if not fits:
-        given = tuple(np.shape(x) for x in fragments) if isinstance(fragments, Fragments) else type(fragments).__name__
-        raise InputError(
-            f"rasterize of {type(sampler).__name__} returned {given}; expected rts.Fragments of "
-            f"{(shape, (*shape, 2), shape)}"
-        )
-    last = int(np.asarray(fragments.triangle_ids).max())
-    if last >= faces:
-        raise InputError(f"rasterize of {type(sampler).__name__} returned triangle {last} of {faces}")
-
-
-def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None, kept: np.ndarray | None = None) -> Samples:
-    """Packed samples from fragments: the triangle's ids, and its corner parameters interpolated.
-
-    Samples are numbered layer by layer, each in rows and columns of the image. There is always at least one row, so
-    that what follows stays connected to θ; a row that no cell refers to has no effect. `kept` (K, H, W) bool says which
-    of the covered cells to take, None for all.
-    """
-    from rts import lifting
-
-    kept = fragments.triangle_ids >= 0 if kept is None else kept
-    table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)
-    corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
-    ids, params, row, depth, total = lifting.pack(fragments, kept, table, corner_params, capacity or 0)
-    return Samples(ids, params, row, depth, np.asarray(max(0, total - len(ids)), np.int32))
-
-
-def merge(samples: Sequence[Samples], layers: int) -> Sampled:
-    """Interleave the layers of several parts by depth and keep the nearest; equal depths go to the earlier part."""
-    overflow = samples[0].overflow
-    for s in samples[1:]:
-        overflow = overflow + s.overflow
-    if len(samples) == 1:
-        only = samples[0]
-        return Sampled(tuple(samples), only.row, only.depth, overflow)
-    given = *(s.row for s in samples), *(s.depth for s in samples)
-    on_host, elsewhere = partial(_interleaved_on_the_host, layers), partial(_interleaved, layers)
-    part, row, depth = engine_of(given).by_host(on_host, elsewhere, *given)
-    xp, start = namespace(row), 0
-    for i, s in enumerate(samples):
-        row = xp.where(part == i, row + start, row) if start else row
-        start += s.ids.shape[0]
-    return Sampled(tuple(samples), row, depth, overflow)
-
-
-def _interleaved(layers: int, *given: Array) -> tuple[Array, ...]:
-    """Part, row within it and depth, (K, H, W) each, from the rows of each part and the depths of each."""
-    xp, rows = namespace(given[0]), given[: len(given) // 2]
-    row, depth = xp.concat(rows), xp.concat(given[len(rows) :])
-    part = xp.concat([xp.where(r >= 0, i, r) for i, r in enumerate(rows)])
-    order = xp.argsort(xp.where(row >= 0, depth, xp.max(depth) + 1), axis=0, stable=True)[:layers]
-    part, row, depth = (xp.take_along_axis(x, order, axis=0) for x in (part, row, depth))
-    return part, row, depth
-
-
-def _interleaved_on_the_host(layers: int, *given: Array) -> tuple[Array, ...]:
-    """The same: sorting many short columns takes array code far longer."""
-    rows, depths = given[: len(given) // 2], given[len(given) // 2 :]
-    shape = (min(layers, sum(r.shape[0] for r in rows)), *rows[0].shape[1:])
-    dtype = np.float64 if any(namespace(d).finfo(d.dtype).bits == 64 for d in depths) else np.float32
-
-    def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-        from rts import lifting
-
-        return lifting.interleave(arrays[: len(rows)], arrays[len(rows) :], layers)
-
-    specs = ArraySpec(shape, np.int32), ArraySpec(shape, np.int32), ArraySpec(shape, dtype)
-    return engine_of(given).call_host(host, specs, *given)
-
-
-WELL_CONDITIONED = 1e-6
-"""The `_spread` of rows from which on a matrix is far from singular."""
-
-
-def check_camera(camera: Camera) -> None:
-    """Refuse host matrices that are not finite, not invertible, or a view that is not affine."""
-    for name, matrix in zip(("view", "projection"), camera, strict=True):
-        if not np.isfinite(matrix).all():
-            raise InputError(f"the camera's {name} matrix holds NaN or infinity; check how it was made")
-    # Most are far from singular; singular values take longer.
-    well = _spread(camera.view[:3, :3]) > WELL_CONDITIONED
-    if not (well and _spread_of_projection(camera.projection.tobytes()) > WELL_CONDITIONED):
-        _check_invertible(camera)
-    if camera.view[3].tolist() != [0, 0, 0, 1]:
-        raise InputError(
-            f"the last row of the camera's view times the part's transform is {camera.view[3].tolist()}; "
-            f"expected 0, 0, 0, 1"
-        )
-
-
-def _spread(m: np.ndarray) -> float:
-    """The square of a (3, 3) determinant over that of the rows' lengths: 1 for orthogonal rows, 0 for dependent."""
-    a, b, c, d, e, f, g, h, i = m.ravel().tolist()  # Few numbers: NumPy would take far longer.
-    square = (a * a + b * b + c * c) * (d * d + e * e + f * f) * (g * g + h * h + i * i)
-    return (a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) ** 2 / square if square > 0 else 0.0
-
-
-@functools.lru_cache(maxsize=64)
-def _spread_of_projection(data: bytes) -> float:
-    """The same of the bytes of a (4, 4) float64 matrix, which often is that of the call before."""
-    matrix = np.frombuffer(data).reshape(4, 4)
-    square = float((matrix * matrix).sum(axis=1).prod())
-    return float(np.linalg.det(matrix)) ** 2 / square if square > 0 else 0.0
-
-
-def _check_invertible(camera: Camera) -> None:
-    # Far from the origin, or at lengths far from one, a matrix is none the worse: so rows and columns are scaled.
-    projection = camera.projection
-    for axis in (1, 0):
-        length = np.linalg.norm(projection, axis=axis, keepdims=True)
-        projection = projection / np.where(length > 0, length, 1)
-    for name, matrix in (("view", camera.view[:3, :3]), ("projection", projection)):
-        singular_values = np.linalg.svd(matrix, compute_uv=False)
-        if not singular_values[-1] > 1e-12 * singular_values[0]:
-            raise InputError(
-                f"the camera's {name} matrix is singular (times the part's transform, for view); it has no inverse"
-            )
-
-
-def check_proxy(proxy: Proxy, surface: Any) -> None:
-    """Refuse vertices that are NaN or infinite."""
-    vertices = proxy.vertices
-    if len(vertices) and not (np.isfinite(vertices.min()) and np.isfinite(vertices.max())):
-        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
-        raise InputError(
-            f"{len(bad)} of the {len(vertices)} vertices of {surface!r} are NaN or infinite, the first is vertex "
-            f"{bad[0]}; check the input, or lower the step size if an optimisation led here"
-        )

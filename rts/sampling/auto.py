@@ -12,8 +12,8 @@ from rts.checks import check_sampler, check_scene
 from rts.engines import engine_of, is_constant
 from rts.errors import PluginError
 from rts.interfaces import Part, Sampler, TriangleSurface
-from rts.preparing import PreparedParts
 from rts.records import Samples
+from rts.sampling.prepared import PreparedParts
 
 STATIC_FACES = 4_000_000
 """From so many triangles on, rays at a structure that is kept are faster than drawing all (benchmarks/samplers.py)."""

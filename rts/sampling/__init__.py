@@ -1,0 +1,1 @@
+"""The step without derivative: where rays meet surfaces, as packed samples."""

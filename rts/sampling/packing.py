@@ -1,0 +1,55 @@
+"""Fragments packed into samples, a row for each covered cell; and samples packed anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from rts.records import Fragments, Proxy, Samples
+
+
+def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None, kept: np.ndarray | None = None) -> Samples:
+    """Packed samples from fragments: the triangle's ids, and its corner parameters interpolated.
+
+    Samples are numbered layer by layer, each in rows and columns of the image. There is always at least one row, so
+    that what follows stays connected to θ; a row that no cell refers to has no effect. `kept` (K, H, W) bool says which
+    of the covered cells to take, None for all.
+    """
+    from rts.sampling import packing_kernels
+
+    kept = fragments.triangle_ids >= 0 if kept is None else kept
+    table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)
+    corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
+    ids, params, row, depth, total = packing_kernels.pack(fragments, kept, table, corner_params, capacity or 0)
+    return Samples(ids, params, row, depth, np.asarray(max(0, total - len(ids)), np.int32))
+
+
+def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
+    """Those samples whose cells are kept (K, H, W), numbered layer by layer, in as many rows as there are.
+
+    Args:
+        samples: on the host.
+        kept: bool, covered cells.
+        capacity: rows to allot, zeros where they are not used; None for as many as are kept, at least one.
+    """
+    index = samples.row[kept]
+    rows = max(1, len(index)) if capacity is None else capacity
+    number = np.full(samples.row.shape, -1, np.int32)
+    number[kept] = np.where(np.arange(len(index)) < rows, np.arange(len(index)), -1)
+    index, overflow = index[:rows], np.asarray(samples.overflow + max(0, len(index) - rows), np.int32)
+
+    def packed(x: np.ndarray) -> np.ndarray:
+        found = np.zeros((rows, *x.shape[1:]), x.dtype)
+        found[: len(index)] = x[index]
+        return found
+
+    return replace(
+        samples,
+        ids=packed(samples.ids),
+        params=packed(samples.params),
+        row=number,
+        depth=np.where(number >= 0, samples.depth, np.float32(0)),
+        overflow=overflow,
+        tables={name: packed(x) if name in samples.by_sample else x for name, x in samples.tables.items()},
+    )

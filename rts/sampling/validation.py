@@ -1,0 +1,194 @@
+"""What is refused of cameras, proxies, fragments and refined samples, on the host."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.errors import InputError
+from rts.interfaces import TriangleSurface
+from rts.records import Fragments, Proxy, Samples
+from rts.trees import Tree
+
+
+def checked_proxy(surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Proxy:
+    """The proxy of a surface for host inputs, refused where it cannot be drawn."""
+    proxy = surface.proxy(inputs, camera, size)
+    if not surface.proxy_is_cheap:
+        proxy = _packed_proxy(proxy, surface)
+    check_proxy(proxy, surface)
+    return proxy
+
+
+def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
+    """The proxy with contiguous arrays of the right dtypes; triangles that would be read out of bounds are refused."""
+    if not isinstance(proxy, Proxy):
+        raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected an rts.Proxy")
+    vertices, faces = np.asarray(proxy.vertices), np.asarray(proxy.faces)
+    for name, array, kind in (("vertices", vertices, np.floating), ("faces", faces, np.integer)):
+        if array.ndim != 2 or array.shape[1] != 3 or not np.issubdtype(array.dtype, kind):
+            raise InputError(
+                f"the proxy of {surface!r} has {name} of shape {array.shape} and dtype {array.dtype}; "
+                f"expected (rows, 3) of {'float32' if kind is np.floating else 'int32'}"
+            )
+    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+        raise InputError(
+            f"the proxy of {surface!r} has faces from {faces.min()} to {faces.max()}, but {len(vertices)} vertices"
+        )
+    widths = faces.shape[1] if proxy.ids is None else np.shape(proxy.ids)[1]
+    if not surface.refines and widths != surface.sample_widths[0]:
+        raise InputError(
+            f"the proxy of {surface!r} has {widths} ids a triangle, but sample_widths says {surface.sample_widths[0]}"
+        )
+    for name, array in (("ids", proxy.ids), ("corner_params", proxy.corner_params)):
+        if array is not None and len(array) < len(faces):
+            raise InputError(
+                f"the proxy of {surface!r} has {len(faces)} faces, but {name} of shape {np.shape(array)}; "
+                f"expected a row a face"
+            )
+    return proxy._replace(
+        vertices=np.ascontiguousarray(vertices, np.float32), faces=np.ascontiguousarray(faces, np.int32)
+    )
+
+
+def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sampler: Any) -> None:
+    """Refuse what `rasterize` of a sampler should not have returned."""
+    if isinstance(fragments, Fragments):
+        ids, barycentrics, depth = fragments
+        fits = np.shape(ids) == np.shape(depth) == shape and np.shape(barycentrics) == (*shape, 2)
+    else:
+        fits = False
+    if not fits:
+        given = tuple(np.shape(x) for x in fragments) if isinstance(fragments, Fragments) else type(fragments).__name__
+        raise InputError(
+            f"rasterize of {type(sampler).__name__} returned {given}; expected rts.Fragments of "
+            f"{(shape, (*shape, 2), shape)}"
+        )
+    last = int(np.asarray(fragments.triangle_ids).max())
+    if last >= faces:
+        raise InputError(f"rasterize of {type(sampler).__name__} returned triangle {last} of {faces}")
+
+
+WELL_CONDITIONED = 1e-6
+"""The `_spread` of rows from which on a matrix is far from singular."""
+
+
+def check_camera(camera: Camera) -> None:
+    """Refuse host matrices that are not finite, not invertible, or a view that is not affine."""
+    for name, matrix in zip(("view", "projection"), camera, strict=True):
+        if not np.isfinite(matrix).all():
+            raise InputError(f"the camera's {name} matrix holds NaN or infinity; check how it was made")
+    # Most are far from singular; singular values take longer.
+    well = _spread(camera.view[:3, :3]) > WELL_CONDITIONED
+    if not (well and _spread_of_projection(camera.projection.tobytes()) > WELL_CONDITIONED):
+        _check_invertible(camera)
+    if camera.view[3].tolist() != [0, 0, 0, 1]:
+        raise InputError(
+            f"the last row of the camera's view times the part's transform is {camera.view[3].tolist()}; "
+            f"expected 0, 0, 0, 1"
+        )
+
+
+def _spread(m: np.ndarray) -> float:
+    """The square of a (3, 3) determinant over that of the rows' lengths: 1 for orthogonal rows, 0 for dependent."""
+    a, b, c, d, e, f, g, h, i = m.ravel().tolist()  # Few numbers: NumPy would take far longer.
+    square = (a * a + b * b + c * c) * (d * d + e * e + f * f) * (g * g + h * h + i * i)
+    return (a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) ** 2 / square if square > 0 else 0.0
+
+
+@functools.lru_cache(maxsize=64)
+def _spread_of_projection(data: bytes) -> float:
+    """The same of the bytes of a (4, 4) float64 matrix, which often is that of the call before."""
+    matrix = np.frombuffer(data).reshape(4, 4)
+    square = float((matrix * matrix).sum(axis=1).prod())
+    return float(np.linalg.det(matrix)) ** 2 / square if square > 0 else 0.0
+
+
+def _check_invertible(camera: Camera) -> None:
+    # Far from the origin, or at lengths far from one, a matrix is none the worse: so rows and columns are scaled.
+    projection = camera.projection
+    for axis in (1, 0):
+        length = np.linalg.norm(projection, axis=axis, keepdims=True)
+        projection = projection / np.where(length > 0, length, 1)
+    for name, matrix in (("view", camera.view[:3, :3]), ("projection", projection)):
+        singular_values = np.linalg.svd(matrix, compute_uv=False)
+        if not singular_values[-1] > 1e-12 * singular_values[0]:
+            raise InputError(
+                f"the camera's {name} matrix is singular (times the part's transform, for view); it has no inverse"
+            )
+
+
+def check_proxy(proxy: Proxy, surface: Any) -> None:
+    """Refuse vertices that are NaN or infinite."""
+    vertices = proxy.vertices
+    if len(vertices) and not (np.isfinite(vertices.min()) and np.isfinite(vertices.max())):
+        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+        raise InputError(
+            f"{len(bad)} of the {len(vertices)} vertices of {surface!r} are NaN or infinite, the first is vertex "
+            f"{bad[0]}; check the input, or lower the step size if an optimisation led here"
+        )
+
+
+def checked_refined(found: Any, given: Samples, surface: TriangleSurface) -> Samples:
+    """What `refine` of a surface gave, with arrays of the right dtypes; refused where it breaks its contract."""
+    who = f"refine of {surface!r}"
+    if not isinstance(found, Samples):
+        raise InputError(f"{who} gave a {type(found).__name__}; expected rts.Samples")
+    rows, grid, (i, p) = len(given.ids), given.row.shape, surface.sample_widths
+    ids = _array(f"{who} gave ids", found.ids, (rows, i), np.integer, np.int32)
+    params = _array(f"{who} gave params", found.params, (rows, p), np.floating, np.float32)
+    row = _array(f"{who} gave row", found.row, grid, np.integer, np.int32)
+    depth = _array(f"{who} gave depth", found.depth, grid, np.floating, np.float32)
+    overflow = _array(f"{who} gave overflow", found.overflow, (), np.integer, np.int32)
+    if ((row != given.row) & (row != -1)).any():
+        raise InputError(f"{who} gave another number to a row; expected what it was given, or −1 to drop a sample")
+    if overflow < given.overflow:
+        raise InputError(f"{who} gave an overflow of {overflow}; expected at least the {given.overflow} it was given")
+    covered = row >= 0
+    bad = covered & ~np.isfinite(depth)
+    if bad.any():
+        raise InputError(f"{who} gave {bad.sum()} depths that are not finite; set their rows to −1 where a ray misses")
+    used = params[row[covered]]
+    if not np.isfinite(used).all():
+        count = (~np.isfinite(used).all(axis=1)).sum()
+        raise InputError(f"{who} gave {count} samples whose params are not finite; set their rows to −1")
+    tables = _checked_tables(found.tables, given, who)
+    return replace(given, ids=ids, params=params, row=row, depth=depth, overflow=overflow, tables=tables)
+
+
+def _array(what: str, value: Any, shape: tuple[int, ...], kind: type, dtype: Any) -> np.ndarray:
+    """A value as an array of a dtype, refused where it has another shape, or is of another kind."""
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what} that is no array ({error}); expected shape {shape}") from error
+    if array.shape != shape or not np.issubdtype(array.dtype, kind):
+        raise InputError(
+            f"{what} of shape {array.shape} and dtype {array.dtype}; expected {shape} of {np.dtype(dtype)}"
+        )
+    with np.errstate(over="ignore"):  # Infinite then, which is refused where it is used.
+        return np.ascontiguousarray(array, dtype) if array.ndim else array.astype(dtype)
+
+
+def _checked_tables(found: Any, given: Samples, who: str) -> dict[str, np.ndarray]:
+    """Tables that fit into those that were allotted."""
+    if set(found) != set(given.tables):
+        raise InputError(f"{who} gave the tables {sorted(found)}; table_specs declares {sorted(given.tables)}")
+    tables = {}
+    for name, allotted in given.tables.items():
+        table = np.asarray(found[name], allotted.dtype)
+        if name in given.by_sample and len(table) != len(given.ids):
+            raise InputError(
+                f"{who} gave a table {name!r} of {len(table)} rows; expected {len(given.ids)}, one a sample"
+            )
+        if table.shape[1:] != allotted.shape[1:] or len(table) > len(allotted):
+            raise InputError(
+                f"{who} gave a table {name!r} of shape {table.shape}, where table_specs allots {allotted.shape}; drop "
+                f"the samples that do not fit and add their number to overflow"
+            )
+        tables[name] = table
+    return tables
