@@ -11,7 +11,7 @@ from speed_tasks import ENGINES, START, Task, in_turn
 import rts
 from rts import splatting
 from rts.engines import engine_of, namespace
-from rts.least_squares import normal_equations
+from rts.fitting.least_squares import normal_equations
 
 SPLATTERS = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}
 """The specification of each registered name."""

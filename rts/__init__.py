@@ -6,12 +6,12 @@ differentiate only that.
 
 from rts.adapting import unwrapped
 from rts.camera import Camera
+from rts.diagnostics.gradients import check_gradient, gradient_image
 from rts.engines import Engine, engine_of, namespace
 from rts.errors import EngineError, InputError, LayersWarning, PluginError, RtsError
-from rts.fitting import Fit, fit
+from rts.fitting.fit import Fit, fit
+from rts.fitting.image_residuals import ImageResiduals
 from rts.gbuffer import GBuffer
-from rts.gradients import check_gradient, gradient_image
-from rts.image_residuals import ImageResiduals
 from rts.interfaces import Evaluator, Part, RaySurface, Residuals, Sampler, Shader, Splatter, Surface, TriangleSurface
 from rts.operations.combine import combine
 from rts.operations.gradient import gradient

@@ -14,9 +14,9 @@ from rts import registry
 from rts.camera import Camera
 from rts.engines import Engine, engine_named
 from rts.errors import InputError, PluginError
-from rts.fitting import fit
+from rts.fitting.fit import fit
+from rts.fitting.image_residuals import ImageResiduals
 from rts.framing import Bounds
-from rts.image_residuals import ImageResiduals
 from rts.interfaces import Part
 from rts.operations.linear import matmul
 from rts.operations.rigid import rigid

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import rts
 from rts.errors import EngineError, InputError, PluginError
-from rts.least_squares import LARGEST_DAMPING, _damped_step
+from rts.fitting.least_squares import LARGEST_DAMPING, _damped_step
 
 targets = pytest.mark.parametrize("target", DIFFERENTIABLE)
 

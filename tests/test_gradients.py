@@ -5,7 +5,7 @@ import pytest
 from helpers import DIFFERENTIABLE, arrays, quad
 
 import rts
-from rts import gradients
+from rts.diagnostics import gradients
 
 MESH = rts.plugin("rts.surfaces", "mesh")
 CAMERA = rts.Camera.orthographic((0, 0, 10), (0, 0, 0), height=16)

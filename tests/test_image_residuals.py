@@ -9,11 +9,11 @@ import pytest
 from helpers import DIFFERENTIABLE, arrays, box, icosphere, quad, soup, to_numpy
 
 import rts
-import rts.least_squares
+import rts.fitting.least_squares
 from rts import splatting
 from rts.engines import engine_of
 from rts.errors import InputError
-from rts.least_squares import normal_equations
+from rts.fitting.least_squares import normal_equations
 from rts_backends import fused, fused_normal
 from rts_backends.fused_kernels import Cells, Settings
 
@@ -94,7 +94,7 @@ def check(residuals, parameters, tolerance):
     found = engine.jit(residuals.normal_equations)(parameters)
     kinds = {str(x.dtype) for x in found}
     assert len(kinds) == 1
-    flat, unflatten = rts.least_squares.flatten(parameters)
+    flat, unflatten = rts.fitting.least_squares.flatten(parameters)
     xp = engine.namespace
     r, rows = map(to_numpy, engine.jit(engine.jacobian(lambda v: xp.reshape(residuals(unflatten(v)), (-1,))))(flat))
     r, rows = r.astype(np.float64), rows.astype(np.float64)

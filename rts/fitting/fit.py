@@ -14,9 +14,9 @@ import numpy as np
 from rts.adapting import adapted
 from rts.engines import Engine, engine_of, is_constant
 from rts.errors import InputError
-from rts.fit_runs import Astray, Report, Run, progress_bar, require
+from rts.fitting.least_squares import levenberg_marquardt, mean_square
+from rts.fitting.run import Astray, Report, Run, progress_bar, require
 from rts.interfaces import Residuals
-from rts.least_squares import levenberg_marquardt, mean_square
 from rts.trees import Array, Tree, leaves, map_leaves
 
 STEPS = {"adam": 200, "sgd": 200, "lm": 50}

@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.engines import Engine, namespace
 from rts.errors import InputError
-from rts.fit_runs import Run, require
+from rts.fitting.run import Run, require
 from rts.trees import Array, Tree, leaves, map_leaves
 
 FIRST_DAMPING = 1e-3

@@ -10,8 +10,8 @@ from rts.camera import Camera
 from rts.checks import check_background, check_floating, check_scene, check_size, check_splatter
 from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting
 from rts.errors import InputError
+from rts.fitting.least_squares import flatten, normal_equations
 from rts.interfaces import Part, Residuals, Splatter
-from rts.least_squares import flatten, normal_equations
 from rts.records import Splats
 from rts.rendering import render, sample, to_splats
 from rts.sampling.prepared import PreparedParts

@@ -1,0 +1,1 @@
+"""What a gradient is, and whether it is right."""

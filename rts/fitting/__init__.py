@@ -1,0 +1,1 @@
+"""Parameters fitted to images: `fit`, its methods, and residuals of images."""
