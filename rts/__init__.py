@@ -9,6 +9,8 @@ from rts.camera import Camera
 from rts.diagnostics.gradients import check_gradient, gradient_image
 from rts.engines import Engine, engine_of, namespace
 from rts.errors import EngineError, InputError, LayersWarning, PluginError, RtsError
+from rts.files.images import load_image, save_animation, save_image
+from rts.files.models import load
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.gbuffer import GBuffer
@@ -23,7 +25,6 @@ from rts.rendering import render, render_samples, sample
 from rts.sampling.auto import explain
 from rts.sampling.prepared import prepare
 from rts.sampling.triangle_sampler import TriangleSampler
-from rts.scenes import load, load_image, save_animation, save_image
 from rts.splatting import exact_calibration
 
 __all__ = [

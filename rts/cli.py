@@ -125,7 +125,7 @@ def _background(text: str) -> tuple[float, ...] | None:
     """A linear colour, or None for transparent."""
     from PIL import ImageColor
 
-    from rts.scenes import decode_srgb
+    from rts.files.srgb import decode_srgb
 
     if text == "none":
         return None
@@ -203,8 +203,8 @@ def render(
 ) -> None:
     """Render a model to a picture."""
     import rts
+    from rts.files.paths import output_file
     from rts.framing import bounds_of, orbit
-    from rts.paths import output_file
 
     shape, view, color = _size(size), _view(camera), _background(background)
     output_file(output, "picture", (".png",))
@@ -266,8 +266,8 @@ def fit_pose(
     """
     import rts
     from rts import pose
+    from rts.files.paths import output_folder
     from rts.framing import bounds_of, orbit
-    from rts.paths import output_folder
 
     view = _view(camera)
     output_folder(output)
@@ -293,7 +293,7 @@ def demo(
 ) -> None:
     """Recover the pose of a knot from its silhouette: no input needed, pictures and a summary written."""
     from rts.demo import run
-    from rts.paths import output_folder
+    from rts.files.paths import output_folder
 
     output_folder(output)
     found, files = run(output, None if engine == "auto" else engine)

@@ -14,6 +14,7 @@ from rts import registry
 from rts.camera import Camera
 from rts.engines import Engine, engine_named
 from rts.errors import InputError, PluginError
+from rts.files.images import save_animation, save_image
 from rts.fitting.fit import fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.framing import Bounds
@@ -21,7 +22,6 @@ from rts.interfaces import Part
 from rts.operations.linear import matmul
 from rts.operations.rigid import rigid
 from rts.rendering import render
-from rts.scenes import save_animation, save_image
 from rts.trees import Array
 
 LARGEST_SIDE = 256

@@ -15,10 +15,10 @@ from rts.camera import Camera
 from rts.checks import check_size
 from rts.engines import Engine, engine_of, is_constant, is_traced, namespace
 from rts.errors import InputError
+from rts.files.srgb import decode_srgb
 from rts.interfaces import Part, Splatter
 from rts.records import Splats
 from rts.rendering import render
-from rts.scenes import decode_srgb
 from rts.trees import Array, Tree, leaves, map_leaves
 
 Scene = Callable[[Tree], tuple[Part | Sequence[Part], Camera]]

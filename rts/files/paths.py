@@ -1,9 +1,13 @@
-"""Paths that callers give, checked before any work is done for them."""
+"""Paths that callers and files give, checked before any work is done for them.
+
+A model file may refer to others (materials, textures, buffers), but only to those inside its own folder, so that a
+model from elsewhere cannot read the rest of the disk.
+"""
 
 from __future__ import annotations
 
 import os
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 from rts.errors import InputError
@@ -40,3 +44,25 @@ def output_folder(path: Any) -> Path:
     if existing.exists() and not existing.is_dir():
         raise InputError(f"{existing} is a file; expected a folder to write into")
     return path
+
+
+def inside(folder: Path, name: str, referrer: Path) -> Path:
+    """The path of a file that `referrer` names; refused if outside `folder`.
+
+    Args:
+        folder: the model's folder.
+        name: as written in the file, relative to `referrer`; either slash.
+        referrer: the file that names it.
+
+    Raises:
+        InputError: an absolute path, or one that leads out of the folder, symbolic links followed.
+    """
+    plain = name.replace("\\", "/")
+    absolute = plain.startswith("/") or PureWindowsPath(plain).drive or "\0" in plain
+    target = folder if absolute else (referrer.parent / plain).resolve()
+    if absolute or not target.is_relative_to(folder.resolve()):
+        raise InputError(
+            f"{referrer} refers to {name!r}, outside its own folder, which is refused; copy that file beside "
+            f"the model and name it without a path"
+        )
+    return target

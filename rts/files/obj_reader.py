@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.errors import InputError
-from rts.model_files import Piece, inside, read_texture
+from rts.files.images import read_texture
+from rts.files.paths import inside
+from rts.files.pieces import Piece
 
 # Options of a map statement, such as "-s 2 2 1 -clamp on"; the rest is the file's name, spaces and all.
 _VALUE = r"(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?[\d.][-+.\deE]*)"
@@ -144,7 +146,7 @@ class _Lines:
 
 
 def read_obj(path: Path) -> list[Piece]:
-    """One piece a material, in order of first use. See `rts.model_files.read_pieces`."""
+    """One piece a material, in order of first use. See `rts.files.models.read_pieces`."""
     lines = _Lines(path).read()
     materials = _materials(lines)
     used = {material for _, _, material in lines.faces}

@@ -1,0 +1,1 @@
+"""Models and pictures, from files and to files."""

@@ -1,0 +1,130 @@
+"""Model files of every format but OBJ, read by trimesh."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+
+from rts.errors import InputError
+from rts.files.images import pixels
+from rts.files.paths import inside
+from rts.files.pieces import Piece
+
+LINEAR_COLORS = {"glb", "gltf"}
+"""Formats whose vertex and material colours are linear already; their textures are sRGB like all others."""
+
+
+class _Folder:
+    """Resolves names for trimesh in the model's folder; keeps what went wrong, which trimesh only logs."""
+
+    def __init__(self, path: Path):
+        self.path, self.problem = path, None
+        self.file_name = path.name
+
+    def get(self, name: str) -> bytes:
+        try:
+            target = inside(self.path.parent, name.strip(), self.path)
+            if not target.is_file():
+                target = inside(self.path.parent, unquote(name.strip()), self.path)
+            if not target.is_file():
+                raise InputError(f"{self.path} refers to {name!r}, but there is no file {target}; put it there")
+            return target.read_bytes()
+        except InputError as problem:
+            self.problem = self.problem or problem
+            raise
+
+    __getitem__ = get
+
+
+def read_with_trimesh(path: Path, extension: str) -> list[Piece]:
+    """The meshes of a file. See `rts.files.models.read_pieces`."""
+    import trimesh
+    from trimesh.exchange.load import mesh_formats
+
+    if extension not in mesh_formats():
+        others = ", ".join(sorted(mesh_formats() - {"obj", "ply", "stl", "glb", "gltf", "off"}))
+        raise InputError(
+            f"{path} has the extension {path.suffix!r}, which is not known; expected obj, ply, stl, glb, "
+            f"gltf, off or another of trimesh's: {others}"
+        )
+    folder: Any = _Folder(path)
+    try:
+        if extension == "gltf":
+            json.loads(path.read_bytes())  # Of a damaged file trimesh only says that it found no "model.gltf".
+        with open(path, "rb") as file:
+            scene: Any = trimesh.load(file, file_type=extension, resolver=folder, force="scene", process=False)
+        pieces = _pieces(scene, trimesh.Trimesh, extension in LINEAR_COLORS)
+    except InputError:
+        raise
+    except Exception as error:
+        kind, again = extension.upper(), "the file may be cut short or of another format: export it again"
+        if isinstance(error, ModuleNotFoundError) and isinstance(error.__context__, UnicodeDecodeError):
+            # What is no sound binary file trimesh takes for text, and would guess its encoding with another package.
+            raise InputError(
+                f"{path} is not a valid {kind} file, neither as binary nor as text; {again}"
+            ) from error.__context__
+        raise folder.problem or InputError(
+            f"{path} cannot be read as {kind} ({type(error).__name__}: {error}); {again}"
+        ) from error
+    if folder.problem:
+        raise folder.problem
+    if not pieces:
+        points = sum(len(_known(g, "vertices", ())) for g in scene.geometry.values())
+        what = f"{points} points but no faces" if points else "no geometry"
+        raise InputError(f"{path} holds {what}; expected a mesh with triangles or polygons")
+    return pieces
+
+
+def _pieces(scene: Any, mesh_type: type, linear: bool) -> list[Piece]:
+    pieces = []
+    for node in scene.graph.nodes_geometry:
+        matrix, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        if not isinstance(mesh, mesh_type) or len(mesh.faces) == 0:
+            continue
+        transform = None if np.array_equal(matrix, np.eye(4)) else np.array(matrix, np.float64)
+        faces = np.asarray(mesh.faces)
+        attributes, texture, color = _visual(mesh, faces, linear)
+        # trimesh computes normals on access and keeps them beside those of the file; before any access only
+        # the latter.
+        if "vertex_normals" in mesh._cache:
+            attributes["normals"] = (np.asarray(mesh._cache["vertex_normals"]), faces)
+        pieces.append(Piece(np.asarray(mesh.vertices), faces, attributes, texture, color, linear, transform))
+    return pieces
+
+
+def _visual(mesh: Any, faces: np.ndarray, gltf: bool) -> tuple[dict, np.ndarray | None, np.ndarray | None]:
+    """Attributes "uv" and "colors", the texture and the material's colour."""
+    visual, attributes, texture, color = mesh.visual, {}, None, None
+    if visual.kind == "texture":
+        if visual.uv is not None and len(visual.uv) == len(mesh.vertices):
+            attributes["uv"] = (np.asarray(visual.uv), faces)
+        if "color" in visual.vertex_attributes:
+            attributes["colors"] = (_unit_range(visual.vertex_attributes["color"]), faces)
+        material = visual.material
+        image = _known(material, "baseColorTexture") or _known(material, "image")
+        texture = None if image is None else pixels(image)
+        if _known(material, "baseColorFactor") is not None:
+            color = _unit_range(material.baseColorFactor)
+        if gltf and _known(material, "alphaMode") in (None, "OPAQUE"):
+            texture, color = (None if x is None else x[..., :3] for x in (texture, color))
+    elif visual.kind == "vertex":
+        attributes["colors"] = (_unit_range(visual.vertex_colors), faces)
+    elif visual.kind == "face":
+        one_a_face = np.repeat(np.arange(len(faces))[:, None], 3, axis=1)
+        attributes["colors"] = (_unit_range(visual.face_colors), one_a_face)
+    return attributes, texture, color
+
+
+def _known(thing: Any, name: str, default: Any = None) -> Any:
+    """What trimesh's classes, which are of many kinds, may have: an attribute, or the default."""
+    return getattr(thing, name, default)
+
+
+def _unit_range(colors: Any) -> np.ndarray:
+    colors = np.asarray(colors)
+    return colors / np.iinfo(colors.dtype).max if np.issubdtype(colors.dtype, np.integer) else colors
