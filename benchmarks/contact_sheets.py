@@ -13,8 +13,8 @@ from PIL import Image, ImageDraw
 from scenes import DATA
 
 import rts
+from rts.cli.views import bounds_of, orbit
 from rts.errors import InputError
-from rts.framing import bounds_of, orbit
 
 MODELS = {
     "bunny": "meshes/bunny.obj",

@@ -10,9 +10,11 @@ from PIL import Image
 from typer.testing import CliRunner
 
 import rts
-from rts import cli, demo, pose
+from rts.cli import demo
+from rts.cli import main as cli
+from rts.cli import pose_fit as pose
+from rts.cli.views import Bounds, bounds_of, orbit
 from rts.errors import InputError, PluginError
-from rts.framing import Bounds, bounds_of, orbit
 
 
 def run(*arguments):
@@ -61,7 +63,7 @@ def test_version():
 
 def test_the_installed_program_reports_an_error_in_one_line_and_the_traceback_on_request():
     def program(*arguments):
-        code = "import sys; from rts.cli import main; sys.argv[0] = 'rts'; main()"
+        code = "import sys; from rts.cli.main import main; sys.argv[0] = 'rts'; main()"
         return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
 
     short = program("render", "gone.obj")
@@ -215,7 +217,7 @@ def test_names_that_cannot_be_written_are_refused_before_any_work(model, tmp_pat
     def work(*_, **__):
         raise AssertionError
 
-    for name in ("rts.render", "rts.load", "rts.pose.fit_pose", "rts.demo.fit_pose"):
+    for name in ("rts.render", "rts.load", "rts.cli.pose_fit.fit_pose", "rts.cli.demo.fit_pose"):
         monkeypatch.setattr(name, work)
     (tmp_path / "file").write_text("")
     (tmp_path / "folder.png").mkdir()

@@ -123,9 +123,9 @@ def test_without_matplotlib_all_works_but_the_plot_which_says_what_it_needs():
         "matplotlib",
         """
         from pathlib import Path
-        from rts import cli, pose
-        assert pose._plot(Path("convergence.png"), [1.0, 0.1]) == []
-        cli._say_skipped_plot([])
+        from rts.cli import main, pose_report
+        assert pose_report._plot(Path("convergence.png"), [1.0, 0.1]) == []
+        main._say_skipped_plot([])
         """,
     )
     assert "pip install 'rts[plots]'" in " ".join(printed.split())

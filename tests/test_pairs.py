@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 import rts
 from rts import pairs
-from rts.cli import app
+from rts.cli.main import app
 
 
 class OwnEllipsoid(Ellipsoid):

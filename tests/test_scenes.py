@@ -8,9 +8,9 @@ import trimesh
 from PIL import Image
 
 import rts
+from rts.cli.views import bounds_of, orbit
 from rts.errors import EngineError, InputError, PluginError
 from rts.files.srgb import decode_srgb, encode_srgb
-from rts.framing import bounds_of, orbit
 
 QUAD = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 QUAD_UV = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from rts import registry
-from rts.framing import bounds_of, orbit
+from rts.cli.pose_fit import PoseFit, fit_pose, posed, shrunk, silhouette_of
+from rts.cli.pose_report import write_report
+from rts.cli.views import bounds_of, orbit
 from rts.interfaces import Part
 from rts.operations.rigid import rigid
-from rts.pose import PoseFit, fit_pose, posed, shrunk, silhouette_of, write_report
 from rts.rendering import render
 
 SIZE = (320, 320)

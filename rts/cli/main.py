@@ -179,7 +179,7 @@ def plugins(
     ] = False,
 ) -> None:
     """List every plugin: engines, surfaces, samplers, shaders and splatters, and whether each one loads."""
-    from rts.listing import matrix_table, plugin_table
+    from rts.cli.plugin_tables import matrix_table, plugin_table
 
     Console().print(matrix_table() if matrix else plugin_table())
 
@@ -203,8 +203,8 @@ def render(
 ) -> None:
     """Render a model to a picture."""
     import rts
+    from rts.cli.views import bounds_of, orbit
     from rts.files.paths import output_file
-    from rts.framing import bounds_of, orbit
 
     shape, view, color = _size(size), _view(camera), _background(background)
     output_file(output, "picture", (".png",))
@@ -265,19 +265,21 @@ def fit_pose(
     target.png, animation.gif and convergence.png.
     """
     import rts
-    from rts import pose
+    from rts.cli.pose_fit import fit_pose as fit
+    from rts.cli.pose_fit import silhouette_of
+    from rts.cli.pose_report import write_report
+    from rts.cli.views import bounds_of, orbit
     from rts.files.paths import output_folder
-    from rts.framing import bounds_of, orbit
 
     view = _view(camera)
     output_folder(output)
     parts = rts.load(model)
-    mask = pose.silhouette_of(rts.load_image(target))
+    mask = silhouette_of(rts.load_image(target))
     bounds = bounds_of(parts)
     seen = orbit(bounds, mask.shape, *view, fov=fov, up=up)
     chosen = None if engine == "auto" else engine
-    found = pose.fit_pose(parts, mask, seen, bounds, engine=chosen, method=method, steps=steps)
-    files = pose.write_report(output, found, parts, seen, mask)
+    found = fit(parts, mask, seen, bounds, engine=chosen, method=method, steps=steps)
+    files = write_report(output, found, parts, seen, mask)
     _say(
         f"loss {found.history[0]:.3g} → {found.loss:.3g} in {len(found.history)} steps, "
         f"{found.seconds:.1f} s ({found.reason}); wrote"
@@ -292,7 +294,7 @@ def demo(
     engine: Annotated[str, typer.Option(help="torch or jax; auto is whichever is installed.")] = "auto",
 ) -> None:
     """Recover the pose of a knot from its silhouette: no input needed, pictures and a summary written."""
-    from rts.demo import run
+    from rts.cli.demo import run
     from rts.files.paths import output_folder
 
     output_folder(output)

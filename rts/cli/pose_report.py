@@ -1,0 +1,101 @@
+"""A report of a pose that was fitted: numbers, pictures, an animation and the convergence."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.cli.pose_fit import LARGEST_SIDE, PoseFit, posed, shrunk
+from rts.files.images import save_animation, save_image
+from rts.interfaces import Part
+from rts.rendering import render
+
+PICTURE_SIDE, FRAMES = 512, 48
+PAPER, MARKED = (0.86, 0.87, 0.9), (0.95, 0.32, 0.05)
+
+
+def write_report(
+    folder: Path,
+    found: PoseFit,
+    parts: Sequence[Part],
+    camera: Camera,
+    target: np.ndarray,
+    scenery: Sequence[Part] = (),
+) -> list[Path]:
+    """Write pose.json, pictures of the pose before and after, the target, an animation and the convergence.
+
+    The last, convergence.png, is only written where matplotlib is installed.
+
+    Args:
+        folder: where to; made if need be.
+        found: what `fit_pose` gave.
+        parts: the model.
+        camera: the camera of the target.
+        target: (H, W) silhouette.
+        scenery: parts that stand still, for the pictures.
+
+    Returns:
+        The files written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "pose.json").write_text(json.dumps(_numbers(found), indent=2) + "\n")
+    large, small = shrunk(target, PICTURE_SIDE), shrunk(target, LARGEST_SIDE)
+
+    def picture(matrix: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        return _outlined(posed(parts, matrix), scenery, camera, mask)
+
+    save_image(folder / "before.png", picture(np.eye(4), large))
+    save_image(folder / "after.png", picture(found.matrix, large))
+    save_image(folder / "target.png", large)
+    moved = [found.trail[0]] + [
+        b for a, b in zip(found.trail, found.trail[1:], strict=False) if np.abs(b - a).max() > 1e-4
+    ]
+    chosen = moved[:: -(-len(moved) // FRAMES)]
+    frames = [picture(m, small) for m in [chosen[0]] * 4 + chosen + [found.matrix] * 10]
+    save_animation(folder / "animation.gif", frames, fps=8)
+    names = ["pose.json", "before.png", "after.png", "target.png", "animation.gif"]
+    return [folder / name for name in names] + _plot(folder / "convergence.png", found.history)
+
+
+def _numbers(found: PoseFit) -> dict[str, Any]:
+    return {
+        "axis_angle": found.rotation.tolist(),
+        "translation": found.translation.tolist(),
+        "center": found.center.tolist(),
+        "matrix": found.matrix.tolist(),
+        "loss": found.loss,
+        "iterations": len(found.history),
+        "seconds": found.seconds,
+        "reason": found.reason,
+    }
+
+
+def _outlined(parts: Sequence[Part], scenery: Sequence[Part], camera: Camera, mask: np.ndarray) -> np.ndarray:
+    """The model in the scene, the outline of the target drawn over it."""
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    paper = np.asarray(PAPER) + 0.6 * mask[..., None] * (np.asarray(MARKED) - PAPER)
+    image = render([*parts, *scenery], camera, mask.shape, background=paper)[..., :3]
+    inside = (mask > 0.5).astype(np.float64)
+    edge = (maximum_filter(inside, 3) - minimum_filter(inside, 3))[..., None]
+    return image + 0.85 * edge * (np.asarray(MARKED) - image)
+
+
+def _plot(path: Path, history: list[float]) -> list[Path]:
+    """The loss over the steps; nothing where matplotlib is not installed."""
+    try:
+        from matplotlib.figure import Figure
+    except ModuleNotFoundError:
+        return []
+    figure = Figure(figsize=(6, 3.5), layout="constrained")
+    axes = figure.subplots()
+    axes.semilogy(np.maximum(history, 1e-12), ".-", color="#c2410c", linewidth=1, markersize=4)
+    axes.set(xlabel="step", ylabel="mean square difference", title="Silhouette, from coarse pixels to fine")
+    axes.grid(alpha=0.3)
+    figure.savefig(path, dpi=120)
+    return [path]
