@@ -11,7 +11,7 @@ import pytest
 from analytic import Ellipsoid
 
 import rts
-from rts import Fragments, GBuffer, InputError, Part, PluginError, RayHits, Splats, pairs
+from rts import Fragments, GBuffer, InputError, Part, PluginError, RayHits, Splats
 from rts.arrays import without_border
 from rts.engines import engine_of, namespace
 from rts.registry import instance
@@ -27,6 +27,7 @@ from rts.testing import (
     shaders,
     splatters,
 )
+from rts.testing import compatibility as pairs
 
 Raster = rts.plugin("samplers", "raster")
 RASTER = Raster()

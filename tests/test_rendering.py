@@ -26,8 +26,8 @@ from helpers import (
 
 import rts
 from rts import Camera, Part
-from rts.pairs import APRON
 from rts.shading import Textured
+from rts.testing.compatibility import APRON
 
 Mesh = rts.plugin("surfaces", "mesh")
 

@@ -8,13 +8,26 @@
             return Heightfield.example()
 
 Each class says which fixtures to override. Checks that need torch or jax are skipped, with the reason, where it is not
-installed. Nothing is collected unless it is subclassed, and `import rts` does not load this package or pytest.
+installed. Nothing is collected unless it is subclassed. Classes are imported when they are asked for: `import rts` and
+the command line do without pytest.
 """
 
-from rts.testing.engines import EngineConformance
-from rts.testing.samplers import SamplerConformance
-from rts.testing.shaders import ShaderConformance
-from rts.testing.splatters import SplatterConformance
-from rts.testing.surfaces import SurfaceConformance
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rts.testing.engines import EngineConformance
+    from rts.testing.samplers import SamplerConformance
+    from rts.testing.shaders import ShaderConformance
+    from rts.testing.splatters import SplatterConformance
+    from rts.testing.surfaces import SurfaceConformance
 
 __all__ = ["EngineConformance", "SamplerConformance", "ShaderConformance", "SplatterConformance", "SurfaceConformance"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{name.removesuffix('Conformance').lower()}s"), name)

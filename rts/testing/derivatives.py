@@ -12,7 +12,7 @@ import pytest
 from rts import registry
 from rts.engines import Engine, constants, engine_named
 from rts.errors import PluginError
-from rts.testing.conformance import claim, claim_close, claim_finite, no_error
+from rts.testing.claims import claim, claim_close, claim_finite, no_error
 from rts.trees import Tree, map_leaves
 
 ENGINES = registry.plugins("rts.engines")

@@ -11,56 +11,17 @@ import numpy as np
 import pytest
 
 from rts.adapting import adapted
-from rts.engines import OWNERS, Engine, engine_named, engine_of
+from rts.engines import OWNERS, Engine, engine_named
 from rts.errors import EngineError
-from rts.operations.combine import combine, interpolate
-from rts.operations.linear import affine_map, matmul
-from rts.operations.projection import projective_map
 from rts.operations.rigid import rigid
-from rts.operations.take import take
 from rts.records import ArraySpec, Samples
 from rts.testing import derivatives, scenes
-from rts.testing.conformance import Conformance, claim, claim_close, no_error
+from rts.testing.claims import claim, claim_close, no_error
+from rts.testing.conformance import Conformance
+from rts.testing.engine_examples import IDS, NAMESPACE, OPERATIONS, N, numbers
 from rts.trees import leaves, map_leaves
 
-N = 6
 TOLERANCE = 1e-5
-
-
-def _numbers(*shape: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-1, 1, shape).astype(np.float32)
-
-
-IDS = np.array([(0, 2, 1), (3, 3, 0), (1, 2, 3), (2, 0, 1), (0, 1, 3), (3, 2, 2)], np.int32)
-WITH_DIVISOR = _numbers(4, 4)
-WITH_DIVISOR[2, 3] += 6
-
-OPERATIONS: dict[str, tuple[Callable, list[np.ndarray]]] = {
-    "matmul": (matmul, [_numbers(4, 4), _numbers(4, 4, seed=1)]),
-    "affine_map": (affine_map, [_numbers(4, 4), _numbers(N, 3, seed=1)]),
-    "projective_map": (projective_map, [WITH_DIVISOR, _numbers(N, 3, seed=1)]),
-    "take": (lambda rows: take(rows, _index(rows)), [_numbers(4, 3)]),
-    "interpolate": (lambda rows, w: interpolate(rows, _ids(rows), 0, w), [_numbers(4, 3), _numbers(N, 2, seed=1)]),
-    "combine": (lambda rows, w: combine(rows, _ids(rows), w), [_numbers(4, 3), _numbers(N, 3, seed=1)]),
-    "rigid": (rigid, [_numbers(6), _numbers(3, seed=1)]),
-}
-"""The library's own operations, and operands."""
-
-NAMESPACE: dict[str, Callable] = {
-    "arithmetic": lambda xp, x: (x * x + 2 - x / 3) ** 2,
-    "where": lambda xp, x: xp.where(x > 0, x, xp.zeros_like(x)),
-    "sum and mean": lambda xp, x: xp.sum(x, axis=0) + xp.mean(x),
-    "stack and concat": lambda xp, x: xp.concat([xp.stack([x[:, 0], x[:, 1]], axis=-1), x], axis=1),
-    "reshape": lambda xp, x: xp.reshape(x, (-1, 2)),
-    "broadcast_to": lambda xp, x: xp.broadcast_to(x[:1, :], (3, 4)),
-    "functions": lambda xp, x: xp.exp(x) + xp.sin(x) * xp.cos(x) + xp.sqrt(xp.abs(x) + 1) + xp.floor(x),
-    "clip, minimum, maximum": lambda xp, x: xp.clip(x, -0.5, 0.5) + xp.minimum(x, 0 * x) - xp.maximum(x, 0 * x),
-    "cross": lambda xp, x: xp.linalg.cross(x[:, :3], x[:, 1:]),
-    "inverse": lambda xp, x: xp.linalg.inv(x[:4, :] @ xp.linalg.matrix_transpose(x[:4, :]) + 4 * _eye(xp, x)),
-    "argsort": lambda xp, x: xp.take_along_axis(x, xp.argsort(x, axis=0, stable=True), axis=0),
-    "any and all": lambda xp, x: xp.astype(xp.any(x > 0, axis=0) & ~xp.all(x > 0, axis=0), x.dtype),
-}
-"""Of what the core and plugins use of the array API, each as a function of x (6, 4)."""
 
 
 class EngineConformance(Conformance):
@@ -102,7 +63,7 @@ class EngineConformance(Conformance):
     @pytest.mark.parametrize("name", NAMESPACE)
     def test_its_namespace_is_that_of_the_array_api(self, engine: Any, name: str) -> None:
         """With NumPy's results."""
-        chosen, x, f = _instance(engine), _numbers(N, 4, seed=4), NAMESPACE[name]
+        chosen, x, f = _instance(engine), numbers(N, 4, seed=4), NAMESPACE[name]
         from array_api_compat import numpy as xp
 
         with owning(chosen), no_error(f"{name} in the namespace of {chosen.name}"):
@@ -120,13 +81,13 @@ class EngineConformance(Conformance):
             return (np.asarray(x) * 2).astype(np.float32), np.asarray(ids.sum(), np.int32), x[:2].astype(np.float32)
 
         specs = ArraySpec((N, 3), np.float32), ArraySpec((), np.int32), ArraySpec((N, 3), np.float32, packed=True)
-        x, ids = chosen.constant(_numbers(N, 3)), chosen.constant(IDS)
+        x, ids = chosen.constant(numbers(N, 3)), chosen.constant(IDS)
         for how, f in _both_ways(chosen, lambda x, i: chosen.call_host(host, specs, x, i)):
             with owning(chosen), no_error(f"a host function{how}"):
                 twice, total, packed = (chosen.to_numpy(r) for r in f(x, ids))
-            claim_close(twice, 2 * _numbers(N, 3), 0, f"the result of a host function{how}")
+            claim_close(twice, 2 * numbers(N, 3), 0, f"the result of a host function{how}")
             claim(total.dtype.kind == "i" and total == IDS.sum(), f"an integer result{how} is {total!r}")
-            claim_close(packed[:2], _numbers(N, 3)[:2], 0, f"a packed result{how}")
+            claim_close(packed[:2], numbers(N, 3)[:2], 0, f"a packed result{how}")
             claim((packed[2:] == 0).all(), f"a packed result{how} is not padded with zeros")
 
     def test_host_functions_have_no_derivative(self, engine: Any) -> None:
@@ -139,33 +100,33 @@ class EngineConformance(Conformance):
             return xp.sum(constant * x)
 
         with owning(chosen), no_error("the gradient through a host function"):
-            gradient = chosen.to_numpy(chosen.value_and_grad(f)(chosen.constant(_numbers(N, 3)))[1])
-            along = chosen.jvp(f, chosen.constant(_numbers(N, 3)), chosen.constant(np.ones((N, 3))))[1]
-        claim_close(gradient, 2 * _numbers(N, 3), TOLERANCE, "the gradient of c x, c from the host,")
-        claim_close(chosen.to_numpy(along), 2 * _numbers(N, 3).sum(), 1e-4, "its derivative in forward mode")
+            gradient = chosen.to_numpy(chosen.value_and_grad(f)(chosen.constant(numbers(N, 3)))[1])
+            along = chosen.jvp(f, chosen.constant(numbers(N, 3)), chosen.constant(np.ones((N, 3))))[1]
+        claim_close(gradient, 2 * numbers(N, 3), TOLERANCE, "the gradient of c x, c from the host,")
+        claim_close(chosen.to_numpy(along), 2 * numbers(N, 3).sum(), 1e-4, "its derivative in forward mode")
 
     def test_what_is_decided_by_the_device_is_the_same(self, engine: Any) -> None:
         """`by_host` gives one of its functions' results, compiled or not."""
         chosen = _instance(engine)
         for how, call in _both_ways(chosen, lambda x: chosen.by_host(lambda v: (v * 2,), lambda v: (v + v,), x)[0]):
             with owning(chosen), no_error(f"by_host{how}"):
-                found = chosen.to_numpy(call(chosen.constant(_numbers(N))))
-            claim_close(found, 2 * _numbers(N), 0, f"the result of by_host{how}")
+                found = chosen.to_numpy(call(chosen.constant(numbers(N))))
+            claim_close(found, 2 * numbers(N), 0, f"the result of by_host{how}")
 
     # ------------------------------------------------------------------------------------------- sums, loops
 
     def test_segments_are_summed(self, engine: Any) -> None:
         """(count, C), zero where there is none; and so are derivatives."""
-        chosen, values, segments = _instance(engine), _numbers(N, 3), np.array([1, 1, 3, 0, 1, 3])
+        chosen, values, segments = _instance(engine), numbers(N, 3), np.array([1, 1, 3, 0, 1, 3])
         expected = np.zeros((5, 3), np.float32)
         np.add.at(expected, segments, values)
         found = chosen.to_numpy(chosen.segment_sum(chosen.constant(values), segments, 5))
         claim_close(found, expected, TOLERANCE, "segment_sum")
         if chosen.differentiates:
-            weights = chosen.constant(_numbers(5, 3, seed=2))
+            weights = chosen.constant(numbers(5, 3, seed=2))
             f = lambda v: chosen.namespace.sum(chosen.segment_sum(v, segments, 5) * weights)  # noqa: E731
             gradient = chosen.to_numpy(chosen.value_and_grad(f)(chosen.constant(values))[1])
-            claim_close(gradient, _numbers(5, 3, seed=2)[segments], TOLERANCE, "the gradient of segment_sum")
+            claim_close(gradient, numbers(5, 3, seed=2)[segments], TOLERANCE, "the gradient of segment_sum")
 
     def test_loops_end_early(self, engine: Any) -> None:
         """`repeat` stops as soon as nothing goes on, or after the most times, compiled or not."""
@@ -203,7 +164,7 @@ class EngineConformance(Conformance):
 
     def test_unused_rows_are_filled(self, engine: Any) -> None:
         """With the first row, where no cell of `row` names them; all that are named stay."""
-        chosen, x = _instance(engine), _numbers(N, 3)
+        chosen, x = _instance(engine), numbers(N, 3)
         row = np.array([[[0, 2, -1], [1, -1, -1]]], np.int32)
         with owning(chosen):
             if not chosen.padded(chosen.constant(row)):
@@ -219,7 +180,7 @@ class EngineConformance(Conformance):
         def f(samples: Samples) -> Any:
             return xp.sum(samples.params, axis=1) + xp.astype(samples.ids[:, 0], samples.params.dtype)
 
-        samples = Samples(IDS, _numbers(N, 2), np.zeros((1, 1, 1), np.int32), _numbers(1, 1, 1), np.int32(0))
+        samples = Samples(IDS, numbers(N, 2), np.zeros((1, 1, 1), np.int32), numbers(1, 1, 1), np.int32(0))
         with owning(chosen), no_error("a compiled function of rts.Samples"):
             given = map_leaves(chosen.constant, samples)
             found = chosen.block(chosen.jit(f)(given))
@@ -251,7 +212,7 @@ class EngineConformance(Conformance):
         """Of nested parameters; zero where a parameter is not used."""
         chosen = _differentiating(engine)
         xp = chosen.namespace
-        tree = {"a": _numbers(3), "b": [_numbers(2, seed=1), _numbers(4, seed=2)]}
+        tree = {"a": numbers(3), "b": [numbers(2, seed=1), numbers(4, seed=2)]}
         with owning(chosen):
             value, gradient = chosen.value_and_grad(lambda t: xp.sum(t["a"] ** 2) + 3 * xp.sum(t["b"][0]))(
                 map_leaves(chosen.constant, tree)
@@ -265,7 +226,7 @@ class EngineConformance(Conformance):
     def test_forward_mode_can_be_differentiated(self, engine: Any) -> None:
         """`jvp` of x³ along d, and the gradient of that in a factor that the function closes over."""
         chosen = _differentiating(engine)
-        xp, x, d = chosen.namespace, _numbers(4), _numbers(4, seed=1)
+        xp, x, d = chosen.namespace, numbers(4), numbers(4, seed=1)
         at, along = chosen.constant(x), chosen.constant(d)
         with owning(chosen), no_error("the gradient of a derivative in forward mode"):
             value, slope = chosen.jvp(lambda v: v**3, at, along)
@@ -279,7 +240,7 @@ class EngineConformance(Conformance):
     def test_jacobians_have_a_row_an_unknown(self, engine: Any) -> None:
         """Of a function with two results."""
         chosen = _differentiating(engine)
-        xp, x = chosen.namespace, _numbers(3)
+        xp, x = chosen.namespace, numbers(3)
         with owning(chosen), no_error("jacobian"):
             values, rows = chosen.jacobian(lambda v: (v**2, xp.sum(v)))(chosen.constant(x))
             values, rows = derivatives.host(chosen, (values, rows))
@@ -290,31 +251,31 @@ class EngineConformance(Conformance):
     def test_stop_gradient_stops_it(self, engine: Any) -> None:
         """In both modes, and leaves the value."""
         chosen = _differentiating(engine)
-        xp, x = chosen.namespace, chosen.constant(_numbers(4))
+        xp, x = chosen.namespace, chosen.constant(numbers(4))
         f = lambda v: xp.sum(chosen.stop_gradient(v) * v)  # noqa: E731
         with owning(chosen):
             value, gradient = chosen.value_and_grad(f)(x)
             along = chosen.jvp(f, x, chosen.constant(np.ones(4)))[1]
-        claim_close(chosen.to_numpy(value), (_numbers(4) ** 2).sum(), TOLERANCE, "the value")
-        claim_close(chosen.to_numpy(gradient), _numbers(4), TOLERANCE, "the gradient of stop(x) x")
-        claim_close(chosen.to_numpy(along), _numbers(4).sum(), TOLERANCE, "its derivative in forward mode")
+        claim_close(chosen.to_numpy(value), (numbers(4) ** 2).sum(), TOLERANCE, "the value")
+        claim_close(chosen.to_numpy(gradient), numbers(4), TOLERANCE, "the gradient of stop(x) x")
+        claim_close(chosen.to_numpy(along), numbers(4).sum(), TOLERANCE, "its derivative in forward mode")
 
     def test_checkpoints_have_the_same_gradient(self, engine: Any) -> None:
         """`checkpoint(make, f)` is `f(make())`, for its gradient, too."""
         chosen = _differentiating(engine)
-        xp, x = chosen.namespace, chosen.constant(_numbers(4))
-        constant = chosen.constant(_numbers(4, seed=1))
+        xp, x = chosen.namespace, chosen.constant(numbers(4))
+        constant = chosen.constant(numbers(4, seed=1))
         f = lambda v: chosen.checkpoint(lambda: constant, lambda c: xp.sum(c * v**2))  # noqa: E731
         with owning(chosen), no_error("the gradient of a checkpoint"):
             value, gradient = chosen.value_and_grad(f)(x)
-        expected = _numbers(4, seed=1)
-        claim_close(chosen.to_numpy(value), (expected * _numbers(4) ** 2).sum(), TOLERANCE, "the value")
-        claim_close(chosen.to_numpy(gradient), 2 * expected * _numbers(4), TOLERANCE, "the gradient of a checkpoint")
+        expected = numbers(4, seed=1)
+        claim_close(chosen.to_numpy(value), (expected * numbers(4) ** 2).sum(), TOLERANCE, "the value")
+        claim_close(chosen.to_numpy(gradient), 2 * expected * numbers(4), TOLERANCE, "the gradient of a checkpoint")
 
     def test_optimizers_step(self, engine: Any) -> None:
         """SGD by the rate times the gradient, Adam first by the rate; both leave what they are given alone."""
         chosen = _differentiating(engine)
-        given = {"x": _numbers(3), "y": [_numbers(2, seed=1)]}
+        given = {"x": numbers(3), "y": [numbers(2, seed=1)]}
         slopes = map_leaves(lambda v: np.sign(v) * 2, given)
         with owning(chosen):
             for name, expected in (("sgd", lambda v: v - 0.2 * np.sign(v)), ("adam", lambda v: v - 0.1 * np.sign(v))):
@@ -340,7 +301,7 @@ class EngineConformance(Conformance):
             claim_close(found, expected, TOLERANCE, f"{name}{how}")
         if not chosen.differentiates:
             return
-        weights, along = _numbers(*expected.shape, seed=3), derivatives.directions(operands)
+        weights, along = numbers(*expected.shape, seed=3), derivatives.directions(operands)
         with owning(chosen), no_error(f"the derivatives of {name}"):
             both = derivatives.derivatives(chosen, lambda x: f(*x), operands, along, weights)
             curvature = _curvature(chosen, f, operands, along, weights)
@@ -375,7 +336,7 @@ class EngineConformance(Conformance):
             found = chosen.to_numpy(image([chosen.constant(v) for v in values]))
             claim_close(found, expected, 1e-4, "the image of a ball")
             if chosen.differentiates:
-                weights, along = _numbers(*expected.shape, seed=5), derivatives.directions(values)
+                weights, along = numbers(*expected.shape, seed=5), derivatives.directions(values)
                 both = derivatives.derivatives(chosen, image, values, along, weights)
                 derivatives.claim_consistent(both, along, weights, "the image of a ball")
                 claim(any(np.abs(g).max() > 1e-3 for g in both.gradient), "the image has no gradient in theta")
@@ -426,15 +387,3 @@ def _differentiating(engine: Any) -> Engine:
     if not chosen.differentiates:
         pytest.skip("the engine says that it does not differentiate")
     return chosen
-
-
-def _ids(like: Any) -> Any:
-    return engine_of(like).constant(IDS)
-
-
-def _index(like: Any) -> Any:
-    return engine_of(like).constant(IDS[:, 0])
-
-
-def _eye(xp: Any, like: Any) -> Any:
-    return engine_of(like).constant(np.eye(4), like)

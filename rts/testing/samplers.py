@@ -13,13 +13,14 @@ from rts.camera import Camera
 from rts.checks import check_sampler
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part, TriangleSurface
-from rts.pairs import APRON
 from rts.records import Sampled
 from rts.testing import derivatives, scenes
-from rts.testing.conformance import Conformance, claim, no_error, refusal
+from rts.testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing
+from rts.testing.claims import claim, no_error, refusal
+from rts.testing.compatibility import APRON
+from rts.testing.conformance import Conformance
 from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_or_skip, joined, split
-from rts.testing.samples import claim_empty_where_empty, claim_ordered, claim_reprojected
-from rts.testing.unusual import claim_awkward_views_are_finite, claim_unseen_is_nothing
+from rts.testing.sample_claims import claim_empty_where_empty, claim_ordered, claim_reprojected
 from rts.trees import leaves
 
 DEEPER = 4

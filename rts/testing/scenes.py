@@ -6,14 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from rts import pairs, registry
+from rts import registry
 from rts.camera import Camera
 from rts.checks import check_scene
 from rts.interfaces import Part
-from rts.pairs import APRON, CAPACITY, LAYERS, SIZE
 from rts.records import Sampled
 from rts.rendering import render, render_samples, sample
-from rts.testing.conformance import claim
+from rts.testing import compatibility
+from rts.testing.claims import claim
+from rts.testing.compatibility import APRON, CAPACITY, LAYERS, SIZE
 from rts.testing.derivatives import single
 from rts.trees import Array
 
@@ -29,7 +30,7 @@ def _look(eye: tuple, at: tuple = (0, 0, 0), up: tuple = (0, 1, 0), **options: A
     return _rounded(Camera.look_at(eye, at, up, fov_y=options.pop("fov_y", 45), aspect=SIZE[1] / SIZE[0], **options))
 
 
-CAMERA = _rounded(pairs.CAMERA)
+CAMERA = _rounded(compatibility.CAMERA)
 AWAY = _look((0, 0, 5), (0, 0, 9))
 BESIDE = _look((0, 0, 5), (40, 0, 5.5))
 NEAR = _look((0.9, 1.6, 3.2), near=3.4, far=4.2)

@@ -13,7 +13,8 @@ from rts.engines import Engine, constants, engine_of
 from rts.gbuffer import GBuffer
 from rts.interfaces import Shader
 from rts.testing import derivatives, scenes
-from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
+from rts.testing.claims import claim, claim_close, claim_finite, no_error, refusal
+from rts.testing.conformance import Conformance
 from rts.testing.derivatives import DIFFERENTIABLE, differentiating, names, split
 from rts.trees import Tree, map_leaves
 

@@ -13,7 +13,8 @@ from rts.checks import check_splatter
 from rts.interfaces import Splatter
 from rts.records import Splats
 from rts.testing import derivatives
-from rts.testing.conformance import Conformance, claim, claim_close, no_error, refusal
+from rts.testing.claims import claim, claim_close, no_error, refusal
+from rts.testing.conformance import Conformance
 from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating
 
 HEIGHT, WIDTH, LAYERS = 8, 9, 2

@@ -13,11 +13,12 @@ from rts.gbuffer import GBuffer
 from rts.interfaces import Part, RaySurface, TriangleSurface
 from rts.records import Proxy, Samples
 from rts.testing import derivatives, scenes
-from rts.testing.conformance import Conformance, claim, claim_close, claim_finite, no_error, refusal
+from rts.testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing
+from rts.testing.claims import claim, claim_close, claim_finite, no_error, refusal
+from rts.testing.conformance import Conformance
 from rts.testing.derivatives import DIFFERENTIABLE, claim_slope, differentiating, installed, joined, split
-from rts.testing.refining import claim_found_again, claim_found_from_behind, claim_refined
-from rts.testing.samples import claim_ordered, claim_reprojected
-from rts.testing.unusual import claim_awkward_views_are_finite, claim_unseen_is_nothing
+from rts.testing.refine_claims import claim_found_again, claim_found_from_behind, claim_refined
+from rts.testing.sample_claims import claim_ordered, claim_reprojected
 from rts.trees import Tree, map_leaves
 
 STEP = 1e-5

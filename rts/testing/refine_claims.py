@@ -11,8 +11,8 @@ from rts.interfaces import Part, RaySurface, TriangleSurface
 from rts.sampling.packing import lift
 from rts.sampling.settling import refined
 from rts.testing import derivatives
-from rts.testing.conformance import claim, claim_finite
-from rts.testing.samples import FEW, REPROJECTION, RESIDUAL
+from rts.testing.claims import claim, claim_finite
+from rts.testing.sample_claims import FEW, REPROJECTION, RESIDUAL
 from rts.testing.scenes import GRID, LAYERS
 from rts.trees import Tree, map_leaves
 

@@ -6,8 +6,8 @@ from analytic import Ellipsoid
 from typer.testing import CliRunner
 
 import rts
-from rts import pairs
 from rts.cli.main import app
+from rts.testing import compatibility as pairs
 
 
 class OwnEllipsoid(Ellipsoid):

@@ -6,9 +6,9 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.interfaces import Part
-from rts.pairs import APRON
 from rts.records import Sampled
-from rts.testing.conformance import claim
+from rts.testing.claims import claim
+from rts.testing.compatibility import APRON
 from rts.testing.scenes import GRID, SIZE
 
 REPROJECTION = 0.02
