@@ -187,7 +187,8 @@ def test_what_is_kept_does_not_change_with_the_array_it_was_made_of():
 
 
 def test_moved_vertices_are_followed_by_refitting_and_look_the_same_as_built_anew(monkeypatch):
-    from rts_backends import embree, embree_library
+    from rts_backends.embree import library as embree_library
+    from rts_backends.embree import sampler as embree
 
     rebuilt = []
     move = embree_library.Scene.move
@@ -284,7 +285,7 @@ def test_structures_go_with_their_surface(name):
 
 def test_scenes_of_embree_are_released_with_their_surface(monkeypatch):
     sampler = counting("embree")
-    from rts_backends import embree_library
+    from rts_backends.embree import library as embree_library
 
     released, release = [], embree_library._release
 

@@ -12,9 +12,9 @@ from helpers import DIFFERENTIABLE, arrays, gradient, to_numpy
 import rts
 from rts import splatting
 from rts.arrays import without_border
-from rts_backends import fused
-from rts_backends.fused_kernels import Cells, Settings, _reach
-from rts_backends.fused_survey import BUSY, EMPTY, FLAT
+from rts_backends.fused import splatters as fused
+from rts_backends.fused.cells import Cells, Settings, _reach
+from rts_backends.fused.survey import BUSY, EMPTY, FLAT
 
 torch = pytest.importorskip("torch")
 

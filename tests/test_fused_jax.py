@@ -12,12 +12,12 @@ import pytest
 from test_fused import KINDS, SETTINGS, cells, compiled, noise, specification
 
 import rts
-from rts_backends import jax_host
-from rts_backends.fused_kernels import Cells
+from rts_backends.fused.cells import Cells
+from rts_backends.jax_engine import host as jax_host
 
 jax = pytest.importorskip("jax")
 torch = pytest.importorskip("torch")
-jax_operations = pytest.importorskip("rts_backends.jax_operations")
+jax_operations = pytest.importorskip("rts_backends.jax_engine.operations")
 jnp = jax.numpy
 
 MODES = {"eager": lambda f: f, "jit": jax.jit}

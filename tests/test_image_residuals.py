@@ -14,8 +14,9 @@ from rts import splatting
 from rts.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
-from rts_backends import fused, fused_normal
-from rts_backends.fused_kernels import Cells, Settings
+from rts_backends.fused import normal_equations as fused_normal
+from rts_backends.fused import splatters as fused
+from rts_backends.fused.cells import Cells, Settings
 
 SIZE = (26, 31)
 CAMERA = rts.Camera.look_at((0.7, 0.9, 3.2), (0, 0, 0), fov_y=45, aspect=31 / 26)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 jax = pytest.importorskip("jax")
-jax_host = pytest.importorskip("rts_backends.jax_host")
+jax_host = pytest.importorskip("rts_backends.jax_engine.host")
 jnp = jax.numpy
 
 

@@ -12,8 +12,8 @@ from rts.operations.projection import PROJECTION, projective_map
 
 jax = pytest.importorskip("jax")
 test_fused_jax = pytest.importorskip("test_fused_jax")
-jax_host = pytest.importorskip("rts_backends.jax_host")
-jax_operations = pytest.importorskip("rts_backends.jax_operations")
+jax_host = pytest.importorskip("rts_backends.jax_engine.host")
+jax_operations = pytest.importorskip("rts_backends.jax_engine.operations")
 jnp = jax.numpy
 MODES, close, x64 = test_fused_jax.MODES, test_fused_jax.close, test_fused_jax.x64
 

@@ -305,7 +305,7 @@ class Failing:
 
 def test_targets_half_made_are_released_and_the_error_is_ours():
     sampler = opengl_sampler()
-    from rts_backends.opengl import _targets
+    from rts_backends.opengl.sampler import _targets
 
     expected, kept = render(sampler), []
 
@@ -326,7 +326,8 @@ def test_targets_half_made_are_released_and_the_error_is_ours():
 def public(monkeypatch):
     """The sampler embree where the library cannot be found."""
     pytest.importorskip("embreex")
-    from rts_backends import embree_library, embree_public
+    from rts_backends.embree import library as embree_library
+    from rts_backends.embree import public as embree_public
 
     monkeypatch.setattr(embree_library, "find", lambda: None)
     monkeypatch.setattr(embree_library, "_library", None)

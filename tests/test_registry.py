@@ -83,14 +83,14 @@ def test_built_in_plugins_are_registered_and_listed_in_order(group, names):
 
 
 def test_a_name_gives_what_its_entry_point_names():
-    from rts_backends.fused import Multi
+    from rts_backends.fused.splatters import Multi
 
     assert rts.plugin("rts.splatters", "multi") is Multi
     assert rts.plugin("splatters", "multi") is Multi
 
 
 def test_a_name_or_a_class_gives_one_shared_instance_an_object_itself():
-    from rts_backends.fused import Multi
+    from rts_backends.fused.splatters import Multi
 
     shared = registry.instance("rts.splatters", "multi")
     assert isinstance(shared, Multi) and registry.instance("rts.splatters", "multi") is shared

@@ -301,7 +301,7 @@ class Counted:
 
 def test_a_thousand_renders_leave_no_opengl_object_behind(monkeypatch):
     made("opengl")
-    from rts_backends import opengl_worker
+    from rts_backends.opengl import worker as opengl_worker
 
     create, contexts = opengl_worker._create, []
 

@@ -16,7 +16,7 @@ from rts.errors import RtsError
 from rts.operations.operation import Operation
 from rts.records import ArraySpec
 from rts.trees import STATIC_FIELDS, Tree, join_record, split_record
-from rts_backends import jax_host, jax_operations
+from rts_backends.jax_engine import host, operations
 
 for _cls in STATIC_FIELDS:
     jax.tree_util.register_pytree_node(
@@ -81,7 +81,7 @@ class JaxEngine(Engine):
             return [*found, np.int32(max((len(found[i]) for i in packed), default=0))]
 
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
-        *results, used = jax_host.call(noticed, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args)
+        *results, used = host.call(noticed, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args)
         for i in packed:
             self._note(results[i], used)
         return tuple(results)
@@ -126,10 +126,10 @@ class JaxEngine(Engine):
 
     def apply(self, operation: Operation, operands: Sequence[jax.Array], params: Mapping[str, Any]) -> jax.Array:
         """By compiled code, on CPUs, of floats of one dtype, float32 or float64."""
-        if not jax_operations.fits(operation, operands):
+        if not operations.fits(operation, operands):
             return operation.specification(*operands, **params)
         used = self._used_of([operands[i] for i in operation.packed])
-        result = jax_operations.apply(operation, operands, params, used)
+        result = operations.apply(operation, operands, params, used)
         return self._note(result, used) if operation.packed_result else result
 
     def padded(self, x: jax.Array) -> bool:

@@ -15,7 +15,7 @@ from rts.engines import engine_of
 from rts.operations.operation import Arrays, Operation, Some
 from rts.records import Splats
 from rts.trees import Array
-from rts_backends.fused_kernels import Cells, Choices, Settings
+from rts_backends.fused.cells import Cells, Choices, Settings
 
 
 class _Fused(splatting.Kernel):
@@ -52,18 +52,18 @@ class _Fused(splatting.Kernel):
         """See `rts.Splatter`."""
         if type(self).image is not _Fused.image:
             return None
-        from rts_backends import fused_normal
+        from rts_backends.fused import normal_equations
 
         given = splats.positions, splats.rgba, splats.row, t_positions, t_rgba, target, weights, background
-        return fused_normal.equations(self._settings(splats.border), engine_of(given), *given)
+        return normal_equations.equations(self._settings(splats.border), engine_of(given), *given)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`."""
         if self.kind == "single" or depth.dtype not in (np.float32, np.float64):
             return super().needed(covered, depth)
-        from rts_backends import fused_pruning
+        from rts_backends.fused import pruning
 
-        return fused_pruning.needed(covered, depth, self.kind == "visible", self.epsilon)
+        return pruning.needed(covered, depth, self.kind == "visible", self.epsilon)
 
 
 class Single(_Fused, splatting.Single):

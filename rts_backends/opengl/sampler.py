@@ -21,7 +21,7 @@ from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel
 from rts_backends.neighbours import corner_lists, places, settle
-from rts_backends.opengl_worker import LESS, Worker
+from rts_backends.opengl.worker import LESS, Worker
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
 TARGETS = 4

@@ -1,10 +1,10 @@
-"""The splatters where layers of different surfaces meet, target by target, by the lists of `fused_choices`."""
+"""The splatters where layers of different surfaces meet, target by target, by the lists of `choices.py`."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from rts_backends.fused_rows import compiled, exp, kernel
+from rts_backends.fused.rows import compiled, exp, kernel
 
 
 @compiled

@@ -1,8 +1,8 @@
 """The splatters of `rts.splatting` and their first derivatives as compiled loops on all cores, NumPy in and out.
 
 Every target collects from its nine sources, and in the reverse direction every source from its nine targets, each in
-one fixed order: results do not depend on the number of threads. Most targets are plain (`fused_stencil`); what is
-decided for the others, the mixed ones (`fused_mixed`), is decided once and kept in `Cells`.
+one fixed order: results do not depend on the number of threads. Most targets are plain (`stencil.py`); what is
+decided for the others, the mixed ones (`mixed.py`), is decided once and kept in `Cells`.
 """
 
 from __future__ import annotations
@@ -18,10 +18,9 @@ from rts.splatting.kernel import LEAST_EPSILON
 from rts.splatting.layers import OFFSETS
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only
-from rts_backends import fused_choices as choosing
-from rts_backends import fused_mixed as mixed
-from rts_backends import fused_stencil as stencil
-from rts_backends.fused_survey import BLOCK, survey
+from rts_backends.fused import choices as choosing
+from rts_backends.fused import mixed, stencil
+from rts_backends.fused.survey import BLOCK, survey
 
 
 class Settings(NamedTuple):
@@ -52,7 +51,7 @@ class Choices(NamedTuple):
         ranges: (M, 9, 3, 2), first and last + 1 of the layers that each source gives to each buffer; source 3 (v + 1) +
             (u + 1) lies at −(u, v), and the buffers are in front, at the surface, behind.
         sums: (M, 3, 5), of each buffer the colours over the weight, taken as at least one, and the weight.
-        states: (H, W) uint8, of the other targets (`fused_survey`); such are EMPTY in it.
+        states: (H, W) uint8, of the other targets (`survey.py`); such are EMPTY in it.
         repeated: whether a sample stands in several cells, which would add to its gradient at the same time.
     """
 

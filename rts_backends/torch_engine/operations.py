@@ -16,7 +16,7 @@ from torch import Tensor
 
 from rts.operations.operation import Operation
 from rts.threads import read_only
-from rts_backends.torch_functions import along, applied, foreign, on_host
+from rts_backends.torch_engine.functions import along, applied, foreign, on_host
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
 _INTEGERS = {torch.int32, torch.int64, torch.int16, torch.int8, torch.uint8, torch.bool}

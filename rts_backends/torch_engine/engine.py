@@ -15,8 +15,8 @@ from rts.engines import Engine
 from rts.operations.operation import Operation
 from rts.records import ArraySpec
 from rts.trees import STATIC_FIELDS, Tree, join_record, leaves, map_leaves, split_record
-from rts_backends import torch_operations
-from rts_backends.torch_functions import applied, transformed
+from rts_backends.torch_engine import operations
+from rts_backends.torch_engine.functions import applied, transformed
 
 for _cls in STATIC_FIELDS:
     _pytree.register_pytree_node(
@@ -114,7 +114,7 @@ class TorchEngine(Engine):
 
     def apply(self, operation: Operation, operands: Sequence[torch.Tensor], params: Mapping[str, Any]) -> torch.Tensor:
         """By compiled code, of tensors in the memory of the host whose floats are of one dtype, single or double."""
-        return torch_operations.apply(operation, operands, params)
+        return operations.apply(operation, operands, params)
 
     def on_host(self, *arrays: torch.Tensor) -> bool:
         """Whether all are in the memory of the host."""

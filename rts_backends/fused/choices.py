@@ -11,8 +11,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from rts_backends.fused_mixed import sums_of
-from rts_backends.fused_survey import BLOCK, BUSY, EMPTY
+from rts_backends.fused.mixed import sums_of
+from rts_backends.fused.survey import BLOCK, BUSY, EMPTY
 
 compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
@@ -46,7 +46,7 @@ def find(start, stop, positions, row, visible, everywhere, beyond, hidden, state
         everywhere: whether to look at all blocks, not only where `hidden` and `states` allow for mixed targets.
         beyond: depth of layers that are not covered.
         hidden: (H, B) uint8, the blocks of columns in or beside which hidden layers are covered.
-        states: (H, W) of `fused_survey`.
+        states: (H, W) of `survey.py`.
         mixed: (H, W) uint8, to be filled.
         counts: (H,) zeros, to be filled.
     """
@@ -135,7 +135,7 @@ def choose(
     sums,
     states,
 ):
-    """List each row's mixed targets: the arrays of `fused_kernels.Choices` from `columns` to `sums`."""
+    """List each row's mixed targets: the arrays of `rts_backends.fused.cells.Choices` from `columns` to `sums`."""
     layers, height, width = row.shape
     z, target = np.empty((layers, 9), positions.dtype), np.empty(layers, positions.dtype)
     shift = np.empty(9, np.int64)

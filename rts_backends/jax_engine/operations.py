@@ -30,8 +30,8 @@ from jaxlib.mlir.dialects import stablehlo as hlo
 
 from rts.operations.operation import Arrays, Operation
 from rts.threads import read_only
-from rts_backends import jax_host
-from rts_backends.jax_host import clear
+from rts_backends.jax_engine import host
+from rts_backends.jax_engine.host import clear
 
 Wanted = tuple[bool, ...]
 """Which of the differentiable operands have a tangent or want a gradient."""
@@ -382,7 +382,7 @@ class _Operation:
 
         def call(*given: jax.Array) -> list[jax.Array]:
             name = f"{self.name} {sorted(params.items())}"
-            return jax_host.call_named(name, lambda i, o: self._on_host(i, o, params), shapes, *given)
+            return host.call_named(name, lambda i, o: self._on_host(i, o, params), shapes, *given)
 
         return mlir.lower_fun(call, multiple_results=True)(ctx.replace(avals_in=avals), *operands)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts_backends.fused_rows import (
+from rts_backends.fused.rows import (
     ONE,
     PITCH,
     RX,
@@ -25,7 +25,7 @@ from rts_backends.fused_rows import (
     store,
     tile,
 )
-from rts_backends.fused_survey import BUSY, FLAT
+from rts_backends.fused.survey import BUSY, FLAT
 
 COLORS, ALPHA = (0,) * 5, (0,) * 2
 """The planes of a tangent that count, as tuples whose length compiled code knows: all five, or alpha and the weight."""

@@ -1,7 +1,7 @@
 """Normal equations of the difference between a splatted image and a target, without its Jacobian.
 
-A sweep goes over bands of rows: the derivatives of a row of a tile along all unknowns are made as in `fused_stencil`
-and `fused_mixed`, multiplied with one another and with the residuals, and forgotten. Bands have a fixed height and are
+A sweep goes over bands of rows: the derivatives of a row of a tile along all unknowns are made as in `stencil.py`
+and `mixed.py`, multiplied with one another and with the residuals, and forgotten. Bands have a fixed height and are
 added in their order, so results do not depend on the number of threads.
 """
 
@@ -16,9 +16,9 @@ from rts.engines import Engine
 from rts.records import ArraySpec
 from rts.threads import parallel, read_only
 from rts.trees import Array
-from rts_backends.fused_kernels import Cells, Settings
-from rts_backends.fused_mixed import changes_of
-from rts_backends.fused_rows import (
+from rts_backends.fused.cells import Cells, Settings
+from rts_backends.fused.mixed import changes_of
+from rts_backends.fused.rows import (
     PITCH,
     SOURCE,
     SUM,
@@ -33,8 +33,8 @@ from rts_backends.fused_rows import (
     slot,
     tile,
 )
-from rts_backends.fused_stencil import ALPHA, COLORS, TANGENT, add_tangent_row, load_around, load_tangent, tangent_row
-from rts_backends.fused_survey import BUSY, FLAT
+from rts_backends.fused.stencil import ALPHA, COLORS, TANGENT, add_tangent_row, load_around, load_tangent, tangent_row
+from rts_backends.fused.survey import BUSY, FLAT
 
 BAND = 16
 """Rows of the image whose products are added up together."""

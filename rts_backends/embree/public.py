@@ -26,7 +26,7 @@ REACH = 1.01
 
 
 class Scene:
-    """Stands in for `rts_backends.embree_library.Scene`.
+    """Stands in for `rts_backends.embree.library.Scene`.
 
     Args:
         vertices: (V + 1, 3) float32 within the unit sphere; the last row is padding.

@@ -21,7 +21,7 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
-from rts_backends.fused_survey import FLAT
+from rts_backends.fused.survey import FLAT
 
 TILE = 32
 PITCH = TILE + 8

@@ -12,8 +12,8 @@ from rts.camera import Camera
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel
-from rts_backends import embree_library, embree_public
-from rts_backends.embree_kernels import TILE, cast, keep_nearest_address
+from rts_backends.embree import library, public
+from rts_backends.embree.kernels import TILE, cast, keep_nearest_address
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
 REFITS = 32
@@ -27,8 +27,8 @@ class Structure:
         self.proxy = _packed(proxy)
         self._unit = np.zeros((len(proxy.vertices) + 1, 3), np.float32)
         self._place()
-        library = embree_library if embree_library.load() else embree_public
-        self.scene = library.Scene(self._unit, self.proxy.faces)
+        embree = library if library.load() else public
+        self.scene = embree.Scene(self._unit, self.proxy.faces)
         self.refits = 0
 
     def _place(self) -> None:
@@ -62,7 +62,7 @@ class Embree(TriangleSampler):
     ) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         scene, planes = prepared.scene, _planes(camera.projection)
-        if isinstance(scene, embree_public.Scene):
+        if isinstance(scene, public.Scene):
             return scene.cast(prepared.proxy, prepared.sphere, planes, camera, size, layers, cull)
         height, width = size
         fragments = Fragments(

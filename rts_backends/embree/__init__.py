@@ -1,0 +1,1 @@
+"""The sampler that casts rays by Embree."""

@@ -1,0 +1,1 @@
+"""The splatters of `rts.splatting`, compiled for the CPU."""

@@ -1,0 +1,1 @@
+"""The sampler that peels depths by OpenGL."""
