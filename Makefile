@@ -1,18 +1,22 @@
-# Two commands do all the set-up: `make demo` and `make test`.
+# `make demo` and `make test` set up all they need. `make check` does all that continuous integration does.
 
 PYTHON ?= python3
 VENV ?= .venv
+OLDEST ?= .venv-oldest
 BIN := $(VENV)/bin
 # Each takes up to 5 GB, most of it compiled jax programs.
 WORKERS ?= 2
 INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constraints.txt
 SOURCES := pyproject.toml constraints.txt
+EXAMPLE := tests/plugin_example
 
 # What tests need of the system, by Debian's names; installed where this is root or may use sudo.
 SYSTEM_PACKAGES := python3-venv libegl1 libgl1-mesa-dri
 SUDO := $(shell if [ "$$(id -u)" = 0 ]; then echo env; elif sudo -n true 2>/dev/null; then echo sudo; fi)
 
-.PHONY: demo test lint clean system
+.PHONY: check demo test lint types wheel oldest clean system
+
+check: lint types test wheel oldest
 
 demo: $(VENV)/.demo
 	$(BIN)/rts demo -o out
@@ -20,9 +24,23 @@ demo: $(VENV)/.demo
 test: system $(VENV)/.test
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
-lint: $(VENV)/.test
+# Ruff: rules and format of Python, in Markdown too.
+lint: $(VENV)/.dev
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+types: $(VENV)/.test $(VENV)/.dev
+	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright --pythonpath $(BIN)/python
+
+# Build both distributions; then, elsewhere and from the wheel alone, the demo and the tests of the example plugin.
+wheel: $(VENV)/.dev
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	PYTHON=$(PYTHON) tests/wheel.sh dist $(EXAMPLE) constraints.txt
+
+# The oldest versions that pyproject.toml allows, and the tests that would notice.
+oldest: system $(OLDEST)/.installed
+	NUMBA_CACHE_DIR=$(CURDIR)/$(OLDEST)/numba $(OLDEST)/bin/python -m pytest -n $(WORKERS) --dist loadfile -p no:cacheprovider -m oldest
 
 system:
 	@missing=$$(for p in $(SYSTEM_PACKAGES); do dpkg -s $$p >/dev/null 2>&1 || echo $$p; done); \
@@ -35,18 +53,28 @@ system:
 		echo "not root and no sudo: tests that need these Debian packages are skipped: $$missing"; \
 	fi
 
-$(BIN)/python:
+%/bin/python:
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || $(MAKE) system
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(PYTHON) -m venv $*
+	$@ -m pip install --quiet --upgrade pip
 
 $(VENV)/.demo: $(BIN)/python $(SOURCES)
 	$(INSTALL) -e '.[torch,plots]'
 	@touch $@
 
-$(VENV)/.test: $(BIN)/python $(SOURCES) tests/plugin_example/pyproject.toml
-	$(INSTALL) -e '.[all,test]' -e ./tests/plugin_example
+$(VENV)/.test: $(BIN)/python $(SOURCES) $(EXAMPLE)/pyproject.toml
+	$(INSTALL) -e '.[all,test]' -e ./$(EXAMPLE)
 	@touch $@ $(VENV)/.demo
 
+$(VENV)/.dev: $(BIN)/python $(SOURCES)
+	$(INSTALL) --group dev
+	@touch $@
+
+$(OLDEST)/.installed: $(OLDEST)/bin/python pyproject.toml constraints-oldest.txt $(EXAMPLE)/pyproject.toml
+	PYTHONWARNINGS=ignore $(OLDEST)/bin/python -m pip install --quiet -c constraints-oldest.txt -e '.[all,test]' -e ./$(EXAMPLE)
+	@touch $@
+
+.PRECIOUS: %/bin/python
+
 clean:
-	rm -rf $(VENV) out build *.egg-info
+	rm -rf $(VENV) $(OLDEST) out build dist *.egg-info $(EXAMPLE)/*.egg-info

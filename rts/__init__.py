@@ -27,6 +27,8 @@ from rts.sampling.prepared import prepare
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.splatting import exact_calibration
 
+__version__ = "0.1.0"
+
 __all__ = [
     "ArraySpec",
     "Camera",

@@ -517,12 +517,12 @@ def test_without_embree_raster_serves_and_the_reason_says_so(few, monkeypatch):
 
     def missing(group, name):
         if name == "embree":
-            raise PluginError("the sampler 'embree' needs the package 'embreex': pip install 'rts[embree]'")
+            raise PluginError("the sampler 'embree' needs the package 'embreex': pip install 'rasterize-then-splat[embree]'")
         return plugin(group, name)
 
     monkeypatch.setattr(registry, "plugin", missing)
     (choice,) = rts.explain(part_of(*icosphere(1)), differentiable_camera())
-    assert choice.sampler == "raster" and "pip install 'rts[embree]'" in choice.reason
+    assert choice.sampler == "raster" and "pip install 'rasterize-then-splat[embree]'" in choice.reason
     handle = rts.prepare(part_of(*icosphere(1)))
     assert type(handle.samplers[0]).__name__ == "Raster"
 

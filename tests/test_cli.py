@@ -270,7 +270,7 @@ def test_fit_pose_says_which_extra_draws_the_plot(model, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     succeed("render", model, "-o", tmp_path / "t.png", "--size", 32)
     output = succeed("fit-pose", model, tmp_path / "t.png", "-o", tmp_path / "o", "--steps", 1)
-    assert "pip install 'rts[plots]'" in output
+    assert "pip install 'rasterize-then-splat[plots]'" in output
     assert not (tmp_path / "o" / "convergence.png").exists()
 
 
@@ -311,7 +311,7 @@ def test_shrinking_is_a_box_filter():
 
 def test_without_torch_and_jax_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(PluginError, match=r"pip install 'rts\[torch\]'"):
+    with pytest.raises(PluginError, match=r"pip install 'rasterize-then-splat\[torch\]'"):
         pose.available_engine()
 
 

@@ -896,4 +896,4 @@ def test_the_kit_is_loaded_by_nothing_but_its_own_import():
     code = f"import sys, rts, rts.cli.main; print([m for m in sys.modules if m.startswith({names})])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
-    assert not [e for e in entry_points(group="pytest11") if e.dist and e.dist.name == "rts"]
+    assert not [e for e in entry_points(group="pytest11") if e.dist and e.dist.name == "rasterize-then-splat"]

@@ -92,25 +92,25 @@ def test_without_embreex_the_rest_works_and_auto_passes_embree_by():
         torch=True,
     )
     first, second = printed.splitlines()
-    assert first.startswith("PluginError:") and "'embreex'" in first and "pip install 'rts[embree]'" in first
-    assert second.startswith("raster since") and "pip install 'rts[embree]'" in second
+    assert first.startswith("PluginError:") and "'embreex'" in first and "pip install 'rasterize-then-splat[embree]'" in first
+    assert second.startswith("raster since") and "pip install 'rasterize-then-splat[embree]'" in second
 
 
 def test_without_moderngl_the_rest_works():
     printed = without("moderngl", "error(lambda: rts.render(part, camera, size, sampler='opengl'))")
-    assert "'moderngl'" in printed and "pip install 'rts[opengl]'" in printed
+    assert "'moderngl'" in printed and "pip install 'rasterize-then-splat[opengl]'" in printed
 
 
 def test_without_torch_numpy_and_jax_work():
     pytest.importorskip("jax")
     printed = without("torch", "error(lambda: rts.plugin('engines', 'torch'))", jax=True)
-    assert "'torch'" in printed and "pip install 'rts[torch]'" in printed
+    assert "'torch'" in printed and "pip install 'rasterize-then-splat[torch]'" in printed
 
 
 def test_without_jax_numpy_and_torch_work():
     pytest.importorskip("torch")
     printed = without("jax", "error(lambda: rts.plugin('engines', 'jax'))", torch=True)
-    assert "'jax'" in printed and "pip install 'rts[jax]'" in printed
+    assert "'jax'" in printed and "pip install 'rasterize-then-splat[jax]'" in printed
 
 
 def test_without_optax_jax_renders():
@@ -128,12 +128,12 @@ def test_without_matplotlib_all_works_but_the_plot_which_says_what_it_needs():
         main._say_skipped_plot([])
         """,
     )
-    assert "pip install 'rts[plots]'" in " ".join(printed.split())
+    assert "pip install 'rasterize-then-splat[plots]'" in " ".join(printed.split())
 
 
 @pytest.mark.parametrize(
     "package, plugin",
-    [("embreex", "rts[embree]"), ("jax", "rts[jax]")],
+    [("embreex", "rasterize-then-splat[embree]"), ("jax", "rasterize-then-splat[jax]")],
 )
 def test_the_table_of_plugins_says_what_is_missing_and_lists_the_others(package, plugin):
     printed = without(

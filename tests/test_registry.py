@@ -131,7 +131,7 @@ def test_a_survey_names_the_distribution_and_why_a_plugin_does_not_load(install)
     lines = {info.name: info for info in registry.survey() if info.group == "rts.splatters"}
     assert lines["good"].error is None and lines["good"].distribution == "mixed 3.4"
     assert "no display" in lines["bad"].error
-    assert lines["multi"].error is None and lines["multi"].distribution.startswith("rts ")
+    assert lines["multi"].error is None and lines["multi"].distribution.startswith("rasterize-then-splat ")
 
 
 # ------------------------------------------------------------------------------------------ what is loaded
@@ -264,7 +264,7 @@ def test_an_engine_whose_framework_is_absent_names_our_extra(name, package):
         f"except rts.PluginError as error:\n    print(error)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert f"needs the package '{package}': pip install 'rts[{name}]'" in done.stdout
+    assert f"needs the package '{package}': pip install 'rasterize-then-splat[{name}]'" in done.stdout
 
 
 @pytest.mark.parametrize(

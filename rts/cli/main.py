@@ -6,7 +6,6 @@ import contextlib
 import os
 import time
 from collections.abc import Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,7 +15,7 @@ from rich.console import Console
 from rich.markup import escape
 from typer.core import TyperGroup
 
-from rts import registry
+from rts import __version__, registry
 from rts.errors import RtsError
 from rts.interfaces import Part
 from rts.trees import map_leaves
@@ -150,7 +149,7 @@ Debug = Annotated[bool, typer.Option("--debug", help="Show the traceback of an e
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"rts {version('rts')}")
+        typer.echo(f"rts {__version__}")
         raise typer.Exit
 
 
@@ -306,4 +305,4 @@ def demo(
 
 def _say_skipped_plot(files: list[Path]) -> None:
     if not any(f.name == "convergence.png" for f in files):
-        _say("no convergence.png, which needs matplotlib: pip install 'rts\\[plots]'")
+        _say("no convergence.png, which needs matplotlib: pip install 'rasterize-then-splat\\[plots]'")

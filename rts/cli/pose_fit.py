@@ -61,7 +61,7 @@ def available_engine() -> str:
     for name in (*preferred, *others):
         if importlib.util.find_spec(name) is not None and engine_named(name).differentiates:
             return name
-    raise PluginError("fitting needs torch or jax: pip install 'rts[torch]' (or 'rts[jax]')")
+    raise PluginError("fitting needs torch or jax: pip install 'rasterize-then-splat[torch]' (or '…[jax]')")
 
 
 def silhouette_of(image: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ from jax.interpreters import batching, mlir, partial_eval
 
 TARGET = "rts_host_call"
 
-HostFunction = Callable[..., Sequence[np.ndarray]]
+HostFunction = Callable[..., Sequence[np.ndarray | np.generic]]
 """NumPy arrays in, which are read-only and lent for the length of the call, and NumPy arrays out."""
 
 Filler = Callable[[Sequence[np.ndarray], Sequence[np.ndarray]], None]
@@ -146,7 +146,7 @@ mlir.register_lowering(_call, mlir.lower_fun(_copying_some, multiple_results=Tru
 mlir.register_lowering(_call, _in_place, platform="cpu")
 
 
-def fill(out: np.ndarray, value: np.ndarray) -> None:
+def fill(out: np.ndarray, value: np.ndarray | np.generic) -> None:
     """Copy, and zeros to where the value is short."""
     value = np.asarray(value)
     if value.shape != out.shape:
@@ -280,10 +280,13 @@ def _handle(address: int) -> int | None:
 
 
 def _tell_version(frame: Any, metadata: Any) -> None:
-    """Answer XLA's question which version of the interface this is, and look at what its own is."""
+    """Answer XLA's question which version of the interface this is, and look at what its own is.
+
+    Before jaxlib 0.9 XLA does not say what its own is; it takes no version but its own, then.
+    """
     if frame.size_of < ctypes.sizeof(_Frame) or metadata.size_of < ctypes.sizeof(_Metadata):
         raise RuntimeError("the structures of XLA's interface are smaller than expected")
-    _versions[:] = [frame.api.contents.version.major]
+    _versions[:] = [frame.api.contents.version.major if frame.api else MAJOR]
     metadata.version.major, metadata.version.minor = MAJOR, MINOR
 
 

@@ -1,0 +1,29 @@
+#!/usr/bin/env bash
+# Whether the wheel works by itself: installed into an empty environment, away from the sources, the demo runs, and the
+# tests of the example plugin pass.
+#
+#     tests/wheel.sh <folder of the wheel> <folder of the example plugin> <constraints>
+set -euo pipefail
+dist=$(realpath "$1") example=$(realpath "$2") constraints=$(realpath "$3")
+folder=$(mktemp -d)
+trap 'rm -rf "$folder"' EXIT
+cd "$folder"
+"${PYTHON:-python3}" -m venv venv
+export PYTHONWARNINGS=ignore
+wheel=$(ls "$dist"/rasterize_then_splat-*.whl)
+cp -r "$example" plugin
+venv/bin/python -m pip install --quiet --upgrade pip
+venv/bin/python -m pip install --quiet -c "$constraints" "$wheel[torch,plots]" "./plugin[test]"
+unset PYTHONWARNINGS
+venv/bin/python - <<'PYTHON'
+import pathlib
+import rts
+
+assert "site-packages" in rts.__file__, rts.__file__
+print(f"rts {rts.__version__} from {pathlib.Path(rts.__file__).parent.name} of the wheel")
+PYTHON
+venv/bin/rts demo -o out
+test -s out/summary.md && test -s out/after.png
+venv/bin/rts plugins
+cd plugin
+../venv/bin/python -m pytest -q -p no:cacheprovider tests
