@@ -14,6 +14,8 @@ from rts import Camera, GBuffer, InputError, Part, PluginError, Proxy, TriangleS
 from rts.sampling import cache
 from rts.sampling.cache import KEPT, fingerprint
 
+pytestmark = pytest.mark.sampling
+
 CAMERA = Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=50, aspect=1.25)
 SIZE = (16, 20)
 Mesh = rts.plugin("surfaces", "mesh")
@@ -517,7 +519,9 @@ def test_without_embree_raster_serves_and_the_reason_says_so(few, monkeypatch):
 
     def missing(group, name):
         if name == "embree":
-            raise PluginError("the sampler 'embree' needs the package 'embreex': pip install 'rasterize-then-splat[embree]'")
+            raise PluginError(
+                "the sampler 'embree' needs the package 'embreex': pip install 'rasterize-then-splat[embree]'"
+            )
         return plugin(group, name)
 
     monkeypatch.setattr(registry, "plugin", missing)

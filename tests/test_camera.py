@@ -7,6 +7,8 @@ from helpers import DIFFERENTIABLE, arrays, derivative, finite_difference, gradi
 from rts import Camera, InputError
 from rts.camera import look_at, orthographic, perspective
 
+pytestmark = pytest.mark.rendering
+
 SIZE = (40, 60)
 QUARTER_TURN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 SKEWED_K = np.array([[50.0, 2.0, 31.0], [0.0, 45.0, 22.0], [0.0, 0.0, 1.0]])

@@ -16,6 +16,8 @@ from rts.cli import pose_fit as pose
 from rts.cli.views import Bounds, bounds_of, orbit
 from rts.errors import InputError, PluginError
 
+pytestmark = pytest.mark.files
+
 
 def run(*arguments):
     return CliRunner().invoke(cli.app, [str(a) for a in arguments])

@@ -9,6 +9,8 @@ import rts
 from rts.cli.main import app
 from rts.testing import compatibility as pairs
 
+pytestmark = pytest.mark.plugins
+
 
 class OwnEllipsoid(Ellipsoid):
     """A surface without triangles, as none is registered."""

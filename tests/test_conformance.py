@@ -29,6 +29,8 @@ from rts.testing import (
 )
 from rts.testing import compatibility as pairs
 
+pytestmark = pytest.mark.plugins
+
 Raster = rts.plugin("samplers", "raster")
 RASTER = Raster()
 Mesh = rts.plugin("surfaces", "mesh")

@@ -22,6 +22,8 @@ import rts
 from rts import Camera, Part
 from rts.trees import leaves, map_leaves
 
+pytestmark = pytest.mark.engines
+
 Mesh = rts.plugin("surfaces", "mesh")
 SIZE = (24, 32)
 VERTICES, FACES = icosphere(1)

@@ -12,6 +12,8 @@ from rts.cli.views import bounds_of, orbit
 from rts.errors import EngineError, InputError, PluginError
 from rts.files.srgb import decode_srgb, encode_srgb
 
+pytestmark = pytest.mark.files
+
 QUAD = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
 QUAD_UV = "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
 RED, GREEN, BLUE, WHITE = (255, 0, 0), (0, 255, 0), (0, 0, 255), (255, 255, 255)

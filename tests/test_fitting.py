@@ -9,6 +9,8 @@ import rts
 from rts.errors import EngineError, InputError, PluginError
 from rts.fitting.least_squares import LARGEST_DAMPING, _damped_step
 
+pytestmark = pytest.mark.fitting
+
 targets = pytest.mark.parametrize("target", DIFFERENTIABLE)
 
 MATRIX = np.random.default_rng(5).normal(size=(9, 3))

@@ -16,6 +16,8 @@ from rts_backends.fused import splatters as fused
 from rts_backends.fused.cells import Cells, Settings, _reach
 from rts_backends.fused.survey import BUSY, EMPTY, FLAT
 
+pytestmark = pytest.mark.splatting
+
 torch = pytest.importorskip("torch")
 
 KINDS = {"single": fused.Single, "multi": fused.Multi, "visible": fused.Visible}

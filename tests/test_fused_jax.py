@@ -15,6 +15,8 @@ import rts
 from rts_backends.fused.cells import Cells
 from rts_backends.jax_engine import host as jax_host
 
+pytestmark = pytest.mark.splatting
+
 jax = pytest.importorskip("jax")
 torch = pytest.importorskip("torch")
 jax_operations = pytest.importorskip("rts_backends.jax_engine.operations")

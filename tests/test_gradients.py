@@ -7,6 +7,8 @@ from helpers import DIFFERENTIABLE, arrays, quad
 import rts
 from rts.diagnostics import gradients
 
+pytestmark = pytest.mark.rendering
+
 MESH = rts.plugin("rts.surfaces", "mesh")
 CAMERA = rts.Camera.orthographic((0, 0, 10), (0, 0, 0), height=16)
 SIZE = (16, 16)

@@ -18,6 +18,8 @@ from rts_backends.fused import normal_equations as fused_normal
 from rts_backends.fused import splatters as fused
 from rts_backends.fused.cells import Cells, Settings
 
+pytestmark = pytest.mark.fitting
+
 SIZE = (26, 31)
 CAMERA = rts.Camera.look_at((0.7, 0.9, 3.2), (0, 0, 0), fov_y=45, aspect=31 / 26)
 KINDS = ("single", "multi", "visible")

@@ -15,6 +15,8 @@ from rts.adapting import adapted, unwrapped
 from rts.interfaces import Shader, as_surface
 from rts.testing import SplatterConformance
 
+pytestmark = pytest.mark.core
+
 MESH = rts.plugin("surfaces", "mesh")
 RASTER = rts.plugin("samplers", "raster")
 BALL = {"center": np.zeros(3, np.float32), "radii": np.full(3, 0.8, np.float32)}

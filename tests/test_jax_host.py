@@ -6,6 +6,8 @@ import weakref
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.engines
+
 jax = pytest.importorskip("jax")
 jax_host = pytest.importorskip("rts_backends.jax_engine.host")
 jnp = jax.numpy

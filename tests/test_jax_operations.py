@@ -10,6 +10,8 @@ import rts
 from rts.operations.combine import COMBINE, interpolate
 from rts.operations.projection import PROJECTION, projective_map
 
+pytestmark = pytest.mark.engines
+
 jax = pytest.importorskip("jax")
 test_fused_jax = pytest.importorskip("test_fused_jax")
 jax_host = pytest.importorskip("rts_backends.jax_engine.host")

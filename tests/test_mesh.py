@@ -20,6 +20,8 @@ from helpers import (
 import rts
 from rts import GBuffer, Part
 
+pytestmark = pytest.mark.rendering
+
 Mesh = rts.plugin("surfaces", "mesh")
 
 

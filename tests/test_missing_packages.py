@@ -14,6 +14,8 @@ from test_samplers import interior
 import rts
 from rts import Camera, InputError, Part, PluginError, Proxy
 
+pytestmark = pytest.mark.core
+
 SIZE = (96, 120)
 Mesh = rts.plugin("surfaces", "mesh")
 
@@ -92,7 +94,11 @@ def test_without_embreex_the_rest_works_and_auto_passes_embree_by():
         torch=True,
     )
     first, second = printed.splitlines()
-    assert first.startswith("PluginError:") and "'embreex'" in first and "pip install 'rasterize-then-splat[embree]'" in first
+    assert (
+        first.startswith("PluginError:")
+        and "'embreex'" in first
+        and "pip install 'rasterize-then-splat[embree]'" in first
+    )
     assert second.startswith("raster since") and "pip install 'rasterize-then-splat[embree]'" in second
 
 

@@ -10,6 +10,8 @@ from rts.operations.linear import affine_map, matmul
 from rts.operations.projection import projective_map
 from rts.operations.take import take
 
+pytestmark = pytest.mark.engines
+
 RNG = np.random.default_rng(0)
 
 

@@ -14,6 +14,8 @@ from rts.rendering import sample
 from rts.sampling import pruning
 from rts.trees import map_leaves
 
+pytestmark = pytest.mark.sampling
+
 MESH = rts.plugin("rts.surfaces", "mesh")
 CAMERA = rts.Camera.look_at((0.3, 0.4, 4.0), (0, 0, 0), fov_y=50)
 SIZE = (24, 28)

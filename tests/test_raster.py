@@ -8,6 +8,8 @@ import rts
 from rts import Camera, Proxy
 from rts.camera import orthographic, perspective
 
+pytestmark = pytest.mark.sampling
+
 numba = pytest.importorskip("numba")
 
 SIZE = (24, 30)

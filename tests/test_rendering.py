@@ -29,6 +29,8 @@ from rts import Camera, Part
 from rts.shading import Textured
 from rts.testing.compatibility import APRON
 
+pytestmark = pytest.mark.rendering
+
 Mesh = rts.plugin("surfaces", "mesh")
 
 

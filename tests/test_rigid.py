@@ -8,6 +8,8 @@ from rts.operations.projection import projective_map
 from rts.operations.rigid import RIGID
 from rts.operations.take import take
 
+pytestmark = pytest.mark.engines
+
 torch = pytest.importorskip("torch")
 pytest.importorskip("numba")
 

@@ -11,6 +11,8 @@ import rts
 from rts import Camera, Proxy
 from rts.camera import perspective
 
+pytestmark = pytest.mark.sampling
+
 pytest.importorskip("numba")
 
 SIZE = (96, 120)

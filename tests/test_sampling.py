@@ -11,6 +11,8 @@ from rts.records import ArraySpec
 from rts.sampling.merging import merge
 from rts.sampling.packing import lift
 
+pytestmark = pytest.mark.sampling
+
 CAMERA = Camera.look_at((0.3, 0.5, 4), (0, 0, 0), fov_y=40, near=1, far=10)
 SIZE = (20, 24)
 TRIANGLE_SAMPLERS = [s for s in ("raster", "reference", "embree", "opengl") if s in rts.plugins("samplers")]

@@ -9,6 +9,8 @@ from second_plugin.torus import Torus
 
 from rts.testing import ShaderConformance, SplatterConformance, SurfaceConformance
 
+pytestmark = pytest.mark.plugins
+
 
 class TestTorus(SurfaceConformance):
     @pytest.fixture

@@ -14,6 +14,8 @@ from rts.sampling.packing import lift
 from rts.testing import SurfaceConformance
 from rts.testing.derivatives import claim_slope, directions
 
+pytestmark = pytest.mark.sampling
+
 SIZE = (24, 28)
 CAMERA = rts.Camera.look_at((0.9, 1.6, 3.2), (0, 0, 0), aspect=28 / 24)
 VIEWS = {

@@ -9,6 +9,8 @@ from helpers import ALL, DIFFERENTIABLE, FRONT, TORCH, arrays, gradient, mesh_pa
 from rts import Camera, GBuffer
 from rts.shading import BlinnPhong, Depth, Lambert, Normals, Silhouette, Unlit, sample_texture
 
+pytestmark = pytest.mark.rendering
+
 # ---------------------------------------------------------------------------------------------------- texture
 
 TEXTURE = np.random.default_rng(0).random((3, 4, 3))

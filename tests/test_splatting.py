@@ -20,6 +20,8 @@ from helpers import (
 import rts
 from rts.splatting import Multi, Plain, Single, Visible, exact_calibration
 
+pytestmark = pytest.mark.splatting
+
 E2 = math.exp(-2)
 KERNELS = {"single": Single, "multi": Multi, "visible": partial(Visible, epsilon=0.05, calibration=1.0)}
 """By name, at the paper's settings."""

@@ -10,6 +10,8 @@ import rts
 from rts import rendering
 from rts.splatting import Visible
 
+pytestmark = pytest.mark.splatting
+
 MESH = rts.plugin("rts.surfaces", "mesh")
 CAMERA = rts.Camera.look_at((0.2, 0.1, 3.0), (0, 0, 0))
 SIZE = (10, 12)

@@ -10,6 +10,8 @@ import rts  # noqa: E402
 from rts.operations.combine import interpolate  # noqa: E402
 from rts.operations.projection import projective_map  # noqa: E402
 
+pytestmark = pytest.mark.engines
+
 ROWS, COLUMN = 6, 2
 
 

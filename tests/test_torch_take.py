@@ -8,6 +8,8 @@ torch = pytest.importorskip("torch")
 import rts  # noqa: E402
 from rts.operations.take import take  # noqa: E402
 
+pytestmark = pytest.mark.engines
+
 INDEX = torch.tensor([3, 0, 3, 1, 4, 3], dtype=torch.int32)
 
 

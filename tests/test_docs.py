@@ -1,0 +1,128 @@
+"""The code in README and docs runs, and does what the text beside it says."""
+
+import math
+import re
+import shlex
+import subprocess
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sybil import Sybil
+from sybil.parsers.markdown import PythonCodeBlockParser
+from typer.testing import CliRunner
+
+import rts
+from rts.cli.demo import knot
+from rts.cli.main import app
+
+pytestmark = pytest.mark.docs
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = ["README.md", *(f"docs/{p.name}" for p in sorted((ROOT / "docs").glob("*.md"))), "CONTRIBUTING.md"]
+ELSEWHERE = {"rts demo": "make wheel", "rts plugins --matrix": "test_compatibility.py"}
+"""Commands that take long, and who runs them."""
+
+
+def blocks(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```$", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture
+def model(tmp_path, monkeypatch):
+    """An empty folder to work in, with a model of which no view is symmetric."""
+    part = knot(rings=90, sides=10)
+    rows = [f"v {x} {y} {z}" for x, y, z in 0.45 * part.theta["vertices"]]
+    rows += [f"f {a} {b} {c}" for a, b, c in part.surface.faces + 1]
+    (tmp_path / "model.obj").write_text("\n".join(rows))
+    monkeypatch.chdir(tmp_path)
+
+
+def run(page, **names):
+    """Run a page's Python, block after block: the names there are in the end, and what each name first was."""
+    document, first = Sybil([PythonCodeBlockParser()]).parse(ROOT / page), {}
+    document.namespace.update(names)
+    for example in document.examples():
+        example.evaluate()
+        first = document.namespace | first
+    return document.namespace, first
+
+
+def test_the_python_of_the_readme_does_what_it_says(model):
+    pytest.importorskip("torch")
+    found, _ = run("README.md")
+    assert np.asarray(found["image"]).shape == (256, 256, 4) and Path("view.png").is_file()
+    assert found["vertices"].grad.abs().max() > 0
+    assert found["fit"].loss < 1e-5 and found["fit"].parameters.abs().max() < 1e-3
+    assert float((found["residuals"](found["fit"].parameters) ** 2).mean()) < 1e-5  # Of `ImageResiduals`, too.
+
+
+def test_the_python_of_the_guide_to_plugins_does_what_it_says():
+    torch = pytest.importorskip("torch")
+    package = pytest.importorskip("rts_plugin_example.heightfield")
+
+    def distance(theta, points):
+        return rts.namespace(points).sum(points * points, axis=-1) ** 0.5 - theta["radius"]
+
+    camera = rts.Camera.look_at((0.5, 2.5, 2), (0, 0, 0))
+    names = {"rts": rts, "np": np, "math": math, "camera": camera, "height": package.height, "distance": distance}
+    names |= {"position": np.ones((4, 3)), "scale": np.ones(3)}
+    found, first = run("docs/plugins.md", **names)
+    # The surface of the text is that of the package, in what it shows of it.
+    part = package.Heightfield.example()
+    samples = rts.sample(part, camera, (20, 30)).samples[0]
+    shown = first["Heightfield"].evaluate(None, part.theta, samples)
+    whole = part.surface.evaluate(part.theta, samples)
+    for name in ("position", "normal"):
+        np.testing.assert_array_equal(shown[name], whole[name])
+    # Marching meets a sphere where it is.
+    origins, directions = np.array([[0.0, 0.1, 3.0], [0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0]])
+    np.testing.assert_allclose(
+        found["march"]({"radius": 1.0}, origins, directions, 10.0), [3 - math.sqrt(0.99), 2], atol=1e-4
+    )
+    # The splatter keeps a constant, and its ramp that moves has its true derivative.
+    wide = found["Wide"]()
+    y, x = np.indices((12, 12))
+    positions = torch.tensor(np.stack([x + 0.5, y + 0.5, np.ones_like(x)], -1).reshape(-1, 3), dtype=torch.float64)
+    row = torch.arange(144, dtype=torch.int32).reshape(1, 12, 12)
+    ramp = torch.tensor((x / 12.0).reshape(-1, 1)).expand(-1, 4)
+    along = torch.zeros_like(positions)
+    along[:, 0] = 1
+    image, slope = torch.func.jvp(lambda p: wide.splat(p, ramp, row), (positions,), (along,))
+    np.testing.assert_allclose(image[4:-4, 4:-4, 3], x[4:-4, 4:-4] / 12, atol=1e-6)
+    np.testing.assert_allclose(slope[4:-4, 4:-4, 3], -1 / 12, rtol=1e-2)
+    # The operation has the derivatives that it says.
+    operands = [torch.randn(5, 3, dtype=torch.float64, requires_grad=True), torch.rand(3, dtype=torch.float64) + 1]
+    assert torch.autograd.gradcheck(lambda p: found["CLAMP"](p, operands[1]), operands[:1], check_forward_ad=True)
+    np.testing.assert_allclose(
+        found["CLAMP"](*operands).detach(), found["CLAMP"].specification(*operands).detach(), atol=1e-12
+    )
+    assert issubclass(found["TestHeightfield"], rts.testing.SurfaceConformance)
+
+
+def test_the_entry_points_of_the_guide_are_those_of_the_example():
+    written = {}
+    for block in blocks("docs/plugins.md", "toml"):
+        written |= tomllib.loads(block)["project"]
+    real = tomllib.loads((ROOT / "tests/plugin_example/pyproject.toml").read_text())["project"]
+    assert {name: real[name] for name in written} == written
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_command_line_works(page, model):
+    pytest.importorskip("torch")
+    lines = [line.partition("#")[0].strip() for block in blocks(page, "sh") for line in block.splitlines()]
+    for line in lines:
+        if line.startswith("rts ") and line not in ELSEWHERE:
+            done = CliRunner().invoke(app, shlex.split(line)[1:])
+            assert done.exit_code == 0, f"{line}: {done.output}"
+        elif line.startswith("make "):
+            subprocess.run(["make", "--dry-run", *line.split()[1:]], cwd=ROOT, check=True, capture_output=True)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_link_within_the_repository_leads_somewhere(page):
+    folder = (ROOT / page).parent
+    for target in re.findall(r"\]\(([^)#]*)(?:#[^)]*)?\)", (ROOT / page).read_text()):
+        assert not target or target.startswith("http") or (folder / target).exists(), f"{page}: {target}"

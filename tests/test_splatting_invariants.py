@@ -1,0 +1,261 @@
+"""Splatters on random samples: what no scene may change, and compiled code against the specification."""
+
+import numpy as np
+import pytest
+from helpers import TORCH, arrays, to_numpy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import PROPERTIES, masks, rows_of, steps
+
+from rts import splatting
+from rts_backends.fused import splatters as fused
+
+pytestmark = pytest.mark.splatting
+
+torch = pytest.importorskip("torch")
+
+COMPILED = [fused.Single, fused.Multi, fused.Visible]
+EVERY = [splatting.Single, splatting.Multi, splatting.Visible, *COMPILED]
+TOLERANCE = {np.float32: 1e-5, np.float64: 1e-12}
+EXAMPLES = settings(PROPERTIES, max_examples=60)
+
+
+def splatters(kinds=EVERY):
+    """One of some classes, at any settings."""
+    sigma, epsilon = st.sampled_from([0.3, 0.5, 0.8]), st.sampled_from([0.0, 1e-3, 0.05, 0.2])
+    return st.builds(
+        lambda kind, *settings: kind(*settings), st.sampled_from(kinds), sigma, epsilon, st.sampled_from([None, 1.0])
+    )
+
+
+@st.composite
+def samples(draw, layers=3, side=5, centred=False, opaque=False, kind=None, depths=(1, 4)):
+    """Positions (N, 3), rgba (N, 4) and row; layers are filled from the front, colours premultiplied."""
+    shape = draw(st.integers(1, layers)), draw(st.integers(1, side)), draw(st.integers(1, side + 2))
+    covered = np.logical_and.accumulate(draw(masks(shape)), axis=0)
+    row, total = draw(rows_of(covered))
+    # Quarters: depths are often equal, and their differences, too.
+    depth = np.sort(draw(steps(shape, *depths, dtype=np.float64)), axis=0)
+    rng = np.random.default_rng(draw(st.integers(0, 99)))
+    positions = rng.normal(size=(total, 3))
+    k, y, x = np.nonzero(covered)
+    positions[row[covered]] = np.stack([x + 0.5, y + 0.5, depth[covered]], axis=1)
+    if not (centred or draw(st.booleans())):
+        positions[row[covered], :2] += rng.integers(-6, 7, (len(k), 2)) / 16
+    # Often of few colours: where all around is of one, compiled code takes a shortcut.
+    colors = draw(st.sampled_from([1, 2, 99]))
+    alpha = np.ones((colors, 1)) if opaque else rng.choice([0, 0.5, 1], (colors, 1))
+    palette = np.concatenate([rng.integers(0, 17, (colors, 3)) / 16, np.ones((colors, 1))], axis=1) * alpha
+    rgba = palette[rng.integers(0, colors, total)]
+    kind = kind or draw(st.sampled_from([np.float32, np.float64]))
+    return positions.astype(kind), rgba.astype(kind), row
+
+
+def around(covered):
+    """(9, H, W) bool, whether each neighbour of each cell, and the cell, is one of these (H, W)."""
+    wide, (height, width) = np.pad(covered, 1), covered.shape
+    return np.stack([wide[v : v + height, u : u + width] for v in range(3) for u in range(3)])
+
+
+def tolerance(scene):
+    return TOLERANCE[scene[0].dtype.type]
+
+
+def close(found, expected, atol):
+    np.testing.assert_allclose(found, expected, rtol=0, atol=atol)
+
+
+def placed(scene, corner, size):
+    """The same samples elsewhere, in an image of another size."""
+    (positions, rgba, row), (top, left) = scene, corner
+    wide = np.full((len(row), *size), -1, np.int32)
+    wide[:, top : top + row.shape[1], left : left + row.shape[2]] = row
+    return positions + np.array([left, top, 0], positions.dtype), rgba, wide
+
+
+# ---------------------------------------------------------------------------------------------- constants
+
+
+@EXAMPLES
+@given(splatters(), samples(layers=1, centred=True), st.tuples(*[st.integers(0, 16)] * 4))
+def test_amid_one_colour_one_layer_is_that_colour_at_any_depths(splatter, scene, color):
+    positions, rgba, row = scene
+    color = np.array([min(c, color[3]) for c in color]) / 16
+    image = splatter.splat(positions, np.broadcast_to(color, rgba.shape).astype(rgba.dtype), row)
+    inside = around(row[0] >= 0).all(axis=0)
+    close(image[inside], np.broadcast_to(color, (inside.sum(), 4)), tolerance(scene))
+
+
+@EXAMPLES
+@given(splatters(), samples(centred=True, opaque=True), st.tuples(*[st.integers(0, 16)] * 3))
+def test_amid_one_opaque_colour_layers_far_apart_are_that_colour(splatter, scene, color):
+    positions, rgba, row = scene
+    positions = positions.copy()
+    for k, layer in enumerate(row):
+        positions[layer[layer >= 0], 2] += 10 * k
+    color = np.array([*color, 16]) / 16
+    image = splatter.splat(positions, np.broadcast_to(color, rgba.shape).astype(rgba.dtype), row)
+    inside = around(row[0] >= 0).all(axis=0)
+    close(image[inside], np.broadcast_to(color, (inside.sum(), 4)), tolerance(scene))
+
+
+@EXAMPLES
+@given(splatters(), samples())
+def test_images_are_premultiplied_with_alpha_between_zero_and_one(splatter, scene):
+    image = splatter.splat(*scene)
+    assert np.isfinite(image).all() and image.min(initial=0) >= 0
+    assert image[..., 3].max(initial=0) <= 1 + tolerance(scene)
+    assert (image[..., :3] <= image[..., 3:] + tolerance(scene)).all()
+
+
+@EXAMPLES
+@given(splatters(), samples(centred=True))
+def test_opaque_samples_reach_their_own_and_all_neighbouring_cells_and_no_others(splatter, scene):
+    positions, rgba, row = scene
+    image = splatter.splat(positions, np.ones_like(rgba), row)
+    np.testing.assert_array_equal(image[..., 3] > 0, around(row[0] >= 0).any(axis=0))
+
+
+# ------------------------------------------------------------------------------------ what changes alike
+
+
+@EXAMPLES
+@given(splatters(), samples(), st.integers(-8, 8), st.integers(-8, 8))
+def test_images_are_linear_in_colours_of_given_alphas(splatter, scene, a, b):
+    positions, rgba, row = scene
+    other = np.concatenate([rgba[::-1, :3], rgba[:, 3:]], axis=1)
+    both = np.concatenate([a / 8 * rgba[:, :3] + b / 8 * other[:, :3], rgba[:, 3:]], axis=1).astype(rgba.dtype)
+    first, second, found = (splatter.splat(positions, x, row) for x in (rgba, other, both))
+    close(found[..., :3], a / 8 * first[..., :3] + b / 8 * second[..., :3], tolerance(scene))
+    close(found[..., 3], first[..., 3], tolerance(scene))
+
+
+@EXAMPLES
+@given(splatters([splatting.Single, fused.Single]), samples(), st.integers(0, 9))
+def test_the_image_of_one_layer_is_linear_in_colour_and_alpha(splatter, scene, seed):
+    positions, rgba, row = scene
+    other = np.random.default_rng(seed).random(rgba.shape).astype(rgba.dtype)
+    first, second, found = (splatter.splat(positions, x, row) for x in (rgba, other, rgba - 2 * other))
+    close(found, first - 2 * second, 4 * tolerance(scene))
+
+
+@EXAMPLES
+@given(splatters(), samples(), st.integers(-2, 2), st.integers(-33, 33))
+def test_a_scene_that_moves_by_whole_cells_moves_its_image(splatter, scene, down, right):
+    height, width = scene[2].shape[1:]
+    # Far enough from the sides, and over the borders of the blocks that compiled code looks at.
+    top, left, size = 3, 34, (height + 6, width + 68)
+    still = splatter.splat(*placed(scene, (top, left), size))
+    moved = splatter.splat(*placed(scene, (top + down, left + right), size))
+    close(moved, np.roll(still, (down, right), axis=(0, 1)), tolerance(scene))
+
+
+@EXAMPLES
+@given(splatters(), samples(), st.sampled_from(["left to right", "top to bottom", "rows for columns"]))
+def test_a_mirrored_scene_has_the_mirrored_image(splatter, scene, mirror):
+    positions, rgba, row = scene
+    x, y, z = positions.T
+    height, width = row.shape[1:]
+    if mirror == "left to right":
+        other, turned = (width - x, y, z), lambda image: image[:, ::-1]
+    elif mirror == "top to bottom":
+        other, turned = (x, height - y, z), lambda image: image[::-1]
+    else:
+        other, turned = (y, x, z), lambda image: np.swapaxes(image, 0, 1)
+    cells = np.stack([turned(layer) for layer in row])
+    found = splatter.splat(np.stack(other, axis=1), rgba, cells)
+    close(found, turned(splatter.splat(*scene)), tolerance(scene))
+
+
+@EXAMPLES
+@given(splatters(), samples(), st.data())
+def test_the_order_of_packed_rows_does_not_matter(splatter, scene, data):
+    positions, rgba, row = scene
+    order = np.array(data.draw(st.permutations(range(len(rgba)))))
+    numbers = np.append(np.argsort(order), -1).astype(np.int32)
+    found = splatter.splat(positions[order], rgba[order], numbers[row])
+    np.testing.assert_array_equal(found, splatter.splat(*scene))
+
+
+@EXAMPLES
+@given(splatters([splatting.Visible, fused.Visible]), samples())
+def test_a_layer_that_is_empty_everywhere_changes_nothing(splatter, scene):
+    positions, rgba, row = scene
+    # Of `Multi` it does: an empty target pairs with a source's empty layer, and takes all others in front.
+    found = splatter.splat(positions, rgba, np.concatenate([row, np.full_like(row[:1], -1)]))
+    close(found, splatter.splat(*scene), tolerance(scene))
+
+
+@EXAMPLES
+@given(splatters(), samples(), st.integers(0, 3))
+def test_a_border_is_left_out_and_changes_nothing_inside(splatter, scene, border):
+    whole = splatter.splat(*scene)
+    height, width = whole.shape[:2]
+    expected = whole[border : max(border, height - border), border : max(border, width - border)]
+    close(splatter.splat(*scene, border=border), expected, 0)
+
+
+# --------------------------------------------------------------------------------------- what is needed
+
+
+def without_what_is_not_needed(splatter, scene):
+    """The scene with the rows of samples that the splatter does not need taken from their cells."""
+    positions, rgba, row = scene
+    covered = row >= 0
+    kept = splatter.needed(covered, np.where(covered, positions[row, 2], 0))
+    assert kept.dtype == bool and not (kept & ~covered).any()
+    return positions, rgba, np.where(kept, row, -1).astype(np.int32)
+
+
+@EXAMPLES
+@given(splatters(), samples(centred=True, opaque=True))
+def test_what_is_not_needed_leaves_the_image_of_opaque_samples_as_it_is(splatter, scene):
+    close(splatter.splat(*without_what_is_not_needed(splatter, scene)), splatter.splat(*scene), tolerance(scene))
+
+
+@EXAMPLES
+@given(splatters(COMPILED), samples(centred=True, opaque=True, kind=np.float64), st.integers(0, 9))
+def test_what_is_not_needed_leaves_the_derivative_of_opaque_samples_as_it_is(splatter, scene, seed):
+    found = pulled_back(splatter, without_what_is_not_needed(splatter, scene), seed)
+    for values, expected in zip(found, pulled_back(splatter, scene, seed), strict=True):
+        close(values, expected, 1e-9)
+
+
+# ---------------------------------------------------------------------------- compiled, and the specification
+
+
+def specification(splatter):
+    """The class of `rts.splatting` with the same settings."""
+    return getattr(splatting, type(splatter).__name__)(splatter.sigma, splatter.epsilon, splatter.calibration)
+
+
+def pulled_back(splatter, scene, seed):
+    """Gradients of positions and colours from a random one of the image, by torch."""
+    positions, rgba, row = arrays(TORCH[0], scene, scene[0].dtype)
+    variables = [x.requires_grad_(True) for x in (positions, rgba)]
+    image = splatter.splat(*variables, row)
+    along = np.random.default_rng(seed).normal(size=image.shape)
+    return to_numpy(torch.autograd.grad(image, variables, torch.tensor(along, dtype=image.dtype)))
+
+
+@EXAMPLES
+@given(splatters(COMPILED), samples())
+def test_compiled_images_are_those_of_the_specification(splatter, scene):
+    found = splatter.splat(*scene)
+    assert found.dtype == scene[0].dtype
+    close(found, specification(splatter).splat(*scene), tolerance(scene))
+
+
+@EXAMPLES
+@given(splatters(COMPILED), samples(), st.integers(0, 9))
+def test_compiled_gradients_are_those_of_the_specification(splatter, scene, seed):
+    pairs = zip(pulled_back(splatter, scene, seed), pulled_back(specification(splatter), scene, seed), strict=True)
+    for found, expected in pairs:
+        close(found, expected, 20 * tolerance(scene) * max(1, np.abs(expected).max()))
+
+
+@EXAMPLES
+@given(splatters(COMPILED), samples(centred=True, opaque=True))
+def test_what_compiled_code_needs_is_what_the_specification_needs(splatter, scene):
+    given = without_what_is_not_needed(splatter, scene), without_what_is_not_needed(specification(splatter), scene)
+    np.testing.assert_array_equal(given[0][2], given[1][2])

@@ -1,0 +1,98 @@
+"""The tree is as the documentation says: what imports what, and which file is where."""
+
+import ast
+import re
+import sys
+import tomllib
+from graphlib import CycleError, TopologicalSorter
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+import rts
+
+pytestmark = pytest.mark.core
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGES = ("rts", "rts_backends", "rts_surfaces")
+FILES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for package in PACKAGES
+    for path in sorted((ROOT / package).rglob("*.py"))
+}
+
+
+def imports(path):
+    """The modules of the library that a file imports anywhere, but for the sake of types."""
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            node.body = []
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            full = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= {name if name in FILES else node.module for name in full}
+    return {name for name in found if name in FILES}
+
+
+def test_no_file_imports_in_a_circle():
+    graph = {name: imports(path) - {name} for name, path in FILES.items()}
+    assert sum(map(len, graph.values())) > 200
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" → ".join(error.args[1]))
+
+
+def test_the_core_never_imports_a_plugin_package():
+    for name, path in FILES.items():
+        if name.partition(".")[0] == "rts":
+            assert not {n for n in imports(path) if n.partition(".")[0] != "rts"}, name
+
+
+def test_compiled_code_is_imported_when_it_is_needed():
+    for name, path in FILES.items():
+        if name.partition(".")[0] == "rts" and not name.endswith("_kernels"):
+            top = ast.parse(path.read_text()).body
+            named = {ast.unparse(n) for n in top if isinstance(n, (ast.Import, ast.ImportFrom))}
+            assert not [n for n in named if "numba" in n or "_kernels import" in n or n.endswith("_kernels")], name
+
+
+def test_the_architecture_has_a_line_for_every_file():
+    text = (ROOT / "docs/architecture.md").read_text()
+    tree = text[text.index("```") : text.index("```", text.index("```") + 3)]
+    for name, path in FILES.items():
+        if path.name != "__init__.py" or name == "rts":
+            assert re.search(rf"\b{path.name}\b", tree), f"{name} is not in docs/architecture.md"
+    for named in re.findall(r"\b(\w+)\.py\b", tree.replace("*_kernels.py", "").replace("test_<what>.py", "")):
+        assert any(path.stem == named for path in FILES.values()), f"docs/architecture.md names {named}.py"
+
+
+def test_every_file_of_tests_has_one_area():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    areas = {line.partition(":")[0] for line in project["tool"]["pytest"]["ini_options"]["markers"]}
+    for path in sorted((ROOT / "tests").glob("test_*.py")):
+        marks = re.findall(r"^pytestmark = pytest\.mark\.(\w+)$", path.read_text(), re.MULTILINE)
+        assert len(marks) == 1 and marks[0] in areas, f"{path.name} has the areas {marks}; expected one of {areas}"
+
+
+def test_the_oldest_versions_are_those_that_are_allowed():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    wanted = project["dependencies"] + sum((extras[e] for e in ("torch", "jax", "embree", "opengl", "plots")), [])
+    pinned = dict(
+        line.lower().split("==") for line in (ROOT / "constraints-oldest.txt").read_text().split() if "==" in line
+    )
+    for requirement in wanted:
+        name, least = requirement.lower().split(">=")
+        assert pinned[name].startswith(least), f"{requirement}, but constraints-oldest.txt has {pinned[name]}"
+
+
+def test_the_version_is_that_of_the_distribution():
+    assert rts.__version__ == version("rasterize-then-splat")
+    assert f"version: {rts.__version__}" in (ROOT / "CITATION.cff").read_text()
+    assert sys.modules["rts"].__file__ == str(FILES["rts"])
