@@ -1,0 +1,196 @@
+"""Bézier patches: a surface that refines its samples, from triangles to images."""
+
+import numpy as np
+import pytest
+from helpers import ALL, DIFFERENTIABLE, FRONT, arrays, gradient, to_numpy
+from seen import CAMERA, SIZE, VIEWS, WEIGHTS, close, loss_of, stages
+from test_settling import rays_spread
+from throwaway import Bezier, Crowded
+
+import rts
+from rts import splatting
+from rts.testing import SurfaceConformance
+from rts.testing.derivatives import claim_slope, directions
+
+pytestmark = pytest.mark.sampling
+
+
+BEZIER = Bezier.example()
+
+
+def test_a_flat_patch_is_met_where_its_plane_is():
+    x, y = np.meshgrid(np.linspace(-1, 1, 4), np.linspace(-1, 1, 4), indexing="ij")
+    points = np.stack([x, y, 0.25 * x - 0.5 * y], axis=-1).reshape(-1, 3).astype(np.float32)
+    part = rts.Part(Bezier([np.arange(16)], 2), {"points": points}, "normals")
+    samples = rts.sample(part, FRONT, SIZE, layers=1).samples[0]
+    rays = FRONT.with_apron(SIZE, 2).rays((SIZE[0] + 4, SIZE[1] + 4))
+    cells = samples.row[0] >= 0
+    x, y = rays.origins[cells][:, :2].T
+    assert len(x) > 100
+    params, depth = samples.params[samples.row[0][cells]], samples.depth[0][cells]
+    np.testing.assert_allclose(params, np.stack([x + 1, y + 1], axis=-1) / 2, atol=1e-6)
+    np.testing.assert_allclose(depth, 5 - 0.25 * x + 0.5 * y, atol=1e-6)
+    normal = part.surface.evaluate(part.theta, samples)["normal"]
+    np.testing.assert_allclose(normal, np.tile(np.array([-0.25, 0.5, 1]) / 1.3125**0.5, (len(normal), 1)), atol=1e-5)
+
+
+def test_the_scene_has_layers_that_change_places_meet_and_miss():
+    lifted, moved, settled = stages(BEZIER, CAMERA, 4)
+    disordered = 0
+    for y, x in np.ndindex(SIZE):
+        depth = moved.depth[:, y, x][moved.row[:, y, x] >= 0]
+        disordered += (np.diff(depth) < 0).any()
+    count = [int((s.row >= 0).sum()) for s in (lifted, moved, settled)]
+    assert disordered > 0
+    assert count[0] > count[1] > count[2] > 400
+    assert (settled.row[3] >= 0).sum() > 20
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("layers", [2, 3, 4])
+def test_settled_layers_are_front_to_back_without_gaps_on_centres_of_pixels(view, layers):
+    camera = VIEWS[view]
+    samples = rts.sample(BEZIER, camera, SIZE, layers=layers).samples[0]
+    covered, wide = samples.row >= 0, camera.with_apron(SIZE, 2)
+    assert covered[1].sum() > 5 and not (covered[1:] & ~covered[:-1]).any()
+    spread = rays_spread(camera)
+    apart, behind = np.diff(samples.depth, axis=0)[covered[1:]], samples.depth[1:][covered[1:]]
+    assert (apart > 0.0099 * (spread[0] + spread[1] * behind)).all()
+    np.testing.assert_array_equal(samples.row[covered], np.arange(covered.sum()))
+    assert not samples.depth[~covered].any()
+    near, far = camera.depth_range()
+    assert near * 0.999 < samples.depth[covered].min() and samples.depth[covered].max() < far * 1.001
+    k, y, x = np.nonzero(covered)
+    position = BEZIER.surface.evaluate(BEZIER.theta, samples)["position"][samples.row[covered]]
+    seen = wide.project(position.astype(np.float64), samples.row.shape[1:])
+    np.testing.assert_allclose(seen[:, :2], np.stack([x, y], axis=-1) + 0.5, rtol=0, atol=0.02)
+    np.testing.assert_allclose(seen[:, 2], samples.depth[covered], rtol=1e-5)
+
+
+def test_coarse_and_fine_triangles_lead_to_the_same_roots():
+    coarse, fine = (
+        rts.sample(BEZIER.replace(surface=Bezier(BEZIER.surface.indices, n)), CAMERA, SIZE, layers=4) for n in (3, 24)
+    )
+    both = (coarse.row >= 0) & (fine.row >= 0)
+    assert both.sum() > 0.95 * (fine.row >= 0).sum()
+    same = np.isclose(coarse.depth, fine.depth, rtol=1e-5)[both]
+    # Where one tessellation lacks a sliver, what is behind is a layer further.
+    assert same.mean() > 0.95
+
+
+def unpruned(splatter):
+    return type("Whole", (type(splatter),), {"prunes": False})()
+
+
+@pytest.mark.parametrize("layers", [2, 3, 4])
+def test_the_image_is_the_same_without_what_is_not_needed(layers):
+    for splatter in (rts.plugin("splatters", "visible")(), splatting.Visible()):
+        whole = unpruned(splatter)
+        images = [rts.render(BEZIER, CAMERA, SIZE, layers=layers, splatter=s) for s in (splatter, whole)]
+        np.testing.assert_allclose(*images, rtol=0, atol=1e-6)
+        sampled = [rts.sample(BEZIER, CAMERA, SIZE, layers=layers, splatter=s) for s in (splatter, whole)]
+        counts = [int((s.row >= 0).sum()) for s in sampled]
+        assert 200 < counts[0] < counts[1]
+
+
+def test_with_another_part_and_prepared_the_image_is_the_same_without_what_is_not_needed():
+    parts = [BEZIER, rts.Part(Crowded(2000), {"heights": np.array([-0.3, 0.3, -0.7], np.float32)}, shader="depth")]
+    splatter = splatting.Visible()
+    images = [rts.render(parts, CAMERA, SIZE, layers=4, splatter=s) for s in (splatter, unpruned(splatter))]
+    prepared = rts.prepare(parts, "raster")
+    images.append(rts.render(prepared, CAMERA, SIZE, layers=4, splatter=splatter))
+    for image in images[1:]:
+        np.testing.assert_allclose(image, images[0], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_which_samples_are_needed_is_asked_with_their_final_depths(target):
+    asked = []
+
+    class Spy(splatting.Visible):
+        def needed(self, covered, depth):
+            asked.append((covered.copy(), depth.copy()))
+            return super().needed(covered, depth)
+
+    part = BEZIER.replace(theta=arrays(target, BEZIER.theta))
+    whole = to_numpy(rts.sample(part, CAMERA, SIZE, layers=4))
+    found = to_numpy(rts.sample(part, CAMERA, SIZE, layers=4, splatter=Spy()))
+    ((covered, depth),) = asked
+    np.testing.assert_array_equal(covered, whole.row >= 0)
+    np.testing.assert_array_equal(depth, whole.depth)
+    kept = splatting.Visible().needed(covered, depth)
+    np.testing.assert_array_equal(found.row >= 0, kept)
+    own, all_of_them = found.samples[0], whole.samples[0]
+    np.testing.assert_array_equal(own.ids[found.row[kept]], all_of_them.ids[whole.row[kept]])
+    np.testing.assert_array_equal(own.params[found.row[kept]], all_of_them.params[whole.row[kept]])
+
+
+@pytest.fixture(scope="module")
+def slopes_by_torch():
+    """Values and gradients of the Bézier scene and of another one, in control points."""
+    pytest.importorskip("torch")
+    values = [BEZIER.theta["points"], 0.9 * BEZIER.theta["points"]]
+    loss = loss_of(BEZIER, "points", layers=3)
+    given = [arrays("torch-cpu", v) for v in values]
+    return values, [float(loss(x)) for x in given], [gradient("torch-cpu", loss, x) for x in given]
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_gradients_at_frozen_samples_are_finite_differences(target):
+    sampled = rts.sample(BEZIER, CAMERA, SIZE, layers=3, splatter="visible")
+    points = BEZIER.theta["points"].astype(np.float64)
+
+    def loss(points):
+        image = rts.render_samples(sampled, BEZIER.replace(theta={"points": points}), CAMERA)
+        return (image * rts.engine_of(image).constant(WEIGHTS, image)).sum()
+
+    slope = gradient(target, loss, arrays(target, points))
+    for seed in range(3):
+        (along,) = directions([points], seed)
+        ends = [loss(points + step * along) for step in (1e-6, -1e-6)]
+        claim_slope(slope, along, (ends[0] - ends[1]) / 2e-6, f"the derivative of the image, in {target},")
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_images_of_patches_agree(target):
+    expected = rts.render(BEZIER, CAMERA, SIZE, layers=3)
+    found = rts.render(BEZIER.replace(theta=arrays(target, BEZIER.theta)), CAMERA, SIZE, layers=3)
+    np.testing.assert_allclose(to_numpy(found), expected, rtol=0, atol=1e-5)
+
+
+def test_gradients_of_patches_agree_in_torch_and_jax(slopes_by_torch):
+    jax = pytest.importorskip("jax")
+    values, _, expected = slopes_by_torch
+    close(jax.grad(loss_of(BEZIER, "points", layers=3))(jax.numpy.asarray(values[0])), expected[0])
+
+
+def test_compiled_and_batched_by_jax_images_and_gradients_of_patches_are_the_same(slopes_by_torch):
+    jax = pytest.importorskip("jax")
+    values, losses, expected = slopes_by_torch
+    slope = jax.value_and_grad(loss_of(BEZIER, "points", layers=3))
+    found = jax.jit(slope)(jax.numpy.asarray(values[0]))
+    np.testing.assert_allclose(found[0], losses[0], rtol=1e-4)
+    close(found[1], expected[0])
+    found = jax.jit(jax.vmap(slope))(jax.numpy.stack(values))
+    np.testing.assert_allclose(found[0], losses, rtol=1e-4)
+    for one, other in zip(found[1], expected, strict=True):
+        close(one, other)
+
+
+def test_batched_by_torch_images_and_gradients_of_patches_are_the_same(slopes_by_torch):
+    torch = pytest.importorskip("torch")
+    values, losses, expected = slopes_by_torch
+    slope = torch.func.vmap(torch.func.grad_and_value(loss_of(BEZIER, "points", layers=3)))
+    found = slope(torch.tensor(np.stack(values)))
+    np.testing.assert_allclose(found[1], losses, rtol=1e-4)
+    for one, other in zip(found[0], expected, strict=True):
+        close(one, other)
+
+
+# --------------------------------------------------------------------------------------------- conformance
+
+
+class TestBezier(SurfaceConformance):
+    @pytest.fixture
+    def part(self):
+        return BEZIER
