@@ -51,11 +51,12 @@ def promote(*values: Any) -> tuple[Any, list[Array]]:
     Where all are NumPy or numbers the result is float64.
     """
     owner = OWNERS.get(type(values[0]))
-    for v in values:
-        if owner is None or OWNERS.get(type(v)) is not owner:
-            break
-    else:
-        return owner.namespace, list(values)
+    if owner is not None:
+        for v in values:
+            if OWNERS.get(type(v)) is not owner:
+                break
+        else:
+            return owner.namespace, list(values)
     values_ = [
         np.asarray(v, dtype=np.float64) if isinstance(v, (list, tuple)) and is_constant(v) else v for v in values
     ]

@@ -15,7 +15,7 @@ from rts.arrays import described, from_numbers, shape_of
 from rts.camera import Camera
 from rts.engines import namespace
 from rts.errors import InputError
-from rts.interfaces import Part, Sampler, Shader, Splatter, as_surface
+from rts.interfaces import CheckedPart, Part, Sampler, Shader, Splatter, as_surface
 from rts.trees import Array
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}
@@ -33,7 +33,7 @@ def _memory() -> float:
 MEMORY = _memory()
 
 
-def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Part], Camera]:
+def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[CheckedPart], Camera]:
     """Checked parts, with their shaders looked up and plain numbers made arrays; that all suit one engine is not."""
     parts = list(parts) if isinstance(parts, Sequence) else [parts]
     if not parts or not all(isinstance(p, Part) for p in parts):
@@ -47,7 +47,7 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Part
     return [_check_part(index, part) for index, part in enumerate(parts)], camera
 
 
-def _check_part(index: int, part: Part) -> Part:
+def _check_part(index: int, part: Part) -> CheckedPart:
     strange = [key for key in part.theta if not isinstance(key, str)]
     if strange:
         raise InputError(f"theta of part {index} has the key {strange[0]!r}; expected names")
@@ -67,7 +67,7 @@ def _check_part(index: int, part: Part) -> Part:
     reads = surface.reads(theta)
     if isinstance(reads, str) or not set(reads) <= set(theta):
         raise InputError(f"reads of {surface!r} gave {reads!r}; expected names of entries of theta: {sorted(theta)}")
-    return Part(surface, theta, shader, transform, part.cull)
+    return CheckedPart(surface, theta, shader, transform, part.cull)
 
 
 def check_sampler(chosen: Any) -> Sampler:
@@ -110,7 +110,7 @@ def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple
         height, width = (int(s) for s in size)
         whole = (height, width) == tuple(size)
     except (TypeError, ValueError, OverflowError):
-        whole = False
+        height, width, whole = 0, 0, False
     if not whole or height <= 0 or width <= 0:
         given = " ".join(repr(size).split())[:60]
         raise InputError(f"size is {given}; expected (height, width), two positive integers")
@@ -133,7 +133,7 @@ def check_memory(height: int, width: int, layers: int, *, gradient: bool) -> Non
         )
 
 
-def _is_count(value: Any) -> bool:
+def _is_count(value: Any) -> bool | np.bool_:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 1
 
 

@@ -178,6 +178,10 @@ class Needed(Plugin):
         """Told of how many cells had K layers of triangles, of which fewer were left when they were refined."""
 
 
+AnyNeeded = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""A `Needed`, or a function of its signature."""
+
+
 class Sampler(Plugin):
     """Finds where rays meet one part: the step without derivative.
 
@@ -390,3 +394,15 @@ class Part:
     def replace(self, **changes: Any) -> Part:
         """A copy with some fields changed."""
         return replace(self, **changes)
+
+
+if TYPE_CHECKING:
+
+    class CheckedPart(Part):
+        """A part whose surface and shader have all members of their bases, as `rts.checks` makes it: it is a `Part`."""
+
+        surface: Surface
+        shader: Shader
+
+else:
+    CheckedPart = Part

@@ -99,8 +99,7 @@ def plugin(group: str, name: str) -> Any:
     try:
         return entry.load()
     except ModuleNotFoundError as error:
-        extras = entry.dist.metadata.get_all("Provides-Extra") or [] if entry.dist else []
-        if name in extras:
+        if entry.dist and name in (entry.dist.metadata.get_all("Provides-Extra") or []):
             command = f"pip install '{entry.dist.name}[{name}]'"
             raise PluginError(f"the {kind} {name!r} needs the package {error.name!r}: {command}") from error
         raise PluginError(

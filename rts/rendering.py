@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from rts.arrays import described, shape_of
 from rts.camera import Camera
@@ -24,7 +24,7 @@ from rts.checks import (
 from rts.engines import Engine, constants, engine_of, is_constant, is_traced, namespace, suiting, uncompiled
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.interfaces import Needed, Part, Splatter
+from rts.interfaces import AnyNeeded, CheckedPart, Part, Splatter
 from rts.operations.linear import affine_map
 from rts.records import Sampled, Samples, Splats
 from rts.sampling.merging import merge
@@ -44,7 +44,7 @@ def render(
     *,
     sampler: Any = "auto",
     splatter: Any = "auto",
-    layers: int | str = 2,
+    layers: int | Literal["auto"] = 2,
     supersample: int = 1,
     background: Any = None,
     capacity: int | None = None,
@@ -100,7 +100,7 @@ def sample(
     *,
     sampler: Any = "auto",
     splatter: Any = None,
-    layers: int | str = 2,
+    layers: int | Literal["auto"] = 2,
     supersample: int = 1,
     capacity: int | None = None,
 ) -> Sampled:
@@ -127,7 +127,7 @@ class _Scene(NamedTuple):
         suited: the engine of parts and camera, and an array that sets dtype and device of its constants, or None.
     """
 
-    parts: list[Part]
+    parts: list[CheckedPart]
     camera: Camera
     samplers: Sequence[Any]
     entries: Sequence[Any]
@@ -136,10 +136,10 @@ class _Scene(NamedTuple):
     @classmethod
     def of(cls, parts: Part | Sequence[Part] | PreparedParts, camera: Camera, sampler: Any) -> _Scene:
         """From what the user gave."""
-        prepared = parts if isinstance(parts, PreparedParts) else None
-        checked, camera = check_scene(prepared.parts if prepared else parts, camera)
-        if prepared is not None:
-            return cls(checked, camera, prepared.samplers, prepared.entries, suiting(checked, camera))
+        if isinstance(parts, PreparedParts):
+            checked, camera = check_scene(parts.parts, camera)
+            return cls(checked, camera, parts.samplers, parts.entries, suiting(checked, camera))
+        checked, camera = check_scene(parts, camera)
         chosen = check_sampler(sampler)
         return cls(checked, camera, [chosen] * len(checked), [None] * len(checked), suiting(checked, camera))
 
@@ -150,7 +150,7 @@ def _sampled(
     size: tuple[int, int],
     *,
     splatter: Splatter | None,
-    layers: int | str,
+    layers: int | Literal["auto"],
     supersample: int,
     capacity: int | None,
 ) -> Sampled:
@@ -164,17 +164,17 @@ def _sampled(
     wide = camera.with_apron((height, width), apron)
     wide = constants(wide, *suited)
 
-    def taken(count: int, needed: Needed | None) -> Sampled:
-        samples = []
+    def taken(count: int, needed: AnyNeeded | None) -> Sampled:
+        samples, pruned = [], False
         for part, chosen, entry in zip(parts, samplers, entries, strict=True):
-            known = {} if entry is None else {"entry": entry}
+            known: dict[str, Any] = {} if entry is None else {"entry": entry}
             if needed is not None and chosen.prunes:
-                known["needed"] = needed if len(parts) == 1 else Everything(needed)
+                pruned = len(parts) == 1
+                known["needed"] = needed if pruned else Everything(needed)
             samples.append(chosen.sample(part, wide.within(part.transform), grid, count, capacity=capacity, **known))
         sampled = merge(samples, count)
         # What is traced has the shape of the worst case, with or without them.
-        done = needed is None or (len(parts) == 1 and "needed" in known) or is_traced(sampled.row)
-        return sampled if done else prune(sampled, needed)
+        return sampled if needed is None or pruned or is_traced(sampled.row) else prune(sampled, needed)
 
     samplers = [suited_sampler(chosen, part, camera) for part, chosen in zip(parts, samplers, strict=True)]
     needed = None if splatter is None else needed_by(splatter, parts)
@@ -258,7 +258,7 @@ def _splatted(sampled: Sampled, scene: _Scene, window: Camera, suited: tuple, sp
 
 
 def to_splats(
-    sampled: Sampled, parts: Sequence[Part], camera: Camera, window: Camera, engine: Engine, like: Array | None
+    sampled: Sampled, parts: Sequence[CheckedPart], camera: Camera, window: Camera, engine: Engine, like: Array | None
 ) -> Splats:
     """What was sampled, as splatters take it, with the apron as border.
 
@@ -297,12 +297,12 @@ def to_splats(
     return Splats(xp.concat(positions), xp.concat(colors), row, border=apron)
 
 
-def _planned(layers: int | str) -> int:
+def _planned(layers: int | Literal["auto"]) -> int:
     """Layers to count with before they are known."""
     return 4 if layers == "auto" else int(layers)
 
 
-def _bands(height: int, width: int, layers: int | str, supersample: int) -> list[tuple[int, int]]:
+def _bands(height: int, width: int, layers: int | Literal["auto"], supersample: int) -> list[tuple[int, int]]:
     """(first row, number of rows) of the parts in which a supersampled image is rendered."""
     if supersample == 1:
         return [(0, height)]
@@ -312,7 +312,7 @@ def _bands(height: int, width: int, layers: int | str, supersample: int) -> list
     return [(top, end - top) for top, end in itertools.pairwise(edges)]
 
 
-def _evaluate(part: Part, reads: Sequence[str], samples: Samples, engine: Engine, like: Array | None) -> GBuffer:
+def _evaluate(part: CheckedPart, reads: Sequence[str], samples: Samples, engine: Engine, like: Array | None) -> GBuffer:
     """The part's G-buffer in local space, of the entries of θ that its surface reads."""
     theta = {name: part.theta[name] for name in reads}
     if samples.gbuffer is not None and is_constant(theta):

@@ -91,11 +91,7 @@ class Unlit(Shader):
 
     wrap: str = "repeat"
     opaque: bool = True
-
-    @property
-    def reads(self) -> tuple[str, ...]:
-        """G-buffer entries."""
-        return ("color", "uv")
+    reads = ("color", "uv")
 
     def __post_init__(self):
         if self.wrap not in WRAPS:
@@ -135,10 +131,7 @@ class Unlit(Shader):
 class Textured(Unlit):
     """The base colour, which must come from a texture."""
 
-    @property
-    def reads(self) -> tuple[str, ...]:
-        """G-buffer entries."""
-        return ("uv",)
+    reads = ("uv",)
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
         """See `rts.Shader`."""
@@ -152,10 +145,7 @@ class Textured(Unlit):
 class Lambert(Unlit):
     """Diffuse shading, two-sided: normals are turned towards the viewer."""
 
-    @property
-    def reads(self) -> tuple[str, ...]:
-        """G-buffer entries."""
-        return ("normal", "color", "uv")
+    reads = ("normal", "color", "uv")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
         """See `rts.Shader`."""
@@ -173,10 +163,7 @@ class Lambert(Unlit):
 class BlinnPhong(Unlit):
     """Diffuse shading with highlights (Blinn 1977), two-sided."""
 
-    @property
-    def reads(self) -> tuple[str, ...]:
-        """G-buffer entries."""
-        return ("normal", "color", "uv")
+    reads = ("normal", "color", "uv")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
         """See `rts.Shader`."""
@@ -268,7 +255,7 @@ def _light(theta: Mapping[str, Tree], camera: Camera) -> dict[str, Array]:
     given = dict(given)
     r = camera.view[:3, :3]
     if "direction" not in given:
-        given["direction"] = sum(c * r[i, :] for i, c in enumerate(DEFAULT_LIGHT))
+        given.update(direction=sum(c * r[i, :] for i, c in enumerate(DEFAULT_LIGHT)))
     xp = namespace(given["direction"])
     one = xp.ones_like(given["direction"][..., :3])
     given.setdefault("color", DEFAULT_DIFFUSE * one)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar, dataclass_transform
 
@@ -44,13 +44,13 @@ def record_arrays(value: Any) -> list[Any]:
     return [found[name] for name in _ARRAY_FIELDS[type(value)]]
 
 
-def split_record(value: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+def split_record(value: Any) -> tuple[list[Any], tuple[Any, ...]]:
     """A record's array fields in order of declaration, and its static fields in that of `STATIC_FIELDS`."""
     found = value.__dict__
-    return tuple(record_arrays(value)), tuple([found[name] for name in STATIC_FIELDS[type(value)]])
+    return record_arrays(value), tuple([found[name] for name in STATIC_FIELDS[type(value)]])
 
 
-def join_record(cls: type, arrays: tuple[Any, ...], static: tuple[Any, ...]) -> Any:
+def join_record(cls: type, arrays: Sequence[Any], static: tuple[Any, ...]) -> Any:
     """The inverse of `split_record`; runs no check, since frameworks put placeholders into the fields."""
     value = object.__new__(cls)
     value.__dict__.update(

@@ -38,7 +38,10 @@ class Reference(TriangleSampler):
             columns = (last - first + 1)[triangle, 0]
             x, y = first[triangle, 0] + within % columns, first[triangle, 1] + within // columns
             found.append(_hits(triangle, x, y, corners, depth, size))
-        return _nearest(*map(np.concatenate, zip(*found, strict=True)), size, layers) if found else _empty(size, layers)
+        if not found:
+            return _empty(size, layers)
+        triangle, pixel, barycentrics, depth = map(np.concatenate, zip(*found, strict=True))
+        return _nearest(triangle, pixel, barycentrics, depth, size, layers)
 
 
 def _chunks(counts: np.ndarray) -> list[np.ndarray]:
@@ -54,7 +57,7 @@ def _pixel_boxes(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray
     """First and last pixel (x, y) that each triangle may cover, and whether it may cover any."""
     height, width = size
     w = corners[..., 3]
-    whole = (w > 0).all(axis=1)
+    whole = np.all(w > 0, axis=1)
     safe = np.where(w > 0, w, 1.0)
     with np.errstate(over="ignore"):
         x, y = (corners[..., 0] / safe + 1) * width / 2, (1 - corners[..., 1] / safe) * height / 2
@@ -62,8 +65,8 @@ def _pixel_boxes(corners: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray
     limits = np.array([width - 1, height - 1])
     first = np.where(whole[:, None], np.floor(pixels.min(axis=1) - 0.5), 0).astype(np.int64).clip(0, limits + 1)
     last = np.where(whole[:, None], np.ceil(pixels.max(axis=1) - 0.5), limits).astype(np.int64).clip(-1, limits)
-    inside_near, inside_far = (corners[..., 2] >= -w).any(axis=1), (corners[..., 2] <= w).any(axis=1)
-    return first, last, inside_near & inside_far & (w > 0).any(axis=1)
+    inside_near, inside_far = np.any(corners[..., 2] >= -w, axis=1), np.any(corners[..., 2] <= w, axis=1)
+    return first, last, inside_near & inside_far & np.any(w > 0, axis=1)
 
 
 def _faces_viewer(corners: np.ndarray, camera: Camera) -> np.ndarray:

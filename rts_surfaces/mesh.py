@@ -42,8 +42,9 @@ class Mesh(TriangleSurface):
 
     def __init__(self, faces: Any, indices: Mapping[str, Any] | None = None):
         self.faces = _index_table("faces", faces)
+        self.face_count = len(self.faces)
         self._tables = [self.faces]
-        self._columns = dict.fromkeys(VERTEX_ATTRIBUTES, 0)
+        self._columns: dict[str, int] = dict.fromkeys(VERTEX_ATTRIBUTES, 0)
         for name, table in (indices or {}).items():
             self._columns[name] = 0
             if table is not None:
@@ -58,11 +59,6 @@ class Mesh(TriangleSurface):
         self.sample_widths = (self._ids.shape[1], 2)
         self._normals: tuple[tuple, np.ndarray] | None = None
         self._reads: dict[tuple, tuple[str, ...]] = {}
-
-    @property
-    def face_count(self) -> int:
-        """T."""
-        return len(self.faces)
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.faces)} faces)"

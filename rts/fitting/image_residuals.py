@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from rts.arrays import described, from_numbers, shape_of
 from rts.camera import Camera
@@ -11,7 +11,7 @@ from rts.checks import check_background, check_floating, check_scene, check_size
 from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting
 from rts.errors import InputError
 from rts.fitting.least_squares import flatten, normal_equations
-from rts.interfaces import Part, Residuals, Splatter
+from rts.interfaces import CheckedPart, Part, Residuals, Splatter
 from rts.records import Splats
 from rts.rendering import render, sample, to_splats
 from rts.sampling.prepared import PreparedParts
@@ -60,7 +60,7 @@ class ImageResiduals(Residuals):
         background: Any = None,
         sampler: Any = "auto",
         splatter: Any = "auto",
-        layers: int | str = 2,
+        layers: int | Literal["auto"] = 2,
         supersample: int = 1,
         capacity: int | None = None,
     ):
@@ -95,7 +95,7 @@ class ImageResiduals(Residuals):
         """Parts and camera for these parameters."""
         found = self._scene(parameters)
         if isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Camera):
-            return found
+            return found[0], found[1]
         if self._camera is None:
             raise InputError(
                 "camera is None, and scene gives none; expected an rts.Camera, or (parts, camera) of scene"
@@ -153,11 +153,11 @@ class ImageResiduals(Residuals):
         return target, weights, background
 
 
-def _checked(parts: Any, camera: Camera) -> tuple[list[Part], Camera]:
+def _checked(parts: Parts, camera: Camera) -> tuple[list[CheckedPart], Camera]:
     return check_scene(parts.parts if isinstance(parts, PreparedParts) else parts, camera)
 
 
-def _all_opaque(parts: Any, camera: Camera) -> bool:
+def _all_opaque(parts: Parts, camera: Camera) -> bool:
     return all(part.shader.opaque for part in _checked(parts, camera)[0])
 
 

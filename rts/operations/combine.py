@@ -86,22 +86,27 @@ def _shape(rows: tuple[int, ...], weights: tuple[int, ...], ids: tuple[int, ...]
     return weights[0], rows[1]
 
 
-def _forward(operands: Arrays, out: np.ndarray, **params: object) -> None:
+def _forward(operands: Arrays, out: np.ndarray, *, column: int, count: int, affine: bool) -> None:
     from rts.operations import combine_kernels
 
-    combine_kernels.forward(*operands, out, **params)
+    rows, weights, ids = operands
+    combine_kernels.forward(rows, weights, ids, out, column, count, affine)
 
 
-def _push(operands: Arrays, tangents: Some, out: np.ndarray, **params: object) -> None:
+def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, column: int, count: int, affine: bool) -> None:
     from rts.operations import combine_kernels
 
-    combine_kernels.push(*operands, *tangents, out, **params)
+    rows, weights, ids = operands
+    t_rows, t_weights = tangents
+    combine_kernels.push(rows, weights, ids, t_rows, t_weights, out, column, count, affine)
 
 
-def _pull(operands: Arrays, g: np.ndarray, results: Some, **params: object) -> None:
+def _pull(operands: Arrays, g: np.ndarray, results: Some, *, column: int, count: int, affine: bool) -> None:
     from rts.operations import combine_kernels
 
-    combine_kernels.pull(*operands, g, *results, **params)
+    rows, weights, ids = operands
+    g_rows, g_weights = results
+    combine_kernels.pull(rows, weights, ids, g, g_rows, g_weights, column, count, affine)
 
 
 COMBINE = Operation(

@@ -58,19 +58,24 @@ def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:
 def _forward(operands: Arrays, out: np.ndarray) -> None:
     from rts.operations import linear_kernels
 
-    linear_kernels.affine(*operands, out)
+    rows, points = operands
+    linear_kernels.affine(rows, points, out)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
     from rts.operations import linear_kernels
 
-    linear_kernels.affine_push(*operands, *tangents, out)
+    rows, points = operands
+    t_rows, t_points = tangents
+    linear_kernels.affine_push(rows, points, t_rows, t_points, out)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
     from rts.operations import linear_kernels
 
-    linear_kernels.affine_pull(*operands, g, *results)
+    rows, points = operands
+    g_rows, g_points = results
+    linear_kernels.affine_pull(rows, points, g, g_rows, g_points)
 
 
 _PACKED: dict[str, Any] = {"differentiable": 2, "packed": (1,), "packed_result": True}

@@ -36,19 +36,24 @@ def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:
 def _forward(operands: Arrays, out: np.ndarray) -> None:
     from rts.operations import projection_kernels
 
-    projection_kernels.project(*operands, out)
+    rows, points = operands
+    projection_kernels.project(rows, points, out)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
     from rts.operations import projection_kernels
 
-    projection_kernels.push(*operands, *tangents, out)
+    rows, points = operands
+    t_rows, t_points = tangents
+    projection_kernels.push(rows, points, t_rows, t_points, out)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
     from rts.operations import projection_kernels
 
-    projection_kernels.pull(*operands, g, *results)
+    rows, points = operands
+    g_rows, g_points = results
+    projection_kernels.pull(rows, points, g, g_rows, g_points)
 
 
 PROJECTION = Operation(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,8 @@ def _forward(operands: Arrays, out: np.ndarray) -> None:
     np.take(rows, index, axis=0, out=out, mode="clip")
 
 
-def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
+def _push(operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray) -> None:
+    # Of the one operand with a derivative there is always a tangent.
     np.take(tangents[0], operands[1], axis=0, out=out, mode="clip")
 
 

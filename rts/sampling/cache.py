@@ -78,4 +78,6 @@ def fingerprint(tree: Tree) -> tuple:
 
 
 def _fingerprint(x: np.ndarray) -> tuple:
-    return x.shape, x.dtype.str, xxhash.xxh3_128_intdigest(x.reshape(-1).view(np.uint8))
+    data = x.reshape(-1).view(np.uint8)
+    # To NumPy's stubs an array is a buffer from Python 3.12 on.
+    return x.shape, x.dtype.str, xxhash.xxh3_128_intdigest(data)  # pyright: ignore[reportArgumentType]

@@ -14,14 +14,14 @@ import numpy as np
 from rts.adapting import adapted
 from rts.engines import engine_of, is_traced, namespace
 from rts.errors import InputError, LayersWarning
-from rts.interfaces import Needed, Part, Splatter
+from rts.interfaces import AnyNeeded, CheckedPart, Needed, Splatter
 from rts.records import ArraySpec, Sampled, Samples
 
 LAYER_LIMIT = 8
 """The largest number of layers that `layers="auto"` takes."""
 
 
-def needed_by(splatter: Splatter, parts: Sequence[Part]) -> Callable[[np.ndarray, np.ndarray], np.ndarray] | None:
+def needed_by(splatter: Splatter, parts: Sequence[CheckedPart]) -> AnyNeeded | None:
     """What the splatter needs of a scene, or None where that is not known: all of it.
 
     Only where all samples are opaque and lie on pixel centres are hidden ones without effect.
@@ -48,7 +48,7 @@ class Inspection(Needed):
         short: number of cells whose layers ran out as they were refined: there may be more behind.
     """
 
-    def __init__(self, needed: Callable[[np.ndarray, np.ndarray], np.ndarray] | None):
+    def __init__(self, needed: AnyNeeded | None):
         self._needed, self._lock = needed, threading.Lock()
         self.short = 0
         self.most: int | None = None
@@ -75,7 +75,7 @@ class Inspection(Needed):
 class Everything(Needed):
     """Keeps all samples of one part of several, which are pruned once they are merged; hands on what ran out."""
 
-    def __init__(self, needed: Callable[[np.ndarray, np.ndarray], np.ndarray]):
+    def __init__(self, needed: AnyNeeded):
         self._needed: Needed = adapted(needed, Needed)
 
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -87,7 +87,7 @@ class Everything(Needed):
         self._needed.ran_out(cells)
 
 
-def as_needed(taken: Callable[[int, Needed], Sampled], needed: Needed | None) -> Sampled:
+def as_needed(taken: Callable[[int, Needed], Sampled], needed: AnyNeeded | None) -> Sampled:
     """The scene with as many layers as count.
 
     Args:
@@ -120,7 +120,7 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: Needed | None) ->
     )
 
 
-def prune(sampled: Sampled, needed: Needed) -> Sampled:
+def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
     """The scene without the samples that are not needed; one call to the host."""
     sizes = [s.ids.shape[0] for s in sampled.samples]
     offsets = np.cumsum([0, *sizes])

@@ -12,7 +12,7 @@ from rts.adapting import adapted, unwrapped
 from rts.camera import Camera
 from rts.engines import CONSTANT_TYPES, engine_of, is_constant, namespace, suiting
 from rts.errors import InputError
-from rts.interfaces import Needed, Part, Sampler, Shader, Surface, TriangleSurface, as_surface
+from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, Surface, TriangleSurface, as_surface
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.packing import lift, repack
@@ -110,7 +110,7 @@ class TriangleSampler(Sampler):
         layers: int,
         *,
         capacity: int | None = None,
-        needed: Needed | None = None,
+        needed: AnyNeeded | None = None,
         entry: Entry | None = None,
     ) -> Samples:
         """See `rts.Sampler`. One call to the host does everything.
@@ -172,7 +172,7 @@ class TriangleSampler(Sampler):
         camera: Camera,
         shape: _Shape,
         tables: Mapping[str, ArraySpec],
-        needed: Needed | None,
+        needed: AnyNeeded | None,
         entry: Entry | None,
     ) -> Samples:
         """The samples that are to be kept, on the host."""

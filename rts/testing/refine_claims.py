@@ -104,7 +104,7 @@ def claim_found_from_behind(part: Part, surface: RaySurface, camera: Camera, vie
     there = np.where(hit[:, chosen], distance[:, chosen], NOWHERE)
     again = np.where(np.asarray(back.hit), last - np.asarray(back.distance), NOWHERE)
     again = np.where(again < 0, NOWHERE, again)  # Before the near plane, where the first rays began.
-    wrong = (np.abs(np.sort(there, axis=0) - np.sort(again, axis=0)) > 1e-2).any(axis=0)
+    wrong = np.any(np.abs(np.sort(there, axis=0) - np.sort(again, axis=0)) > 1e-2, axis=0)
     claim(
         wrong.sum() <= FEW * len(wrong),
         f"{view}: {wrong.sum()} of {len(wrong)} rays hit other places when they come from behind; does intersect miss "

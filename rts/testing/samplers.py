@@ -177,7 +177,8 @@ class SamplerConformance(Conformance):
         part = parts[0]
         part = scenes.checked(part)
         whole = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2)
-        found = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2, needed=fronts)
+        pruning: dict[str, Any] = {"needed": fronts}
+        found = chosen.sample(part, scenes.CAMERA, scenes.SIZE, 2, **pruning)
         claim((np.asarray(found.row)[1] < 0).all(), "samples that are not needed are kept")
         kept = (np.asarray(found.row)[0] >= 0) == (np.asarray(whole.row)[0] >= 0)
         claim(kept.all(), "samples that are needed are left out")
@@ -268,18 +269,18 @@ class Expected(NamedTuple):
 class Silhouettes(NamedTuple):
     """How many pixels are at silhouettes, and how many of them differ from what was expected."""
 
-    count: int = 0
+    pixels: int = 0
     different: int = 0
 
     def __add__(self, other: Any) -> Silhouettes:
         """Both together."""
-        return Silhouettes(self.count + other[0], self.different + other[1])
+        return Silhouettes(self.pixels + other[0], self.different + other[1])
 
     def claim_few(self, what: str) -> None:
         """Fail if more than one in a hundred differ."""
         claim(
-            self.different <= 0.01 * self.count,
-            f"{what}{self.different} of {self.count} pixels at silhouettes differ from what they should be; expected "
+            self.different <= 0.01 * self.pixels,
+            f"{what}{self.different} of {self.pixels} pixels at silhouettes differ from what they should be; expected "
             f"at most 1 %",
         )
 

@@ -8,10 +8,13 @@ candidate that the exact test puts just beyond an edge stays only if no neighbou
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numba
 import numpy as np
 from llvmlite import ir
-from numba import types
+from numba import carray, types  # pyright: ignore[reportPrivateImportUsage]  # Documented, but not in __all__.
 from numba.extending import intrinsic
 
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
@@ -45,7 +48,12 @@ LAYERS, COUNT, PIXEL_X, PIXEL_Y, KEEP, DEPTH_SLACK, START, NEAREST, FARTHEST = r
 HEADER = 9
 
 
-@intrinsic
+def _intrinsic(definition: Callable[..., tuple]) -> Callable[..., Any]:
+    """`intrinsic`, whose functions are called without the typing context that their definition takes first."""
+    return intrinsic(definition)
+
+
+@_intrinsic
 def _call(typing_context, function, a, b, c):
     """Call a C function of three pointers that returns nothing, all given as integers."""
     signature = types.void(types.intp, types.intp, types.intp, types.intp)
@@ -60,7 +68,7 @@ def _call(typing_context, function, a, b, c):
     return signature, generate
 
 
-@intrinsic
+@_intrinsic
 def _pointer(typing_context, address):
     """An integer as a pointer."""
 
@@ -167,21 +175,21 @@ def _insert(t, z, kind, state, depths, ids, kinds, work, vertices, faces):
 @numba.cfunc(types.void(types.CPointer(types.intp)), cache=True)
 def _keep_nearest(arguments):
     """Embree's intersection filter; fields: valid, user, context, ray, hit."""
-    fields = numba.carray(arguments, 5)
-    valid = numba.carray(_pointer(fields[0]), 1, types.int32)
-    ray = numba.carray(_pointer(fields[3]), 9, types.float32)
-    hit = numba.carray(_pointer(fields[4]), 5, types.float32)
-    t = numba.carray(_pointer(fields[4]), 7, types.int32)[5]
+    fields = carray(arguments, 5)
+    valid = carray(_pointer(fields[0]), 1, np.int32)
+    ray = carray(_pointer(fields[3]), 9, np.float32)
+    hit = carray(_pointer(fields[4]), 5, np.float32)
+    t = carray(_pointer(fields[4]), 7, np.int32)[5]
     # Ours, behind the 16 bytes of Embree's own query context: addresses and counts.
-    context = numba.carray(_pointer(fields[2]), 12, types.intp)
+    context = carray(_pointer(fields[2]), 12, np.intp)
     slots = context[3]
-    state = numba.carray(_pointer(context[2]), HEADER, types.float64)
-    depths = numba.carray(_pointer(context[4]), slots, types.float64)
-    ids = numba.carray(_pointer(context[5]), slots, types.int32)
-    kinds = numba.carray(_pointer(context[6]), slots, types.int8)
-    vertices = numba.carray(_pointer(context[7]), (context[8], 3), types.float32)
-    faces = numba.carray(_pointer(context[9]), (context[10], 3), types.int32)
-    work = numba.carray(_pointer(context[11]), (8, 4), types.float64)
+    state = carray(_pointer(context[2]), HEADER, np.float64)
+    depths = carray(_pointer(context[4]), slots, np.float64)
+    ids = carray(_pointer(context[5]), slots, np.int32)
+    kinds = carray(_pointer(context[6]), slots, np.int8)
+    vertices = carray(_pointer(context[7]), (context[8], 3), np.float32)
+    faces = carray(_pointer(context[9]), (context[10], 3), np.int32)
+    work = carray(_pointer(context[11]), (8, 4), np.float64)
 
     valid[0] = REJECT
     u, v, z = hit[3], hit[4], state[START] + ray[8]
@@ -215,7 +223,7 @@ def _keep_nearest(arguments):
 
 def keep_nearest_address() -> int:
     """Address of the intersection filter."""
-    return _keep_nearest.address
+    return _keep_nearest.address  # pyright: ignore[reportReturnType]  # None before it is compiled, which it is.
 
 
 @numba.njit(cache=True, nogil=True)

@@ -206,7 +206,7 @@ class Cells:
         found = [None if x is None else np.zeros((len(index), x.shape[1]), x.dtype) for x in results]
         copy.vjp(g, *found)
         for result, values in zip(results, found, strict=True):
-            if result is not None:
+            if result is not None and values is not None:
                 np.add.at(result, index, values)
 
 

@@ -99,17 +99,22 @@ def _shape(positions: tuple, rgba: tuple, row: tuple, *, settings: Settings) -> 
 
 
 def _forward(operands: Arrays, out: np.ndarray, *, settings: Settings) -> Choices | None:
-    cells = Cells(settings, *operands)
+    positions, rgba, row = operands
+    cells = Cells(settings, positions, rgba, row)
     cells.image(out)
     return cells.choices if out.size else None
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, settings: Settings, kept: Choices | None) -> None:
-    Cells(settings, *operands, kept).jvp(*tangents, out)
+    positions, rgba, row = operands
+    t_positions, t_rgba = tangents
+    Cells(settings, positions, rgba, row, kept).jvp(t_positions, t_rgba, out)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings, kept: Choices | None) -> None:
-    Cells(settings, *operands, kept).vjp(g, *results)
+    positions, rgba, row = operands
+    g_positions, g_rgba = results
+    Cells(settings, positions, rgba, row, kept).vjp(g, g_positions, g_rgba)
 
 
 def _used(operands: Arrays) -> int:

@@ -72,7 +72,7 @@ class JaxEngine(Engine):
 
         packed = [i for i, spec in enumerate(specs) if spec.packed]
 
-        def noticed(*host_args: Any) -> Sequence[np.ndarray]:
+        def noticed(*host_args: Any) -> Sequence[np.ndarray | np.generic]:
             try:
                 found = fn(*host_args)
             except RtsError as error:

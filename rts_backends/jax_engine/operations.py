@@ -153,7 +153,7 @@ class _Differentiable:
         operands = [read_only(x) for x in given[: self._inputs]]
         operation, used = self.operation, 0
         if operation.packed:
-            used = int(given[self._inputs]) if self._told else operation.used(operands)
+            used = int(given[self._inputs]) if operation.used is None else operation.used(operands)
             for i in operation.packed:
                 x = operands[i]
                 # Of even operands there may be but one row.
@@ -374,17 +374,17 @@ class _Operation:
     def _lowered(self, ctx: Any, *operands: Any, **params: Any) -> Any:
         """In a program for the CPU."""
         shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in ctx.avals_out)
-        operands, avals = list(operands), list(ctx.avals_in)
+        values, avals = list(operands), list(ctx.avals_in)
         for i in self._even:
-            row = _only_row(operands[i]) if avals[i].ndim == self.ranks[i] and avals[i].shape[0] else None
+            row = _only_row(values[i]) if avals[i].ndim == self.ranks[i] and avals[i].shape[0] else None
             if row is not None:
-                operands[i], avals[i] = row, avals[i].update(shape=(1, *avals[i].shape[1:]))
+                values[i], avals[i] = row, avals[i].update(shape=(1, *avals[i].shape[1:]))
 
         def call(*given: jax.Array) -> list[jax.Array]:
             name = f"{self.name} {sorted(params.items())}"
             return host.call_named(name, lambda i, o: self._on_host(i, o, params), shapes, *given)
 
-        return mlir.lower_fun(call, multiple_results=True)(ctx.replace(avals_in=avals), *operands)
+        return mlir.lower_fun(call, multiple_results=True)(ctx.replace(avals_in=avals), *values)
 
     def _eager(self, *operands: Any, **params: Any) -> list[jax.Array]:
         device = _cpu_of(operands)

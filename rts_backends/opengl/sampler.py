@@ -189,8 +189,8 @@ def _targets(context: moderngl.Context, size: tuple[int, int]) -> list[tuple[Any
         pairs, made = [], []
         try:
             for _ in range(2):
-                made.append(texture := context.texture(size[::-1], 2, dtype="i4"))
-                made.append(depth := context.depth_renderbuffer(size[::-1]))
+                made.append(texture := context.texture((size[1], size[0]), 2, dtype="i4"))
+                made.append(depth := context.depth_renderbuffer((size[1], size[0])))
                 made.append(framebuffer := context.framebuffer([texture], depth))
                 pairs.append((framebuffer, texture, depth))
         except BaseException:

@@ -96,8 +96,9 @@ class Worker:
                 future.set_exception(error)
             except BaseException as error:
                 future.set_exception(error)
-                with contextlib.suppress(Exception):
-                    _errors(self.context)  # Not left for the next task to find.
+                if self.context is not None:
+                    with contextlib.suppress(Exception):
+                        _errors(self.context)  # Not left for the next task to find.
             del task, function, args, future
         if self.context is not None:
             self.context.release()
@@ -124,7 +125,7 @@ def _errors(context: moderngl.Context) -> list[str]:
 
 
 def _create() -> moderngl.Context:
-    options = {"backend": "egl"} if sys.platform.startswith("linux") else {}
+    options: dict[str, Any] = {"backend": "egl"} if sys.platform.startswith("linux") else {}
     try:
         return moderngl.create_context(require=VERSION, standalone=True, **options)
     except Exception as error:  # moderngl raises bare Exceptions.

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 import torch.utils.checkpoint
 from array_api_compat import torch as array_api
+from torch._C._functorch import get_unwrapped, is_functorch_wrapped_tensor, maybe_current_level
 from torch.utils import _pytree
 
 from rts.engines import Engine
@@ -21,7 +22,7 @@ from rts_backends.torch_engine.functions import applied, transformed
 for _cls in STATIC_FIELDS:
     _pytree.register_pytree_node(
         _cls,
-        lambda value: ((parts := split_record(value))[0], parts[1]),
+        split_record,
         lambda arrays, static, cls=_cls: join_record(cls, tuple(arrays), static),
         serialized_type_name=f"rts.{_cls.__name__}",
     )
@@ -66,8 +67,9 @@ class _HostCall(torch.autograd.Function):
     def jvp(ctx, *_):
         return (None,) * ctx.counts[1]
 
+    # torch's own signature has no named arguments, though its manual has.
     @staticmethod
-    def vmap(info, in_dims, fn, specs, *args):
+    def vmap(info, in_dims, fn, specs, *args):  # pyright: ignore[reportIncompatibleMethodOverride]
         def select(b):
             return [a if d is None else a.select(d, b) for a, d in zip(args, in_dims[2:], strict=True)]
 
@@ -101,7 +103,8 @@ class TorchEngine(Engine):
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[torch.Tensor, ...]:
         """Call `fn` on NumPy views or copies of `args`; under vmap once an item, packed rows padded alike."""
         if torch.compiler.is_compiling():
-            return torch.compiler.disable(applied)(_HostCall, fn, specs, *args)
+            # torch annotates nothing of what `disable` returns.
+            return torch.compiler.disable(applied)(_HostCall, fn, specs, *args)  # pyright: ignore[reportCallIssue]
         return applied(_HostCall, fn, specs, *args)
 
     def uncompiled(self, f: Callable) -> Callable:
@@ -127,7 +130,7 @@ class TorchEngine(Engine):
 
     def padded(self, x: torch.Tensor) -> bool:
         """Under `torch.vmap`, whose items have as many rows as the largest."""
-        return torch._C._functorch.maybe_current_level() is not None
+        return maybe_current_level() is not None
 
     def fill_unused(self, x: torch.Tensor, row: torch.Tensor) -> torch.Tensor:
         """By selection; ones where no cell refers to any row."""
@@ -164,8 +167,8 @@ class TorchEngine(Engine):
         for _ in range(most):
             on = going(state)
             whole = on
-            while torch._C._functorch.is_functorch_wrapped_tensor(whole):
-                whole = torch._C._functorch.get_unwrapped(whole)
+            while is_functorch_wrapped_tensor(whole):
+                whole = get_unwrapped(whole)
             if not bool(whole.any()):
                 break
             new = iter(list(leaves(body(state))))
@@ -208,7 +211,8 @@ class TorchEngine(Engine):
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[torch.Tensor, torch.Tensor]:
         """By forward-mode autodiff."""
-        return torch.func.jvp(f, (primal,), (tangent,))
+        # A third result, with `has_aux` alone, is always in torch's annotation.
+        return torch.func.jvp(f, (primal,), (tangent,))  # pyright: ignore[reportReturnType]
 
     def jacobian(self, f: Callable) -> Callable:
         """By forward-mode autodiff, all unknowns in one vectorised pass."""
@@ -216,7 +220,12 @@ class TorchEngine(Engine):
         def call(vector: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
             vector = vector.detach()
             along = torch.eye(vector.numel(), dtype=vector.dtype, device=vector.device)
-            return torch.func.vmap(lambda t: torch.func.jvp(f, (vector,), (t,)), out_dims=(None, 0))(along)
+            # torch's annotation of axes has no None in a tuple.
+            pushed = torch.func.vmap(
+                lambda t: torch.func.jvp(f, (vector,), (t,)),
+                out_dims=(None, 0),  # pyright: ignore[reportArgumentType]
+            )
+            return pushed(along)  # pyright: ignore[reportReturnType]  # Two results, as above.
 
         return call
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch._C._functorch import is_legacy_batchedtensor, unwrap_if_dead
+from torch._C._functorch import is_legacy_batchedtensor, maybe_current_level, unwrap_if_dead
 from torch.autograd import forward_ad
 from torch.utils import _pytree
 
@@ -21,15 +21,15 @@ def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
     if torch._C._are_functorch_transforms_active():
         return function.apply(*args)
     # What torch does with all arguments, in one loop.
-    args = [unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
-    return super(torch.autograd.Function, function).apply(*args)  # pyright: ignore[reportAttributeAccessIssue]
+    given = [unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
+    return super(torch.autograd.Function, function).apply(*given)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def transformed() -> bool:
     """Whether a transform of torch, forward mode or a compilation looks at what is computed now."""
     if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
         return True
-    return torch._C._functorch.maybe_current_level() is not None
+    return maybe_current_level() is not None
 
 
 def foreign(*tensors: Tensor | None) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from rts.threads import read_only
 from rts_backends.torch_engine.functions import along, applied, foreign, on_host
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}
+_T = TypeVar("_T", Tensor, np.ndarray)
 _INTEGERS = {torch.int32, torch.int64, torch.int16, torch.int8, torch.uint8, torch.bool}
 
 
@@ -111,7 +112,7 @@ class _Call:
         return push
 
 
-def _spread(given: Sequence[Tensor], present: Sequence[bool]) -> list[Tensor | None]:
+def _spread(given: Sequence[_T], present: Sequence[bool]) -> list[_T | None]:
     """Those given in the places where they are present, None in the others."""
     it = iter(given)
     return [next(it) if there else None for there in present]
@@ -168,8 +169,9 @@ class _Value(torch.autograd.Function):
             return call.pushed(present, fixed)(*varied, *there)[0]
         return applied(_Push, call, present, *operands, *there)[0]
 
+    # torch's own signature has no named arguments, though its manual has.
     @staticmethod
-    def vmap(info, in_dims, call, *operands):
+    def vmap(info, in_dims, call, *operands):  # pyright: ignore[reportIncompatibleMethodOverride]
         items = _items(info, in_dims[1:], operands)
         return torch.stack([applied(_Value, call.another(), *item) for item in items]), 0
 
@@ -209,8 +211,9 @@ class _Pull(torch.autograd.Function):
         pull, primals, _ = _Pull._differentiable(ctx)
         return along(pull, primals, (*given[2 : 2 + ctx.call.count], given[-1]))
 
+    # torch's own signature has no named arguments, though its manual has.
     @staticmethod
-    def vmap(info, in_dims, call, wanted, *given):
+    def vmap(info, in_dims, call, wanted, *given):  # pyright: ignore[reportIncompatibleMethodOverride]
         same = all(d is None for d in in_dims[2:-1])
         items = [
             applied(_Pull, call if same else call.another(), wanted, *item) for item in _items(info, in_dims[2:], given)
@@ -254,8 +257,9 @@ class _Push(torch.autograd.Function):
         push, primals, _ = _Push._differentiable(ctx)
         return along(push, primals, (*given[2 : 2 + ctx.call.count], *given[-sum(ctx.present) :]))
 
+    # torch's own signature has no named arguments, though its manual has.
     @staticmethod
-    def vmap(info, in_dims, call, present, *given):
+    def vmap(info, in_dims, call, present, *given):  # pyright: ignore[reportIncompatibleMethodOverride]
         count, dims = sum(present), in_dims[2:]
         if any(d is not None for d in dims[:-count]):
             items = _items(info, dims, given)
