@@ -45,7 +45,7 @@ class _Wrapped:
 
     @property
     def __class__(self) -> type:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Of the object, so that `isinstance` knows it by its own class as by the base's."""
+        """The object's class: so `isinstance` knows a wrapper by the object's own class as by the base."""
         return type(self._given)
 
     def __getattr__(self, name: str) -> Any:

@@ -13,7 +13,7 @@ from rts.trees import Array, Tree, is_named, leaves
 
 
 def from_numbers(tree: Tree) -> Tree:
-    """The same tree with every list or tuple that holds only numbers, nested or not, as a float32 array."""
+    """A copy of a tree in which every list or tuple that holds only numbers, nested or not, is a float32 array."""
     if type(tree) is np.ndarray or type(tree) in OWNERS:
         return tree
     if isinstance(tree, Mapping):
@@ -43,6 +43,15 @@ def shape_of(x: Any) -> tuple[int, ...]:
 def described(x: Any) -> str:
     """What an error says of a value: "has shape (2, 3)" of an array, what it is of anything else."""
     return f"is a {type(x).__name__}" if _shape(x) is None else f"has shape {shape_of(x)}"
+
+
+def kind_of(x: Any) -> str:
+    """What an error calls a value that it did not expect: "a torch.Tensor of shape (2, 3)", "a str", "None"."""
+    if x is None:
+        return "None"
+    kind, shape = type(x), shape_of(x)
+    name = kind.__qualname__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__qualname__}"
+    return f"a {name}{f' of shape {shape}' if shape else ''}"
 
 
 def promote(*values: Any) -> tuple[Any, list[Array]]:

@@ -280,7 +280,7 @@ class Camera(NamedTuple):
     # ----------------------------------------------------------------------------------------------- use
 
     def within(self, transform: Array | None) -> Camera:
-        """The same camera in the local space of a part with this world-from-local transform."""
+        """This camera in the local space of a part, whose world-from-local transform is given."""
         if transform is None:
             return self
         _, (view, transform) = promote(self.view, transform)

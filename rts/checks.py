@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
+from numbers import Integral, Real
 from typing import Any
-
-import numpy as np
 
 from rts import registry
 from rts.adapting import adapted
@@ -84,7 +83,7 @@ def suited_sampler(chosen: Sampler, part: Part, camera: Camera | None) -> Sample
 def check_splatter(chosen: Any) -> Splatter:
     """A usable splatter from a name, a class or an object."""
     found = _checked_plugin("rts.splatters", chosen, Splatter, "image")
-    if not (isinstance(found.reach, int) and found.reach >= 1):
+    if not (is_count(found.reach)):
         raise InputError(f"reach of {found!r} is {found.reach!r}; expected cells, an integer of at least 1")
     return found
 
@@ -114,11 +113,11 @@ def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple
     if not whole or height <= 0 or width <= 0:
         given = " ".join(repr(size).split())[:60]
         raise InputError(f"size is {given}; expected (height, width), two positive integers")
-    if not (isinstance(layers, str) and layers == "auto") and not _is_count(layers):
+    if not (isinstance(layers, str) and layers == "auto") and not is_count(layers):
         raise InputError(f'layers is {layers!r}; expected an integer of at least 1, or "auto"')
-    if capacity is not None and not _is_count(capacity):
+    if capacity is not None and not is_count(capacity):
         raise InputError(f"capacity is {capacity!r}; expected an integer of at least 1, or None")
-    if not _is_count(supersample):
+    if not is_count(supersample):
         raise InputError(f"supersample is {supersample!r}; expected an integer of at least 1")
     return height, width
 
@@ -133,8 +132,14 @@ def check_memory(height: int, width: int, layers: int, *, gradient: bool) -> Non
         )
 
 
-def _is_count(value: Any) -> bool | np.bool_:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 1
+def is_count(value: Any) -> bool:
+    """Whether a value is an integer of at least 1, Python's or NumPy's."""
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1
+
+
+def is_real(value: Any) -> bool:
+    """Whether a value is a real number, Python's or NumPy's, infinity and NaN included."""
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def check_background(background: Any, size: tuple[int, int]) -> Array | None:

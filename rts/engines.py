@@ -56,7 +56,7 @@ class Engine(Plugin):
 
     @abc.abstractmethod
     def stop_gradient(self, x: Array) -> Array:
-        """The same values without derivatives."""
+        """The values of an array, without derivatives."""
 
     @abc.abstractmethod
     def segment_sum(self, values: Array, segments: np.ndarray, count: int) -> Array:
@@ -292,7 +292,7 @@ def uncompiled(f: _F) -> _F:
             outside = engine.uncompiled(outside)
         return outside(*args, **kwargs)
 
-    return call  # pyright: ignore[reportReturnType]
+    return call  # pyright: ignore[reportReturnType]  # A wrapper stands for what it wraps.
 
 
 def is_traced(x: Array) -> bool:
@@ -326,7 +326,7 @@ def namespace(*arrays: Array) -> Any:
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:
-    """The same tree with every NumPy array and number as a constant of the engine."""
+    """A copy of a tree in which every NumPy array and number is a constant of the engine."""
     if tree is None or type(tree) in OWNERS:
         return tree
     if type(tree) is np.ndarray:

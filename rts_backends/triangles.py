@@ -66,7 +66,7 @@ def depth_of(row, vertices, v):
 
 @numba.njit
 def determinant(corners, ia, ib, ic):
-    """Of the three corners (X, Y, w): twice the signed area on screen, times the three w."""
+    """The determinant of three corners (X, Y, w): twice the signed area on screen, times the three w."""
     ax, ay, aw = corners[ia, 0], corners[ia, 1], corners[ia, 3]
     bx, by, bw = corners[ib, 0], corners[ib, 1], corners[ib, 3]
     cx, cy, cw = corners[ic, 0], corners[ic, 1], corners[ic, 3]

@@ -129,8 +129,8 @@ def test_a_direction_that_does_not_fit_is_refused():
 @pytest.mark.parametrize(
     "change, said",
     [
-        ({"scene": lambda p: card(p)[0]}, r"scene gave a Part; expected \(parts, camera\)"),
-        ({"scene": lambda p: None}, "scene gave a NoneType"),
+        ({"scene": lambda p: card(p)[0]}, r"scene gave a rts.interfaces.Part; expected \(parts, camera\)"),
+        ({"scene": lambda p: None}, "scene gave None"),
         ({"loss": lambda image: image}, "loss gave .*; expected a .* scalar"),
         ({"loss": lambda image: 1.0}, "loss gave a float"),
         ({"size": 64}, "size is 64; expected"),

@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import from_numbers, shape_of
+from rts.arrays import from_numbers, kind_of
 from rts.camera import Camera
-from rts.checks import check_size
+from rts.checks import check_size, is_count, is_real
 from rts.engines import Engine, engine_of, is_constant, is_traced, namespace
 from rts.errors import InputError
 from rts.files.srgb import decode_srgb
@@ -74,13 +73,13 @@ def gradient_image(
             raise InputError("parameters holds more than one number; give the direction along which to differentiate")
         direction = map_leaves(lambda p: engine.namespace.ones_like(p), parameters)
     direction = _like(from_numbers(direction), parameters, engine)
-    if scale is not None and not (isinstance(scale, Real) and 0 < scale < math.inf):
+    if scale is not None and not (is_real(scale) and 0 < scale < math.inf):
         raise InputError(f"scale is {scale!r}; expected a positive number, or None for the largest change")
 
     def checked(p: Tree) -> Array:
         found = image(p)
         if not engine.owns(found) or found.ndim != 3:
-            raise InputError(f"image gave {_kind(found)}; expected a {engine.name} array (H, W, C)")
+            raise InputError(f"image gave {kind_of(found)}; expected a {engine.name} array (H, W, C)")
         return found
 
     derivative = engine.to_numpy(engine.jvp(checked, parameters, direction)[1])
@@ -176,14 +175,14 @@ def check_gradient(
     """
     engine, parameters = _differentiable(parameters)
     size = check_size(size, 1, None, samples)
-    if isinstance(entries, bool) or not isinstance(entries, Integral) or entries < 1:
+    if not is_count(entries):
         raise InputError(f"entries is {entries!r}; expected an integer of at least 1")
     loss = _scalar(_smooth_weighting(size, engine, parameters) if loss is None else loss, engine)
 
     def image(p: Tree, **changes: Any) -> Array:
         found = scene(p)
         if not isinstance(found, tuple) or len(found) != 2:
-            raise InputError(f"scene gave {_kind(found)}; expected (parts, camera)")
+            raise InputError(f"scene gave {kind_of(found)}; expected (parts, camera)")
         return render(*found, size, **{**options, **changes})
 
     value, gradient = engine.value_and_grad(lambda p: loss(image(p)))(parameters)
@@ -239,18 +238,13 @@ def _scalar(loss: Callable[[Array], Array], engine: Engine) -> Callable[[Array],
 
     def call(image: Array) -> Array:
         if not engine.owns(image):
-            raise InputError(f"the image is {_kind(image)}: nothing in the scene depends on the parameters")
+            raise InputError(f"the image is {kind_of(image)}: nothing in the scene depends on the parameters")
         value = loss(image)
         if not engine.owns(value) or value.shape != ():
-            raise InputError(f"loss gave {_kind(value)}; expected a {engine.name} scalar, of shape ()")
+            raise InputError(f"loss gave {kind_of(value)}; expected a {engine.name} scalar, of shape ()")
         return value
 
     return call
-
-
-def _kind(value: Any) -> str:
-    shape = shape_of(value)
-    return f"a {type(value).__name__}{f' of shape {shape}' if shape else ''}"
 
 
 def _named(tree: Tree, name: str = "") -> Iterator[tuple[str, Array]]:

@@ -90,6 +90,7 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
     # The usual pixel format of mp4 halves the resolution of colour: sides must be even.
     even: list[Any] = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in pictures]
     even = [np.pad(p, ((0, p.shape[0] % 2), (0, p.shape[1] % 2), (0, 0)), mode="edge") for p in even]
+    # The format's own options are not in the function's annotations.
     imageio.mimwrite(path, even, fps=fps, macro_block_size=2)  # pyright: ignore[reportCallIssue]
 
 

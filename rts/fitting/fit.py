@@ -6,12 +6,13 @@ import math
 import time
 from collections.abc import Callable
 from functools import partial
-from numbers import Integral, Real
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rts.adapting import adapted
+from rts.arrays import kind_of
+from rts.checks import is_count, is_real
 from rts.engines import Engine, engine_of, is_constant
 from rts.errors import InputError
 from rts.fitting.least_squares import levenberg_marquardt, mean_square
@@ -144,23 +145,19 @@ def _check_method(method: str, loss: Callable, steps: int | None, learning_rate:
         raise InputError('method "lm" minimises the mean square and takes no other loss; use "adam", or leave out loss')
     if steps is not None:
         _check_count("steps", steps)
-    if learning_rate is not None and not (_is_real(learning_rate) and 0 < learning_rate < math.inf):
+    if learning_rate is not None and not (is_real(learning_rate) and 0 < learning_rate < math.inf):
         raise InputError(f"learning_rate is {learning_rate!r}; expected a positive number")
 
 
 def _check_limits(tolerance: float, patience: int) -> None:
-    if not (_is_real(tolerance) and tolerance >= 0):
+    if not (is_real(tolerance) and tolerance >= 0):
         raise InputError(f"tolerance is {tolerance!r}; expected a number, at least 0")
     _check_count("patience", patience)
 
 
 def _check_count(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+    if not is_count(value):
         raise InputError(f"{name} is {value!r}; expected a whole number, at least 1")
-
-
-def _is_real(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def _checked_engine(parameters: Tree) -> Engine:
@@ -175,12 +172,14 @@ def _checked_engine(parameters: Tree) -> Engine:
 
 
 def _checked(residuals: Callable[[Tree], Array], engine: Engine) -> Callable[[Tree], Array]:
-    """The same function, whose result is known to be a floating array of the engine."""
+    """A function like `residuals`, whose result is known to be a floating array of the engine."""
 
     def call(parameters: Tree) -> Array:
         result = residuals(parameters)
         if not engine.owns(result):
-            raise InputError(f"residuals gave {_kind(result)}; expected one {engine.name} array, as the parameters are")
+            raise InputError(
+                f"residuals gave {kind_of(result)}; expected one {engine.name} array, as the parameters are"
+            )
         if not engine.namespace.isdtype(result.dtype, "real floating") or 0 in result.shape:
             raise InputError(
                 f"residuals gave an array of shape {tuple(result.shape)} and dtype {result.dtype}; "
@@ -197,14 +196,8 @@ def _objective(residuals: Callable, loss: Callable, engine: Engine) -> Callable[
     def call(parameters: Tree) -> Array:
         value = loss(residuals(parameters))
         if not engine.owns(value) or value.shape != ():
-            what = f"an array of shape {tuple(value.shape)}" if engine.owns(value) else _kind(value)
+            what = f"an array of shape {tuple(value.shape)}" if engine.owns(value) else kind_of(value)
             raise InputError(f"loss gave {what}; expected a {engine.name} scalar, of shape ()")
         return value
 
     return call
-
-
-def _kind(value: Any) -> str:
-    return (
-        "None" if value is None else f"a {type(value).__module__}.{type(value).__qualname__}".replace("builtins.", "")
-    )

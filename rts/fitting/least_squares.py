@@ -30,7 +30,7 @@ class _Linear(NamedTuple):
     gradient: np.ndarray
 
     def checked(self, start: bool) -> _Linear:
-        """The same, which must be finite."""
+        """This, refused where it is not finite."""
         require(math.isfinite(self.value), f"the loss is {self.value}", start)
         require(bool(np.isfinite(self.matrix).all()), "the Jacobian is not finite", start)
         return self

@@ -121,5 +121,5 @@ COMBINE = Operation(
     packed=(1, 2),
     packed_result=True,
 )
-"""Of rows, weights and ids; parameters are the first of the columns of ids, their number, and whether the last weight
-is what the others lack of one."""
+"""The operation of `combine` and `interpolate`, on rows, weights and ids. Its parameters: the first of the columns of
+ids that are used, how many are, and whether there is one weight less, the last being what the others lack of one."""

@@ -11,7 +11,7 @@ from rts.errors import InputError
 from rts.trees import Array
 
 STEP = 6e-6
-"""Of central differences in float64, as a share of the largest coordinate: the cube root of its precision."""
+"""The step of central differences in float64, as a share of the largest coordinate: the cube root of its precision."""
 
 
 def gradient(f: Callable[[Array], Array], points: Array) -> Array:

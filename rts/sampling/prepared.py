@@ -26,7 +26,7 @@ class PreparedParts:
         self.parts, self.samplers, self.entries = tuple(parts), tuple(samplers), tuple(entries)
 
     def replace(self, index: int = 0, **changes: Any) -> PreparedParts:
-        """The same with some fields of one part changed, such as its `transform`; the triangles are not looked at."""
+        """A copy with some fields of one part changed, such as its `transform`; the triangles are not looked at."""
         if "surface" in changes:
             raise InputError("a prepared part keeps its surface; call rts.prepare for another one")
         unknown = set(changes) - {"theta", "shader", "transform", "cull"}

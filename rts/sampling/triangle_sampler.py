@@ -83,7 +83,7 @@ class TriangleSampler(Sampler):
         return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None)
 
     def _entry(self, surface: TriangleSurface, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
-        """The same, kept from call to call where that pays."""
+        """What `_built` gives, kept from call to call where that pays."""
         if surface.proxy_is_cheap and not self.builds:
             proxy = checked_proxy(surface, inputs, camera, size)
             return Entry(proxy, self.prepare(proxy))
@@ -218,11 +218,11 @@ class _Shape(NamedTuple):
         return self.layers * self.size[0] * self.size[1] if self.capacity is None else self.capacity
 
     def row_spec(self, dtype: Any, *widths: int) -> ArraySpec:
-        """Of an array with a row a sample."""
+        """The spec of an array with a row for each sample."""
         return ArraySpec((self.rows, *widths), dtype, self.capacity is None)
 
     def tables(self, surface: TriangleSurface) -> dict[str, ArraySpec]:
-        """Of what a surface's `refine` fills."""
+        """The specs of what a surface's `refine` fills."""
         specs = dict(surface.table_specs(self.layers * self.size[0] * self.size[1], self.capacity))
         for name, spec in specs.items():
             if spec.by_sample:
@@ -230,7 +230,7 @@ class _Shape(NamedTuple):
         return specs
 
     def specs(self, widths: tuple[int, int]) -> tuple[ArraySpec, ...]:
-        """Of ids, params, row, depth and overflow."""
+        """The specs of ids, params, row, depth and overflow."""
         grid = self.layers, *self.size
         return (
             self.row_spec(np.int32, widths[0]),

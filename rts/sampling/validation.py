@@ -102,7 +102,7 @@ def _spread(m: np.ndarray) -> float:
 
 @functools.lru_cache(maxsize=64)
 def _spread_of_projection(data: bytes) -> float:
-    """The same of the bytes of a (4, 4) float64 matrix, which often is that of the call before."""
+    """What `_spread` is, of a (4, 4) float64 matrix given as bytes: kept, since it often is that of the call before."""
     matrix = np.frombuffer(data).reshape(4, 4)
     square = float((matrix * matrix).sum(axis=1).prod())
     return float(np.linalg.det(matrix)) ** 2 / square if square > 0 else 0.0

@@ -16,11 +16,10 @@ import abc
 import functools
 import math
 from dataclasses import dataclass
-from numbers import Real
-from typing import Any
 
 import numpy as np
 
+from rts.checks import is_count, is_real
 from rts.engines import engine_of, namespace
 from rts.errors import InputError
 from rts.interfaces import Splatter
@@ -51,11 +50,11 @@ class Kernel(Splatter):
     calibration: float | None = 1.0
 
     def __post_init__(self):
-        if not (_is_real(self.sigma) and LEAST_SIGMA <= self.sigma <= LARGEST_SIGMA):
+        if not (is_real(self.sigma) and LEAST_SIGMA <= self.sigma <= LARGEST_SIGMA):
             raise InputError(f"sigma is {self.sigma}; expected pixels, from {LEAST_SIGMA} to {LARGEST_SIGMA:g}")
-        if not (_is_real(self.epsilon) and self.epsilon >= 0):
+        if not (is_real(self.epsilon) and 0 <= self.epsilon < math.inf):
             raise InputError(f"epsilon is {self.epsilon}; expected a number of at least 0")
-        if self.calibration is not None and not (_is_real(self.calibration) and self.calibration > 0):
+        if self.calibration is not None and not (is_real(self.calibration) and 0 < self.calibration < math.inf):
             raise InputError(f"calibration is {self.calibration}; expected a positive number, or None for the exact")
 
     def image(self, splats: Splats) -> Array:
@@ -103,10 +102,6 @@ class Kernel(Splatter):
         )
 
 
-def _is_real(value: Any) -> bool:
-    return isinstance(value, Real) and math.isfinite(value)
-
-
 def exact_calibration(sigma: float, reach: int = 1) -> float:
     """The factor γ on splats' offsets with which a linear ramp of colour that moves has its true derivative.
 
@@ -121,7 +116,7 @@ def exact_calibration(sigma: float, reach: int = 1) -> float:
     Returns:
         γ = σ² Σ e / Σ u² e, e = exp(−u² / 2σ²) over −reach ≤ u ≤ reach.
     """
-    if not (_is_real(sigma) and sigma > 0) or not (isinstance(reach, int) and reach >= 1):
+    if not (is_real(sigma) and 0 < sigma < math.inf) or not is_count(reach):
         raise InputError(
             f"sigma is {sigma!r} and reach {reach!r}; expected a positive number and an integer of at least 1"
         )

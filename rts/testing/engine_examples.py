@@ -51,7 +51,7 @@ NAMESPACE: dict[str, Callable] = {
     "argsort": lambda xp, x: xp.take_along_axis(x, xp.argsort(x, axis=0, stable=True), axis=0),
     "any and all": lambda xp, x: xp.astype(xp.any(x > 0, axis=0) & ~xp.all(x > 0, axis=0), x.dtype),
 }
-"""Of what the core and plugins use of the array API, each as a function of x (6, 4)."""
+"""What the core and plugins use of the array API, each as a function of x (6, 4)."""
 
 
 def _ids(like: Any) -> Any:

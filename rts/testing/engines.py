@@ -209,7 +209,7 @@ class EngineConformance(Conformance):
             claim(False, f"{name} raises nothing, though the engine says that it does not differentiate")
 
     def test_gradients_are_those_of_closed_forms(self, engine: Any) -> None:
-        """Of nested parameters; zero where a parameter is not used."""
+        """Parameters may be nested; the gradient is zero where one is not used."""
         chosen = _differentiating(engine)
         xp = chosen.namespace
         tree = {"a": numbers(3), "b": [numbers(2, seed=1), numbers(4, seed=2)]}
@@ -238,7 +238,7 @@ class EngineConformance(Conformance):
         claim_close(chosen.to_numpy(second), (3 * x**2 * d).sum(), TOLERANCE, "the gradient of a derivative")
 
     def test_jacobians_have_a_row_an_unknown(self, engine: Any) -> None:
-        """Of a function with two results."""
+        """A function with two results has a Jacobian of each."""
         chosen = _differentiating(engine)
         xp, x = chosen.namespace, numbers(3)
         with owning(chosen), no_error("jacobian"):

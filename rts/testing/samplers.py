@@ -27,7 +27,7 @@ DEEPER = 4
 """Layers of the reference beyond those compared, which tell where a silhouette is."""
 
 SCALES = 1, 0.9, 0.8, 0.7, 0.8
-"""Of θ, call after call: more than are kept (`rts.sampling.cache.KEPT`), and one that is."""
+"""Factors of θ, call after call: more than are kept (`rts.sampling.cache.KEPT`), and one that is."""
 
 
 class Elsewhere:
@@ -69,7 +69,7 @@ class SamplerConformance(Conformance):
             claim_reprojected(part, scenes.find(part, camera, sampler, layers=3), camera, view)
 
     def test_it_agrees_with_the_reference(self, sampler: Any, parts: list[Part]) -> None:
-        """The same triangles inside, at most one in a hundred pixels different at silhouettes, depth to 1e-5."""
+        """Inside all triangles are those of the reference; at most one pixel in a hundred differs at silhouettes."""
         triangles = [p for p in parts if is_of_triangles(p)]
         if not triangles:
             pytest.skip("no triangles to compare with the reference")
@@ -362,7 +362,7 @@ def _differing(found: Sampled, expected: Sampled) -> np.ndarray:
 
 
 def _scaled(part: Part, scale: float) -> Part:
-    """The same surface with new arrays."""
+    """The part with θ times a factor, in new arrays."""
     values, join = split(part.theta)
     return part.replace(theta=join([(scale * v).astype(v.dtype) for v in values]))
 

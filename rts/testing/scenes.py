@@ -94,5 +94,5 @@ def shown(part: Part, camera: Camera = CAMERA, sampler: Any = "auto") -> Array:
 
 
 def shown_at(sampled: Sampled, part: Part, camera: Camera = CAMERA) -> Array:
-    """The same at samples found before."""
+    """The image of samples that were found before."""
     return render_samples(sampled, part, camera, splatter="single")

@@ -159,7 +159,7 @@ def random_gbuffer() -> dict[str, np.ndarray]:
 
 
 def awkward(gbuffer: dict) -> dict:
-    """The same with rows on which careless arithmetic divides by zero."""
+    """A copy of a G-buffer with rows on which careless arithmetic divides by zero."""
     gbuffer = {name: value.copy() for name, value in gbuffer.items()}
     eye = np.linalg.inv(scenes.CAMERA.view.astype(np.float64))[:3, 3]
     gbuffer["position"][5] = eye

@@ -149,7 +149,7 @@ class SurfaceConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_gradients_at_frozen_samples_are_finite_differences(self, part: Part, sampler: Any, engine: str) -> None:
-        """Of every entry of the G-buffer, in every entry of θ."""
+        """Every entry of the G-buffer is differentiated in every entry of θ."""
         chosen, (values, join) = differentiating(engine), split(part.theta)
         values = [v.astype(np.float64) for v in values]
         sampled = scenes.frozen(part, sampler=sampler).samples[0]

@@ -23,7 +23,7 @@ TILE = 8
 ACCEPT, REJECT = -1, 0
 COHERENT, INVOKE_FILTER = 1 << 16, 1 << 1
 SLACK = 1e-5
-"""Of the object's size: depths closer than this are compared in float64."""
+"""Depths that differ by less than this share of the object's size are compared in float64."""
 MARGIN = 1e-3
 """Barycentrics, and cosines, further than this from zero are believed as Embree gives them."""
 

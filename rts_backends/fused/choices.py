@@ -83,7 +83,7 @@ def find(start, stop, positions, row, visible, everywhere, beyond, hidden, state
 
 @compiled
 def _load(z, positions, row, y, first, last, beyond):
-    """The same of cells of a row."""
+    """Depths of some cells of a row into z (K, ·): NaN where one holds nothing, `beyond` where it lacks the layer."""
     layers, height, width = row.shape
     nothing = z.dtype.type(np.nan)
     for x in range(first, last):

@@ -31,7 +31,7 @@ COLOR, ONE, WX, WY, RX, RY, SOURCE = (PITCH * p for p in (0, 4, 5, 8, 11, 12, 13
 """Places in a source's slot: colour, 1 if covered, weights by u and by v, offset from the cell's centre."""
 
 SUM, SUMS = 5 * PITCH, 10 * PITCH
-"""Of a buffer, and of both: colours and the weight."""
+"""How many numbers a buffer's sums take, and those of two buffers: colours and the weight."""
 
 compiled = numba.njit(nogil=True, fastmath={"contract"})
 kernel = numba.njit(nogil=True, fastmath={"contract"}, cache=True)

@@ -495,7 +495,7 @@ _bound: dict[Operation, _Differentiable] = {}
 
 
 def _name(operation: Operation) -> str:
-    """Of its primitives: one of its own for each, if several are named alike, as when a notebook's cell is run anew."""
+    """The name of its primitives: one for each operation, also if several are named alike."""
     same = sum(1 for other in _bound if other.name == operation.name)
     return f"{operation.name}~{same}" if same else operation.name
 

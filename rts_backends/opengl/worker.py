@@ -62,7 +62,7 @@ class Worker:
         return future.result()
 
     def later(self, function: Callable, *args: Any) -> None:
-        """The same without waiting, for clean-up; nothing where the worker has ended."""
+        """Run a function in the thread without waiting for it, for clean-up; nothing where the thread has ended."""
         if not _forked() and self._thread is not None and self._thread.is_alive():
             self._tasks.put((function, args, Future()))
 

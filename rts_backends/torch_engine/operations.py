@@ -67,11 +67,11 @@ class _Call:
         self.count, self.kept = operation.differentiable, None
 
     def another(self) -> _Call:
-        """The same, at other operands."""
+        """A call of this operation with these parameters, at other operands."""
         return _Call(self.operation, self.params)
 
     def split(self, given: Sequence[Any]) -> tuple[Sequence[Any], Sequence[Any]]:
-        """Of operands those that have derivatives, and the others."""
+        """The operands that have derivatives, and the others."""
         return given[: self.count], given[self.count :]
 
     def specification(self, *fixed: Tensor) -> Callable[..., Tensor]:
