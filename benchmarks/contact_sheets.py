@@ -1,6 +1,8 @@
-"""Real meshes under every shader, one sheet a mesh, to be looked at.
+"""Real meshes under every shader, one sheet a mesh.
 
-python benchmarks/contact_sheets.py -o out/sheets
+Measures nothing: it writes pictures to be looked at.
+
+    python -m benchmarks.contact_sheets -o out/sheets
 """
 
 from __future__ import annotations
@@ -10,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw
-from scenes import DATA
 
 import rts
+from benchmarks.meshes import DATA
 from rts.cli.views import bounds_of, orbit
 from rts.errors import InputError
 

@@ -16,7 +16,7 @@ from rts.records import Samples
 from rts.sampling.prepared import PreparedParts
 
 STATIC_FACES = 4_000_000
-"""From so many triangles on, rays at a structure that is kept are faster than drawing all (benchmarks/samplers.py)."""
+"""From so many triangles on, rays at a kept structure are faster than drawing all (benchmarks/speed/samplers.py)."""
 
 _log = logging.getLogger("rts")
 

@@ -1,0 +1,116 @@
+"""What is compared on the scenes: this library's splatters and other renderers, each a name and two functions.
+
+A method gives the derivative image by forward mode, and the slope of a scalar loss by reverse mode.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+import rts
+from benchmarks.accuracy import other_renderers, scenes
+
+CASES = ("A", "B", "C")
+"""The scenes that peers render too, and that times are taken of."""
+CLOSED = {
+    "box over card": (0,),
+    "card behind box": (0,),
+    "turned box": (0,),
+    "spheres": (0, 1),
+    "spot": (0,),
+    "spot turns": (0,),
+    "sphere": (0,),
+}
+"""Scene → its parts that are closed, whose back faces are hidden whether they are culled or not."""
+
+
+class Method(NamedTuple):
+    """A renderer of one scene.
+
+    Attributes:
+        name: in tables.
+        derivative: seed → derivative image (H, W, 3) a pixel of motion.
+        gradient: weights (H, W, 3) → the slope dL/dt of L = Σ weights · image, by reverse mode.
+        seeds: how many derivatives differ by their noise.
+    """
+
+    name: str
+    derivative: Callable[[int], np.ndarray]
+    gradient: Callable[[np.ndarray], float]
+    seeds: int = 1
+
+
+def name_of(splatter: str, layers: int, supersample: int = 1) -> str:
+    """Of one of ours."""
+    return f"{splatter}, K = {layers}" + (f", {supersample} × {supersample}" if supersample > 1 else "")
+
+
+def ours(scene: scenes.Scene, splatter: str, layers: int, supersample: int = 1) -> Method:
+    """A splatter of this library; `multi, calibrated` has the constants of `visible`."""
+    chosen = splatter
+    if splatter == "multi, calibrated":
+        visible = rts.plugin("rts.splatters", "visible")()
+        chosen = rts.plugin("rts.splatters", "multi")(epsilon=visible.epsilon, calibration=visible.calibration)
+
+    def image(t: torch.Tensor) -> torch.Tensor:
+        parts = scene.at(t)
+        options = {"splatter": chosen, "layers": layers, "supersample": supersample}
+        return rts.render(parts, scene.camera, scene.size, **options)[..., :3]
+
+    def derivative(seed: int) -> np.ndarray:
+        return torch.func.jvp(image, (torch.zeros(()),), (torch.ones(()),))[1].numpy()
+
+    def gradient(weights: np.ndarray) -> float:
+        t = torch.zeros((), requires_grad=True)
+        (torch.as_tensor(weights, dtype=torch.float32) * image(t)).sum().backward()
+        return float(t.grad)
+
+    return Method(name_of(splatter, layers, supersample), derivative, gradient)
+
+
+def splatters(scene: scenes.Scene) -> list[Method]:
+    """All of ours that are scored on a scene."""
+    most = scene.layers[-1]
+    found = [ours(scene, "single", 1, s) for s in (1, 2)]
+    found += [ours(scene, name, k, s) for name in ("multi", "visible") for k in scene.layers for s in (1, 2)]
+    found.append(ours(scene, "multi, calibrated", most))
+    if scene.name in CASES:
+        found += [ours(scene, "none", 1), ours(scene, "visible", most, 4)]
+    return found
+
+
+def deodr(scene: scenes.Scene) -> Method:
+    renderer = other_renderers.Deodr(scene)
+    return Method("DEODR", lambda seed: renderer.derivative(), renderer.gradient)
+
+
+def mitsuba(scene: scenes.Scene, spp: list[int]) -> list[Method]:
+    """Mitsuba with each number of samples a pixel."""
+    renderer = other_renderers.Mitsuba(scene)
+    return [
+        Method(
+            f"Mitsuba, {n} spp",
+            lambda seed, n=n: renderer.derivative(n, seed),
+            lambda weights, n=n: renderer.gradient(weights, n, seed=0),
+            # Its noise has heavy tails, and many samples take long.
+            seeds=4 if n <= 64 else 2,
+        )
+        for n in spp
+    ]
+
+
+def turned_over(scene: scenes.Scene) -> scenes.Scene | None:
+    """The same scene with the closed parts' back faces culled, or drawn where they were culled; None where none is."""
+    if scene.name not in CLOSED:
+        return None
+    rest = list(scene.rest)
+    cull = "none" if rest[CLOSED[scene.name][0]].cull == "back" else "back"
+    for i in CLOSED[scene.name]:
+        rest[i] = rest[i].replace(cull=cull)
+    name = scene.name + (" culled" if cull == "back" else " unculled")
+    return replace(scene, name=name, rest=tuple(rest), layers=(1, 2) if cull == "back" else (2, 4))

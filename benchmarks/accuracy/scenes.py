@@ -1,0 +1,372 @@
+"""The scenes whose image derivatives are compared: parts as a function of one parameter t, in pixels of motion.
+
+Colours are unlit, the background is black, the camera is that of all benchmarks. What moves goes along +x, at t = 1 by
+one pixel at its own depth, unless the note says otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+import rts
+from benchmarks.accuracy.shapes import QUAD, box, grid, icosphere, motion, on_screen, pixel, rectangle, unlit
+from benchmarks.camera import DISTANCE, camera
+from benchmarks.meshes import DATA, mesh, normalised, rotation_xy
+from rts.engines import constants, engine_of, exemplar
+
+SIZE = 256
+CARD_DEPTH = 4.3
+"""Camera depth of what lies behind the object in the middle."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Parts that move with t.
+
+    Attributes:
+        name: of the scene.
+        size: (height, width).
+        rest: the parts at t = 0, NumPy, without transforms.
+        directions: for each part the (4, 4) derivative of its transform in t, or None where it rests.
+        layers: the numbers of layers K to try: the fewest that may do, and more.
+        note: what moves, and what is hard about it.
+    """
+
+    name: str
+    size: tuple[int, int]
+    rest: tuple[rts.Part, ...]
+    directions: tuple[np.ndarray | None, ...]
+    layers: tuple[int, ...]
+    note: str
+
+    @property
+    def camera(self) -> rts.Camera:
+        return camera()
+
+    def at(self, t: Any) -> list[rts.Part]:
+        """The parts at t: a number, or a scalar of torch or jax, in which they are then differentiable."""
+        engine, like = engine_of(t), exemplar(t)
+        parts = []
+        for part, direction in zip(self.rest, self.directions, strict=True):
+            if direction is not None:
+                eye, direction = constants((np.eye(4), direction), engine, like)
+                part = part.replace(transform=eye + t * direction)
+            parts.append(part)
+        return parts
+
+
+@cache
+def _bunny_and_square() -> tuple[rts.Part, rts.Part]:
+    """The green bunny and the red square behind it, both unlit."""
+    surface = rts.plugin("rts.surfaces", "mesh")
+    vertices, faces = mesh("bunny")
+    bunny = surface(faces)
+    green = 0.25 + 0.7 * np.maximum(0, bunny.vertex_normals(vertices) @ [0.4, 0.5, 0.77])
+    colors = np.stack([np.zeros_like(green), green, np.zeros_like(green)], axis=-1)
+    c, s = np.cos(0.03), np.sin(0.03)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.62 @ np.array([[c, s], [-s, c]])
+    square = np.concatenate([corners + [0.35, 0.15], np.full((4, 1), -1.1)], axis=1)
+    red = np.tile([0.8, 0.1, 0.1], (4, 1))
+    return (
+        rts.Part(bunny, {"vertices": vertices, "colors": colors}, "unlit"),
+        rts.Part(surface(QUAD), {"vertices": square, "colors": red}, "unlit"),
+    )
+
+
+def bunny_over_black(size: int, cull: str = "back") -> Scene:
+    bunny = _bunny_and_square()[0].replace(cull=cull)
+    return Scene(
+        "A" if cull == "back" else "A unculled",
+        (size, size),
+        (bunny,),
+        (motion(DISTANCE, size),),
+        (1, 2) if cull == "back" else (2, 4),
+        f"the bunny moves over black; cull {cull}",
+    )
+
+
+def square_behind_bunny(size: int, cull: str = "back") -> Scene:
+    parts = tuple(p.replace(cull=cull) for p in _bunny_and_square())
+    return Scene(
+        "B" if cull == "back" else "B unculled",
+        (size, size),
+        parts,
+        (None, motion(CARD_DEPTH, size)),
+        (1, 2) if cull == "back" else (2, 4),
+        f"the square moves behind the bunny; cull {cull}",
+    )
+
+
+def bunny_before_square(size: int, cull: str = "back") -> Scene:
+    parts = tuple(p.replace(cull=cull) for p in _bunny_and_square())
+    return Scene(
+        "C" if cull == "back" else "C unculled",
+        (size, size),
+        parts,
+        (motion(DISTANCE, size), None),
+        (1, 2) if cull == "back" else (2, 4),
+        f"the bunny moves before the square; cull {cull}",
+    )
+
+
+BOX = tuple(i / 256 for i in (88.3, 81.9, 159.4, 168.7))
+"""Left, top, right and bottom of the box's front face, share of the image's side; at 256 off pixel boundaries."""
+CARD = tuple(i / 256 for i in (43.6, 64.4, 129.2, 222.8))
+"""The same of the card behind it, whose right edge passes behind the box."""
+BOX_FRONT, BOX_BACK = 2.9, 3.6
+BOX_COLOR, CARD_COLOR = (0.2, 0.5, 0.9), (0.9, 0.3, 0.1)
+
+
+def box_over_card(size: int, moves: str = "box") -> Scene:
+    """The box is seen from straight in front: its outline is its front face, so the derivative has a closed form."""
+    front = rectangle(*(size * i for i in BOX), BOX_FRONT, size)
+    vertices, faces = box([*front[0, :2], DISTANCE - BOX_BACK], front[2])
+    return Scene(
+        "box over card" if moves == "box" else "card behind box",
+        (size, size),
+        (
+            unlit(vertices, faces, BOX_COLOR),
+            unlit(rectangle(*(size * i for i in CARD), CARD_DEPTH, size), QUAD, CARD_COLOR),
+        ),
+        (motion(BOX_FRONT, size), None) if moves == "box" else (None, motion(CARD_DEPTH, size)),
+        (2, 4),
+        f"a closed, unculled box before a card, edges upright; the {moves} moves",
+    )
+
+
+def turned_box(size: int) -> Scene:
+    vertices, faces = box([-0.45, -0.35, -0.4], [0.45, 0.35, 0.4])
+    hues = np.array(
+        [[0.9, 0.3, 0.1], [0.2, 0.7, 0.3], [0.8, 0.8, 0.2], [0.5, 0.2, 0.7], [0.1, 0.4, 0.9], [0.3, 0.8, 0.8]]
+    )
+    back, order = grid(16, 16)
+    card = np.column_stack([1.1 * back, np.full(len(back), DISTANCE - CARD_DEPTH)])
+    waves = 0.5 + 0.3 * np.column_stack([np.sin(5 * back[:, 0]), np.sin(4 * back[:, 1]), np.cos(3 * back.sum(1))])
+    return Scene(
+        "turned box",
+        (size, size),
+        (unlit(vertices @ rotation_xy(0.5, 0.6).T, faces, np.repeat(hues, 4, axis=0)), unlit(card, order, waves)),
+        (motion(DISTANCE, size), None),
+        (2, 4),
+        "a closed, unculled box with a colour a face moves before a card with a pattern",
+    )
+
+
+def cards(size: int, count: int, alternating: bool = False) -> Scene:
+    """Open cards one behind the other, tilted and turned at random (fixed seed), the first the nearest."""
+    random = np.random.default_rng(count)
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    parts, directions = [], []
+    for i in range(count):
+        depth = 2.6 + 2.0 * i / (count - 1)
+        turn, tilt_x, tilt_y = random.uniform(-np.pi, np.pi), *random.uniform(-0.12, 0.12, 2)
+        c, s = np.cos(turn), np.sin(turn)
+        rotation = rotation_xy(tilt_x, tilt_y) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        extent = np.append(random.uniform(0.15, 0.35, 2) + 0.3 * i / count, 1) * depth / DISTANCE
+        place = np.append(random.uniform(-0.35, 0.35, 2) * depth / DISTANCE, DISTANCE - depth)
+        color = 0.55 + 0.4 * np.cos(2.4 * i + np.array([0, 2.1, 4.2]))
+        parts.append(unlit(corners * extent @ rotation.T + place, QUAD, color))
+        if alternating:
+            directions.append(motion(depth, size, (-1) ** i))
+        else:
+            directions.append(motion(depth, size) if i == count // 2 else None)
+    return Scene(
+        f"{count} cards" + (", alternating" if alternating else ""),
+        (size, size),
+        tuple(parts),
+        tuple(directions),
+        (2, 4, count),
+        "overlapping open cards; "
+        + ("neighbours in depth move in opposite directions" if alternating else "one in the middle moves"),
+    )
+
+
+def sheet(size: int) -> Scene:
+    """A sheet in waves, twisted until it shows both of its sides, before a card with a pattern."""
+    uv, faces = grid(96, 48)
+    along, across, angle = 0.95 * uv[:, 0], 0.6 * uv[:, 1], 2.2 * uv[:, 0] + 1.3
+    bulge = 0.12 * np.sin(5.5 * uv[:, 0] + 2.0 * uv[:, 1])
+    twisted = np.column_stack([np.cos(angle) * across - np.sin(angle) * bulge, -along])
+    wave = np.column_stack([twisted, np.sin(angle) * across + np.cos(angle) * bulge])
+    colors = 0.5 + 0.45 * np.column_stack(
+        [np.sin(6 * uv[:, 0]), np.cos(4 * uv[:, 0] + 2), -np.sin(3 * uv[:, 0] + uv[:, 1])]
+    )
+    back, order = grid(32, 32)
+    card = np.column_stack([1.0 * back, np.full(len(back), DISTANCE - CARD_DEPTH)])
+    waves = 0.5 + 0.4 * np.column_stack([np.sin(7 * back[:, 0]), np.sin(6 * back[:, 1] + 1), np.cos(5 * back.sum(1))])
+    return Scene(
+        "sheet",
+        (size, size),
+        (unlit(wave @ rotation_xy(0.15, 0.2).T, faces, colors), unlit(card, order, waves)),
+        (motion(DISTANCE, size), None),
+        (2, 4),
+        "an open wavy sheet seen from both sides, its colours change along it, moves before a card with a pattern",
+    )
+
+
+def wires(size: int, width: float) -> Scene:
+    """Seven thin quads from nearly upright to nearly level."""
+    vertices, faces = [], []
+    for i, slant in enumerate(np.radians([4, -9, 17, -31, 44, 68, -83])):
+        along, across = np.array([np.sin(slant), np.cos(slant)]), np.array([np.cos(slant), -np.sin(slant)])
+        center = size * np.array([0.5 + 0.085 * (i - 3), 0.5 + 0.05 * (i % 3 - 1)]) + 0.3
+        ends = [
+            center + a * 0.22 * size * along + b * width / 2 * across for a, b in ((-1, -1), (-1, 1), (1, 1), (1, -1))
+        ]
+        vertices.append(on_screen(np.array(ends), DISTANCE + 0.02 * i, size))
+        faces += [[4 * i + j for j in f] for f in QUAD]
+    colors = np.repeat(
+        np.array([[1, 1, 1], [1, 0.6, 0.2], [0.3, 0.8, 1], [0.9, 0.9, 0.2]])[np.arange(7) % 4], 4, axis=0
+    )
+    return Scene(
+        f"wires {width:g} px",
+        (size, size),
+        (unlit(np.concatenate(vertices), faces, colors),),
+        (motion(DISTANCE, size),),
+        (1, 2),
+        f"seven slanted wires, {width:g} pixels wide, move over black",
+    )
+
+
+def spheres(size: int) -> Scene:
+    vertices, faces = icosphere(5)
+    shade = 0.35 + 0.6 * np.maximum(0, vertices @ [0.4, 0.5, 0.77])[:, None]
+    still = unlit(0.6 * vertices + [-0.28, 0.05, -0.05], faces, shade * [1.0, 0.5, 0.15])
+    moving = unlit(0.5 * vertices + [0.32, -0.05, 0.1], faces, shade * [0.2, 0.6, 1.0])
+    return Scene(
+        "spheres",
+        (size, size),
+        (still, moving),
+        (None, motion(DISTANCE - 0.1, size)),
+        (2, 4),
+        "two spheres that pass through one another, unculled; the nearer moves",
+    )
+
+
+@cache
+def _spot() -> rts.Part:
+    (part,) = rts.load(DATA / "meshes" / "spot" / "spot_triangulated.obj")
+    if "texture" not in part.theta:
+        image = rts.load_image(DATA / "meshes" / "spot" / "spot_texture.png")
+        part = part.replace(theta={**part.theta, "texture": image[..., :3]})
+    vertices = normalised(part.theta["vertices"].astype(float)) @ rotation_xy(0.2, 0.4 + np.pi).T
+    theta = {**part.theta, "vertices": vertices}
+    return part.replace(theta={k: theta[k] for k in ("vertices", "uv", "texture")}, shader="unlit", cull="back")
+
+
+def spot(size: int, turns: bool = False) -> Scene:
+    direction = motion(DISTANCE, size)
+    if turns:
+        # Linear in t, as every motion here: a rotation about +y whose speed is one pixel at distance 1 from the axis.
+        direction = np.zeros((4, 4))
+        direction[0, 2], direction[2, 0] = pixel(DISTANCE, size), -pixel(DISTANCE, size)
+    return Scene(
+        "spot turns" if turns else "spot",
+        (size, size),
+        (_spot(),),
+        (direction,),
+        (1, 2),
+        "textured spot, culled, " + ("turns about +y, a pixel at distance 1 from the axis" if turns else "moves"),
+    )
+
+
+SPHERE_RADIUS, SPHERE_COLOR = 0.7, (0.9, 0.7, 0.2)
+
+
+def sphere(size: int) -> Scene:
+    vertices, faces = icosphere(6)
+    return Scene(
+        "sphere",
+        (size, size),
+        (unlit(SPHERE_RADIUS * vertices, faces, SPHERE_COLOR),),
+        (motion(DISTANCE, size),),
+        (1, 2),
+        "a closed, unculled sphere in one colour moves over black",
+    )
+
+
+EDGE, EDGE_COLOR = 0.5014140625, (0.9, 0.5, 0.2)  # The edge, share of the image's width: not on a pixel's boundary.
+
+
+def half_plane(size: int) -> Scene:
+    card = rectangle(-size, -size, EDGE * size, 2 * size, DISTANCE, size)
+    return Scene(
+        "half-plane",
+        (size, size),
+        (unlit(card, QUAD, EDGE_COLOR),),
+        (motion(DISTANCE, size),),
+        (1, 2),
+        "the right edge of a card that covers the left half of the image, upright, moves",
+    )
+
+
+DISK_CENTER, DISK_RADIUS, DISK_COLOR = (0.4823, 0.5141), 0.1462, (0.3, 0.9, 0.6)
+
+
+def disk(size: int) -> Scene:
+    angle = np.linspace(0, 2 * np.pi, 4096, endpoint=False)
+    rim = size * (np.array(DISK_CENTER) + DISK_RADIUS * np.column_stack([np.cos(angle), np.sin(angle)]))
+    xy = np.concatenate([[size * np.array(DISK_CENTER)], rim])
+    index = 1 + np.arange(4096)
+    return Scene(
+        "disk",
+        (size, size),
+        (unlit(on_screen(xy, DISTANCE, size), np.column_stack([0 * index, np.roll(index, -1), index]), DISK_COLOR),),
+        (motion(DISTANCE, size),),
+        (1, 2),
+        "a flat disk moves over black",
+    )
+
+
+RAMP_SLOPE, RAMP_SLOPE_Y = np.array([1.0, -0.5, 0.25]), np.array([0.0, 0.1, -0.4])
+"""Change of colour over the width and the height of the image."""
+
+
+def ramp(size: int) -> Scene:
+    card = rectangle(-size, -size, 2 * size, 2 * size, DISTANCE, size)
+    share = np.array([[-1, 2], [2, 2], [2, -1], [-1, -1]])
+    colors = 0.5 + (share[:, :1] - 0.5) * RAMP_SLOPE + (share[:, 1:] - 0.5) * RAMP_SLOPE_Y
+    return Scene(
+        "ramp",
+        (size, size),
+        (unlit(card, QUAD, colors),),
+        (motion(DISTANCE, size),),
+        (1, 2),
+        "a card whose colours are linear, larger than the image, moves",
+    )
+
+
+SCENES: dict[str, Callable[[int], Scene]] = {
+    "A": bunny_over_black,
+    "B": square_behind_bunny,
+    "C": bunny_before_square,
+    "A unculled": lambda size: bunny_over_black(size, "none"),
+    "B unculled": lambda size: square_behind_bunny(size, "none"),
+    "C unculled": lambda size: bunny_before_square(size, "none"),
+    "box over card": box_over_card,
+    "card behind box": lambda size: box_over_card(size, "card"),
+    "turned box": turned_box,
+    "6 cards": lambda size: cards(size, 6),
+    "8 cards": lambda size: cards(size, 8),
+    "6 cards, alternating": lambda size: cards(size, 6, alternating=True),
+    "8 cards, alternating": lambda size: cards(size, 8, alternating=True),
+    "sheet": sheet,
+    **{f"wires {w:g} px": (lambda size, w=w: wires(size, w)) for w in (0.3, 0.5, 1.0, 2.0)},
+    "spheres": spheres,
+    "spot": spot,
+    "spot turns": lambda size: spot(size, turns=True),
+    "sphere": sphere,
+    "half-plane": half_plane,
+    "disk": disk,
+    "ramp": ramp,
+}
+
+
+def scene(name: str, size: int = SIZE) -> Scene:
+    """A scene by name, for a square image."""
+    return SCENES[name](size)

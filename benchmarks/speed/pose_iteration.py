@@ -1,0 +1,151 @@
+"""The pose iteration that speed is measured on, by rts: loss, and a step with torch or jax.
+
+One iteration renders the silhouette of a mesh, takes the mean squared difference to the hard silhouette of 4 × 4
+samples a pixel at the zero pose, its gradient in the pose, and a step of Adam.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import rts
+from benchmarks.camera import camera, supersampled
+from benchmarks.timing import RATE, START
+
+VERTEX_RATE = 1e-5
+"""Of Adam; vertices go by steps so small that the mesh stays what it is while time is taken."""
+
+MODES = ("pose", "full", "full, both")
+"""Gradient of the pose, vertices constant; of pose and vertices, a step in the pose; the same, a step in both."""
+
+
+class Task:
+    """A mesh, and the image that its pose is to be found from.
+
+    Args:
+        name: of the mesh.
+        vertices: (V, 3) float32.
+        faces: (T, 3) int32.
+        side: of the image, pixels.
+        shader: of the part.
+        layers: K.
+        splatter: by which it is rendered.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        side: int,
+        shader: str = "silhouette",
+        layers: int = 2,
+        splatter: Any = "auto",
+    ):
+        self.name, self.vertices, self.faces, self.side = name, vertices, faces, side
+        self.layers, self.splatter = layers, splatter
+        self.size, self.view = (side, side), camera()
+        self.part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {"vertices": vertices}, shader)
+        self.channels = slice(3, 4) if shader == "silhouette" else slice(0, 4)
+        self.target = self._target()
+
+    def _target(self) -> np.ndarray:
+        image = supersampled(self.part, self.view, self.size, 4)
+        return image[..., self.channels].astype(np.float32)
+
+    def resized(self, side: int) -> Task:
+        """The same part, with what samplers keep of it, in an image of another size."""
+        other = copy.copy(self)
+        other.side, other.size = side, (side, side)
+        other.target = other._target()
+        return other
+
+    def posed(self, pose: Any, vertices: Any = None) -> rts.Part:
+        """The part at a pose (6,); its vertices replaced if others are given."""
+        part = self.part.replace(transform=rts.rigid(pose))
+        return part if vertices is None else part.replace(theta={"vertices": vertices})
+
+    def loss(self, pose: Any, vertices: Any, target: Any, sampler: str) -> Any:
+        """Mean squared difference."""
+        parts = self.posed(pose, vertices)
+        image = rts.render(parts, self.view, self.size, sampler=sampler, splatter=self.splatter, layers=self.layers)
+        difference = image[..., self.channels] - target
+        return (difference * difference).mean()
+
+
+# ------------------------------------------------------------------------------------------------------- iterations
+
+
+def torch_iteration(task: Task, mode: str = "pose", sampler: str = "auto") -> Callable[[], object]:
+    """One eager iteration a call."""
+    import torch
+
+    pose = torch.tensor(START, requires_grad=True)
+    vertices = None if mode == "pose" else torch.tensor(task.vertices, requires_grad=True)
+    groups: list[dict] = [{"params": [pose], "lr": RATE}]
+    if mode == "full, both":
+        groups.append({"params": [vertices], "lr": VERTEX_RATE})
+    optimizer = torch.optim.Adam(groups)
+    target = torch.from_numpy(task.target)
+
+    def step() -> float:
+        pose.grad = None
+        if vertices is not None:
+            vertices.grad = None
+        loss = task.loss(pose, vertices, target, sampler)
+        loss.backward()
+        optimizer.step()
+        return loss.item()
+
+    return step
+
+
+def jax_iteration(task: Task, mode: str = "pose", sampler: str = "auto") -> Callable[[], object]:
+    """One iteration a call, all of it in one compiled function."""
+    import jax
+
+    function, state = jax_function(task, mode, sampler)
+    function = jax.jit(function)
+
+    def step() -> float:
+        nonlocal state
+        state, loss, _ = function(*state)
+        jax.block_until_ready(state)
+        return loss.item()
+
+    return step
+
+
+def jax_function(task: Task, mode: str, sampler: str) -> tuple[Callable, tuple]:
+    """An iteration as a function of parameters and the optimiser's state, and the first of both."""
+    import jax
+    import jax.numpy as jnp
+    import optax
+
+    variables = {"pose": jnp.asarray(START, jnp.float32)}
+    if mode != "pose":
+        variables["vertices"] = jnp.asarray(task.vertices)
+    stepped = ("pose", "vertices") if mode == "full, both" else ("pose",)
+    rates = {"pose": RATE, "vertices": VERTEX_RATE}
+    rules = {name: optax.adam(rates[name]) for name in stepped}
+    target = jnp.asarray(task.target)
+
+    def function(variables: dict, states: dict) -> tuple:
+        value, gradient = jax.value_and_grad(lambda x: task.loss(x["pose"], x.get("vertices"), target, sampler))(
+            variables
+        )
+        moved, kept = dict(variables), {}
+        for name, rule in rules.items():
+            updates, kept[name] = rule.update(gradient[name], states[name])
+            moved[name] = optax.apply_updates(variables[name], updates)
+        # All of the gradient is handed out, lest XLA leave out what nothing reads.
+        return (moved, kept), value, gradient
+
+    return function, (variables, {name: rule.init(variables[name]) for name, rule in rules.items()})
+
+
+ENGINES = {"torch": torch_iteration, "jax": jax_iteration}
