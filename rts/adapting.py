@@ -17,9 +17,10 @@ class Plugin(abc.ABC):  # noqa: B024
     Attributes:
         FLAGS: method → class variable, which is True in a subclass that has such a method of its own, unless it says
             otherwise.
-        STAND_INS: method → the name of another that an object of a foreign class may have in its place, and a function
-            `(object, ...)` that does by it what the method is to do. A base that has both keeps the other for itself.
-        DECLARES: of a base of plugins in another module than this one: its methods are members of plugins, too.
+        STAND_INS: method → (name, function): an object of a foreign class may have a method of that name instead, by
+            which `function(object, ...)` does what the method is to do. Subclasses of the base must not override it.
+        DECLARES: whether the class is itself a base for plugins, though a subclass of one, as `TriangleSampler` is: its
+            methods are members of plugins, too.
     """
 
     FLAGS: ClassVar[Mapping[str, str]] = {}
@@ -27,7 +28,7 @@ class Plugin(abc.ABC):  # noqa: B024
     DECLARES: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Set the class variables."""
+        """Set the class variables that `FLAGS` names."""
         super().__init_subclass__(**options)
         for base in cls.__mro__:
             for method, flag in base.__dict__.get("FLAGS", {}).items():
@@ -38,18 +39,18 @@ class Plugin(abc.ABC):  # noqa: B024
 
 
 class _Wrapped:
-    """An object that has the members of a base without being of it. It passes for the object, too."""
+    """Wrapper that makes an object an instance of a base which its class does not inherit from."""
 
     def __init__(self, given: Any):
         object.__setattr__(self, "_given", given)
 
     @property
     def __class__(self) -> type:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The object's class: so `isinstance` knows a wrapper by the object's own class as by the base."""
+        """The object's class: so `isinstance` holds for it as for the base."""
         return type(self._given)
 
     def __getattr__(self, name: str) -> Any:
-        if name == "_given":  # Of a copy that is being made.
+        if name == "_given":  # Asked of a copy that is still being made.
             raise AttributeError(name)
         return getattr(self._given, name)
 
@@ -70,7 +71,7 @@ class _Wrapped:
 
 
 def unwrapped(plugin: Any) -> Any:
-    """What the user gave: the plugin itself or, of a wrapper, the object in it. Caches go by it."""
+    """The plugin as the user gave it: the object in a wrapper, or the plugin itself. Caches go by it."""
     return plugin._given if issubclass(type(plugin), _Wrapped) else plugin
 
 
@@ -79,7 +80,7 @@ _wrappers: dict[tuple, type] = {}
 
 
 def adapted(given: Any, *bases: type[Plugin]) -> Any:
-    """A plugin as an object of its base: as it is, or wrapped where its class is not one of theirs.
+    """A plugin as an instance of its base: as it is, or wrapped if its class does not inherit from it.
 
     Args:
         given: the plugin: an object, or a function where the base has nothing but `__call__`.
@@ -124,7 +125,7 @@ def adapted(given: Any, *bases: type[Plugin]) -> Any:
 def _wrapper(
     kind: type, bases: tuple[type[Plugin], ...], present: frozenset[str], stood_in: Mapping[str, Callable]
 ) -> type:
-    """The class of wrappers for objects of a class that have these members, some of them by others of its own."""
+    """The class of wrappers for objects of a class that have these members, `stood_in` for by others where missing."""
     own = present - {"__call__"} - stood_in.keys() - {name for base in bases for name in _final(base)}
     namespace: dict[str, Any] = {name: property(lambda self, get=attrgetter(name): get(self._given)) for name in own}
     for method, by in stood_in.items():

@@ -55,7 +55,7 @@ def kind_of(x: Any) -> str:
 
 
 def promote(*values: Any) -> tuple[Any, list[Array]]:
-    """Arguments of one call, numbers and lists included, as floating arrays of one engine, and their namespace.
+    """Namespace and arrays: the arguments of a call, numbers and lists included, as floating arrays of one engine.
 
     Where all are NumPy or numbers the result is float64.
     """
@@ -96,6 +96,6 @@ def unit(x: Array, axis: int = -1) -> Array:
 
 
 def without_border(image: Array, border: int) -> Array:
-    """An image (H, W, C) without so many rows and columns at each side."""
+    """An image (H, W, C) without `border` rows and columns at each side."""
     height, width = image.shape[:2]
     return image[border : height - border, border : width - border, ...] if border else image

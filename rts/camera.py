@@ -73,7 +73,10 @@ class Camera(NamedTuple):
             aspect: width over height.
             near: near plane; default 1/100 of the distance to the target.
             far: far plane; default 100 times the distance to the target.
-            principal_point: (2,) NDC of the axis.
+            principal_point: (2,) where the axis meets the image, NDC.
+
+        Raises:
+            InputError: eye and target coincide, the direction of view is parallel to `up`, or planes are out of order.
         """
         view = look_at(eye, target, up)
         if near is None or far is None:
@@ -96,7 +99,21 @@ class Camera(NamedTuple):
         far: Any = 100.0,
         principal_point: Any = (0.0, 0.0),
     ) -> Camera:
-        """An orthographic camera; `height` of the image in world units, the rest as in `look_at`."""
+        """An orthographic camera at `eye` that faces `target`.
+
+        Args:
+            eye: (3,) world.
+            target: (3,) world.
+            up: (3,) direction that is up in the image.
+            height: what the image shows from bottom to top, world units.
+            aspect: width over height.
+            near: depth of the near plane; may be negative.
+            far: depth of the far plane.
+            principal_point: (2,) where the axis meets the image, NDC.
+
+        Raises:
+            InputError: eye and target coincide, the direction of view is parallel to `up`, or planes are out of order.
+        """
         view = look_at(eye, target, up)
         return cls(*_alike(view, orthographic(height, aspect, near, far, principal_point)))
 
@@ -112,7 +129,7 @@ class Camera(NamedTuple):
         far: Any = 1000.0,
         pixel_center: float = 0.0,
     ) -> Camera:
-        """From OpenCV's x = K (R X + t): camera axes x right, y down, z forward.
+        """A camera from OpenCV's x = K (R X + t): camera axes x right, y down, z forward.
 
         Args:
             K: (3, 3) intrinsics, pixels; skew is kept.
@@ -145,22 +162,27 @@ class Camera(NamedTuple):
 
     @classmethod
     def from_opengl(cls, modelview: Any, projection: Any) -> Camera:
-        """From OpenGL's matrices, which are ours."""
+        """A camera from OpenGL's matrices, whose conventions are those of this library.
+
+        Args:
+            modelview: (4, 4) camera-from-world.
+            projection: (4, 4) clip space from camera space.
+        """
         _, (view, projection) = promote(modelview, projection)
         check_shapes({"modelview": (view, ((4, 4),)), "projection": (projection, ((4, 4),))})
         return cls(view, projection)
 
     @classmethod
     def from_nvdiffrast(cls, modelview: Any, projection: Any, *, top_down: bool = False) -> Camera:
-        """From the matrices whose product feeds `nvdiffrast`.
+        """A camera from the matrices whose product feeds `nvdiffrast`.
 
-        nvdiffrast's row 0 is NDC y = −1, the bottom; with plain OpenGL matrices its image is ours upside down, and the
-        matrices are ours unchanged.
+        nvdiffrast's row 0 is NDC y = −1, the bottom. With plain OpenGL matrices its image is ours upside down, and the
+        matrices are taken unchanged.
 
         Args:
-            modelview: (4, 4).
-            projection: (4, 4).
-            top_down: the projection has its y negated, so that nvdiffrast's row 0 is the top already.
+            modelview: (4, 4) camera-from-world.
+            projection: (4, 4) clip space from camera space.
+            top_down: whether the projection has its y negated, so that nvdiffrast's row 0 is the top already.
         """
         view, projection = cls.from_opengl(modelview, projection)
         return cls(view, scaled_rows(projection, (1, -1, 1, 1)) if top_down else projection)
@@ -177,11 +199,13 @@ class Camera(NamedTuple):
         near: Any = 0.01,
         far: Any = 1000.0,
     ) -> Camera:
-        """From PyTorch3D's `PerspectiveCameras` in NDC: X_camera = X R + T (row vectors), x left, y up, z forward.
+        """A camera from PyTorch3D's `PerspectiveCameras` in NDC, whose x is left, y up and z forward.
+
+        Points are row vectors: X_camera = X R + T.
 
         Args:
             R: (3, 3), acting on row vectors.
-            T: (3,).
+            T: (3,) translation, world units.
             focal_length: number or (2,), NDC; 1 / tan(fov / 2) of a `FoVPerspectiveCameras`.
             principal_point: (2,) NDC, x left and y up; the shorter side of the image spans [−1, 1].
             size: (height, width).
@@ -212,7 +236,7 @@ class Camera(NamedTuple):
     def from_blender(
         cls, camera_to_world: Any, size: tuple[int, int], *, focal: Any, near: Any = 0.01, far: Any = 1000.0
     ) -> Camera:
-        """From the camera-to-world matrix of Blender and of NeRF's data sets, whose camera axes are ours.
+        """A camera from the camera-to-world matrix of Blender and of NeRF's data sets; their camera axes are ours.
 
         Args:
             camera_to_world: (4, 4) or (3, 4).
@@ -231,7 +255,7 @@ class Camera(NamedTuple):
     # ------------------------------------------------------------------------------------------ converters
 
     def to_opencv(self, size: tuple[int, int], *, pixel_center: float = 0.0) -> tuple[Array, Array, Array]:
-        """(K, R, t) of a perspective camera; the inverse of `from_opencv`."""
+        """OpenCV's K (3, 3), R (3, 3) and t (3,) of a perspective camera; the inverse of `from_opencv`."""
         xp, p = namespace(self.projection), self.projection
         height, width = size
         scale = -1 / p[3, 2]
@@ -253,15 +277,15 @@ class Camera(NamedTuple):
         return K, view[:3, :3], view[:3, 3]
 
     def to_opengl(self) -> tuple[Array, Array]:
-        """(modelview, projection), which are ours."""
+        """OpenGL's modelview and projection, (4, 4) each: the camera's own matrices."""
         return self.view, self.projection
 
     def to_nvdiffrast(self, *, top_down: bool = False) -> tuple[Array, Array]:
-        """(modelview, projection); with `top_down`, row 0 of nvdiffrast's image is the top, as here."""
+        """Matrices (modelview, projection) for nvdiffrast; with `top_down`, row 0 of its image is the top, as here."""
         return self.view, scaled_rows(self.projection, (1, -1, 1, 1)) if top_down else self.projection
 
     def to_pytorch3d(self, size: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
-        """(R, T, focal_length (2,), principal_point (2,)); the inverse of `from_pytorch3d`."""
+        """PyTorch3D's R (3, 3), T (3,), focal_length (2,) and principal_point (2,); the inverse of `from_pytorch3d`."""
         xp, p = namespace(self.projection), self.projection
         sx, sy, scale = min(size) / size[1], min(size) / size[0], -1 / p[3, 2]
         view = scaled_rows(self.view, (-1, 1, -1, 1))
@@ -274,7 +298,7 @@ class Camera(NamedTuple):
         )
 
     def to_blender(self, size: tuple[int, int]) -> tuple[Array, Array]:
-        """(camera-to-world (4, 4), focal length in pixels)."""
+        """Blender's camera-to-world matrix (4, 4), and the focal length in pixels; the inverse of `from_blender`."""
         return namespace(self.view).linalg.inv(self.view), self.projection[1, 1] * size[0] / 2
 
     # ----------------------------------------------------------------------------------------------- use
@@ -292,7 +316,7 @@ class Camera(NamedTuple):
         return self.window(size, (-apron, -apron), (height + 2 * apron, width + 2 * apron))
 
     def window(self, size: tuple[int, int], corner: tuple[int, int], extent: tuple[int, int]) -> Camera:
-        """The camera of a part of the image, or of more than it.
+        """The camera of a rectangle of the image, which may reach beyond it.
 
         Args:
             size: (height, width) of the image, pixels.
@@ -320,7 +344,7 @@ class Camera(NamedTuple):
         depth = np.zeros((4, 4))
         depth[3, 2] = -1
         engine, own = engine_of(p), engine_of(self.view)
-        # Of what is constant, in NumPy.
+        # Products of constant matrices are computed in NumPy.
         rows = matmul(engine.constant(from_clip, p), p) + engine.constant(depth, p)
         rows = matmul(constants(rows, own, None if is_constant(self.view) else self.view), self.view)
         return projective_map(rows, points)
@@ -334,7 +358,7 @@ class Camera(NamedTuple):
         return at[..., 0:1] * r[0, :] + at[..., 1:2] * r[1, :] + at[..., 2:3] * r[2, :] + axis
 
     def depth_range(self) -> tuple[Array, Array]:
-        """Linear depths of the near and the far plane; infinity where there is no such plane, in either order of z."""
+        """Linear depths of the near and the far plane, whichever way clip z runs; infinity for no such plane."""
         xp, (p,) = promote(self.projection)
         depths = []
         for a, b in ((p[2, 3] + p[3, 3], p[2, 2] + p[3, 2]), (p[2, 3] - p[3, 3], p[2, 2] - p[3, 2])):
@@ -369,12 +393,12 @@ class Camera(NamedTuple):
         return Rays(origins, directions, self._spread(inverse, (height, width)))
 
     def _spread(self, inverse: Array, size: tuple[int, int]) -> Array:
-        """See `Rays`; `inverse` is that of the view."""
+        """The `spread` (2,) of `Rays`; `inverse` is the inverse of the view."""
         xp, (inverse, p) = promote(inverse, self.projection)
         # A pixel at clip w spans 4 w² / (height width) of what the first two columns of the projection span.
         area = 4 / (size[0] * size[1] * xp.abs(p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0]))
         a, b, c = (inverse[:3, i] for i in range(3))
-        # Of a view that scales, in its local units; a geometric mean where it does so by axis.
+        # If the view scales, widths are in its local units; a geometric mean if it scales axes differently.
         scale = xp.abs(xp.sum(a * xp.linalg.cross(b, c))) ** (1 / 3)
         return xp.sqrt(area) * scale * xp.stack([p[3, 3], -p[3, 2]])
 

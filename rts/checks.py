@@ -33,7 +33,7 @@ MEMORY = _memory()
 
 
 def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[CheckedPart], Camera]:
-    """Checked parts, with their shaders looked up and plain numbers made arrays; that all suit one engine is not."""
+    """Checked parts, with shaders looked up and plain numbers made arrays; that all suit one engine is not checked."""
     parts = list(parts) if isinstance(parts, Sequence) else [parts]
     if not parts or not all(isinstance(p, Part) for p in parts):
         kinds = ", ".join(type(p).__name__ for p in parts) or "nothing"
@@ -75,7 +75,7 @@ def check_sampler(chosen: Any) -> Sampler:
 
 
 def suited_sampler(chosen: Sampler, part: Part, camera: Camera | None) -> Sampler:
-    """The sampler that a sampler takes for a part."""
+    """The sampler that `chosen` takes for a part, itself or another."""
     own = chosen.suited(part, camera)
     return own if own is chosen else check_sampler(own)
 
@@ -157,7 +157,7 @@ def check_background(background: Any, size: tuple[int, int]) -> Array | None:
 
 
 def check_floating(name: str, value: Array) -> None:
-    """Refuse integers, which would be taken for 0 to 255 by the one and for 0 to 1 by the other."""
+    """Refuse integers: some would mean 0 to 255 by them, others 0 to 1."""
     if not namespace(value).isdtype(value.dtype, "real floating"):
         raise InputError(f"{name} has dtype {value.dtype}; expected floating numbers")
 

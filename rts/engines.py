@@ -27,7 +27,7 @@ class Engine(Plugin):
     has imported that module.
 
     Attributes:
-        name: of the entry point.
+        name: the name of its entry point.
         namespace: the array-API namespace of its arrays.
         differentiates: whether it has derivatives: `value_and_grad`, `jvp`, `jacobian` and `optimizer`.
     """
@@ -50,7 +50,7 @@ class Engine(Plugin):
 
         Args:
             fn: host arrays → as many host arrays as there are specs.
-            specs: of the results.
+            specs: shape and dtype of each result.
             *args: arrays.
         """
 
@@ -64,12 +64,12 @@ class Engine(Plugin):
 
     @abc.abstractmethod
     def to_numpy(self, x: Array) -> np.ndarray:
-        """The value on the host; not for traced arrays."""
+        """The value of an array as NumPy, on the host; not for traced arrays."""
 
     # ----------------------------------------------------------------------------- how arrays are computed with
 
     def apply(self, operation: Operation, operands: Sequence[Array], params: Mapping[str, Any]) -> Array:
-        """The result of an operation; by its compiled functions where the engine can. Default its specification."""
+        """The result of an operation. The default runs its specification; override it to run compiled code."""
         return operation.specification(*operands, **params)
 
     def on_host(self, *arrays: Array) -> bool:
@@ -77,14 +77,14 @@ class Engine(Plugin):
         return False
 
     def by_host(self, f: Callable, otherwise: Callable, *arrays: Array) -> tuple[Array, ...]:
-        """`f` of arrays for which `on_host` holds, `otherwise` of others; the results are alike.
+        """Call `f` if `on_host` holds for the arrays, else `otherwise`; both give the same results.
 
         Engines that trace decide when the compiled program knows its device.
         """
         return f(*arrays) if self.on_host(*arrays) else otherwise(*arrays)
 
     def exact_products(self, *arrays: Array) -> bool:
-        """Whether matrix products of these keep their precision; matrix units of some devices round float32."""
+        """Whether matrix products of these arrays keep their precision: some devices' matrix units round float32."""
         return False
 
     def traced(self, x: Array) -> bool:
@@ -92,28 +92,35 @@ class Engine(Plugin):
         return False
 
     def padded(self, x: Array) -> bool:
-        """Whether packed arrays like this one may have rows that nobody uses."""
+        """Whether packed arrays like this one may have rows that no cell refers to."""
         return False
 
     def fill_unused(self, x: Array, row: Array) -> Array:
-        """Packed x (N, ·) with its first row for those that no cell of `row` (K, H, W) names; asked where `padded`."""
+        """Packed x (N, ·), with its first row in place of all that no cell of `row` (K, H, W) names.
+
+        Only called if `padded(row)` is True.
+        """
         return x
 
     def block(self, x: Tree) -> Tree:
-        """Wait until the arrays are computed."""
+        """Wait until the arrays are computed, and return them."""
         return x
 
     def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], Array], state: Tree, most: int) -> Tree:
-        """`state = body(state)` as long as `going(state)` () bool holds, at most so many times.
+        """Do `state = body(state)` as long as `going(state)`, () bool, is true, at most `most` times.
 
-        Without derivatives, and a loop in compiled programs, too, where unrolling takes minutes to compile. What `body`
-        closes over has to be without derivatives by itself (`stop_gradient`), as θ is where rays are intersected.
+        The result has no derivative. In compiled programs it is a loop, too: unrolled, it would take minutes to
+        compile. What `body` closes over must have no derivatives by itself (`stop_gradient`); θ has none where rays are
+        intersected.
 
         Args:
             body: tree of arrays → the same tree of other values; shapes and dtypes stay.
-            going: tree → () bool, such as whether any is not done.
+            going: tree → () bool, such as whether any ray is not done.
             state: arrays of this engine.
             most: the largest number of times.
+
+        Returns:
+            The last state.
         """
         for _ in range(most):
             if not bool(going(state)):
@@ -124,14 +131,14 @@ class Engine(Plugin):
     # ---------------------------------------------------------------------------------------------- derivatives
 
     def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Array]) -> Array:
-        """`f(make())`, done again for its gradient instead of keeping what it went through; `make` has no derivative.
+        """The result of `f(make())`, computed once more for its gradient instead of keeping intermediate arrays.
 
-        What `make` gives may be kept where it could not be made again as it was.
+        `make` has no derivative. An engine may keep what it gave instead of calling it again.
         """
         return f(make())
 
     def value_and_grad(self, f: Callable) -> Callable:
-        """`f(tree) -> scalar` to `tree -> (value, gradient tree)`."""
+        """Turn `f(tree) -> scalar` into `tree -> (value, gradient tree)`."""
         raise self._no_derivatives()
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[Array, Array]:
@@ -139,11 +146,11 @@ class Engine(Plugin):
         raise self._no_derivatives()
 
     def jacobian(self, f: Callable) -> Callable:
-        """`f(vector) -> arrays` to `vector -> (values, derivatives)`, a row for each unknown, by forward mode."""
+        """Turn `f(vector) -> arrays` into `vector -> (values, derivatives)`, a row an unknown, by forward mode."""
         raise self._no_derivatives()
 
     def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
-        """A step function `(parameters, gradient) -> parameters` with its own state; "adam" or "sgd"."""
+        """A step function `(parameters, gradient) -> parameters` of "adam" or "sgd", with its own state."""
         raise self._no_derivatives()
 
     def _no_derivatives(self) -> EngineError:
@@ -157,11 +164,11 @@ class Engine(Plugin):
     # ---------------------------------------------------------------------------------------------- compilation
 
     def jit(self, f: Callable) -> Callable:
-        """Compile where the framework can, else return `f`."""
+        """Compile `f` if the framework can, else return it."""
         return f
 
     def uncompiled(self, f: Callable) -> Callable:
-        """`f`, which what compiles Python code is to call as it is, and not to look into."""
+        """A function like `f` that the framework's compiler of Python code calls as it is, without looking into it."""
         return f
 
     def take_error(self) -> RtsError | None:
@@ -174,7 +181,7 @@ CONSTANT_TYPES = (np.ndarray, np.generic, bool, int, float)
 
 
 def is_constant(tree: Tree) -> bool:
-    """Whether every leaf is NumPy or a Python number: never differentiated."""
+    """Whether every leaf is a NumPy array or a Python number, which are never differentiated."""
     if type(tree) in OWNERS:
         return False
     for x in collected(tree):
@@ -186,14 +193,14 @@ def is_constant(tree: Tree) -> bool:
 # Plain dictionaries rather than functools caches: torch.compile looks through the latter, and warns.
 _ENGINES: dict[str, Engine] = {}
 OWNERS: dict[type, Engine] = {}
-"""Engines by the types of arrays that have been met; NumPy's own, which are constants beside any, are not in it."""
+"""Engines by the types of arrays that have been met; NumPy's are not in it: they are constants beside any engine's."""
 _BITS: dict[Any, int] = {}
 _BROKEN: set[str] = set()
 """Engines that do not load."""
 
 
 def engine_named(name: str) -> Engine:
-    """The one object of an engine, which is loaded.
+    """The one object of the engine of a name, loaded if need be.
 
     Raises:
         PluginError: it cannot be loaded.
@@ -217,7 +224,7 @@ def _owner(x: Any) -> Engine:
 
 
 def engine_of(*trees: Tree) -> Engine:
-    """The engine of the arrays in these trees; NumPy arrays and Python numbers are constants beside any.
+    """The engine of the arrays in these trees; NumPy arrays and Python numbers go with any.
 
     Raises:
         EngineError: arrays of two engines, or of an unknown type.
@@ -253,7 +260,7 @@ def _engine_of_leaves(found: Sequence[Any]) -> Engine:
 
 
 def suiting(*trees: Tree) -> tuple[Engine, Array | None]:
-    """The engine of these trees, and their exemplar."""
+    """The engine of these trees, and their `exemplar`."""
     found = collected(trees)
     return _engine_of_leaves(found), _widest(found)
 
@@ -279,10 +286,10 @@ def _imported() -> list[Engine]:
 
 
 def uncompiled(f: _F) -> _F:
-    """`f`, which what compiles Python code, as `torch.compile` does, is to call and not to look into.
+    """A function like `f` that compilers of Python code, such as `torch.compile`, call without looking into it.
 
-    Such a compiler would follow it through checks, caches and plugins, for most of a minute, and sees little of the
-    work, which is compiled already.
+    They would follow it through checks, caches and plugins for most of a minute, and would see little of the work,
+    which is compiled already.
     """
 
     @functools.wraps(f)
@@ -320,13 +327,17 @@ def _widest(found: Sequence[Any]) -> Array | None:
 
 
 def namespace(*arrays: Array) -> Any:
-    """The array-API namespace of these arrays."""
+    """The array-API namespace of these arrays; NumPy's if all are constants.
+
+    Raises:
+        EngineError: arrays of two engines, or of an unknown type.
+    """
     engine = OWNERS.get(type(arrays[0])) if len(arrays) == 1 else None
     return (engine_of(*arrays) if engine is None else engine).namespace
 
 
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:
-    """A copy of a tree in which every NumPy array and number is a constant of the engine."""
+    """A copy of a tree in which every NumPy array and number is a constant of the engine; see `Engine.constant`."""
     if tree is None or type(tree) in OWNERS:
         return tree
     if type(tree) is np.ndarray:

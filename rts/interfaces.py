@@ -1,6 +1,7 @@
 """What plugins implement: a base class for each kind, with every optional member, its default and its contract.
 
-A plugin subclasses its base, or is any object with the required members: such are wrapped (`rts.adapting`).
+A plugin subclasses its base. An object of another class will do if it has the required members: it is wrapped
+(`rts.adapting`).
 Shapes use the letters of `rts.records`; conventions of space are in `rts.camera`.
 """
 
@@ -29,27 +30,32 @@ if TYPE_CHECKING:
 
 
 class Evaluator(Plugin):
-    """Evaluates a surface at samples: the step G of the method."""
+    """Evaluates a surface at samples: the step that makes the G-buffer."""
 
     @abc.abstractmethod
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Points of the surface and their attributes, in local space; differentiable in θ.
 
+        Write it over the array namespace of θ (`rts.namespace`), and every engine can run it.
+
         Args:
             theta: the entries that `Surface.reads` names.
-            samples: where; constants. Rows that no cell refers to are all zero, and must give finite values.
+            samples: where to evaluate; constants. Rows that no cell refers to are all zero, and must give finite
+                values.
 
         Returns:
-            "position" (N, 3), and what else there is, each (N, C), in θ's dtype; written over θ's array namespace.
+            "position" (N, 3) and further attributes, each (N, C), in θ's dtype.
         """
 
 
 class Surface(Evaluator):
-    """A kind of surface: holds topology, takes θ, and is immutable. One of `TriangleSurface`, `RaySurface`, or both.
+    """A kind of surface. It holds topology and is immutable; its numbers come as θ.
+
+    Subclass `TriangleSurface`, `RaySurface`, or both.
 
     Attributes:
-        sample_widths: (I, P), how many integers and reals a sample has, after `refine`.
-        centered: whether samples lie on the rays through pixel centres.
+        sample_widths: (I, P), how many integers and reals a sample has, after `refine`. Every surface sets it.
+        centered: whether samples lie on the rays through cells' centres.
     """
 
     sample_widths: tuple[int, int] = (-1, -1)
@@ -59,14 +65,15 @@ class Surface(Evaluator):
         """Raise an `InputError` of one line where an entry is missing or of a wrong shape; values may be traced."""
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
-        """The entries of θ that the surface needs, the others being its shader's. Default all of them."""
+        """The names of the entries of θ that the surface reads; others are its shader's. The default is all of them."""
         return tuple(theta)
 
     @classmethod
     def example(cls) -> Part | None:
-        """A small part with its shader and NumPy θ, about the origin and within two units of it; None for none.
+        """A small part to try the surface with, or None.
 
-        `rts plugins --matrix` and tests draw it.
+        It has a shader and NumPy θ, and lies about the origin, within two units of it. `rts plugins --matrix` and tests
+        draw it.
         """
         return None
 
@@ -75,10 +82,11 @@ class TriangleSurface(Surface):
     """A surface that gives triangles to be sampled in its place.
 
     Attributes:
-        proxy_is_cheap: making the triangles costs no more than looking whether their inputs have changed.
-        depends_on_view: whether the triangles depend on camera and size; True where there is a `proxy_key`.
-        refines: whether samples on the triangles go through `refine`; True where there is one.
-        face_count: how many triangles there are, or None where that is not known beforehand; "auto" goes by it.
+        proxy_is_cheap: whether making the triangles costs no more than looking whether their inputs have changed.
+        depends_on_view: whether the triangles depend on camera and size; True in a class with its own `proxy_key`.
+        refines: whether samples on the triangles go through `refine`; True in a class with its own `refine`.
+        face_count: how many triangles there are, or None if that is not known beforehand; the sampler "auto" goes by
+            it.
     """
 
     FLAGS = {"refine": "refines", "proxy_key": "depends_on_view"}
@@ -94,6 +102,9 @@ class TriangleSurface(Surface):
 
         Args:
             theta: θ without derivatives.
+
+        Returns:
+            An array, or tree of arrays, of θ's engine.
         """
 
     @abc.abstractmethod
@@ -103,32 +114,32 @@ class TriangleSurface(Surface):
         Args:
             inputs: what `proxy_inputs` gave, on the host.
             camera: NumPy float64 matrices; world is the surface's local space.
-            size: (height, width) of the grid of samples.
+            size: (height, width) of the grid of cells.
         """
 
     def proxy_key(self, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Hashable:
-        """What changes when triangles must be made anew for another reason than their inputs.
+        """A value that changes when triangles must be rebuilt for another reason than their inputs, e.g. the camera.
 
-        Asked where `depends_on_view`; the default is the view itself.
+        Only called if `depends_on_view` is True. The default is the view itself: triangles are rebuilt for each.
         """
         return size, *(m.tobytes() for m in camera)
 
     def refine(self, inputs: Tree, samples: Samples, rays: Rays) -> Samples:
-        """Better samples: on the host, move or replace those that were found on the triangles.
+        """Move samples from the triangles onto the surface, along their rays, or drop them; on the host.
 
-        Rows of a cell may become −1 where its ray misses the surface. Layers need not be in order afterwards, and two
-        may have met at one root: what is dropped, sorted and merged, the core sees to.
+        Set `row` of a cell to −1 where its ray misses the surface. Layers need not be in order afterwards, and two may
+        have met at one root: the core sorts and merges them, and closes gaps.
 
         Args:
             inputs: what `proxy_inputs` gave, on the host.
-            samples: ids (N, I), params (N, P) and the depth (K, H, W) of cells, a row for each covered cell. Its tables
-                are those of `table_specs`, zeros of the largest shape, to be filled, or replaced by shorter ones; those
-                `by_sample` have N rows.
-            rays: origins and directions (N, 3), of each row.
+            samples: samples on the triangles: ids (N, I) and params (N, P), a row for each covered cell, and `row` and
+                depth (K, H, W) of the cells. The tables are those of `table_specs`, as zeros of the largest shape: fill
+                them, or replace them by shorter ones. Tables `by_sample` have N rows.
+            rays: the ray of each row: origins and directions (N, 3), local space.
 
         Returns:
-            Samples with other ids and params, of N rows, other depths, and tables. What does not fit into a table is to
-            be dropped, its rows −1, and added to `overflow`.
+            Samples with new ids and params, in the same N rows, new depths, and tables. A sample that finds no room in
+            a table is dropped: `row` of its cell becomes −1, and `overflow` counts it.
         """
         return samples
 
@@ -138,8 +149,10 @@ class TriangleSurface(Surface):
         Args:
             rows: the largest number of samples that `refine` may be given: every cell of every layer.
             capacity: the number of rows that is allotted for samples where shapes have to be known, as in `jax.jit`;
-                None where tables may have any length, and their specs are to be packed. The core sees to the rows of
-                tables `by_sample`.
+                None if tables may have any length up to that of their specs, which then say `packed=True`.
+
+        Returns:
+            Name → spec; none by default. The core sets the number of rows of tables `by_sample`.
         """
         return {}
 
@@ -168,14 +181,14 @@ def as_surface(given: Any) -> Any:
 
 
 class Needed(Plugin):
-    """Which samples can reach the image; on the host. Any function of that signature will do."""
+    """Says which samples can reach the image; on the host. Any function with the signature of `__call__` will do."""
 
     @abc.abstractmethod
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W)."""
+        """Which samples to keep, (K, H, W) bool, where covered (K, H, W) bool lie at depth (K, H, W)."""
 
     def ran_out(self, cells: int) -> None:
-        """Told of how many cells had K layers of triangles, of which fewer were left when they were refined."""
+        """Take note of how many cells had K layers of triangles, of which fewer were left after `refine`."""
 
 
 AnyNeeded = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -186,7 +199,8 @@ class Sampler(Plugin):
     """Finds where rays meet one part: the step without derivative.
 
     Attributes:
-        prunes: whether `sample` also takes `needed`, a `Needed`, a function or None: which samples to keep.
+        prunes: whether `sample` also takes the keyword `needed`, which says which samples to keep: a `Needed`, a
+            function of its signature, or None for all.
     """
 
     prunes: bool = False
@@ -200,17 +214,23 @@ class Sampler(Plugin):
         Args:
             part: the part; its `transform` is already in the camera.
             camera: the camera, in the part's local space.
-            size: (height, width).
+            size: (height, width) of the grid of cells.
             layers: K.
             capacity: number of packed rows to allot, or None for as many as there are.
+
+        Returns:
+            Samples, without derivative, in arrays of the engine of the part and the camera.
+
+        Raises:
+            InputError: this sampler cannot sample the surface.
         """
 
     def suited(self, part: Part, camera: Camera | None) -> Sampler:
-        """The sampler that is to sample a part; another than this one where it only chooses.
+        """The sampler that is to sample a part: this one or, if this one only chooses, as "auto" does, another.
 
         Args:
             part: the part.
-            camera: the camera; None where what is built of the part is to be kept.
+            camera: the camera; None in `rts.prepare`, which keeps what is built.
         """
         return self
 
@@ -235,11 +255,23 @@ class Shader(Plugin):
 
     @abc.abstractmethod
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
-        """(N, 4) premultiplied linear RGBA from the part's θ and its G-buffer in world space."""
+        """The colours of N samples, each from its own sample alone.
+
+        Args:
+            theta: θ of the part.
+            gbuffer: its G-buffer, in world space.
+            camera: the camera of the whole image.
+
+        Returns:
+            (N, 4) premultiplied linear RGBA, in [0, 1].
+
+        Raises:
+            InputError: an entry that the shader needs is missing.
+        """
 
 
 def _image_of_arrays(given: Any, splats: Splats) -> Array:
-    """`image` of an object that has only `splat(positions, rgba, row)`."""
+    """What `Splatter.image` does for an object that only has `splat(positions, rgba, row)`."""
     return given.splat(splats.positions, splats.rgba, splats.row)
 
 
@@ -248,8 +280,8 @@ class Splatter(Plugin):
 
     Attributes:
         reach: how many cells away from its own, along either axis, a sample may have an effect.
-        prunes: whether it knows what it needs; True where there is a `needed`.
-        sums_products: whether it gives normal equations; True where there is a `normal_equations`.
+        prunes: whether it says which samples it needs; True in a class with its own `needed`.
+        sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
     """
 
     FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}
@@ -261,10 +293,10 @@ class Splatter(Plugin):
 
     @abc.abstractmethod
     def image(self, splats: Splats) -> Array:
-        """(H, W, 4) premultiplied RGBA of all cells; `border` is left to `cropped`."""
+        """The image of all cells, those of the border included: (H, W, 4) premultiplied RGBA."""
 
     def cropped(self, splats: Splats) -> Array:
-        """The image without the border: (H − 2 border, W − 2 border, 4). To be overridden only to save a copy."""
+        """The image without the border: (H − 2 border, W − 2 border, 4). Override it only to save a copy."""
         return without_border(self.image(splats), splats.border)
 
     @final
@@ -279,6 +311,10 @@ class Splatter(Plugin):
 
         Returns:
             (H − 2 border, W − 2 border, 4) premultiplied RGBA.
+
+        Raises:
+            InputError: wrong shapes, or `row` holds no integers.
+            EngineError: arrays of two engines.
         """
         return self.cropped(_checked_splats(positions, rgba, row, border))
 
@@ -292,7 +328,7 @@ class Splatter(Plugin):
             depth: (K, H, W) float.
 
         Returns:
-            (K, H, W) bool. Default all that are covered.
+            (K, H, W) bool; by default all that are covered.
         """
         return covered
 
@@ -308,15 +344,15 @@ class Splatter(Plugin):
         """Normal equations of the n residuals weight · (image − target), without their Jacobian.
 
         Args:
-            splats: the samples; the image is without their border, (h, w).
+            splats: the samples; the image without their border has h × w pixels.
             t_positions: (T, N, 3), tangents of positions along T directions.
-            t_rgba: (T, N, 4) of colours; None for zeros.
+            t_rgba: (T, N, 4), tangents of colours; None for zeros.
             target: (h, w, C): alpha (C = 1), colours (3) or both (4).
-            weights: (h, w, 1) or (h, w, C).
-            background: (h, w, 4), what the image is composited onto.
+            weights: (h, w, 1) or (h, w, C); None for ones.
+            background: (h, w, 4), what the image is composited onto, or None.
 
         Returns:
-            Mean square (), JᵀJ / n (T, T) and Jᵀr / n (T,); None for arrays of a kind that it does not know.
+            Mean square (), JᵀJ / n (T, T) and Jᵀr / n (T,); None where it cannot work on these arrays.
         """
         return None
 
@@ -345,7 +381,7 @@ class Residuals(Plugin):
     """What `rts.fit` makes small: any function of parameters will do.
 
     Attributes:
-        sums_products: whether it gives normal equations; True where there is a `normal_equations`.
+        sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
     """
 
     FLAGS = {"normal_equations": "sums_products"}

@@ -1,4 +1,4 @@
-"""What passes between the parts of the library.
+"""The records that pass from one stage of rendering to the next.
 
 Shapes use these letters: N packed samples, K layers front to back, H × W pixels (row 0 on top), V vertices,
 T triangles, I integers and P reals a sample, C channels. Conventions of space are in `rts.camera`.
@@ -17,14 +17,14 @@ from rts.trees import Array, record
 
 
 class ArraySpec(NamedTuple):
-    """What a host function returns: the shape and dtype of one array.
+    """The shape and dtype of one array that a host function returns.
 
     Attributes:
         shape: the shape, or the largest one where `packed`.
         dtype: a NumPy dtype.
-        packed: the first axis counts samples and may come back shorter; an engine that needs fixed shapes pads it
-            with zeros.
-        by_sample: of a table of a surface: it has a row for each sample, which goes where the sample goes.
+        packed: whether the first axis counts samples and may come back shorter; an engine that needs fixed shapes pads
+            it with zeros.
+        by_sample: for tables of a surface: whether the table has a row for each sample, which moves with the sample.
     """
 
     shape: tuple[int, ...]
@@ -50,10 +50,10 @@ class Proxy(NamedTuple):
 
 
 class Fragments(NamedTuple):
-    """What a triangle sampler finds. Host arrays.
+    """The triangles that rays through cells' centres meet, as a triangle sampler finds them. Host arrays.
 
     Attributes:
-        triangle_ids: (K, H, W) int32 front to back, −1 where a pixel has no such layer.
+        triangle_ids: (K, H, W) int32 front to back, −1 where a cell has no such layer.
         barycentrics: (K, H, W, 2) float32, the weights of the triangle's first two corners, perspective-correct.
         depth: (K, H, W) float32, linear distance along the camera's axis; 0 where empty.
     """
@@ -83,8 +83,8 @@ class RayHits(NamedTuple):
 
     Attributes:
         hit: (K, R) bool, whether there is such a hit; those of a ray come first.
-        distance: (K, R) the hit is at `origin + distance * direction`; any finite number where there is none.
-        params: (K, R, P) what `evaluate` finds in `Samples.params`; finite where there is no hit, too.
+        distance: (K, R) float: the hit is at `origin + distance * direction`; any finite number where there is none.
+        params: (K, R, P) float, what `evaluate` finds in `Samples.params`; finite where there is no hit, too.
         ids: (K, R, I) int32, or None for I = 0.
     """
 
@@ -99,16 +99,16 @@ class Samples:
     """Where the rays of one part meet its surface: the paper's U, packed.
 
     Attributes:
-        ids: (N, I) int32.
-        params: (N, P) float32; θ's own dtype where they were found on the device.
+        ids: (N, I) int32, such as the vertices of a triangle.
+        params: (N, P) float32, such as barycentrics; in θ's own dtype if they were found on the device.
         row: (K, H, W) int32, the sample in each cell, or −1.
         depth: (K, H, W) float32, linear camera depth; 0 where `row` is −1.
         overflow: () int32, samples that did not fit into the capacity and were dropped, deepest layers first.
-        tables: further arrays of the surface, filled by its `refine`.
-        gbuffer: the evaluated G-buffer where the surface's θ is constant, else None.
-        asked: the entries that were asked for when `gbuffer` was evaluated; None for all.
-        centered: whether the samples reproject to the centres of their pixels.
-        by_sample: the tables that have a row for each sample; the others belong to all.
+        tables: further arrays of the surface by name, filled by its `refine`.
+        gbuffer: the evaluated G-buffer if the surface's θ is constant, else None.
+        asked: the names of the entries that were wanted when `gbuffer` was evaluated; None for all.
+        centered: whether the samples reproject to the centres of their cells.
+        by_sample: the names of the tables that have a row for each sample; other tables are shared by all.
     """
 
     ids: Array
@@ -131,11 +131,11 @@ class Sampled:
     the image's, times `supersample`, plus twice the apron.
 
     Attributes:
-        samples: one `Samples` a part.
+        samples: one `Samples` for each part.
         row: (K, H, W) int32, the sample in each cell, counted over all parts in order, or −1.
         depth: (K, H, W) float32, linear camera depth; 0 where empty.
         overflow: () int32, samples dropped for want of capacity, or beyond the limit of `layers="auto"`. Should be 0.
-        supersample: s, where each pixel has s² cells.
+        supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
     """
 
@@ -168,7 +168,7 @@ class Splats:
         positions: (N, 3) pixel x, pixel y, linear depth; differentiable.
         rgba: (N, 4) premultiplied, of the engine of the positions; differentiable.
         row: (K, H, W) int32, the sample of each cell front to back, or −1; an array of the positions' engine.
-        part: (K, H, W) int32, the part of each sample, or −1; None where nobody has said.
+        part: (K, H, W) int32, the part of each sample, or −1; None if that is not known.
         facing: (N,) float, the cosine between a sample's normal and the direction to the viewer; or None.
         settled: (H, W) bool, cells amid one colour, where nothing that moves changes the image; or None.
         sentinel: () float, the depth that stands for empty layers, beyond all samples; None for one of the scene's

@@ -63,9 +63,10 @@ def render(
             bands of rows, so that memory stays bounded; in a gradient each band is then made once more.
         background: colour (3,) or (4,), or image (H, W, 3 or 4), premultiplied, to composite onto; None for
             transparent.
-        capacity: number of rows to allot for the samples of a part inside `jax.jit`, where shapes must be known;
-            None for the worst case, every cell of every layer. What does not fit is dropped, deepest layers first:
-            `rts.sample` reports how much. Where the image is rendered in bands, of each band.
+        capacity: number of rows to allot for the samples of a part inside `jax.jit`, where shapes must be known. None
+            for the worst case, layers × cells. If a third of the cells are covered, pass a third of that. What does not
+            fit is dropped, deepest layers first, and counted: `overflow` of `rts.sample` is above 0, then. Where the
+            image is rendered in bands, it is the capacity of each band.
 
     Returns:
         (H, W, 4) premultiplied linear RGBA, row 0 on top.
@@ -104,10 +105,25 @@ def sample(
     supersample: int = 1,
     capacity: int | None = None,
 ) -> Sampled:
-    """The half of `render` without derivative: where the rays through pixel centres meet the surfaces.
+    """Find where the rays through cells' centres meet the surfaces: the half of `render` without derivative.
 
-    Takes the arguments of `render`. With the splatter to come, hidden samples that it does not need are dropped; None
-    keeps all. The result may be handed to a function under `jax.jit`.
+    Args:
+        parts: as in `render`.
+        camera: as in `render`.
+        size: as in `render`.
+        sampler: as in `render`.
+        splatter: the splatter that the samples are for: the apron suits its reach, and hidden samples that it does not
+            need are dropped. None keeps all, with an apron for a reach of 1.
+        layers: as in `render`.
+        supersample: as in `render`.
+        capacity: as in `render`.
+
+    Returns:
+        Samples for `render_samples`, which may be handed to a function under `jax.jit`.
+
+    Raises:
+        InputError: what was given cannot be sampled.
+        EngineError: torch and jax arrays in one scene.
     """
     scene = _Scene.of(parts, camera, sampler)
     size = check_size(size, layers, capacity, supersample)
@@ -117,12 +133,12 @@ def sample(
 
 
 class _Scene(NamedTuple):
-    """What is checked once for sampling and shading.
+    """A scene that is checked, once for sampling and shading.
 
     Attributes:
         parts: checked parts.
-        camera: of the whole image.
-        samplers: of each part.
+        camera: the camera of the whole image.
+        samplers: the sampler of each part.
         entries: what each sampler has built for its part, or None.
         suited: the engine of parts and camera, and an array that sets dtype and device of its constants, or None.
     """
@@ -135,7 +151,7 @@ class _Scene(NamedTuple):
 
     @classmethod
     def of(cls, parts: Part | Sequence[Part] | PreparedParts, camera: Camera, sampler: Any) -> _Scene:
-        """From what the user gave."""
+        """The scene of what the user gave."""
         if isinstance(parts, PreparedParts):
             checked, camera = check_scene(parts.parts, camera)
             return cls(checked, camera, parts.samplers, parts.entries, suiting(checked, camera))
@@ -173,7 +189,7 @@ def _sampled(
                 known["needed"] = needed if pruned else Everything(needed)
             samples.append(chosen.sample(part, wide.within(part.transform), grid, count, capacity=capacity, **known))
         sampled = merge(samples, count)
-        # What is traced has the shape of the worst case, with or without them.
+        # Traced arrays have the shape of the worst case, pruned or not.
         return sampled if needed is None or pruned or is_traced(sampled.row) else prune(sampled, needed)
 
     samplers = [suited_sampler(chosen, part, camera) for part, chosen in zip(parts, samplers, strict=True)]
@@ -194,15 +210,19 @@ def render_samples(
     """The half of `render` with derivatives: evaluate the parts at the samples, shade, project and splat.
 
     Args:
-        sampled: what `sample` gave for these parts; θ, transform and camera may have other values now, except that a
-            surface whose θ is NumPy, beside torch or jax arrays, has been evaluated when it was sampled.
+        sampled: what `sample` gave for these parts. θ, transform and camera may have other values now, but for one
+            case: a surface whose θ is NumPy, beside torch or jax arrays, was evaluated when it was sampled.
         parts: as in `render`.
         camera: as in `render`.
         splatter: as in `render`.
         background: as in `render`.
 
     Returns:
-        (H, W, 4) premultiplied linear RGBA.
+        (H, W, 4) premultiplied linear RGBA, row 0 on top.
+
+    Raises:
+        InputError: the samples are not of these parts, or their apron is too narrow for the splatter.
+        EngineError: torch and jax arrays in one scene.
     """
     scene = _Scene.of(parts, camera, "auto")
     if len(scene.parts) != len(sampled.samples):
@@ -221,9 +241,9 @@ def render_samples(
 
 
 def apron_of(splatter: Splatter | None) -> int:
-    """Cells to sample beyond the image's border on each side: from those within reach a sample shows in it.
+    """How many cells to sample on each side beyond the image: as many as the splatter reaches, and one more.
 
-    One more, since pairing looks at a cell beside them.
+    Samples within reach show in the image, and pairing looks at one cell beside theirs.
     """
     return (Splatter if splatter is None else splatter).reach + 1
 
@@ -260,15 +280,15 @@ def _splatted(sampled: Sampled, scene: _Scene, window: Camera, suited: tuple, sp
 def to_splats(
     sampled: Sampled, parts: Sequence[CheckedPart], camera: Camera, window: Camera, engine: Engine, like: Array | None
 ) -> Splats:
-    """What was sampled, as splatters take it, with the apron as border.
+    """Evaluate, shade and project samples: what splatters take, with the apron as border.
 
     Args:
         sampled: the samples.
         parts: checked parts.
-        camera: of the whole image, which shaders see.
+        camera: the camera of the whole image, which shaders see.
         window: the camera of the samples.
-        engine: to compute with.
-        like: sets dtype and device of its constants, or None.
+        engine: the engine to compute with.
+        like: an array that sets dtype and device of its constants, or None.
     """
     grid, apron = tuple(sampled.row.shape[1:]), sampled.apron
     wide = window.with_apron((grid[0] - 2 * apron, grid[1] - 2 * apron), apron)
@@ -303,7 +323,7 @@ def _planned(layers: int | Literal["auto"]) -> int:
 
 
 def _bands(height: int, width: int, layers: int | Literal["auto"], supersample: int) -> list[tuple[int, int]]:
-    """(first row, number of rows) of the parts in which a supersampled image is rendered."""
+    """(first row, number of rows) of the bands in which a supersampled image is rendered."""
     if supersample == 1:
         return [(0, height)]
     rows = max(1, BAND // (_planned(layers) * int(supersample) ** 2 * width))
@@ -328,7 +348,7 @@ def _evaluate(part: CheckedPart, reads: Sequence[str], samples: Samples, engine:
 
 
 def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
-    """The attributes as shaders may read them: in rows that no cell refers to a derivative must be finite, too."""
+    """The G-buffer for shaders: rows that no cell refers to hold values at which derivatives are finite, too."""
     if not engine.padded(samples.row):
         return gbuffer
     found = GBuffer()

@@ -85,8 +85,8 @@ class Unlit(Shader):
     """The base colour.
 
     Attributes:
-        wrap: of the texture, "repeat", "mirror" or "clamp".
-        opaque: ignore the alpha of texture and colours.
+        wrap: how the texture goes on outside [0, 1]: "repeat", "mirror" or "clamp".
+        opaque: whether to ignore the alpha of texture and colours.
     """
 
     wrap: str = "repeat"
@@ -123,7 +123,7 @@ class Unlit(Shader):
         return color, alpha
 
     def premultiplied(self, color: Array, alpha: Array) -> Array:
-        """(N, 4) of colour (N, 3) and alpha (N, 1), the latter ignored by an opaque shader."""
+        """Premultiplied (N, 4) of colour (N, 3) and alpha (N, 1); an opaque shader takes 1 for alpha."""
         return _opaque(color) if self.opaque else namespace(color).concat([color * alpha, alpha], axis=1)
 
 
@@ -137,7 +137,7 @@ class Textured(Unlit):
         """See `rts.Shader`."""
         if "texture" not in theta:
             raise InputError(f"the textured shader needs theta['texture'] (h, w, C); theta has {sorted(theta)}")
-        gbuffer["uv"]  # Its absence is an error here, not a reason for white.
+        gbuffer["uv"]  # Raises an error without uv, where the base colour would be white.
         return super().__call__(theta, gbuffer, camera)
 
 
@@ -190,7 +190,7 @@ def facing_normals(gbuffer: GBuffer, camera: Camera) -> tuple[Array, Array]:
 
 
 def _towards(gbuffer: GBuffer, camera: Camera) -> Array:
-    """Vectors (N, 3) towards the viewer, of any length and without derivative: what it takes to tell a side."""
+    """Vectors (N, 3) towards the viewer, of any length and without derivative: enough to tell which side is seen."""
     given = gbuffer["position"], *camera
     engine = engine_of(given)
     position, *matrices = (x if is_constant(x) else engine.stop_gradient(x) for x in given)
@@ -202,7 +202,7 @@ def _turned(normal: Array, toward: Array) -> Array:
 
 
 def sample_texture(texture: Array, uv: Array, wrap: str = "repeat") -> Array:
-    """Bilinear texture lookup, differentiable in both.
+    """Bilinear texture lookup, differentiable in texture and uv.
 
     Args:
         texture: (h, w, C), row 0 on top; texel (i, j) has its centre at u = (j + 0.5) / w, v = 1 − (i + 0.5) / h.

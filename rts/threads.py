@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 TASKS_PER_THREAD = 4
-"""More tasks than threads, so that one that gets the heavy rows does not keep the others waiting."""
+"""Several tasks for each thread, so that one that gets the heavy rows does not keep the others waiting."""
 
 LITTLE_WORK = 100_000
 """Nanoseconds, below which a loop stays on the thread that asks for it: to ask another takes tens of thousands."""
@@ -38,7 +38,7 @@ class _Job:
         self._going.acquire()
 
     def claim(self) -> bool:
-        """True for the first who asks."""
+        """Whether nobody has claimed it before; it is the caller's then."""
         return self._unclaimed.acquire(blocking=False)
 
     def withdraw(self) -> bool:
@@ -49,7 +49,7 @@ class _Job:
         return mine
 
     def run(self) -> None:
-        """Do it, and say so."""
+        """Do the work, and mark it as done."""
         try:
             self.work()
         except BaseException as error:
@@ -57,7 +57,7 @@ class _Job:
         self._going.release()
 
     def wait(self) -> None:
-        """Until it is done."""
+        """Wait until it is done."""
         self._going.acquire()
 
 
@@ -76,7 +76,7 @@ class _Helpers:
                 while self.count < count:
                     try:
                         threading.Thread(target=self._serve, name="rts", daemon=True).start()
-                    except RuntimeError:  # The system has no more: those that there are, or the caller, do the work.
+                    except RuntimeError:  # The system gives no more: those that there are, or the caller, do the work.
                         break
                     self.count += 1
         self._jobs.put(job)
@@ -86,14 +86,14 @@ class _Helpers:
             job = self._jobs.get()
             if job.claim():
                 job.run()
-            del job  # What waits is to hold no arrays.
+            del job  # A thread that waits must not keep arrays alive.
 
 
 _helpers = _Helpers()
 
 
 def _forget() -> None:
-    """A forked child has none of its parent's threads."""
+    """Start without helpers in a forked child, which has none of its parent's threads."""
     global _helpers
     _helpers = _Helpers()
 

@@ -68,7 +68,7 @@ def leaves(tree: Tree) -> Iterator[Any]:
 
 
 def collected(tree: Tree) -> list[Any]:
-    """`leaves` as a list. One loop, since it is asked for dozens of times a render."""
+    """`leaves` as a list. One loop, since it is called dozens of times a render."""
     found, rest = [], [tree]
     while rest:
         x = rest.pop()
@@ -86,7 +86,7 @@ def collected(tree: Tree) -> list[Any]:
 
 _LEAF, _NOTHING, _RECORD, _SEQUENCE, _MAPPING = range(1, 6)
 _KINDS: dict[type, int] = {}
-"""What trees of a type are."""
+"""Which of these kinds trees of a type are."""
 
 
 def _kind(tree: Tree) -> int:

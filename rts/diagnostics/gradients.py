@@ -25,7 +25,7 @@ Scene = Callable[[Tree], tuple[Part | Sequence[Part], Camera]]
 STEP_PIXELS = 1.0
 """How far the finite differences move what moves fastest in the image."""
 STEP_COLOR = 0.05
-"""How far they change the colour that changes fastest, where nothing moves."""
+"""How far the finite differences change the colour that changes fastest, where nothing moves."""
 NEGLIGIBLE = 0.01
 """What does not matter, as a share of the largest effect of a step."""
 LOSS_SMOOTHNESS = 4.0
@@ -94,10 +94,10 @@ class Slope(NamedTuple):
 
     Attributes:
         name: where the number is, such as "pose[2]".
-        autodiff: through the splatter.
-        difference: central finite difference of area-sampled hard renders.
+        autodiff: the derivative through the splatter.
+        difference: the central finite difference of area-sampled hard renders.
         error: how far the difference may be off: what two sampling grids and two steps disagree on.
-        step: of the difference, in units of the number.
+        step: the step of the difference, in units of the number.
     """
 
     name: str
@@ -119,9 +119,10 @@ class GradientCheck(NamedTuple):
     tolerance: float
 
     def agrees(self, slope: Slope) -> bool:
-        """Whether autodiff is within the tolerance, three error bars, and what hardly matters beside the others.
+        """Whether autodiff and the difference agree.
 
-        Numbers of different units are compared by what a step of a pixel does to the loss.
+        They may be off by the tolerance, three error bars and what is negligible beside the other slopes. Slopes of
+        different units are compared by what a step of a pixel does to the loss.
         """
         largest = max(abs(s.difference * s.step) for s in self.slopes)
         allowed = self.tolerance * abs(slope.difference) + 3 * slope.error + NEGLIGIBLE * largest / slope.step
@@ -129,7 +130,7 @@ class GradientCheck(NamedTuple):
 
     @property
     def ok(self) -> bool:
-        """Whether all agree."""
+        """Whether all slopes agree."""
         return all(map(self.agrees, self.slopes))
 
     def __str__(self) -> str:
@@ -165,9 +166,9 @@ def check_gradient(
         parameters: a torch or jax array, or nested dicts and lists of them.
         size: (height, width).
         loss: image (H, W, 4) → scalar; None for a smooth random weighting of the image, with a fixed seed.
-        entries: of each array, look at so many numbers: those of largest gradient, and some at random.
+        entries: how many numbers to look at in each array: those of largest gradient, and some at random.
         samples: the square root of the number of samples a pixel.
-        tolerance: what is called agreement, relative to each derivative.
+        tolerance: how far a derivative may be off, relative to itself.
         **options: splatter, layers, supersample, background, … of `rts.render`.
 
     Raises:
@@ -234,7 +235,7 @@ def _like(direction: Tree, parameters: Tree, engine: Engine) -> Tree:
 
 
 def _scalar(loss: Callable[[Array], Array], engine: Engine) -> Callable[[Array], Array]:
-    """The loss, known to be a scalar of the engine."""
+    """The loss, refused where it is no scalar of the engine."""
 
     def call(image: Array) -> Array:
         if not engine.owns(image):

@@ -38,7 +38,11 @@ def save_image(path: Any, image: Array) -> None:
 
 
 def load_image(path: Any) -> np.ndarray:
-    """(H, W, 4) float32 premultiplied linear RGBA of a picture of any kind that Pillow reads."""
+    """(H, W, 4) float32 premultiplied linear RGBA of a picture of any kind that Pillow reads.
+
+    Raises:
+        InputError: there is no such file, or it cannot be read as a picture.
+    """
     path = as_path(path)
     if not path.is_file():
         raise InputError(f"there is no picture {path}; check the path (relative paths start at {Path.cwd()})")
@@ -49,7 +53,7 @@ def load_image(path: Any) -> np.ndarray:
 
 
 def save_animation(path: Any, frames: Iterable[Array], fps: float = 20.0) -> None:
-    """Write an animated .gif or .png, or an .mp4 where imageio-ffmpeg is installed.
+    """Write an animated .gif or .png, or an .mp4 if imageio-ffmpeg is installed.
 
     Args:
         path: a name with one of these extensions; folders that do not exist are made.

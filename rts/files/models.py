@@ -25,7 +25,7 @@ from rts.shading import Lambert, Textured
 def load(path: Any, *, merge: bool = False, weld: bool = True) -> list[Part]:
     """The parts of a model file: OBJ with MTL and textures, PLY, STL, GLB, glTF, OFF, what trimesh reads.
 
-    There is one part for each mesh of the scene, for each material of an OBJ. θ holds NumPy float32 arrays:
+    There is one part for each mesh of the scene or, in an OBJ, for each material. θ holds NumPy float32 arrays:
     "vertices", and where the file has them "uv", "normals", "colors", "texture" and "color". Vertices are in
     the order of the file; those that no face refers to are left out, and those that coincide exactly are
     welded: where uv or normals differ between the faces around a vertex they have an index table of their
@@ -98,7 +98,7 @@ def _used(rows: np.ndarray, table: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _welded(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distinct rows in order of first occurrence, and for each given row its place among them."""
-    _, first, inverse = np.unique(rows + 0.0, axis=0, return_index=True, return_inverse=True)  # -0 + 0 is 0.
+    _, first, inverse = np.unique(rows + 0.0, axis=0, return_index=True, return_inverse=True)  # −0 + 0 is 0.
     order = np.argsort(first)
     place = np.empty(len(order), np.int64)
     place[order] = np.arange(len(order))
@@ -158,7 +158,7 @@ def _in_scene(piece: Piece) -> Piece:
         if "normals" in attributes:
             rows, table = attributes["normals"]
             attributes["normals"] = (rows @ np.linalg.inv(m[:3, :3]), table)
-        if mirrored:  # Keep the outside outside.
+        if mirrored:  # A mirror image would be inside out.
             faces = faces[:, ::-1]
             attributes = {name: (rows, table[:, ::-1]) for name, (rows, table) in attributes.items()}
     return piece._replace(vertices=vertices, faces=faces, attributes=attributes, transform=None)

@@ -162,7 +162,7 @@ def read_obj(path: Path) -> list[Piece]:
     if vt.shape[1] == 1:
         vt = np.concatenate([vt, np.zeros_like(vt)], axis=1)
     corners, owner = lines.triangles((len(v), len(vt), len(vn)))
-    # Of one identity in all pieces, so that merging need not repeat them.
+    # One array, shared by all pieces, so that merging need not repeat it.
     vertices = v[:, :3]
     pieces = []
     for name, index in lines.materials.items():

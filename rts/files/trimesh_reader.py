@@ -54,7 +54,7 @@ def read_with_trimesh(path: Path, extension: str) -> list[Piece]:
     folder: Any = _Folder(path)
     try:
         if extension == "gltf":
-            json.loads(path.read_bytes())  # Of a damaged file trimesh only says that it found no "model.gltf".
+            json.loads(path.read_bytes())  # All that trimesh says of a damaged file is that it found no "model.gltf".
         with open(path, "rb") as file:
             scene: Any = trimesh.load(file, file_type=extension, resolver=folder, force="scene", process=False)
         pieces = _pieces(scene, trimesh.Trimesh, extension in LINEAR_COLORS)
@@ -63,7 +63,7 @@ def read_with_trimesh(path: Path, extension: str) -> list[Piece]:
     except Exception as error:
         kind, again = extension.upper(), "the file may be cut short or of another format: export it again"
         if isinstance(error, ModuleNotFoundError) and isinstance(error.__context__, UnicodeDecodeError):
-            # What is no sound binary file trimesh takes for text, and would guess its encoding with another package.
+            # trimesh takes anything but a sound binary file for text, and guesses its encoding with another package.
             raise InputError(
                 f"{path} is not a valid {kind} file, neither as binary nor as text; {again}"
             ) from error.__context__
@@ -121,7 +121,7 @@ def _visual(mesh: Any, faces: np.ndarray, gltf: bool) -> tuple[dict, np.ndarray 
 
 
 def _known(thing: Any, name: str, default: Any = None) -> Any:
-    """What trimesh's classes, which are of many kinds, may have: an attribute, or the default."""
+    """An attribute that one of trimesh's many classes may have, or the default."""
     return getattr(thing, name, default)
 
 

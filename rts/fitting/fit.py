@@ -28,8 +28,8 @@ class Fit(NamedTuple):
     """The outcome of `fit`.
 
     Attributes:
-        parameters: those with the lowest loss met.
-        loss: their loss.
+        parameters: the parameters with the lowest loss met.
+        loss: that loss.
         history: the loss at the start and after each update; for Levenberg–Marquardt of each trial, accepted or not.
         steps: number of losses computed, the one at the start included.
         reason: why it stopped.
@@ -71,9 +71,9 @@ def fit(
             sum of squares, by the forward-mode Jacobian, for up to some hundred unknowns.
         loss: reduces residuals to a scalar, for Adam and SGD; Levenberg–Marquardt always takes the mean square.
         steps: at most so many losses are computed, the first at the start; default 200, for "lm" 50.
-        learning_rate: of Adam (default 0.01) and SGD (default 0.1).
+        learning_rate: the rate of Adam (default 0.01) or SGD (default 0.1).
         tolerance: stop when the loss has not fallen by this fraction in `patience` steps ("lm": in an accepted step).
-        patience: see `tolerance`.
+        patience: the number of steps that `tolerance` speaks of; not for "lm".
         callback: called as `callback(step, parameters, loss)`; a true result stops the fit.
         progress: show a progress bar with loss and ms/iteration; default only on a terminal.
         jit: compile with jax (no effect on torch). Turn off if `residuals` cannot be traced.
@@ -112,7 +112,7 @@ def _copied(engine: Engine, x: Array) -> Array:
 def _descend(
     objective: Callable, parameters: Tree, engine: Engine, method: str, rate: float, run: Run, jit: bool
 ) -> None:
-    """Adam or SGD."""
+    """Run Adam or SGD."""
     xp = engine.namespace
     value_and_grad = engine.value_and_grad(objective)
 
@@ -172,7 +172,7 @@ def _checked_engine(parameters: Tree) -> Engine:
 
 
 def _checked(residuals: Callable[[Tree], Array], engine: Engine) -> Callable[[Tree], Array]:
-    """A function like `residuals`, whose result is known to be a floating array of the engine."""
+    """A function like `residuals` that refuses a result which is no floating array of the engine."""
 
     def call(parameters: Tree) -> Array:
         result = residuals(parameters)
@@ -191,7 +191,7 @@ def _checked(residuals: Callable[[Tree], Array], engine: Engine) -> Callable[[Tr
 
 
 def _objective(residuals: Callable, loss: Callable, engine: Engine) -> Callable[[Tree], Array]:
-    """The loss of parameters, known to be a scalar."""
+    """The loss as a function of parameters, refused if it is no scalar."""
 
     def call(parameters: Tree) -> Array:
         value = loss(residuals(parameters))

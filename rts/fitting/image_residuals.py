@@ -112,7 +112,7 @@ class ImageResiduals(Residuals):
         return normal_equations(self, parameters, engine) if found is None else found
 
     def _swept(self, splatter: Splatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
-        """By the splatter; None where it cannot."""
+        """`normal_equations` by those of the splatter; None where it gives none."""
         vector, unflatten = flatten(parameters)
         parts, camera = self.scene(parameters)
         sampled = sample(parts, camera, self.size, splatter=splatter, **self._sampling)

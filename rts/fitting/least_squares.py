@@ -18,7 +18,7 @@ LARGEST_DAMPING = 1e12
 
 
 def mean_square(residuals: Array) -> Array:
-    """The default loss."""
+    """The mean square: the default loss."""
     return namespace(residuals).mean(residuals * residuals)
 
 
@@ -30,7 +30,7 @@ class _Linear(NamedTuple):
     gradient: np.ndarray
 
     def checked(self, start: bool) -> _Linear:
-        """This, refused where it is not finite."""
+        """Give itself back, or raise an error where it is not finite."""
         require(math.isfinite(self.value), f"the loss is {self.value}", start)
         require(bool(np.isfinite(self.matrix).all()), "the Jacobian is not finite", start)
         return self
@@ -39,14 +39,16 @@ class _Linear(NamedTuple):
 def levenberg_marquardt(
     residuals: Callable, parameters: Tree, engine: Engine, run: Run, jit: bool, own: Callable | None = None
 ) -> None:
-    """Normal equations with Marquardt's scaling and Nielsen's control of the damping (Madsen et al. 2004).
+    """Minimise the mean square of residuals by normal equations.
+
+    With Marquardt's scaling and Nielsen's control of the damping (Madsen et al. 2004).
 
     Args:
-        residuals: checked.
-        parameters: where to start; the fit's own.
-        engine: of the parameters.
-        run: what is kept.
-        jit: compile.
+        residuals: a checked function of the parameters.
+        parameters: where to start; a private copy.
+        engine: the engine of the parameters.
+        run: takes note of each step, and says when to stop.
+        jit: whether to compile.
         own: the residuals' method `normal_equations`, where they have one; see `rts.Residuals`.
     """
     vector, unflatten = flatten(parameters)
@@ -67,7 +69,7 @@ def levenberg_marquardt(
         if not run.record(unflatten(trial), trial_value):
             return
         gain = here.value - trial_value
-        promising = gain > 0  # Not where trials are not finite, too.
+        promising = gain > 0  # False for a trial that is not finite, too.
         if not promising:
             damping, growth = damping * growth, growth * 2
             going = damping <= LARGEST_DAMPING or run.stop("no step lowers the loss")
@@ -115,7 +117,7 @@ def _least_squares(
 
 
 def _checked_equations(found: Any, count: int, engine: Engine) -> tuple[Array, Array, Array]:
-    """What a user's method gave, refused where it is of another form."""
+    """The result of a user's `normal_equations`, refused where its form is another."""
     expected = (), (count, count), (count,)
     given: Any = tuple(found) if isinstance(found, (tuple, list)) else (found,)
     if not all(engine.owns(x) for x in given) or tuple(tuple(x.shape) for x in given) != expected:

@@ -51,16 +51,16 @@ class Run:
         return self.steps - len(self.history)
 
     def stop(self, reason: str) -> bool:
-        """Say why; always False."""
+        """Note why the fit stops. Always False, which `record` returns then."""
         self.reason = reason
         return False
 
     def stalled(self) -> bool:
-        """Whether patience is over."""
+        """Whether the loss has not fallen enough in the last `patience` steps."""
         return len(self.history) - self._last_gain >= self.patience
 
     def attempt(self, engine: Engine, call: Callable, *args: Any) -> Any:
-        """`call(*args)`, computed; an InputError of a later step stops the fit."""
+        """The result of `call(*args)`, waited for. After the first step an InputError in it becomes `Astray`."""
         # jax wraps errors of host functions in one of its own; the engine keeps the original.
         engine.take_error()
         try:

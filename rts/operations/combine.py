@@ -17,7 +17,7 @@ def combine(rows: Array, ids: Array, weights: Array) -> Array:
 
     Args:
         rows: (V, C) float, such as control points.
-        ids: (N, I) integers, rows by number. Where fewer count, any row with a weight of zero.
+        ids: (N, I) integers, rows by number. For a sum of fewer, name any row and give it a weight of zero.
         weights: (N, I) float.
 
     Raises:
@@ -39,12 +39,12 @@ def combine(rows: Array, ids: Array, weights: Array) -> Array:
 def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
     """(N, C): c + w₀ (a − c) + w₁ (b − c), for the rows a, b, c of (V, C) that three columns of `ids` name.
 
-    This is `combine` of three rows, whose last weight is what the others lack of one.
+    This is `combine` of three rows, whose last weight is one minus the others.
 
     Args:
         rows: (V, C) float.
         ids: (N, I) integers.
-        column: the first of the three.
+        column: the first of the three columns.
         weights: (N, W) float, the first two of which count.
 
     Raises:
@@ -122,4 +122,4 @@ COMBINE = Operation(
     packed_result=True,
 )
 """The operation of `combine` and `interpolate`, on rows, weights and ids. Its parameters: the first of the columns of
-ids that are used, how many are, and whether there is one weight less, the last being what the others lack of one."""
+ids that are used, how many are, and whether there is one weight less, the last being one minus the others."""

@@ -1,7 +1,7 @@
 """Sums of rows with weights and their derivatives, compiled for arrays on the host. It imports numba.
 
 Columns of `ids` (N, I), `count` from `column` on, name rows of (V, C); of weights (N, W) the first columns belong to
-them. Where `affine`, the weight of the last row is what the others lack of one: last + Σ wᵢ (rowᵢ − last). Triangles
+them. If `affine`, the weight of the last row is one minus the others: last + Σ wᵢ (rowᵢ − last). Triangles
 have loops of their own. Gradients are added up in the order of the samples.
 """
 

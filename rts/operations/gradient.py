@@ -17,8 +17,8 @@ STEP = 6e-6
 def gradient(f: Callable[[Array], Array], points: Array) -> Array:
     """The gradient (N, 3) of a function of points, each value of which depends on its own point alone.
 
-    By three derivatives in forward mode, differentiable in turn in the points and in what `f` closes over; NumPy has no
-    derivatives, and takes central differences in float64.
+    It takes three derivatives in forward mode, and is differentiable in turn in the points and in what `f` closes over.
+    NumPy arrays have no derivatives: for them it takes central differences in float64.
 
     Args:
         f: points (N, 3) → (N,), in array code.

@@ -1,4 +1,4 @@
-"""One idea, one record: a function of arrays, its specification, and its compiled value and derivatives."""
+"""The record `Operation`: a function of arrays, its specification, and its compiled value and derivatives."""
 
 from __future__ import annotations
 
@@ -28,33 +28,35 @@ class Operation:
     """A function of arrays that every engine can differentiate, in forward and reverse mode, and to second order.
 
     Where arrays are on the host, and their floats all of one dtype, float32 or float64, its value and first derivatives
-    are computed by `forward`, `push` and `pull`. Everywhere else, and for second derivatives, by `specification`. Under
-    `vmap` items are computed one after another. An operation is called with its operands, and parameters by name:
-    hashable values that are no arrays and are handed on to all of its functions.
+    are computed by `forward`, `push` and `pull`. Everywhere else, and for second derivatives, `specification` is what
+    runs. Under `vmap` items are computed one after another. An operation is called with its operands, and parameters by
+    name: hashable values that are no arrays and are handed on to all of its functions.
 
-    Args of the functions on the host: `operands` (Arrays) are NumPy; `out` and `results` are to be filled in place.
+    `forward`, `push` and `pull` run on the host. Their `operands` are NumPy arrays, C-contiguous and read-only; they
+    fill `out` and `results` in place.
 
     Attributes:
         name: unique, such as "my_package.warp"; programs that jax keeps on disk find it by this name.
         specification: (*operands, **params) → the result, in array code.
-        ranks: of the operands; their number of axes.
-        shape: (*shapes of the operands, **params) → the shape of the result; of the floats' dtype.
-        forward: (operands, out, **params), the value into `out`. See `keeps`.
-        push: (operands, tangents, out, **params), the derivative along tangents of the first operands (JVP); at least
-            one is not None. See `sweeps`.
-        pull: (operands, gradient, results, **params), the gradients of the first operands from that of the result
-            (VJP), into `results`, which are zeros, or None where not wanted.
-        differentiable: the first so many operands have derivatives; they are floats.
-        packed: operands with a row a sample, of which engines may have allotted more than are used. The functions are
-            given the rows in use, as far as the engine knows: of what comes straight from sampling or from another
-            operation. The others are zero in the result, and have gradients of zero.
-        packed_result: whether the result has a row a sample likewise.
+        ranks: the number of axes of each operand.
+        shape: (*shapes of the operands, **params) → the shape of the result, whose dtype is that of the floats.
+        forward: (operands, out, **params), writes the value to `out`. See `keeps`.
+        push: (operands, tangents, out, **params), writes to `out` the derivative along tangents of the differentiable
+            operands (JVP); a tangent of zeros is None, but not all are. See `sweeps`.
+        pull: (operands, gradient, results, **params), turns the gradient of the result into those of the
+            differentiable operands (VJP). It writes them to `results`, which are zeros, or None where not wanted.
+        differentiable: how many operands, from the first on, have derivatives; these are floats.
+        packed: the indices of operands that have a row for each sample. Engines may have allotted more rows than are
+            used. The functions get the rows in use, as far as the engine knows them: it does for arrays that come
+            straight from sampling or from another operation. Other rows are zero in the result, and so are their
+            gradients.
+        packed_result: whether the result has a row for each sample, too.
         used: (operands) → how many rows of the packed operands are used; None for as many as the engine knows of.
-        even: packed operands whose rows are often all alike, which a compiling engine may make use of.
-        keeps: whether `forward` returns an object that helps the derivatives at the same operands: `push` and `pull`
-            then take a keyword `kept`, that object or, where it is known no longer, None.
-        sweeps: whether `push` takes tangents (T, ·) of T directions at once, and `out` (T, ·); else it is called for
-            each.
+        even: the indices of packed operands whose rows are often all alike, which a compiling engine may make use of.
+        keeps: whether `forward` returns an object that helps the derivatives at the same operands. `push` and `pull`
+            then take a keyword `kept`: that object, or None if it is no longer known.
+        sweeps: whether `push` takes tangents (T, ·) of T directions at once, and `out` (T, ·). If not, it is called
+            for each direction.
     """
 
     name: str
@@ -113,7 +115,7 @@ class Operation:
         return engine.apply(self, operands, params)
 
     def check_ranks(self, operands: Sequence[Array]) -> None:
-        """Raise an InputError for operands with another number of axes."""
+        """Raise an InputError if an operand has another number of axes than `ranks` says."""
         for x, rank in zip(operands, self.ranks, strict=True):
             if x.ndim != rank:
                 shapes = ", ".join(str(tuple(x.shape)) for x in operands)
@@ -129,10 +131,10 @@ class Operation:
                 return False
         return True
 
-    # What binders of engines call, with operands of NumPy.
+    # The methods below are what engines' binders call, with operands in NumPy.
 
     def value_on_host(self, operands: Arrays, params: dict[str, Any]) -> tuple[np.ndarray, Any]:
-        """The result, and what is kept."""
+        """The result, and what `forward` keeps for the derivatives."""
         out = np.empty(self.shape(*map(_SHAPE, operands), **params), operands[0].dtype)
         return out, self.forward(operands, out, **params)
 
@@ -146,5 +148,5 @@ class Operation:
             self.push(operands, [None if t is None else t[i] for t in tangents], result, **options)
 
     def pull_on_host(self, operands: Arrays, g: np.ndarray, results: Some, kept: Any, params: dict) -> None:
-        """Fill `results`, zeros, with the gradients from that of the result."""
+        """Fill `results`, given as zeros, with the gradients of the operands; `g` is that of the result."""
         self.pull(operands, g, results, **({**params, "kept": kept} if self.keeps else params))

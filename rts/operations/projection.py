@@ -11,7 +11,7 @@ from rts.trees import Array
 
 
 def projective_map(rows: Array, points: Array) -> Array:
-    """(N, 3): of four affine maps (4, 4) of points (N, 3), the first two over the third, and the fourth.
+    """Four affine maps (4, 4) of points (N, 3), as (N, 3): the first two over the third, and the fourth.
 
     Where the third is zero there is no image; the result is finite.
     """

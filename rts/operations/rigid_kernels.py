@@ -1,4 +1,4 @@
-"""The matrix of a rigid pose and its Jacobian, compiled: some sixty operations on a few numbers take far longer."""
+"""The matrix of a rigid pose and its Jacobian, compiled: sixty array operations on so few numbers are far slower."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def _forward(operands: Arrays, out: np.ndarray) -> None:
 
 
 def _push(operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray) -> None:
-    # Of the one operand with a derivative there is always a tangent.
+    # Only this operand has a derivative, so its tangent is always there.
     np.take(tangents[0], operands[1], axis=0, out=out, mode="clip")
 
 

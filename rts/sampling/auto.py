@@ -55,7 +55,15 @@ def is_static(part: Part, camera: Camera) -> bool:
 
 
 def explain(parts: Part | Sequence[Part] | PreparedParts, camera: Camera) -> list[Choice]:
-    """What `sampler="auto"` takes for each part of a scene, and why."""
+    """What `sampler="auto"` takes for each part of a scene, and why.
+
+    Args:
+        parts: as in `rts.render`.
+        camera: as in `rts.render`.
+
+    Returns:
+        For each part the name of the `sampler`, and the `reason`.
+    """
     parts, camera = check_scene(parts.parts if isinstance(parts, PreparedParts) else parts, camera)
     return [choose(part, static=is_static(part, camera)) for part in parts]
 

@@ -26,11 +26,11 @@ def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None, kept: 
 
 
 def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
-    """Those samples whose cells are kept (K, H, W), numbered layer by layer, in as many rows as there are.
+    """Samples packed anew: those whose cells are kept, numbered layer by layer.
 
     Args:
         samples: on the host.
-        kept: bool, covered cells.
+        kept: (K, H, W) bool; covered cells only.
         capacity: rows to allot, zeros where they are not used; None for as many as are kept, at least one.
     """
     index = samples.row[kept]

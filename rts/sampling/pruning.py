@@ -22,9 +22,9 @@ LAYER_LIMIT = 8
 
 
 def needed_by(splatter: Splatter, parts: Sequence[CheckedPart]) -> AnyNeeded | None:
-    """What the splatter needs of a scene, or None where that is not known: all of it.
+    """The function that says which samples of a scene the splatter needs; None to keep all.
 
-    Only where all samples are opaque and lie on pixel centres are hidden ones without effect.
+    Hidden samples are only without effect if all samples are opaque and lie on cells' centres.
     """
     if not splatter.prunes or not all(p.shader.opaque and p.surface.centered for p in parts):
         return None
@@ -91,8 +91,8 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: AnyNeeded | None)
     """The scene with as many layers as count.
 
     Args:
-        taken: the scene with a number of layers, some of them dropped by a `Needed`.
-        needed: what the splatter needs.
+        taken: samples the scene with a number of layers, less what a `Needed` drops.
+        needed: says which samples the splatter needs.
     """
     count = 2
     while True:
@@ -128,7 +128,7 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
     def host(row: np.ndarray, depth: np.ndarray, *own_rows: np.ndarray) -> tuple[np.ndarray, ...]:
         used = np.zeros(offsets[-1], bool)
         used[row[needed(row >= 0, depth)]] = True
-        # In their order, so that neighbours in the image stay neighbours in memory.
+        # The order stays, so that neighbours in the image stay neighbours in memory.
         indices = [np.flatnonzero(used[a:b]).astype(np.int32) for a, b in itertools.pairwise(offsets)]
         numbers = [np.where(used[a:b], np.cumsum(used[a:b]) - 1, -1) for a, b in itertools.pairwise(offsets)]
         rows = zip((np.concatenate(numbers), *numbers), (row, *own_rows), strict=True)

@@ -33,7 +33,7 @@ def refined(
 
     Args:
         surface: the surface.
-        inputs: of its proxy, on the host.
+        inputs: what its `proxy_inputs` gave, on the host.
         lifted: the samples, a row for each covered cell.
         camera: host matrices.
         size: (height, width).
@@ -45,7 +45,7 @@ def refined(
         for name, spec in tables.items()
     }
     lifted, rays = replace(lifted, tables=allotted, by_sample=by_sample), _rays_of(lifted, camera, size)
-    # A copy of the rows, which tells what has been written to them.
+    # `refine` gets a copy of `row`, so that the check sees what it has changed.
     return checked_refined(surface.refine(inputs, replace(lifted, row=lifted.row.copy()), rays), lifted, surface), rays
 
 
@@ -65,7 +65,7 @@ def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
     Args:
         samples: what a surface's `refine` gave; rows that are −1 are no samples.
         camera: host matrices.
-        spread: of `Rays`, local units.
+        spread: the `spread` of `Rays`, local units.
 
     Returns:
         Samples with another `row` and `depth`. What lies before the near or beyond the far plane is gone.
@@ -73,7 +73,7 @@ def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
     from rts.sampling import settling_kernels
 
     row, depth = np.empty_like(samples.row), np.empty_like(samples.depth)
-    # Depths are the camera's; of the view's units there are so many in one of the surface's.
+    # Depths are in the camera's units, the spread in the surface's: the view scales by this cube root.
     near, slope = SAME_ROOT_PIXELS * np.abs(np.linalg.det(camera.view[:3, :3])) ** (1 / 3) * spread
     limits = np.array([*_planes(camera), near, slope + SAME_ROOT])
     given = read_only(samples.row, np.int32), read_only(samples.depth, np.float32)

@@ -27,8 +27,8 @@ class TriangleSampler(Sampler):
     What was prepared is kept (`rts.sampling.cache`) until the proxy's inputs change.
 
     Attributes:
-        builds: whether something is worth building once for a proxy; True where there is a `prepare`.
-        follows: whether what was prepared can follow moved vertices; True where there is an `update`.
+        builds: whether something is worth building once for a proxy; True in a class with its own `prepare`.
+        follows: whether what was prepared can follow moved vertices; True in a class with its own `update`.
     """
 
     DECLARES = True
@@ -45,11 +45,11 @@ class TriangleSampler(Sampler):
         return self
 
     def prepare(self, proxy: Proxy) -> Any:
-        """What `rasterize` needs of the proxy: an acceleration structure, device buffers. Default the proxy itself."""
+        """Build what `rasterize` needs: an acceleration structure, device buffers. The default is the proxy itself."""
         return proxy
 
     def update(self, prepared: Any, proxy: Proxy) -> Any:
-        """What was prepared, in place, for moved vertices of the same faces; None where it has to be made anew."""
+        """Adapt what was prepared to moved vertices of the same faces, and return it; None if it must be made anew."""
         return None
 
     @abc.abstractmethod
@@ -62,6 +62,9 @@ class TriangleSampler(Sampler):
             size: (height, width).
             layers: K.
             cull: "none", or "back": ignore triangles whose normal (counter-clockwise winding) faces away.
+
+        Returns:
+            Fragments, front to back in each pixel; no layer follows an empty one.
         """
 
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
@@ -113,16 +116,19 @@ class TriangleSampler(Sampler):
         needed: AnyNeeded | None = None,
         entry: Entry | None = None,
     ) -> Samples:
-        """See `rts.Sampler`. One call to the host does everything.
+        """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
 
         Args:
-            part: see there.
-            camera: see there.
-            size: see there.
-            layers: see there.
-            capacity: see there.
-            needed: which samples to keep, or None for all.
+            part: as in `rts.Sampler`.
+            camera: as in `rts.Sampler`.
+            size: as in `rts.Sampler`.
+            layers: as in `rts.Sampler`.
+            capacity: as in `rts.Sampler`.
+            needed: says which samples to keep; None for all.
             entry: what `hold` gave, to be used without a look at the surface's inputs.
+
+        Raises:
+            InputError: the surface has no triangles, or a plugin broke its contract.
         """
         surface, theta = _of_triangles(part.surface), part.theta
         engine, like = suiting(theta, camera)
@@ -191,7 +197,7 @@ class TriangleSampler(Sampler):
         lifted = lift(fragments, found.proxy, None, covered)
         moved, rays = refined(surface, inputs, lifted, camera, shape.size, tables)
         settled = settle(moved, camera, rays.spread)
-        # Which samples are needed is asked with their final depths.
+        # `needed` is asked only now, since it goes by the final depths.
         left = kept = settled.row >= 0
         if needed is not None:
             adapted(needed, Needed).ran_out(int((covered[-1] & ~left[-1]).sum()))
@@ -264,7 +270,7 @@ def _stop(x: Any) -> Any:
 
 
 def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
-    """A table of as many rows as there have to be."""
+    """A table with zeros added up to the number of rows that its spec fixes."""
     if spec.packed or len(table) == spec.shape[0]:
         return table
     return np.concatenate([table, np.zeros((spec.shape[0] - len(table), *table.shape[1:]), table.dtype)])

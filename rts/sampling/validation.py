@@ -102,7 +102,7 @@ def _spread(m: np.ndarray) -> float:
 
 @functools.lru_cache(maxsize=64)
 def _spread_of_projection(data: bytes) -> float:
-    """What `_spread` is, of a (4, 4) float64 matrix given as bytes: kept, since it often is that of the call before."""
+    """The `_spread` of a (4, 4) float64 matrix, given as bytes; kept, since it is often that of the last call."""
     matrix = np.frombuffer(data).reshape(4, 4)
     square = float((matrix * matrix).sum(axis=1).prod())
     return float(np.linalg.det(matrix)) ** 2 / square if square > 0 else 0.0
@@ -170,7 +170,7 @@ def _array(what: str, value: Any, shape: tuple[int, ...], kind: type, dtype: Any
         raise InputError(
             f"{what} of shape {array.shape} and dtype {array.dtype}; expected {shape} of {np.dtype(dtype)}"
         )
-    with np.errstate(over="ignore"):  # Infinite then, which is refused where it is used.
+    with np.errstate(over="ignore"):  # Too large a number becomes infinity, which is refused where it is used.
         return np.ascontiguousarray(array, dtype) if array.ndim else array.astype(dtype)
 
 

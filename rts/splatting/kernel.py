@@ -30,7 +30,7 @@ from rts.trees import Array
 SIGMA, EPSILON = 0.5, 0.05
 LEAST_SIGMA, LARGEST_SIGMA = 0.1, 1e3
 TIE, LEAST_EPSILON = 1e-5, 1e-4
-"""Depths so near, relative to the farthest, may be ordered by rounding; and an ε that outweighs rounding of weights."""
+"""Depths that differ by less, relative to the farthest, may be ordered by rounding; the ε outweighs that of weights."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class Kernel(Splatter):
         sigma: standard deviation, pixels. Below 0.45 little of the kernel reaches the neighbouring cells, and most of
             the derivative at edges is lost.
         epsilon: excess of the weights' sum over one, so that the interior is always normalised.
-        calibration: factor γ on a splat's offset from its cell's centre, P' = c + γ (P − c): nothing to the image of
-            samples on pixel centres, but a factor on its derivative. None for the γ of `exact_calibration`.
+        calibration: factor γ on a splat's offset from its cell's centre, P' = c + γ (P − c). It leaves the image of
+            samples on pixel centres as it is, and multiplies its derivative. None for the γ of `exact_calibration`.
     """
 
     sigma: float = SIGMA
@@ -65,7 +65,7 @@ class Kernel(Splatter):
 
     @abc.abstractmethod
     def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
-        """The image of all cells, of at least one sample."""
+        """The image of all cells (H, W, 4), if there is at least one sample; see `rts.Splats` for the arguments."""
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`: fronts, and the hidden layers around targets that are not `plain`."""
@@ -88,7 +88,7 @@ class Kernel(Splatter):
         return exact_calibration(self.sigma) if self.calibration is None else self.calibration
 
     def weights(self, position: Array) -> tuple[dict[int, Array], dict[int, Array]]:
-        """Weights of cells (h, w, ·), the first being cell (−1, −1): by target offset u, and by v; w = x[u] · y[v]."""
+        """Factors (x, y) of the weights w(u, v) = x[u] · y[v] of cells (h, w), of which the first is cell (−1, −1)."""
         xp = namespace(position)
         height, width = position.shape[:2]
         constant = engine_of(position).constant

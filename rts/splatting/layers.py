@@ -38,14 +38,14 @@ class Depths:
         return self.at(self._covered, u, v)
 
     def pairing(self, u: int, v: int) -> tuple[Array, Array]:
-        """The number s of `Multi`, and what the depths that it pairs are off, (H, W) both."""
+        """The number s of `Multi`, and the distance of the depths that it pairs, (H, W) both."""
         source = self.source(u, v)
         a, best_a = _first_minimum([self.xp.abs(z - self.target[0]) for z in source], self.xp)
         b, best_b = _first_minimum([self.xp.abs(z - source[0]) for z in self.target], self.xp)
         return self.xp.where(best_b < best_a, -b, a), self.xp.minimum(best_a, best_b)
 
     def fronts_pair(self, u: int, v: int, margin: float) -> tuple[Array, Array]:
-        """Whether fronts are nearer, by a margin, than any pair with a hidden layer; and the smallest distance."""
+        """Whether the fronts are nearer, by a margin, than a front and a hidden layer; and the least such distance."""
         source, xp = self.source(u, v), self.xp
         front, hidden = xp.abs(source[0] - self.target[0]), xp.full_like(source[0], xp.inf)
         for p, q in zip(source[1:], self.target[1:], strict=True):
@@ -53,7 +53,10 @@ class Depths:
         return front + margin < hidden, xp.minimum(front, hidden)
 
     def continues(self, u: int, v: int, limit: Array) -> Array:
-        """Whether the front of the source or of the target is nearer than a limit to where the other's line leads."""
+        """Whether one front, the source's or the target's, lies on the line through the other and its next cell.
+
+        It may be off the line by less than `limit`.
+        """
         xp = self.xp
         source, target = self.at(self._depth[0], u, v), self.target[0]
         found = xp.zeros_like(target, dtype=xp.bool)
@@ -129,12 +132,12 @@ def _beyond(depth: list[Array], covered: Array) -> list[Array]:
 
 
 def all_of(conditions: list[Array]) -> Array:
-    """Where all of some conditions hold."""
+    """Where all conditions hold, at least one of them given."""
     return functools.reduce(operator.and_, conditions)
 
 
 def fronts(covered: np.ndarray) -> np.ndarray:
-    """(K, H, W) bool: the first layer."""
+    """(K, H, W) bool: the covered cells of the first layer."""
     return covered & (np.arange(len(covered)) == 0)[:, None, None]
 
 

@@ -23,7 +23,7 @@ class Plain(Splatter):
         if rgba.shape[0] == 0:
             return nothing(rgba, row)
         xp = namespace(rgba)
-        # Nothing, but it keeps the image connected to the positions, whose derivative it is to say is zero.
+        # Adds zero. It keeps the image connected to the positions, so that their derivative is there, and zero.
         image = 0 * xp.sum(positions)
         for k in reversed(range(row.shape[0])):
             layer = xp.where((row[k] >= 0)[..., None], unpack(rgba, row[k]), 0.0)
@@ -46,7 +46,7 @@ class Single(Kernel):
         return normalised(total, namespace(rgba))
 
     def plain(self, depths: Depths, margin: float) -> Array:
-        """See `Kernel`: everywhere."""
+        """See `Kernel`: every target, since hidden layers are not splatted."""
         return depths.covers(0, 0) | True
 
 

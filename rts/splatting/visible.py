@@ -17,8 +17,8 @@ CONTINUED = 0.5
 class Visible(Kernel):
     """`Multi` with a calibrated derivative, where opaque layers of one source hide each other.
 
-    Pairing is that of `Multi`, save that front layers pair (s = 0) also where one lies on the line through the other
-    and its next cell, to half of what the best of A and B is off: depth that changes fast, as on the sides of a box
+    Pairing is that of `Multi`, but front layers also pair (s = 0) where one lies on the line through the other and its
+    next cell, or off it by less than half of the smallest of A and B: depth that changes fast, as on the sides of a box
     near its outline, is nearer to a back face than to itself.
 
     Each buffer gets at most one layer of a source. An empty target takes the source's front layer, at the surface. A
