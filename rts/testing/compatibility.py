@@ -135,7 +135,7 @@ def pairs() -> Iterator[Pair]:
 def _problem(part: Part, sampler: str, engine: str) -> str | None:
     try:
         attempt(part, sampler, engine)
-    except Exception as error:  # Of other people's plugins, too.
+    except Exception as error:  # Other people's plugins may raise anything.
         return _reason(error)
     return None
 

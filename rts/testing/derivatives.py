@@ -53,7 +53,7 @@ def installed() -> list[Engine]:
 
 
 def single(x: Any) -> Any:
-    """Floats as float32, everything else as it is."""
+    """An array of floats as float32; anything else as it is."""
     x = np.asarray(x)
     return x.astype(np.float32) if np.issubdtype(x.dtype, np.floating) else x
 
@@ -88,7 +88,7 @@ def split(tree: Tree) -> tuple[list[np.ndarray], Callable[[Sequence[Any]], Tree]
 
 
 def names(tree: Tree) -> list[str]:
-    """Where the leaves that `split` finds are."""
+    """Names of the leaves that `split` finds, which say where they are."""
     return [f"theta[{key!r}]" for key in sorted(tree) for _ in split(tree[key])[0]]
 
 
@@ -148,8 +148,8 @@ def claim_engines_agree(f: Callable, at: list, value: np.ndarray, what: str) -> 
     Args:
         f: from a list of arrays to an array, in any engine.
         at: NumPy arrays.
-        value: of `f`, by NumPy.
-        what: is computed.
+        value: the value of `f`, by NumPy.
+        what: what is computed, in words.
     """
     weights = np.random.default_rng(0).standard_normal(value.shape)
     along, first = directions(at), None

@@ -39,7 +39,7 @@ class EngineConformance(Conformance):
     # ------------------------------------------------------------------------------------------- arrays
 
     def test_it_owns_its_arrays_alone(self, engine: Any) -> None:
-        """Those that `constant` gives, and no lists, numbers or arrays of others."""
+        """`owns` holds for what `constant` gives, and not for lists, numbers or other frameworks' arrays."""
         chosen = _instance(engine)
         claim(chosen.owns(chosen.constant(np.ones(3))), "it does not own the array that `constant` gives")
         strangers = [1.0, [1.0], None, *([] if chosen.name == "numpy" else [np.ones(3)])]
@@ -47,7 +47,7 @@ class EngineConformance(Conformance):
             claim(not chosen.owns(x), f"it owns a {type(x).__name__}")
 
     def test_constants_keep_their_values(self, engine: Any) -> None:
-        """Floats in the dtype of `like`, else float32 (NumPy: as they are); integers and booleans as such."""
+        """`constant` gives floats in the dtype of `like`; integers and booleans stay what they are."""
         chosen = _instance(engine)
         single = chosen.constant(np.ones(2, np.float32))
         for value in (np.array([1.5, -2.0]), np.arange(6, dtype=np.int32).reshape(2, 3), np.array([True, False]), 0.5):
@@ -62,7 +62,7 @@ class EngineConformance(Conformance):
 
     @pytest.mark.parametrize("name", NAMESPACE)
     def test_its_namespace_is_that_of_the_array_api(self, engine: Any, name: str) -> None:
-        """With NumPy's results."""
+        """Functions of `namespace` give NumPy's results."""
         chosen, x, f = _instance(engine), numbers(N, 4, seed=4), NAMESPACE[name]
         from array_api_compat import numpy as xp
 
@@ -73,7 +73,7 @@ class EngineConformance(Conformance):
     # ------------------------------------------------------------------------------------------ the host
 
     def test_host_functions_are_called_with_numpy(self, engine: Any) -> None:
-        """And their results are the engine's, with values, shapes and dtypes, compiled or not."""
+        """`call_host` gives NumPy arrays to the function, and the engine's arrays back, compiled or not."""
         chosen = _instance(engine)
 
         def host(x: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -91,7 +91,7 @@ class EngineConformance(Conformance):
             claim((packed[2:] == 0).all(), f"a packed result{how} is not padded with zeros")
 
     def test_host_functions_have_no_derivative(self, engine: Any) -> None:
-        """And let those of others pass."""
+        """Derivatives go around what `call_host` gives: it is a constant, in both modes."""
         chosen = _differentiating(engine)
         xp, spec = chosen.namespace, ArraySpec((N, 3), np.float32)
 
@@ -116,7 +116,7 @@ class EngineConformance(Conformance):
     # ------------------------------------------------------------------------------------------- sums, loops
 
     def test_segments_are_summed(self, engine: Any) -> None:
-        """(count, C), zero where there is none; and so are derivatives."""
+        """`segment_sum` gives the sums, zero for an empty segment, and has their derivatives."""
         chosen, values, segments = _instance(engine), numbers(N, 3), np.array([1, 1, 3, 0, 1, 3])
         expected = np.zeros((5, 3), np.float32)
         np.add.at(expected, segments, values)
@@ -163,7 +163,7 @@ class EngineConformance(Conformance):
             claim_close(found, np.array([1.0, 0.125]), 0, f"the gradient of repeat(x) x{how}")
 
     def test_unused_rows_are_filled(self, engine: Any) -> None:
-        """With the first row, where no cell of `row` names them; all that are named stay."""
+        """`fill_unused` puts the first row where no cell of `row` names one, and leaves the others."""
         chosen, x = _instance(engine), numbers(N, 3)
         row = np.array([[[0, 2, -1], [1, -1, -1]]], np.int32)
         with owning(chosen):
@@ -209,7 +209,7 @@ class EngineConformance(Conformance):
             claim(False, f"{name} raises nothing, though the engine says that it does not differentiate")
 
     def test_gradients_are_those_of_closed_forms(self, engine: Any) -> None:
-        """Parameters may be nested; the gradient is zero where one is not used."""
+        """`value_and_grad` takes nested parameters, and gives zeros for those that are not used."""
         chosen = _differentiating(engine)
         xp = chosen.namespace
         tree = {"a": numbers(3), "b": [numbers(2, seed=1), numbers(4, seed=2)]}
@@ -224,7 +224,7 @@ class EngineConformance(Conformance):
         claim_close(found["b"][1], np.zeros(4), 0, "the gradient in what is not used")
 
     def test_forward_mode_can_be_differentiated(self, engine: Any) -> None:
-        """`jvp` of x³ along d, and the gradient of that in a factor that the function closes over."""
+        """`jvp` is right for x³ along d, and has a gradient in a factor that the function closes over."""
         chosen = _differentiating(engine)
         xp, x, d = chosen.namespace, numbers(4), numbers(4, seed=1)
         at, along = chosen.constant(x), chosen.constant(d)
@@ -238,7 +238,7 @@ class EngineConformance(Conformance):
         claim_close(chosen.to_numpy(second), (3 * x**2 * d).sum(), TOLERANCE, "the gradient of a derivative")
 
     def test_jacobians_have_a_row_an_unknown(self, engine: Any) -> None:
-        """A function with two results has a Jacobian of each."""
+        """`jacobian` of a function with two results gives the Jacobian of each."""
         chosen = _differentiating(engine)
         xp, x = chosen.namespace, numbers(3)
         with owning(chosen), no_error("jacobian"):
@@ -249,7 +249,7 @@ class EngineConformance(Conformance):
         claim_close(rows[1], np.ones(3), TOLERANCE, "the Jacobian of a sum")
 
     def test_stop_gradient_stops_it(self, engine: Any) -> None:
-        """In both modes, and leaves the value."""
+        """`stop_gradient` leaves the value, and no derivative in either mode."""
         chosen = _differentiating(engine)
         xp, x = chosen.namespace, chosen.constant(numbers(4))
         f = lambda v: xp.sum(chosen.stop_gradient(v) * v)  # noqa: E731
@@ -261,7 +261,7 @@ class EngineConformance(Conformance):
         claim_close(chosen.to_numpy(along), numbers(4).sum(), TOLERANCE, "its derivative in forward mode")
 
     def test_checkpoints_have_the_same_gradient(self, engine: Any) -> None:
-        """`checkpoint(make, f)` is `f(make())`, for its gradient, too."""
+        """`checkpoint(make, f)` has the value and the gradient of `f(make())`."""
         chosen = _differentiating(engine)
         xp, x = chosen.namespace, chosen.constant(numbers(4))
         constant = chosen.constant(numbers(4, seed=1))
@@ -273,7 +273,7 @@ class EngineConformance(Conformance):
         claim_close(chosen.to_numpy(gradient), 2 * expected * numbers(4), TOLERANCE, "the gradient of a checkpoint")
 
     def test_optimizers_step(self, engine: Any) -> None:
-        """SGD by the rate times the gradient, Adam first by the rate; both leave what they are given alone."""
+        """`optimizer` steps by rate times gradient (SGD), first by the rate (Adam), and changes no array in place."""
         chosen = _differentiating(engine)
         given = {"x": numbers(3), "y": [numbers(2, seed=1)]}
         slopes = map_leaves(lambda v: np.sign(v) * 2, given)
@@ -291,10 +291,10 @@ class EngineConformance(Conformance):
 
     @pytest.mark.parametrize("name", OPERATIONS)
     def test_operations_are_their_specification(self, engine: Any, name: str) -> None:
-        """The value of each, compiled or not; their derivatives in both modes; and the derivative of a gradient."""
+        """Operations have the specification's value, compiled or not; derivatives in both modes and twice are right."""
         chosen, (f, operands) = _instance(engine), OPERATIONS[name]
         with mock.patch.object(type(engine_named("numpy")), "apply", Engine.apply):
-            expected = np.asarray(f(*operands))  # By specification.
+            expected = np.asarray(f(*operands))  # The value of the specification.
         for how, call in _both_ways(chosen, lambda *x: f(*x)):
             with owning(chosen), no_error(f"{name}{how}"):
                 found = chosen.to_numpy(call(*map(chosen.constant, operands)))
@@ -322,7 +322,7 @@ class EngineConformance(Conformance):
     # ----------------------------------------------------------------------------------------- a render
 
     def test_a_render_is_numpys(self, engine: Any) -> None:
-        """The image of a shaded ball; and forward and reverse mode are one derivative."""
+        """The image of a shaded ball is NumPy's; forward and reverse mode are one derivative."""
         chosen = _instance(engine)
         part = scenes.ball(transform=np.asarray(rigid([0.2, 0.3, 0.1, 0.05, 0.1, 0.0]), np.float32))
         expected = scenes.render(part, scenes.CAMERA, scenes.SIZE, sampler="reference")
@@ -358,7 +358,7 @@ def _curvature(engine: Engine, f: Callable, operands: list, along: list, weights
 
 @contextlib.contextmanager
 def owning(engine: Engine) -> Iterator[None]:
-    """Have the core take this object for the engine of its arrays, as long as it lasts."""
+    """Context in which the core takes this object for the engine of its arrays."""
     kinds = {type(engine.constant(np.ones(1)))} - {np.ndarray}
     before = {kind: OWNERS.get(kind) for kind in kinds}
     OWNERS.update(dict.fromkeys(kinds, engine))

@@ -75,7 +75,7 @@ def claim_found_again(part: Part, surface: RaySurface, camera: Camera, view: str
     claim_finite((distance, np.asarray(hits.params)), f"{view}: what intersect gives, also where nothing is hit,")
     missed, total, worst = 0, 0, 0.0
     for k in range(len(hit)):
-        # Not where another hit lies between.
+        # Hits before which another one lies are left out.
         apart = distance[k] - (distance[k - 1] if k else 0) > 2 * SHORT
         chosen = np.flatnonzero(hit[k] & apart)
         if not len(chosen):
@@ -97,13 +97,13 @@ def claim_found_from_behind(part: Part, surface: RaySurface, camera: Camera, vie
     theta, origins, directions = _rays_of(part, camera)
     hits = surface.intersect(theta, origins, directions, DEEP)
     hit, distance = np.asarray(hits.hit), np.where(hits.hit, hits.distance, -np.inf)
-    # Those that have hit all there is.
+    # Rays whose hits are all known: the last layer is empty.
     chosen = np.flatnonzero(hit[0] & ~hit[-1])
     last = distance.max(axis=0)[chosen] + BEYOND
     back = surface.intersect(theta, origins[chosen] + last[:, None] * directions[chosen], -directions[chosen], DEEP)
     there = np.where(hit[:, chosen], distance[:, chosen], NOWHERE)
     again = np.where(np.asarray(back.hit), last - np.asarray(back.distance), NOWHERE)
-    again = np.where(again < 0, NOWHERE, again)  # Before the near plane, where the first rays began.
+    again = np.where(again < 0, NOWHERE, again)  # Hits before the near plane, where the first rays began, do not count.
     wrong = np.any(np.abs(np.sort(there, axis=0) - np.sort(again, axis=0)) > 1e-2, axis=0)
     claim(
         wrong.sum() <= FEW * len(wrong),

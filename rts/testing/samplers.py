@@ -39,7 +39,7 @@ class Elsewhere:
         return "Elsewhere()"
 
     def evaluate(self, theta: Any, samples: Any) -> GBuffer:
-        """A point wherever it is asked for one."""
+        """The origin, for any sample."""
         return GBuffer(position=theta["center"] + 0 * samples.params[:, :1])
 
 
@@ -57,19 +57,19 @@ class SamplerConformance(Conformance):
 
     @pytest.fixture
     def parts(self) -> list[Part]:
-        """What it is to sample: triangles that are closed, culled, moved, and in a heap."""
+        """The parts to sample: triangles that are closed, culled, moved, and in a heap."""
         turned = np.array([(0.8, 0, 0.6, 0.1), (0, 1.2, 0, -0.1), (-0.6, 0, 0.8, 0.2), (0, 0, 0, 1)], np.float32)
         return [scenes.ball(), scenes.ball(cull="back", transform=turned), scenes.soup()]
 
     # ---------------------------------------------------------------------------------------- geometry
 
     def test_samples_lie_on_the_centres_of_their_pixels(self, sampler: Any, parts: list[Part]) -> None:
-        """Evaluated and projected, each sample is where its ray went, at its depth."""
+        """Each sample, evaluated and projected, lies on its pixel's centre, at its depth."""
         for view, camera, part in _scenes(parts):
             claim_reprojected(part, scenes.find(part, camera, sampler, layers=3), camera, view)
 
     def test_it_agrees_with_the_reference(self, sampler: Any, parts: list[Part]) -> None:
-        """Inside all triangles are those of the reference; at most one pixel in a hundred differs at silhouettes."""
+        """Triangles are those of `reference`; of the pixels at silhouettes at most one in a hundred differs."""
         triangles = [p for p in parts if is_of_triangles(p)]
         if not triangles:
             pytest.skip("no triangles to compare with the reference")
@@ -81,7 +81,7 @@ class SamplerConformance(Conformance):
         silhouettes.claim_few("")
 
     def test_layers_are_front_to_back(self, sampler: Any, parts: list[Part]) -> None:
-        """In every pixel, without gaps; and one layer is the first of three."""
+        """Layers of a pixel are sorted by depth, without gaps; asked for one layer, it gives the first of three."""
         for view, camera, part in _scenes(parts):
             one, three = (scenes.find(part, camera, sampler, layers=k) for k in (1, 3))
             claim_ordered(three, view)
@@ -89,7 +89,7 @@ class SamplerConformance(Conformance):
             claim(np.allclose(one.depth, first, rtol=1e-6), f"{view}: one layer is not the first of three")
 
     def test_background_is_empty(self, sampler: Any, parts: list[Part]) -> None:
-        """Row −1 and depth 0 where nothing is seen, no row twice, and an image that is zero there."""
+        """`row` is −1, and depth and image 0, where nothing is seen; no row stands twice."""
         for view, camera, part in _scenes(parts):
             sampled = scenes.find(part, camera, sampler)
             claim_empty_where_empty(sampled, view)
@@ -98,7 +98,7 @@ class SamplerConformance(Conformance):
             claim((image[empty] == 0).all(), f"{view}: the image is not zero where nothing is seen")
 
     def test_samples_lie_between_the_near_and_the_far_plane(self, sampler: Any, parts: list[Part]) -> None:
-        """What is before the one or beyond the other is not seen."""
+        """Nothing is seen before the near or beyond the far plane."""
         near, far = 3.4, 4.2
         for part in parts:
             sampled = scenes.find(part, scenes.NEAR, sampler, layers=3)
@@ -110,7 +110,7 @@ class SamplerConformance(Conformance):
     # -------------------------------------------------------------------------------------- the contract
 
     def test_two_calls_give_the_same(self, sampler: Any, parts: list[Part]) -> None:
-        """To the last bit, whatever was sampled between; and what was, new arrays on the same surfaces, is right."""
+        """Two calls agree to the last bit; what was sampled between, new arrays on the same surfaces, is right."""
         between = [_scaled(part, 0.9) for part in parts]
         expected = [right(part, scenes.AXES[2], sampler) for part in between]
         silhouettes = Silhouettes()
@@ -123,7 +123,7 @@ class SamplerConformance(Conformance):
         silhouettes.claim_few("with new arrays in θ, ")
 
     def test_it_follows_theta(self, sampler: Any, parts: list[Part]) -> None:
-        """One value after another on one surface, more than are kept: each is built, updated, or found again."""
+        """It samples each of several θ on one surface, more than are kept: built, updated, or found again."""
         silhouettes = Silhouettes()
         for i, part in enumerate(parts):
             for call, scale in enumerate(SCALES):
@@ -134,7 +134,7 @@ class SamplerConformance(Conformance):
         silhouettes.claim_few("with one θ after another, ")
 
     def test_it_sees_arrays_that_change_in_place(self, sampler: Any, parts: list[Part]) -> None:
-        """What is built is kept by the values, not by the identity of arrays."""
+        """It keeps what it has built by the values of arrays, not by their identity."""
         for i, part in enumerate(parts):
             values, join = split(part.theta)
             changing = [v.copy() for v in values]
@@ -150,7 +150,7 @@ class SamplerConformance(Conformance):
                 claim_like(found, expected, f"part {i}, after a change in place of the arrays of θ").claim_few("")
 
     def test_capacity_drops_the_deepest_layers_first(self, sampler: Any, parts: list[Part]) -> None:
-        """Exactly so many rows; what does not fit is counted."""
+        """`capacity` gives exactly so many rows; the deepest layers are dropped first, and counted."""
         part = parts[0]
         everything = np.asarray(scenes.find(part, sampler=sampler).row)
         hits, front = (everything >= 0).sum(), (everything[0] >= 0).sum()
@@ -165,7 +165,7 @@ class SamplerConformance(Conformance):
         claim((row[0] >= 0).sum() == front, "samples of the front layer were dropped before those behind")
 
     def test_it_leaves_out_what_is_not_needed(self, sampler: Any, parts: list[Part]) -> None:
-        """Where it says that it prunes: fronts alone, if `needed` keeps these."""
+        """A sampler that says that it prunes gives fronts alone if `needed` keeps only these."""
         chosen = check_sampler(sampler)
         if not chosen.prunes:
             pytest.skip("the sampler does not prune")
@@ -184,7 +184,7 @@ class SamplerConformance(Conformance):
         claim(kept.all(), "samples that are needed are left out")
 
     def test_what_it_cannot_sample_is_refused_in_one_line(self, sampler: Any) -> None:
-        """An `rts.InputError` that says what to do, for a surface with neither triangles nor an intersection."""
+        """A surface with neither triangles nor an intersection is an `rts.InputError` that says what to do."""
         part = Part(Elsewhere(), {"center": np.zeros(3, np.float32)})
         what = "a surface without triangles and intersection"
         claim(refusal(lambda: scenes.find(part, sampler=sampler), what), f"{what} is accepted")
@@ -193,7 +193,7 @@ class SamplerConformance(Conformance):
 
     @pytest.mark.parametrize("engine", ENGINES)
     def test_every_engine_finds_the_same_samples(self, sampler: Any, parts: list[Part], engine: str) -> None:
-        """Also inside a compiled function."""
+        """Every engine finds NumPy's samples, inside a compiled function, too."""
         chosen = engine_or_skip(engine)
         for part in parts[:2]:
             values, join = split(part.theta)
@@ -213,7 +213,7 @@ class SamplerConformance(Conformance):
                 claim(same.mean() >= 0.99, f"in {engine}{how}, {np.sum(~same)} of {same.size} cells are not NumPy's")
 
     def test_engines_agree(self, sampler: Any, parts: list[Part]) -> None:
-        """On the image, its gradient, and its derivative along a direction, each at samples of its own."""
+        """Engines agree on image, gradient and derivative along a direction, each at samples of its own."""
         part = parts[0]
         values, join = split(part.theta)
 
@@ -224,7 +224,7 @@ class SamplerConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_samples_carry_no_derivative(self, sampler: Any, parts: list[Part], engine: str) -> None:
-        """Parameters and depth are constants, whatever they were computed from."""
+        """Parameters and depths of samples are constants, though θ is not."""
         chosen, (values, join) = differentiating(engine), split(parts[0].theta)
         xp = chosen.namespace
 
@@ -240,13 +240,13 @@ class SamplerConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_unseen_parts_give_nothing_and_no_gradient(self, sampler: Any, parts: list[Part], engine: str) -> None:
-        """Behind the camera or beside the image: an empty image and a gradient of zero."""
+        """Parts behind the camera or beside the image give an empty image, and a gradient of zero."""
         for part in parts[:1]:
             claim_unseen_is_nothing(part, sampler, differentiating(engine))
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_awkward_views_are_finite(self, sampler: Any, parts: list[Part], engine: str) -> None:
-        """From inside, cut by the near plane, edge-on: a finite image and gradient."""
+        """Views from inside, cut by the near plane and edge-on have a finite image and gradient."""
         triangles = [scenes.flat()] if is_of_triangles(parts[0]) else []
         for part in [parts[0], *triangles]:
             claim_awkward_views_are_finite(part, sampler, differentiating(engine))
@@ -258,7 +258,7 @@ class Expected(NamedTuple):
     Attributes:
         sampled: the samples.
         edge: (H, W) bool, pixels at silhouettes, where others may be right, too.
-        source: whose they are.
+        source: what found them, in words.
     """
 
     sampled: Sampled
@@ -273,7 +273,7 @@ class Silhouettes(NamedTuple):
     different: int = 0
 
     def __add__(self, other: Any) -> Silhouettes:
-        """Both together."""
+        """The counts of both, added up."""
         return Silhouettes(self.pixels + other[0], self.different + other[1])
 
     def claim_few(self, what: str) -> None:
@@ -307,14 +307,14 @@ def right(part: Part, camera: Camera, sampler: Any) -> Expected:
 
 
 def _new(sampler: Any) -> Any:
-    """Another object of a sampler's class; None where arguments may have made the one there is."""
+    """Another object of a sampler's class; None if it might have been made with arguments."""
     kind = type(registry.instance("rts.samplers", sampler) if isinstance(sampler, str) else sampler)
     plain = kind.__init__ is object.__init__ or len(inspect.signature(kind.__init__).parameters) == 1
     if not (isinstance(sampler, str) or plain):
         return None
     try:
         return kind()
-    except Exception:  # Whatever a class of somebody else raises.
+    except Exception:  # A plugin's class may raise anything.
         return None
 
 
@@ -339,7 +339,7 @@ def is_of_triangles(part: Part) -> bool:
 
 
 def _edges(sampled: Sampled) -> np.ndarray:
-    """(H, W) pixels whose number of layers is not that of all around."""
+    """(H, W) bool, pixels whose number of layers is not that of all around."""
     count = np.pad(_covered(sampled).sum(axis=0), 1, mode="edge")
     height, width = scenes.GRID
     around = np.stack([count[i : i + height, j : j + width] for i in range(3) for j in range(3)])
@@ -351,13 +351,13 @@ def _covered(sampled: Sampled) -> np.ndarray:
 
 
 def _off(found: Sampled, expected: Sampled) -> np.ndarray:
-    """(K, H, W) where depths differ by more than 1e-5 of them."""
+    """(K, H, W) bool, cells whose depths differ by more than a share of 1e-5."""
     depth, other = np.asarray(found.depth), np.asarray(expected.depth)
     return np.abs(depth - other) > 1e-5 * other
 
 
 def _differing(found: Sampled, expected: Sampled) -> np.ndarray:
-    """(K, H, W) cells that hold something else."""
+    """(K, H, W) bool, cells that hold other ids, or other depths."""
     return (_ids(found) != _ids(expected)).any(axis=-1) | _off(found, expected)
 
 

@@ -22,7 +22,7 @@ GRID = SIZE[0] + 2 * APRON, SIZE[1] + 2 * APRON
 
 
 def _rounded(camera: Camera) -> Camera:
-    """In float32, so that every engine sees the same one."""
+    """The camera rounded to float32, so that every engine sees the same one."""
     return Camera(*map(single, camera))
 
 

@@ -48,7 +48,7 @@ class ShaderConformance(Conformance):
     # ------------------------------------------------------------------------------------------- values
 
     def test_it_gives_a_premultiplied_color_for_each_sample(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """(N, 4) in the G-buffer's dtype, within [0, 1], no colour above alpha."""
+        """Colours are (N, 4) in the G-buffer's dtype, within [0, 1], and none is above alpha."""
         rgba = _shaded(shader, theta, gbuffer)
         claim(rgba.shape == (ROWS, 4), f"the shader returned {rgba.shape}; expected {(ROWS, 4)}")
         claim(rgba.dtype == np.float32, f"the shader returned {rgba.dtype} for float32; expected float32")
@@ -58,7 +58,7 @@ class ShaderConformance(Conformance):
         claim(above <= TOLERANCE, f"a colour exceeds its alpha by {above:.3g}; multiply colours by alpha")
 
     def test_samples_are_shaded_one_by_one(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """Their order, and what else is seen, change nothing."""
+        """A sample's colour depends neither on the order of samples nor on the other samples."""
         rgba = _shaded(shader, theta, gbuffer)
         order = np.random.default_rng(1).permutation(ROWS)
         found = _shaded(shader, theta, {name: value[order] for name, value in gbuffer.items()})
@@ -74,7 +74,7 @@ class ShaderConformance(Conformance):
         claim((alpha == 1).all(), f"the shader promises to be opaque; alpha is {alpha.min():.3g} somewhere")
 
     def test_it_reads_what_it_says(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """With only position and the entries that it names, it gives the same."""
+        """Given only position and the entries that `reads` names, a shader gives the same colours."""
         reads = _instance(shader).reads
         if reads is None:
             pytest.skip("the shader does not say what it reads")
@@ -86,7 +86,7 @@ class ShaderConformance(Conformance):
     # -------------------------------------------------------------------------------------- derivatives
 
     def test_engines_agree(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """On colours, their gradient, and their derivative along a direction, in θ and the G-buffer."""
+        """Engines agree on colours, gradient and derivative along a direction, in θ and the G-buffer."""
         values, join = split({"theta": theta, "gbuffer": gbuffer})
 
         def f(x: list) -> Any:
@@ -97,7 +97,7 @@ class ShaderConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_gradients_are_finite_differences(self, shader: Any, theta: Tree, gbuffer: dict, engine: str) -> None:
-        """In every entry of θ."""
+        """The gradient in every entry of θ is that of finite differences."""
         chosen, (values, join) = differentiating(engine), split(theta)
         values = [v.astype(np.float64) for v in values]
         if not values:
@@ -124,7 +124,7 @@ class ShaderConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_awkward_samples_have_finite_gradients(self, shader: Any, theta: Tree, gbuffer: dict, engine: str) -> None:
-        """Normals of zero, seen edge-on or from behind, uv far outside, black, positions at the camera."""
+        """Gradients are finite: normals of zero, edge-on or from behind, uv far outside, black, at the camera."""
         chosen = differentiating(engine)
         values, join = split({"theta": theta, "gbuffer": awkward(gbuffer)})
 
@@ -137,7 +137,7 @@ class ShaderConformance(Conformance):
     # ------------------------------------------------------------------------------------------- errors
 
     def test_what_is_missing_is_refused_in_one_line(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """Without an entry of θ or of the G-buffer, it works, or raises an `rts.InputError` that says what to do."""
+        """Without an entry of θ or the G-buffer a shader works, or raises an `rts.InputError` that says what to do."""
         for name in theta:
             fewer = {k: v for k, v in theta.items() if k != name}
             refusal(lambda fewer=fewer: _shaded(shader, fewer, gbuffer), f"theta without {name!r}")

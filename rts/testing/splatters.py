@@ -39,7 +39,7 @@ class SplatterConformance(Conformance):
     # ------------------------------------------------------------------------------------------- values
 
     def test_a_constant_interior_stays(self, splatter: Any) -> None:
-        """Away from the image's border an opaque colour is reproduced, from one layer or two."""
+        """An opaque colour is reproduced away from the image's border, from one layer or two."""
         color = np.array([0.2, 0.5, 0.9, 1.0], np.float32)
         for layers in (1, 2):
             splats = everywhere(layers)
@@ -51,7 +51,7 @@ class SplatterConformance(Conformance):
             claim_close(inside, expected, TOLERANCE, f"a constant colour of {layers} layers")
 
     def test_the_front_layer_hides_those_behind(self, splatter: Any) -> None:
-        """Where it is opaque and covers everything."""
+        """A front layer that is opaque and covers everything hides all others."""
         splats = everywhere(LAYERS)
         rgba = splats.rgba.copy()
         rgba[splats.row[0].ravel()] = [1, 0, 0, 1]
@@ -75,7 +75,7 @@ class SplatterConformance(Conformance):
         claim(0 < own == most, f"a sample shows with {own:.3g} in its own cell, and with {most:.3g} in another")
 
     def test_colors_stay_premultiplied(self, splatter: Any) -> None:
-        """0 ≤ colour ≤ alpha ≤ 1, of any layers."""
+        """Images of any layers have 0 ≤ colour ≤ alpha ≤ 1."""
         image = _splat(splatter, scattered())
         low, alpha = image.min(), image[..., 3].max()
         claim(low >= -TOLERANCE and alpha <= 1 + TOLERANCE, f"values from {low:.3g}, alpha to {alpha:.3g}")
@@ -83,14 +83,14 @@ class SplatterConformance(Conformance):
         claim(above <= TOLERANCE, f"a colour exceeds its alpha by {above:.3g}")
 
     def test_the_order_of_packed_rows_has_no_effect(self, splatter: Any) -> None:
-        """`row` says which sample is where."""
+        """The image stays the same if rows are permuted, and `row` with them."""
         splats, order = scattered(), np.random.default_rng(2).permutation(CELLS)
         row = np.where(splats.row >= 0, np.argsort(order)[splats.row], -1).astype(np.int32)
         image = _splat(splatter, Splats(splats.positions[order], splats.rgba[order], row))
         claim_close(image, _splat(splatter, splats), TOLERANCE, "the image of permuted rows")
 
     def test_rows_of_no_cell_have_no_effect(self, splatter: Any) -> None:
-        """Padding, whatever its values."""
+        """Rows that only pad have no effect on the image, whatever their values."""
         splats = scattered()
         unused = np.setdiff1d(np.arange(CELLS), splats.row)
         positions, rgba = splats.positions.copy(), splats.rgba.copy()
@@ -99,7 +99,7 @@ class SplatterConformance(Conformance):
         claim_close(image, _splat(splatter, splats), TOLERANCE, "the image with other values in padded rows")
 
     def test_what_it_does_not_need_has_no_effect(self, splatter: Any) -> None:
-        """`needed`, where there is one: without other samples the image and its derivative are the same."""
+        """Without the samples that `needed` leaves out, image and derivative are the same."""
         chosen = _instance(splatter)
         if not chosen.prunes:
             pytest.skip("the splatter does not say which samples it needs")
@@ -117,7 +117,7 @@ class SplatterConformance(Conformance):
             claim_close(found, expected, 1e-4, "the derivative of needed samples")
 
     def test_cells_of_the_border_only_splat(self, splatter: Any) -> None:
-        """`cropped`: the image of all cells, without the border."""
+        """`cropped` gives the image of all cells, without the border."""
         whole = _splat(splatter, scattered())
         for border in (1, 2):
             image = np.asarray(_instance(splatter).cropped(scattered().replace(border=border)))
@@ -143,7 +143,7 @@ class SplatterConformance(Conformance):
 
     @pytest.mark.parametrize("engine", ENGINES)
     def test_every_engine_gives_the_same_image(self, splatter: Any, engine: str) -> None:
-        """To 1e-5."""
+        """Every engine's image is NumPy's, to 1e-5."""
         chosen = differentiating(engine)
         for splats in (everywhere(LAYERS), scattered()):
             with no_error(f"splatting in {engine}"):
@@ -151,14 +151,14 @@ class SplatterConformance(Conformance):
             claim_close(image, _splat(splatter, splats), TOLERANCE, f"the image in {engine}")
 
     def test_engines_agree(self, splatter: Any) -> None:
-        """On the image, its gradient, and its derivative along a direction; both modes are one derivative."""
+        """Engines agree on image, gradient and derivative along a direction; both modes are one derivative."""
         splats = scattered()
         f, given = _of_positions_and_colors(splatter, splats.row), [splats.positions, splats.rgba]
         derivatives.claim_engines_agree(f, given, np.asarray(f(given)), "the image")
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_rows_of_no_cell_have_no_gradient(self, splatter: Any, engine: str) -> None:
-        """Nor have any where nothing is seen; none is NaN."""
+        """Rows of no cell have a gradient of zero, as have all where nothing is seen; none is NaN."""
         chosen, splats = differentiating(engine), scattered()
         for row in (splats.row, np.full_like(splats.row, -1)):
             f = _of_positions_and_colors(splatter, row)
@@ -172,7 +172,7 @@ class SplatterConformance(Conformance):
     # ------------------------------------------------------------------------------------------- errors
 
     def test_wrong_shapes_are_refused_in_one_line(self, splatter: Any) -> None:
-        """An `rts.InputError` that says what was expected."""
+        """Wrong shapes are an `rts.InputError` that says what was expected."""
         splats = scattered()
         wrong = {
             "positions of two coordinates": splats.replace(positions=splats.positions[:, :2]),
@@ -244,7 +244,7 @@ def _splat(splatter: Any, splats: Splats) -> np.ndarray:
 
 
 def _direct(splatter: Any, splats: Splats) -> Any:
-    """By a direct call with arrays: the plugin's own, where it has one."""
+    """The image by a direct call with arrays; the plugin's own `splat`, if it has one."""
     found = _instance(splatter)
     own = unwrapped(found)
     return (own if hasattr(own, "splat") else found).splat(splats.positions, splats.rgba, splats.row)

@@ -33,7 +33,7 @@ class SurfaceConformance(Conformance):
 
     @pytest.fixture
     def part(self) -> Part:
-        """The surface, its θ, and a shader."""
+        """The part to try: the surface, its θ, and a shader."""
         raise NotImplementedError("override the fixture 'part' with an rts.Part of your surface")
 
     @pytest.fixture
@@ -44,17 +44,17 @@ class SurfaceConformance(Conformance):
     # ------------------------------------------------------------------------------------------ samples
 
     def test_samples_lie_on_the_centres_of_their_pixels(self, part: Part, sampler: Any) -> None:
-        """Evaluated and projected, each sample is where its ray went, at its depth."""
+        """Each sample, evaluated and projected, lies on its pixel's centre, at its depth."""
         for view, camera in scenes.VIEWS.items():
             claim_reprojected(part, scenes.find(part, camera, sampler), camera, view)
 
     def test_layers_are_front_to_back(self, part: Part, sampler: Any) -> None:
-        """In every pixel, and without gaps."""
+        """Layers of a pixel are sorted by depth, without gaps."""
         for view, camera in scenes.VIEWS.items():
             claim_ordered(scenes.find(part, camera, sampler), view)
 
     def test_refine_keeps_samples_on_their_rays(self, part: Part) -> None:
-        """What `refine` does to each sample: a point of the surface on its ray, at its depth, or a row of −1."""
+        """`refine` makes of each sample a point of the surface on its ray, at its depth, or sets `row` to −1."""
         surface = scenes.checked(part).surface
         if not (isinstance(surface, TriangleSurface) and surface.refines):
             pytest.skip("the surface has no refine")
@@ -78,7 +78,7 @@ class SurfaceConformance(Conformance):
             claim_found_from_behind(part, surface, camera, view)
 
     def test_two_renders_are_the_same(self, part: Part, sampler: Any) -> None:
-        """To the last bit, whatever was rendered between, and when arrays change in place."""
+        """Two renders agree to the last bit, whatever was rendered between; changes of arrays in place are seen."""
         values, join = split(part.theta)
         other = part.replace(theta=join([0.9 * v for v in values]))
         first, different = (scenes.shown(p, sampler=sampler) for p in (part, other))
@@ -96,7 +96,7 @@ class SurfaceConformance(Conformance):
     # ----------------------------------------------------------------------------------------- evaluate
 
     def test_the_g_buffer_has_a_row_for_each_sample(self, part: Part, sampler: Any) -> None:
-        """(N, C) of finite numbers in θ's dtype, also where a sample is only padding: all zeros."""
+        """The G-buffer holds (N, C) finite numbers in θ's dtype, even where a row is only padding: all zeros."""
         samples = map_leaves(derivatives.single, scenes.find(part, sampler=sampler).samples[0])
         widths, declared = (samples.ids.shape[1], samples.params.shape[1]), tuple(part.surface.sample_widths)
         claim(widths == declared, f"samples have ids and params of widths {widths}; sample_widths says {declared}")
@@ -127,7 +127,7 @@ class SurfaceConformance(Conformance):
             claim(inward.mean() < 0.05, f"{inward.mean():.0%} of the normals face the inside of the triangles")
 
     def test_triangles_depend_on_the_view_only_with_a_key(self, part: Part) -> None:
-        """They are kept from view to view unless `depends_on_view` says otherwise, as where there is a `proxy_key`."""
+        """Triangles are the same in two views, unless `depends_on_view` says otherwise."""
         one, other = (_proxy(part, camera).vertices for camera in (scenes.CAMERA, scenes.AXES[0]))
         if scenes.checked(part).surface.depends_on_view:
             pytest.skip("the surface says that its triangles depend on the view")
@@ -135,7 +135,7 @@ class SurfaceConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_evaluate_can_be_compiled(self, part: Part, sampler: Any, engine: str) -> None:
-        """It looks at no value of θ, and uses nothing but the namespace of θ."""
+        """`evaluate` looks at no value of θ, and uses nothing but its namespace."""
         chosen, (values, join) = differentiating(engine), split(part.theta)
         sampled = scenes.frozen(part, sampler=sampler).samples[0]
         samples = derivatives.on(chosen, sampled)
@@ -149,7 +149,7 @@ class SurfaceConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_gradients_at_frozen_samples_are_finite_differences(self, part: Part, sampler: Any, engine: str) -> None:
-        """Every entry of the G-buffer is differentiated in every entry of θ."""
+        """Gradients of every entry of the G-buffer in every entry of θ are those of finite differences."""
         chosen, (values, join) = differentiating(engine), split(part.theta)
         values = [v.astype(np.float64) for v in values]
         sampled = scenes.frozen(part, sampler=sampler).samples[0]
@@ -173,7 +173,7 @@ class SurfaceConformance(Conformance):
                 claim_slope(gradient[i], along, (ends[0] - ends[1]) / (2 * STEP), what)
 
     def test_engines_agree(self, part: Part, sampler: Any) -> None:
-        """On the image, its gradient, and its derivative along a direction, at the same samples."""
+        """Engines agree on image, gradient and derivative along a direction, at the same samples."""
         values, join = split(part.theta)
         sampled = scenes.frozen(part, sampler=sampler)
 
@@ -183,7 +183,7 @@ class SurfaceConformance(Conformance):
         derivatives.claim_engines_agree(image, values, image([derivatives.single(v) for v in values]), "the image")
 
     def test_the_image_depends_on_the_surface(self, part: Part, sampler: Any) -> None:
-        """Its gradient is not zero at the outline, in at least one entry of θ."""
+        """The image's gradient is not zero at the outline, in at least one entry of θ."""
         values, join = split(part.theta)
         sampled = scenes.frozen(part.replace(shader="silhouette"), sampler=sampler)
         weights = np.random.default_rng(0).random((*scenes.SIZE, 4))
@@ -201,16 +201,16 @@ class SurfaceConformance(Conformance):
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_unseen_it_gives_nothing_and_no_gradient(self, part: Part, sampler: Any, engine: str) -> None:
-        """Behind the camera or beside the image: an empty image and a gradient of zero."""
+        """A part behind the camera or beside the image gives an empty image, and a gradient of zero."""
         claim_unseen_is_nothing(part, sampler, differentiating(engine))
 
     @pytest.mark.parametrize("engine", DIFFERENTIABLE)
     def test_awkward_views_are_finite(self, part: Part, sampler: Any, engine: str) -> None:
-        """From inside, cut by the near plane, and along the axes: a finite image and gradient."""
+        """Views from inside, cut by the near plane and along the axes have a finite image and gradient."""
         claim_awkward_views_are_finite(part, sampler, differentiating(engine))
 
     def test_wrong_theta_is_refused_in_one_line(self, part: Part, sampler: Any) -> None:
-        """An `rts.InputError` that says what to do, wherever an entry is missing or has a wrong shape."""
+        """An entry that is missing or has a wrong shape is an `rts.InputError` that says what to do."""
         reads = scenes.checked(part).surface.reads(part.theta)
         part = part.replace(shader="silhouette")
 
