@@ -404,6 +404,6 @@ class Camera(NamedTuple):
 
 
 def _alike(view: Array, projection: Array) -> tuple[Array, Array]:
-    """Both matrices in the engine and dtype of the one that is not constant."""
+    """View and projection in one engine and dtype: those of the one that is not constant."""
     _, (view, projection) = promote(view, projection)
     return view, projection

@@ -1,4 +1,4 @@
-"""What is refused before any work starts."""
+"""Checks of what users and plugins give."""
 
 from __future__ import annotations
 

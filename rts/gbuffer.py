@@ -11,8 +11,9 @@ from rts.errors import InputError
 class GBuffer(dict):
     """Attributes of the samples by name, each (N, C); "position" (N, 3) is required.
 
-    An attribute may be deferred: it is computed when first read, so a shader pays for what it reads.
-    Built-in surfaces use the names position, normal, uv and color, and any others that the user adds.
+    Surfaces give it in local space; shaders get it with positions and normals in world space. An attribute may be
+    deferred: it is computed when first read, so a shader pays for what it reads. To read one that is missing raises an
+    `InputError`. Built-in surfaces use the names position, normal, uv and color, and any others that the user adds.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):
@@ -22,7 +23,7 @@ class GBuffer(dict):
 
     @property
     def like(self) -> Any:
-        """An array (N, ·) of the samples' number, dtype and device that costs nothing to read."""
+        """An array (N, ·), a row for each sample, of their dtype and device; it costs nothing to read."""
         return self["position"] if self._like is None else self._like
 
     @like.setter

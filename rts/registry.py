@@ -61,7 +61,11 @@ def _distribution(entry: EntryPoint) -> str:
 
 
 def plugins(group: str) -> list[str]:
-    """The names registered in a group, such as "rts.samplers" (or "samplers"), sorted."""
+    """The names registered in a group, such as "rts.samplers" (or "samplers"), sorted.
+
+    Raises:
+        InputError: no such group.
+    """
     return sorted(_entries(_group(group)))
 
 

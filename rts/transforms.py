@@ -92,7 +92,7 @@ def orthographic(
     """(4, 4) orthographic projection.
 
     Args:
-        height: of the image, world units.
+        height: what the image shows from bottom to top, world units.
         aspect: width over height.
         near: depth of the near plane; may be negative.
         far: depth of the far plane.

@@ -39,17 +39,17 @@ class NumpyEngine(Engine):
         return fn(*args)
 
     def apply(self, operation: Operation, operands: Sequence[np.ndarray], params: Mapping[str, Any]) -> np.ndarray:
-        """By compiled code, of floats of one dtype, float32 or float64."""
+        """The result by compiled code if all floats are float32 or all float64, else by specification."""
         if not operation.fits(list(map(_DTYPE, operands))):
             return operation.specification(*operands, **params)
         return operation.value_on_host(list(map(read_only, operands)), dict(params))[0]
 
     def on_host(self, *arrays: np.ndarray) -> bool:
-        """Always."""
+        """True: NumPy arrays are always on the host."""
         return True
 
     def exact_products(self, *arrays: np.ndarray) -> bool:
-        """Always."""
+        """True: NumPy's products keep their precision."""
         return True
 
     def stop_gradient(self, x: Array) -> Array:

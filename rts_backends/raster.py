@@ -27,7 +27,7 @@ BAND_ROWS = 16
 CHUNK = 1 << 11
 BLOCK = 64
 LONG_BLOCK = 256
-"""Where less is kept of a triangle, or of a vertex."""
+"""The block for loops that keep little of each triangle or vertex."""
 
 LIMIT = np.float32(2**15 - 2)
 """Steps from the middle of the image to two pixels outside of it; a position beyond is put there.
@@ -59,7 +59,7 @@ class Raster(TriangleSampler):
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         height, width = size
-        # Unsigned, no index has to be wrapped.
+        # With unsigned indices compiled code need not look for negative ones, which count from the end.
         vertices, faces = prepared.vertices, np.asarray(prepared.faces, np.int32).view(np.uint32)
         matrix, keep = pixel_matrix(camera, size), facing(camera, cull)
         # Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
@@ -264,7 +264,7 @@ def _draw(first, last, offsets, items, listed, vertices, matrix, view_depth, kee
                     depths[k, j, i] = z if z < np.inf else 0.0
 
 
-# Only inlined by numba itself, so that lengths of rows are known, do loops over several arrays become vectors.
+# numba itself must inline these, so that lengths of rows are known: only then do their loops become vector code.
 
 
 @numba.njit(inline="always")

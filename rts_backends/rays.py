@@ -1,4 +1,4 @@
-"""For surfaces that intersect rays themselves: no triangles at all."""
+"""The sampler for surfaces that intersect rays themselves, without any triangles."""
 
 from __future__ import annotations
 

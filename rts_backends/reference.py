@@ -12,7 +12,7 @@ CANDIDATES_AT_ONCE = 1 << 20
 
 
 class Reference(TriangleSampler):
-    """Slow and obvious.
+    """Sampler that tests each triangle against each pixel near it: slow and obvious.
 
     A pixel's ray meets a triangle where Σ bᵢ (xᵢ − X wᵢ, yᵢ − Y wᵢ) = 0 with Σ bᵢ = 1 and bᵢ ≥ 0: (x, y, w) are the
     corners in clip space and (X, Y) the pixel's centre in NDC. So with gᵢ = (xᵢ − X wᵢ, yᵢ − Y wᵢ), the b are in the

@@ -79,7 +79,7 @@ class Mesh(TriangleSurface):
         return Part(cls(faces), theta, shader="lambert")
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Shapes and dtypes of θ."""
+        """Refuse θ whose entries have wrong shapes or dtypes."""
         for name in ("vertices", *self._attributes(theta)):
             if name not in theta:
                 raise InputError(f"theta of a mesh has no {name!r}; it has {sorted(theta)}")

@@ -106,9 +106,9 @@ def fit_pose(
         parts: the model, NumPy arrays; its pose as loaded is the start.
         target: (H, W) silhouette.
         camera: the camera of the target.
-        bounds: of the model; translations are fitted in units of its radius, so that they weigh like radians.
+        bounds: those of the model; translations are fitted in units of its radius, so that they weigh like radians.
         engine: "torch" or "jax"; default whichever is installed.
-        method: of `rts.fit`.
+        method: as in `rts.fit`.
         steps: at most so many at each resolution; default that of `rts.fit`.
         progress: see `rts.fit`.
     """

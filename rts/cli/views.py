@@ -59,7 +59,7 @@ def orbit(
         size: (height, width) of the image.
         azimuth: degrees about the upright axis; 0 looks from +z (from −y where z is up), 90 from +x.
         elevation: degrees above the horizon, −90 to 90.
-        distance: from the centre; default so that the whole object is seen.
+        distance: the camera's distance from the centre; by default the whole object is seen.
         fov: vertical field of view, degrees.
         up: "y" or "z", the axis that is upright.
     """

@@ -61,7 +61,7 @@ def gradient_image(
     Args:
         image: parameters → (H, W, C), such as a function that calls `rts.render`.
         parameters: a torch or jax array, or nested dicts and lists of them.
-        direction: of the same structure; None for one, if the parameters are a single number.
+        direction: a tree of the parameters' structure; None stands for 1 if they are a single number.
         scale: the change that is shown at full strength; None for the largest there is.
 
     Raises:
@@ -108,7 +108,7 @@ class Slope(NamedTuple):
 
 
 class GradientCheck(NamedTuple):
-    """What `check_gradient` found; as a string, a table.
+    """The result of `check_gradient`; as a string, a table.
 
     Attributes:
         slopes: one for each number that was looked at.

@@ -59,7 +59,7 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
 
 
 def _alike(rows: Array, weights: Array) -> tuple[Array, Array]:
-    """Both in one engine, the weights at least as wide as the rows."""
+    """Rows and weights in one engine, the weights' dtype at least as wide as the rows'."""
     if weights.dtype == rows.dtype:
         return rows, weights
     engine = engine_of(rows, weights)

@@ -75,7 +75,7 @@ def pull(
     count: int,
     affine: bool,
 ) -> None:
-    """From the gradient of the result (N, C) add to that of rows (V, C), and fill that of weights (N, W)."""
+    """Pull back the gradient `g` (N, C) of the result: add to that of rows (V, C), and fill that of weights (N, W)."""
     g = read_only(g)
     if g_rows is not None:
         if affine and count == 3:

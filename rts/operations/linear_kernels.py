@@ -29,7 +29,7 @@ def affine_push(
 def affine_pull(
     rows: np.ndarray, points: np.ndarray, g: np.ndarray, g_rows: np.ndarray | None, g_points: np.ndarray | None
 ) -> None:
-    """From the gradient of the result (N, R) fill those of rows and points, where they are wanted."""
+    """Pull back the gradient `g` (N, R) of the result: fill those of rows and points that are wanted."""
     g = read_only(g)
     if g_rows is not None:
         sums = np.zeros((-(-len(points) // CHUNK), *rows.shape))

@@ -32,7 +32,7 @@ def push(
 def pull(
     rows: np.ndarray, points: np.ndarray, g: np.ndarray, g_rows: np.ndarray | None, g_points: np.ndarray | None
 ) -> None:
-    """From the gradient of the result (N, 3) fill those of rows (4, 4) and points (N, 3), where they are wanted."""
+    """Pull back the gradient `g` (N, 3) of the result: fill those of rows (4, 4) and points (N, 3) that are wanted."""
     sums = np.empty((-(-len(points) // CHUNK), 4, 4))
     g_points = np.empty((0, 3), points.dtype) if g_points is None else g_points
     parallel(_pull, len(sums), rows, points, read_only(g), sums, g_points, work=5 * len(points))
@@ -76,7 +76,7 @@ def _pull(start, stop, m, points, g, sums, g_points):
     for chunk in range(start, stop):
         total = np.zeros((4, 4))
         for n in range(chunk * CHUNK, min(len(points), (chunk + 1) * CHUNK)):
-            if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:  # As in the interior of a silhouette.
+            if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:  # Common: the interior of a silhouette.
                 if len(g_points):
                     g_points[n, 0] = g_points[n, 1] = g_points[n, 2] = zero
                 continue

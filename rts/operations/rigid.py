@@ -25,6 +25,9 @@ def rigid(pose: Any, center: Any = ORIGIN) -> Array:
 
     Returns:
         (4, 4), usable as `Part.transform`.
+
+    Raises:
+        InputError: the pose has another shape.
     """
     if isinstance(pose, (list, tuple)) and is_constant(pose):
         pose = np.asarray(pose, np.float64)
@@ -41,7 +44,7 @@ def _specification(pose: Array, center: Array) -> Array:
     xp = namespace(pose, center)
     x, y, z = pose[0], pose[1], pose[2]
     square = x * x + y * y + z * z
-    # Below a tenth of a radian the series is exact to rounding; the square root is kept away from zero, where its
+    # Below a tenth of a radian the series are right to 3e-14; the square root is kept away from zero, where its
     # derivative is infinite.
     small = square < 1e-2
     angle = xp.sqrt(xp.where(small, xp.ones_like(square), square))

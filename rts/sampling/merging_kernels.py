@@ -12,8 +12,8 @@ def interleave(rows: tuple[np.ndarray, ...], depths: tuple[np.ndarray, ...], lay
     """The nearest layers of several parts: part and row within it, −1 where empty, and depth, (K, H, W) each.
 
     Args:
-        rows: of each part (L, H, W) int32, front to back.
-        depths: of each part (L, H, W).
+        rows: `row` of each part, (L, H, W) int32, front to back.
+        depths: depths of each part, (L, H, W).
         layers: K.
     """
     count, (_, height, width) = len(rows), rows[0].shape

@@ -38,8 +38,8 @@ class Kernel(Splatter):
     """What the splatters share: a Gaussian over 3 × 3 cells.
 
     Attributes:
-        sigma: standard deviation, pixels. Below 0.45 little of the kernel reaches the neighbouring cells, and most of
-            the derivative at edges is lost.
+        sigma: standard deviation, cells (pixels without supersampling). Below 0.45 little of the kernel reaches the
+            neighbouring cells, and most of the derivative at edges is lost.
         epsilon: excess of the weights' sum over one, so that the interior is always normalised.
         calibration: factor γ on a splat's offset from its cell's centre, P' = c + γ (P − c). It leaves the image of
             samples on pixel centres as it is, and multiplies its derivative. None for the γ of `exact_calibration`.

@@ -132,7 +132,7 @@ def _beyond(depth: list[Array], covered: Array) -> list[Array]:
 
 
 def all_of(conditions: list[Array]) -> Array:
-    """Where all conditions hold, at least one of them given."""
+    """Where all of the conditions hold, of which there is at least one."""
     return functools.reduce(operator.and_, conditions)
 
 

@@ -123,7 +123,7 @@ class SamplerConformance(Conformance):
         silhouettes.claim_few("with new arrays in θ, ")
 
     def test_it_follows_theta(self, sampler: Any, parts: list[Part]) -> None:
-        """It samples each of several θ on one surface, more than are kept: built, updated, or found again."""
+        """Each of several θ on one surface is sampled rightly: more than are kept, built, updated or found again."""
         silhouettes = Silhouettes()
         for i, part in enumerate(parts):
             for call, scale in enumerate(SCALES):
@@ -134,7 +134,7 @@ class SamplerConformance(Conformance):
         silhouettes.claim_few("with one θ after another, ")
 
     def test_it_sees_arrays_that_change_in_place(self, sampler: Any, parts: list[Part]) -> None:
-        """It keeps what it has built by the values of arrays, not by their identity."""
+        """A change of arrays in place is seen: what is built is kept by their values, not by their identity."""
         for i, part in enumerate(parts):
             values, join = split(part.theta)
             changing = [v.copy() for v in values]

@@ -111,7 +111,7 @@ class SurfaceConformance(Conformance):
                 claim_finite(value, f"{name!r} of {kind} samples")
 
     def test_triangles_have_their_corners_on_the_surface(self, part: Part) -> None:
-        """What `proxy` says of a corner evaluates to that corner, and normals face the triangles' outside."""
+        """The `proxy`'s ids and parameters of a corner evaluate to that corner; normals face the triangles' outside."""
         surface, proxy = scenes.checked(part).surface, _proxy(part, scenes.CAMERA)
         first = _at_corner(proxy, 0)
         widths = first.ids.shape[1], first.params.shape[1]

@@ -1,6 +1,6 @@
 """Embree's C interface through ctypes: the library that ships inside the embreex wheel, or the system's.
 
-Only what a scene of one triangle mesh needs. Buffers are shared: Embree reads our arrays where they lie.
+It covers only what a scene of one triangle mesh needs. Buffers are shared: Embree reads our arrays where they lie.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ class Scene:
         self._library, self.vertices, self.faces = library, vertices, faces
         self.handle = library.rtcNewScene(_device)
         library.rtcSetSceneFlags(self.handle, SCENE_ROBUST | SCENE_DYNAMIC)
-        # So the geometry gets a structure of its own, of its own quality; only such a one can be refitted (25 times
-        # faster than built), and rays find it no slower.
+        # With this the geometry gets a structure and a quality of its own. Only such a structure can be refitted (25
+        # times faster than built), and rays are no slower in it.
         library.rtcSetSceneBuildQuality(self.handle, QUALITY_LOW)
         self._geometry = library.rtcNewGeometry(_device, GEOMETRY_TRIANGLES)
         share = library.rtcSetSharedGeometryBuffer

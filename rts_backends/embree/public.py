@@ -62,9 +62,9 @@ class Scene:
             sphere: (4,) its centre and radius; the scene is the object moved and scaled to the unit sphere.
             planes: depths; nothing is seen before the first or beyond the second.
             camera: see `TriangleSampler.rasterize`.
-            size: likewise.
-            layers: likewise.
-            cull: likewise.
+            size: see `TriangleSampler.rasterize`.
+            layers: see `TriangleSampler.rasterize`.
+            cull: see `TriangleSampler.rasterize`.
         """
         rays = camera.rays(size)
         origins = (rays.origins.reshape(-1, 3) - sphere[:3]) / sphere[3]

@@ -34,7 +34,7 @@ class Structure:
     def _place(self) -> None:
         vertices = self.proxy.vertices
         self.sphere = bounding_sphere(vertices, self.proxy.faces)
-        with np.errstate(over="ignore"):  # Of vertices that no triangle refers to, however far away.
+        with np.errstate(over="ignore"):  # Vertices that no triangle refers to may lie however far away.
             np.divide(vertices - self.sphere[:3], self.sphere[3], out=self._unit[:-1], casting="same_kind")
 
     def move(self, proxy: Proxy) -> None:
@@ -53,7 +53,7 @@ class Embree(TriangleSampler):
         return Structure(proxy)
 
     def update(self, prepared: Structure, proxy: Proxy) -> Structure:
-        """Refit it to moved vertices."""
+        """Refit the structure to moved vertices."""
         prepared.move(proxy)
         return prepared
 

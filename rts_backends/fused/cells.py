@@ -46,12 +46,12 @@ class Choices(NamedTuple):
 
     Attributes:
         mixed: (H, W) uint8, 1 at such targets.
-        offsets: (H + 1,) int64, where each row's begin in the lists.
+        offsets: (H + 1,) int64, where the targets of each row begin in the lists below.
         columns: (M,) int32, their columns.
         ranges: (M, 9, 3, 2), first and last + 1 of the layers that each source gives to each buffer; source 3 (v + 1) +
             (u + 1) lies at −(u, v), and the buffers are in front, at the surface, behind.
         sums: (M, 3, 5), of each buffer the colours over the weight, taken as at least one, and the weight.
-        states: (H, W) uint8, of the other targets (`survey.py`); such are EMPTY in it.
+        states: (H, W) uint8, states of targets (`survey.py`); mixed ones are EMPTY here.
         repeated: whether a sample stands in several cells, which would add to its gradient at the same time.
     """
 
@@ -68,11 +68,11 @@ class Cells:
     """Samples in their cells, to be splatted, pulled back and pushed forward.
 
     Args:
-        settings: of the splatter.
+        settings: the splatter, as numbers.
         positions: (N, 3) float32 or float64, pixel position and linear depth.
         rgba: (N, 4), of the same dtype, premultiplied colours.
         row: (K, H, W) signed integers, the sample of each cell, negative where there is none.
-        choices: those of the same samples, where they are known.
+        choices: the choices for the same samples, if they are known.
 
     Raises:
         InputError: `row` refers to a sample that is not there.
@@ -98,7 +98,7 @@ class Cells:
 
     @property
     def plain_arguments(self) -> tuple:
-        """Arguments of the stencil's kernels; of `visible` no plain target takes a hidden layer."""
+        """Arguments of the stencil's kernels. In `visible` no plain target takes a hidden layer."""
         return self.positions, self.rgba, self.row[:1] if self.visible else self.row, *self._numbers
 
     @property
@@ -226,11 +226,11 @@ def _reach(settings: Settings) -> float:
     full = 1 + 2 * math.exp(-scale)
 
     def least(off: float) -> float:
-        off = settings.gamma * off  # All go the worst way.
+        off = settings.gamma * off  # The nine splats are off in the worst way.
         side = (math.exp(-(off**2) * scale) + 2 * math.exp(-((1 + off) ** 2) * scale)) / full
         return (1 + settings.epsilon) * side**2
 
     for _ in range(40):
         middle = (low + high) / 2
         low, high = (middle, high) if least(middle) >= 1 else (low, middle)
-    return 0.9 * low  # Weights are rounded.
+    return 0.9 * low  # Less than that, since weights are rounded.

@@ -43,7 +43,7 @@ def sums_of(total, positions, rgba, row, y, x, choice, scale, peak, gamma):
 
 @kernel
 def forward(start, stop, offsets, columns, sums, border, image):
-    """Mixed targets of rows [start, stop) of the image (H, W, 4), so much smaller than the cells at each side."""
+    """Fill mixed targets of rows [start, stop) of the image (H, W, 4), which is the cells without `border`."""
     one = image.dtype.type(1)
     for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
@@ -114,7 +114,7 @@ def pull(
 
 @kernel
 def push(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, sums, tangents, border, out):
-    """Mixed targets of rows [start, stop) of the tangents (T, H, W, 4); `tangents` are those of positions and rgba."""
+    """Fill mixed targets of rows [start, stop) of `out` (T, H, W, 4); `tangents` are those of positions and rgba."""
     one, changes = out.dtype.type(1), np.empty((len(out), 3, 5), out.dtype)
     for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):

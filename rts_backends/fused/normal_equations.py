@@ -47,8 +47,8 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
     """`normal_equations` of arrays of any engine on the host, traced or not; None for others.
 
     Args:
-        settings: of the splatter.
-        engine: of the arrays.
+        settings: the splatter, as numbers.
+        engine: the engine of the arrays.
         *given: positions, rgba, row and the arguments of `normal_equations` from `t_positions`, arrays or None.
     """
     positions, rgba, _, t_positions = given[:4]
@@ -62,7 +62,7 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
         it = iter(arrays)
         whole: list[Any] = [next(it) if there else None for there in present]
         positions, rgba, row, *rest = whole
-        used = int(row.max(initial=-1)) + 1  # Under `jit` there may be many more.
+        used = int(row.max(initial=-1)) + 1  # Under `jit` many more rows may be allotted.
         cells = Cells(settings, positions[:used], rgba[:used], row)
         return tuple(np.asarray(x, kind) for x in normal_equations(cells, *rest))
 

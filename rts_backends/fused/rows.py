@@ -66,7 +66,7 @@ def _exp(x):
     return single
 
 
-# Helpers are handed views: the compiler then knows that no index is negative, as which it would be from the end.
+# Helpers get views, so that the compiler knows that no index is negative: it would have to count from the end.
 
 
 @compiled
@@ -154,7 +154,7 @@ def normalised_sums(total, sources, layers, y, count):
 
 @compiled
 def composite(total, layers, count):
-    """The image, over the surface's colours."""
+    """Composite the surface over what is behind, in place of the surface's colours."""
     one = total.dtype.type(1)
     if layers > 1:
         for j in range(count):
@@ -165,7 +165,7 @@ def composite(total, layers, count):
 
 @compiled
 def fill(s, rgba, cells, states, left, count):
-    """The image where all around is of one colour, or nothing."""
+    """Fill planes without busy targets: the colour of targets that are FLAT, and zeros."""
     for j in range(count):
         for c in range(4):
             s[c * PITCH + j] = rgba[cells[left + j], c] if states[left + j] == FLAT else s.dtype.type(0)

@@ -19,7 +19,7 @@ from rts_backends.fused.cells import Cells, Choices, Settings
 
 
 class _Fused(splatting.Kernel):
-    """`image` by compiled kernels, before a class of `rts.splatting` in the order of bases."""
+    """Base that makes `image` by compiled kernels; it stands before a class of `rts.splatting`, which it extends."""
 
     kind: ClassVar[str]
 
@@ -31,7 +31,7 @@ class _Fused(splatting.Kernel):
 
     def cropped(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
-        if type(self).image is not _Fused.image:  # A subclass has one of its own.
+        if type(self).image is not _Fused.image:  # A subclass has an `image` of its own.
             return super().cropped(splats)
         if splats.rgba.shape[0] == 0:
             return without_border(super().image(splats), splats.border)
@@ -67,19 +67,19 @@ class _Fused(splatting.Kernel):
 
 
 class Single(_Fused, splatting.Single):
-    """`rts.splatting.Single`."""
+    """`rts.splatting.Single`, compiled."""
 
     kind = "single"
 
 
 class Multi(_Fused, splatting.Multi):
-    """`rts.splatting.Multi`."""
+    """`rts.splatting.Multi`, compiled."""
 
     kind = "multi"
 
 
 class Visible(_Fused, splatting.Visible):
-    """`rts.splatting.Visible`."""
+    """`rts.splatting.Visible`, compiled."""
 
     kind = "visible"
 

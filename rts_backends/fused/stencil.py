@@ -48,7 +48,7 @@ def load_around(sources, loaded, positions, rgba, row, y, first, count, scale, p
 
 @kernel
 def forward(start, stop, positions, rgba, row, scale, peak, gamma, states, border, image):
-    """Rows [start, stop) of the image (H, W, 4), which is so much smaller than the cells at each side."""
+    """Fill rows [start, stop) of the image (H, W, 4), which is the cells without `border`."""
     layers, (_, width, _) = len(row), image.shape
     sources, total = np.empty(3 * layers * SOURCE, image.dtype), np.empty(SUMS, image.dtype)
     loaded = np.empty(3, np.int64)
@@ -70,7 +70,7 @@ def forward(start, stop, positions, rgba, row, scale, peak, gamma, states, borde
 
 @compiled
 def _copy(image, rgba, cells, states):
-    """Where all around is of one colour, or nothing."""
+    """Fill a row without busy targets: the colour of targets that are FLAT, and zeros."""
     for x in range(len(image)):
         if states[x] == FLAT:
             i = cells[x]
@@ -111,7 +111,7 @@ def adjoint_row(to, total, g, layers, count):
 
 @compiled
 def load_image(s, image, states, least, border, y, first, count):
-    """Cells of an image as planes, zero beyond it and where targets are of less than a state."""
+    """Cells of an image as planes, zero beyond it and at targets whose state is below `least`."""
     height, width, _ = image.shape
     within = 0 <= y - border < height
     for j in range(count):
@@ -253,7 +253,7 @@ def tangent_row(to, total, layers, count, planes=COLORS):
 
 @kernel
 def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_rgba, states, border, out):
-    """Rows [start, stop) of the tangents (T, H, W, 4); of absent tangents there are T of no rows."""
+    """Fill rows [start, stop) of the tangents (T, H, W, 4). Tangents that are zeros may be absent: (T, 0, ·)."""
     layers, (many, _, width, _) = len(row), out.shape
     sources, total, change = (
         np.empty(3 * layers * SOURCE, out.dtype),

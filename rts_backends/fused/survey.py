@@ -17,7 +17,7 @@ kernel = numba.njit(nogil=True, cache=True)
 
 @kernel
 def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, depths, seen, counts):
-    """States of the targets of rows [start, stop), and what else is to be known of all cells.
+    """Find the states of the targets of rows [start, stop), and fill the other arrays that describe the cells.
 
     Args:
         start: first row.
@@ -34,7 +34,7 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, dep
         counts: (H,) zeros, for the number of such cells.
     """
     _, height, width = row.shape
-    # Of three rows of cells: covered, three alike in a row, alike with the cell above.
+    # For three rows of cells: which are covered, which amid three alike, and which alike with the cell above.
     cells = np.zeros((3, 3, width + 2), np.uint8)
     covered, calm, joins = cells[0], cells[1], cells[2]
     for y in range(start - 1, stop + 1):

@@ -94,7 +94,7 @@ class JaxEngine(Engine):
         return x
 
     def _used_of(self, packed: Sequence[jax.Array]) -> jax.Array | np.int32:
-        """How many rows of arrays (N, ·), which belong together, are used, as far as is known of any."""
+        """How many rows are used of arrays (N, ·) that belong together, as far as that is known of any of them."""
         for x in packed:
             known = self._used.get(id(x))
             if known is not None and known[0]() is x:
@@ -110,7 +110,7 @@ class JaxEngine(Engine):
         return all(isinstance(x, Tracer) or all(d.platform == "cpu" for d in x.devices()) for x in arrays)
 
     def by_host(self, f: Callable, otherwise: Callable, *arrays: jax.Array) -> tuple[jax.Array, ...]:
-        """In a traced program, as its device turns out to be."""
+        """See `Engine.by_host`. A traced program decides when its device is known."""
         if any(isinstance(x, Tracer) for x in arrays):
             return jax.lax.platform_dependent(*arrays, cpu=f, default=otherwise)
         return super().by_host(f, otherwise, *arrays)
@@ -125,7 +125,7 @@ class JaxEngine(Engine):
         return jax.lax.stop_gradient(x)
 
     def apply(self, operation: Operation, operands: Sequence[jax.Array], params: Mapping[str, Any]) -> jax.Array:
-        """By compiled code, on CPUs, of floats of one dtype, float32 or float64."""
+        """The result by compiled code on CPUs, if all floats are float32 or all float64; else by specification."""
         if not operations.fits(operation, operands):
             return operation.specification(*operands, **params)
         used = self._used_of([operands[i] for i in operation.packed])
@@ -133,11 +133,11 @@ class JaxEngine(Engine):
         return self._note(result, used) if operation.packed_result else result
 
     def padded(self, x: jax.Array) -> bool:
-        """Always, perhaps: to a bucket, or to the capacity."""
+        """True: packed arrays may be padded to a bucket, or to the capacity."""
         return True
 
     def fill_unused(self, x: jax.Array, row: jax.Array) -> jax.Array:
-        """As part of what reads it; ones where no cell refers to any row."""
+        """By selection, which XLA can fuse with what reads it; ones where no cell refers to any row."""
         used = jnp.max(row) + 1
         index = jnp.arange(x.shape[0]).reshape(-1, *[1] * (x.ndim - 1))
         return jnp.where(index < used, x, jnp.where(used > 0, x[:1], 1))
@@ -172,7 +172,7 @@ class JaxEngine(Engine):
             count, state = counted
             return (count < most) & going(state)
 
-        # Of one dtype throughout, as a loop asks: numbers among them may be weakly typed.
+        # A loop wants dtypes that stay; numbers in the state may be weakly typed.
         state = jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
         return jax.lax.while_loop(on, step, (jnp.int32(0), state))[1]
 
@@ -185,7 +185,7 @@ class JaxEngine(Engine):
         return jax.value_and_grad(f)
 
     def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], jax.Array]) -> jax.Array:
-        """By `jax.checkpoint`; what was made is kept, since to trace it would fix its shapes."""
+        """By `jax.checkpoint` of `f`. What `make` gave is kept: to trace `make` would fix the shapes of its arrays."""
         made = make()
         return jax.checkpoint(lambda: f(made))()
 

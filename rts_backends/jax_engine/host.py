@@ -50,7 +50,7 @@ def call_named(name: str, function: Filler, shapes: Shapes, *operands: jax.Array
         name: stands for the function in the program, and in programs that jax keeps on disk: says all that the function
             depends on but its operands.
         function: kept as long as the process lives.
-        shapes: of the results.
+        shapes: shapes and dtypes of the results.
         operands: of the function.
     """
     if not _available():
@@ -147,7 +147,7 @@ mlir.register_lowering(_call, _in_place, platform="cpu")
 
 
 def fill(out: np.ndarray, value: np.ndarray | np.generic) -> None:
-    """Copy, and zeros to where the value is short."""
+    """Copy a value, and write zeros where it is shorter than `out`."""
     value = np.asarray(value)
     if value.shape != out.shape:
         if value.ndim != out.ndim or any(n > size for n, size in zip(value.shape, out.shape, strict=True)):
@@ -158,14 +158,14 @@ def fill(out: np.ndarray, value: np.ndarray | np.generic) -> None:
 
 
 def clear(out: np.ndarray) -> None:
-    """Zeros. Of a large array pages of memory are handed back: the system gives empty ones when they are touched."""
+    """Fill with zeros. A large array's pages are handed back: the system gives empty ones when they are touched."""
     if out.nbytes < _LEAST or not out.flags.c_contiguous or _give_back is None:
         out[...] = 0
         return
     data = out.reshape(-1).view(np.uint8)
     start = -data.ctypes.data % mmap.PAGESIZE
     stop = start + (len(data) - start) // mmap.PAGESIZE * mmap.PAGESIZE
-    # Memory that is shared would come back as it was: the mark tells.
+    # Shared memory would come back as it was; the mark at `start` tells.
     data[:start], data[stop:], data[start] = 0, 0, 1
     if _give_back(data[start:].ctypes.data, stop - start, mmap.MADV_DONTNEED) or data[start]:
         out[...] = 0
@@ -184,7 +184,7 @@ if sys.platform == "linux":  # Elsewhere the advice promises no zeros.
 def _available() -> bool:
     """Whether the handler is registered; XLA asks it for its version on the way."""
     try:
-        jax.local_devices(backend="cpu")  # Registers late what is given before there are any.
+        jax.local_devices(backend="cpu")  # jax registers late what it is given before there are devices.
         handler = jax.ffi.pycapsule(ctypes.cast(_HANDLER, ctypes.c_void_p).value)
         jax.ffi.register_ffi_target(TARGET, handler, platform="cpu", api_version=1)
     except Exception as error:

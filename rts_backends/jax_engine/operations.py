@@ -36,11 +36,11 @@ from rts_backends.jax_engine.host import clear
 Wanted = tuple[bool, ...]
 """Which of the differentiable operands have a tangent or want a gradient."""
 
-# Rules whose results are kept for the next equation alike do not see what operands come from.
+# jax reuses what a cacheable rule gave for an equation alike; such a rule does not see where operands come from.
 _SEEING_OPERANDS = {"cacheable": False} if "cacheable" in inspect.signature(mlir.register_lowering).parameters else {}
 
 MOST_KEPT = 1 << 24
-"""Bytes of what values leave to derivatives that are kept."""
+"""The most bytes that are kept of what values leave to derivatives."""
 
 
 def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[str, Any], used: Any) -> jax.Array:
@@ -64,15 +64,15 @@ def fits(operation: Operation, operands: Sequence[jax.Array]) -> bool:
 
 
 class _Kept:
-    """The latest of what values have left to derivatives, by a number for each."""
+    """The latest objects that values have left to derivatives, each under a number."""
 
     def __init__(self):
-        # Not from 0: a number that some other process has given is to name nothing here.
+        # Does not count from 0, so that a number from another process names nothing here.
         self._numbers, self._found = itertools.count(secrets.randbits(30)), collections.OrderedDict()
         self._lock, self._bytes = threading.Lock(), 0
 
     def add(self, kept: Any) -> int:
-        """The number of an object."""
+        """Keep an object, and give its number."""
         with self._lock:
             number = next(self._numbers) % 2**31
             self._found[number] = kept
@@ -100,7 +100,7 @@ class _Differentiable:
 
     Args:
         operation: the operation.
-        name: of its primitives.
+        name: the name of its primitives.
         params: some parameters; the number of axes of its result does not depend on them.
     """
 
@@ -156,7 +156,7 @@ class _Differentiable:
             used = int(given[self._inputs]) if operation.used is None else operation.used(operands)
             for i in operation.packed:
                 x = operands[i]
-                # Of even operands there may be but one row.
+                # Even operands may have a single row, which stands for all.
                 one = i in operation.even and len(x) == 1
                 operands[i] = np.broadcast_to(x, (used, *x.shape[1:])) if one else x[:used]
         kept = _kept.get(int(given[self.count - 1])) if operation.keeps and len(given) >= self.count else None
@@ -233,7 +233,7 @@ class _Differentiable:
         if not given:
             return found, _zeros(found)
         at = 1 if found[0].ndim > self.rank else 0
-        # Of operands by item, tangents have B before T; of the others T alone.
+        # Tangents of operands by item have the axes B and T, in this order; tangents of others T alone.
         ranks = (r for r, wish in zip(self._value.ranks, wanted, strict=False) if wish)
         swept = [jnp.expand_dims(t, t.ndim - rank) for t, rank in zip(given, ranks, strict=True)]
         (pushed,) = self._push(*primals, *found[1:], *swept, wanted=wanted, **params)
@@ -292,15 +292,15 @@ class _Differentiable:
 
 
 class _Operation:
-    """One of the three as a primitive: what it is to eager arrays, to the compiler and to `vmap`.
+    """One of the three functions of an operation as a primitive: for eager arrays, the compiler and `vmap`.
 
     Args:
-        name: of the primitive.
-        ranks: of its operands without the axis B.
+        name: the name of the primitive.
+        ranks: the number of axes of its operands, without the axis B.
         samples: number of operands before tangents or gradients.
-        shapes: of the results without it, from the shapes of the operands without it and the parameters.
+        shapes: gives the shapes of the results, from those of the operands, both without B, and the parameters.
         host: fills the results for one item.
-        specified: the same by specification.
+        specified: computes the results by specification.
         even: see `Operation`.
         noted: whether the last result is a note.
         some: whether of the operands after the samples there are only those that a parameter `wanted` says.
@@ -372,7 +372,7 @@ class _Operation:
             self._host(item, [x[b, ...] for x in results], **params)
 
     def _lowered(self, ctx: Any, *operands: Any, **params: Any) -> Any:
-        """In a program for the CPU."""
+        """The call in a program for the CPU."""
         shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in ctx.avals_out)
         values, avals = list(operands), list(ctx.avals_in)
         for i in self._even:
@@ -420,7 +420,7 @@ class _Operation:
     def _over_samples(
         self, operands: list, mapped: list[bool], size: int, ranks: Sequence[int], params: dict
     ) -> tuple[list, list[int]]:
-        """Each item with samples of its own."""
+        """Compute a batch whose items have samples of their own, item by item."""
         inner = [x.shape[m] for x, m, r in zip(operands, mapped, ranks, strict=True) if x.ndim - m > r]
         if not inner:
             found = self(*operands, **params)
@@ -438,7 +438,7 @@ class _Operation:
 def _only_row(value: Any) -> Any:
     """The first row of an array in a program that is about to be compiled, if it plainly equals all others, or None."""
     ir, operation = mlir.ir, value.owner
-    name = getattr(operation, "name", "")  # Of the owner of an argument there is none.
+    name = getattr(operation, "name", "")  # An argument's owner has no name.
     kind = ir.RankedTensorType(value.type)
     shape = ir.RankedTensorType.get([1, *kind.shape[1:]], kind.element_type)
     if name == "stablehlo.broadcast_in_dim":
@@ -471,7 +471,7 @@ def _whole(operation: _Operation, params: tuple) -> Callable:
 
 
 def _spread(given: Sequence, wanted: Wanted) -> list:
-    """Those given, in the places that are wanted, and None in the others."""
+    """The given things in the places that are wanted, and None in the others."""
     it = iter(given)
     return [next(it) if wish else None for wish in wanted]
 
@@ -485,7 +485,7 @@ def _zeros(like: Sequence[jax.Array]) -> list:
 
 
 def _present(tangents: Sequence, wanted: Wanted | None = None) -> tuple[list, Wanted]:
-    """Tangents that are not zeros, and of what they are."""
+    """Tangents that are not zeros, and which operands they belong to."""
     places = tangents if wanted is None else _spread(tangents, wanted)
     given = tuple(t is not None and not _is_zero(t) for t in places)
     return [t for t, g in zip(places, given, strict=True) if g], given

@@ -63,7 +63,7 @@ void main() { found = ivec2(-1, 0); }
 
 
 class Device:
-    """Objects of one context: of another one, after it was lost, they must not be touched."""
+    """A proxy's objects in one context; once that is lost they must not be touched in another."""
 
     context: moderngl.Context | None = None
     objects: tuple[Any, ...] = ()

@@ -98,7 +98,7 @@ class Worker:
                 future.set_exception(error)
                 if self.context is not None:
                     with contextlib.suppress(Exception):
-                        _errors(self.context)  # Not left for the next task to find.
+                        _errors(self.context)  # Errors are cleared here, so that the next task does not find them.
             del task, function, args, future
         if self.context is not None:
             self.context.release()

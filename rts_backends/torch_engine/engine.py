@@ -116,7 +116,7 @@ class TorchEngine(Engine):
         return x.detach()
 
     def apply(self, operation: Operation, operands: Sequence[torch.Tensor], params: Mapping[str, Any]) -> torch.Tensor:
-        """By compiled code, of tensors in the memory of the host whose floats are of one dtype, single or double."""
+        """The result by compiled code on the host, if all floats are float32 or all float64; else by specification."""
         return operations.apply(operation, operands, params)
 
     def on_host(self, *arrays: torch.Tensor) -> bool:
@@ -124,12 +124,12 @@ class TorchEngine(Engine):
         return all(x.device.type == "cpu" for x in arrays)
 
     def exact_products(self, *arrays: torch.Tensor) -> bool:
-        """On the CPU, but for `torch.autocast`, and of one dtype."""
+        """True for two arrays of one dtype on the CPU, outside of `torch.autocast`."""
         a, b = arrays
         return a.device.type == b.device.type == "cpu" and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
 
     def padded(self, x: torch.Tensor) -> bool:
-        """Under `torch.vmap`, whose items have as many rows as the largest."""
+        """True under `torch.func` transforms: under `torch.vmap` each item has as many rows as the largest."""
         return maybe_current_level() is not None
 
     def fill_unused(self, x: torch.Tensor, row: torch.Tensor) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""What the compiled torch functions share."""
+"""Functions that the torch binders of operations share."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from torch.utils import _pytree
 
 
 def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
-    """`function.apply(*args)`, of all arguments.
+    """Call `function.apply(*args)`, with all arguments given.
 
-    Outside of transforms without torch's look for those that have defaults, which takes longer than a small kernel.
+    Outside of transforms it spares torch's search for defaults, which takes longer than a small kernel.
     """
     if torch._C._are_functorch_transforms_active():
         return function.apply(*args)

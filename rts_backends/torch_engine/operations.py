@@ -43,7 +43,7 @@ _specifying = _Specifying()
 
 
 def _fits(operands: Sequence[Tensor]) -> bool:
-    """Whether compiled code knows them: on the host, the floats all of one dtype, single or double."""
+    """Whether compiled code takes these operands: on the host, all floats float32 or all float64."""
     real = operands[0].dtype
     if real not in _DTYPES:
         return False
@@ -75,7 +75,7 @@ class _Call:
         return given[: self.count], given[self.count :]
 
     def specification(self, *fixed: Tensor) -> Callable[..., Tensor]:
-        """As a function of the differentiable operands."""
+        """The specification as a function of the differentiable operands."""
 
         def specified(*varied: Tensor) -> Tensor:
             before, _specifying.on = _specifying.on, True
@@ -113,7 +113,7 @@ class _Call:
 
 
 def _spread(given: Sequence[_T], present: Sequence[bool]) -> list[_T | None]:
-    """Those given in the places where they are present, None in the others."""
+    """The given things in the places that are present, and None in the others."""
     it = iter(given)
     return [next(it) if there else None for there in present]
 
@@ -195,7 +195,7 @@ class _Pull(torch.autograd.Function):
 
     @staticmethod
     def _differentiable(ctx):
-        """The specification's pullback of what has a derivative, and that; and the number of other operands."""
+        """The specification's pullback, its arguments that have derivatives, and the number of other operands."""
         *operands, g = ctx.saved_tensors
         varied, fixed = ctx.call.split(operands)
         return ctx.call.pulled(ctx.wanted, fixed), (*varied, g), len(fixed)
@@ -241,7 +241,7 @@ class _Push(torch.autograd.Function):
 
     @staticmethod
     def _differentiable(ctx):
-        """The specification's pushforward of what has a derivative, and that; and the number of other operands."""
+        """The specification's pushforward, its arguments that have derivatives, and the number of other operands."""
         given, count = ctx.saved_tensors, sum(ctx.present)
         varied, fixed = ctx.call.split(given[:-count])
         return ctx.call.pushed(ctx.present, fixed), (*varied, *given[-count:]), len(fixed)
