@@ -178,6 +178,26 @@ def test_a_view_is_rigid_and_looks_from_the_eye_to_the_target_with_up_upward(vie
 
 
 @PROPERTIES
+@given(views(), sizes(), reals(5, 130), reals(0.3, 3), vectors(-0.8, 0.8, 2), st.booleans())
+def test_the_target_is_at_the_principal_point_and_half_a_field_of_view_is_half_an_image(
+    view, size, fov, aspect, point, perspective
+):
+    eye, target, up = view
+    distance = np.linalg.norm(target - eye)
+    half = np.tan(np.radians(fov) / 2) * distance
+    options = {"aspect": aspect, "principal_point": point}
+    if perspective:
+        camera = Camera.look_at(eye, target, up, fov_y=fov, **options)
+    else:
+        camera = Camera.orthographic(eye, target, up, height=2 * half, **options)
+    right, upward, _ = camera.view[:3, :3]
+    points = target + np.array([np.zeros(3), half * upward, half * aspect * right])
+    middle, (height, width) = np.array([1 + point[0], 1 - point[1]]) * size[::-1] / 2, size
+    expected = middle + np.array([(0, 0), (0, -height / 2), (width / 2, 0)])
+    close(camera.project(points, size), np.column_stack([expected, [distance] * 3]))
+
+
+@PROPERTIES
 @given(views(), rotations(), vectors(-5, 5))
 def test_a_world_that_moves_with_the_camera_looks_the_same(view, linear, shift):
     motion = rigid(translation=shift)

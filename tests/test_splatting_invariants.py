@@ -151,6 +151,24 @@ def test_a_scene_that_moves_by_whole_cells_moves_its_image(splatter, scene, down
 
 
 @EXAMPLES
+@given(splatters(), samples(), st.integers(1, 40))
+def test_how_far_away_a_scene_is_does_not_matter(splatter, scene, quarters):
+    positions, rgba, row = scene
+    farther = positions + np.array([0, 0, quarters / 4], positions.dtype)
+    close(splatter.splat(farther, rgba, row), splatter.splat(*scene), tolerance(scene))
+
+
+@pytest.mark.xfail(
+    strict=True, reason="the depth of empty layers, twice the largest, is not beyond all that is negative"
+)
+@pytest.mark.parametrize("kind", [splatting.Visible, fused.Visible])
+def test_how_far_away_a_scene_is_does_not_matter_where_the_camera_is_amid_it(kind):
+    positions, row = np.array([(0.5, 0.5, 1.5), (1.5, 0.5, 1.0)]), np.array([[[0, 1]], [[-1, -1]]], np.int32)
+    away = kind().splat(positions, np.ones((2, 4)), row)
+    close(kind().splat(positions - [0, 0, 1.25], np.ones((2, 4)), row), away, 1e-12)
+
+
+@EXAMPLES
 @given(splatters(), samples(), st.sampled_from(["left to right", "top to bottom", "rows for columns"]))
 def test_a_mirrored_scene_has_the_mirrored_image(splatter, scene, mirror):
     positions, rgba, row = scene
