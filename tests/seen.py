@@ -15,6 +15,10 @@ VIEWS = {
 }
 
 
+def rays_spread(camera, size=SIZE):
+    return np.asarray(camera.rays(size).spread, np.float64)
+
+
 def stages(part, camera, layers, size=SIZE):
     """Samples on the triangles, refined, and settled."""
     sampler, inputs = rts.plugin("samplers", "raster")(), part.theta["points"]

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from helpers import ALL, DIFFERENTIABLE, FRONT, arrays, gradient, to_numpy
-from seen import CAMERA, SIZE, VIEWS, WEIGHTS, close, loss_of, stages
-from test_settling import rays_spread
+from seen import CAMERA, SIZE, VIEWS, WEIGHTS, close, loss_of, rays_spread, stages
 from throwaway import Bezier, Crowded
 
 import rts

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from helpers import ALL, FRONT, arrays, rigid, to_numpy
-from seen import CAMERA, SIZE, VIEWS
+from seen import CAMERA, SIZE, VIEWS, rays_spread
 from throwaway import Crowded, Sheets
 
 import rts
@@ -16,10 +16,6 @@ pytestmark = pytest.mark.sampling
 
 
 PLANES = rts.Camera.look_at((0, 0, 4), (0, 0, 0), near=1, far=9)
-
-
-def rays_spread(camera, size=SIZE):
-    return np.asarray(camera.rays(size).spread, np.float64)
 
 
 def made(row, depth, **options):

@@ -48,7 +48,9 @@ def load(path: Any, *, merge: bool = False, weld: bool = True) -> list[Part]:
     """
     path = as_path(path)
     pieces = [_linear(piece) for piece in read_pieces(path)]
-    return [_part(piece, weld) for piece in ([_merged(path, pieces)] if merge and len(pieces) > 1 else pieces)]
+    if merge and (len(pieces) > 1 or pieces[0].transform is not None):
+        pieces = [_merged(path, pieces)]
+    return [_part(piece, weld) for piece in pieces]
 
 
 def _linear(piece: Piece) -> Piece:

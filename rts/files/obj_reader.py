@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,9 +46,8 @@ class _Lines:
 
     def read(self) -> _Lines:
         """Sort the lines of the file."""
-        text = _text(self.path).replace("\\\r\n", " ").replace("\\\n", " ")
         material = self.materials.setdefault(None, 0)
-        for number, line in enumerate(text.splitlines(), start=1):
+        for number, line in _statements(_text(self.path)):
             key, _, rest = line.partition("#")[0].replace("\t", " ").strip().partition(" ")
             if key in self.rows:
                 self.rows[key].append(rest)
@@ -228,6 +228,20 @@ def _numbers(library: Path, number: int, text: str) -> list[float]:
     if not np.isfinite(values).all():
         raise InputError(f"{library}, line {number}: {text!r} is not finite; expected numbers from 0 to 1")
     return values
+
+
+def _statements(text: str) -> Iterator[tuple[int, str]]:
+    """The lines of a text with their numbers, those that end in a backslash joined with the next."""
+    start, joined = 0, ""
+    for number, line in enumerate(text.splitlines(), start=1):
+        start = start or number
+        if line.endswith("\\"):
+            joined += line[:-1] + " "
+            continue
+        yield start, joined + line
+        start, joined = 0, ""
+    if joined:
+        yield start, joined
 
 
 def _text(path: Path) -> str:

@@ -35,7 +35,7 @@ def _interleaved(layers: int, *given: Array) -> tuple[Array, ...]:
     xp, rows = namespace(given[0]), given[: len(given) // 2]
     row, depth = xp.concat(rows), xp.concat(given[len(rows) :])
     part = xp.concat([xp.where(r >= 0, i, r) for i, r in enumerate(rows)])
-    order = xp.argsort(xp.where(row >= 0, depth, xp.max(depth) + 1), axis=0, stable=True)[:layers]
+    order = xp.argsort(xp.where(row >= 0, depth, xp.inf), axis=0, stable=True)[:layers]
     part, row, depth = (xp.take_along_axis(x, order, axis=0) for x in (part, row, depth))
     return part, row, depth
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import collections
 import functools
-import inspect
 import itertools
 import secrets
 import threading
@@ -24,20 +23,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
-from jax.interpreters import ad, batching, mlir
-from jaxlib.mlir.dialects import stablehlo as hlo
+from jax.interpreters import ad
 
 from rts.operations.operation import Arrays, Operation
 from rts.threads import read_only
-from rts_backends.jax_engine import host
 from rts_backends.jax_engine.host import clear
+from rts_backends.jax_engine.primitives import HostPrimitive
 
 Wanted = tuple[bool, ...]
 """Which of the differentiable operands have a tangent or want a gradient."""
-
-# jax reuses what a cacheable rule gave for an equation alike; such a rule does not see where operands come from.
-_SEEING_OPERANDS = {"cacheable": False} if "cacheable" in inspect.signature(mlir.register_lowering).parameters else {}
 
 MOST_KEPT = 1 << 24
 """The most bytes that are kept of what values leave to derivatives."""
@@ -124,13 +118,13 @@ class _Differentiable:
 
         even, noted = operation.even, operation.keeps
         ranks = *operation.ranks, *[0] * self._told
-        self._value = _Operation(name, ranks, given, valued, self._host_value, self._plain, even, noted)
+        self._value = HostPrimitive(name, ranks, given, valued, self._host_value, self._plain, even, noted)
         ranks = *ranks, *[0] * noted
         swept, backward = (*ranks, *(r + 1 for r in ranks[:varied])), (*ranks, self.rank + 1)
-        self._push = _Operation(
+        self._push = HostPrimitive(
             f"{name}_push", swept, count, pushed, self._host_push, self._specified_push, even, some=True
         )
-        self._pull = _Operation(f"{name}_pull", backward, count, pulled, self._host_pull, self._specified_pull, even)
+        self._pull = HostPrimitive(f"{name}_pull", backward, count, pulled, self._host_pull, self._specified_pull, even)
         ad.primitive_jvps[self._value.primitive] = self._value_jvp
         ad.primitive_jvps[self._push.primitive] = self._push_jvp
         ad.primitive_jvps[self._pull.primitive] = self._pull_jvp
@@ -257,7 +251,7 @@ class _Differentiable:
         return found, _zeros(found) if along is None else along
 
     def _along_operands(
-        self, operation: _Operation, primals: Sequence, tangents: Sequence, params: dict
+        self, operation: HostPrimitive, primals: Sequence, tangents: Sequence, params: dict
     ) -> list | None:
         """Derivatives of an operation's results along tangents of the varied operands, by specification; or None."""
         n = self.varied
@@ -291,181 +285,8 @@ class _Differentiable:
         return [None] * self.count + [_summed(found, g.aval.ndim)]
 
 
-class _Operation:
-    """One of the three functions of an operation as a primitive: for eager arrays, the compiler and `vmap`.
-
-    Args:
-        name: the name of the primitive.
-        ranks: the number of axes of its operands, without the axis B.
-        samples: number of operands before tangents or gradients.
-        shapes: gives the shapes of the results, from those of the operands, both without B, and the parameters.
-        host: fills the results for one item.
-        specified: computes the results by specification.
-        even: see `Operation`.
-        noted: whether the last result is a note.
-        some: whether of the operands after the samples there are only those that a parameter `wanted` says.
-    """
-
-    def __init__(
-        self,
-        name: str,
-        ranks: tuple[int, ...],
-        samples: int,
-        shapes: Callable,
-        host: Callable,
-        specified: Callable,
-        even: tuple[int, ...],
-        noted: bool = False,
-        some: bool = False,
-    ):
-        self.name, self.ranks, self.samples, self._even, self._noted = name, ranks, samples, even, noted
-        self._shapes, self._host, self._specified = shapes, host, specified
-        self._some = some
-        self.primitive = primitive = Primitive(f"rts_{name}")
-        primitive.multiple_results = True
-        primitive.def_impl(self._eager)
-        primitive.def_abstract_eval(
-            lambda *avals, **params: [ShapedArray(r.shape, r.dtype) for r in self._results(avals, params)]
-        )
-        mlir.register_lowering(primitive, mlir.lower_fun(self.specification, multiple_results=True))
-        mlir.register_lowering(primitive, self._lowered, platform="cpu", **_SEEING_OPERANDS)
-        batching.primitive_batchers[primitive] = self._batched
-
-    def __call__(self, *operands: jax.Array, **params: Any) -> list[jax.Array]:
-        """The results."""
-        return self.primitive.bind(*operands, **params)
-
-    def specification(self, *operands: jax.Array, **params: Any) -> list[jax.Array]:
-        """The results by specification, which is differentiable."""
-        axes = tuple(0 if b else None for b in self._by_item(operands, params))
-        function = functools.partial(self._specified, **params)
-        return (function if not any(a == 0 for a in axes) else jax.vmap(function, axes))(*operands)
-
-    def _own_ranks(self, params: dict) -> list[int]:
-        """Ranks of those operands that there are: tangents may be of one alone."""
-        samples, rest = self.ranks[: self.samples], self.ranks[self.samples :]
-        if self._some:
-            rest = (r for r, wish in zip(rest, params["wanted"], strict=True) if wish)
-        return [*samples, *rest]
-
-    def _by_item(self, operands: Sequence[Any], params: dict) -> list[bool]:
-        """Which operands have the axis B."""
-        return [x.ndim > rank for x, rank in zip(operands, self._own_ranks(params), strict=True)]
-
-    def _results(self, operands: Sequence[Any], params: dict) -> list[jax.ShapeDtypeStruct]:
-        """Shapes and dtypes of the results."""
-        by_item = self._by_item(operands, params)
-        lead = next(((x.shape[0],) for x, b in zip(operands, by_item, strict=True) if b), ())
-        shapes = (x.shape[1:] if b else x.shape for x, b in zip(operands, by_item, strict=True))
-        shapes = [(*lead, *shape) for shape in self._shapes(*shapes, **params)]
-        dtypes = [operands[0].dtype] * (len(shapes) - self._noted) + [np.int32] * self._noted
-        return list(map(jax.ShapeDtypeStruct, shapes, dtypes))
-
-    def _on_host(self, operands: Arrays, results: Arrays, params: dict) -> None:
-        """Fill the results."""
-        by_item = self._by_item(operands, params)
-        if not any(by_item):
-            self._host(operands, results, **params)
-            return
-        for b in range(len(results[0])):
-            item = [x[b] if by else x for x, by in zip(operands, by_item, strict=True)]
-            self._host(item, [x[b, ...] for x in results], **params)
-
-    def _lowered(self, ctx: Any, *operands: Any, **params: Any) -> Any:
-        """The call in a program for the CPU."""
-        shapes = tuple(jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in ctx.avals_out)
-        values, avals = list(operands), list(ctx.avals_in)
-        for i in self._even:
-            row = _only_row(values[i]) if avals[i].ndim == self.ranks[i] and avals[i].shape[0] else None
-            if row is not None:
-                values[i], avals[i] = row, avals[i].update(shape=(1, *avals[i].shape[1:]))
-
-        def call(*given: jax.Array) -> list[jax.Array]:
-            name = f"{self.name} {sorted(params.items())}"
-            return host.call_named(name, lambda i, o: self._on_host(i, o, params), shapes, *given)
-
-        return mlir.lower_fun(call, multiple_results=True)(ctx.replace(avals_in=avals), *values)
-
-    def _eager(self, *operands: Any, **params: Any) -> list[jax.Array]:
-        device = _cpu_of(operands)
-        if device is None:
-            return _compiled(self.primitive, tuple(params.items()))(*operands)
-        found = [np.empty(result.shape, result.dtype) for result in self._results(operands, params)]
-        self._on_host([np.asarray(x) for x in operands], found, params)
-        if any(x.committed for x in operands if isinstance(x, jax.Array)):
-            return jax.device_put(found, device)
-        with jax.default_device(device):
-            return jax.device_put(found)
-
-    def _batched(self, operands: Sequence[Any], dims: Sequence, **params: Any) -> tuple[list[jax.Array], list[int]]:
-        mapped = [d is not None for d in dims]
-        operands = [jnp.moveaxis(x, d, 0) if m else x for x, d, m in zip(operands, dims, mapped, strict=True)]
-        size = next(x.shape[0] for x, m in zip(operands, mapped, strict=True) if m)
-        ranks = self._own_ranks(params)
-        if any(mapped[: self.samples]):
-            return self._over_samples(operands, mapped, size, ranks, params)
-        # The batch is more tangents or gradients of the same samples: one sweep for all.
-        folded, by_item = [], False
-        for x, m, rank in zip(operands, mapped, ranks, strict=True):
-            by_item |= x.ndim - m > rank
-            if len(folded) >= self.samples:
-                x = x if m else jnp.broadcast_to(x, (size, *x.shape))
-                at = x.ndim - 1 - rank
-                x = jnp.moveaxis(x, 0, at)
-                x = x.reshape(*x.shape[:at], size * x.shape[at + 1], *x.shape[at + 2 :])
-            folded.append(x)
-        found, at = self(*folded, **params), int(by_item)
-        return [x.reshape(*x.shape[:at], size, -1, *x.shape[at + 1 :]) for x in found], [at] * len(found)
-
-    def _over_samples(
-        self, operands: list, mapped: list[bool], size: int, ranks: Sequence[int], params: dict
-    ) -> tuple[list, list[int]]:
-        """Compute a batch whose items have samples of their own, item by item."""
-        inner = [x.shape[m] for x, m, r in zip(operands, mapped, ranks, strict=True) if x.ndim - m > r]
-        if not inner:
-            found = self(*operands, **params)
-            return found, [0] * len(found)
-        lead = size, inner[0]
-        for i, (x, m, rank) in enumerate(zip(operands, mapped, ranks, strict=True)):
-            if m or x.ndim > rank:
-                own = x.shape[x.ndim - rank :]
-                x = x[:, None] if m and x.ndim == rank + 1 else x
-                operands[i] = jnp.broadcast_to(x, (*lead, *own)).reshape(size * inner[0], *own)
-        found = self(*operands, **params)
-        return [x.reshape(*lead, *x.shape[1:]) for x in found], [0] * len(found)
-
-
-def _only_row(value: Any) -> Any:
-    """The first row of an array in a program that is about to be compiled, if it plainly equals all others, or None."""
-    ir, operation = mlir.ir, value.owner
-    name = getattr(operation, "name", "")  # An argument's owner has no name.
-    kind = ir.RankedTensorType(value.type)
-    shape = ir.RankedTensorType.get([1, *kind.shape[1:]], kind.element_type)
-    if name == "stablehlo.broadcast_in_dim":
-        operand, dims = operation.operands[0], [int(d) for d in operation.attributes["broadcast_dimensions"]]
-        if 0 in dims and ir.RankedTensorType(operand.type).shape[dims.index(0)] != 1:
-            return None
-        return hlo.broadcast_in_dim(shape, operand, mlir.dense_int_array(dims))
-    if name == "stablehlo.concatenate" and ir.IntegerAttr(operation.attributes["dimension"]).value > 0:
-        rows = [_only_row(operand) for operand in operation.operands]
-        if all(row is not None for row in rows):
-            return hlo.concatenate(rows, operation.attributes["dimension"])
-    return None
-
-
-def _cpu_of(operands: Sequence[jax.Array]) -> Any:
-    """The device of the arrays if it is one CPU, else None."""
-    devices = set().union(*(x.devices() for x in operands if isinstance(x, jax.Array)))
-    return next(iter(devices)) if len(devices) == 1 and all(d.platform == "cpu" for d in devices) else None
-
-
 @functools.cache
-def _compiled(primitive: Primitive, params: tuple) -> Callable:
-    return jax.jit(functools.partial(primitive.bind, **dict(params)))
-
-
-@functools.cache
-def _whole(operation: _Operation, params: tuple) -> Callable:
+def _whole(operation: HostPrimitive, params: tuple) -> Callable:
     """The specification of an operation, compiled as a whole: operation by operation, each would be compiled alone."""
     return jax.jit(functools.partial(operation.specification, **dict(params)))
 
