@@ -179,7 +179,6 @@ def test_a_wrong_line_is_named_by_its_number(folder, obj, wrong, place):
     assert re.search(rf"m\.obj, line {place + 1}: ", str(error.value))
 
 
-@pytest.mark.xfail(strict=True, reason="lines that continue others are not counted")
 def test_a_wrong_line_after_one_that_is_continued_is_named_by_its_number(folder):
     path = folder / "m.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 \\\n2 3\nf 1 2 9\n")
@@ -250,7 +249,6 @@ def test_the_meshes_of_a_scene_are_where_it_puts_them_also_when_they_are_merged(
     assert as_set(found) == as_set(np.concatenate(unturned))
 
 
-@pytest.mark.xfail(strict=True, reason="where there is but one mesh, its vertices stay in its own coordinates")
 def test_merged_a_single_mesh_is_in_the_coordinates_of_the_scene(folder):
     scene = trimesh.Scene()
     scene.add_geometry(trimesh.creation.box(), transform=trimesh.transformations.translation_matrix([2, 0, 0]))
