@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rich.markup import escape
-from rich.table import Table
+from rich.table import Column, Table
 
 from rts import registry
 from rts.testing.compatibility import DIFFERING, SHARE, pairs
@@ -18,7 +18,7 @@ OK = (
 
 def plugin_table() -> Table:
     """Every plugin, and whether it loads."""
-    table = Table("group", "name", "from", "state")
+    table = Table("group", "name", "from", Column("state", overflow="fold"))
     for group, name, distribution, error in registry.survey():
         state = "[green]ready[/]" if error is None else f"[red]{escape(error)}[/]"
         table.add_row(group.removeprefix("rts."), name, distribution, state)
@@ -28,7 +28,7 @@ def plugin_table() -> Table:
 def matrix_table() -> Table:
     """Every surface with every sampler, tried in every engine."""
     engines = registry.plugins("rts.engines")
-    table = Table("surface", "sampler", *engines, "why not", caption=OK)
+    table = Table("surface", "sampler", *engines, Column("why not", overflow="fold"), caption=OK)
     for pair in pairs():
         cells = ["[green]ok[/]" if pair.problems[e] is None else "[red]no[/]" for e in engines]
         reasons = dict.fromkeys(p for p in pair.problems.values() if p is not None)
