@@ -145,7 +145,7 @@ def _final(base: type[Plugin]) -> set[str]:
 def _members(base: type[Plugin]) -> list[str]:
     """What a base declares: names of methods and class variables."""
     names = [n for c in base.__mro__ if c not in (Plugin, abc.ABC, object) for n in c.__dict__]
-    return [n for n in dict.fromkeys(names) if not n.startswith("_") and n != "FLAGS"] + ["__call__"]
+    return [n for n in dict.fromkeys(names) if not n.startswith("_") and n not in Plugin.__annotations__] + ["__call__"]
 
 
 def _check_names(kind: type, bases: tuple[type[Plugin], ...]) -> None:

@@ -76,7 +76,7 @@ def _entry(group: str, name: str) -> EntryPoint:
     kind = group.removeprefix("rts.").removesuffix("s")
     if not found:
         names = plugins(group)
-        hint = "" if names else "; is the distribution installed (pip install .)?"
+        hint = "; is its distribution installed, and was it again after its entry points changed (pip install .)?"
         raise InputError(f"no {kind} named {name!r}; there are {', '.join(names)}{_suggest(name, names)}{hint}")
     if len(found) > 1:
         raise PluginError(

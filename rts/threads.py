@@ -117,11 +117,6 @@ def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
     return view
 
 
-def read_all(*arrays: np.ndarray) -> list[np.ndarray]:
-    """`read_only` of each."""
-    return [read_only(x) for x in arrays]
-
-
 def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) -> None:
     """Call `kernel(start, stop, *args)` so that the ranges cover [0, count); the kernel must release the lock.
 

@@ -1,1 +1,1 @@
-"""Samplers and engines that come with the library, one plugin a file."""
+"""Samplers, engines and compiled splatters that come with the library, a file or folder each; and what they share."""

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from example_surfaces import Bezier, Crowded
 from helpers import ALL, DIFFERENTIABLE, FRONT, arrays, gradient, to_numpy
 from seen import CAMERA, SIZE, VIEWS, WEIGHTS, close, loss_of, rays_spread, stages
-from throwaway import Bezier, Crowded
 
 import rts
 from rts import splatting

@@ -339,7 +339,7 @@ def test_the_knot_is_closed_and_wound_outwards():
     assert solid.is_watertight and solid.volume > 0
 
 
-# ------------------------------------------------------------------------------------------------- framing
+# --------------------------------------------------------------------------------------------------- views
 
 
 def test_orbit_looks_from_where_it_says():

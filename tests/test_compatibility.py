@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 import rts
 from rts.cli.main import app
-from rts.testing import compatibility as pairs
+from rts.testing import compatibility
 
 pytestmark = pytest.mark.plugins
 
@@ -21,7 +21,9 @@ class OwnEllipsoid(Ellipsoid):
         return rts.Part(cls(), theta, shader="lambert")
 
 
-EXAMPLES = {name: pairs.example(name) for name in rts.plugins("surfaces")} | {"ellipsoid": OwnEllipsoid.example()}
+EXAMPLES = {name: compatibility.example(name) for name in rts.plugins("surfaces")} | {
+    "ellipsoid": OwnEllipsoid.example()
+}
 
 
 def works(surface, sampler):
@@ -38,13 +40,13 @@ def test_a_pair_shows_the_surface_or_says_why_not(surface, sampler, engine):
         pytest.skip("the surface gives no example")
     if not works(part.surface, sampler):
         with pytest.raises(rts.InputError, match=r"\A[^\n]*; use a sampler of [^\n]*\Z"):
-            pairs.attempt(part, sampler, engine)
+            compatibility.attempt(part, sampler, engine)
         return
     try:
-        image = pairs.attempt(part, sampler, engine)
+        image = compatibility.attempt(part, sampler, engine)
     except rts.PluginError as error:
         pytest.skip(str(error))
-    expected = pairs.attempt(part, "rays" if hasattr(part.surface, "intersect") else "reference", "numpy")
+    expected = compatibility.attempt(part, "rays" if hasattr(part.surface, "intersect") else "reference", "numpy")
     differing = (np.abs(image - expected) > 1e-4).any(axis=-1)
     assert expected[..., 3].mean() > 0.1 and differing.mean() < 0.01
 
@@ -93,4 +95,4 @@ def test_an_example_that_shows_nothing_is_no_success(change, expected):
 
     part = Detached.example()
     with pytest.raises(rts.RtsError, match=expected):
-        pairs.attempt(part.replace(theta={**part.theta, **change}), "rays", "torch")
+        compatibility.attempt(part.replace(theta={**part.theta, **change}), "rays", "torch")

@@ -23,11 +23,11 @@ from rts.testing import (
     ShaderConformance,
     SplatterConformance,
     SurfaceConformance,
+    compatibility,
     scenes,
     shaders,
     splatters,
 )
-from rts.testing import compatibility as pairs
 
 pytestmark = pytest.mark.plugins
 
@@ -876,9 +876,9 @@ def test_what_is_wrong_anyway_is_not_taken_for_a_change_in_place_unseen():
     "sampler", [OddRaster(lambda f, _: Fragments(*(x[:, ::-1] for x in f))), OddRaster(next_triangle)]
 )
 def test_an_image_that_is_not_the_reference_s_is_not_ok(sampler):
-    pairs.attempt(Mesh.example(), OddRaster(), "numpy")
+    compatibility.attempt(Mesh.example(), OddRaster(), "numpy")
     with pytest.raises(rts.RtsError, match="pixels are not those of the sampler 'reference'"):
-        pairs.attempt(Mesh.example(), sampler, "numpy")
+        compatibility.attempt(Mesh.example(), sampler, "numpy")
 
 
 @pytest.mark.parametrize("kit", KIT, ids=lambda kit: kit.__name__)

@@ -57,6 +57,12 @@ def message(error):
 # ----------------------------------------------------------------------------------------------- what loads
 
 
+def test_texture_coordinates_of_one_number_take_nothing_from_the_others(tmp_path):
+    (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0.25\nvt 1 0.5 7\nvt 0 1\nf 1/1 2/2 3/3\n")
+    (part,) = rts.load(tmp_path / "m.obj")
+    np.testing.assert_array_equal(part.theta["uv"], [(0.25, 0), (1, 0.5), (0, 1)])
+
+
 def test_the_texture_of_an_obj_is_upright(tmp_path):
     [part] = rts.load(textured_quad(tmp_path))
     assert part.shader == rts.plugin("shaders", "textured")()

@@ -332,13 +332,13 @@ def test_targets_half_made_are_released_and_the_error_is_ours():
 def public(monkeypatch):
     """The sampler embree where the library cannot be found."""
     pytest.importorskip("embreex")
+    from rts_backends.embree import embreex_fallback
     from rts_backends.embree import library as embree_library
-    from rts_backends.embree import public as embree_public
 
     monkeypatch.setattr(embree_library, "find", lambda: None)
     monkeypatch.setattr(embree_library, "_library", None)
     sampler = rts.plugin("samplers", "embree")()
-    assert isinstance(sampler.prepare(Proxy(*quad())).scene, embree_public.Scene)
+    assert isinstance(sampler.prepare(Proxy(*quad())).scene, embreex_fallback.Scene)
     return sampler
 
 

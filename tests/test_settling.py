@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from example_surfaces import Crowded, Sheets
 from helpers import ALL, FRONT, arrays, rigid, to_numpy
 from seen import CAMERA, SIZE, VIEWS, rays_spread
-from throwaway import Crowded, Sheets
 
 import rts
 from rts import Samples

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from example_surfaces import Torus, distance
 from helpers import ALL, DIFFERENTIABLE, arrays, finite_difference, gradient, to_numpy
 from seen import CAMERA, SIZE, VIEWS, loss_of
-from throwaway import Torus, distance
 
 import rts
 from rts import Samples

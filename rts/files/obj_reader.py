@@ -90,16 +90,23 @@ class _Lines:
             raise self.fail(number, f"{token!r} is no index") from None
 
     def array(self, key: str, least: int, widths: tuple[int, ...]) -> np.ndarray:
-        """The rows of one kind: the widest of `widths` that every row has, at least `least` columns."""
+        """The rows of one kind.
+
+        They have the widest of `widths` that every row has. If some are shorter than all of these, though they have
+        `least` numbers, zeros fill them up to the first.
+        """
         split = [row.split() for row in self.rows[key]]
         if not split:
-            return np.zeros((0, least))
+            return np.zeros((0, widths[0]))
         shortest = min(range(len(split)), key=lambda i: len(split[i]))
         if len(split[shortest]) < least:
             raise self.fail(
                 self.numbers[key][shortest], f"{key!r} has {len(split[shortest])} numbers; expected {least}"
             )
-        width = max(w for w in widths if w <= len(split[shortest]))
+        fitting = [w for w in widths if w <= len(split[shortest])]
+        width = max(fitting, default=widths[0])
+        if not fitting:
+            split = [[*row, *["0"] * (width - len(row))] for row in split]
         try:
             return np.array([[float(x) for x in row[:width]] for row in split])
         except ValueError:
@@ -155,12 +162,10 @@ def read_obj(path: Path) -> list[Piece]:
         for name, index in lines.materials.items()
         if index in used and (file := materials.get(name, Material()).texture) is not None
     }
-    v, vt, vn = lines.array("v", 3, (3, 6)), lines.array("vt", 1, (1, 2)), lines.array("vn", 3, (3,))
+    v, vt, vn = lines.array("v", 3, (3, 6)), lines.array("vt", 1, (2,)), lines.array("vn", 3, (3,))
     if not lines.faces:
         what = f"{len(v)} vertices but no faces" if len(v) else "neither vertices nor faces"
         raise InputError(f"{path} holds {what}; expected a mesh with triangles or polygons")
-    if vt.shape[1] == 1:
-        vt = np.concatenate([vt, np.zeros_like(vt)], axis=1)
     corners, owner = lines.triangles((len(v), len(vt), len(vn)))
     # One array, shared by all pieces, so that merging need not repeat it.
     vertices = v[:, :3]

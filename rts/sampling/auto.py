@@ -34,8 +34,8 @@ def choose(part: Part, *, static: bool) -> Choice:
     if not isinstance(surface, TriangleSurface):
         return Choice("rays", f"{surface!r} intersects rays itself and has no triangles")
     if not static:
-        reason = "triangles that may change each call are drawn at once, with nothing to build"
-        return Choice("raster", f"{reason} (they count as unchanging where something is differentiated, but not they)")
+        reason = "its triangles may change with every call, so nothing is built for them"
+        return Choice("raster", f"{reason} (they count as fixed where only other things are differentiated)")
     faces = surface.face_count
     if faces is None:
         return Choice("raster", f"{surface!r} does not say how many triangles it has (`face_count`)")

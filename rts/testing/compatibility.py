@@ -58,7 +58,7 @@ def attempt(part: Part, sampler: Any, engine: str) -> np.ndarray:
             derivative is not finite; or whatever rendering raises.
     """
     chosen = engine_named(engine)
-    theta = constants(map_leaves(_single, part.theta), chosen, None)
+    theta = constants(map_leaves(single, part.theta), chosen, None)
 
     def image(theta: Any) -> Any:
         seen = part.replace(theta=theta)
@@ -84,7 +84,7 @@ def _is_of_triangles(part: Part, sampler: Any) -> bool:
 
 def _check_image(found: np.ndarray, part: Part) -> None:
     """Refuse an image that is not the one of the sampler `reference`, in NumPy."""
-    part = part.replace(theta=map_leaves(_single, part.theta))
+    part = part.replace(theta=map_leaves(single, part.theta))
     expected = render(part, CAMERA, SIZE, sampler="reference", splatter="single", layers=LAYERS, capacity=CAPACITY)
     differing = (np.abs(found - expected) > DIFFERING).any(axis=-1)
     if differing.mean() > SHARE:
@@ -111,7 +111,8 @@ def _check_gradient(engine: Engine, image: Any, theta: Any) -> None:
         raise RtsError("the gradient in theta is zero everywhere")
 
 
-def _single(x: Any) -> np.ndarray:
+def single(x: Any) -> np.ndarray:
+    """An array of floats as float32; anything else as it is."""
     x = np.asarray(x)
     return x.astype(np.float32) if np.issubdtype(x.dtype, np.floating) else x
 

@@ -13,6 +13,7 @@ from rts import registry
 from rts.engines import Engine, constants, engine_named
 from rts.errors import PluginError
 from rts.testing.claims import claim, claim_close, claim_finite, no_error
+from rts.testing.compatibility import single
 from rts.trees import Tree, map_leaves
 
 ENGINES = registry.plugins("rts.engines")
@@ -50,12 +51,6 @@ def installed() -> list[Engine]:
     if not engines:
         pytest.skip(f"none of {', '.join(DIFFERENTIABLE)} is installed")
     return engines
-
-
-def single(x: Any) -> Any:
-    """An array of floats as float32; anything else as it is."""
-    x = np.asarray(x)
-    return x.astype(np.float32) if np.issubdtype(x.dtype, np.floating) else x
 
 
 def on(engine: Engine, tree: Tree) -> Tree:

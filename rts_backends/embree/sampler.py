@@ -12,7 +12,7 @@ from rts.camera import Camera
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel
-from rts_backends.embree import library, public
+from rts_backends.embree import embreex_fallback, library
 from rts_backends.embree.kernels import TILE, cast, keep_nearest_address
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
@@ -27,7 +27,7 @@ class Structure:
         self.proxy = _packed(proxy)
         self._unit = np.zeros((len(proxy.vertices) + 1, 3), np.float32)
         self._place()
-        embree = library if library.load() else public
+        embree = library if library.load() else embreex_fallback
         self.scene = embree.Scene(self._unit, self.proxy.faces)
         self.refits = 0
 
@@ -62,7 +62,7 @@ class Embree(TriangleSampler):
     ) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         scene, planes = prepared.scene, _planes(camera.projection)
-        if isinstance(scene, public.Scene):
+        if isinstance(scene, embreex_fallback.Scene):
             return scene.cast(prepared.proxy, prepared.sphere, planes, camera, size, layers, cull)
         height, width = size
         fragments = Fragments(

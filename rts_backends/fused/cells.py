@@ -18,7 +18,7 @@ from rts.splatting.kernel import LEAST_EPSILON
 from rts.splatting.layers import OFFSETS
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only
-from rts_backends.fused import choices as choosing
+from rts_backends.fused import choices as listing
 from rts_backends.fused import mixed, stencil
 from rts_backends.fused.survey import BLOCK, survey
 
@@ -140,7 +140,7 @@ class Cells:
         if layers > 1:
             # With no depth below zero, nothing is nearer to what is beyond everything than to a front.
             given = self.row, self.visible, least < 0, beyond, hidden, states
-            parallel(choosing.find, height, self.positions, *given, marks, counts, work=self.row.size)
+            parallel(listing.find, height, self.positions, *given, marks, counts, work=self.row.size)
         offsets = np.concatenate([[0], np.cumsum(counts)])
         columns = np.empty(offsets[-1], np.int32)
         ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
@@ -149,7 +149,7 @@ class Cells:
             continued = kind.type(CONTINUED)  # An argument, since compiled code that is cached would keep its value.
             given = self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states
             arrays = self.positions, self.rgba, self.row, *self._numbers
-            parallel(choosing.choose, height, *arrays, *given, work=500 * len(columns))
+            parallel(listing.choose, height, *arrays, *given, work=500 * len(columns))
         return Choices(marks, offsets, columns, ranges, sums, states, repeated)
 
     def image(self, out: np.ndarray) -> None:

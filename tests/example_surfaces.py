@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 import rts
-from rts.arrays import unit
-from rts.checks import described
+from rts.arrays import described, unit
 
 
 class Bezier(rts.TriangleSurface):
