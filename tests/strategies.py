@@ -23,8 +23,8 @@ def table(dtype, shape, elements):
 
 
 def masks(shape):
-    """Booleans."""
-    return table(bool, shape, st.booleans())
+    """Booleans, the simplest of which are all true: there is more to see where more is covered."""
+    return table(bool, shape, st.booleans()).map(np.logical_not)
 
 
 def steps(shape, low, high, step=Fraction(1, 4), dtype=np.float32):
