@@ -10,7 +10,7 @@ from collections.abc import Callable
 START = (0.12, -0.15, 0.10, 0.05, -0.04, 0.06)
 """The pose at first: a rotation vector and a translation; it is to become zero."""
 RATE = 0.01
-"""Of Adam."""
+"""The learning rate of Adam."""
 
 WARM_UP, ROUNDS = 2, 7
 CONSECUTIVE = 3

@@ -45,7 +45,7 @@ class _Wrapped:
         object.__setattr__(self, "_given", given)
 
     @property
-    def __class__(self) -> type:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def __class__(self) -> type:  # pyright: ignore[reportIncompatibleMethodOverride]  # Assigned nowhere.
         """The object's class: so `isinstance` holds for it as for the base."""
         return type(self._given)
 

@@ -20,7 +20,7 @@ class Bezier(rts.TriangleSurface):
     """Pixels that a sample may be off its ray."""
 
     def __init__(self, indices, squares=3):
-        """Of patches (n, 16), whose points go first along v, then along u; `squares` along each side of a patch."""
+        """Patches (n, 16), whose points go first along v, then along u; `squares` along each side of a patch."""
         self.indices, self.squares = np.asarray(indices, np.int32), squares
 
     def check(self, theta):

@@ -17,7 +17,7 @@ torch = pytest.importorskip("torch")
 COMPILED = [fused.Single, fused.Multi, fused.Visible]
 EVERY = [splatting.Single, splatting.Multi, splatting.Visible, *COMPILED]
 POSITIVE = 1e-3, 0.05, 0.2
-"""Of ε: with none, rounding decides whether weights add up to one, and with it the derivative of samples on centres."""
+"""Values of ε: with none, rounding decides whether weights add up to one, and so the derivative on centres."""
 TOLERANCE = {np.float32: 1e-5, np.float64: 1e-12}
 MANY, SOME = settings(PROPERTIES, max_examples=90), settings(PROPERTIES, max_examples=40)
 
@@ -83,7 +83,7 @@ def close(found, expected, atol):
 
 
 def placed(scene, corner, size):
-    """The same samples elsewhere, in an image of another size."""
+    """Samples moved elsewhere, in an image of another size."""
     (positions, rgba, row), (top, left) = scene, corner
     wide = np.full((len(row), *size), -1, np.int32)
     wide[:, top : top + row.shape[1], left : left + row.shape[2]] = row

@@ -62,6 +62,12 @@ def test_compiled_code_is_imported_when_it_is_needed():
             assert not [n for n in named if "numba" in n or "_kernels import" in n or n.endswith("_kernels")], name
 
 
+def test_a_docstring_says_by_itself_what_it_speaks_of():
+    for path in [*FILES.values(), *(ROOT / "benchmarks").rglob("*.py"), *(ROOT / "tests").rglob("*.py")]:
+        for start in re.findall(r'"""(The same |Of )', path.read_text().replace('r\'"""', "")):
+            pytest.fail(f"{path.relative_to(ROOT)} has a docstring that begins with {start!r}")
+
+
 def test_the_architecture_has_a_line_for_every_file():
     text = (ROOT / "docs/architecture.md").read_text()
     tree = text[text.index("```") : text.index("```", text.index("```") + 3)]

@@ -100,7 +100,7 @@ def _sphere(size: int) -> ClosedForm:
 
 
 def _upright(image: Callable[[float], np.ndarray]) -> ClosedForm:
-    """Of upright edges: linear in t as long as no edge crosses a pixel's boundary, so a small difference is exact."""
+    """The derivative of upright edges: linear in t within a pixel, so that a small difference is exact."""
     small = 1e-3
     return ClosedForm(image, (image(small) - image(-small)) / (2 * small))
 

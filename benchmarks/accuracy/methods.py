@@ -46,7 +46,7 @@ class Method(NamedTuple):
 
 
 def name_of(splatter: str, layers: int, supersample: int = 1) -> str:
-    """Of one of ours."""
+    """The name of a method of ours."""
     return f"{splatter}, K = {layers}" + (f", {supersample} × {supersample}" if supersample > 1 else "")
 
 
@@ -105,7 +105,7 @@ def mitsuba(scene: scenes.Scene, spp: list[int]) -> list[Method]:
 
 
 def turned_over(scene: scenes.Scene) -> scenes.Scene | None:
-    """The same scene with the closed parts' back faces culled, or drawn where they were culled; None where none is."""
+    """A scene with the closed parts' back faces culled, or drawn if they were culled; None if no part is closed."""
     if scene.name not in CLOSED:
         return None
     rest = list(scene.rest)

@@ -117,7 +117,7 @@ def bunny_before_square(size: int, cull: str = "back") -> Scene:
 BOX = tuple(i / 256 for i in (88.3, 81.9, 159.4, 168.7))
 """Left, top, right and bottom of the box's front face, share of the image's side; at 256 off pixel boundaries."""
 CARD = tuple(i / 256 for i in (43.6, 64.4, 129.2, 222.8))
-"""The same of the card behind it, whose right edge passes behind the box."""
+"""Left, top, right and bottom of the card; its right edge passes behind the box."""
 BOX_FRONT, BOX_BACK = 2.9, 3.6
 BOX_COLOR, CARD_COLOR = (0.2, 0.5, 0.9), (0.9, 0.3, 0.1)
 

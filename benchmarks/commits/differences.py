@@ -14,7 +14,7 @@ TOLERANCES |= {"images, not pinned": 1e-4, "gradients, not pinned": 1e-3}
 
 
 class Difference(NamedTuple):
-    """Of one array on both sides: whether they are the same to the bit, and how much they are off, relatively."""
+    """One array of both sides compared: whether they are equal to the bit, and how much they are off, relatively."""
 
     key: str
     equal: bool

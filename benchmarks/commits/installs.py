@@ -77,7 +77,7 @@ def copy_of(revision: str, folder: Path) -> Path:
 
 
 def digest(copy: Path) -> str:
-    """Of the sources that are installed."""
+    """A checksum of the sources that are installed."""
     found = hashlib.sha256(sys.version.encode())
     for path in sorted(copy.rglob("*")):
         name = path.relative_to(copy).as_posix()

@@ -22,7 +22,7 @@ from benchmarks.meshes import kept_mesh
 from benchmarks.timing import CONSECUTIVE, RATE, START, WARM_UP
 
 PROCESSES = 3
-"""Of each side, one after the other: what one is given of memory and cores makes it faster or slower for life."""
+"""Processes of each side, in turn: the memory and cores that one is given make it faster or slower for life."""
 
 
 def sorted_and_welded(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +157,7 @@ class Server:
 
 
 class Times:
-    """Of one mesh, size and engine.
+    """The times of one mesh, size and engine.
 
     Attributes:
         seconds: of iterations, by pair of processes, then by side.
@@ -169,7 +169,7 @@ class Times:
         self.faces = 0
 
     def side(self, n: int) -> list[float]:
-        """Of all processes of a side."""
+        """The times of all processes of a side."""
         return [t for pair in self.seconds for t in pair[n]]
 
     def ratios(self) -> str:

@@ -17,7 +17,7 @@ from benchmarks.camera import camera, supersampled
 from benchmarks.timing import RATE, START
 
 VERTEX_RATE = 1e-5
-"""Of Adam; vertices go by steps so small that the mesh stays what it is while time is taken."""
+"""The learning rate of Adam for vertices: steps so small that the mesh stays what it is while time is taken."""
 
 MODES = ("pose", "full", "full, both")
 """Gradient of the pose, vertices constant; of pose and vertices, a step in the pose; the same, a step in both."""
@@ -58,7 +58,7 @@ class Task:
         return image[..., self.channels].astype(np.float32)
 
     def resized(self, side: int) -> Task:
-        """The same part, with what samplers keep of it, in an image of another size."""
+        """This part, with what samplers keep of it, in an image of another size."""
         other = copy.copy(self)
         other.side, other.size = side, (side, side)
         other.target = other._target()

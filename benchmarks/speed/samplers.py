@@ -28,7 +28,7 @@ from rts.threads import thread_count
 from rts_backends.triangles import pixel_matrix
 
 MEASURED = ("teapot_2464", "bunny", "spot", "nefertiti")
-"""Of MESHES."""
+"""The meshes of `benchmarks.meshes.MESHES` that are sampled."""
 
 SAMPLERS = ("raster", "embree", "opengl")
 SIZES, LAYERS = (256, 512), (1, 2, 4)

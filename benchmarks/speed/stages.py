@@ -50,7 +50,7 @@ class Clock:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
     def timed(self, name: str, function: Callable) -> Callable:
-        """The same function, timed."""
+        """A function that does what another does, and is timed."""
 
         def call(*args: Any, **kwargs: Any) -> Any:
             with self.stage(name):

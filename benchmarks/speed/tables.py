@@ -28,7 +28,7 @@ def number(ms: float) -> str:
 
 
 def faces_of(rows: list[dict]) -> dict[str, int]:
-    """Of each mesh, in their order."""
+    """The number of faces of each mesh, in the order of the rows."""
     return {row["mesh"]: row["faces"] for row in rows}
 
 

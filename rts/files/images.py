@@ -88,6 +88,7 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
     import imageio.v2 as imageio
 
     try:
+        # Not among what is installed for checks of types.
         import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
         raise PluginError("mp4 needs the package imageio-ffmpeg: pip install imageio-ffmpeg; or write a .gif") from None

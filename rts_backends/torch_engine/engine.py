@@ -69,7 +69,7 @@ class _HostCall(torch.autograd.Function):
 
     # torch's own signature has no named arguments, though its manual has.
     @staticmethod
-    def vmap(info, in_dims, fn, specs, *args):  # pyright: ignore[reportIncompatibleMethodOverride]
+    def vmap(info, in_dims, fn, specs, *args):  # pyright: ignore[reportIncompatibleMethodOverride]  # torch's has *args.
         def select(b):
             return [a if d is None else a.select(d, b) for a, d in zip(args, in_dims[2:], strict=True)]
 

@@ -22,6 +22,7 @@ def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
         return function.apply(*args)
     # What torch does with all arguments, in one loop.
     given = [unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
+    # Torch's stubs leave out the class above `Function`.
     return super(torch.autograd.Function, function).apply(*given)  # pyright: ignore[reportAttributeAccessIssue]
 
 

@@ -171,7 +171,7 @@ class _Value(torch.autograd.Function):
 
     # torch's own signature has no named arguments, though its manual has.
     @staticmethod
-    def vmap(info, in_dims, call, *operands):  # pyright: ignore[reportIncompatibleMethodOverride]
+    def vmap(info, in_dims, call, *operands):  # pyright: ignore[reportIncompatibleMethodOverride]  # torch's has *args.
         items = _items(info, in_dims[1:], operands)
         return torch.stack([applied(_Value, call.another(), *item) for item in items]), 0
 
@@ -213,7 +213,7 @@ class _Pull(torch.autograd.Function):
 
     # torch's own signature has no named arguments, though its manual has.
     @staticmethod
-    def vmap(info, in_dims, call, wanted, *given):  # pyright: ignore[reportIncompatibleMethodOverride]
+    def vmap(info, in_dims, call, wanted, *given):  # pyright: ignore[reportIncompatibleMethodOverride]  # torch's has *args.
         same = all(d is None for d in in_dims[2:-1])
         items = [
             applied(_Pull, call if same else call.another(), wanted, *item) for item in _items(info, in_dims[2:], given)
@@ -259,7 +259,7 @@ class _Push(torch.autograd.Function):
 
     # torch's own signature has no named arguments, though its manual has.
     @staticmethod
-    def vmap(info, in_dims, call, present, *given):  # pyright: ignore[reportIncompatibleMethodOverride]
+    def vmap(info, in_dims, call, present, *given):  # pyright: ignore[reportIncompatibleMethodOverride]  # torch's has *args.
         count, dims = sum(present), in_dims[2:]
         if any(d is not None for d in dims[:-count]):
             items = _items(info, dims, given)
