@@ -546,7 +546,7 @@ def test_each_part_is_explained_in_order(few):
 def test_the_choice_is_logged_for_debugging(few, caplog):
     with caplog.at_level(logging.DEBUG, logger="rts"):
         image = rts.render(part_of(*icosphere(1)), CAMERA, SIZE)
-    assert "raster for Mesh(80 faces): triangles that may change" in caplog.text
+    assert "raster for Mesh(80 faces): its triangles may change" in caplog.text
     assert all(record.levelno == logging.DEBUG for record in caplog.records)
     np.testing.assert_array_equal(image, rts.render(part_of(*icosphere(1)), CAMERA, SIZE, sampler="raster"))
 

@@ -16,18 +16,23 @@ torch = pytest.importorskip("torch")
 
 COMPILED = [fused.Single, fused.Multi, fused.Visible]
 EVERY = [splatting.Single, splatting.Multi, splatting.Visible, *COMPILED]
-POSITIVE = 1e-3, 0.05, 0.2
-"""Values of ε: with none, rounding decides whether weights add up to one, and so the derivative on centres."""
+of_every_kind = pytest.mark.parametrize("kind", EVERY, ids=lambda kind: f"{kind.__module__}.{kind.__name__}")
+of_compiled_kinds = pytest.mark.parametrize("kind", COMPILED, ids=lambda kind: kind.__name__)
+
+FEW, MANY = settings(PROPERTIES, max_examples=14), settings(PROPERTIES, max_examples=30)
 TOLERANCE = {np.float32: 1e-5, np.float64: 1e-12}
-MANY, SOME = settings(PROPERTIES, max_examples=90), settings(PROPERTIES, max_examples=40)
+REALS = st.sampled_from([np.float32, np.float64])
+
+POSITIVE = 1e-3, 0.05, 0.2
+"""Of ε: with none, rounding decides whether weights add up to one, and with it the derivative of samples on centres."""
 
 
-def splatters(kinds=EVERY, epsilons=(0.0, *POSITIVE)):
-    """One of some classes, at any settings."""
-    sigma, epsilon = st.sampled_from([0.3, 0.5, 0.8]), st.sampled_from(epsilons)
-    return st.builds(
-        lambda kind, *settings: kind(*settings), st.sampled_from(kinds), sigma, epsilon, st.sampled_from([None, 1.0])
-    )
+def options(epsilons=(0.0, *POSITIVE)):
+    """σ, ε and γ."""
+    return st.tuples(st.sampled_from([0.5, 0.3, 0.8]), st.sampled_from(epsilons), st.sampled_from([None, 1.0]))
+
+
+# ------------------------------------------------------------------------------------------------- samples
 
 
 @st.composite
@@ -45,26 +50,55 @@ def depths_of(draw, shape):
 
 
 @st.composite
-def samples(draw, layers=3, side=5, centred=False, opaque=False, kind=None):
-    """Positions (N, 3), rgba (N, 4) and row; layers are filled from the front, colours premultiplied."""
-    shape = draw(st.integers(1, layers)), draw(st.integers(1, side)), draw(st.integers(1, side + 2))
-    # All cells of a layer, or of its rows or columns, or any.
+def patches(draw):
+    """Covered (K, H, W), depths and a number for the colour, of small scenes: all cells of a layer, a line, or any."""
+    shape = draw(st.tuples(st.integers(1, 3), st.integers(1, 5), st.integers(1, 7)))
     extent = draw(st.sampled_from([(shape[0], 1, 1), (*shape[:2], 1), (shape[0], 1, shape[2]), shape]))
-    covered = np.logical_and.accumulate(np.broadcast_to(draw(masks(extent)), shape), axis=0)
-    row, total = draw(rows_of(covered))
-    depth = np.sort(draw(depths_of(shape)), axis=0)
-    rng = np.random.default_rng(draw(st.integers(0, 99)))
-    positions = rng.normal(size=(total, 3))
+    covered = np.broadcast_to(draw(masks(extent)), shape)
+    colors = draw(steps(shape, 0, draw(st.integers(0, 2)), step=1, dtype=np.int64))
+    return covered, draw(depths_of(shape)), colors
+
+
+@st.composite
+def quilts(draw):
+    """The same of larger scenes, of rectangles that overlap, over more than one block of columns of compiled code."""
+    layers, height, width = draw(st.tuples(st.integers(1, 4), st.integers(5, 12), st.integers(20, 45)))
+    rng = np.random.default_rng(draw(st.integers(0, 9999)))
+    covered, colors = np.zeros((layers, height, width), bool), np.zeros((layers, height, width), np.int64)
+    depth = np.ones(covered.shape)
+    for _ in range(8):
+        top, left = rng.integers(height) - 3, rng.integers(width) - 3
+        place = slice(max(0, top), top + rng.integers(4, 9)), slice(max(0, left), left + rng.integers(4, 16))
+        y, x = np.indices((height, width))
+        slopes, rough = rng.integers(-4, 5, (2, 1 if rng.random() < 0.5 else layers, 1, 1)), 2 * (rng.random() < 0.3)
+        plane = rng.integers(0, 9, (layers, 1, 1)) + slopes[0] * x + slopes[1] * y
+        plane = plane + rng.integers(0, 1 + rough, plane.shape)
+        depth[:, *place] = 60 + plane[:, *place] / 4
+        covered[:, *place] = (np.arange(layers) < rng.integers(0, layers + 1))[:, None, None]
+        colors[:, *place] = rng.integers(0, 3, (layers if rng.random() < 0.5 else 1, 1, 1))
+    return covered, depth, colors
+
+
+@st.composite
+def scenes(draw, centred=False, opaque=False, reals=REALS):
+    """Positions (N, 3), rgba (N, 4) and row; layers are filled from the front, colours premultiplied."""
+    covered, depth, colors = draw(patches() | quilts())
+    covered, depth = np.logical_and.accumulate(covered, axis=0), np.sort(depth, axis=0)
+    rng = np.random.default_rng(draw(st.integers(0, 999)))
+    total = max(1, covered.sum() + draw(st.integers(0, 3)))
+    row = np.full(covered.shape, -1, np.int32)
+    row[covered] = rng.permutation(total)[: covered.sum()]
     k, y, x = np.nonzero(covered)
+    positions, rgba = rng.normal(size=(total, 3)), rng.random((total, 4))
     positions[row[covered]] = np.stack([x + 0.5, y + 0.5, depth[covered]], axis=1)
-    if not (centred or draw(st.booleans())):
-        positions[row[covered], :2] += rng.integers(-6, 7, (len(k), 2)) / 16
-    # Often of few colours: where all around is of one, compiled code takes a shortcut.
-    colors = draw(st.sampled_from([1, 2, 99]))
-    alpha = np.ones((colors, 1)) if opaque else rng.choice([0, 0.5, 0.5, 1], (colors, 1))
-    palette = np.concatenate([rng.integers(0, 17, (colors, 3)) / 16, np.ones((colors, 1))], axis=1) * alpha
-    rgba = palette[rng.integers(0, colors, total)]
-    kind = kind or draw(st.sampled_from([np.float32, np.float64]))
+    # All of them off the centres, one in twenty, or none; a little is no matter to compiled code.
+    share = draw(st.just(0.0) if centred else st.sampled_from([0.0, 0.05, 1.0]))
+    off = rng.integers(-6, 7, (len(k), 2)) / draw(st.sampled_from([16, 2**17]))
+    positions[row[covered], :2] += off * (rng.random((len(k), 1)) < share)
+    palette = np.concatenate([rng.integers(0, 17, (3, 3)) / 16, np.ones((3, 1))], axis=1)
+    palette = palette * (1 if opaque else rng.choice([0.5, 1], (3, 1)))
+    rgba[row[covered]] = palette[colors[covered]]
+    kind = draw(reals)
     return positions.astype(kind), rgba.astype(kind), row
 
 
@@ -83,96 +117,107 @@ def close(found, expected, atol):
 
 
 def placed(scene, corner, size):
-    """Samples moved elsewhere, in an image of another size."""
+    """The same samples elsewhere, in an image of another size."""
     (positions, rgba, row), (top, left) = scene, corner
     wide = np.full((len(row), *size), -1, np.int32)
     wide[:, top : top + row.shape[1], left : left + row.shape[2]] = row
     return positions + np.array([left, top, 0], positions.dtype), rgba, wide
 
 
+def of_one_color(scene, color):
+    """The scene with all samples of a colour, and the cells amid them."""
+    positions, rgba, row = scene
+    return (positions, np.broadcast_to(color, rgba.shape).astype(rgba.dtype), row), around(row[0] >= 0).all(axis=0)
+
+
 # ---------------------------------------------------------------------------------------------- constants
 
 
-@SOME
-@given(splatters(), samples(layers=1, centred=True), st.tuples(*[st.integers(0, 16)] * 4))
-def test_amid_one_colour_one_layer_is_that_colour_at_any_depths(splatter, scene, color):
-    positions, rgba, row = scene
+@of_every_kind
+@FEW
+@given(options=options(), scene=scenes(centred=True), color=st.tuples(*[st.integers(0, 16)] * 4))
+def test_amid_one_colour_one_layer_is_that_colour_at_any_depths(kind, options, scene, color):
     color = np.array([min(c, color[3]) for c in color]) / 16
-    image = splatter.splat(positions, np.broadcast_to(color, rgba.shape).astype(rgba.dtype), row)
-    inside = around(row[0] >= 0).all(axis=0)
+    (positions, rgba, row), inside = of_one_color(scene, color)
+    image = kind(*options).splat(positions, rgba, row[:1])
     close(image[inside], np.broadcast_to(color, (inside.sum(), 4)), tolerance(scene))
 
 
-@SOME
-@given(splatters(), samples(centred=True, opaque=True), st.tuples(*[st.integers(0, 16)] * 3))
-def test_amid_one_opaque_colour_layers_far_apart_are_that_colour(splatter, scene, color):
-    positions, rgba, row = scene
+@of_every_kind
+@FEW
+@given(options=options(), scene=scenes(centred=True), color=st.tuples(*[st.integers(0, 16)] * 3))
+def test_amid_one_opaque_colour_layers_far_apart_are_that_colour(kind, options, scene, color):
+    color = np.array([*color, 16]) / 16
+    (positions, rgba, row), inside = of_one_color(scene, color)
     positions = positions.copy()
     for k, layer in enumerate(row):
-        positions[layer[layer >= 0], 2] += 10 * k
-    color = np.array([*color, 16]) / 16
-    image = splatter.splat(positions, np.broadcast_to(color, rgba.shape).astype(rgba.dtype), row)
-    inside = around(row[0] >= 0).all(axis=0)
+        positions[layer[layer >= 0], 2] += 1000 * k
+    image = kind(*options).splat(positions, rgba, row)
     close(image[inside], np.broadcast_to(color, (inside.sum(), 4)), tolerance(scene))
 
 
-@SOME
-@given(splatters(), samples())
-def test_images_are_premultiplied_with_alpha_between_zero_and_one(splatter, scene):
-    image = splatter.splat(*scene)
+@of_every_kind
+@FEW
+@given(options=options(), scene=scenes())
+def test_images_are_premultiplied_with_alpha_between_zero_and_one(kind, options, scene):
+    image = kind(*options).splat(*scene)
     assert np.isfinite(image).all() and image.min(initial=0) >= 0
     assert image[..., 3].max(initial=0) <= 1 + tolerance(scene)
     assert (image[..., :3] <= image[..., 3:] + tolerance(scene)).all()
 
 
-@SOME
-@given(splatters(), samples(centred=True))
-def test_opaque_samples_reach_their_own_and_all_neighbouring_cells_and_no_others(splatter, scene):
-    positions, rgba, row = scene
-    image = splatter.splat(positions, np.ones_like(rgba), row)
-    np.testing.assert_array_equal(image[..., 3] > 0, around(row[0] >= 0).any(axis=0))
+@of_every_kind
+@FEW
+@given(options=options(), scene=scenes(centred=True, opaque=True))
+def test_opaque_samples_reach_their_own_and_all_neighbouring_cells_and_no_others(kind, options, scene):
+    image = kind(*options).splat(*scene)
+    np.testing.assert_array_equal(image[..., 3] > 0, around(scene[2][0] >= 0).any(axis=0))
 
 
 # ------------------------------------------------------------------------------------ what changes alike
 
 
-@SOME
-@given(splatters(), samples(), st.integers(-8, 8), st.integers(-8, 8))
-def test_images_are_linear_in_colours_of_given_alphas(splatter, scene, a, b):
+@of_every_kind
+@FEW
+@given(options=options(), scene=scenes(), a=st.integers(-8, 8), b=st.integers(-8, 8))
+def test_images_are_linear_in_colours_of_given_alphas(kind, options, scene, a, b):
     positions, rgba, row = scene
     other = np.concatenate([rgba[::-1, :3], rgba[:, 3:]], axis=1)
     both = np.concatenate([a / 8 * rgba[:, :3] + b / 8 * other[:, :3], rgba[:, 3:]], axis=1).astype(rgba.dtype)
-    first, second, found = (splatter.splat(positions, x, row) for x in (rgba, other, both))
+    first, second, found = (kind(*options).splat(positions, x, row) for x in (rgba, other, both))
     close(found[..., :3], a / 8 * first[..., :3] + b / 8 * second[..., :3], tolerance(scene))
     close(found[..., 3], first[..., 3], tolerance(scene))
 
 
-@SOME
-@given(splatters([splatting.Single, fused.Single]), samples(), st.integers(0, 9))
-def test_the_image_of_one_layer_is_linear_in_colour_and_alpha(splatter, scene, seed):
+@pytest.mark.parametrize("kind", [splatting.Single, fused.Single])
+@FEW
+@given(options=options(), scene=scenes(), seed=st.integers(0, 9))
+def test_the_image_of_one_layer_is_linear_in_colour_and_alpha(kind, options, scene, seed):
     positions, rgba, row = scene
     other = np.random.default_rng(seed).random(rgba.shape).astype(rgba.dtype)
-    first, second, found = (splatter.splat(positions, x, row) for x in (rgba, other, rgba - 2 * other))
+    first, second, found = (kind(*options).splat(positions, x, row) for x in (rgba, other, rgba - 2 * other))
     close(found, first - 2 * second, 4 * tolerance(scene))
 
 
-@SOME
-@given(splatters(), samples(), st.integers(-2, 2), st.integers(16, 30))
-def test_a_scene_that_moves_by_whole_cells_moves_its_image(splatter, scene, down, right):
+@of_every_kind
+@FEW
+@given(options=options(), scene=scenes(), down=st.integers(-2, 2), right=st.integers(1, 30))
+def test_a_scene_that_moves_by_whole_cells_moves_its_image(kind, options, scene, down, right):
     height, width = scene[2].shape[1:]
-    # Away from the sides, and onto the border of the blocks of columns that compiled code looks at.
+    # Away from the sides; other columns are beside the borders of the blocks that compiled code looks at.
     top, left, size = 3, 3, (height + 6, width + 36)
-    still = splatter.splat(*placed(scene, (top, left), size))
-    moved = splatter.splat(*placed(scene, (top + down, left + right), size))
+    still = kind(*options).splat(*placed(scene, (top, left), size))
+    moved = kind(*options).splat(*placed(scene, (top + down, left + right), size))
     close(moved, np.roll(still, (down, right), axis=(0, 1)), tolerance(scene))
 
 
-@SOME
-@given(splatters(), samples(), st.integers(1, 40))
-def test_how_far_away_a_scene_is_does_not_matter(splatter, scene, quarters):
+@of_every_kind
+@FEW
+@given(options=options(), scene=scenes(), quarters=st.integers(1, 40))
+def test_how_far_away_a_scene_is_does_not_matter(kind, options, scene, quarters):
     positions, rgba, row = scene
     farther = positions + np.array([0, 0, quarters / 4], positions.dtype)
-    close(splatter.splat(farther, rgba, row), splatter.splat(*scene), tolerance(scene))
+    close(kind(*options).splat(farther, rgba, row), kind(*options).splat(*scene), tolerance(scene))
 
 
 @pytest.mark.xfail(
@@ -185,9 +230,11 @@ def test_how_far_away_a_scene_is_does_not_matter_where_the_camera_is_amid_it(kin
     close(kind().splat(positions - [0, 0, 1.25], np.ones((2, 4)), row), away, 1e-12)
 
 
-@SOME
-@given(splatters(), samples(), st.sampled_from(["left to right", "top to bottom", "rows for columns"]))
-def test_a_mirrored_scene_has_the_mirrored_image(splatter, scene, mirror):
+@pytest.mark.parametrize("mirror", ["left to right", "top to bottom", "rows for columns"])
+@of_every_kind
+@FEW
+@given(options=options(), scene=scenes())
+def test_a_mirrored_scene_has_the_mirrored_image(kind, mirror, options, scene):
     positions, rgba, row = scene
     x, y, z = positions.T
     height, width = row.shape[1:]
@@ -198,36 +245,39 @@ def test_a_mirrored_scene_has_the_mirrored_image(splatter, scene, mirror):
     else:
         other, turned = (y, x, z), lambda image: np.swapaxes(image, 0, 1)
     cells = np.stack([turned(layer) for layer in row])
-    found = splatter.splat(np.stack(other, axis=1), rgba, cells)
-    close(found, turned(splatter.splat(*scene)), tolerance(scene))
+    found = kind(*options).splat(np.stack(other, axis=1), rgba, cells)
+    close(found, turned(kind(*options).splat(*scene)), tolerance(scene))
 
 
-@SOME
-@given(splatters(), samples(), st.data())
-def test_the_order_of_packed_rows_does_not_matter(splatter, scene, data):
+@of_every_kind
+@FEW
+@given(options=options(), scene=scenes(), seed=st.integers(0, 9))
+def test_the_order_of_packed_rows_does_not_matter(kind, options, scene, seed):
     positions, rgba, row = scene
-    order = np.array(data.draw(st.permutations(range(len(rgba)))))
+    order = np.random.default_rng(seed).permutation(len(rgba))
     numbers = np.append(np.argsort(order), -1).astype(np.int32)
-    found = splatter.splat(positions[order], rgba[order], numbers[row])
-    np.testing.assert_array_equal(found, splatter.splat(*scene))
+    found = kind(*options).splat(positions[order], rgba[order], numbers[row])
+    np.testing.assert_array_equal(found, kind(*options).splat(*scene))
 
 
-@SOME
-@given(splatters([splatting.Visible, fused.Visible]), samples())
-def test_a_layer_that_is_empty_everywhere_changes_nothing(splatter, scene):
+@pytest.mark.parametrize("kind", [splatting.Visible, fused.Visible])
+@MANY
+@given(options=options(), scene=scenes())
+def test_a_layer_that_is_empty_everywhere_changes_nothing(kind, options, scene):
     positions, rgba, row = scene
     # Of `Multi` it does: an empty target pairs with a source's empty layer, and takes all others in front.
-    found = splatter.splat(positions, rgba, np.concatenate([row, np.full_like(row[:1], -1)]))
-    close(found, splatter.splat(*scene), tolerance(scene))
+    found = kind(*options).splat(positions, rgba, np.concatenate([row, np.full_like(row[:1], -1)]))
+    close(found, kind(*options).splat(*scene), tolerance(scene))
 
 
-@SOME
-@given(splatters(), samples(), st.integers(0, 3))
-def test_a_border_is_left_out_and_changes_nothing_inside(splatter, scene, border):
-    whole = splatter.splat(*scene)
+@of_every_kind
+@FEW
+@given(options=options(), scene=scenes(), border=st.integers(1, 3))
+def test_a_border_is_left_out_and_changes_nothing_inside(kind, options, scene, border):
+    whole = kind(*options).splat(*scene)
     height, width = whole.shape[:2]
     expected = whole[border : max(border, height - border), border : max(border, width - border)]
-    close(splatter.splat(*scene, border=border), expected, 0)
+    close(kind(*options).splat(*scene, border=border), expected, 0)
 
 
 # --------------------------------------------------------------------------------------- what is needed
@@ -242,15 +292,23 @@ def without_what_is_not_needed(splatter, scene):
     return positions, rgba, np.where(kept, row, -1).astype(np.int32)
 
 
-@SOME
-@given(splatters(), samples(centred=True, opaque=True))
-def test_what_is_not_needed_leaves_the_image_of_opaque_samples_as_it_is(splatter, scene):
+@of_every_kind
+@MANY
+@given(options=options(), scene=scenes(centred=True, opaque=True))
+def test_what_is_not_needed_leaves_the_image_of_opaque_samples_as_it_is(kind, options, scene):
+    splatter = kind(*options)
     close(splatter.splat(*without_what_is_not_needed(splatter, scene)), splatter.splat(*scene), tolerance(scene))
 
 
-@SOME
-@given(splatters(COMPILED, POSITIVE), samples(centred=True, opaque=True, kind=np.float64), st.integers(0, 9))
-def test_what_is_not_needed_leaves_the_derivative_of_opaque_samples_as_it_is(splatter, scene, seed):
+@of_compiled_kinds
+@FEW
+@given(
+    options=options(POSITIVE),
+    scene=scenes(centred=True, opaque=True, reals=st.just(np.float64)),
+    seed=st.integers(0, 9),
+)
+def test_what_is_not_needed_leaves_the_derivative_of_opaque_samples_as_it_is(kind, options, scene, seed):
+    splatter = kind(*options)
     found = pulled_back(splatter, without_what_is_not_needed(splatter, scene), seed)
     for values, expected in zip(found, pulled_back(splatter, scene, seed), strict=True):
         close(values, expected, 1e-9)
@@ -259,9 +317,9 @@ def test_what_is_not_needed_leaves_the_derivative_of_opaque_samples_as_it_is(spl
 # ---------------------------------------------------------------------------- compiled, and the specification
 
 
-def specification(splatter):
-    """The class of `rts.splatting` with the same settings."""
-    return getattr(splatting, type(splatter).__name__)(splatter.sigma, splatter.epsilon, splatter.calibration)
+def specification(kind):
+    """The class of `rts.splatting`."""
+    return getattr(splatting, kind.__name__)
 
 
 def pulled_back(splatter, scene, seed):
@@ -273,53 +331,27 @@ def pulled_back(splatter, scene, seed):
     return to_numpy(torch.autograd.grad(image, variables, torch.tensor(along, dtype=image.dtype)))
 
 
+@of_compiled_kinds
 @MANY
-@given(splatters(COMPILED), samples())
-def test_compiled_images_are_those_of_the_specification(splatter, scene):
-    found = splatter.splat(*scene)
+@given(options=options(), scene=scenes(), border=st.integers(0, 2))
+def test_compiled_images_are_those_of_the_specification(kind, options, scene, border):
+    found = kind(*options).splat(*scene, border=border)
     assert found.dtype == scene[0].dtype
-    close(found, specification(splatter).splat(*scene), tolerance(scene))
+    close(found, specification(kind)(*options).splat(*scene, border=border), tolerance(scene))
 
 
+@of_compiled_kinds
 @MANY
-@given(splatters(COMPILED, POSITIVE), samples(), st.integers(0, 9))
-def test_compiled_gradients_are_those_of_the_specification(splatter, scene, seed):
-    pairs = zip(pulled_back(splatter, scene, seed), pulled_back(specification(splatter), scene, seed), strict=True)
-    for found, expected in pairs:
+@given(options=options(POSITIVE), scene=scenes(), seed=st.integers(0, 9))
+def test_compiled_gradients_are_those_of_the_specification(kind, options, scene, seed):
+    given = pulled_back(kind(*options), scene, seed), pulled_back(specification(kind)(*options), scene, seed)
+    for found, expected in zip(*given, strict=True):
         close(found, expected, 20 * tolerance(scene) * max(1, np.abs(expected).max()))
 
 
-@st.composite
-def patches(draw):
-    """Two colours side by side, which compiled code need not splat; a few samples are away, or off their centres."""
-    shape = draw(st.integers(1, 3)), draw(st.integers(3, 6)), draw(st.integers(3, 6))
-    depth = np.sort(draw(depths_of(shape)), axis=0)
-    row = np.arange(depth.size, dtype=np.int32).reshape(shape)
-    k, y, x = np.indices(shape).reshape(3, -1)
-    positions = np.stack([x + 0.5, y + 0.5, depth.ravel()], axis=1)
-    one = st.integers(0, depth.size - 1)
-    for i in draw(st.lists(one, max_size=2)):
-        positions[i, :2] += draw(st.sampled_from([1e-5, -1e-4, 0.25]))
-    colors = np.array([(0.25, 0.5, 0, 1), (0.75, 0, 0.5, 1)]) * draw(st.sampled_from([0.5, 1.0]))
-    rgba = colors[(x >= draw(st.integers(0, 6))).astype(int)]
-    for i in draw(st.lists(one, max_size=1)):
-        row[i // row[0].size :, i // shape[2] % shape[1], i % shape[2]] = -1
-    kind = draw(st.sampled_from([np.float32, np.float64]))
-    return positions.astype(kind), rgba.astype(kind), row
-
-
+@of_compiled_kinds
 @MANY
-@given(splatters(COMPILED, POSITIVE), patches(), st.integers(0, 2), st.integers(0, 9))
-def test_amid_one_colour_compiled_images_and_gradients_are_those_of_the_specification(splatter, scene, border, seed):
-    expected = specification(splatter).splat(*scene, border=border)
-    close(splatter.splat(*scene, border=border), expected, tolerance(scene))
-    pairs = zip(pulled_back(splatter, scene, seed), pulled_back(specification(splatter), scene, seed), strict=True)
-    for found, wanted in pairs:
-        close(found, wanted, 20 * tolerance(scene) * max(1, np.abs(wanted).max()))
-
-
-@MANY
-@given(splatters(COMPILED), samples(centred=True, opaque=True))
-def test_what_compiled_code_needs_is_what_the_specification_needs(splatter, scene):
-    given = without_what_is_not_needed(splatter, scene), without_what_is_not_needed(specification(splatter), scene)
-    np.testing.assert_array_equal(given[0][2], given[1][2])
+@given(options=options(), scene=scenes(centred=True, opaque=True))
+def test_what_compiled_code_needs_is_what_the_specification_needs(kind, options, scene):
+    own, specified = (without_what_is_not_needed(k(*options), scene)[2] for k in (kind, specification(kind)))
+    np.testing.assert_array_equal(own, specified)
