@@ -24,7 +24,7 @@ TOLERANCE = {np.float32: 1e-5, np.float64: 1e-12}
 REALS = st.sampled_from([np.float32, np.float64])
 
 POSITIVE = 1e-3, 0.05, 0.2
-"""Of ε: with none, rounding decides whether weights add up to one, and with it the derivative of samples on centres."""
+"""Values of ε: with none, rounding decides whether weights add up to one, and so the derivative on centres."""
 
 
 def options(epsilons=(0.0, *POSITIVE)):
@@ -61,7 +61,7 @@ def patches(draw):
 
 @st.composite
 def quilts(draw):
-    """The same of larger scenes, of rectangles that overlap, over more than one block of columns of compiled code."""
+    """Larger scenes, of rectangles that overlap, over more than one block of columns of compiled code."""
     layers, height, width = draw(st.tuples(st.integers(1, 4), st.integers(5, 12), st.integers(20, 45)))
     rng = np.random.default_rng(draw(st.integers(0, 9999)))
     covered, colors = np.zeros((layers, height, width), bool), np.zeros((layers, height, width), np.int64)
@@ -117,7 +117,7 @@ def close(found, expected, atol):
 
 
 def placed(scene, corner, size):
-    """The same samples elsewhere, in an image of another size."""
+    """Samples moved elsewhere, in an image of another size."""
     (positions, rgba, row), (top, left) = scene, corner
     wide = np.full((len(row), *size), -1, np.int32)
     wide[:, top : top + row.shape[1], left : left + row.shape[2]] = row
