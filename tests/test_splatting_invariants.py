@@ -61,14 +61,19 @@ def patches(draw):
 
 @st.composite
 def quilts(draw):
-    """Larger scenes, of rectangles that overlap, over more than one block of columns of compiled code."""
+    """Larger scenes, of rectangles that overlap, over more than one block of columns of compiled code.
+
+    Some rectangles are as wide as the image, since compiled code takes shortcuts along whole lines. In some scenes
+    deeper layers are only on one side of the border between two blocks.
+    """
     layers, height, width = draw(st.tuples(st.integers(1, 4), st.integers(5, 12), st.integers(20, 45)))
     rng = np.random.default_rng(draw(st.integers(0, 9999)))
     covered, colors = np.zeros((layers, height, width), bool), np.zeros((layers, height, width), np.int64)
     depth = np.ones(covered.shape)
     for _ in range(8):
         top, left = rng.integers(height) - 3, rng.integers(width) - 3
-        place = slice(max(0, top), top + rng.integers(4, 9)), slice(max(0, left), left + rng.integers(4, 16))
+        across = slice(max(0, left), left + rng.integers(4, 16)) if rng.random() < 0.6 else slice(width)
+        place = slice(max(0, top), top + rng.integers(4, 9)), across
         y, x = np.indices((height, width))
         slopes, rough = rng.integers(-4, 5, (2, 1 if rng.random() < 0.5 else layers, 1, 1)), 2 * (rng.random() < 0.3)
         plane = rng.integers(0, 9, (layers, 1, 1)) + slopes[0] * x + slopes[1] * y
@@ -76,6 +81,7 @@ def quilts(draw):
         depth[:, *place] = 60 + plane[:, *place] / 4
         covered[:, *place] = (np.arange(layers) < rng.integers(0, layers + 1))[:, None, None]
         colors[:, *place] = rng.integers(0, 3, (layers if rng.random() < 0.5 else 1, 1, 1))
+    covered[1:, :, draw(st.sampled_from([slice(0), slice(32), slice(32, None)]))] = False
     return covered, depth, colors
 
 
@@ -277,7 +283,7 @@ def test_a_border_is_left_out_and_changes_nothing_inside(kind, options, scene, b
     whole = kind(*options).splat(*scene)
     height, width = whole.shape[:2]
     expected = whole[border : max(border, height - border), border : max(border, width - border)]
-    close(kind(*options).splat(*scene, border=border), expected, 0)
+    close(kind(*options).splat(*scene, border=border), expected, tolerance(scene))
 
 
 # --------------------------------------------------------------------------------------- what is needed
@@ -323,12 +329,16 @@ def specification(kind):
 
 
 def pulled_back(splatter, scene, seed):
-    """Gradients of positions and colours from a random one of the image, by torch."""
+    """Gradients from a random one of the image, by torch: of positions and colours, and of positions alone."""
     positions, rgba, row = arrays(TORCH[0], scene, scene[0].dtype)
-    variables = [x.requires_grad_(True) for x in (positions, rgba)]
-    image = splatter.splat(*variables, row)
-    along = np.random.default_rng(seed).normal(size=image.shape)
-    return to_numpy(torch.autograd.grad(image, variables, torch.tensor(along, dtype=image.dtype)))
+    found = []
+    for wanted in ((positions, rgba), (positions,)):
+        for x in (positions, rgba):
+            x.requires_grad_(any(x is w for w in wanted))
+        image = splatter.splat(positions, rgba, row)
+        along = torch.tensor(np.random.default_rng(seed).normal(size=image.shape), dtype=image.dtype)
+        found += torch.autograd.grad(image, wanted, along)
+    return to_numpy(found)
 
 
 @of_compiled_kinds
