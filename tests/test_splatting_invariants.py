@@ -75,7 +75,7 @@ def quilts(draw):
         across = slice(max(0, left), left + rng.integers(4, 16)) if rng.random() < 0.6 else slice(width)
         place = slice(max(0, top), top + rng.integers(4, 9)), across
         y, x = np.indices((height, width))
-        slopes, rough = rng.integers(-4, 5, (2, 1 if rng.random() < 0.5 else layers, 1, 1)), 2 * (rng.random() < 0.3)
+        slopes, rough = rng.integers(-4, 5, (2, 1 if rng.random() < 0.5 else layers, 1, 1)), rng.choice([0, 0, 2, 12])
         plane = rng.integers(0, 9, (layers, 1, 1)) + slopes[0] * x + slopes[1] * y
         plane = plane + rng.integers(0, 1 + rough, plane.shape)
         depth[:, *place] = 60 + plane[:, *place] / 4
