@@ -189,7 +189,7 @@ def test_an_oblique_near_plane_cuts_as_in_the_reference(sampler):
     plane = np.array([1.0, 0.0, 2.0, 6.0]) * -1
     corner = np.linalg.inv(projection) @ [np.sign(plane[0]), np.sign(plane[1]), 1, 1]
     projection[2] = plane * 2 / (plane @ corner) - projection[3]
-    camera = camera._replace(projection=projection)
+    camera = camera.replace(projection=projection)
     vertices, faces = soup(40, 5, size=0.9)
     whole = rasterize("reference", vertices, faces, CAMERAS["perspective"], SIZE, 4)
     expected = rasterize("reference", vertices, faces, camera, SIZE, 4)
@@ -218,7 +218,7 @@ def test_cameras_with_any_principal_point_and_skew_agree(sampler, seed):
 @pytest.mark.parametrize("corner, step", [(-0.5, 1.0), (-0.5, 0.5), (-1.0, 1.0), (-1.5, 3.0), (-0.25, 0.75)])
 def test_a_grid_through_pixel_centres_covers_each_pixel_once(sampler, corner, step, flip):
     vertices, faces = grid(corner, step, int(np.ceil(34 / step)))
-    camera = PIXELS._replace(projection=np.diag([1.0, -1, 1, 1]) @ PIXELS.projection) if flip else PIXELS
+    camera = PIXELS.replace(projection=np.diag([1.0, -1, 1, 1]) @ PIXELS.projection) if flip else PIXELS
     found = rasterize(sampler, vertices, faces, camera, (32, 32), 2)
     assert (found.triangle_ids[0] >= 0).all()
     assert (found.triangle_ids[1] == -1).all()
@@ -292,7 +292,7 @@ def test_coplanar_layers_keep_the_order_of_their_indices(sampler, tilt):
     other = np.array([(0, 1, 3), (1, 2, 3)], np.int32)
     vertices = (vertices @ rotation((1, 2, 0), 20 * tilt).T).astype(np.float32)
     faces = np.concatenate([faces, other, faces])
-    camera = Camera.look_at((0, 0, 3), (0, 0, 0))
+    camera = Camera.look_at((0, 0, 3), (0, 0, 0), aspect=1.0)
     expected = rasterize("reference", vertices, faces, camera, SIZE, 4)
     found = rasterize(sampler, vertices, faces, camera, SIZE, 4)
     np.testing.assert_array_equal(np.sort(found.triangle_ids, axis=0), np.sort(expected.triangle_ids, axis=0))
@@ -486,3 +486,49 @@ def test_the_result_depends_neither_on_the_number_of_threads_nor_on_chance(name,
     for one, *others in zip(*results, strict=True):
         for other in others:
             np.testing.assert_array_equal(one, other)
+
+
+# ------------------------------------------------------------------------- rays, at edges and at any size
+
+
+@pytest.mark.parametrize("scale", [1e-2, 1e-4, 1e-6, 1e-8])
+def test_rays_find_triangles_however_small_they_are_in_their_mesh(scale):
+    usable("embree")
+    vertices, faces = soup(20, 3, size=0.4)
+    far = np.array([(9, 0, -30), (10, 0, -30), (9, 1, -30)], np.float32)
+    vertices, faces = np.concatenate([vertices * np.float32(scale), far]), np.concatenate([faces, [[60, 61, 62]]])
+    camera = Camera.look_at(
+        (scale, 2 * scale, 3 * scale), (0, 0, 0), fov_y=50, aspect=1.25, near=0.5 * scale, far=9 * scale
+    )
+    found = rasterize("embree", vertices, faces.astype(np.int32), camera, SIZE, 4)
+    expected = rasterize("reference", vertices, faces.astype(np.int32), camera, SIZE, 4)
+    assert (expected.triangle_ids >= 0).sum() > 2000
+    np.testing.assert_array_equal(found.triangle_ids, expected.triangle_ids)
+
+
+@pytest.mark.parametrize("turned", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+def test_rays_through_free_edges_and_corners_are_decided_as_the_rasterizer_decides(turned):
+    usable("embree")
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        corners = np.concatenate([rng.integers(0, 64, (30, 3, 2)) / 2, rng.integers(-9, 9, (30, 3, 1))], axis=2)
+        vertices = (corners * [1, -1, 1]).reshape(-1, 3).astype(np.float32)
+        faces = np.arange(90, dtype=np.int32).reshape(-1, 3)[:, list(turned)]
+        found, expected = (rasterize(name, vertices, faces, PIXELS, (32, 32), 30) for name in ("embree", "raster"))
+        np.testing.assert_array_equal(np.sort(found.triangle_ids, 0), np.sort(expected.triangle_ids, 0))
+
+
+def test_rays_find_moved_triangles_that_have_become_thin():
+    usable("embree")
+    sampler, (vertices, faces) = make("embree"), soup(60, 4, size=0.5)
+    camera = host(CAMERAS["perspective"])
+    thin = vertices.reshape(-1, 3, 3).copy()
+    thin[::2, 2] = (thin[::2, 0] + thin[::2, 1]) / 2 + np.float32(1e-3)
+    prepared = sampler.prepare(Proxy(vertices, faces))
+    for moved in (thin.reshape(-1, 3), vertices, vertices[::-1].copy()):
+        proxy = Proxy(moved, faces)
+        prepared = sampler.update(prepared, proxy) or sampler.prepare(proxy)  # As a `TriangleSampler` does.
+        found = sampler.rasterize(prepared, camera, SIZE, 60, "none")
+        expected = rasterize("reference", moved, faces, CAMERAS["perspective"], SIZE, 60)
+        assert (expected.triangle_ids >= 0).sum() > 3000
+        np.testing.assert_array_equal(found.triangle_ids, expected.triangle_ids)

@@ -29,8 +29,8 @@ class Scene:
     """Stands in for `rts_backends.embree.library.Scene`.
 
     Args:
-        vertices: (V + 1, 3) float32 within the unit sphere; the last row is padding.
-        faces: (T, 3) int32.
+        vertices: (V + 1, 3) float32, of covers (`Covers`); the last row is padding.
+        faces: (M, 3) int32.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray):
@@ -39,15 +39,14 @@ class Scene:
 
     def move(self, *, rebuild: bool) -> None:
         """Follow vertices that have changed in place; always by building anew, since embreex cannot refit."""
-        vertices = self._vertices[:-1]
-        self._places = places(vertices, self._faces)
-        self._around = corner_lists(self._places, len(vertices))
+        self._looked_up: Proxy | None = None
         self.handle = EmbreeScene(robust=True)
-        TriangleMesh(self.handle, vertices, self._faces)
+        TriangleMesh(self.handle, self._vertices[:-1], self._faces)
 
     def cast(
         self,
         proxy: Proxy,
+        owners: np.ndarray,
         sphere: np.ndarray,
         planes: np.ndarray,
         camera: Camera,
@@ -59,6 +58,7 @@ class Scene:
 
         Args:
             proxy: the object.
+            owners: the triangle of each cover.
             sphere: (4,) its centre and radius; the scene is the object moved and scaled to the unit sphere.
             planes: depths; nothing is seen before the first or beyond the second.
             camera: see `TriangleSampler.rasterize`.
@@ -66,6 +66,9 @@ class Scene:
             layers: see `TriangleSampler.rasterize`.
             cull: see `TriangleSampler.rasterize`.
         """
+        if self._looked_up is not proxy:
+            self._looked_up, self._places = proxy, places(proxy.vertices, proxy.faces)
+            self._around = corner_lists(self._places, len(proxy.vertices))
         rays = camera.rays(size)
         origins = (rays.origins.reshape(-1, 3) - sphere[:3]) / sphere[3]
         directions = rays.directions.reshape(-1, 3) / sphere[3]
@@ -88,7 +91,7 @@ class Scene:
             hit = hits["primID"] >= 0
             live = live[hit]
             depth = reach[live] + hits["tfar"][hit] / length[live]
-            args = live, hits["primID"][hit], size[1], *scene, self._places, *self._around, ids, found
+            args = live, owners[hits["primID"][hit]], size[1], *scene, self._places, *self._around, ids, found
             parallel(_take, len(live), *args)
             again = last[live] == hits["primID"][hit]
             last[live] = hits["primID"][hit]

@@ -1,9 +1,9 @@
 """Rays through pixel centres, K nearest hits each, by compiled code that calls Embree.
 
-Embree finds candidates in float32 and hands each to our intersection filter. A hit well inside its triangle, and at a
-depth of its own, is believed. Any other is decided in float64 by the edge functions of `rts_backends.triangles`,
-exactly as the rasterizer decides: so an edge between triangles is hit once, and coplanar layers keep their order. A
-candidate that the exact test puts just beyond an edge stays only if no neighbour across that edge turns up.
+Embree finds candidates in float32, among covers of the triangles (`covers.py`), and hands each to our intersection
+filter. A hit well inside its triangle, and at a depth of its own, is believed. Any other is decided in float64 by the
+edge functions of `rts_backends.triangles`, exactly as the rasterizer decides: so hits are those of the rasterizer, an
+edge between triangles is hit once, and coplanar layers keep their order.
 """
 
 from __future__ import annotations
@@ -17,34 +17,25 @@ from llvmlite import ir
 from numba import carray, types  # pyright: ignore[reportPrivateImportUsage]  # Documented, but not in __all__.
 from numba.extending import intrinsic
 
+from rts_backends.embree.covers import NEVER
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
 
 TILE = 8
 ACCEPT, REJECT = -1, 0
 COHERENT, INVOKE_FILTER = 1 << 16, 1 << 1
-SLACK = 1e-5
-"""Depths that differ by less than this share of the object's size are compared in float64."""
-MARGIN = 1e-3
-"""Barycentrics, and cosines, further than this from zero are believed as Embree gives them."""
+SLACK, REACH_SLACK_SHARE = 1e-5, 1e-4
+"""Depths that differ by less than the first share of the object's size are compared in float64; rays end as far behind
+the last hit as the second."""
 
-BEYOND_AT_MOST = 0.01
-"""How far beyond an edge a hit may lie, in barycentrics: further than what float32 explains, it is noise."""
-
-NOISE = 1e-13
-"""Square of twice the area, in units of the object's size, from which on it is more than rounding in float32."""
-
-THIN = 1e-7
-"""Height of a triangle over its longest edge."""
+GRAZING = 0.05
+"""Cosine between ray and normal below which Embree's depth, and side, are not believed."""
 
 REACH = 1.01
 """Square of the radius of the sphere that rays start on, in units of the object's."""
 
-BEYOND, EXACT, BELIEVED = range(3)
-"""How sure a hit is: just beyond an edge; inside, with an exact depth; inside, with Embree's depth."""
-
-# Per ray: K, hits so far, pixel x, y, sign of determinants to keep, depth slack, depth where the ray starts, and the
-# depths between which no plane clips.
-LAYERS, COUNT, PIXEL_X, PIXEL_Y, KEEP, DEPTH_SLACK, START, NEAREST, FARTHEST = range(9)
+# Per ray: hits so far, pixel x, y, sign of determinants to keep, slack of depths and of the ray's end, depth where the
+# ray starts, and the depths between which no plane clips.
+COUNT, PIXEL_X, PIXEL_Y, KEEP, DEPTH_SLACK, REACH_SLACK, START, NEAREST, FARTHEST = range(9)
 HEADER = 9
 
 
@@ -78,40 +69,9 @@ def _pointer(typing_context, address):
     return types.voidptr(types.intp), generate
 
 
-@numba.njit
-def _touch(vertices, faces, s, t):
-    """Whether two triangles have a corner in one place."""
-    for i in range(3):
-        for j in range(3):
-            p, q = faces[s, i], faces[t, j]
-            if p == q or (
-                vertices[p, 0] == vertices[q, 0]
-                and vertices[p, 1] == vertices[q, 1]
-                and vertices[p, 2] == vertices[q, 2]
-            ):
-                return True
-    return False
-
-
-@numba.njit
-def _edge(vertices, i, j):
-    x, y, z = np.float64(vertices[i, 0]), np.float64(vertices[i, 1]), np.float64(vertices[i, 2])
-    return vertices[j, 0] - x, vertices[j, 1] - y, vertices[j, 2] - z
-
-
-@numba.njit
-def _is_line(vertices, ia, ib, ic):
-    """Whether a triangle is so thin that float32 sees no area."""
-    ux, uy, uz = _edge(vertices, ia, ib)
-    vx, vy, vz = _edge(vertices, ia, ic)
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    longest = max(ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz)
-    return nx * nx + ny * ny + nz * nz <= (THIN * longest) ** 2
-
-
-@numba.njit
+@numba.njit(error_model="numpy")
 def _decide(t, state, work, vertices, faces):
-    """Whether a triangle is hit (BEYOND, EXACT or −1 for no), and the exact depth; see `cast` for `work`."""
+    """Whether a triangle is hit, and at which depth; see `cast` for `work`."""
     matrix, row, corners = work[:4], work[4], work[5:]
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
     to_corner(matrix, vertices, ia, corners, 0)
@@ -119,43 +79,35 @@ def _decide(t, state, work, vertices, faces):
     to_corner(matrix, vertices, ic, corners, 2)
     area = determinant(corners, 0, 1, 2)
     if not (area * state[KEEP] > 0 or (state[KEEP] == 0 and area != 0)):
-        return -1, 0.0
+        return False, 0.0
     ea, eb, ec, inside = edge_values(corners, 0, 1, 2, state[PIXEL_X], state[PIXEL_Y])
     total = ea + eb + ec
-    if not total > 0 or clipped(corners, 0, 1, 2, ea, eb, ec):
-        return -1, 0.0
+    if not inside or not total > 0 or clipped(corners, 0, 1, 2, ea, eb, ec):
+        return False, 0.0
     za, zb, zc = depth_of(row, vertices, ia), depth_of(row, vertices, ib), depth_of(row, vertices, ic)
-    if not inside and (min(ea, eb, ec) < -BEYOND_AT_MOST * total or _is_line(vertices, ia, ib, ic)):
-        return -1, 0.0
-    return EXACT if inside else BEYOND, (ea * za + eb * zb + ec * zc) / total
+    return True, (ea * za + eb * zb + ec * zc) / total
 
 
 @numba.njit
-def _insert(t, z, kind, state, depths, ids, kinds, work, vertices, faces):
+def _insert(t, z, exact, state, depths, ids, sure, work, vertices, faces):
     """Put a hit in its place among the nearest; True if it is one of them."""
-    slack, slots = state[DEPTH_SLACK], len(ids)
-    if kind == BELIEVED:
-        for i in range(int(state[COUNT])):
-            if abs(depths[i] - z) <= slack:
-                kind, z = _decide(t, state, work, vertices, faces)
-                break
-    if kind == -1:
-        return False
-    count, i = int(state[COUNT]), 0
+    slack, count, i = state[DEPTH_SLACK], int(state[COUNT]), 0
     while i < count:
         if ids[i] == t:
             return False
         if abs(depths[i] - z) <= slack:
-            if kinds[i] == BELIEVED:
-                kinds[i], depths[i] = _decide(ids[i], state, work, vertices, faces)
-            drop = kinds[i] == -1
-            if not drop and (kind == BEYOND or kinds[i] == BEYOND) and _touch(vertices, faces, ids[i], t):
-                if kind == BEYOND:
+            hit = True
+            if not exact:
+                exact = True
+                hit, z = _decide(t, state, work, vertices, faces)
+                if not hit:
                     return False
-                drop = True
-            if drop:
+            if not sure[i]:
+                hit, depths[i] = _decide(ids[i], state, work, vertices, faces)
+                sure[i] = True
+            if not hit:
                 for k in range(i, count - 1):
-                    depths[k], ids[k], kinds[k] = depths[k + 1], ids[k + 1], kinds[k + 1]
+                    depths[k], ids[k], sure[k] = depths[k + 1], ids[k + 1], sure[k + 1]
                 count -= 1
                 continue
         i += 1
@@ -163,12 +115,12 @@ def _insert(t, z, kind, state, depths, ids, kinds, work, vertices, faces):
     while at > 0 and (z < depths[at - 1] or (z == depths[at - 1] and t < ids[at - 1])):
         at -= 1
     state[COUNT] = count
-    if at >= slots:
+    if at >= len(ids):
         return False
-    for k in range(min(count, slots - 1), at, -1):
-        depths[k], ids[k], kinds[k] = depths[k - 1], ids[k - 1], kinds[k - 1]
-    depths[at], ids[at], kinds[at] = z, t, kind
-    state[COUNT] = min(count + 1, slots)
+    for k in range(min(count, len(ids) - 1), at, -1):
+        depths[k], ids[k], sure[k] = depths[k - 1], ids[k - 1], sure[k - 1]
+    depths[at], ids[at], sure[at] = z, t, exact
+    state[COUNT] = min(count + 1, len(ids))
     return True
 
 
@@ -179,46 +131,42 @@ def _keep_nearest(arguments):
     valid = carray(_pointer(fields[0]), 1, np.int32)
     ray = carray(_pointer(fields[3]), 9, np.float32)
     hit = carray(_pointer(fields[4]), 5, np.float32)
-    t = carray(_pointer(fields[4]), 7, np.int32)[5]
+    cover = carray(_pointer(fields[4]), 7, np.int32)[5]
     # Ours, behind the 16 bytes of Embree's own query context: addresses and counts.
-    context = carray(_pointer(fields[2]), 12, np.intp)
-    slots = context[3]
+    context = carray(_pointer(fields[2]), 15, np.intp)
+    layers = context[3]
     state = carray(_pointer(context[2]), HEADER, np.float64)
-    depths = carray(_pointer(context[4]), slots, np.float64)
-    ids = carray(_pointer(context[5]), slots, np.int32)
-    kinds = carray(_pointer(context[6]), slots, np.int8)
+    depths = carray(_pointer(context[4]), layers, np.float64)
+    ids = carray(_pointer(context[5]), layers, np.int32)
+    sure = carray(_pointer(context[6]), layers, np.bool_)
     vertices = carray(_pointer(context[7]), (context[8], 3), np.float32)
     faces = carray(_pointer(context[9]), (context[10], 3), np.int32)
     work = carray(_pointer(context[11]), (8, 4), np.float64)
+    owners = carray(_pointer(context[12]), context[13], np.int32)
+    margins = carray(_pointer(context[14]), context[10], np.uint8)
 
     valid[0] = REJECT
-    u, v, z = hit[3], hit[4], state[START] + ray[8]
-    kind = BELIEVED
-    normal = hit[0] * hit[0] + hit[1] * hit[1] + hit[2] * hit[2]
-    believed = u > MARGIN and v > MARGIN and u + v < 1 - MARGIN and normal > NOISE
-    if not (believed and state[NEAREST] < z < state[FARTHEST]):
-        kind, z = _decide(t, state, work, vertices, faces)
-    elif state[KEEP] != 0:
+    t, exact, z = cover, True, state[START] + ray[8]
+    if cover < len(faces) and margins[cover] != NEVER and state[NEAREST] < z < state[FARTHEST]:
+        margin, u, v = np.float32(0.001) * margins[cover], hit[3], hit[4]
         along = hit[0] * ray[4] + hit[1] * ray[5] + hit[2] * ray[6]
+        normal = hit[0] * hit[0] + hit[1] * hit[1] + hit[2] * hit[2]
         step = ray[4] * ray[4] + ray[5] * ray[5] + ray[6] * ray[6]
-        if along * along < MARGIN * MARGIN * normal * step:
-            kind, z = _decide(t, state, work, vertices, faces)
-        elif along > 0:
+        within = u > margin and v > margin and u + v < 1 - margin
+        exact = not (within and along * along > GRAZING * GRAZING * normal * step)
+        if not exact and state[KEEP] != 0 and along > 0:
             return
-    if kind == -1 or not _insert(t, z, kind, state, depths, ids, kinds, work, vertices, faces):
+    if exact:
+        t = owners[cover]
+        found, z = _decide(t, state, work, vertices, faces)
+        if not found:
+            return
+    if not _insert(t, z, exact, state, depths, ids, sure, work, vertices, faces):
         return
-    # Nothing beyond the K-th hit matters: an accepted hit ends the ray there. A hit beyond an edge may yet be
-    # replaced by its neighbour, so one slot more is filled before the ray ends.
-    layers, count = int(state[LAYERS]), int(state[COUNT])
-    last = layers
-    if count >= layers:
-        last = layers - 1
-        for k in range(layers):
-            if kinds[k] == BEYOND:
-                last = layers
-    if last < count:
+    # Nothing beyond the K-th hit matters: an accepted hit ends the ray there.
+    if state[COUNT] == layers:
         valid[0] = ACCEPT
-        ray[8] = depths[last] - state[START] + state[DEPTH_SLACK]
+        ray[8] = depths[layers - 1] - state[START] + state[REACH_SLACK]
 
 
 def keep_nearest_address() -> int:
@@ -226,10 +174,10 @@ def keep_nearest_address() -> int:
     return _keep_nearest.address  # pyright: ignore[reportReturnType]  # None before it is compiled, which it is.
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def cast(
     first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep, vertices, faces,
-    triangle_ids, barycentrics, depths_out,
+    owners, margins, triangle_ids, barycentrics, depths_out,
 ):  # fmt: skip
     """Fill the fragment arrays for tiles of pixels.
 
@@ -247,15 +195,16 @@ def cast(
         keep: sign of the determinants to keep, or 0.
         vertices: (V, 3) of the proxy.
         faces: (T, 3).
+        owners: (M,) of `Covers`.
+        margins: (T,) of `Covers`.
         triangle_ids: (K, H, W) to fill.
         barycentrics: (K, H, W, 2) to fill.
         depths_out: (K, H, W) to fill.
     """
     layers, height, width = triangle_ids.shape
-    slots = layers + 1
     across = (width + TILE - 1) // TILE
-    state, depths = np.empty(HEADER), np.empty(slots)
-    ids, kinds = np.empty(slots, np.int32), np.empty(slots, np.int8)
+    state, depths = np.empty(HEADER), np.empty(layers)
+    ids, sure = np.empty(layers, np.int32), np.empty(layers, np.bool_)
     near_faces = np.empty((layers * TILE * TILE, 3), np.int32)
     near_vertices = np.empty((layers * TILE * TILE * 3, 3), np.float32)
     work = np.empty((8, 4))
@@ -263,12 +212,13 @@ def cast(
     corners = work[5:]
     ray, options = np.zeros(32, np.float32), np.zeros(4, np.intp)
     ray_bits, option_bits = ray.view(np.int32), options.view(np.int32)
-    context = np.zeros(12, np.intp)
+    context = np.zeros(15, np.intp)
     context.view(np.int32)[:4] = -1
-    context[2], context[3], context[4] = state.ctypes.data, slots, depths.ctypes.data
-    context[5], context[6] = ids.ctypes.data, kinds.ctypes.data
+    context[2], context[3], context[4] = state.ctypes.data, layers, depths.ctypes.data
+    context[5], context[6] = ids.ctypes.data, sure.ctypes.data
     context[7], context[8] = vertices.ctypes.data, len(vertices)
     context[9], context[10], context[11] = faces.ctypes.data, len(faces), work.ctypes.data
+    context[12], context[13], context[14] = owners.ctypes.data, len(owners), margins.ctypes.data
     option_bits[0], option_bits[1] = COHERENT | INVOKE_FILTER, -1
     options[1], options[2] = context.ctypes.data, filter_address
     # Rays are read as 16-byte vectors.
@@ -276,7 +226,7 @@ def cast(
     ray, ray_bits = ray[shift : shift + 24], ray_bits[shift : shift + 24]
     radius = object_sphere[3]
     slack = SLACK * radius
-    state[LAYERS], state[KEEP], state[DEPTH_SLACK] = layers, keep, slack
+    state[KEEP], state[DEPTH_SLACK], state[REACH_SLACK] = keep, slack, REACH_SLACK_SHARE * radius
     state[NEAREST], state[FARTHEST] = planes[2] + slack, planes[3] - slack
     for tile in range(first, last):
         top, left = tile // across * TILE, tile % across * TILE
@@ -329,7 +279,7 @@ def cast(
                     n += 1
 
 
-@numba.njit
+@numba.njit(error_model="numpy")
 def _aim(space, sphere, planes, x, y, ray, state):
     """Write the ray through an NDC position, from where it meets the object's sphere; False if it misses.
 

@@ -13,6 +13,7 @@ from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel
 from rts_backends.embree import embreex_fallback, library
+from rts_backends.embree.covers import Covers
 from rts_backends.embree.kernels import TILE, cast, keep_nearest_address
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
@@ -21,28 +22,26 @@ REFITS = 32
 
 
 class Structure:
-    """A proxy and Embree's structure over it, the vertices moved and scaled to the unit sphere."""
+    """A proxy and Embree's structure over covers of its triangles, moved and scaled to the unit sphere."""
 
     def __init__(self, proxy: Proxy):
         self.proxy = _packed(proxy)
-        self._unit = np.zeros((len(proxy.vertices) + 1, 3), np.float32)
-        self._place()
+        self.sphere = bounding_sphere(self.proxy.vertices, self.proxy.faces)
+        self.covers = Covers.of(self.proxy.vertices, self.proxy.faces, self.sphere)
         embree = library if library.load() else embreex_fallback
-        self.scene = embree.Scene(self._unit, self.proxy.faces)
+        self.scene = embree.Scene(self.covers.corners, self.covers.faces)
         self.refits = 0
 
-    def _place(self) -> None:
-        vertices = self.proxy.vertices
-        self.sphere = bounding_sphere(vertices, self.proxy.faces)
-        with np.errstate(over="ignore"):  # Vertices that no triangle refers to may lie however far away.
-            np.divide(vertices - self.sphere[:3], self.sphere[3], out=self._unit[:-1], casting="same_kind")
-
-    def move(self, proxy: Proxy) -> None:
-        """Follow other vertices of the same faces."""
-        self.proxy = _packed(proxy)
-        self._place()
+    def move(self, proxy: Proxy) -> bool:
+        """Follow other vertices of the same faces; False if they need a new structure."""
+        proxy = _packed(proxy)
+        sphere = bounding_sphere(proxy.vertices, proxy.faces)
+        if not self.covers.follow(proxy.vertices, proxy.faces, sphere):
+            return False
+        self.proxy, self.sphere = proxy, sphere
         self.refits = (self.refits + 1) % REFITS
         self.scene.move(rebuild=self.refits == 0)
+        return True
 
 
 class Embree(TriangleSampler):
@@ -52,10 +51,9 @@ class Embree(TriangleSampler):
         """Build the acceleration structure."""
         return Structure(proxy)
 
-    def update(self, prepared: Structure, proxy: Proxy) -> Structure:
+    def update(self, prepared: Structure, proxy: Proxy) -> Structure | None:
         """Refit the structure to moved vertices."""
-        prepared.move(proxy)
-        return prepared
+        return prepared if prepared.move(proxy) else None
 
     def rasterize(
         self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str
@@ -63,7 +61,9 @@ class Embree(TriangleSampler):
         """See `TriangleSampler.rasterize`."""
         scene, planes = prepared.scene, _planes(camera.projection)
         if isinstance(scene, embreex_fallback.Scene):
-            return scene.cast(prepared.proxy, prepared.sphere, planes, camera, size, layers, cull)
+            return scene.cast(
+                prepared.proxy, prepared.covers.owners, prepared.sphere, planes, camera, size, layers, cull
+            )
         height, width = size
         fragments = Fragments(
             np.empty((layers, height, width), np.int32),
@@ -84,6 +84,8 @@ class Embree(TriangleSampler):
             facing(camera, cull),
             prepared.proxy.vertices,
             prepared.proxy.faces,
+            prepared.covers.owners,
+            prepared.covers.margins,
             *fragments,
         )
         return fragments
