@@ -13,6 +13,7 @@ from rts import registry
 from rts.cli.pose_fit import PoseFit, fit_pose, posed, shrunk, silhouette_of
 from rts.cli.pose_report import write_report
 from rts.cli.views import bounds_of, orbit
+from rts.files.paths import writing
 from rts.interfaces import Part
 from rts.operations.rigid import rigid
 from rts.rendering import render
@@ -79,8 +80,9 @@ def run(folder: Path, engine: str | None = None, progress: bool | None = None) -
         "triangles": len(model[0].surface.faces),
         "pixels": list(shrunk(target, 256).shape),
     }
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
-    (folder / "summary.md").write_text(_markdown(summary, files))
+    with writing(folder / "summary.json"):
+        (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+        (folder / "summary.md").write_text(_markdown(summary, files))
     return found, [*files, folder / "summary.json", folder / "summary.md"]
 
 

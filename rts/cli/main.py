@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -47,7 +48,7 @@ class _Group(TyperGroup):
             return super().parse_args(ctx, args or ["--help"])
 
     def invoke(self, ctx: Any) -> Any:
-        with _one_line(ctx):
+        with _one_line(ctx), _warnings_in_a_line():
             return super().invoke(ctx)
 
 
@@ -62,10 +63,26 @@ def _one_line(ctx: Any) -> Iterator[None]:
         _fail(error, f"{error.format_message().rstrip('.')}; try '{help_}'", 2)
     except BrokenPipeError:  # The reader of our output has gone; click knows what to do.
         raise
-    except (RtsError, OSError) as error:
+    except (RtsError, OSError, MemoryError) as error:
         if ctx.params.get("debug"):
             raise
-        _fail(error, str(error), 1)
+        _fail(error, str(error) or "there is not enough memory; choose a smaller size", 1)
+
+
+@contextlib.contextmanager
+def _warnings_in_a_line() -> Iterator[None]:
+    """Show each warning once, as a line on standard error, without the line of code that it came from."""
+    shown: set[str] = set()
+
+    def show(message: Warning | str, category: type, *_: Any) -> None:
+        text = " ".join(str(message).split())
+        if text not in shown:
+            shown.add(text)
+            typer.echo(f"rts: warning: {text}", err=True)
+
+    with warnings.catch_warnings():
+        warnings.showwarning = show
+        yield
 
 
 def _fail(error: Exception, message: str, code: int) -> None:
@@ -86,7 +103,7 @@ def main() -> None:
     """The entry point `rts`."""
     # Idle threads of OpenMP, which torch and numba both use, would spin and take the processor from others.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    app()
+    app(prog_name="rts")
 
 
 def _say(text: str) -> None:
@@ -279,9 +296,11 @@ def fit_pose(
     chosen = None if engine == "auto" else engine
     found = fit(parts, mask, seen, bounds, engine=chosen, method=method, steps=steps)
     files = write_report(output, found, parts, seen, mask)
+    several = len(found.levels) > 1
     _say(
-        f"loss {found.history[0]:.3g} → {found.loss:.3g} in {len(found.history)} steps, "
-        f"{found.seconds:.1f} s ({found.reason}); wrote"
+        f"loss {found.history[0]:.3g} → {found.loss:.3g} in {len(found.history)} steps"
+        f"{f', {_sum(found.levels)} from coarse pixels to fine' if several else ''}, "
+        f"{found.seconds:.1f} s ({'at the finest, ' if several else ''}{found.reason}); wrote"
     )
     _say_written(files)
     _say_skipped_plot(files)
@@ -301,6 +320,10 @@ def demo(
     _say(f"pose found in {len(found.history)} steps, {found.seconds:.1f} s; wrote")
     _say_written(files)
     _say_skipped_plot(files)
+
+
+def _sum(counts: list[int]) -> str:
+    return " + ".join(map(str, counts))
 
 
 def _say_skipped_plot(files: list[Path]) -> None:

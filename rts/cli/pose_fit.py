@@ -38,8 +38,9 @@ class PoseFit(NamedTuple):
         trail: the best matrix so far, at each step.
         history: the loss at each step: mean square of the difference of silhouettes, at that step's
             resolution.
+        levels: how many steps were made at each resolution, from coarse to fine.
         loss: the lowest loss at full resolution.
-        reason: why it stopped.
+        reason: why it stopped there.
         seconds: wall time.
     """
 
@@ -49,6 +50,7 @@ class PoseFit(NamedTuple):
     matrix: np.ndarray
     trail: list[np.ndarray]
     history: list[float]
+    levels: list[int]
     loss: float
     reason: str
     seconds: float
@@ -142,7 +144,10 @@ def fit_pose(
     matrix = _matrix(found, bounds)
     trail.append(matrix)
     history = sum(levels, [])
-    return PoseFit(found[:3], found[3:], bounds.center, matrix, trail, history, result.loss, result.reason, seconds)
+    counts = [len(level) for level in levels]
+    return PoseFit(
+        found[:3], found[3:], bounds.center, matrix, trail, history, counts, result.loss, result.reason, seconds
+    )
 
 
 def _engine(name: str) -> Engine:

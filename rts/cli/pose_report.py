@@ -12,6 +12,7 @@ import numpy as np
 from rts.camera import Camera
 from rts.cli.pose_fit import LARGEST_SIDE, PoseFit, posed, shrunk
 from rts.files.images import save_animation, save_image
+from rts.files.paths import writing
 from rts.interfaces import Part
 from rts.rendering import render
 
@@ -41,9 +42,13 @@ def write_report(
 
     Returns:
         The files written.
+
+    Raises:
+        InputError: a file cannot be written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / "pose.json").write_text(json.dumps(_numbers(found), indent=2) + "\n")
+    with writing(folder / "pose.json"):
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "pose.json").write_text(json.dumps(_numbers(found), indent=2) + "\n")
     large, small = shrunk(target, PICTURE_SIDE), shrunk(target, LARGEST_SIDE)
 
     def picture(matrix: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -97,5 +102,6 @@ def _plot(path: Path, history: list[float]) -> list[Path]:
     axes.semilogy(np.maximum(history, 1e-12), ".-", color="#c2410c", linewidth=1, markersize=4)
     axes.set(xlabel="step", ylabel="mean square difference", title="Silhouette, from coarse pixels to fine")
     axes.grid(alpha=0.3)
-    figure.savefig(path, dpi=120)
+    with writing(path):
+        figure.savefig(path, dpi=120)
     return [path]

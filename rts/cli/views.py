@@ -15,6 +15,9 @@ from rts.interfaces import Part
 MARGIN = 1.05
 """Radius of what the default view shows, over the radius of the object."""
 
+FARTHEST = 1e9
+"""Distance of a camera over the radius of the object beyond which float32 cannot tell the object from a point."""
+
 
 class Bounds(NamedTuple):
     """A sphere around a scene, world space.
@@ -62,6 +65,10 @@ def orbit(
         distance: the camera's distance from the centre; by default the whole object is seen.
         fov: vertical field of view, degrees.
         up: "y" or "z", the axis that is upright.
+
+    Raises:
+        InputError: `up` is another axis; an angle is not finite or out of its range; the distance is not positive, or
+            more than a milliard times the radius of the object, or less than a milliardth.
     """
     if up not in ("y", "z"):
         raise InputError(f'up is {up!r}; expected "y" or "z"')
@@ -75,6 +82,11 @@ def orbit(
         distance = MARGIN * bounds.radius / math.sin(narrower)
     if not (math.isfinite(distance) and distance > 0):
         raise InputError(f"the camera's distance is {distance}; expected a positive number")
+    if not 1 / FARTHEST < distance / bounds.radius < FARTHEST:
+        raise InputError(
+            f"the camera's distance is {distance:g}, and the object's radius {bounds.radius:g}; expected at most "
+            f"{FARTHEST:g} times as much or as little: give another distance, or a wider field of view"
+        )
     a, e = math.radians(azimuth), math.radians(elevation)
     back = np.array([math.cos(e) * math.sin(a), math.sin(e), math.cos(e) * math.cos(a)])
     # Perpendicular to `back` at every elevation, the poles included.

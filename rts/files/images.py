@@ -5,15 +5,19 @@ Inside the library colours are linear and images premultiplied; files hold sRGB 
 
 from __future__ import annotations
 
+import math
+import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rts.checks import MEMORY, is_real
 from rts.engines import engine_of
-from rts.errors import InputError, PluginError
-from rts.files.paths import as_path, output_file
+from rts.errors import EngineError, InputError, PluginError
+from rts.files.damage import FileWarning, gathered
+from rts.files.paths import as_path, output_file, writing
 from rts.files.srgb import decode_srgb, encode_srgb
 from rts.trees import Array
 
@@ -27,26 +31,39 @@ def save_image(path: Any, image: Array) -> None:
             clipped.
 
     Raises:
-        InputError: another shape, integers, NaN or infinity, another extension, or a path that cannot be.
+        InputError: no array, another shape, integers, NaN or infinity, more than fits into memory, another extension,
+            or a path that cannot be or may not be written to.
     """
     from PIL import Image
 
     path = output_file(path, "picture", (".png",))
-    encoded = _bytes(image)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(encoded).save(path)
+    encoded = _bytes(_host(image, "the image"))
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(encoded).save(path)
 
 
 def load_image(path: Any) -> np.ndarray:
     """(H, W, 4) float32 premultiplied linear RGBA of a picture of any kind that Pillow reads.
 
+    Of several frames it is the first.
+
     Raises:
-        InputError: there is no such file, or it cannot be read as a picture.
+        InputError: there is no such file, it cannot be read as a picture, or holds floating-point numbers, whose
+            range is not known.
+
+    Warns:
+        UserWarning: Pillow found something wrong with it.
     """
     path = as_path(path)
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; expected a picture")
     if not path.is_file():
         raise InputError(f"there is no picture {path}; check the path (relative paths start at {Path.cwd()})")
-    encoded = read_image(path)
+    with gathered(path) as notes:
+        encoded = read_image(path)
+    for note in notes:
+        warnings.warn(note, FileWarning, stacklevel=2)
     straight = decode_srgb(encoded)
     alpha = straight[..., 3:] if straight.shape[2] == 4 else np.ones_like(straight[..., :1])
     return np.concatenate([straight[..., :3] * alpha, alpha], axis=2)
@@ -58,30 +75,66 @@ def save_animation(path: Any, frames: Iterable[Array], fps: float = 20.0) -> Non
     Args:
         path: a name with one of these extensions; folders that do not exist are made.
         frames: images as for `save_image`, all of one size; transparent ones are put on white.
-        fps: frames a second.
+        fps: frames a second. A .gif counts in hundredths of a second, a .png in thousandths: the nearest is taken.
 
     Raises:
-        InputError: no frames, a wrong or changing shape, NaN or infinity, another extension, or a path that cannot be.
+        InputError: no frames, or one image instead of several; what is no image, a wrong or changing shape, NaN or
+            infinity; fps that are no positive number, or that the format cannot hold; another extension, or a path
+            that cannot be or may not be written to.
         PluginError: .mp4 without imageio-ffmpeg.
     """
     from PIL import Image
 
     path = output_file(path, "animation", (".gif", ".png", ".mp4"))
     kind = path.suffix.lower()
-    if not (np.isfinite(fps) and fps > 0):
-        raise InputError(f"fps is {fps}; expected a positive number of frames a second")
-    pictures = [_bytes(_on_white(_host(frame))) for frame in frames]
+    if not (is_real(fps) and np.isfinite(fps) and fps > 0):
+        raise InputError(f"fps is {_shown(fps)}; expected a positive number of frames a second")
+    duration = _duration(kind, float(fps))
+    pictures = [_bytes(_on_white(_host(f, f"frame {i}"))) for i, f in enumerate(_each(frames))]
     if not pictures or len({p.shape for p in pictures}) > 1:
         shapes = ", ".join(sorted({str(p.shape) for p in pictures})) or "nothing"
         raise InputError(f"the frames are {shapes}; expected at least one, and all of one shape")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if kind == ".mp4":
-        _write_mp4(path, pictures, fps)
-        return
-    images = [Image.fromarray(p) for p in pictures]
-    if kind == ".gif":
-        images = [i.convert("RGB").quantize(256, dither=Image.Dither.NONE) for i in images]
-    images[0].save(path, save_all=True, append_images=images[1:], duration=1000 / fps, loop=0)
+    if kind == ".gif" and max(pictures[0].shape[:2]) > 65535:
+        raise InputError(f"the frames are {pictures[0].shape}; expected at most 65535 pixels a side in a .gif")
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if kind == ".mp4":
+            _write_mp4(path, pictures, float(fps))
+            return
+        images = [Image.fromarray(p) for p in pictures]
+        if kind == ".gif":
+            images = [i.convert("RGB").quantize(256, dither=Image.Dither.NONE) for i in images]
+        images[0].save(path, save_all=True, append_images=images[1:], duration=duration, loop=0)
+
+
+def _duration(kind: str, fps: float) -> int:
+    """Milliseconds of a frame, as the format holds them."""
+    step = {".gif": 10, ".png": 1}.get(kind)
+    if step is None:
+        return 0
+    duration = round(1000 / fps / step) if 1000 / fps < 1e9 else 2**31
+    if not 1 <= duration <= 65535:
+        raise InputError(
+            f"fps is {fps:g}, and a {kind} holds from {1000 / step / 65535:.2g} to {1000 // step} frames a second; "
+            "choose others, or leave frames out"
+        )
+    return duration * step
+
+
+def _each(frames: Any) -> Iterable[Any]:
+    """The frames; refused where they are none, or one image."""
+    shape = tuple(getattr(frames, "shape", ()))
+    one = len(shape) in (1, 2) or (len(shape) == 3 and shape[2] in (1, 3, 4))
+    if one or isinstance(frames, (str, bytes, dict)) or not isinstance(frames, Iterable):
+        given = f"one image, {shape}" if one else f"a {type(frames).__name__}"
+        raise InputError(f"frames is {given}; expected several images, such as a list of arrays (H, W, 4)")
+    return frames
+
+
+def _shown(value: Any) -> str:
+    """One short line of a value."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
@@ -99,27 +152,40 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
     imageio.mimwrite(path, even, fps=fps, macro_block_size=2)  # pyright: ignore[reportCallIssue]
 
 
-def _host(image: Array) -> np.ndarray:
+def _host(image: Any, name: str) -> np.ndarray:
     """A checked image as NumPy floats, (H, W, 3 or 4) or (H, W)."""
-    array = np.asarray(engine_of(image).to_numpy(image))
+    shapes = "(H, W, 4), (H, W, 3), (H, W, 1) or (H, W)"
+    if not hasattr(image, "shape"):
+        raise InputError(f"{name} is {_shown(image)}, a {type(image).__name__}; expected an array {shapes}")
+    try:
+        engine = engine_of(image)
+    except EngineError as error:
+        raise InputError(
+            f"{name} is a {type(image).__name__}; expected an array {shapes} of NumPy, torch or jax"
+        ) from error
+    shape = tuple(image.shape)
+    if len(shape) not in (2, 3) or 0 in shape or (len(shape) == 3 and shape[2] not in (1, 3, 4)):
+        raise InputError(f"{name} has shape {shape}; expected {shapes}")
+    if 100 * math.prod(shape) > MEMORY:  # A few copies in float64.
+        raise InputError(f"{name} has shape {shape}, which does not fit into memory; write it in pieces")
+    array = np.asarray(engine.to_numpy(image))
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[..., 0]
-    if array.ndim not in (2, 3) or array.size == 0 or (array.ndim == 3 and array.shape[2] not in (3, 4)):
-        raise InputError(f"the image has shape {array.shape}; expected (H, W, 4), (H, W, 3), (H, W, 1) or (H, W)")
     if not np.issubdtype(array.dtype, np.floating):
-        raise InputError(f"the image has dtype {array.dtype}; expected linear floats in [0, 1]")
+        raise InputError(f"{name} has dtype {array.dtype}; expected linear floats in [0, 1]")
     wrong = array.size - int(np.isfinite(array).sum())
     if wrong:
-        raise InputError(f"{wrong} of the image's {array.size} values are NaN or infinite; check what made it")
+        raise InputError(f"{wrong} of {name}'s {array.size} values are NaN or infinite; check what made it")
     return array
 
 
-def _bytes(image: Array) -> np.ndarray:
+def _bytes(image: np.ndarray) -> np.ndarray:
     """8-bit sRGB with straight alpha of a premultiplied linear image."""
-    array = _host(image).astype(np.float64)
+    array = image.astype(np.float64)
     if array.ndim == 3 and array.shape[2] == 4:
         alpha = np.clip(array[..., 3:], 0, 1)
-        straight = np.divide(array[..., :3], alpha, out=np.zeros_like(array[..., :3]), where=alpha > 0)
+        with np.errstate(over="ignore"):  # What is infinite is clipped.
+            straight = np.divide(array[..., :3], alpha, out=np.zeros_like(array[..., :3]), where=alpha > 0)
         array = np.concatenate([encode_srgb(np.clip(straight, 0, 1)), alpha], axis=2)
     else:
         array = encode_srgb(np.clip(array, 0, 1))
@@ -127,7 +193,9 @@ def _bytes(image: Array) -> np.ndarray:
 
 
 def _on_white(image: np.ndarray) -> np.ndarray:
-    return image[..., :3] + (1 - image[..., 3:]) if image.ndim == 3 and image.shape[2] == 4 else image
+    if image.ndim == 2 or image.shape[2] == 3:
+        return image
+    return np.clip(image[..., :3], -1e30, 1e30) + (1 - np.clip(image[..., 3:], 0, 1))
 
 
 def read_texture(path: Path, referrer: Path) -> np.ndarray:
@@ -147,12 +215,17 @@ def read_image(path: Path) -> np.ndarray:
     try:
         with Image.open(path) as image:
             return pixels(image)
+    except InputError as error:
+        raise InputError(f"{path} {error}") from None
     except Exception as error:  # Pillow's decoders raise many kinds, SyntaxError and struct.error among them.
-        raise InputError(f"{path} cannot be read as an image ({error}); export it again, as PNG for example") from error
+        said = " ".join(str(error).split())
+        raise InputError(f"{path} cannot be read as an image ({said}); export it again, as PNG for example") from error
 
 
 def pixels(image: Any) -> np.ndarray:
     """(h, w, 3) float32 in [0, 1] of a Pillow image as encoded, (h, w, 4) where some alpha is below one."""
+    if image.mode == "F":
+        raise InputError("holds floating-point numbers, whose range is not known; export it again, as PNG for example")
     if image.mode.startswith("I"):  # 16 bits of grey, which Pillow would clip to 8.
         grey = np.asarray(image, np.float32) / 65535
         return np.repeat(np.clip(grey, 0, 1)[..., None], 3, axis=2)

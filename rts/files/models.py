@@ -6,6 +6,7 @@ what a `Mesh` takes; every other format goes through trimesh.
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from rts import registry
 from rts.errors import InputError
+from rts.files.damage import FileWarning, gathered
 from rts.files.obj_reader import read_obj
 from rts.files.paths import as_path
 from rts.files.pieces import Piece, check_piece
@@ -30,8 +32,13 @@ def load(path: Any, *, merge: bool = False, weld: bool = True) -> list[Part]:
     the order of the file; those that no face refers to are left out, and those that coincide exactly are
     welded: where uv or normals differ between the faces around a vertex they have an index table of their
     own, so that moving vertices opens no seams. Normals of the file do not follow moving vertices: drop them
-    from θ, and smooth ones are computed that do. Polygons are cut into triangles. The shader is `textured`
-    where there are uv and a texture, else `lambert`.
+    from θ, and smooth ones are computed that do. The shader is `textured` where there are uv and a texture, else
+    `lambert`.
+
+    Polygons of n corners are cut into n − 2 triangles: convex ones into the fan about their first corner, concave
+    ones so that the triangles do not overlap. A material of an OBJ is as opaque as `d` says, and where that is
+    missing as 1 − `Tr`; but where `Tr` is 1 or more, or the comments of the MTL say that MeshLab wrote it, `Tr` is
+    taken for `d`, as MeshLab does. So `Tr 1` is opaque, and `d 0` transparent.
 
     So the number of vertices may be less than the file's. For data of your own, one row for each vertex of the
     file, load with `weld=False`.
@@ -43,14 +50,25 @@ def load(path: Any, *, merge: bool = False, weld: bool = True) -> list[Part]:
             their number and order. (All parts of an OBJ share one table of vertices; each then holds all of it.)
 
     Raises:
-        InputError: the file is missing, damaged, of unknown kind, empty, or refers to what is missing or
-            elsewhere.
+        InputError: the file is missing, damaged, of unknown kind, empty, holds other than it promises, or refers to
+            what is missing or elsewhere; something in it is not finite or too large for float32, colours as linear
+            ones included; or `merge` or `weld` is neither True nor False.
+
+    Warns:
+        UserWarning: something was left out or guessed, such as a library of materials that is not there.
     """
     path = as_path(path)
-    pieces = [_linear(piece) for piece in read_pieces(path)]
-    if merge and (len(pieces) > 1 or pieces[0].transform is not None):
-        pieces = [_merged(path, pieces)]
-    return [_part(piece, weld) for piece in pieces]
+    for name, flag in (("merge", merge), ("weld", weld)):
+        if not isinstance(flag, (bool, np.bool_)):
+            raise InputError(f"{name} is {' '.join(repr(flag).split())[:60]}; expected True or False")
+    with gathered(path) as notes, np.errstate(over="ignore", invalid="ignore"):  # What overflows is refused by name.
+        pieces = [_linear(piece) for piece in read_pieces(path)]
+        if merge and (len(pieces) > 1 or pieces[0].transform is not None):
+            pieces = [_merged(path, pieces)]
+        parts = [_part(path, piece, weld) for piece in pieces]
+    for note in notes:
+        warnings.warn(note, FileWarning, stacklevel=2)
+    return parts
 
 
 def _linear(piece: Piece) -> Piece:
@@ -65,7 +83,7 @@ def _linear(piece: Piece) -> Piece:
     return piece._replace(attributes=attributes, color=color, texture=texture)
 
 
-def _part(piece: Piece, weld: bool) -> Part:
+def _part(path: Path, piece: Piece, weld: bool) -> Part:
     vertices, faces = piece.vertices.astype(np.float32), piece.faces
     if weld:
         rows, faces = _used(vertices, faces)
@@ -81,6 +99,15 @@ def _part(piece: Piece, weld: bool) -> Part:
         theta["texture"] = piece.texture.astype(np.float32)
     if piece.color is not None and (piece.color < 1).any():
         theta["color"] = piece.color[: 3 if (piece.color[3:] >= 1).all() else 4].astype(np.float32)
+    for name, values in theta.items():
+        wrong = np.flatnonzero(~np.isfinite(values))
+        if len(wrong):
+            first = int(wrong[0]) // (values.shape[-1] if values.ndim > 1 else values.size)
+            what = "linear " if name in ("colors", "color", "texture") else ""
+            raise InputError(
+                f"{path}: row {first} of {name}, as {what}float32, is NaN or infinite; expected smaller numbers: "
+                "repair the file"
+            )
     translucent = any(
         name in theta and theta[name].shape[-1] == 4 for name in ("color", "texture" if textured else "colors")
     )

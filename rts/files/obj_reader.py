@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.errors import InputError
+from rts.files import polygons
+from rts.files.damage import contents, warn
 from rts.files.images import read_texture
 from rts.files.paths import inside
 from rts.files.pieces import Piece
@@ -18,6 +19,8 @@ from rts.files.pieces import Piece
 # Options of a map statement, such as "-s 2 2 1 -clamp on"; the rest is the file's name, spaces and all.
 _VALUE = r"(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?[\d.][-+.\deE]*)"
 _MAP_OPTIONS = re.compile(rf"^(?:-[a-z]+\s+(?:{_VALUE}\s+)*)+", re.IGNORECASE)
+_MESHLAB = re.compile(r"^\s*#.*(?:meshlab|vcglib)", re.IGNORECASE | re.MULTILINE)
+"""A comment by which MeshLab signs; its Tr is 1 for what is opaque."""
 _MAPS = ("map_", "bump", "disp", "decal", "refl", "norm")
 
 
@@ -25,7 +28,8 @@ class Material(NamedTuple):
     """What is used of an MTL material.
 
     Attributes:
-        color: (3,) Kd, sRGB, or (4,) where d or Tr make it translucent; None where there is no Kd.
+        color: (3,) Kd, sRGB, or (4,) where d or Tr make it translucent; None where there is no Kd. Without d, alpha is
+            1 − Tr, unless Tr is at least 1 or MeshLab wrote the file: then Tr is what others call d.
         texture: file of map_Kd, or None. It replaces Kd.
     """
 
@@ -115,27 +119,28 @@ class _Lines:
                     raise self.fail(number, f"{' '.join(row)!r} are not numbers") from None
             raise
 
-    def triangles(self, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+    def triangles(self, points: np.ndarray, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Zero-based indices of position, uv and normal (T, 3 corners, 3), and the material (T,).
 
-        An index that is not given is −1. Polygons become fans.
+        An index that is not given is −1. See `rts.files.polygons.cut`; `points` are the positions (V, 3).
         """
         corners: list[tuple[int, ...]] = []
-        materials: list[int] = []
+        sizes: list[int] = []
         known: dict[str, tuple[int, ...]] = {}
-        for number, rest, material in self.faces:
+        for number, rest, _ in self.faces:
             tokens = rest.split()
             if len(tokens) < 3:
                 raise self.fail(number, f"a face has {len(tokens)} corners; expected at least 3")
-            polygon = []
             for token in tokens:
                 if token not in known:
                     known[token] = self._corner(token, number, counts)
-                polygon.append(known[token])
-            for second, third in zip(polygon[1:], polygon[2:], strict=False):
-                corners += (polygon[0], second, third)
-                materials.append(material)
-        return np.array(corners, np.int64).reshape(-1, 3, 3), np.array(materials, np.int64)
+                corners.append(known[token])
+            sizes.append(len(tokens))
+        table = np.array(corners, np.int64)
+        cut, owner, forced = polygons.cut(points, table[:, 0], np.array(sizes))
+        if forced:
+            warn(f"{self.path}: {forced} polygons cross themselves and may be cut wrongly; export triangles to be sure")
+        return table[cut], np.array([material for _, _, material in self.faces], np.int64)[owner]
 
     def _corner(self, token: str, number: int, counts: tuple[int, int, int]) -> tuple[int, ...]:
         indices = []
@@ -166,9 +171,9 @@ def read_obj(path: Path) -> list[Piece]:
     if not lines.faces:
         what = f"{len(v)} vertices but no faces" if len(v) else "neither vertices nor faces"
         raise InputError(f"{path} holds {what}; expected a mesh with triangles or polygons")
-    corners, owner = lines.triangles((len(v), len(vt), len(vn)))
     # One array, shared by all pieces, so that merging need not repeat it.
     vertices = v[:, :3]
+    corners, owner = lines.triangles(vertices, (len(v), len(vt), len(vn)))
     pieces = []
     for name, index in lines.materials.items():
         if index not in used:
@@ -189,23 +194,31 @@ def read_obj(path: Path) -> list[Piece]:
 def _materials(lines: _Lines) -> dict[str | None, Material]:
     """The materials of all libraries by name."""
     found: dict[str | None, Material] = {}
+    complete = True
     for name in lines.libraries:
         library = inside(lines.path.parent, name, lines.path)
         if library.is_file():
             found.update(_read_mtl(library, lines.path.parent))
         else:
-            warnings.warn(
+            warn(
                 f"{lines.path} names the material library {name!r}, but there is no file {library}; it is "
-                "loaded without materials",
-                stacklevel=2,
+                "loaded without materials"
             )
+            complete = False
+    used = {index for _, _, index in lines.faces}
+    missing = [name for name, index in lines.materials.items() if name and index in used and name not in found]
+    if missing and complete and lines.libraries:
+        names = ", ".join(map(repr, missing[:5]))
+        warn(f"{lines.path} uses materials that its libraries lack: {names}; they are loaded as plain ones")
     return found
 
 
 def _read_mtl(library: Path, folder: Path) -> dict[str, Material]:
     found: dict[str, dict[str, Any]] = {}
     current: dict[str, Any] = {}
-    for number, line in enumerate(_text(library).splitlines(), start=1):
+    text = _text(library)
+    of_meshlab = _MESHLAB.search(text) is not None
+    for number, line in enumerate(text.splitlines(), start=1):
         key, _, rest = line.replace("\t", " ").strip().partition(" ")
         key, rest = key.lower(), rest.strip()
         values = _numbers(library, number, rest) if key in ("kd", "d", "tr") else []
@@ -216,7 +229,7 @@ def _read_mtl(library: Path, folder: Path) -> dict[str, Material]:
         elif key == "d" and len(values) == 1:
             current["alpha"] = values[0]
         elif key == "tr" and len(values) == 1:
-            current.setdefault("alpha", 1 - values[0])
+            current.setdefault("alpha", values[0] if of_meshlab or values[0] >= 1 else 1 - values[0])
         elif key.startswith(_MAPS) and rest:
             file = inside(folder, _MAP_OPTIONS.sub("", rest), library)
             if key == "map_kd":
@@ -251,7 +264,7 @@ def _statements(text: str) -> Iterator[tuple[int, str]]:
 
 def _text(path: Path) -> str:
     """The text of a file, without the mark of its encoding that some editors put first."""
-    return path.read_bytes().decode("utf-8-sig", errors="replace")
+    return contents(path).decode("utf-8-sig", errors="replace")
 
 
 def _material(values: dict[str, Any]) -> Material:

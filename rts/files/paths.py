@@ -6,7 +6,12 @@ model from elsewhere cannot read the rest of the disk.
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
+import struct
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path, PureWindowsPath
 from typing import Any
 
@@ -14,18 +19,28 @@ from rts.errors import InputError
 
 
 def as_path(path: Any) -> Path:
-    """A path from a string or path object."""
+    """A path from a string or path object; an InputError where no file can have that name."""
     try:
-        return Path(os.fspath(path))
+        found = Path(os.fspath(path))
     except TypeError:
         raise InputError(f"the path is a {type(path).__name__}; expected a string or pathlib.Path") from None
+    try:
+        found.lstat()
+    except ValueError:
+        raise InputError(f"the path is {str(path)[:60]!r}, which no file can be called; choose another name") from None
+    except OSError as error:
+        if error.errno in (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL):
+            shown = str(path) if len(str(path)) <= 60 else f"{str(path)[:57]}..."
+            raise InputError(f"the path {shown!r} is no good ({error.strerror}); choose another name") from None
+    return found
 
 
 def output_file(path: Any, what: str, extensions: tuple[str, ...]) -> Path:
     """The path of a file to write.
 
     Raises:
-        InputError: another extension, a folder of that name, or a file where a folder ought to be.
+        InputError: another extension, a folder of that name, a file where a folder ought to be, or no permission to
+            write there.
     """
     path = as_path(path)
     if path.suffix.lower() not in extensions:
@@ -33,17 +48,37 @@ def output_file(path: Any, what: str, extensions: tuple[str, ...]) -> Path:
         raise InputError(f"the {what} is to be called {path.name!r}; expected a name ending in {expected}")
     if path.is_dir():
         raise InputError(f"{path} is a folder; expected the name of a file to write")
-    output_folder(path.parent)
+    if not path.exists():
+        output_folder(path.parent)
+    elif not os.access(path, os.W_OK):
+        raise InputError(
+            f"{path} cannot be written (Permission denied); change its permissions, or choose another name"
+        )
     return path
 
 
 def output_folder(path: Any) -> Path:
-    """The path of a folder to write into, which need not exist; an InputError where it cannot be made."""
+    """The path of a folder to write into, which need not exist; an InputError where it cannot be made or written to."""
     path = as_path(path)
-    existing = next((p for p in (path, *path.parents) if p.exists()), path)
-    if existing.exists() and not existing.is_dir():
+    existing = next(p for p in (path, *path.parents, Path(".")) if os.path.lexists(p))
+    if not existing.is_dir():
         raise InputError(f"{existing} is a file; expected a folder to write into")
+    try:  # Permissions do not tell everything, of file systems that are read only for example.
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise InputError(f"nothing can be written into {existing} ({error.strerror}); choose another folder") from error
     return path
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turns what goes wrong while a file is written, or the folders above it, into an InputError of one line."""
+    try:
+        yield
+    except (OSError, MemoryError, struct.error, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        raise InputError(f"{path} cannot be written ({reason}); choose another name or folder") from error
 
 
 def inside(folder: Path, name: str, referrer: Path) -> Path:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import io
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote
@@ -10,9 +10,13 @@ from urllib.parse import unquote
 import numpy as np
 
 from rts.errors import InputError
+from rts.files.damage import contents, unreadable
+from rts.files.gltf_checks import sound_glb, sound_gltf
 from rts.files.images import pixels
+from rts.files.off_and_stl import plain_off, sound_stl
 from rts.files.paths import inside
 from rts.files.pieces import Piece
+from rts.files.ply_tables import plain_ply
 
 LINEAR_COLORS = {"glb", "gltf"}
 """Formats whose vertex and material colours are linear already; their textures are sRGB like all others."""
@@ -32,7 +36,7 @@ class _Folder:
                 target = inside(self.path.parent, unquote(name.strip()), self.path)
             if not target.is_file():
                 raise InputError(f"{self.path} refers to {name!r}, but there is no file {target}; put it there")
-            return target.read_bytes()
+            return contents(target)
         except InputError as problem:
             self.problem = self.problem or problem
             raise
@@ -52,24 +56,22 @@ def read_with_trimesh(path: Path, extension: str) -> list[Piece]:
             f"gltf, off or another of trimesh's: {others}"
         )
     folder: Any = _Folder(path)
+    kind = extension.upper()
     try:
-        if extension == "gltf":
-            json.loads(path.read_bytes())  # All that trimesh says of a damaged file is that it found no "model.gltf".
-        with open(path, "rb") as file:
-            scene: Any = trimesh.load(file, file_type=extension, resolver=folder, force="scene", process=False)
+        form, data = _checked(path, extension, contents(path), folder)
+        scene: Any = trimesh.load(io.BytesIO(data), file_type=form, resolver=folder, force="scene", process=False)
         pieces = _pieces(scene, trimesh.Trimesh, extension in LINEAR_COLORS)
     except InputError:
         raise
     except Exception as error:
-        kind, again = extension.upper(), "the file may be cut short or of another format: export it again"
         if isinstance(error, ModuleNotFoundError) and isinstance(error.__context__, UnicodeDecodeError):
             # trimesh takes anything but a sound binary file for text, and guesses its encoding with another package.
             raise InputError(
-                f"{path} is not a valid {kind} file, neither as binary nor as text; {again}"
+                f"{path} is not a valid {kind} file, neither as binary nor as text; the file may be cut short or of "
+                "another format: export it again"
             ) from error.__context__
-        raise folder.problem or InputError(
-            f"{path} cannot be read as {kind} ({type(error).__name__}: {error}); {again}"
-        ) from error
+        said = " ".join(f"{type(error).__name__}: {error}".split())
+        raise folder.problem or unreadable(path, kind, said) from error
     if folder.problem:
         raise folder.problem
     if not pieces:
@@ -77,6 +79,22 @@ def read_with_trimesh(path: Path, extension: str) -> list[Piece]:
         what = f"{points} points but no faces" if points else "no geometry"
         raise InputError(f"{path} holds {what}; expected a mesh with triangles or polygons")
     return pieces
+
+
+def _checked(path: Path, extension: str, data: bytes, folder: _Folder) -> tuple[str, bytes]:
+    """The format and the bytes that trimesh is to read, once what the file promises has been found to be there."""
+    match extension:
+        case "ply":
+            return "ply", plain_ply(path, data)
+        case "off":
+            return "ply", plain_off(path, data)
+        case "stl" | "stl_ascii":
+            return "stl", sound_stl(path, data)
+        case "glb":
+            return "glb", sound_glb(path, data, folder.get)
+        case "gltf":
+            return "gltf", sound_gltf(path, data, folder.get)
+    return extension, data
 
 
 def _pieces(scene: Any, mesh_type: type, linear: bool) -> list[Piece]:

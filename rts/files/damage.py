@@ -1,0 +1,87 @@
+"""What is said of files that are damaged, and warnings of a file gathered while it is read."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+from rts.errors import InputError
+
+_ONE_AT_A_TIME = threading.RLock()  # Filters of warnings belong to the whole process.
+
+
+class FileWarning(UserWarning):
+    """Something about a file that its user ought to know; the message names the file."""
+
+
+def unreadable(path: Path, kind: str, what: str) -> InputError:
+    """The error of a file that is not what its name says, or is damaged."""
+    return InputError(
+        f"{path} cannot be read as {kind} ({what}); the file may be cut short or of another format: export it again"
+    )
+
+
+def contents(path: Path) -> bytes:
+    """The bytes of a file; an InputError where it cannot be read."""
+    try:
+        return path.read_bytes()
+    except (OSError, MemoryError) as error:
+        reason = getattr(error, "strerror", None) or "it does not fit into memory"
+        raise InputError(f"{path} cannot be read ({reason}); check the file and who may read it") from error
+
+
+@contextlib.contextmanager
+def gathered(path: Path) -> Iterator[list[str]]:
+    """A list that has, once the block is left, one line for each thing that was warned of in it.
+
+    Other libraries warn in their own ways, and some only log: what they say is caught, and led back to the file.
+
+    Raises:
+        InputError: NumPy came upon text among numbers.
+    """
+    lines: list[str] = []
+    handler = _Lines(path, lines)
+    logger = logging.getLogger("trimesh")
+    with _ONE_AT_A_TIME:
+        propagated, logger.propagate = logger.propagate, False
+        logger.addHandler(handler)
+        try:
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                yield lines
+        finally:
+            logger.removeHandler(handler)
+            logger.propagate = propagated
+    for warning in caught:
+        text = " ".join(str(warning.message).split())
+        if "unmatched data" in text:
+            raise unreadable(path, path.suffix[1:].upper(), "there is text where numbers ought to be")
+        if issubclass(warning.category, FileWarning):
+            lines.append(text)
+        elif not issubclass(warning.category, (DeprecationWarning, PendingDeprecationWarning, ResourceWarning)):
+            lines.append(f"{path}: {text}; check what was loaded")
+    lines[:] = dict.fromkeys(lines)
+
+
+class _Lines(logging.Handler):
+    """Notes what is logged as a warning, or worse, with the error that led to it."""
+
+    def __init__(self, path: Path, lines: list[str]):
+        super().__init__(logging.WARNING)
+        self.path, self.lines = path, lines
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Add a line."""
+        error = record.exc_info[1] if record.exc_info else None
+        reason = f" ({type(error).__name__}: {error})" if error is not None else ""
+        text = " ".join(f"{record.getMessage()}{reason}".split())
+        self.lines.append(f"{self.path}: {text}; check what was loaded")
+
+
+def warn(text: str) -> None:
+    """Warn of a file; inside `gathered`, from which the warning comes to the user."""
+    warnings.warn(text, FileWarning, stacklevel=3)

@@ -1,0 +1,147 @@
+"""OFF and STL files checked before trimesh reads them, which takes what is there for what is promised."""
+
+from __future__ import annotations
+
+import re
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from rts.errors import InputError
+from rts.files.damage import unreadable, warn
+from rts.files.ply_tables import Fail, Mesh, numbers_of, written
+
+_NUMBER = r"[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|\.\d+(?:e[-+]?\d+)?|nan|inf(?:inity)?)"
+_VERTEX = rf"vertex\s+{_NUMBER}\s+{_NUMBER}\s+{_NUMBER}[ \t]*\r?\n\s*"
+_FACET = re.compile(
+    rf"facet(?:\s+normal\s+\S+\s+\S+\s+\S+)?\s+outer\s+loop\s+{_VERTEX * 3}endloop\s+endfacet\b\s*", re.IGNORECASE
+)
+_SOLID = re.compile(r"\s*solid\b([^\n]*)\n\s*", re.IGNORECASE)
+_END = re.compile(r"endsolid\b[^\n]*\n?\s*", re.IGNORECASE)
+TRIANGLE = 50
+"""Bytes of a triangle of a binary STL, after 84 of a header that ends in their number."""
+
+
+def text_of(path: Path, kind: str, data: bytes) -> str:
+    """A file's text; an InputError where the bytes are none."""
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"{path} is not a valid {kind} file, neither as binary nor as text; the file may be cut short or of "
+            "another format: export it again"
+        ) from error
+
+
+# ---------------------------------------------------------------------------------------------------- OFF
+
+
+def plain_off(path: Path, data: bytes) -> bytes:
+    """A binary PLY of triangles with what an OFF holds: vertices, their colours, and polygons.
+
+    Raises:
+        InputError: rows are not as many as promised, or not as long; something is no number; a face has less than 3
+            corners, or refers to a vertex that is not there; a kind of OFF that is not read (binary, or not of 3 axes).
+    """
+
+    def fail(what: str) -> InputError:
+        return unreadable(path, "OFF", what)
+
+    numbered = [
+        (number, row)
+        for number, line in enumerate(text_of(path, "OFF", data).splitlines(), start=1)
+        if (row := line.partition("#")[0].strip())
+    ]
+    first = numbered.pop(0)[1].split() if numbered else [""]
+    kind = re.fullmatch(r"(ST)?(C)?(N)?OFF", first[0])
+    if kind is None or first[1:2] == ["BINARY"]:
+        raise fail(
+            f"it begins with {' '.join(first)[:40]!r}; expected OFF, perhaps with ST, C or N before it, and text"
+        )
+    counts = first[1:] or (numbered.pop(0)[1].split() if numbered else [])
+    if len(counts) not in (2, 3) or not all(c.isdecimal() for c in counts):
+        raise fail(f"{' '.join(counts)[:40]!r} are no counts; expected those of vertices, faces and edges")
+    vertex_count, face_count = int(counts[0]), int(counts[1])
+    if len(numbered) != vertex_count + face_count:
+        raise fail(f"it promises {vertex_count} vertices and {face_count} faces, and has {len(numbered)} rows")
+    table = _vertices(numbered[:vertex_count], fail)
+    columns = {name: table[:, i] for i, name in enumerate("xyz")}
+    begin = 6 if kind[3] else 3
+    colors = table[:, begin : begin + 4] if kind[2] else table[:, :0]
+    if kind[2] and kind[1]:
+        colors = colors[:, : table.shape[1] - begin - 2]
+    if kind[2] and colors.shape[1] < 3:
+        raise fail(f"it promises colours, and the rows of vertices have {table.shape[1]} numbers")
+    columns |= {name: colors[:, i] for i, name in enumerate(("red", "green", "blue", "alpha")[: colors.shape[1]])}
+    return written(path, "OFF", Mesh(columns, _polygons(path, numbered[vertex_count:], fail), {}))
+
+
+def _vertices(rows: list[tuple[int, str]], fail: Fail) -> np.ndarray:
+    found = numbers_of(rows, fail) if rows else []
+    if isinstance(found, np.ndarray) and found.shape[1] >= 3:
+        return found
+    usual = max(len(row) for row in found) if rows else 0
+    number = next((n for (n, _), row in zip(rows, found, strict=True) if len(row) < max(usual, 3)), 0)
+    raise fail(f"line {number} ought to be a vertex, and has not as many numbers as others, or less than 3")
+
+
+def _polygons(path: Path, rows: list[tuple[int, str]], fail: Fail) -> tuple[np.ndarray, np.ndarray]:
+    """How many corners each face has, and all corners, one face after the other."""
+    found = numbers_of(rows, fail) if rows else []
+    if isinstance(found, np.ndarray) and (found[:, 0] == found.shape[1] - 1).all() and found.shape[1] > 3:
+        faces = found[:, 1:]
+        if ((faces >= 0) & (faces < 2**31) & (faces == np.floor(faces))).all():
+            return np.full(len(faces), faces.shape[1]), faces.astype(np.int64).ravel()
+    sizes, corners, colored = [], [], 0
+    for (number, line), row in zip(rows, found, strict=True):
+        size = int(row[0]) if 3 <= row[0] < len(row) else 0
+        face = row[: size + 1]
+        if size == 0 or not all(0 <= x < 2**31 and x == int(x) for x in face):
+            raise fail(f"line {number}, {line[:60]!r}, is no face: how many corners, at least 3, and their indices")
+        beyond = len(row) - 1 - size
+        if beyond not in (0, 1, 3, 4):  # Numbers of a colour may follow.
+            raise fail(f"line {number} promises a face of {size} corners, and has {beyond} numbers too many")
+        corners += [int(x) for x in face[1:]]
+        sizes.append(size)
+        colored += beyond > 0
+    if colored:
+        warn(f"{path}: {colored} faces have numbers after their corners; if those are colours, they are not loaded")
+    return np.array(sizes, np.int64), np.array(corners, np.int64)
+
+
+# ---------------------------------------------------------------------------------------------------- STL
+
+
+def sound_stl(path: Path, data: bytes) -> bytes:
+    """The STL itself where it is binary and as long as it promises; one in text as nothing but solids and vertices.
+
+    Raises:
+        InputError: it is longer or shorter, or the text departs from the format.
+    """
+    if len(data) >= 84 and len(data) == 84 + TRIANGLE * struct.unpack_from("<I", data, 80)[0]:
+        return data
+    if b"\0" in data:
+        promised = struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 0
+        raise unreadable(
+            path,
+            "STL",
+            f"its header promises {promised} triangles, {84 + TRIANGLE * promised} bytes, and it has {len(data)}",
+        )
+    text = text_of(path, "STL", data)
+    solids, at = [], 0
+    while found := _SOLID.match(text, at):
+        at = begin = found.end()
+        while facet := _FACET.match(text, at):
+            at = facet.end()
+        end = _END.match(text, at)
+        if end is None:
+            break
+        # trimesh looks for words, in names too.
+        solids.append(f"solid {len(solids)}\n{text[begin:at]}endsolid\n")
+        at = end.end()
+    if at < len(text.rstrip()) or not text.strip():
+        line = text.count("\n", 0, at) + 1
+        there = " ".join(text[at : at + 200].split())[:40]
+        raise unreadable(path, "STL", f"line {line}, {there!r}, is no solid, facet of three vertices, or endsolid")
+    return "".join(solids).encode()

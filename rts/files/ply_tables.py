@@ -1,0 +1,410 @@
+"""The tables of PLY files: read strictly, polygons cut, and written as the plainest PLY there is, for trimesh.
+
+trimesh knows what the columns mean. But it takes what rows there are for those that the header promises, cannot tell
+polygons of different sizes in binary files, and cuts concave ones wrongly.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.errors import InputError
+from rts.files import polygons
+from rts.files.damage import unreadable, warn
+
+Lists = tuple[np.ndarray, np.ndarray]
+"""Lists of different lengths: how long each one is, and all entries, one list after the other."""
+
+TYPES = {
+    **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
+    **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
+    **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
+}
+NAMES = {
+    "i1": "char",
+    "u1": "uchar",
+    "i2": "short",
+    "u2": "ushort",
+    "i4": "int",
+    "u4": "uint",
+    "f4": "float",
+    "f8": "double",
+}
+CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
+COLORS = ("red", "green", "blue", "alpha")
+
+
+class Property(NamedTuple):
+    """A column: its name, the type of its entries, and that of the lengths where it is of lists."""
+
+    name: str
+    type: str
+    length_type: str | None = None
+
+
+class Element(NamedTuple):
+    """A table that the header promises: its name, how many rows, and its columns."""
+
+    name: str
+    rows: int
+    properties: list[Property]
+
+
+class Mesh(NamedTuple):
+    """What a file of polygons holds.
+
+    Attributes:
+        vertices: columns (V,) by name, "x", "y" and "z" among them.
+        faces: corners of polygons, indices into the vertices; None where the file has no faces.
+        per_face: columns (F,) by name.
+        texcoord: two numbers for each corner of each face, (C, 2), or None.
+        comments: lines of the header, which may name a texture.
+    """
+
+    vertices: dict[str, np.ndarray]
+    faces: Lists | None
+    per_face: dict[str, np.ndarray]
+    texcoord: np.ndarray | None = None
+    comments: tuple[str, ...] = ()
+
+
+Fail = Callable[[str], InputError]
+
+
+def plain_ply(path: Path, data: bytes) -> bytes:
+    """A PLY of the same mesh that is binary, and of triangles only.
+
+    Raises:
+        InputError: rows or entries of lists are not as many as promised, or are not numbers; a face has less than 3
+            corners, or refers to a vertex that is not there; colours are no colours.
+    """
+
+    def fail(what: str) -> InputError:
+        return unreadable(path, "PLY", what)
+
+    return written(path, "PLY", _mesh(path, data, fail))
+
+
+def written(path: Path, kind: str, mesh: Mesh) -> bytes:
+    """A binary PLY of triangles."""
+
+    def fail(what: str) -> InputError:
+        return unreadable(path, kind, what)
+
+    count = len(mesh.vertices["x"])
+    lines = ["ply", "format binary_little_endian 1.0", *mesh.comments, f"element vertex {count}"]
+    vertices = _with_colors(mesh.vertices, "vertex", fail)
+    lines += [f"property {NAMES[c.dtype.str[1:]]} {name}" for name, c in vertices.items()]
+    table = np.empty(count, [(name, "<" + c.dtype.str[1:]) for name, c in vertices.items()])
+    for name, column in vertices.items():
+        table[name] = column
+    blocks = [table.tobytes()]
+    if mesh.faces is not None and len(mesh.faces[0]):
+        more, block = _face_table(path, mesh, fail)
+        lines += more
+        blocks.append(block)
+    return "\n".join([*lines, "end_header\n"]).encode() + b"".join(blocks)
+
+
+def _face_table(path: Path, mesh: Mesh, fail: Fail) -> tuple[list[str], bytes]:
+    """The lines of the header that promise the faces, and the faces, all of them triangles."""
+    sizes, corners = mesh.faces or (np.zeros(0), np.zeros(0))
+    count = len(mesh.vertices["x"])
+    if sizes.min() < 3:
+        raise fail(f"face {int(np.argmax(sizes < 3))} has {int(sizes[sizes < 3][0])} corners; expected at least 3")
+    strange = (corners < 0) | (corners >= count)
+    if strange.any():
+        face = int(np.searchsorted(np.cumsum(sizes), np.argmax(strange), side="right"))
+        raise fail(f"face {face} refers to vertex {int(corners[strange][0])} of {count}, which count from 0")
+    points = np.stack([mesh.vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    triangles, owner, forced = polygons.cut(points, corners, sizes)
+    if forced:
+        warn(f"{path}: {forced} polygons cross themselves and may be cut wrongly; export triangles to be sure")
+    lines = [f"element face {len(triangles)}", "property list uchar int vertex_indices"]
+    fields: list[Any] = [("3", "u1"), ("indices", "<i4", 3)]
+    columns = {"3": 3, "indices": corners[triangles]}
+    if mesh.texcoord is not None:
+        lines.append("property list uchar float texcoord")
+        fields += [("6", "u1"), ("texcoord", "<f4", 6)]
+        columns |= {"6": 6, "texcoord": mesh.texcoord[triangles].reshape(-1, 6)}
+    for name, column in _with_colors(mesh.per_face, "face", fail).items():
+        lines.append(f"property {NAMES[column.dtype.str[1:]]} {name}")
+        fields.append((f"own {name}", "<" + column.dtype.str[1:]))
+        columns[f"own {name}"] = column[owner]
+    table = np.empty(len(triangles), fields)
+    with np.errstate(over="ignore"):  # What is used is looked at later.
+        for name, column in columns.items():
+            table[name] = column
+    return lines, table.tobytes()
+
+
+def _with_colors(columns: dict[str, np.ndarray], element: str, fail: Fail) -> dict[str, np.ndarray]:
+    """The columns, with colours of 8 bits, from 0 to 255."""
+    if not {"red", "green", "blue"} <= set(columns):
+        return columns
+    names = [name for name in COLORS if name in columns]
+    top = max(columns[name].max(initial=0) for name in names)
+    found = dict(columns)
+    for name in names:
+        values = np.asarray(columns[name], np.float64)
+        limit = 65535.0 if columns[name].dtype == np.uint16 and top > 255 else 255.0
+        wrong = ~((values >= 0) & (values <= limit))
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise fail(
+                f"row {row} of {element} has {name} = {values[row]:g}; expected colours from 0 to 1, or from 0 to 255"
+            )
+        floating = columns[name].dtype.kind == "f"
+        scale = 255.0 if floating and top <= 1 else 255 / limit
+        found[name] = np.round(values * scale).astype(np.uint8)
+    return found
+
+
+# ------------------------------------------------------------------------------------------------ reading
+
+
+def _mesh(path: Path, data: bytes, fail: Fail) -> Mesh:
+    elements, layout, comments, start = _header(data, fail)
+    if layout == "ascii":
+        tables = _text_tables(elements, data[:start].count(b"\n"), data[start:], fail)
+    else:
+        tables = _binary_tables(elements, data, start, ">" if "big" in layout else "<", fail)
+    vertex = {n: c for n, c in tables.get("vertex", {}).items() if isinstance(c, np.ndarray)}
+    if not set("xyz") <= set(vertex):
+        raise fail("it has no vertices with x, y and z")
+    face = tables.get("face", {})
+    scalars = {name: column for name, column in face.items() if isinstance(column, np.ndarray)}
+    lists = {name: column for name, column in face.items() if isinstance(column, tuple)}
+    if "face" not in tables:
+        return Mesh(vertex, None, {}, None, comments)
+    named = [n for n in ("vertex_indices", "vertex_index") if n in lists] or list(lists)
+    if not named:
+        raise fail("its faces have no list vertex_indices")
+    faces, texcoord = lists[named[0]], None
+    if faces[1].dtype.kind != "i":
+        raise fail(f"the list {named[0]} is not of integers")
+    if "texcoord" in lists:
+        sizes, values = lists["texcoord"]
+        if np.array_equal(sizes, 2 * faces[0]):
+            texcoord = values.reshape(-1, 2)
+        else:
+            warn(f"{path}: texcoord has not two numbers for each corner of each face; it is loaded without them")
+    return Mesh(vertex, faces, scalars, texcoord, comments)
+
+
+def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, tuple[str, ...], int]:
+    """What is promised: elements, layout, comments; and where the data begin."""
+    end = data.find(b"end_header")
+    after = data.find(b"\n", end)
+    if not data.startswith(b"ply") or end < 0 or after < 0 or data[end:after].strip() != b"end_header":
+        raise fail("it does not begin with a header from 'ply' to 'end_header'")
+    lines = data[:end].decode("utf-8", "replace").splitlines()
+    elements: list[Element] = []
+    layout, comments = "", []
+    for number, line in enumerate(lines[1:], start=2):
+        match line.split():
+            case [] | ["obj_info", *_]:
+                pass
+            case ["comment", *_]:
+                comments.append(" ".join(line.split()))
+            case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as layout, "1.0"]:
+                pass
+            case ["element", name, count] if count.isdecimal() and name not in {e.name for e in elements}:
+                elements.append(Element(name, int(count), []))
+            case ["property", "list", length, kind, name] if (
+                elements and TYPES.get(length, "f")[0] != "f" and kind in TYPES
+            ):
+                elements[-1].properties.append(Property(name, TYPES[kind], TYPES[length]))
+            case ["property", kind, name] if elements and kind in TYPES:
+                elements[-1].properties.append(Property(name, TYPES[kind]))
+            case _:
+                raise fail(f"line {number} of its header, {line.strip()[:60]!r}, is no part of one")
+    if not layout:
+        raise fail("its header names no format")
+    for element in elements:
+        if len({p.name for p in element.properties}) < len(element.properties) or not element.properties:
+            raise fail(f"its header gives {element.name!r} no properties, or one of them twice")
+    return elements, layout, tuple(comments), after + 1
+
+
+def _joined(sizes: Any, entries: list[np.ndarray], dtype: str) -> Lists:
+    """Lists of their lengths and their entries; integers as int64."""
+    kind = np.int64 if dtype[0] in "iu" else dtype
+    flat = np.concatenate(entries) if entries else np.zeros(0)
+    return np.asarray(sizes, np.int64), flat.astype(kind)
+
+
+# ------------------------------------------------------------------------------------------------ as text
+
+
+def _text_tables(elements: list[Element], before: int, data: bytes, fail: Fail) -> dict[str, dict[str, Any]]:
+    """The tables of a file in text, one row a line; blank lines do not count."""
+    lines = data.decode("ascii", "replace").split("\n")
+    numbered = [(number, line) for number, line in enumerate(lines, start=before + 1) if line.strip()]
+    if len(numbered) != sum(element.rows for element in elements):
+        counts = " + ".join(f"{e.rows} ({e.name})" for e in elements)
+        raise fail(f"its header promises {counts} rows, and it has {len(numbered)}")
+    tables, begin = {}, 0
+    for element in elements:
+        rows = numbered[begin : begin + element.rows]
+        tables[element.name] = _text_table(element, rows, fail)
+        begin += element.rows
+    return tables
+
+
+def numbers_of(rows: list[tuple[int, str]], fail: Fail) -> np.ndarray | list[list[float]]:
+    """The numbers of lines, given with their places in the file: as an array (R, C) where all are as many."""
+    try:
+        return np.loadtxt([line for _, line in rows], comments=None, ndmin=2)
+    except ValueError:
+        pass
+    found = []
+    for number, line in rows:
+        try:
+            found.append([float(word.replace("_", "?")) for word in line.split()])  # Python takes 1_0 for 10.
+        except ValueError:
+            raise fail(f"line {number}, {' '.join(line.split())[:60]!r}, is not of numbers") from None
+    return found
+
+
+def _text_table(element: Element, rows: list[tuple[int, str]], fail: Fail) -> dict[str, Any]:
+    properties = element.properties
+    if not rows:
+        return {p.name: np.zeros(0, p.type) if p.length_type is None else _joined([], [], p.type) for p in properties}
+    values = numbers_of(rows, fail)
+    numbers = np.array([number for number, _ in rows])
+    found: dict[str, Any] = {}
+    # The places of columns in the rows, where those are all alike.
+    places = _places(properties, values[0])
+    table = values if isinstance(values, np.ndarray) else np.zeros((0, 0))
+    if places and len(table) and all((table[:, i - 1] == j - i).all() for p, i, j in places if p.length_type):
+        for p, begin, end in places:
+            block = _typed(element, p, table[:, begin:end], numbers, fail)
+            lengths = [end - begin] * len(rows)
+            found[p.name] = block[:, 0] if p.length_type is None else _joined(lengths, [block.ravel()], p.type)
+        return found
+    parts: dict[str, list[Any]] = {p.name: [] for p in properties}
+    for number, row in zip(numbers, values, strict=True):
+        places = _places(properties, row)
+        if places is None:
+            raise fail(f"line {number} has {len(row)} numbers, which do not make a row of {element.name}")
+        for p, begin, end in places:
+            parts[p.name].append(row[begin:end])
+    for p in properties:
+        sizes = np.array([len(part) for part in parts[p.name]])
+        flat = np.array([x for part in parts[p.name] for x in part])
+        block = _typed(element, p, flat[:, None], np.repeat(numbers, sizes), fail)[:, 0]
+        found[p.name] = block if p.length_type is None else _joined(sizes, [block], p.type)
+    return found
+
+
+def _places(properties: list[Property], row: Any) -> list[tuple[Property, int, int]] | None:
+    """Where each property begins and ends in a row of numbers; None where the row is too long or too short."""
+    places, at = [], 0
+    for p in properties:
+        length = 1
+        if p.length_type is not None:
+            if at >= len(row) or not (0 <= row[at] <= len(row) and row[at] == int(row[at])):
+                return None
+            length = int(row[at])
+            at += 1
+        places.append((p, at, at + length))
+        at += length
+    return places if at == len(row) else None
+
+
+def _typed(element: Element, p: Property, values: np.ndarray, numbers: Any, fail: Fail) -> np.ndarray:
+    """Numbers (R, C) as the type that the header promises."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = values.astype(p.type)
+    wrong = (found != values).any(axis=1) if p.type[0] != "f" else np.zeros(len(values), bool)
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        value = values[at][found[at] != values[at]][0]
+        raise fail(f"line {numbers[at]} has {value:g} for {p.name} of {element.name}, which is no {NAMES[p.type]}")
+    return found
+
+
+# ------------------------------------------------------------------------------------------------ binary
+
+
+def _binary_tables(elements: list[Element], data: bytes, at: int, order: str, fail: Fail) -> dict[str, dict[str, Any]]:
+    tables = {}
+    for element in elements:
+        least = sum(np.dtype(p.length_type or p.type).itemsize for p in element.properties)
+        short = fail(
+            f"its header promises {element.rows} rows of {element.name}, for which {len(data) - at} bytes are too few"
+        )
+        if element.rows * least > len(data) - at:
+            raise short
+        try:
+            tables[element.name], at = _alike(element, data, at, order) or _different(element, data, at, order)
+        except struct.error:
+            raise short from None
+    if data[at:].strip():
+        raise fail(f"after all that its header promises there are {len(data) - at} bytes more")
+    return tables
+
+
+def _alike(element: Element, data: bytes, at: int, order: str) -> tuple[dict[str, Any], int] | None:
+    """The table, and where it ends, if all rows have lists as long as the first."""
+    fields: list[Any] = []
+    place = at
+    for p in element.properties:
+        if p.length_type is None:
+            fields.append((p.name, order + p.type))
+            place += np.dtype(p.type).itemsize
+            continue
+        if element.rows == 0:
+            length = 0
+        else:
+            [length] = struct.unpack_from(order + CODES[p.length_type], data, place)
+        place += np.dtype(p.length_type).itemsize + length * np.dtype(p.type).itemsize
+        if length < 0 or place > len(data):
+            return None
+        fields += [(f"length of {p.name}", order + p.length_type), (p.name, order + p.type, (length,))]
+    row = np.dtype(fields)
+    if element.rows * row.itemsize > len(data) - at:
+        return None
+    table = np.frombuffer(data, row, element.rows, at)
+    found: dict[str, Any] = {}
+    for p in element.properties:
+        column = table[p.name].astype(p.type)
+        if p.length_type is not None:
+            lengths = table[f"length of {p.name}"]
+            if not (lengths == column.shape[1]).all():
+                return None
+            column = _joined(lengths, [column.ravel()], p.type)
+        found[p.name] = column
+    return found, at + element.rows * row.itemsize
+
+
+def _different(element: Element, data: bytes, at: int, order: str) -> tuple[dict[str, Any], int]:
+    """The table, and where it ends, row by row; a struct.error where the file ends before."""
+    parts: dict[str, list[tuple[Any, ...]]] = {p.name: [] for p in element.properties}
+    steps = [
+        (parts[p.name], CODES[p.type], np.dtype(p.type).itemsize, struct.Struct(order + CODES[p.length_type or "u1"]))
+        for p in element.properties
+    ]
+    of_lists = [p.length_type is not None for p in element.properties]
+    for _ in range(element.rows):
+        for (entries, code, size, lengths), is_list in zip(steps, of_lists, strict=True):
+            length = 1
+            if is_list:
+                [length] = lengths.unpack_from(data, at)
+                at += lengths.size
+                if not 0 <= length * size <= len(data) - at:
+                    raise struct.error
+            entries.append(struct.unpack_from(f"{order}{length}{code}", data, at))
+            at += length * size
+    found: dict[str, Any] = {}
+    for p in element.properties:
+        flat = np.array([x for part in parts[p.name] for x in part], p.type)
+        lengths = [len(part) for part in parts[p.name]]
+        found[p.name] = flat if p.length_type is None else _joined(lengths, [flat], p.type)
+    return found, at

@@ -1,0 +1,112 @@
+"""Polygons of model files, cut into triangles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+TOLERANCE = 1e-9
+"""A triangle of a fan may be turned over by this share of the area of its polygon, which is rounding."""
+
+
+def cut(points: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """Triangles of polygons, n − 2 for one of n corners, wound like it.
+
+    A polygon all of whose corners are seen from its first one, such as any that is convex, becomes the fan about that
+    corner. Others, which are concave, are cut as seen along the axis that their Newell normal is nearest to. What has
+    no area, or crosses itself so that nothing fits, becomes a fan.
+
+    Args:
+        points: (V, 3) float, one unit for all axes; what is not finite does no harm.
+        corners: (C,) int into `points`, the corners of one polygon after those of another.
+        sizes: (F,) int, how many corners each polygon has, at least 3.
+
+    Returns:
+        (T, 3) int64 into `corners`, ordered by polygon; (T,) int64, the polygon of each triangle; and how many polygons
+        are fans only because nothing else fits.
+    """
+    sizes = np.asarray(sizes, np.int64)
+    ends = np.cumsum(sizes)
+    first = np.cumsum(sizes - 2) - (sizes - 2)
+    owner = np.repeat(np.arange(len(sizes)), sizes - 2)
+    step = np.arange(len(owner)) - first[owner]
+    start = (ends - sizes)[owner]
+    triangles = np.stack([start, start + step + 1, start + step + 2], axis=1)
+    forced = 0
+    for polygon in _turned(points, corners[triangles], owner, sizes):
+        begin, count = ends[polygon] - sizes[polygon], sizes[polygon]
+        found = _ears(points[corners[begin : begin + count]])
+        if found is None:
+            forced += 1
+        else:
+            triangles[first[polygon] : first[polygon] + count - 2] = begin + found
+    return triangles, owner, forced
+
+
+def _turned(points: np.ndarray, triangles: np.ndarray, owner: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """The polygons that have a triangle in their fan that faces away from the polygon."""
+    several = (sizes > 3)[owner]
+    if not several.any():
+        return np.zeros(0, np.int64)
+    owner = owner[several]
+    a, b, c = np.moveaxis(np.asarray(points, np.float64)[triangles[several]], 1, 0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        normals = np.cross(b - a, c - a)
+        # The normals of a fan add up to Newell's normal of the polygon.
+        whole = np.stack([np.bincount(owner, n, len(sizes)) for n in normals.T], axis=1)
+        away = (normals * whole[owner]).sum(axis=1) < -TOLERANCE * (whole * whole).sum(axis=1)[owner]
+    return np.unique(owner[away])
+
+
+def _ears(ring: np.ndarray) -> np.ndarray | None:
+    """(n − 2, 3) int triangles of one polygon of corners (n, 3), or None where there are none that fit."""
+    import mapbox_earcut
+
+    size = np.abs(ring).max()
+    ring = (ring - ring[0]) / (size if size > 0 else 1.0)
+    normal = np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0)
+    # Across the axis that the normal is nearest to, so that areas keep their signs.
+    axis = int(np.argmax(np.abs(normal)))
+    flat = np.ascontiguousarray(ring[:, [(axis + 1) % 3, (axis + 2) % 3]] * [np.sign(normal[axis]), 1])
+    found = mapbox_earcut.triangulate_float64(flat, np.array([len(flat)], np.uint32)).reshape(-1, 3).astype(np.int64)
+    if _areas(flat[found]).sum() < 0:
+        found = found[:, ::-1]
+    found = _with_slivers(found, len(flat))
+    # Where a polygon crosses itself, triangles overlap, or are too few.
+    excess = np.abs(_areas(flat[found])).sum() - abs(normal[axis]) / 2
+    return found if len(found) == len(flat) - 2 and abs(excess) <= TOLERANCE * abs(normal[axis]) else None
+
+
+def _areas(corners: np.ndarray) -> np.ndarray:
+    """Signed areas of triangles (T, 3, 2)."""
+    (x, y), (z, w) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+    return (x * w - y * z) / 2
+
+
+def _with_slivers(triangles: np.ndarray, count: int) -> np.ndarray:
+    """The triangles, and some without area where corners that lie on a line with others were left out.
+
+    What is left out leaves edges without a partner, be they of the outline or of triangles. They make loops, which are
+    filled.
+    """
+    if len(triangles) == count - 2:
+        return triangles
+    rows = triangles.tolist()
+    present = {edge for t in rows for edge in zip(t, t[1:] + t[:1], strict=True)}
+    outline = {(i, (i + 1) % count) for i in range(count)}
+    wanted = outline - present | {(b, a) for a, b in present - outline if (b, a) not in present}
+    following: dict[int, list[int]] = {}
+    for a, b in sorted(wanted):
+        following.setdefault(a, []).append(b)
+    while following:
+        path = [next(iter(following))]
+        while path[-1] not in path[:-1]:
+            if path[-1] not in following:
+                return triangles
+            path.append(following[path[-1]].pop())
+            if not following[path[-2]]:
+                del following[path[-2]]
+        loop = path[path.index(path[-1]) : -1]
+        rows += [[loop[0], b, c] for b, c in zip(loop[1:], loop[2:], strict=False)]
+        for a, b in zip(path, path[1 : path.index(path[-1]) + 1], strict=False):  # Not yet part of a loop.
+            following.setdefault(a, []).append(b)
+    return np.array(rows, np.int64)
