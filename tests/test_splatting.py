@@ -81,8 +81,8 @@ def splat_by_loops(positions, rgba, row, sigma=0.5, epsilon=0.05, calibration=1.
     layers, height, width = row.shape
     offsets = [(u, v) for v in (-1, 0, 1) for u in (-1, 0, 1)]
     total = sum(math.exp(-(u * u + v * v) / (2 * sigma**2)) for u, v in offsets)
-    seen = [abs(positions[i, 2]) for i in row.ravel() if i >= 0]
-    beyond = 2 * max(seen) if seen else 1.0
+    seen = [positions[i, 2] for i in row.ravel() if i >= 0]
+    beyond = 2 * (max(*seen, 0) - min(*seen, 0)) if seen else 1.0
 
     def depth(k, y, x):
         return positions[row[k, y, x], 2] if row[k, y, x] >= 0 else beyond

@@ -226,14 +226,30 @@ def test_how_far_away_a_scene_is_does_not_matter(kind, options, scene, quarters)
     close(kind(*options).splat(farther, rgba, row), kind(*options).splat(*scene), tolerance(scene))
 
 
-@pytest.mark.xfail(
-    strict=True, reason="the depth of empty layers, twice the largest, is not beyond all that is negative"
-)
 @pytest.mark.parametrize("kind", [splatting.Visible, fused.Visible])
 def test_how_far_away_a_scene_is_does_not_matter_where_the_camera_is_amid_it(kind):
     positions, row = np.array([(0.5, 0.5, 1.5), (1.5, 0.5, 1.0)]), np.array([[[0, 1]], [[-1, -1]]], np.int32)
     away = kind().splat(positions, np.ones((2, 4)), row)
     close(kind().splat(positions - [0, 0, 1.25], np.ones((2, 4)), row), away, 1e-12)
+
+
+@of_every_kind
+def test_scenes_before_and_behind_the_camera_look_as_they_do_when_all_is_before_it(kind):
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        shape = rng.integers(2, 4), *rng.integers(2, 6, 2)
+        covered = np.logical_and.accumulate(rng.random(shape) < 0.8, axis=0)
+        depth = np.sort(rng.integers(4, 36, shape) / 4, axis=0)
+        k, y, x = np.nonzero(covered)
+        row = np.full(shape, -1, np.int32)
+        row[covered] = np.arange(len(k))
+        positions = np.stack([x + 0.5, y + 0.5, depth[covered]], axis=1)
+        rgba = np.concatenate([rng.random((len(k), 3)), np.ones((len(k), 1))], axis=1)
+        away, splatter = kind().splat(positions, rgba, row), kind()
+        for back in (1, 3, 5, 7, 9, 12):
+            nearer = positions - [0, 0, back], rgba, row
+            close(splatter.splat(*nearer), away, 1e-12)
+            close(splatter.splat(*without_what_is_not_needed(splatter, nearer)), away, 1e-12)
 
 
 @pytest.mark.parametrize("mirror", ["left to right", "top to bottom", "rows for columns"])

@@ -124,10 +124,14 @@ def normalised(total: Array, xp: Any) -> Array:
 
 
 def _beyond(depth: list[Array], covered: Array) -> list[Array]:
-    """Depths of each layer; an empty cell lies beyond everything, at a distance of the scene's own scale."""
+    """Depths of each layer; an empty cell lies beyond everything, at a distance of the scene's own scale.
+
+    It is at least as far from any layer as two layers are from each other, so that none pairs with it for being near.
+    """
     xp = namespace(covered, depth[0])
     depth = [xp.where(covered[k], z, 0.0) for k, z in enumerate(depth)]
-    farthest = 2 * xp.max(xp.abs(xp.stack(depth)))
+    every = xp.stack(depth)
+    farthest = 2 * (xp.clip(xp.max(every), 0.0, None) - xp.clip(xp.min(every), None, 0.0))
     return [xp.where(covered[k], z, xp.where(farthest > 0, farthest, 1.0)) for k, z in enumerate(depth)]
 
 

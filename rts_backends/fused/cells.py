@@ -136,10 +136,10 @@ class Cells:
         repeated = int(np.count_nonzero(seen)) != int(counts.sum())
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
         least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
-        beyond = 2 * max(-least, largest) if least < 0 or largest > 0 else kind.type(1)
+        # See `rts.splatting.layers`: nothing is nearer to what is beyond everything than to a front.
+        beyond = 2 * (largest - least) if least < 0 or largest > 0 else kind.type(1)
         if layers > 1:
-            # With no depth below zero, nothing is nearer to what is beyond everything than to a front.
-            given = self.row, self.visible, least < 0, beyond, hidden, states
+            given = self.row, self.visible, beyond, hidden, states
             parallel(listing.find, height, self.positions, *given, marks, counts, work=self.row.size)
         offsets = np.concatenate([[0], np.cumsum(counts)])
         columns = np.empty(offsets[-1], np.int32)

@@ -34,7 +34,7 @@ def _depths(z, at, positions, row, y, x, beyond):
 
 
 @kernel
-def find(start, stop, positions, row, visible, everywhere, beyond, hidden, states, mixed, counts):
+def find(start, stop, positions, row, visible, beyond, hidden, states, mixed, counts):
     """Mark mixed targets (H, W), and count those of each row.
 
     Args:
@@ -43,8 +43,7 @@ def find(start, stop, positions, row, visible, everywhere, beyond, hidden, state
         positions: (N, 3).
         row: (K, H, W).
         visible: whether the splatter is `Visible`.
-        everywhere: whether to look at all blocks, not only where `hidden` and `states` allow for mixed targets.
-        beyond: depth of layers that are not covered.
+        beyond: depth of layers that are not covered; no two layers are farther apart than each is from it.
         hidden: (H, B) uint8, the blocks of columns in or beside which hidden layers are covered.
         states: (H, W) of `survey.py`.
         mixed: (H, W) uint8, to be filled.
@@ -60,7 +59,7 @@ def find(start, stop, positions, row, visible, everywhere, beyond, hidden, state
             marks = mixed[y, left:right]
             marks[:] = 0
             near = hidden[max(y - 1, 0), b] | hidden[y, b] | hidden[min(y + 1, height - 1), b]
-            if not (everywhere or near or (not visible and _any(states[y, left:right]))):
+            if not (near or (not visible and _any(states[y, left:right]))):
                 continue
             for v in range(y - 1, y + 2):
                 if loaded[(v + 3) % 3] != v:

@@ -16,36 +16,41 @@ compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
 
 
-def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, epsilon: float) -> np.ndarray:
-    """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W); for `Visible`, or for `Multi`."""
+def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, epsilon: float, size: float = 0.0) -> np.ndarray:
+    """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W); for `Visible`, or for `Multi`.
+
+    `size` is that of the numbers that depths are computed of.
+    """
     layers, height, _ = covered.shape
     if layers == 1 or not (visible or epsilon >= LEAST_EPSILON):
         return covered
     covered, depth = np.ascontiguousarray(covered), np.ascontiguousarray(depth)
-    farthest, kept = np.zeros(height, depth.dtype), np.empty_like(covered)
-    parallel(_farthest, height, covered, depth, farthest, work=covered.size // 4)
-    beyond, kind = 2 * farthest.max(initial=0), depth.dtype.type
-    numbers = beyond, kind(TIE * beyond / 2), kind(CONTINUED)
+    extent, kept = np.zeros((2, height), depth.dtype), np.empty_like(covered)
+    parallel(_extent, height, covered, depth, extent, work=covered.size // 4)
+    least, largest, kind = extent[0].min(initial=0), extent[1].max(initial=0), depth.dtype.type
+    numbers = kind(2 * (largest - least)), kind(TIE * max(largest, -least, size)), kind(CONTINUED)
     parallel(_keep, height, covered, depth, visible, *numbers, kept, work=2 * covered.size)
     return kept
 
 
 @kernel
-def _farthest(start, stop, covered, depth, farthest):
-    """The largest size of a depth in each row."""
-    sizes = np.empty(covered.shape[2], depth.dtype)
+def _extent(start, stop, covered, depth, extent):
+    """The least and the largest depth in each row, and zero."""
+    low, high = np.empty(covered.shape[2], depth.dtype), np.empty(covered.shape[2], depth.dtype)
     for y in range(start, stop):
-        sizes[:] = depth.dtype.type(0)
+        low[:] = high[:] = depth.dtype.type(0)
         for k in range(len(covered)):
-            _enlarge(sizes, covered[k, y], depth[k, y])
-        farthest[y] = sizes.max()
+            _enlarge(low, high, covered[k, y], depth[k, y])
+        extent[0, y], extent[1, y] = low.min(), high.max()
 
 
 @compiled
-def _enlarge(sizes, covered, depth):
-    for x in range(len(sizes)):
-        size = abs(depth[x]) if covered[x] else sizes[x]
-        sizes[x] = size if size > sizes[x] else sizes[x]
+def _enlarge(low, high, covered, depth):
+    zero = depth.dtype.type(0)
+    for x in range(len(low)):
+        z = depth[x] if covered[x] else zero
+        low[x] = z if z < low[x] else low[x]
+        high[x] = z if z > high[x] else high[x]
 
 
 @kernel
