@@ -17,6 +17,10 @@ from rts.files.damage import unreadable, warn
 
 TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+ATTRIBUTES = {
+    **{"POSITION": ("VEC3",), "NORMAL": ("VEC3",), "TEXCOORD_0": ("VEC2",), "COLOR_0": ("VEC3", "VEC4")},
+    "indices": ("SCALAR",),
+}
 MOST = 2**24
 """Rows of an accessor without data, all zero, which a damaged file could otherwise have any number of."""
 
@@ -155,6 +159,9 @@ def _check_primitive(
     sparse = [kind for kind, accessor in found.items() if "sparse" in accessor]
     if sparse:
         raise fail(f"{sparse[0]} of {name} is sparse, which is not read")
+    for kind, accessor in found.items():
+        if accessor["type"] not in ATTRIBUTES.get(kind, WIDTHS):
+            raise fail(f"{kind} of {name} is of {accessor['type']}; expected {' or '.join(ATTRIBUTES[kind])}")
     count = found["POSITION"]["count"]
     different = [kind for kind in attributes if found[kind]["count"] != count]
     if different:

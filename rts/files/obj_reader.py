@@ -23,6 +23,9 @@ _MESHLAB = re.compile(r"^\s*#.*(?:meshlab|vcglib)", re.IGNORECASE | re.MULTILINE
 """A comment by which MeshLab signs; its Tr is 1 for what is opaque."""
 _MAPS = ("map_", "bump", "disp", "decal", "refl", "norm")
 
+LENGTHS = {"v": {3, 4, 6, 7}, "vt": {1, 2, 3}, "vn": {3}}
+"""How many numbers rows may have: a position may have a weight, or a colour, and that an alpha."""
+
 
 class Material(NamedTuple):
     """What is used of an MTL material.
@@ -53,6 +56,8 @@ class _Lines:
         material = self.materials.setdefault(None, 0)
         for number, line in _statements(_text(self.path)):
             key, _, rest = line.partition("#")[0].replace("\t", " ").strip().partition(" ")
+            if "_" in rest and (key in self.rows or key == "f"):  # Python takes 1_0 for 10.
+                raise self.fail(number, f"{rest.strip()[:60]!r} are not numbers")
             if key in self.rows:
                 self.rows[key].append(rest)
                 self.numbers[key].append(number)
@@ -93,23 +98,26 @@ class _Lines:
         except ValueError:
             raise self.fail(number, f"{token!r} is no index") from None
 
-    def array(self, key: str, least: int, widths: tuple[int, ...]) -> np.ndarray:
+    def array(self, key: str, widths: tuple[int, ...]) -> np.ndarray:
         """The rows of one kind.
 
-        They have the widest of `widths` that every row has. If some are shorter than all of these, though they have
-        `least` numbers, zeros fill them up to the first.
+        They have the widest of `widths` that every row has. If some are shorter than all of these, zeros fill them up
+        to the first.
         """
         split = [row.split() for row in self.rows[key]]
         if not split:
             return np.zeros((0, widths[0]))
-        shortest = min(range(len(split)), key=lambda i: len(split[i]))
-        if len(split[shortest]) < least:
-            raise self.fail(
-                self.numbers[key][shortest], f"{key!r} has {len(split[shortest])} numbers; expected {least}"
+        lengths = {len(row) for row in split}
+        if not lengths <= LENGTHS[key]:
+            number, row = next(
+                (n, r) for n, r in zip(self.numbers[key], split, strict=True) if len(r) not in LENGTHS[key]
             )
-        fitting = [w for w in widths if w <= len(split[shortest])]
-        width = max(fitting, default=widths[0])
-        if not fitting:
+            expected = " or ".join(map(str, sorted(LENGTHS[key])))
+            raise self.fail(number, f"{key!r} has {len(row)} numbers; expected {expected}")
+        width = max((w for w in widths if w <= min(lengths)), default=widths[0])
+        if max(widths) > width and max(lengths) >= max(widths):
+            warn(f"{self.path}: some {key!r} have {max(lengths)} numbers and some {min(lengths)}; colours are left out")
+        if min(lengths) < width:
             split = [[*row, *["0"] * (width - len(row))] for row in split]
         try:
             return np.array([[float(x) for x in row[:width]] for row in split])
@@ -167,7 +175,7 @@ def read_obj(path: Path) -> list[Piece]:
         for name, index in lines.materials.items()
         if index in used and (file := materials.get(name, Material()).texture) is not None
     }
-    v, vt, vn = lines.array("v", 3, (3, 6)), lines.array("vt", 1, (2,)), lines.array("vn", 3, (3,))
+    v, vt, vn = lines.array("v", (3, 6)), lines.array("vt", (2,)), lines.array("vn", (3,))
     if not lines.faces:
         what = f"{len(v)} vertices but no faces" if len(v) else "neither vertices nor faces"
         raise InputError(f"{path} holds {what}; expected a mesh with triangles or polygons")

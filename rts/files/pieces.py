@@ -9,6 +9,9 @@ import numpy as np
 
 from rts.errors import InputError
 
+WIDTHS = {"vertices": (3,), "uv": (2,), "normals": (3,), "colors": (3, 4)}
+"""How many numbers the rows of each table have."""
+
 
 class Piece(NamedTuple):
     """One mesh of a model file.
@@ -34,9 +37,13 @@ class Piece(NamedTuple):
 
 
 def check_piece(path: Path, piece: Piece) -> None:
-    """Refuse indices that refer to nothing, and values that are not finite in float32."""
+    """Refuse indices that refer to nothing, rows of another width, and values that are not finite in float32."""
     tables = {"vertices": (piece.vertices, piece.faces), **piece.attributes}
     for name, (rows, table) in tables.items():
+        if rows.ndim != 2 or rows.shape[1] not in WIDTHS[name]:
+            raise InputError(
+                f"{path}: {name} has shape {rows.shape}; expected {WIDTHS[name][0]} numbers a row: repair the file"
+            )
         if table.min() < 0 or table.max() >= len(rows):
             bad = table.max() if table.max() >= len(rows) else table.min()
             raise InputError(f"{path}: a face refers to row {bad} of {name}, which has {len(rows)}; repair the file")
