@@ -1,6 +1,9 @@
+import base64
 import json
+import logging
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -9,7 +12,7 @@ from PIL import Image
 
 import rts
 from rts.cli.views import bounds_of, orbit
-from rts.errors import EngineError, InputError, PluginError
+from rts.errors import InputError, PluginError
 from rts.files.srgb import decode_srgb, encode_srgb
 
 pytestmark = pytest.mark.files
@@ -224,6 +227,33 @@ def test_vertex_and_face_colors_of_a_ply(tmp_path):
     assert part.theta["colors"].shape == (12, 4) and not part.shader.opaque
 
 
+def test_vertex_colors_of_floating_numbers_and_of_an_off(tmp_path):
+    rows = "".join(f"{xyz} {{}}\n" for xyz in ("0 0 0", "1 0 0", "0 1 0"))
+    floating = PLY.replace(
+        "element face", "property float red\nproperty float green\nproperty float blue\nelement face"
+    )
+    files = {
+        "unit.ply": floating.format(3, 1) + rows.format("1 0 0.5", "1 0 0.5", "1 0 0.5") + "3 0 1 2\n",
+        "bytes.ply": floating.format(3, 1) + rows.format("255 0 128", "255 0 128", "255 0 128") + "3 0 1 2\n",
+        "short.ply": floating.replace("float red", "ushort red").replace("float green", "ushort green").format(3, 1)
+        + rows.format(*["65535 0 0.5"] * 3).replace("0.5", "32896")
+        + "3 0 1 2\n",
+        "bytes.off": "COFF\n3 1 0\n" + rows.format(*["255 0 128 255"] * 3) + "3 0 1 2\n",
+        "normals.off": "CNOFF\n3 1 0\n" + rows.format(*["0 0 1 1 0 0.5 1"] * 3) + "3 0 1 2\n",
+    }
+    files["short.ply"] = files["short.ply"].replace("float blue", "ushort blue")
+    for name, text in files.items():
+        [part] = rts.load(write(tmp_path / name, text))
+        np.testing.assert_allclose(part.theta["colors"], np.tile([1, 0, 0.2158605], (3, 1)), atol=1e-6, err_msg=name)
+
+
+def test_numbers_after_the_corners_of_an_off_are_warned_of(tmp_path):
+    path = write(tmp_path / "m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2 255 0 0\n")
+    with pytest.warns(UserWarning, match="m.off: 1 faces have numbers after their corners") as caught:
+        rts.load(path)
+    assert caught[0].filename == __file__
+
+
 def test_scene_graphs_give_one_part_an_instance_with_its_transform(tmp_path):
     scene, box = trimesh.Scene(), trimesh.creation.box()
     shift = trimesh.transformations.translation_matrix([2, 0, 0]) @ np.diag([-1, 1, 1, 1])
@@ -254,6 +284,40 @@ def test_gltf_colors_are_linear_already(tmp_path):
     )
     mesh.export(tmp_path / "m.glb")
     np.testing.assert_allclose(rts.load(tmp_path / "m.glb")[0].theta["color"], [0.2, 0.4, 1], atol=1e-6)
+
+
+GRID = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [[0, 1, 2], [0, 2, 3]]
+
+
+def gltf_with(folder, name, values, component, kind, **more):
+    """A square as glTF with one attribute more, (4, C) of any type."""
+    mesh = trimesh.Trimesh(*GRID, process=False)
+    files = trimesh.exchange.gltf.export_gltf(trimesh.Scene(mesh), embed_buffers=True)
+    tree = json.loads(files["model.gltf"])
+    data = base64.b64encode(values.tobytes()).decode()
+    tree["buffers"].append({"uri": f"data:application/octet-stream;base64,{data}", "byteLength": values.nbytes})
+    tree["bufferViews"].append({"buffer": len(tree["buffers"]) - 1, "byteLength": values.nbytes})
+    view = len(tree["bufferViews"]) - 1
+    tree["accessors"].append({"bufferView": view, "componentType": component, "count": 4, "type": kind, **more})
+    primitive = tree["meshes"][0]["primitives"][0]
+    primitive["attributes"][name] = len(tree["accessors"]) - 1
+    primitive["material"], tree["materials"] = 0, [{}]
+    if name == "COLOR_0":
+        del primitive["material"]
+    return write(folder / "m.gltf", json.dumps(tree))
+
+
+@pytest.mark.parametrize(("dtype", "component"), [(np.uint8, 5121), (np.uint16, 5123), (np.float32, 5126)])
+def test_fractions_of_a_gltf_may_be_integers(tmp_path, dtype, component):
+    whole = 1 if dtype is np.float32 else np.iinfo(dtype).max
+    values = np.round(np.array([[1, 0.2, 0, 1]] * 4) * whole, 2).astype(dtype)
+    more = {} if dtype is np.float32 else {"normalized": True}
+    [part] = rts.load(gltf_with(tmp_path, "COLOR_0", values, component, "VEC4", **more))
+    np.testing.assert_allclose(part.theta["colors"], [[1, 0.2, 0]] * 4, atol=1e-6)
+    uv = np.round(np.array([[0, 1], [1, 1], [1, 0.2], [0, 0]]) * whole, 2).astype(dtype)
+    [part] = rts.load(gltf_with(tmp_path, "TEXCOORD_0", uv, component, "VEC2", **more))
+    np.testing.assert_allclose(part.theta["uv"], [[0, 0], [1, 0], [1, 0.8], [0, 1]], atol=1e-6)
+    np.testing.assert_array_equal(part.theta["vertices"], GRID[0])
 
 
 # --------------------------------------------------------------------------------------------- what does not
@@ -290,6 +354,176 @@ def test_a_bad_file_is_one_clear_line(tmp_path, name, text, expected):
         rts.load(write(tmp_path / name, text))
     assert expected in message(error)
     assert str(tmp_path) in message(error)
+
+
+PLY = (
+    "ply\nformat ascii 1.0\nelement vertex {}\nproperty float x\nproperty float y\nproperty float z\n"
+    "element face {}\nproperty list uchar int vertex_indices\nend_header\n"
+)
+SQUARE = "0 0 0\n1 0 0\n1 1 0\n0 1 0\n"
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "expected"),
+    [
+        ((4, 2), "3 0 1 2\n", "4 .*2 .*5"),
+        ((4, 1), "3 0 1 2\n3 0 2 3\n", "4 .*1 .*6"),
+        ((5, 1), "3 0 1 2\n", "5 .*1 .*5"),
+        ((4, 1), "4 0 1 2\n", "line [0-9]+.*4"),
+        ((4, 2), "4 0 1 2\n3 0 2 3\n", "line [0-9]+.*4"),
+        ((4, 2), "3 0 1 2\n2 0 1\n", "corners"),
+        ((4, 1), "3 0 x 2\n", "'3 0 x 2'"),
+        ((4, 1), "3 0 1.5 2\n", "line [0-9]+"),
+        ((4, 1), "3 0 1 -2\n", "-2"),
+        ((4, 1), "3 0 1 4\n", "4"),
+        ((4_000_000_000, 1), "3 0 1 2\n", "4000000000"),
+    ],
+)
+def test_rows_that_are_not_those_that_were_promised(tmp_path, header, rows, expected):
+    files = {"m.ply": PLY.format(*header) + SQUARE + rows, "m.off": f"OFF\n{header[0]} {header[1]} 0\n{SQUARE}{rows}"}
+    for name, text in files.items():
+        with pytest.raises(InputError, match=f"{name} cannot be read as {name[2:].upper()} \\(.*{expected}") as error:
+            rts.load(write(tmp_path / name, text))
+        message(error)
+
+
+def test_a_list_that_is_too_short_for_its_row_in_a_ply_or_too_long_in_an_off(tmp_path):
+    with pytest.raises(InputError, match="line 14 has 5 numbers, which do not make a row of face"):
+        rts.load(write(tmp_path / "m.ply", PLY.format(4, 1) + SQUARE + "3 0 1 2 3\n"))
+    with pytest.raises(InputError, match="line 7 promises a face of 3 corners, and has 2 numbers too many"):
+        rts.load(write(tmp_path / "m.off", f"OFF\n4 1 0\n{SQUARE}3 0 1 2 3 1\n"))
+
+
+FACET = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+
+
+def test_an_stl_in_text_is_what_it_says(tmp_path):
+    [part] = rts.load(write(tmp_path / "m.stl", f"solid vertex normal solid\n{FACET}endsolid vertex\n"))
+    np.testing.assert_array_equal(part.theta["vertices"], [(0, 0, 0), (1, 0, 0), (0, 1, 0)])
+    assert len(rts.load(write(tmp_path / "m.stl", f"solid a\n{FACET}endsolid a\nsolid b\n{FACET}endsolid b\n"))) == 2
+    for wrong in (
+        FACET.replace("vertex 1 0 0", "vertex 1 0").replace("vertex 0 1 0", "vertex 0 1 0 7"),
+        FACET.replace("vertex 1 0 0\n", ""),
+        FACET.replace("1 0 0", "1 x 0"),
+        FACET.replace("endfacet\n", ""),
+        FACET + "hello\n",
+    ):
+        with pytest.raises(InputError, match=r"m.stl cannot be read as STL \(line [0-9]+") as error:
+            rts.load(write(tmp_path / "m.stl", f"solid a\n{FACET}{wrong}endsolid a\n"))
+        message(error)
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "1e30", "-1"])
+def test_colours_that_are_none_are_refused(tmp_path, value):
+    header = PLY.replace("element face", "property float red\nproperty float green\nproperty float blue\nelement face")
+    rows = f"0 0 0 0.5 {value} 0\n1 0 0 0 0 0\n0 1 0 0 0 0\n3 0 1 2\n"
+    with pytest.raises(InputError, match=r"row 0 of vertex has green = .*; expected colours from 0 to 1") as error:
+        rts.load(write(tmp_path / "m.ply", header.format(3, 1) + rows))
+    message(error)
+    if value == "-1":
+        return
+    with pytest.raises(InputError, match="m.obj: .*row.* of colors.*(NaN|infinite)"):
+        rts.load(write(tmp_path / "m.obj", f"v 0 0 0 {value} 0 0\nv 1 0 0 0 0 0\nv 0 1 0 0 0 0\nf 1 2 3\n"))
+    colors = np.zeros((4, 3), np.float32)
+    colors[2, 1] = float(value)
+    with pytest.raises(InputError, match="row 2 of COLOR_0 of mesh 0 is .*; expected colours from 0 to 1") as error:
+        rts.load(gltf_with(tmp_path, "COLOR_0", colors, 5126, "VEC3"))
+    message(error)
+
+
+@pytest.mark.parametrize(
+    ("text", "alpha"),
+    [
+        ("Tr 1.000000", 1),
+        ("Tr 1.0001", 1),
+        ("Tr 0", 1),
+        ("Tr 0.25", 0.75),
+        ("# Wavefront material file\n# Converted by Meshlab Group\nTr 1.000000", 1),
+        ("# Converted by Meshlab Group\nTr 0.25", 0.25),
+        ("#\n# File generated with VCGLib\nTr 0.25", 0.25),
+        ("# not of MeshLab's kin\nd 0.5\nTr 0.25", 0.5),
+        ("d 0", 0),
+        ("Tr 1\nd 0", 0),
+        ("d 0\nTr 1", 0),
+        ("d 1\nTr 1", 1),
+        ("Tr 1\nd 0.5", 0.5),
+    ],
+)
+def test_how_opaque_a_material_is(tmp_path, text, alpha):
+    write(tmp_path / "m.mtl", f"newmtl m\nKd 1 0 0\n{text}\n")
+    [part] = rts.load(write(tmp_path / "m.obj", "mtllib m.mtl\n" + QUAD + "usemtl m\nf 1 2 3 4\n"))
+    assert part.shader.opaque == (alpha == 1)
+    np.testing.assert_allclose(part.theta["color"], [1, 0, 0] if alpha == 1 else [1, 0, 0, alpha])
+    if alpha > 0:
+        np.testing.assert_allclose(front_view(part)[..., 3], alpha, atol=1e-6)
+
+
+def test_materials_that_no_library_has_are_warned_of(tmp_path):
+    write(tmp_path / "m.mtl", "newmtl m\nKd 1 0 0\n")
+    path = write(tmp_path / "m.obj", "mtllib m.mtl\n" + QUAD + "usemtl m\nf 1 2 3\nusemtl n\nf 1 3 4\n")
+    with pytest.warns(UserWarning, match="m.obj uses materials that its libraries lack: 'n'"):
+        rts.load(path)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("v 0 0 0 1 0", "'v' has 5 numbers; expected 3 or 4 or 6 or 7"),
+        ("vn 0 0 1 1", "'vn' has 4 numbers; expected 3"),
+        ("vt 0 0 1 1", "'vt' has 4 numbers; expected 1 or 2 or 3"),
+        ("v 0 1_0 0", "'0 1_0 0' are not numbers"),
+        ("f 1 2 3_0", "'1 2 3_0' are not numbers"),
+    ],
+)
+def test_rows_of_an_obj_with_too_many_numbers_or_odd_ones(tmp_path, line, expected):
+    with pytest.raises(InputError, match=f"m.obj, line 5: {expected}"):
+        rts.load(write(tmp_path / "m.obj", QUAD + line + "\nf 1 2 3\n"))
+
+
+def test_colours_that_not_all_vertices_have_are_left_out_with_a_warning(tmp_path):
+    with pytest.warns(UserWarning, match="m.obj: some 'v' have 6 numbers and some 3; colours are left out"):
+        [part] = rts.load(write(tmp_path / "m.obj", QUAD + "v 0 0 1 1 0 0\nf 1 2 5\n"))
+    assert "colors" not in part.theta
+
+
+@pytest.mark.parametrize("name", ["merge", "weld"])
+@pytest.mark.parametrize("value", ["no", 0, 1, None, [], np.zeros(3), 0.5])
+def test_merge_and_weld_are_true_or_false(tmp_path, name, value):
+    path = write(tmp_path / "m.obj", QUAD + "f 1 2 3\n")
+    with pytest.raises(InputError, match=f"{name} is .*; expected True or False") as error:
+        rts.load(path, **{name: value})
+    message(error)
+    assert rts.load(path, **{name: np.True_})
+
+
+def test_a_texture_that_is_no_image_is_refused_in_every_format(tmp_path):
+    header = PLY.replace("element vertex", "comment TextureFile t.png\nelement vertex")
+    (tmp_path / "t.png").write_text("hello")
+    with pytest.raises(InputError, match="m.ply .*its texture t.png cannot be read as an image"):
+        rts.load(write(tmp_path / "m.ply", header.format(4, 1) + SQUARE + "3 0 1 2\n"))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=Image.open(quadrants(tmp_path / "u.png")))
+    visual = trimesh.visual.TextureVisuals(uv=[[0, 0], [1, 0], [1, 1], [0, 1]], material=material)
+    data = trimesh.Trimesh(*GRID, visual=visual, process=False).export(file_type="glb")
+    (tmp_path / "m.glb").write_bytes(data.replace(b"\x89PNG", b"none"))
+    with pytest.raises(InputError, match="m.glb .*the texture of material 0 cannot be read as an image"):
+        rts.load(tmp_path / "m.glb")
+
+
+def test_what_trimesh_and_numpy_warn_of_is_one_warning_that_names_the_file(tmp_path, monkeypatch):
+    def careless(*args, **kwargs):
+        logging.getLogger("trimesh").warning("something\nis odd")
+        for _ in range(2):
+            np.array([1e300]).astype(np.float32) / np.zeros(1, np.float32)
+            warnings.warn("two\nlines", RuntimeWarning, stacklevel=1)
+            warnings.warn("of the past", DeprecationWarning, stacklevel=1)
+        return load(*args, **kwargs)
+
+    load = trimesh.load
+    monkeypatch.setattr(trimesh, "load", careless)
+    with pytest.warns(UserWarning) as caught:
+        rts.load(write(tmp_path / "m.off", f"OFF\n4 1 0\n{SQUARE}3 0 1 2\n"))
+    ours = [f"{tmp_path / 'm.off'}: {said}; check what was loaded" for said in ("something is odd", "two lines")]
+    assert [str(w.message) for w in caught] == ours and {w.filename for w in caught} == {__file__}
 
 
 def test_missing_files_and_folders(tmp_path):
@@ -448,19 +682,31 @@ def test_grey_pictures_of_16_bits(tmp_path):
 @pytest.mark.parametrize(
     ("image", "expected"),
     [
-        (np.full((2, 2, 3), np.nan), "12 of the image's 12 values are NaN"),
+        (np.full((2, 2, 3), np.nan), "12 of .*'s 12 values are NaN"),
         (np.full((2, 2), np.inf), "NaN or infinite"),
         (np.zeros((2, 2, 5)), "shape"),
         (np.zeros(4), "shape"),
         (np.zeros((0, 2, 3)), "shape"),
         (np.zeros((2, 2, 3), np.uint8), "dtype uint8"),
+        (np.zeros((2, 2), complex), "dtype complex128"),
+        (np.zeros((2, 2), object), "dtype object"),
+        (np.zeros((2, 2, 2, 2)), "shape"),
+        (np.float64(0.5), "shape"),
+        (np.broadcast_to(0.5, (10**6, 10**6)), "does not fit into memory"),
+        (None, "is None, a NoneType; expected an array"),
+        ("hello", "is 'hello', a str; expected an array"),
+        (3, "is 3, a int; expected an array"),
+        ([[0.5] * 99] * 99, r"is \[\[0.5, 0.5.{0,60}\.\.\., a list; expected an array"),
+        ({"a": 1}, "a dict; expected an array"),
     ],
 )
 def test_what_is_no_picture_is_refused(tmp_path, image, expected):
-    with pytest.raises(InputError, match=expected):
+    with pytest.raises(InputError, match=expected) as error:
         rts.save_image(tmp_path / "a.png", image)
-    with pytest.raises(InputError, match=expected):
-        rts.save_animation(tmp_path / "a.gif", [image])
+    assert "the image" in message(error)
+    with pytest.raises(InputError, match=expected) as error:
+        rts.save_animation(tmp_path / "a.gif", [np.zeros((2, 2)), image])
+    assert "frame 1" in message(error)
     assert not list(tmp_path.iterdir())
 
 
@@ -480,8 +726,66 @@ def test_bad_names_of_pictures(tmp_path):
         rts.load_image(tmp_path / "gone.png")
     with pytest.raises(InputError, match="cannot be read as an image"):
         rts.load_image(write(tmp_path / "a.png", "hello"))
-    with pytest.raises(EngineError, match="belongs to no engine"):
-        rts.save_image(tmp_path / "a.png", "hello")
+    with pytest.raises(InputError, match="is a folder; expected a picture"):
+        rts.load_image(tmp_path)
+    for load in (rts.load_image, rts.load, lambda path: rts.save_image(path, np.zeros((2, 2)))):
+        for path in (None, 3, ["a.png"], b"a.png", np.zeros(3)):
+            with pytest.raises(InputError, match=f"the path is a {type(path).__name__}; expected a string"):
+                load(path)
+        for path, expected in {"a\0.png": "no file can be called", f"{'a' * 999}.png": "name too long"}.items():
+            with pytest.raises(InputError, match=f"(?i){expected}") as error:
+                load(path)
+            assert len(message(error)) < 200
+
+
+def test_where_nothing_can_be_written_is_found_before_anything_is_made(tmp_path, monkeypatch):
+    def refused(*_, **__):
+        raise OSError(30, "Read-only file system")
+
+    (tmp_path / "old.png").write_text("")
+    with monkeypatch.context() as patched:
+        patched.setattr("tempfile.TemporaryFile", refused)
+        for name in ("a.png", "new/deeper/a.png"):
+            with pytest.raises(
+                InputError, match=r"nothing can be written into .*Read-only file system\); choose"
+            ) as error:
+                rts.save_image(tmp_path / name, np.zeros((2, 2)))
+            message(error)
+        patched.setattr("os.access", lambda *_: False)
+        with pytest.raises(InputError, match=r"old.png cannot be written \(Permission denied\)"):
+            rts.save_image(tmp_path / "old.png", np.zeros((2, 2)))
+    assert [p.name for p in tmp_path.iterdir()] == ["old.png"]
+    monkeypatch.setattr(Image.Image, "save", refused)
+    for save in (
+        lambda: rts.save_image(tmp_path / "a.png", np.zeros((2, 2))),
+        lambda: rts.save_animation(tmp_path / "a.png", [np.zeros((2, 2))]),
+    ):
+        with pytest.raises(InputError, match=r"a.png cannot be written \(Read-only file system\)") as error:
+            save()
+        message(error)
+
+
+def test_colours_that_are_far_too_bright_or_hardly_opaque_are_saved_without_a_warning(tmp_path):
+    image = np.zeros((1, 3, 4))
+    image[0] = [[1e308, 0, 0, 1e-310], [0, 1e300, 0, 1], [-1e308, 0, 0, 1e300]]
+    rts.save_image(tmp_path / "a.png", image)
+    np.testing.assert_array_equal(rts.load_image(tmp_path / "a.png")[0], [[0] * 4, [0, 1, 0, 1], [0, 0, 0, 1]])
+    rts.save_animation(tmp_path / "a.gif", [image.astype(np.float64)])
+
+
+def test_pictures_of_floating_numbers_are_refused(tmp_path):
+    Image.fromarray(np.full((2, 2), 0.5, np.float32)).save(tmp_path / "a.tiff")
+    with pytest.raises(InputError, match="a.tiff holds floating-point numbers") as error:
+        rts.load_image(tmp_path / "a.tiff")
+    message(error)
+
+
+def test_what_pillow_warns_of_is_a_warning_that_names_the_picture(tmp_path, monkeypatch):
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 40)
+    with pytest.warns(UserWarning, match=r"a\.png: Image size \(64 pixels\) exceeds") as caught:
+        rts.load_image(tmp_path / "a.png")
+    assert caught[0].filename == __file__
 
 
 @pytest.mark.parametrize("kind", ["gif", "png"])
@@ -502,8 +806,29 @@ def test_bad_animations(tmp_path):
         rts.save_animation(tmp_path / "a.gif", [np.zeros((2, 2)), np.zeros((3, 2))])
     with pytest.raises(InputError, match=".gif, .png or .mp4"):
         rts.save_animation(tmp_path / "a.avi", [np.zeros((2, 2))])
-    with pytest.raises(InputError, match="fps is 0"):
-        rts.save_animation(tmp_path / "a.gif", [np.zeros((2, 2))], fps=0)
+    for fps in (0, -1, np.nan, np.inf, None, "20", [20], True, np.ones(3), 1j):
+        with pytest.raises(InputError, match="fps is .*; expected a positive number") as error:
+            rts.save_animation(tmp_path / "a.gif", [np.zeros((2, 2))], fps=fps)
+        message(error)
+    for kind, fps in [("gif", 1e-9), ("gif", 0.001), ("gif", 500), ("png", 1e-300), ("png", 1e4)]:
+        with pytest.raises(InputError, match=f"fps is .*, and a .{kind} holds from .* to 10+ frames a second"):
+            rts.save_animation(tmp_path / f"a.{kind}", [np.zeros((2, 2))], fps=fps)
+    for frames in (None, 3, "abc", b"abc", {"a": 1}):
+        with pytest.raises(InputError, match=f"frames is a {type(frames).__name__}; expected several images"):
+            rts.save_animation(tmp_path / "a.gif", frames)
+    for shape in [(4, 6, 3), (4, 6, 4), (4, 6)]:
+        with pytest.raises(InputError, match=r"frames is one image, \(4, 6.*; expected several"):
+            rts.save_animation(tmp_path / "a.gif", np.zeros(shape))
+    with pytest.raises(InputError, match="at most 65535 pixels a side"):
+        rts.save_animation(tmp_path / "a.gif", [np.zeros((1, 70000))])
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_array_of_frames_is_an_animation_and_its_speed_is_the_nearest_that_there_is(tmp_path):
+    for fps, duration in {60: 20, 30: 30, 25: 40}.items():
+        rts.save_animation(tmp_path / "a.gif", np.linspace(0, 1, 3)[:, None, None, None] * np.ones((4, 6, 3)), fps=fps)
+        with Image.open(tmp_path / "a.gif") as file:
+            assert file.n_frames == 3 and file.info["duration"] == duration
 
 
 def test_mp4_needs_a_package(tmp_path, monkeypatch):

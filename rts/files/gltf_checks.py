@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import importlib.util
 import json
 import struct
 from collections.abc import Callable
@@ -14,6 +15,7 @@ import numpy as np
 
 from rts.errors import InputError
 from rts.files.damage import unreadable, warn
+from rts.files.images import is_image
 
 TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -26,7 +28,7 @@ MOST = 2**24
 
 
 def sound_glb(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
-    """The GLB, without what may follow its end.
+    """The GLB, without what may follow its end; or one with floating numbers for integers that stand for fractions.
 
     Args:
         path: its path.
@@ -58,43 +60,70 @@ def sound_glb(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
     if chunks[0][0] != b"JSON":
         raise fail("its first part is no JSON")
     binary = next((content for kind, content in chunks[1:] if kind == b"BIN\0"), None)
-    _check(path, chunks[0][1], binary, file, fail)
-    return data
+    return _checked(path, chunks[0][1], binary, file, fail) or data
 
 
-def sound_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
-    """The glTF itself; arguments and errors are those of `sound_glb`."""
+def sound_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> tuple[str, bytes]:
+    """The glTF itself, or a GLB of the same; arguments and errors are those of `sound_glb`."""
 
     def fail(what: str) -> InputError:
         return unreadable(path, "GLTF", what)
 
-    _check(path, data, None, file, fail)
-    return data
+    found = _checked(path, data, None, file, fail)
+    return ("gltf", data) if found is None else ("glb", found)
 
 
-def _check(path: Path, text: bytes, binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> None:
+def _checked(path: Path, text: bytes, binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes | None:
+    """Refuse what is not sound. A GLB with floating numbers, if there are integers that trimesh would misread."""
     try:
         tree = json.loads(text)
         if not isinstance(tree, dict):
             raise ValueError("the whole is no object")
         buffers = [_buffer(b, binary if i == 0 else None, file, fail) for i, b in enumerate(tree.get("buffers", []))]
         views = [_view(i, v, buffers, fail) for i, v in enumerate(tree.get("bufferViews", []))]
-        accessors = tree.get("accessors", [])
-        for index, accessor in enumerate(accessors):
+        for index, accessor in enumerate(tree.get("accessors", [])):
             _check_accessor(index, accessor, tree.get("bufferViews", []), views, fail)
+        integers: set[int] = set()
         for m, mesh in enumerate(tree.get("meshes", [])):
             for primitive in mesh["primitives"]:
-                _check_primitive(path, f"mesh {m}", primitive, tree, views, fail)
+                integers |= _check_primitive(path, f"mesh {m}", primitive, tree, views, fail)
         for m, material in enumerate(tree.get("materials", [])):
-            factor = np.array(material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1.0] * 4), np.float64)
-            if factor.shape != (4,):
-                raise fail(f"the baseColorFactor of material {m} is {factor.tolist()}; expected four numbers")
-            _check_colors(path, f"baseColorFactor of material {m}", factor[None], fail)
+            _check_material(path, f"material {m}", material, tree, views, file, fail)
         _check_nodes(tree.get("nodes", []), fail)
+        return _with_floats(tree, views, sorted(integers)) if integers else None
     except InputError:
         raise
     except Exception as error:  # Anything may be missing, or of another kind.
         raise fail(f"{type(error).__name__}: {error}") from error
+
+
+def _with_floats(tree: dict[str, Any], views: list[bytes], integers: list[int]) -> bytes:
+    """A GLB in which these accessors, of integers that stand for fractions, hold the fractions."""
+    blocks = [content + bytes(-len(content) % 4) for content in views]
+    descriptions = [dict(view, buffer=0) for view in tree["bufferViews"]]
+    for index in integers:
+        accessor = tree["accessors"][index]
+        values = _rows(accessor, tree["bufferViews"], views)
+        fractions = np.maximum(values / np.float32(np.iinfo(values.dtype).max), -1).astype("<f4").tobytes()
+        kept = {key: value for key, value in accessor.items() if key not in ("byteOffset", "normalized", "min", "max")}
+        tree["accessors"][index] = {**kept, "componentType": 5126, "bufferView": len(blocks)}
+        blocks.append(fractions)
+        descriptions.append({"buffer": 0, "byteLength": len(fractions)})
+    ends = np.cumsum([len(block) for block in blocks]).tolist()
+    tree["bufferViews"] = [
+        {**view, "byteOffset": end - len(block)} for view, end, block in zip(descriptions, ends, blocks, strict=True)
+    ]
+    tree["buffers"] = [{"byteLength": ends[-1]}]
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    return b"".join(
+        [
+            struct.pack("<4sIII4s", b"glTF", 2, 28 + len(text) + ends[-1], len(text), b"JSON"),
+            text,
+            struct.pack("<I4s", ends[-1], b"BIN\0"),
+            *blocks,
+        ]
+    )
 
 
 def _count(value: Any) -> int:
@@ -105,19 +134,20 @@ def _count(value: Any) -> int:
 
 def _buffer(buffer: dict[str, Any], binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes:
     uri = buffer.get("uri")
-    if uri is None:
-        content = binary or b""
-    elif uri.startswith("data:"):
-        try:
-            content = base64.b64decode(uri.partition("base64,")[2], validate=True)
-        except binascii.Error as error:
-            raise fail(f"data of a buffer are not base64: {error}") from None
-    else:
-        content = file(uri)
+    content = (binary or b"") if uri is None else _content(uri, file, fail)
     promised = _count(buffer["byteLength"])
     if promised > len(content):
         raise fail(f"a buffer promises {promised} bytes, and has {len(content)}")
     return content
+
+
+def _content(uri: str, file: Callable[[str], bytes], fail: Any) -> bytes:
+    if not uri.startswith("data:"):
+        return file(uri)
+    try:
+        return base64.b64decode(uri.partition("base64,")[2], validate=True)
+    except binascii.Error as error:
+        raise fail(f"there are data that are not base64: {error}") from None
 
 
 def _view(index: int, view: dict[str, Any], buffers: list[bytes], fail: Any) -> bytes:
@@ -150,9 +180,18 @@ def _check_accessor(
         raise fail(f"accessor {index} promises {count} rows, which end at byte {end} of {len(content)}")
 
 
+def _rows(accessor: dict[str, Any], descriptions: list[dict[str, Any]], views: list[bytes]) -> np.ndarray:
+    """The rows (N, C) of an accessor that has data, in its own type."""
+    start, stride, row = _layout(accessor, descriptions)
+    content = np.frombuffer(views[accessor["bufferView"]], np.uint8)[start:]
+    rows = np.lib.stride_tricks.as_strided(content, (accessor["count"], row), (stride, 1))
+    return np.ascontiguousarray(rows).view("<" + TYPES[accessor["componentType"]])
+
+
 def _check_primitive(
     path: Path, name: str, primitive: dict[str, Any], tree: dict[str, Any], views: list[bytes], fail: Any
-) -> None:
+) -> set[int]:
+    """Refuse attributes that do not fit; which accessors hold integers that stand for fractions."""
     attributes = primitive["attributes"]
     used = {**attributes, **({"indices": primitive["indices"]} if "indices" in primitive else {})}
     found = {kind: tree["accessors"][_count(index)] for kind, index in used.items()}
@@ -166,12 +205,53 @@ def _check_primitive(
     different = [kind for kind in attributes if found[kind]["count"] != count]
     if different:
         raise fail(f"{different[0]} of {name} has {found[different[0]]['count']} rows, and POSITION {count}")
-    colors = found.get("COLOR_0", {"componentType": None})
-    if colors["componentType"] == 5126 and "bufferView" in colors and count > 0:
-        start, stride, row = _layout(colors, tree["bufferViews"])
-        content = np.frombuffer(views[colors["bufferView"]], np.uint8)[start:]
-        rows = np.lib.stride_tricks.as_strided(content, (count, row), (stride, 1))
-        _check_colors(path, f"COLOR_0 of {name}", np.ascontiguousarray(rows).view("<f4"), fail)
+    if "bufferView" not in found["POSITION"] and not importlib.util.find_spec("DracoPy"):
+        extensions = ", ".join(primitive.get("extensions", {})) or "none is named"
+        raise fail(f"{name} has no data of its own, and the extension that has them is not read: {extensions}")
+    read = {kind: a for kind, a in found.items() if kind in ATTRIBUTES and "bufferView" in a and count > 0}
+    colors = read.get("COLOR_0")
+    if colors is not None and colors["componentType"] == 5126:
+        _check_colors(path, f"COLOR_0 of {name}", _rows(colors, tree["bufferViews"], views), fail)
+    # Colours of 8 bits are what trimesh has itself.
+    return {
+        used[kind]
+        for kind, a in read.items()
+        if kind != "indices"
+        and a["componentType"] not in (5126, 5121 if kind == "COLOR_0" else 5126)
+        and (a.get("normalized") or kind == "COLOR_0")
+    }
+
+
+def _check_material(
+    path: Path,
+    name: str,
+    material: dict[str, Any],
+    tree: dict[str, Any],
+    views: list[bytes],
+    file: Callable[[str], bytes],
+    fail: Any,
+) -> None:
+    """Refuse a colour or a texture that is none; trimesh leaves out what it cannot read."""
+    look = material.get("pbrMetallicRoughness", {})
+    factor = np.array(look.get("baseColorFactor", [1.0] * 4), np.float64)
+    if factor.shape != (4,):
+        raise fail(f"the baseColorFactor of {name} is {factor.tolist()}; expected four numbers")
+    _check_colors(path, f"baseColorFactor of {name}", factor[None], fail)
+    if "baseColorTexture" not in look:
+        return
+    reference = look["baseColorTexture"]
+    if "KHR_texture_transform" in reference.get("extensions", {}) or reference.get("texCoord", 0) != 0:
+        warn(f"{path}: the texture of {name} has a transform or coordinates of its own, which are not read")
+    texture = tree["textures"][_count(reference["index"])]
+    webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
+    source = webp.get("source", texture.get("source"))
+    if source is None:
+        warn(f"{path}: the texture of {name} is of a kind that is not read; it is loaded without")
+        return
+    image = tree["images"][_count(source)]
+    content = views[_count(image["bufferView"])] if "bufferView" in image else _content(image["uri"], file, fail)
+    if not is_image(content):
+        raise fail(f"the texture of {name} cannot be read as an image")
 
 
 def _check_colors(path: Path, name: str, colors: np.ndarray, fail: Any) -> None:

@@ -5,6 +5,7 @@ Inside the library colours are linear and images premultiplied; files hold sRGB 
 
 from __future__ import annotations
 
+import io
 import math
 import warnings
 from collections.abc import Iterable
@@ -220,6 +221,17 @@ def read_image(path: Path) -> np.ndarray:
     except Exception as error:  # Pillow's decoders raise many kinds, SyntaxError and struct.error among them.
         said = " ".join(str(error).split())
         raise InputError(f"{path} cannot be read as an image ({said}); export it again, as PNG for example") from error
+
+
+def is_image(content: bytes) -> bool:
+    """Whether bytes begin like an image that Pillow reads."""
+    from PIL import Image
+
+    try:
+        Image.open(io.BytesIO(content)).close()
+    except Exception:  # Of many kinds, as in `read_image`.
+        return False
+    return True
 
 
 def pixels(image: Any) -> np.ndarray:

@@ -35,10 +35,10 @@ def load(path: Any, *, merge: bool = False, weld: bool = True) -> list[Part]:
     from θ, and smooth ones are computed that do. The shader is `textured` where there are uv and a texture, else
     `lambert`.
 
-    Polygons of n corners are cut into n − 2 triangles: convex ones into the fan about their first corner, concave
-    ones so that the triangles do not overlap. A material of an OBJ is as opaque as `d` says, and where that is
-    missing as 1 − `Tr`; but where `Tr` is 1 or more, or the comments of the MTL say that MeshLab wrote it, `Tr` is
-    taken for `d`, as MeshLab does. So `Tr 1` is opaque, and `d 0` transparent.
+    Polygons of n corners, as OBJ, PLY and OFF have them, are cut into n − 2 triangles: convex ones into the fan
+    about their first corner, concave ones so that the triangles do not overlap. A material of an OBJ is as opaque
+    as `d` says, and where that is missing as 1 − `Tr`; but where `Tr` is 1 or more, or the comments of the MTL say
+    that MeshLab wrote it, `Tr` is taken for `d`, as MeshLab does. So `Tr 1` is opaque, and `d 0` transparent.
 
     So the number of vertices may be less than the file's. For data of your own, one row for each vertex of the
     file, load with `weld=False`.

@@ -16,6 +16,7 @@ import numpy as np
 from rts.errors import InputError
 from rts.files import polygons
 from rts.files.damage import unreadable, warn
+from rts.files.images import is_image
 
 Lists = tuple[np.ndarray, np.ndarray]
 """Lists of different lengths: how long each one is, and all entries, one list after the other."""
@@ -76,18 +77,29 @@ class Mesh(NamedTuple):
 Fail = Callable[[str], InputError]
 
 
-def plain_ply(path: Path, data: bytes) -> bytes:
+def plain_ply(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
     """A PLY of the same mesh that is binary, and of triangles only.
+
+    Args:
+        path: its path.
+        data: its bytes.
+        file: the bytes of a file that it refers to.
 
     Raises:
         InputError: rows or entries of lists are not as many as promised, or are not numbers; a face has less than 3
-            corners, or refers to a vertex that is not there; colours are no colours.
+            corners, or refers to a vertex that is not there; colours are no colours; a texture is no image.
     """
 
     def fail(what: str) -> InputError:
         return unreadable(path, "PLY", what)
 
-    return written(path, "PLY", _mesh(path, data, fail))
+    mesh = _mesh(path, data, fail)
+    for comment in mesh.comments:
+        at = comment.lower().find("texturefile")
+        name = comment[at + len("texturefile") :].strip() if at >= 0 else ""
+        if name and not is_image(file(name)):
+            raise fail(f"its texture {name} cannot be read as an image")
+    return written(path, "PLY", mesh)
 
 
 def written(path: Path, kind: str, mesh: Mesh) -> bytes:
@@ -211,7 +223,7 @@ def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, tuple[str, ...
             case [] | ["obj_info", *_]:
                 pass
             case ["comment", *_]:
-                comments.append(" ".join(line.split()))
+                comments.append(line.strip())
             case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as layout, "1.0"]:
                 pass
             case ["element", name, count] if count.isdecimal() and name not in {e.name for e in elements}:

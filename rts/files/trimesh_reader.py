@@ -85,7 +85,7 @@ def _checked(path: Path, extension: str, data: bytes, folder: _Folder) -> tuple[
     """The format and the bytes that trimesh is to read, once what the file promises has been found to be there."""
     match extension:
         case "ply":
-            return "ply", plain_ply(path, data)
+            return "ply", plain_ply(path, data, folder.get)
         case "off":
             return "ply", plain_off(path, data)
         case "stl" | "stl_ascii":
@@ -93,7 +93,7 @@ def _checked(path: Path, extension: str, data: bytes, folder: _Folder) -> tuple[
         case "glb":
             return "glb", sound_glb(path, data, folder.get)
         case "gltf":
-            return "gltf", sound_gltf(path, data, folder.get)
+            return sound_gltf(path, data, folder.get)
     return extension, data
 
 
