@@ -241,6 +241,7 @@ def test_auto_without_a_splatter_takes_every_layer():
     assert rts.sample(SCENES["closed box"], CAMERA, SIZE, layers="auto").row.shape[0] == 2
 
 
+@pytest.mark.filterwarnings("ignore::rts.EmptyImageWarning")
 def test_auto_of_an_empty_view_takes_one_layer():
     image = rts.render(card(50.0), CAMERA, SIZE, layers="auto")
     np.testing.assert_array_equal(image, 0)
@@ -276,3 +277,66 @@ def test_auto_works_under_gradients_and_says_what_to_do_under_jit():
 def test_other_layers_are_refused(wrong):
     with pytest.raises(rts.InputError, match='expected an integer of at least 1, or "auto"'):
         rts.render(card(0.0), CAMERA, SIZE, layers=wrong)
+
+
+# ------------------------------------------------------------------------------------- far from the origin
+
+
+def far_scene(seed, offset, count):
+    """Parts of a soup, some of it doubled at nearly its depth, so far off that float32 rounds depths; and a camera."""
+    rng = np.random.default_rng(seed)
+    place = offset * np.array([0.6, -0.64, 0.48])
+    parts = []
+    for i in range(count):
+        vertices, faces = soup(6, 10 * seed + i, size=0.6)
+        behind = rng.uniform(1, 20) * 1e-7 * (1000 + offset)
+        vertices = np.concatenate([vertices, vertices - np.float32([0, 0, behind])])
+        faces = np.concatenate([faces, faces + len(vertices) // 2])
+        theta = {"vertices": (vertices + place).astype(np.float32)}
+        theta["colors"] = rng.random(vertices.shape).astype(np.float32)
+        parts.append(rts.Part(MESH(faces.astype(np.int32)), theta, "unlit"))
+    return parts, rts.Camera.look_at(place + (0.3, 0.4, 4.0), place, fov_y=50, aspect=1.0)
+
+
+def both_ways(parts, camera, splatter):
+    """Images and gradients of the vertices, by torch, of all samples and of those that are needed; and their counts."""
+    torch = pytest.importorskip("torch")
+    weights = torch.tensor(np.random.default_rng(0).normal(size=(16, 16, 4)), dtype=torch.float32)
+    found = []
+    for chosen in (None, splatter):
+        vertices = [torch.tensor(p.theta["vertices"], requires_grad=True) for p in parts]
+        moving = with_vertices(parts, vertices)
+        sampled = sample(moving, camera, (16, 16), splatter=chosen, layers=3)
+        image = rts.render_samples(sampled, moving, camera, splatter=splatter)
+        grads = torch.autograd.grad((image * weights).sum(), vertices)
+        found.append((to_numpy(image), to_numpy(grads), int((sampled.row >= 0).sum())))
+    return found
+
+
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("splatter", ["multi", "visible"])
+@pytest.mark.parametrize("offset", [0.0, 10.0, 1e2, 1e3, 1e4, 1e5])
+def test_nothing_that_counts_is_dropped_however_far_off_the_origin(offset, splatter, count):
+    fewer = 0
+    for seed in range(40):
+        (whole, gradients, every), (pruned, others, kept) = both_ways(*far_scene(seed, offset, count), splatter)
+        np.testing.assert_allclose(pruned, whole, rtol=0, atol=1e-6)
+        for found, expected in zip(others, gradients, strict=True):
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * max(1, np.abs(expected).max()))
+        fewer += every - kept
+    assert fewer > 0 if offset <= 10 and splatter == "visible" else offset <= 100 or fewer == 0
+
+
+def test_nothing_that_counts_is_dropped_far_off_the_origin_inside_jit():
+    jax = pytest.importorskip("jax")
+    parts, camera = far_scene(3, 1e4, 1)
+
+    def image(vertices, splatter):
+        moving = with_vertices(parts, [vertices])
+        sampled = sample(moving, camera, (16, 16), splatter=splatter, layers=3)
+        return rts.render_samples(sampled, moving, camera, splatter="visible"), (sampled.row >= 0).sum()
+
+    vertices = jax.numpy.asarray(parts[0].theta["vertices"])
+    (whole, every), (pruned, kept) = (jax.jit(lambda v, s=s: image(v, s))(vertices) for s in (None, "visible"))
+    np.testing.assert_allclose(pruned, whole, rtol=0, atol=1e-6)
+    assert every == kept

@@ -8,17 +8,32 @@ import numpy as np
 
 from rts.records import Fragments, Proxy, Samples
 
+FAR = 20
+"""How many times larger than the farthest depth coordinates may be, so that depths, computed of them in float32, differ
+from those that were sampled by less than splatters allow for."""
+
+
+def largest(x: np.ndarray) -> float:
+    """The largest size of a number in an array; 0 for none."""
+    return float(max(x.max(initial=0), -x.min(initial=0)))
+
+
+def too_far(size: float, depth: np.ndarray) -> bool:
+    """Whether coordinates of a size are so large that rounding may reorder depths (0 where there is none)."""
+    return size > FAR * largest(depth)
+
 
 def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None, kept: np.ndarray | None = None) -> Samples:
     """Packed samples from fragments: the triangle's ids, and its corner parameters interpolated.
 
     Samples are numbered layer by layer, each in rows and columns of the image. There is always at least one row, so
     that what follows stays connected to θ; a row that no cell refers to has no effect. `kept` (K, H, W) bool says which
-    of the covered cells to take, None for all.
+    of the covered cells to take, None for all; all are taken, too, where depths are too rough to tell (`too_far`).
     """
     from rts.sampling import packing_kernels
 
-    kept = fragments.triangle_ids >= 0 if kept is None else kept
+    if kept is None or (len(kept) > 1 and too_far(largest(proxy.vertices), fragments.depth)):
+        kept = fragments.triangle_ids >= 0
     table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
     ids, params, row, depth, total = packing_kernels.pack(fragments, kept, table, corner_params, capacity or 0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import threading
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -12,10 +11,12 @@ from typing import Any
 import numpy as np
 
 from rts.adapting import adapted
-from rts.engines import engine_of, is_traced, namespace
-from rts.errors import InputError, LayersWarning
-from rts.interfaces import AnyNeeded, CheckedPart, Needed, Splatter
+from rts.engines import engine_of, is_traced, namespace, value_of
+from rts.errors import InputError, LayersWarning, warn
+from rts.interfaces import AnyNeeded, CheckedPart, Needed, Splatter, TriangleSurface
 from rts.records import ArraySpec, Sampled, Samples
+from rts.sampling.packing import largest, too_far
+from rts.trees import leaves
 
 LAYER_LIMIT = 8
 """The largest number of layers that `layers="auto"` takes."""
@@ -24,12 +25,19 @@ LAYER_LIMIT = 8
 def needed_by(splatter: Splatter, parts: Sequence[CheckedPart]) -> AnyNeeded | None:
     """The function that says which samples of a scene the splatter needs; None to keep all.
 
-    Hidden samples are only without effect if all samples are opaque and lie on cells' centres.
+    Hidden samples are only without effect if all samples are opaque and lie on cells' centres; and only if numbers of
+    the scene are not so large that rounding reorders depths. Where these are not known, since they are traced, `lift`
+    looks at the triangles, unless samples are refined.
     """
     if not splatter.prunes or not all(p.shader.opaque and p.surface.centered for p in parts):
         return None
+    size = _size(parts)
+    if size is None and not all(isinstance(p.surface, TriangleSurface) and not p.surface.refines for p in parts):
+        return None
 
     def needed(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        if len(covered) == 1 or (size is not None and too_far(size, depth)):
+            return covered
         kept = splatter.needed(covered, depth)
         if not (isinstance(kept, np.ndarray) and kept.shape == covered.shape and kept.dtype == bool):
             given = f"{kept.dtype} of {kept.shape}" if isinstance(kept, np.ndarray) else type(kept).__name__
@@ -37,6 +45,19 @@ def needed_by(splatter: Splatter, parts: Sequence[CheckedPart]) -> AnyNeeded | N
         return kept & covered
 
     return needed
+
+
+def _size(parts: Sequence[CheckedPart]) -> float | None:
+    """The largest number of those that surfaces read; None where one is traced."""
+    size = 0.0
+    for part in parts:
+        for x in leaves({name: part.theta[name] for name in part.surface.reads(part.theta)}):
+            value = value_of(x)
+            if value is None:
+                return None
+            if value.dtype in (np.float32, np.float64):
+                size = max(size, largest(value))
+    return size
 
 
 class Inspection(Needed):
@@ -109,11 +130,10 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: AnyNeeded | None)
     kept = min(inspection.most, LAYER_LIMIT)
     missing = int(inspection.beyond[LAYER_LIMIT:].sum())
     if missing:
-        warnings.warn(
+        warn(
             f"{missing} cells where surfaces hide one another have more than the {LAYER_LIMIT} layers of "
             f'layers="auto"; give a larger number if their derivative matters',
             LayersWarning,
-            stacklevel=5,
         )
     return replace(
         sampled, row=sampled.row[:kept, ...], depth=sampled.depth[:kept, ...], overflow=sampled.overflow + missing

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rts.arguments import quoted
 from rts.checks import is_count, is_real
 from rts.engines import engine_of, namespace
 from rts.errors import InputError
@@ -29,8 +30,9 @@ from rts.trees import Array
 
 SIGMA, EPSILON = 0.5, 0.05
 LEAST_SIGMA, LARGEST_SIGMA = 0.1, 1e3
-TIE, LEAST_EPSILON = 1e-5, 1e-4
-"""Depths that differ by less, relative to the farthest, may be ordered by rounding; the ε outweighs that of weights."""
+TIE, LEAST_EPSILON = 1.5e-4, 1e-4
+"""Depths that differ by less, relative to the farthest, may be ordered by rounding, unless coordinates are larger than
+`rts.sampling.packing.FAR` says; the ε outweighs the rounding of weights."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class Kernel(Splatter):
 
     def __post_init__(self):
         if not (is_real(self.sigma) and LEAST_SIGMA <= self.sigma <= LARGEST_SIGMA):
-            raise InputError(f"sigma is {self.sigma}; expected pixels, from {LEAST_SIGMA} to {LARGEST_SIGMA:g}")
+            raise InputError(f"sigma is {quoted(self.sigma)}; expected pixels, from {LEAST_SIGMA} to {LARGEST_SIGMA:g}")
         if not (is_real(self.epsilon) and 0 <= self.epsilon < math.inf):
             raise InputError(f"epsilon is {self.epsilon}; expected a number of at least 0")
         if self.calibration is not None and not (is_real(self.calibration) and 0 < self.calibration < math.inf):
@@ -118,7 +120,8 @@ def exact_calibration(sigma: float, reach: int = 1) -> float:
     """
     if not (is_real(sigma) and 0 < sigma < math.inf) or not is_count(reach):
         raise InputError(
-            f"sigma is {sigma!r} and reach {reach!r}; expected a positive number and an integer of at least 1"
+            f"sigma is {quoted(sigma)} and reach {quoted(reach)}; expected a positive number and an integer of at "
+            f"least 1"
         )
     e = [math.exp(-(u**2) / (2 * sigma**2)) for u in range(1, reach + 1)]
     return sigma**2 * (1 + 2 * sum(e)) / (2 * sum(u**2 * x for u, x in enumerate(e, start=1)))

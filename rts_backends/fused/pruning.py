@@ -16,11 +16,8 @@ compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
 
 
-def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, epsilon: float, size: float = 0.0) -> np.ndarray:
-    """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W); for `Visible`, or for `Multi`.
-
-    `size` is that of the numbers that depths are computed of.
-    """
+def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, epsilon: float) -> np.ndarray:
+    """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W); for `Visible`, or for `Multi`."""
     layers, height, _ = covered.shape
     if layers == 1 or not (visible or epsilon >= LEAST_EPSILON):
         return covered
@@ -28,7 +25,7 @@ def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, epsilon: float
     extent, kept = np.zeros((2, height), depth.dtype), np.empty_like(covered)
     parallel(_extent, height, covered, depth, extent, work=covered.size // 4)
     least, largest, kind = extent[0].min(initial=0), extent[1].max(initial=0), depth.dtype.type
-    numbers = kind(2 * (largest - least)), kind(TIE * max(largest, -least, size)), kind(CONTINUED)
+    numbers = kind(2 * (largest - least)), kind(TIE * max(largest, -least)), kind(CONTINUED)
     parallel(_keep, height, covered, depth, visible, *numbers, kept, work=2 * covered.size)
     return kept
 
