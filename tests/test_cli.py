@@ -2,6 +2,7 @@ import json
 import re
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -20,7 +21,9 @@ pytestmark = pytest.mark.files
 
 
 def run(*arguments):
-    return CliRunner().invoke(cli.app, [str(a) for a in arguments])
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")  # As in a program; the tests' own filter makes errors of warnings.
+        return CliRunner().invoke(cli.app, [str(a) for a in arguments])
 
 
 def succeed(*arguments):
@@ -64,18 +67,18 @@ def test_version():
 
 
 def test_the_installed_program_reports_an_error_in_one_line_and_the_traceback_on_request():
-    def program(*arguments):
+    def installed(*arguments):
         code = "import sys; from rts.cli.main import main; sys.argv[0] = 'rts'; main()"
         return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
 
-    short = program("render", "gone.obj")
+    short = installed("render", "gone.obj")
     assert short.returncode == 1 and short.stdout == ""
     assert short.stderr.startswith("rts: no file gone.obj; check the path") and short.stderr.count("\n") == 1
     for arguments in (["--debug", "render", "gone.obj"], ["render", "--debug", "gone.obj"]):
-        long = program(*arguments)
+        long = installed(*arguments)
         assert long.returncode == 1
         assert "Traceback" in long.stderr and "InputError: no file gone.obj" in long.stderr
-    usage = program("render", "--sise", "3", "gone.obj")
+    usage = installed("render", "--sise", "3", "gone.obj")
     assert usage.returncode == 2 and usage.stdout == ""
     assert usage.stderr.startswith("rts: No such option: --sise") and usage.stderr.count("\n") == 1
 
@@ -86,6 +89,50 @@ def test_debug_may_stand_anywhere(place):
     arguments.insert(place, "--debug")
     assert isinstance(run(*arguments).exception, InputError)
     assert "No such option: --debug" not in fail("render", "--", "--debug")
+
+
+def program(*arguments, cwd=None):
+    command = [sys.executable, "-m", "rts", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd)
+
+
+def test_as_a_module_it_is_the_same_program(tmp_path):
+    shown = program("render", "--help").stdout
+    assert "Usage: rts render [OPTIONS]" in shown and "-m" not in shown and "__main__" not in shown
+    assert "Usage: rts [OPTIONS]" in program().stdout
+    wrong = program("render", "--sise", "3", "gone.obj")
+    assert wrong.returncode == 2 and wrong.stdout == ""
+    assert wrong.stderr.startswith("rts: No such option: --sise") and "try 'rts render --help'" in wrong.stderr
+
+
+QUAD = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+
+
+def test_warnings_are_lines_like_errors_in_the_installed_program(tmp_path):
+    (tmp_path / "m.obj").write_text(f"mtllib gone.mtl\n{QUAD}f 1 2 3 4\n")
+    done = program("render", "m.obj", "-o", "a.png", "--size", "8", cwd=tmp_path)
+    assert done.returncode == 0 and "wrote a.png" in done.stdout
+    [line] = done.stderr.splitlines()
+    assert line.startswith("rts: warning: m.obj names the material library 'gone.mtl', but there is no file")
+
+
+def test_each_warning_is_shown_once_and_in_one_line_whoever_warns(tmp_path, monkeypatch):
+    (tmp_path / "m.obj").write_text(f"{QUAD}f 1 2 3 4\n")
+    load = rts.load
+
+    def warning(path):
+        for number in (1, 2, 1, 2):
+            warnings.warn(f"odd\n  thing {number}", RuntimeWarning, stacklevel=number)
+        np.float32(1e30) * np.float32(1e30)
+        return load(path)
+
+    monkeypatch.setattr(rts, "load", warning)
+    before = warnings.showwarning
+    result = run("render", tmp_path / "m.obj", "-o", tmp_path / "a.png", "--size", 8)
+    assert result.exit_code == 0 and warnings.showwarning is before
+    lines = result.stderr.splitlines()
+    assert lines[:2] == ["rts: warning: odd thing 1", "rts: warning: odd thing 2"]
+    assert len(lines) == 3 and re.fullmatch("rts: warning: overflow encountered in .*", lines[2])
 
 
 def test_without_arguments_there_is_the_help():
@@ -194,6 +241,23 @@ def test_wrong_usage_exits_with_2(model, options, expected):
     [
         (["--camera", "0,91"], "elevation 91.0"),
         (["--camera", "0,0,-1"], "distance is -1.0"),
+        (["--camera", "nan,0"], "azimuth is nan"),
+        (["--camera", "0,nan"], "elevation nan"),
+        (["--camera", "inf,0"], "azimuth is inf"),
+        (["--camera", "0,0,nan"], "distance is nan"),
+        (["--camera", "0,0,inf"], "distance is inf"),
+        (["--camera", "0,0,1e300"], "distance is 1e+300, and the object's radius"),
+        (["--camera", "0,0,1e-300"], "distance is 1e-300, and the object's radius"),
+        (["--fov", "1e-300"], "give another distance, or a wider field of view"),
+        (["--fov", "-3"], "fov is -3.0"),
+        (["--fov", "nan"], "fov is nan"),
+        (["--size", "100000000"], "100000000 x 100000000 pixels"),
+        (["--size", f"{10**40}"], "choose a smaller size"),
+        (["--layers", f"{10**20}"], "choose a smaller size"),
+        (["--supersample", f"{10**12}"], "choose a smaller size"),
+        (["--supersample", "0"], "supersample is 0"),
+        (["--sampler", ""], "no sampler named ''"),
+        (["--engine", "../numpy"], "no engine named '../numpy'"),
         (["--fov", "180"], "fov is 180.0"),
         (["--up", "x"], "up is 'x'"),
         (["--layers", "0"], "layers is 0"),
@@ -213,6 +277,29 @@ def test_wrong_values_exit_with_1(model, options, expected):
 def test_unreadable_and_unwritable_files(model, tmp_path):
     assert "no file" in fail("render", tmp_path / "gone.obj")
     assert "is a folder" in fail("render", tmp_path)
+    for name in ("m.obj", "m.ply", "m.stl", "m.glb", "m.gltf", "m.off", "m.3mf", "m.xyz", "m.dae", "m"):
+        (tmp_path / name).write_bytes(b"")
+        assert name in fail("render", tmp_path / name)
+    assert "(File name too long)" in fail("render", f"{'a' * 999}.obj")
+    assert "(File name too long)" in fail("render", model, "-o", f"{'a' * 999}.png")
+    assert "ending in .png" in fail("render", model, "-o", "")
+
+
+def test_a_file_that_cannot_be_written_in_the_end_is_one_line(model, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Image.Image, "save", full)
+    said = fail("render", model, "--size", 8, "-o", tmp_path / "a.png")
+    assert "a.png cannot be written (No space left on device)" in said
+
+
+def test_a_lack_of_memory_is_one_line(model, tmp_path, monkeypatch):
+    def large(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr("rts.render", large)
+    assert "not enough memory" in fail("render", model, "--size", 8, "-o", tmp_path / "a.png")
 
 
 def test_names_that_cannot_be_written_are_refused_before_any_work(model, tmp_path, monkeypatch):
@@ -233,6 +320,15 @@ def test_names_that_cannot_be_written_are_refused_before_any_work(model, tmp_pat
     for command in (["fit-pose", model, model], ["demo"]):
         for output in ("file", "file/new"):
             assert "file is a file; expected a folder" in fail(*command, "-o", tmp_path / output)
+
+    def refused(*_, **__):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refused)
+    for command in (["render", model, "-o", tmp_path / "a.png"], ["fit-pose", model, model, "-o", tmp_path / "new"]):
+        assert f"nothing can be written into {tmp_path} (Read-only file system)" in fail(*command)
+    assert "(Read-only file system)" in fail("demo", "-o", tmp_path / "new" / "deeper")
+    assert not (tmp_path / "new").exists()
 
 
 # ---------------------------------------------------------------------------------------------------- pose
@@ -267,6 +363,17 @@ def test_fit_pose_with_adam_lowers_the_loss(model, tmp_path):
     assert after < before / 4
 
 
+def test_fit_pose_says_how_many_steps_it_made_where(model, tmp_path):
+    pytest.importorskip("torch")
+    succeed("render", model, "-o", tmp_path / "t.png", "--size", 48, "--shader", "silhouette")
+    output = succeed("fit-pose", model, tmp_path / "t.png", "-o", tmp_path / "o", "--steps", 3, "--camera", "45,30")
+    assert "in 6 steps, 3 + 3 from coarse pixels to fine, " in output
+    assert "s (at the finest, all 3 steps made); wrote" in output
+    succeed("render", model, "-o", tmp_path / "t.png", "--size", 32, "--shader", "silhouette")
+    output = succeed("fit-pose", model, tmp_path / "t.png", "-o", tmp_path / "o", "--steps", 3, "--camera", "45,30")
+    assert re.search(r"in 3 steps, [\d.]+ s \(all 3 steps made\); wrote", output)
+
+
 def test_fit_pose_says_which_extra_draws_the_plot(model, tmp_path, monkeypatch):
     pytest.importorskip("torch")
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
@@ -289,11 +396,22 @@ def test_fit_pose_refuses(model, tmp_path, options, expected):
     assert expected in fail("fit-pose", model, tmp_path / "t.png", *options)
 
 
+def bright(path):
+    """A picture of a white square on black."""
+    rts.save_image(path, np.pad(np.ones((8, 8)), 4))
+    return path
+
+
 def test_targets_without_a_silhouette_are_refused(model, tmp_path):
     rts.save_image(tmp_path / "t.png", np.zeros((8, 8)))
     assert "the target's silhouette lies between 0 and 0" in fail("fit-pose", model, tmp_path / "t.png")
     assert "no picture" in fail("fit-pose", model, tmp_path / "gone.png")
     assert "cannot be read as an image" in fail("fit-pose", model, model)
+    (tmp_path / "empty.png").write_bytes(b"")
+    assert "empty.png cannot be read as an image" in fail("fit-pose", model, tmp_path / "empty.png")
+    assert "is a folder; expected a picture" in fail("fit-pose", model, tmp_path)
+    for steps in (0, -1):
+        assert f"steps is {steps}" in fail("fit-pose", model, bright(tmp_path / "b.png"), "--steps", steps)
 
 
 def test_the_silhouette_is_the_alpha_or_else_the_brightness():
