@@ -33,6 +33,6 @@ def supersampled(parts, view: rts.Camera, size: tuple[int, int], samples: int | 
         shift = np.eye(4)
         # Moving the image by −dx pixels puts the point at +dx under the pixel's centre.
         shift[0, 3], shift[1, 3] = -2 * dx / size[1], 2 * dy / size[0]
-        moved = view._replace(projection=shift @ view.projection)
+        moved = view.replace(projection=shift @ view.projection)
         total = total + rts.render(parts, moved, size, splatter="none", layers=1, **options)
     return total / len(points)

@@ -8,7 +8,17 @@ from rts.adapting import unwrapped
 from rts.camera import Camera
 from rts.diagnostics.gradients import check_gradient, gradient_image
 from rts.engines import Engine, engine_of, namespace
-from rts.errors import EngineError, InputError, LayersWarning, PluginError, RtsError
+from rts.errors import (
+    AspectWarning,
+    EmptyImageWarning,
+    EngineError,
+    FileWarning,
+    InputError,
+    LayersWarning,
+    PluginError,
+    RtsError,
+    RtsWarning,
+)
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
 from rts.fitting.fit import Fit, fit
@@ -31,10 +41,13 @@ __version__ = "0.1.0"
 
 __all__ = [
     "ArraySpec",
+    "AspectWarning",
     "Camera",
+    "EmptyImageWarning",
     "Engine",
     "EngineError",
     "Evaluator",
+    "FileWarning",
     "Fit",
     "Fragments",
     "GBuffer",
@@ -50,6 +63,7 @@ __all__ = [
     "Rays",
     "Residuals",
     "RtsError",
+    "RtsWarning",
     "Sampled",
     "Sampler",
     "Samples",

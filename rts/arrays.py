@@ -7,28 +7,76 @@ from typing import Any
 
 import numpy as np
 
-from rts.engines import CONSTANT_TYPES, OWNERS, engine_of, exemplar, is_constant, namespace
-from rts.errors import InputError
-from rts.trees import Array, Tree, is_named, leaves
+from rts.engines import CONSTANT_TYPES, OWNERS, engine_of, exemplar, is_constant, namespace, value_of
+from rts.errors import EngineError, InputError
+from rts.trees import STATIC_FIELDS, Array, Tree, is_named, leaves, map_leaves
 
 
-def from_numbers(tree: Tree) -> Tree:
-    """A copy of a tree in which every list or tuple that holds only numbers, nested or not, is a float32 array."""
-    if type(tree) is np.ndarray or type(tree) in OWNERS:
+def from_numbers(tree: Tree, name: str = "an array") -> Tree:
+    """A copy of a tree whose leaves are arrays or numbers that the library can work with.
+
+    Every list or tuple that holds only numbers, nested or not, becomes a float32 array. NumPy arrays in another than
+    this machine's byte order, in half and in extended precision become ordinary ones.
+
+    Args:
+        tree: nested dicts, lists, tuples and records.
+        name: what an error calls it.
+
+    Raises:
+        InputError: what is no array, of complex numbers, or without values in one piece of memory.
+    """
+    kind = type(tree)
+    if kind is np.ndarray:
+        return tree if tree.dtype in _ORDINARY else _ordinary(tree, name)
+    owner = OWNERS.get(kind)
+    if owner is not None:
+        return owner.admitted(tree, name)
+    if tree is None or kind in _NUMBERS:
         return tree
     if isinstance(tree, Mapping):
         found = {}
         for key, value in tree.items():
-            found[key] = value if type(value) is np.ndarray or type(value) in OWNERS else from_numbers(value)
+            if not isinstance(key, str):
+                raise InputError(f"{name} has the key {key!r}; expected names")
+            found[key] = from_numbers(value, f"{name}[{key!r}]")
         return found
-    if isinstance(tree, (list, tuple)) and not is_named(tree):
-        if tree and all(isinstance(x, (bool, int, float)) for x in leaves(tree)):
+    if isinstance(tree, (list, tuple)):
+        if tree and not is_named(tree) and all(isinstance(x, (bool, int, float)) for x in leaves(tree)):
             try:
                 return np.asarray(tree, np.float32)
-            except ValueError:
-                raise InputError(f"a list of numbers has rows of different lengths: {str(tree)[:60]}") from None
-        return type(tree)(from_numbers(x) for x in tree)
-    return tree
+            except (ValueError, OverflowError):
+                what = " ".join(str(tree).split())[:60]
+                raise InputError(f"{name} is {what}, whose rows have different lengths; expected an array") from None
+        items = [from_numbers(x, f"{name}[{i}]") for i, x in enumerate(tree)]
+        return kind(*items) if is_named(tree) else kind(items)
+    if kind in STATIC_FIELDS:
+        return map_leaves(lambda x: from_numbers(x, name), tree)
+    if isinstance(tree, np.generic):
+        return tree if tree.dtype in _ORDINARY else _ordinary(np.asarray(tree), name)
+    if isinstance(tree, np.ndarray):
+        return from_numbers(np.asarray(tree), name)
+    try:
+        engine = engine_of(tree)
+    except EngineError as error:
+        if _shape(tree) is not None:  # An array of some other framework.
+            raise EngineError(f"{name} is not usable: {error}") from None
+        what = " ".join(repr(tree).split())
+        raise InputError(f"{name} is {what if len(what) <= 60 else kind_of(tree)}; expected an array") from None
+    return engine.admitted(tree, name)
+
+
+_NUMBERS = (bool, int, float)
+_ORDINARY = frozenset(np.dtype(t) for t in "? b h i l q B H I L Q f d".split())
+
+
+def _ordinary(array: np.ndarray, name: str) -> np.ndarray:
+    """An array of unusual numbers as one of ordinary numbers."""
+    dtype = array.dtype.newbyteorder("=")
+    if dtype.kind == "f" and dtype not in _ORDINARY:
+        dtype = np.dtype(np.float32 if dtype.itemsize < 4 else np.float64)
+    if dtype not in _ORDINARY:
+        raise InputError(f"{name} has dtype {array.dtype}; expected real numbers, such as float32")
+    return array.astype(dtype)
 
 
 def _shape(x: Any) -> Any:
@@ -99,3 +147,18 @@ def without_border(image: Array, border: int) -> Array:
     """An image (H, W, C) without `border` rows and columns at each side."""
     height, width = image.shape[:2]
     return image[border : height - border, border : width - border, ...] if border else image
+
+
+def is_finite(x: Array) -> bool:
+    """Whether all values are finite, as far as they are known; quick where they are."""
+    engine = engine_of(x)
+    if not engine.on_host(x):
+        known = value_of(engine.namespace.all(engine.namespace.isfinite(x)))
+        return known is None or bool(known.all())
+    known = engine.known(x)
+    if known is None:
+        return True
+    flat = known.reshape(-1)
+    with np.errstate(over="ignore", invalid="ignore"):
+        square = np.dot(flat, flat)  # Ten times as fast as to look at each.
+    return bool(np.isfinite(square)) or bool(np.isfinite(flat).all())

@@ -12,41 +12,71 @@ camera's matrices are of that kind; give numbers or NumPy arrays, and they are f
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
 
-from rts.arrays import promote
-from rts.engines import constants, engine_of, is_constant, namespace
+from rts.arguments import check_numbers, check_planes, check_positive, check_rotation, quoted
+from rts.arrays import described, from_numbers, promote, shape_of, unit
+from rts.engines import constants, engine_of, is_constant, load_engines, namespace, value_of
+from rts.errors import InputError
 from rts.operations.linear import affine, matmul
 from rts.operations.projection import projective_map
 from rts.records import Rays
 from rts.transforms import (
     affine_matrix,
-    check_range,
-    check_shapes,
     look_at,
     matrix_of,
     orthographic,
     perspective,
     scaled_rows,
 )
-from rts.trees import Array
+from rts.trees import Array, map_leaves, record
 
 NEAR_OVER_DISTANCE = 1e-2
 FAR_OVER_DISTANCE = 1e2
 
 
-class Camera(NamedTuple):
-    """A camera: two matrices.
+@record(static=("aspect",))
+class Camera:
+    """A camera: two matrices, and for which ratio of width to height they are.
+
+    `Camera(view, projection)` takes matrices as they are. Linear depth is read off `view`, so a product of both, such
+    as makes vertices in clip space for nvdiffrast, is no `projection`: `Camera.from_mvp` takes it apart.
 
     Attributes:
-        view: (4, 4) camera-from-world.
-        projection: (4, 4) OpenGL clip space from camera space.
+        view: (4, 4) camera-from-world, affine.
+        projection: (4, 4) OpenGL clip space from camera space; its last row is (0, 0, ±c, d).
+        aspect: width over height of the image that the projection is for; "open" if it is for a square one and to be
+            widened to any size, as `for_size` does; None if nobody knows.
     """
 
     view: Array
     projection: Array
+    aspect: float | Literal["open"] | None = None
+
+    def __post_init__(self):
+        load_engines()  # So that cameras may be arguments of their transforms.
+
+    def __iter__(self) -> Iterator[Array]:
+        """View and projection, for `view, projection = camera`."""
+        self._check_closed("unpacked")
+        return iter((self.view, self.projection))
+
+    def __eq__(self, other: Any) -> bool:
+        """Whether both have the same matrices, in value, and the same ratio."""
+        if not isinstance(other, Camera):
+            return NotImplemented
+        pairs = (self.view, other.view), (self.projection, other.projection)
+        return self.aspect == other.aspect and all(a is b or _equal(a, b) for a, b in pairs)
+
+    __hash__ = None  # pyright: ignore[reportAssignmentType]  # Arrays change.
+
+    def replace(self, **changes: Any) -> Camera:
+        """A copy with some fields changed."""
+        return replace(self, **changes)
 
     # ---------------------------------------------------------------------------------------- constructors
 
@@ -58,7 +88,7 @@ class Camera(NamedTuple):
         up: Any = (0.0, 1.0, 0.0),
         *,
         fov_y: Any = 45.0,
-        aspect: Any = 1.0,
+        aspect: Any = None,
         near: Any = None,
         far: Any = None,
         principal_point: Any = (0.0, 0.0),
@@ -70,7 +100,7 @@ class Camera(NamedTuple):
             target: (3,) world.
             up: (3,) direction that is up in the image.
             fov_y: vertical field of view, degrees.
-            aspect: width over height.
+            aspect: width over height of the image; None for that of the size it is rendered at.
             near: near plane; default 1/100 of the distance to the target.
             far: far plane; default 100 times the distance to the target.
             principal_point: (2,) where the axis meets the image, NDC.
@@ -84,7 +114,8 @@ class Camera(NamedTuple):
             distance = xp.sqrt(xp.sum((eye - target) ** 2))
             near = NEAR_OVER_DISTANCE * distance if near is None else near
             far = FAR_OVER_DISTANCE * distance if far is None else far
-        return cls(*_alike(view, perspective(fov_y, aspect, near, far, principal_point)))
+        projection = perspective(fov_y, 1.0 if aspect is None else aspect, near, far, principal_point)
+        return cls(*_alike(view, projection), _known_ratio(aspect))
 
     @classmethod
     def orthographic(
@@ -94,7 +125,7 @@ class Camera(NamedTuple):
         up: Any = (0.0, 1.0, 0.0),
         *,
         height: Any,
-        aspect: Any = 1.0,
+        aspect: Any = None,
         near: Any = 0.0,
         far: Any = 100.0,
         principal_point: Any = (0.0, 0.0),
@@ -106,7 +137,7 @@ class Camera(NamedTuple):
             target: (3,) world.
             up: (3,) direction that is up in the image.
             height: what the image shows from bottom to top, world units.
-            aspect: width over height.
+            aspect: width over height of the image; None for that of the size it is rendered at.
             near: depth of the near plane; may be negative.
             far: depth of the far plane.
             principal_point: (2,) where the axis meets the image, NDC.
@@ -115,7 +146,8 @@ class Camera(NamedTuple):
             InputError: eye and target coincide, the direction of view is parallel to `up`, or planes are out of order.
         """
         view = look_at(eye, target, up)
-        return cls(*_alike(view, orthographic(height, aspect, near, far, principal_point)))
+        projection = orthographic(height, 1.0 if aspect is None else aspect, near, far, principal_point)
+        return cls(*_alike(view, projection), _known_ratio(aspect))
 
     @classmethod
     def from_opencv(
@@ -140,11 +172,17 @@ class Camera(NamedTuple):
             far: far plane.
             pixel_center: where K puts the centre of the first pixel: 0 in OpenCV, 0.5 in COLMAP and most data sets
                 whose principal point is exactly (width / 2, height / 2).
+
+        Raises:
+            InputError: K is no matrix of intrinsics, R no rotation, or planes are out of order.
         """
-        check_range(near, far, positive=True)
+        check_planes(near, far, positive=True)
+        _check_intrinsics(K)
+        check_rotation("R", R)
+        check_numbers("t", t, (3,), (3, 1))
+        check_numbers("pixel_center", pixel_center, ())
+        height, width = check_pixels(size)
         xp, (K, R, t, near, far) = promote(K, R, t, near, far)
-        check_shapes({"K": (K, ((3, 3),)), "R": (R, ((3, 3),)), "t": (t, ((3,), (3, 1)))})
-        height, width = size
         view = scaled_rows(affine_matrix(R, xp.reshape(t, (3,))), (1, -1, -1, 1))
         cx, cy = K[0, 2] + (0.5 - pixel_center), K[1, 2] + (0.5 - pixel_center)
         depth = far - near
@@ -158,7 +196,43 @@ class Camera(NamedTuple):
             ],
             cx,
         )
-        return cls(view, projection)
+        return cls(view, projection, width / height)
+
+    @classmethod
+    def from_mvp(cls, matrix: Any) -> Camera:
+        """A camera from one matrix: model-view-projection, the product that takes the world to clip space.
+
+        For those who hold vertices in clip space, as nvdiffrast and diffren take them: give vertices in the world, and
+        the matrix that they were multiplied with. The image is the same, and depth is the linear one, in units of
+        the world, if the matrix is the product of any projection, perspective or parallel, and of a view that does
+        not scale.
+
+        Args:
+            matrix: (4, 4) OpenGL clip space from world space, acting on column vectors; `projection @ view`.
+
+        Raises:
+            InputError: the matrix is singular.
+        """
+        known = check_numbers("matrix", matrix, (4, 4))
+        if known is not None and not _invertible(known):
+            raise InputError("matrix is singular; expected an invertible product projection @ view")
+        xp, (m,) = promote(matrix)
+        x, y, z, w = (m[i, :3] for i in range(4))
+        parallel = known is not None and np.linalg.norm(known[3, :3]) <= PARALLEL * np.linalg.norm(known[:2, :3])
+        if parallel:  # Depth grows along the rays, from the near plane on.
+            along = xp.linalg.cross(x, y)
+            axis, start = unit(along * xp.sign(xp.sum(along * z))), m[2, :] + m[3, :]
+        else:
+            axis, start = unit(w), m[3, :]
+        rows = xp.stack([m[0, :], m[1, :], start])
+        eye = -matmul(xp.linalg.inv(rows[:, :3]), rows[:, 3:])
+        right = unit(x - axis * xp.sum(axis * x))
+        linear = xp.stack([right, xp.linalg.cross(right, axis), -axis])
+        view = affine_matrix(linear, -matmul(linear, eye)[:, 0])
+        projection = matmul(m, affine_matrix(xp.linalg.matrix_transpose(linear), eye[:, 0]))
+        # The last row, without its rounding.
+        last = [[0, 0, 0, m[3, 3]]] if parallel else [[0, 0, -xp.sum(axis * w), 0]]
+        return cls(view, xp.concat([projection[:3, :], matrix_of(xp, last, m[3, 3])]))
 
     @classmethod
     def from_opengl(cls, modelview: Any, projection: Any) -> Camera:
@@ -168,8 +242,9 @@ class Camera(NamedTuple):
             modelview: (4, 4) camera-from-world.
             projection: (4, 4) clip space from camera space.
         """
+        check_numbers("modelview", modelview, (4, 4))
+        check_numbers("projection", projection, (4, 4))
         _, (view, projection) = promote(modelview, projection)
-        check_shapes({"modelview": (view, ((4, 4),)), "projection": (projection, ((4, 4),))})
         return cls(view, projection)
 
     @classmethod
@@ -184,8 +259,8 @@ class Camera(NamedTuple):
             projection: (4, 4) clip space from camera space.
             top_down: whether the projection has its y negated, so that nvdiffrast's row 0 is the top already.
         """
-        view, projection = cls.from_opengl(modelview, projection)
-        return cls(view, scaled_rows(projection, (1, -1, 1, 1)) if top_down else projection)
+        camera = cls.from_opengl(modelview, projection)
+        return camera._flipped() if top_down else camera
 
     @classmethod
     def from_pytorch3d(
@@ -211,12 +286,18 @@ class Camera(NamedTuple):
             size: (height, width).
             near: near plane.
             far: far plane.
+
+        Raises:
+            InputError: R is no rotation, a focal length is not positive, or planes are out of order.
         """
-        check_range(near, far, positive=True)
+        check_planes(near, far, positive=True)
+        check_rotation("R", R)
+        check_numbers("T", T, (3,))
+        check_positive("focal_length", focal_length, (), (1,), (2,))
+        check_numbers("principal_point", principal_point, (2,))
+        height, width = check_pixels(size)
         xp, (R, T, focal, point, near, far) = promote(R, T, focal_length, principal_point, near, far)
-        check_shapes({"R": (R, ((3, 3),)), "T": (T, ((3,),))})
-        height, width = size
-        sx, sy = min(size) / width, min(size) / height
+        sx, sy = min(height, width) / width, min(height, width) / height
         focal = focal + xp.zeros_like(point)
         view = scaled_rows(affine_matrix(xp.linalg.matrix_transpose(R), T), (-1, 1, -1, 1))
         depth = far - near
@@ -230,7 +311,7 @@ class Camera(NamedTuple):
             ],
             far,
         )
-        return cls(view, projection)
+        return cls(view, projection, width / height)
 
     @classmethod
     def from_blender(
@@ -244,19 +325,32 @@ class Camera(NamedTuple):
             focal: focal length, pixels: 0.5 width / tan(0.5 camera_angle_x).
             near: near plane.
             far: far plane.
+
+        Raises:
+            InputError: the matrix is not affine or singular, or planes are out of order.
         """
+        known = check_numbers("camera_to_world", camera_to_world, (4, 4), (3, 4))
+        if known is not None and not (_is_affine(known) and _invertible(known[:3, :3])):
+            raise InputError(
+                "camera_to_world is singular, or its last row is not (0, 0, 0, 1); expected a rotation and a position"
+            )
+        check_positive("focal", focal)
+        height, width = check_pixels(size)
         xp, (c2w, focal) = promote(camera_to_world, focal)
-        check_shapes({"camera_to_world": (c2w, ((4, 4), (3, 4)))})
         c2w = affine_matrix(c2w[:3, :3], c2w[:3, 3])
-        fov_y = xp.atan(size[0] / (2 * focal)) * (360 / math.pi)
+        fov_y = xp.atan(height / (2 * focal)) * (360 / math.pi)
         fov_y = fov_y if not is_constant(fov_y) else float(fov_y)
-        return cls(*_alike(xp.linalg.inv(c2w), perspective(fov_y, size[1] / size[0], near, far)))
+        return cls(*_alike(xp.linalg.inv(c2w), perspective(fov_y, width / height, near, far)), width / height)
 
     # ------------------------------------------------------------------------------------------ converters
 
     def to_opencv(self, size: tuple[int, int], *, pixel_center: float = 0.0) -> tuple[Array, Array, Array]:
-        """OpenCV's K (3, 3), R (3, 3) and t (3,) of a perspective camera; the inverse of `from_opencv`."""
-        xp, p = namespace(self.projection), self.projection
+        """OpenCV's K (3, 3), R (3, 3) and t (3,) of a perspective camera; the inverse of `from_opencv`.
+
+        Raises:
+            InputError: the camera is orthographic.
+        """
+        xp, p = self._perspective("to_opencv", size)
         height, width = size
         scale = -1 / p[3, 2]
         shift = pixel_center - 0.5
@@ -276,17 +370,32 @@ class Camera(NamedTuple):
         view = scaled_rows(self.view, (1, -1, -1, 1))
         return K, view[:3, :3], view[:3, 3]
 
-    def to_opengl(self) -> tuple[Array, Array]:
-        """OpenGL's modelview and projection, (4, 4) each: the camera's own matrices."""
-        return self.view, self.projection
+    def to_opengl(self, size: tuple[int, int] | None = None) -> tuple[Array, Array]:
+        """OpenGL's modelview and projection, (4, 4) each: the camera's own matrices.
 
-    def to_nvdiffrast(self, *, top_down: bool = False) -> tuple[Array, Array]:
-        """Matrices (modelview, projection) for nvdiffrast; with `top_down`, row 0 of its image is the top, as here."""
-        return self.view, scaled_rows(self.projection, (1, -1, 1, 1)) if top_down else self.projection
+        Args:
+            size: (height, width) of the image; needed where the camera leaves its ratio open.
+        """
+        view, projection = self if size is None else self.for_size(size)
+        return view, projection
+
+    def to_nvdiffrast(self, *, top_down: bool = False, size: tuple[int, int] | None = None) -> tuple[Array, Array]:
+        """Matrices (modelview, projection) for nvdiffrast.
+
+        Args:
+            top_down: whether row 0 of its image is to be the top, as here.
+            size: as in `to_opengl`.
+        """
+        camera = self if size is None else self.for_size(size)
+        return (camera._flipped() if top_down else camera).to_opengl()
 
     def to_pytorch3d(self, size: tuple[int, int]) -> tuple[Array, Array, Array, Array]:
-        """PyTorch3D's R (3, 3), T (3,), focal_length (2,) and principal_point (2,); the inverse of `from_pytorch3d`."""
-        xp, p = namespace(self.projection), self.projection
+        """PyTorch3D's R (3, 3), T (3,), focal_length (2,) and principal_point (2,); the inverse of `from_pytorch3d`.
+
+        Raises:
+            InputError: the camera is orthographic.
+        """
+        xp, p = self._perspective("to_pytorch3d", size)
         sx, sy, scale = min(size) / size[1], min(size) / size[0], -1 / p[3, 2]
         view = scaled_rows(self.view, (-1, 1, -1, 1))
         focal = xp.stack([p[0, 0] / sx, p[1, 1] / sy]) * scale
@@ -298,17 +407,43 @@ class Camera(NamedTuple):
         )
 
     def to_blender(self, size: tuple[int, int]) -> tuple[Array, Array]:
-        """Blender's camera-to-world matrix (4, 4), and the focal length in pixels; the inverse of `from_blender`."""
-        return namespace(self.view).linalg.inv(self.view), self.projection[1, 1] * size[0] / 2
+        """Blender's camera-to-world matrix (4, 4), and the focal length in pixels; the inverse of `from_blender`.
+
+        Raises:
+            InputError: the camera is orthographic.
+        """
+        _, p = self._perspective("to_blender", size)
+        return namespace(self.view).linalg.inv(self.view), p[1, 1] * size[0] / 2
+
+    def _perspective(self, converter: str, size: tuple[int, int]) -> tuple[Any, Array]:
+        """Namespace and projection for a size; refused where it is known that there is no centre of projection."""
+        height, width = check_pixels(size)
+        projection = self.for_size((height, width)).projection
+        last = value_of(projection[3, 2])
+        if last is not None and (last == 0).any():
+            raise InputError(f"the camera is orthographic; {converter} needs a perspective one")
+        return namespace(projection), projection
 
     # ----------------------------------------------------------------------------------------------- use
+
+    def for_size(self, size: tuple[int, int]) -> Camera:
+        """The camera for images of a size (height, width), if it leaves the ratio open; else the camera itself."""
+        if self.aspect != "open":
+            return self
+        aspect = size[1] / size[0]
+        columns = engine_of(self.projection).constant(np.array([1 / aspect, 1, 1, 1]), self.projection)
+        return Camera(self.view, self.projection * columns, aspect)
+
+    def map(self, f: Callable[[Array], Array]) -> Camera:
+        """A copy with `f` applied to both matrices."""
+        return map_leaves(f, self)
 
     def within(self, transform: Array | None) -> Camera:
         """This camera in the local space of a part, whose world-from-local transform is given."""
         if transform is None:
             return self
         _, (view, transform) = promote(self.view, transform)
-        return self._replace(view=matmul(view, transform))
+        return self.replace(view=matmul(view, transform))
 
     def with_apron(self, size: tuple[int, int], apron: int) -> Camera:
         """The camera of the image with `apron` more pixels on every side."""
@@ -324,10 +459,11 @@ class Camera(NamedTuple):
             extent: (height, width) of the window, pixels.
         """
         (height, width), (top, left), (rows, columns) = size, corner, extent
+        self = self.for_size(size)
         change = np.diag([width / columns, height / rows, 1.0, 1.0])
         change[:2, 3] = (width - 2 * left) / columns - 1, 1 - (height - 2 * top) / rows
         change = engine_of(self.projection).constant(change, self.projection)
-        return self._replace(projection=matmul(change, self.projection))
+        return self.replace(projection=matmul(change, self.projection))
 
     def project(self, points: Array, size: tuple[int, int]) -> Array:
         """Pixel x, pixel y and linear depth of world points.
@@ -339,7 +475,10 @@ class Camera(NamedTuple):
         Returns:
             (N, 3). Points on the plane of the camera's centre have no image; they give finite values.
         """
-        (x, y), p = (size[1] / 2, size[0] / 2), self.projection
+        size, points = check_pixels(size), from_numbers(points, "points")
+        if shape_of(points)[-1:] != (3,):
+            raise InputError(f"points {described(points)}; expected (N, 3)")
+        (x, y), p = (size[1] / 2, size[0] / 2), self.for_size(size).projection
         from_clip = np.array([[x, 0, 0, x], [0, -y, 0, y], [0, 0, 0, 1], [0, 0, 0, 0]])
         depth = np.zeros((4, 4))
         depth[3, 2] = -1
@@ -357,6 +496,23 @@ class Camera(NamedTuple):
         axis = self.projection[3, 3] * r[2, :]
         return at[..., 0:1] * r[0, :] + at[..., 1:2] * r[1, :] + at[..., 2:3] * r[2, :] + axis
 
+    def turned(self) -> Camera:
+        """The camera of the same image that looks along −z, for one that looks along +z."""
+        columns = engine_of(self.projection).constant(np.array([1.0, 1, -1, 1]), self.projection)
+        return self.replace(view=scaled_rows(self.view, (1, 1, -1, 1)), projection=self.projection * columns)
+
+    def _flipped(self) -> Camera:
+        """The camera of the image upside down."""
+        self._check_closed("flipped")
+        return self.replace(projection=scaled_rows(self.projection, (1, -1, 1, 1)))
+
+    def _check_closed(self, what: str) -> None:
+        if self.aspect == "open":
+            raise InputError(
+                f"a camera that leaves the ratio of width to height open cannot be {what}; call "
+                f"for_size((height, width)) first, or give `aspect` to its constructor"
+            )
+
     def depth_range(self) -> tuple[Array, Array]:
         """Linear depths of the near and the far plane, whichever way clip z runs; infinity for no such plane."""
         xp, (p,) = promote(self.projection)
@@ -369,6 +525,8 @@ class Camera(NamedTuple):
 
     def rays(self, size: tuple[int, int]) -> Rays:
         """Rays (H, W, 3) through the pixel centres, world space; differentiable."""
+        size = check_pixels(size)
+        self = self.for_size(size)
         xp, (view, p) = promote(self.view, self.projection)
         engine = engine_of(view)
         height, width = size
@@ -403,7 +561,61 @@ class Camera(NamedTuple):
         return xp.sqrt(area) * scale * xp.stack([p[3, 3], -p[3, 2]])
 
 
+def check_pixels(size: Any) -> tuple[int, int]:
+    """(height, width) as integers, refused where they make no image."""
+    try:
+        height, width = (int(s) for s in size if not isinstance(size, (set, frozenset, dict)))
+        whole = (height, width) == tuple(size)
+    except (TypeError, ValueError, OverflowError):
+        height, width, whole = 0, 0, False
+    if not whole or height <= 0 or width <= 0:
+        raise InputError(f"size is {quoted(size)}; expected (height, width), two positive integers")
+    return height, width
+
+
+ROUNDING = 1e-5
+"""What entries of matrices that are to be zero or one may be off by."""
+PARALLEL = 1e-12
+"""Rays are parallel if w changes by less than this share over lengths in which x or y do by one."""
+
+
 def _alike(view: Array, projection: Array) -> tuple[Array, Array]:
     """View and projection in one engine and dtype: those of the one that is not constant."""
     _, (view, projection) = promote(view, projection)
     return view, projection
+
+
+def _known_ratio(aspect: Any) -> float | Literal["open"] | None:
+    if aspect is None:
+        return "open"
+    return float(aspect) if is_constant(aspect) else None
+
+
+def _equal(a: Array, b: Array) -> bool:
+    a, b = value_of(a), value_of(b)
+    return a is not None and b is not None and np.array_equal(a, b)
+
+
+def _is_affine(matrix: np.ndarray) -> bool:
+    return matrix.shape[0] == 3 or bool(np.abs(matrix[3] - [0, 0, 0, 1]).max() <= ROUNDING)
+
+
+def _invertible(matrix: np.ndarray) -> bool:
+    """Whether a matrix has an inverse; lengths of its rows and columns do not matter."""
+    for axis in (1, 0):
+        length = np.linalg.norm(matrix, axis=axis, keepdims=True)
+        matrix = matrix / np.where(length > 0, length, 1)
+    singular = np.linalg.svd(matrix, compute_uv=False)
+    return bool(singular[-1] > 1e-12 * singular[0])
+
+
+def _check_intrinsics(K: Any) -> None:
+    known = check_numbers("K", K, (3, 3))
+    if known is None:
+        return
+    rest = np.abs(known[[1, 2, 2, 2], [0, 0, 1, 2]] - [0, 0, 0, 1])
+    if rest.max() > ROUNDING or min(known[0, 0], known[1, 1]) <= 0:
+        raise InputError(
+            f"K is {known.tolist()}; expected [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] in pixels, with positive fx and "
+            f"fy"
+        )

@@ -8,14 +8,18 @@ from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
 
+import numpy as np
+
 from rts import registry
 from rts.adapting import adapted
-from rts.arrays import described, from_numbers, shape_of
-from rts.camera import Camera
-from rts.engines import namespace
-from rts.errors import InputError
+from rts.arguments import quoted
+from rts.arrays import described, from_numbers, is_finite, shape_of
+from rts.camera import Camera, check_pixels
+from rts.engines import namespace, value_of
+from rts.errors import AspectWarning, InputError, warn
+from rts.gbuffer import GBuffer
 from rts.interfaces import CheckedPart, Part, Sampler, Shader, Splatter, as_surface
-from rts.trees import Array
+from rts.trees import Array, named_leaves
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}
 """Rough memory of a cell of a layer through sampling, shading and splatting in array code; compiled, it is less."""
@@ -34,34 +38,38 @@ MEMORY = _memory()
 
 def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[CheckedPart], Camera]:
     """Checked parts, with shaders looked up and plain numbers made arrays; that all suit one engine is not checked."""
-    parts = list(parts) if isinstance(parts, Sequence) else [parts]
-    if not parts or not all(isinstance(p, Part) for p in parts):
-        kinds = ", ".join(type(p).__name__ for p in parts) or "nothing"
+    given: list[Any] = list(parts) if isinstance(parts, (list, tuple)) else [parts]
+    if not given or not all(isinstance(p, Part) for p in given):
+        kinds = ", ".join(sorted({type(p).__name__ for p in given})) or "nothing"
         raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
     if not isinstance(camera, Camera):
-        raise InputError(f"camera is a {type(camera).__name__}; expected an rts.Camera")
-    camera = Camera(*from_numbers(tuple(camera)))
-    for name, matrix in zip(camera._fields, camera, strict=True):
-        check_matrix(f"the camera's {name}", matrix)
-    return [_check_part(index, part) for index, part in enumerate(parts)], camera
+        raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera")
+    camera = _check_camera(camera)
+    return [_check_part(index, part) for index, part in enumerate(given)], camera
+
+
+def _check_camera(camera: Camera) -> Camera:
+    """The camera with arrays for matrices, turned to look along −z; values that are traced are checked later."""
+    view, projection = (check_matrix(f"the camera's {n}", getattr(camera, n)) for n in ("view", "projection"))
+    if view is not camera.view or projection is not camera.projection:
+        camera = camera.replace(view=view, projection=projection)
+    known = value_of(projection[3, 2])
+    return camera.turned() if known is not None and (known > 0).all() else camera
 
 
 def _check_part(index: int, part: Part) -> CheckedPart:
-    strange = [key for key in part.theta if not isinstance(key, str)]
-    if strange:
-        raise InputError(f"theta of part {index} has the key {strange[0]!r}; expected names")
     surface = as_surface(part.surface)
     if surface is None:
-        raise InputError(f"the surface of part {index} is {part.surface!r}; expected an object such as a mesh")
+        raise InputError(f"the surface of part {index} is {quoted(part.surface)}; expected an object such as a mesh")
     if min(surface.sample_widths) < 0:
         raise InputError(f"{surface!r} has no sample_widths; expected (I, P), the integers and reals of a sample")
     chosen = registry.instance("rts.shaders", part.shader)
     shader = adapted(chosen, Shader)
     if shader is None:
-        raise InputError(f"the shader of part {index} is {chosen!r}; expected a name or a function")
-    theta, transform = from_numbers(part.theta), from_numbers(part.transform)
+        raise InputError(f"the shader of part {index} is {quoted(chosen)}; expected a name or a function")
+    theta, transform = from_numbers(part.theta, f"part {index}'s theta"), part.transform
     if transform is not None:
-        check_matrix(f"the transform of part {index}", transform)
+        transform = check_matrix(f"the transform of part {index}", transform)
     surface.check(theta)
     reads = surface.reads(theta)
     if isinstance(reads, str) or not set(reads) <= set(theta):
@@ -93,38 +101,55 @@ def _checked_plugin(group: str, chosen: Any, base: type, method: str) -> Any:
     found = adapted(instance, base)
     if found is None:
         kind = group.removeprefix("rts.").removesuffix("s")
-        raise InputError(f"the {kind} is {instance!r}; expected a name or an object with a method {method!r}")
+        raise InputError(f"the {kind} is {quoted(instance)}; expected a name or an object with a method {method!r}")
     return found
 
 
-def check_matrix(name: str, matrix: Any) -> None:
-    """Refuse what is not (4, 4)."""
+def check_matrix(name: str, matrix: Any) -> Array:
+    """A (4, 4) matrix of floating numbers; anything else is refused."""
+    matrix = from_numbers(matrix, name)
     if shape_of(matrix) != (4, 4):
-        raise InputError(f"{name} has shape {shape_of(matrix)}; expected a (4, 4) array")
+        raise InputError(f"{name} {described(matrix)}; expected a (4, 4) array")
+    if isinstance(matrix, np.ndarray):
+        return matrix if matrix.dtype.kind == "f" else matrix.astype(np.float64)
+    check_floating(name, matrix)
+    return matrix
+
+
+def check_ratio(camera: Camera, size: tuple[int, int]) -> None:
+    """Warn of an image that is not of the ratio that its camera is for, by more than a pixel."""
+    if not isinstance(camera.aspect, float):
+        return
+    height, width = size
+    if abs(width - camera.aspect * height) > 1 and abs(width / camera.aspect - height) > 1:
+        warn(
+            f"the camera is for images of width / height = {camera.aspect:.4g}, and size is ({height}, {width}), of "
+            f"{width / height:.4g}: the image is stretched; give both the same ratio",
+            AspectWarning,
+        )
 
 
 def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple[int, int]:
-    """(height, width) as integers, refused where they make no image."""
-    try:
-        height, width = (int(s) for s in size)
-        whole = (height, width) == tuple(size)
-    except (TypeError, ValueError, OverflowError):
-        height, width, whole = 0, 0, False
-    if not whole or height <= 0 or width <= 0:
-        given = " ".join(repr(size).split())[:60]
-        raise InputError(f"size is {given}; expected (height, width), two positive integers")
+    """(height, width) as integers, refused where they make no image; and the counts that go with them."""
+    height, width = check_pixels(size)
     if not (isinstance(layers, str) and layers == "auto") and not is_count(layers):
-        raise InputError(f'layers is {layers!r}; expected an integer of at least 1, or "auto"')
+        raise InputError(f'layers is {quoted(layers)}; expected an integer of at least 1, or "auto"')
     if capacity is not None and not is_count(capacity):
-        raise InputError(f"capacity is {capacity!r}; expected an integer of at least 1, or None")
+        raise InputError(f"capacity is {quoted(capacity)}; expected an integer of at least 1, or None")
     if not is_count(supersample):
-        raise InputError(f"supersample is {supersample!r}; expected an integer of at least 1")
+        raise InputError(f"supersample is {quoted(supersample)}; expected an integer of at least 1")
     return height, width
 
 
-def check_memory(height: int, width: int, layers: int, *, gradient: bool) -> None:
+def check_memory(height: int, width: int, layers: int, capacity: int | None, *, gradient: bool) -> None:
     """Refuse what would not fit into this machine."""
-    needed = height * width * layers * BYTES_PER_CELL["gradient" if gradient else "forward"]
+    bytes_ = BYTES_PER_CELL["gradient" if gradient else "forward"]
+    if capacity is not None and capacity * bytes_ > MEMORY:
+        raise InputError(
+            f"capacity is {capacity}, rows of about {capacity * bytes_ / 2**30:.3g} GiB, and this machine has "
+            f"{MEMORY / 2**30:.3g} GiB; the worst case is layers x cells, {height * width * layers}"
+        )
+    needed = height * width * layers * bytes_
     if needed > MEMORY:
         raise InputError(
             f"{height} x {width} pixels with {layers} layers need about {needed / 2**30:.3g} GiB, and this machine has "
@@ -146,13 +171,15 @@ def check_background(background: Any, size: tuple[int, int]) -> Array | None:
     """The background as an array, refused where it fits no image of this size."""
     if background is None:
         return None
-    background = from_numbers(background)
+    background = from_numbers(background, "background")
     if shape_of(background) not in ((3,), (4,), (*size, 3), (*size, 4)):
         height, width = size
         raise InputError(
             f"background {described(background)}; expected (3,), (4,), ({height}, {width}, 3) or ({height}, {width}, 4)"
         )
     check_floating("background", background)
+    if not is_finite(background):
+        raise InputError("background holds NaN or infinity; expected finite colours")
     return background
 
 
@@ -163,6 +190,50 @@ def check_floating(name: str, value: Array) -> None:
 
 
 def check_shaded(rgba: Any, count: int, shader: Any) -> None:
-    """Refuse what a shader should not have returned."""
+    """Refuse what a shader should not have returned: another shape, or no floating numbers."""
     if shape_of(rgba) != (count, 4):
-        raise InputError(f"what the shader {shader!r} returned {described(rgba)}; expected ({count}, 4)")
+        raise InputError(f"what the shader {quoted(shader)} returned {described(rgba)}; expected ({count}, 4)")
+    check_floating(f"what the shader {quoted(shader)} returned", rgba)
+
+
+def check_splats(
+    index: int, part: CheckedPart, gbuffer: GBuffer, positions: Array, rgba: Array, row: Array, first: int
+) -> None:
+    """Refuse samples of a part whose position or colour is NaN or infinite, and say what made it so.
+
+    What is traced is not looked at. No shader or splatter of the library turns NaN into a number.
+
+    Args:
+        index: the part's.
+        part: the part.
+        gbuffer: what its shader read, in world space.
+        positions: (N, 3) pixel x, pixel y, depth.
+        rgba: (N, 4).
+        row: (K, H, W) of all parts.
+        first: the row of all parts that is the first of this one.
+    """
+    if is_finite(positions) and is_finite(rgba):
+        return
+    rows = value_of(row)
+    if rows is None:
+        return
+    count = positions.shape[-2]
+    used = np.unique(rows[(rows >= first) & (rows < first + count)]) - first
+
+    def wrong(x: Any) -> bool:
+        """Whether a value is not finite, where it is of samples in those that are seen."""
+        found = value_of(x)
+        if found is None or found.dtype.kind != "f":
+            return False
+        return not np.isfinite(found[..., used, :] if found.shape[-2:-1] == (count,) else found).all()
+
+    if not (wrong(positions) or wrong(rgba)):  # Rows that are allotted, but not used, may hold anything.
+        return
+    for name, value in named_leaves(part.theta, "theta"):
+        if wrong(value):
+            raise InputError(f"{name} of part {index} holds NaN or infinity; expected finite numbers")
+    for name in gbuffer:
+        if dict.__contains__(gbuffer, name) and wrong(gbuffer[name]):
+            raise InputError(f"{name!r} of {part.surface!r} is NaN or infinite at samples of part {index}")
+    what = "the positions of samples" if wrong(positions) else f"what the shader {quoted(part.shader)} returned"
+    raise InputError(f"{what} of part {index} holds NaN or infinity, where θ and the surface are finite")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import functools
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
@@ -12,7 +13,7 @@ import numpy as np
 
 from rts import registry
 from rts.adapting import Plugin, adapted
-from rts.errors import EngineError, PluginError, RtsError
+from rts.errors import EngineError, InputError, PluginError, RtsError
 from rts.trees import Array, Tree, collected, map_leaves
 
 if TYPE_CHECKING:
@@ -90,6 +91,25 @@ class Engine(Plugin):
     def traced(self, x: Array) -> bool:
         """Whether an array has a shape but not yet a value."""
         return False
+
+    def admitted(self, x: Array, name: str) -> Array:
+        """The array, or one like it that the library can work with.
+
+        Args:
+            x: an array of this engine that a user gave.
+            name: what an error calls it.
+
+        Raises:
+            InputError: it cannot be used, such as a sparse one.
+        """
+        return x
+
+    def known(self, x: Array) -> np.ndarray | None:
+        """The value of an array on the host, where it can be had while Python runs; None for what is traced.
+
+        Under transforms of batches it may have more axes than the array.
+        """
+        return None if self.traced(x) else self.to_numpy(self.stop_gradient(x))
 
     def padded(self, x: Array) -> bool:
         """Whether packed arrays like this one may have rows that no cell refers to."""
@@ -265,7 +285,52 @@ def suiting(*trees: Tree) -> tuple[Engine, Array | None]:
     return _engine_of_leaves(found), _widest(found)
 
 
+def suiting_scene(parts: Sequence[Any], *others: Tree, engine: str | None = None) -> tuple[Engine, Array]:
+    """The engine of a scene, and an array of its dtype: the one rule for dtypes.
+
+    The dtype is the widest floating one of the torch or jax arrays. Where all is NumPy it is that of the widest array
+    in θ: cameras, transforms and backgrounds in NumPy are constants, and widen nothing. It is float32 at least.
+
+    Args:
+        parts: the parts.
+        *others: further arrays of the scene.
+        engine: the name of an engine to use, whatever the arrays are; those of another are refused.
+    """
+    own, like = suiting(parts, *others)
+    if engine is not None:
+        if not isinstance(engine, str):
+            raise InputError(f"engine is a {type(engine).__name__}; expected a name, such as 'torch' or 'jax'")
+        chosen = engine_named(engine)
+        if own is not chosen and like is not None:
+            raise EngineError(
+                f"engine is {engine!r}, but the scene has {own.name} arrays; leave it out, or convert them"
+            )
+        own = chosen
+    if like is not None:
+        return own, like
+    thetas = collected([part.theta for part in parts])
+    wide = any(x.dtype == np.float64 for x in thetas if isinstance(x, (np.ndarray, np.generic)))
+    if own.name == "numpy":
+        return own, _FLOAT64 if wide else _FLOAT32
+    return own, own.constant(np.zeros((), np.float32)) if not wide else _float64(own)
+
+
+_FLOAT32, _FLOAT64 = np.zeros((), np.float32), np.zeros((), np.float64)
+
+
+def _float64(engine: Engine) -> Array:
+    """A zero in float64, or in the widest dtype that the engine is set to."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # jax says that it is not set to float64.
+        return engine.namespace.zeros((), dtype=engine.namespace.float64)
+
+
 _names: list[str] = []
+
+
+def load_engines() -> None:
+    """Load the engines whose framework has been imported, so that they know the library's records."""
+    _imported()
 
 
 def _imported() -> list[Engine]:
@@ -305,6 +370,16 @@ def uncompiled(f: _F) -> _F:
 def is_traced(x: Array) -> bool:
     """Whether an array has a shape but not yet a value."""
     return engine_of(x).traced(x)
+
+
+def value_of(x: Array) -> np.ndarray | None:
+    """The value of an array, or of a list of scalars, as NumPy; None where it is traced."""
+    if isinstance(x, CONSTANT_TYPES):
+        return np.asarray(x)
+    if isinstance(x, (list, tuple)):
+        values = [value_of(item) for item in x]
+        return None if any(v is None for v in values) else np.array(values)
+    return engine_of(x).known(x)
 
 
 def exemplar(*trees: Tree) -> Array | None:

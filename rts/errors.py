@@ -1,7 +1,13 @@
 """Every error that the library raises on purpose.
 
-Each message says what was given, what was expected, and what to do next.
+Each message says what was given, what was expected, and what to do next. Warnings say what an image lacks that was
+rendered nevertheless.
 """
+
+from __future__ import annotations
+
+import sys
+import warnings
 
 
 class RtsError(Exception):
@@ -20,5 +26,32 @@ class PluginError(RtsError, ImportError):
     """A plugin is registered but cannot be used: a package is missing, or its import fails."""
 
 
-class LayersWarning(UserWarning):
+class RtsWarning(UserWarning):
+    """Base class of all warnings of this library."""
+
+
+class LayersWarning(RtsWarning):
     """`layers="auto"` came to its limit."""
+
+
+class AspectWarning(RtsWarning):
+    """An image of another ratio of width to height than its camera is for: it is stretched."""
+
+
+class EmptyImageWarning(RtsWarning):
+    """An image in which nothing is seen."""
+
+
+class FileWarning(RtsWarning):
+    """A file was read, but not all that it says could be followed."""
+
+
+def warn(message: str, category: type[RtsWarning]) -> None:
+    """Warn at the line that called the library."""
+    level, frame = 1, sys._getframe(0)
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in OWN_PACKAGES:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)
+
+
+OWN_PACKAGES = ("rts", "rts_backends", "rts_surfaces")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, final
 import numpy as np
 
 from rts.adapting import Plugin, adapted
+from rts.arguments import quoted
 from rts.arrays import from_numbers, shape_of, without_border
 from rts.engines import constants, engine_of, exemplar, namespace
 from rts.errors import InputError
@@ -359,8 +360,8 @@ class Splatter(Plugin):
 
 def _checked_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Splats:
     """Splats of arrays, or of lists, all of one engine; wrong shapes and dtypes are refused."""
-    given = tuple(from_numbers(x) for x in (positions, rgba))
-    row = np.asarray(row, np.int32) if isinstance(row, (list, tuple)) else row
+    given = from_numbers(positions, "positions"), from_numbers(rgba, "rgba")
+    row = np.asarray(from_numbers(row, "row"), np.int32) if isinstance(row, (list, tuple)) else from_numbers(row, "row")
     shapes = [shape_of(x) for x in (*given, row)]
     ok = len(shapes[0]) == 2 and shapes[0][1] == 3 and shapes[1] == (shapes[0][0], 4) and len(shapes[2]) == 3
     if not ok or shapes[2][0] < 1:
@@ -422,10 +423,10 @@ class Part:
     cull: str = "none"
 
     def __post_init__(self):
-        if self.cull not in ("none", "back"):
-            raise InputError(f'cull is {self.cull!r}; expected "none" or "back"')
+        if not isinstance(self.cull, str) or self.cull not in ("none", "back"):
+            raise InputError(f'cull is {quoted(self.cull)}; expected "none" or "back"')
         if not isinstance(self.theta, Mapping):
-            raise InputError(f"theta is a {type(self.theta).__name__}; expected a dict of arrays")
+            raise InputError(f"theta is {quoted(self.theta)}; expected a dict of arrays")
 
     def replace(self, **changes: Any) -> Part:
         """A copy with some fields changed."""

@@ -45,6 +45,8 @@ def _entries(group: str) -> dict[str, list[EntryPoint]]:
 
 
 def _group(group: str) -> str:
+    if not isinstance(group, str):
+        raise InputError(f"the group of plugins is a {type(group).__name__}; expected one of {', '.join(GROUPS)}")
     full = group if group.startswith("rts.") else f"rts.{group}"
     if full not in GROUPS:
         raise InputError(f"no plugin group {group!r}; expected one of {', '.join(GROUPS)}{_suggest(full, GROUPS)}")
@@ -98,6 +100,10 @@ def plugin(group: str, name: str) -> Any:
         PluginError: two distributions claim the name, or it cannot be imported.
     """
     group = _group(group)
+    if not isinstance(name, str):
+        raise InputError(
+            f"the name of a plugin is a {type(name).__name__}; expected one of {', '.join(plugins(group))}"
+        )
     entry = _entry(group, name)
     kind = group.removeprefix("rts.").removesuffix("s")
     try:

@@ -4,33 +4,48 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
+from rts.arguments import quoted
 from rts.arrays import described, shape_of
 from rts.camera import Camera
 from rts.checks import (
     check_background,
     check_memory,
+    check_ratio,
     check_sampler,
     check_scene,
     check_shaded,
     check_size,
+    check_splats,
     check_splatter,
     suited_sampler,
 )
-from rts.engines import Engine, constants, engine_of, is_constant, is_traced, namespace, suiting, uncompiled
-from rts.errors import InputError
+from rts.engines import (
+    Engine,
+    constants,
+    engine_of,
+    is_constant,
+    is_traced,
+    namespace,
+    suiting,
+    suiting_scene,
+    uncompiled,
+    value_of,
+)
+from rts.errors import EmptyImageWarning, InputError, warn
 from rts.gbuffer import GBuffer
 from rts.interfaces import AnyNeeded, CheckedPart, Part, Splatter
 from rts.operations.linear import affine_map
 from rts.records import Sampled, Samples, Splats
+from rts.sampling.emptiness import why_empty
 from rts.sampling.merging import merge
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.pruning import Everything, as_needed, needed_by, prune
-from rts.trees import Array
+from rts.trees import Array, Tree
 
 BAND = 2**20
 """Cells, over all layers, that a supersampled image may have before it is rendered in bands of rows."""
@@ -48,6 +63,7 @@ def render(
     supersample: int = 1,
     background: Any = None,
     capacity: int | None = None,
+    engine: str | None = None,
 ) -> Array:
     """Render a scene, differentiably in everything that is a torch or jax array.
 
@@ -67,30 +83,40 @@ def render(
             for the worst case, layers × cells. If a third of the cells are covered, pass a third of that. What does not
             fit is dropped, deepest layers first, and counted: `overflow` of `rts.sample` is above 0, then. Where the
             image is rendered in bands, it is the capacity of each band.
+        engine: name of the engine to compute with, "torch" or "jax", where the scene alone does not tell: its arrays
+            are all NumPy, but a shader holds a network. None for the engine of the arrays.
 
     Returns:
-        (H, W, 4) premultiplied linear RGBA, row 0 on top.
+        (H, W, 4) premultiplied linear RGBA, row 0 on top. Its dtype is the widest floating one of the torch or jax
+        arrays in parts and camera; in a scene of NumPy arrays, the widest in any θ; at least float32. What else is
+        NumPy, such as a camera in float64, does not widen it.
 
     Raises:
         InputError: what was given cannot be rendered.
         EngineError: torch and jax arrays in one scene.
+
+    Warns:
+        EmptyImageWarning: nothing is seen; it says why.
+        AspectWarning: the camera is for images of another ratio of width to height.
     """
-    scene = _Scene.of(parts, camera, sampler)
+    scene = _Scene.of(parts, camera, sampler, engine)
     size = check_size(size, layers, capacity, supersample)
+    scene = scene.at(size)
     background = check_background(background, size)
     splatter = check_splatter(splatter)
     options = dict(splatter=splatter, layers=layers, supersample=int(supersample), capacity=capacity)
     bands = _bands(*size, layers, supersample)
-    suited = scene.suited if is_constant(background) else suiting(scene.parts, scene.camera, background)
+    suited = scene.suited if is_constant(background) else scene.suiting(background)
     if len(bands) == 1:
-        return _finished(_sampled(scene, scene.camera, size, **options), scene, suited, splatter, background)
+        sampled = _sampled(scene, scene.camera, size, **options)
+        image = _splatted(sampled, scene, scene.camera, suited, splatter)
+        return _over_background(_seen(image, scene), background)
     images = []
     for top, rows in bands:
         window = scene.camera.window(size, (top, 0), (rows, size[1]))
         take = partial(_sampled, scene, window, (rows, size[1]), **options)
         images.append(suited[0].checkpoint(take, lambda s, w=window: _splatted(s, scene, w, suited, splatter)))
-    image, background = constants((namespace(*images).concat(images), background), *suited)
-    return image if background is None else _over_background(image, background)
+    return _over_background(_seen(namespace(*images).concat(images), scene), background)
 
 
 @uncompiled
@@ -104,6 +130,7 @@ def sample(
     layers: int | Literal["auto"] = 2,
     supersample: int = 1,
     capacity: int | None = None,
+    engine: str | None = None,
 ) -> Sampled:
     """Find where the rays through cells' centres meet the surfaces: the half of `render` without derivative.
 
@@ -117,6 +144,7 @@ def sample(
         layers: as in `render`.
         supersample: as in `render`.
         capacity: as in `render`.
+        engine: as in `render`.
 
     Returns:
         Samples for `render_samples`, which may be handed to a function under `jax.jit`.
@@ -125,8 +153,9 @@ def sample(
         InputError: what was given cannot be sampled.
         EngineError: torch and jax arrays in one scene.
     """
-    scene = _Scene.of(parts, camera, sampler)
+    scene = _Scene.of(parts, camera, sampler, engine)
     size = check_size(size, layers, capacity, supersample)
+    scene = scene.at(size)
     splatter = None if splatter is None else check_splatter(splatter)
     options = dict(splatter=splatter, layers=layers, supersample=int(supersample), capacity=capacity)
     return _sampled(scene, scene.camera, size, **options)
@@ -150,14 +179,29 @@ class _Scene(NamedTuple):
     suited: tuple[Engine, Array | None]
 
     @classmethod
-    def of(cls, parts: Part | Sequence[Part] | PreparedParts, camera: Camera, sampler: Any) -> _Scene:
+    def of(
+        cls,
+        parts: Part | Sequence[Part] | PreparedParts,
+        camera: Camera,
+        sampler: Any,
+        engine: str | None,
+    ) -> _Scene:
         """The scene of what the user gave."""
-        if isinstance(parts, PreparedParts):
-            checked, camera = check_scene(parts.parts, camera)
-            return cls(checked, camera, parts.samplers, parts.entries, suiting(checked, camera))
-        checked, camera = check_scene(parts, camera)
-        chosen = check_sampler(sampler)
-        return cls(checked, camera, [chosen] * len(checked), [None] * len(checked), suiting(checked, camera))
+        prepared = isinstance(parts, PreparedParts)
+        checked, camera = check_scene(parts.parts if prepared else parts, camera)
+        chosen = parts.samplers if prepared else [check_sampler(sampler)] * len(checked)
+        entries = parts.entries if prepared else [None] * len(checked)
+        return cls(checked, camera, chosen, entries, suiting_scene(checked, camera, engine=engine))
+
+    def at(self, size: tuple[int, int]) -> _Scene:
+        """The scene for images of a size."""
+        check_ratio(self.camera, size)
+        return self._replace(camera=self.camera.for_size(size))
+
+    def suiting(self, *others: Tree) -> tuple[Engine, Array | None]:
+        """As `suited`, with further arrays in the scene."""
+        engine, like = suiting_scene(self.parts, self.camera, *others)
+        return (engine, like) if engine.differentiates else self.suited
 
 
 def _sampled(
@@ -173,12 +217,13 @@ def _sampled(
     """The samples of a window of the image, through the camera of this window."""
     parts, _, samplers, entries, suited = scene
     height, width = supersample * size[0], supersample * size[1]
-    check_memory(height, width, _planned(layers), gradient=suited[1] is not None)
+    check_memory(height, width, _planned(layers), capacity, gradient=suited[0].differentiates)
     apron = apron_of(splatter)
     grid = height + 2 * apron, width + 2 * apron
     # Every part is sampled by the one engine, and by the very views that samples are projected with.
     wide = camera.with_apron((height, width), apron)
-    wide = constants(wide, *suited)
+    if suited[0].differentiates:
+        wide = constants(wide, *suited)
 
     def taken(count: int, needed: AnyNeeded | None) -> Sampled:
         samples, pruned = [], False
@@ -206,6 +251,7 @@ def render_samples(
     *,
     splatter: Any = "auto",
     background: Any = None,
+    engine: str | None = None,
 ) -> Array:
     """The half of `render` with derivatives: evaluate the parts at the samples, shade, project and splat.
 
@@ -216,6 +262,7 @@ def render_samples(
         camera: as in `render`.
         splatter: as in `render`.
         background: as in `render`.
+        engine: as in `render`.
 
     Returns:
         (H, W, 4) premultiplied linear RGBA, row 0 on top.
@@ -224,20 +271,24 @@ def render_samples(
         InputError: the samples are not of these parts, or their apron is too narrow for the splatter.
         EngineError: torch and jax arrays in one scene.
     """
-    scene = _Scene.of(parts, camera, "auto")
+    if not isinstance(sampled, Sampled):
+        raise InputError(f"sampled is {quoted(sampled)}; expected what rts.sample gave")
+    apron, fine = sampled.apron, sampled.supersample
+    size = tuple((n - 2 * apron) // fine for n in sampled.row.shape[1:])
+    scene = _Scene.of(parts, camera, "auto", engine).at(size)
     if len(scene.parts) != len(sampled.samples):
         raise InputError(
             f"{len(scene.parts)} parts were given for the samples of {len(sampled.samples)}; pass the same parts"
         )
-    fine, apron, splatter = sampled.supersample, sampled.apron, check_splatter(splatter)
+    splatter = check_splatter(splatter)
     if apron < apron_of(splatter):
         raise InputError(
             f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
             f"{apron_of(splatter)}; give it to rts.sample, too"
         )
-    background = check_background(background, tuple((n - 2 * apron) // fine for n in sampled.row.shape[1:]))
-    suited = suiting(scene.parts, scene.camera, sampled, background)
-    return _finished(sampled, scene, suited, splatter, background)
+    background = check_background(background, size)
+    suited = scene.suiting(sampled, background)
+    return _over_background(_splatted(sampled, scene, scene.camera, suited, splatter), background)
 
 
 def apron_of(splatter: Splatter | None) -> int:
@@ -246,14 +297,6 @@ def apron_of(splatter: Splatter | None) -> int:
     Samples within reach show in the image, and pairing looks at one cell beside theirs.
     """
     return (Splatter if splatter is None else splatter).reach + 1
-
-
-def _finished(sampled: Sampled, scene: _Scene, suited: tuple, splatter: Splatter, background: Any) -> Array:
-    """The image of all samples over its background."""
-    image = _splatted(sampled, scene, scene.camera, suited, splatter)
-    if background is None:
-        return image
-    return _over_background(image, constants(background, engine_of(image), image))
 
 
 def _splatted(sampled: Sampled, scene: _Scene, window: Camera, suited: tuple, splatter: Splatter) -> Array:
@@ -288,25 +331,31 @@ def to_splats(
         camera: the camera of the whole image, which shaders see.
         window: the camera of the samples.
         engine: the engine to compute with.
-        like: an array that sets dtype and device of its constants, or None.
+        like: an array that sets dtype and device of its constants and of the splats.
     """
+    dtype = like
+    if not engine.differentiates:
+        like = None  # All is constant, and computed in the dtypes that are given.
     grid, apron = tuple(sampled.row.shape[1:]), sampled.apron
     wide = window.with_apron((grid[0] - 2 * apron, grid[1] - 2 * apron), apron)
-    wide = wide._replace(view=constants(wide.view, engine, like))
+    wide = wide.replace(view=constants(wide.view, engine, like))
     camera = constants(camera, engine, like)
     if not engine.owns(sampled.row):
         sampled = constants(sampled, engine, like)
 
-    positions, colors = [], []
-    for part, samples in zip(parts, sampled.samples, strict=True):
+    positions, colors, first = [], [], 0
+    for index, (part, samples) in enumerate(zip(parts, sampled.samples, strict=True)):
         transform = constants(part.transform, engine, like)
         reads = part.surface.reads(part.theta)
         local = _evaluate(part, reads, samples, engine, like)
         theta = {k: v if k in reads else constants(v, engine, like) for k, v in part.theta.items()}
-        rgba = part.shader(theta, _to_world(_readable(local, samples, engine), transform), camera)
+        world = _to_world(_readable(local, samples, engine), transform)
+        rgba = _shaded(part, theta, world, camera)
         check_shaded(rgba, local["position"].shape[0], part.shader)
-        positions.append(wide.within(transform).project(local["position"], grid))
-        colors.append(constants(rgba, engine, like))
+        positions.append(constants(wide.within(transform).project(local["position"], grid), engine, dtype))
+        check_splats(index, part, world, positions[-1], rgba, sampled.row, first)
+        colors.append(constants(rgba, engine, dtype))
+        first += samples.ids.shape[-2]
     row = sampled.row
     if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
         # A shader may close over arrays of an engine that the scene has none of.
@@ -315,6 +364,19 @@ def to_splats(
         return Splats(positions[0], colors[0], row, border=apron)
     xp = namespace(row)
     return Splats(xp.concat(positions), xp.concat(colors), row, border=apron)
+
+
+def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+    """What the shader of a part returns."""
+    try:
+        return part.shader(theta, gbuffer, camera)
+    except TypeError as error:
+        if is_constant(gbuffer.like):
+            error.add_note(
+                "All arrays of this scene are NumPy's. If its shader holds a network, call rts.render(…, "
+                "engine='torch'), or 'jax'."
+            )
+        raise
 
 
 def _planned(layers: int | Literal["auto"]) -> int:
@@ -382,8 +444,23 @@ def _move_normals(transform: Array, normals: Array) -> Array:
     return sum(normals[:, i : i + 1] * (cofactors[i] * outside) for i in range(3))
 
 
-def _over_background(image: Array, background: Array) -> Array:
+def _seen(image: Array, scene: _Scene) -> Array:
+    """The image, with a warning if nothing is seen in it."""
+    coarse = value_of(image[:: max(1, image.shape[0] // 16), :: max(1, image.shape[1] // 16), 3])
+    if coarse is None or coarse.any():
+        return image
+    alpha = value_of(image[..., 3])
+    if alpha is None or alpha.any():
+        return image
+    warn(f"nothing is seen in the image: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
+    return image
+
+
+def _over_background(image: Array, background: Array | None) -> Array:
+    if background is None:
+        return image
+    over: Array = constants(background, engine_of(image), image)
     xp = namespace(image)
-    if background.shape[-1] == 3:
-        background = xp.concat([background, xp.ones_like(background[..., :1])], axis=-1)
-    return image + (1 - image[..., 3:]) * background
+    if over.shape[-1] == 3:
+        over = xp.concat([over, xp.ones_like(over[..., :1])], axis=-1)
+    return image + (1 - image[..., 3:]) * over

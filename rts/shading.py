@@ -15,17 +15,19 @@ The base colour is the texture where θ has one and the surface has uv, else the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rts.arrays import described, shape_of, unit
+from rts.arguments import quoted
+from rts.arrays import described, is_finite, shape_of, unit
 from rts.camera import Camera
 from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Shader
-from rts.trees import Array, Tree
+from rts.trees import Array, Tree, map_leaves
 
 WRAPS = ("repeat", "mirror", "clamp")
 DEFAULT_AMBIENT, DEFAULT_DIFFUSE = 0.2, 0.8
@@ -73,7 +75,7 @@ class Depth(Shader):
         xp = namespace(position)
         depth = camera.project(position, (1, 1))[:, 2]
         if "depth_range" in theta:
-            near, far = theta["depth_range"][0], theta["depth_range"][1]
+            near, far = (_entry(theta, "depth_range", (2,))[i] for i in (0, 1))
         else:
             near, far = camera.depth_range()
         grey = xp.clip((depth - near) / (far - near), 0.0, 1.0)
@@ -94,8 +96,8 @@ class Unlit(Shader):
     reads = ("color", "uv")
 
     def __post_init__(self):
-        if self.wrap not in WRAPS:
-            raise InputError(f"wrap is {self.wrap!r}; expected one of {', '.join(WRAPS)}")
+        if not isinstance(self.wrap, str) or self.wrap not in WRAPS:
+            raise InputError(f"wrap is {quoted(self.wrap)}; expected one of {', '.join(WRAPS)}")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
         """See `rts.Shader`."""
@@ -116,8 +118,7 @@ class Unlit(Shader):
         color = base if base.shape[1] >= 3 else base[:, :1] * xp.ones_like(position)
         color, alpha = color[:, :3], color[:, 3:4] if base.shape[1] == 4 else one
         if "color" in theta:
-            factor = theta["color"]
-            _check_shape("['color']", factor, "(3,) or (4,)", shape_of(factor) in ((3,), (4,)))
+            factor = _entry(theta, "color", (3,), (4,))
             color = color * factor[:3]
             alpha = alpha * factor[3] if factor.shape[0] == 4 else alpha
         return color, alpha
@@ -171,15 +172,15 @@ class BlinnPhong(Unlit):
         normal, toward = facing_normals(gbuffer, camera)
         xp = namespace(color)
         light = _light(theta, camera)
-        specular = theta.get("specular", DEFAULT_SPECULAR)
-        shininess = theta.get("shininess", DEFAULT_SHININESS)
+        specular = _entry(theta, "specular", (), (1,), (3,)) if "specular" in theta else DEFAULT_SPECULAR
+        shininess = _entry(theta, "shininess", (), (1,)) if "shininess" in theta else DEFAULT_SHININESS
         shade, highlight = light["ambient"] + xp.zeros_like(color), xp.zeros_like(color)
         for direction, brightness in zip(*_each(light), strict=True):
             cosine = _dot(normal, direction)
             shade = shade + _positive(cosine) * brightness
             # A power of zero has an infinite derivative for exponents below one, and a NaN one in its exponent.
             half = xp.clip(_dot(normal, unit(direction + toward)), 1e-6, 1.0)
-            highlight = highlight + xp.where(cosine > 0, half**shininess, xp.zeros_like(half)) * brightness
+            highlight = highlight + xp.where(cosine > 0, half**shininess, 0 * half) * brightness
         return self.premultiplied(xp.clip(color * shade + specular * highlight, 0.0, 1.0), alpha)
 
 
@@ -191,10 +192,10 @@ def facing_normals(gbuffer: GBuffer, camera: Camera) -> tuple[Array, Array]:
 
 def _towards(gbuffer: GBuffer, camera: Camera) -> Array:
     """Vectors (N, 3) towards the viewer, of any length and without derivative: enough to tell which side is seen."""
-    given = gbuffer["position"], *camera
+    given = gbuffer["position"], camera
     engine = engine_of(given)
-    position, *matrices = (x if is_constant(x) else engine.stop_gradient(x) for x in given)
-    return Camera(*matrices).toward(position)
+    position, camera = map_leaves(lambda x: x if is_constant(x) else engine.stop_gradient(x), given)
+    return camera.toward(position)
 
 
 def _turned(normal: Array, toward: Array) -> Array:
@@ -212,10 +213,15 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat") -> Array:
     Returns:
         (N, C).
     """
+    shape = shape_of(texture)
+    if len(shape) != 3 or shape[2] not in (1, 3, 4) or 0 in shape:
+        raise InputError(f"the texture {described(texture)}; expected (h, w, C) with C = 1, 3 or 4")
     xp = namespace(texture, uv)
-    if len(texture.shape) != 3 or texture.shape[2] not in (1, 3, 4) or 0 in texture.shape:
-        raise InputError(f"the texture has shape {tuple(texture.shape)}; expected (h, w, C) with C = 1, 3 or 4")
-    height, width, channels = texture.shape
+    if not xp.isdtype(texture.dtype, "real floating"):
+        raise InputError(
+            f"the texture has dtype {texture.dtype}; expected floating numbers, linear and from 0 to 1 (rts.load_image)"
+        )
+    height, width, channels = shape
     flat = xp.reshape(texture, (height * width, channels))
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     x0, y0 = xp.floor(x), xp.floor(y)
@@ -249,9 +255,12 @@ def _light(theta: Mapping[str, Tree], camera: Camera) -> dict[str, Array]:
     for name, value in given.items():
         if name not in LIGHT_ENTRIES:
             raise InputError(f"theta['light'] has an entry {name!r}; expected {', '.join(LIGHT_ENTRIES)}")
-        if name != "ambient":
-            shape = shape_of(value)
-            _check_shape(f"['light'][{name!r}]", value, "(3,) or (L, 3)", len(shape) in (1, 2) and shape[-1] == 3)
+        shape = shape_of(value)
+        if name == "ambient":
+            _check("['light']['ambient']", value, "() or (3,)", shape in ((), (1,), (3,)))
+        else:
+            ok = len(shape) in (1, 2) and shape[-1] == 3 and shape[0] > 0
+            _check(f"['light'][{name!r}]", value, "(3,) or (L, 3)", ok)
     given = dict(given)
     r = camera.view[:3, :3]
     if "direction" not in given:
@@ -263,10 +272,22 @@ def _light(theta: Mapping[str, Tree], camera: Camera) -> dict[str, Array]:
     return given
 
 
-def _check_shape(entry: str, value: Any, expected: str, ok: bool) -> None:
-    """Refuse what is not an array of the expected shape."""
-    if not ok:
+def _entry(theta: Mapping[str, Tree], name: str, *shapes: tuple[int, ...]) -> Array:
+    """An entry of θ, refused where it has none of these shapes."""
+    value = theta[name]
+    _check(f"[{name!r}]", value, " or ".join(map(str, shapes)), shape_of(value) in shapes)
+    return value
+
+
+def _check(entry: str, value: Any, expected: str, ok: bool) -> None:
+    """Refuse what is not a number or a floating array of the expected shape, and what is infinite."""
+    number = isinstance(value, (bool, int, float))
+    if not ok or not (number or hasattr(value, "dtype")):
         raise InputError(f"theta{entry} {described(value)}; expected an array of shape {expected}")
+    if not number and not namespace(value).isdtype(value.dtype, "real floating"):
+        raise InputError(f"theta{entry} has dtype {value.dtype}; expected floating numbers")
+    if not (math.isfinite(value) if number else is_finite(value)):
+        raise InputError(f"theta{entry} holds NaN or infinity; expected finite numbers")
 
 
 def _each(light: dict[str, Array]) -> tuple[list[Array], list[Array]]:
@@ -285,8 +306,7 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _positive(x: Array) -> Array:
-    xp = namespace(x)
-    return xp.where(x > 0, x, xp.zeros_like(x))
+    return namespace(x).where(x > 0, x, 0 * x)  # Of NaN, NaN.
 
 
 def _opaque(color: Array) -> Array:

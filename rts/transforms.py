@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from rts.arguments import check_numbers, check_planes, check_positive, quoted
 from rts.arrays import promote, unit
-from rts.engines import is_constant, namespace
+from rts.engines import namespace
 from rts.errors import InputError
 from rts.operations.linear import matmul
 from rts.trees import Array
@@ -38,24 +39,6 @@ def affine_matrix(linear: Array, translation: Array) -> Array:
     return xp.concat([xp.concat([linear, translation[:, None]], axis=1), bottom[None, :]], axis=0)
 
 
-def check_range(near: Any, far: Any, *, positive: bool) -> None:
-    """Refuse planes in the wrong order, where their values are known."""
-    if not is_constant((near, far)):
-        return
-    if not (math.isfinite(near) and math.isfinite(far) and near < far):
-        raise InputError(f"near is {near} and far is {far}; expected finite numbers with near < far")
-    if positive and near <= 0:
-        raise InputError(f"near is {near}; a perspective camera needs near > 0")
-
-
-def check_shapes(given: dict[str, tuple[Array, tuple[tuple[int, ...], ...]]]) -> None:
-    """Refuse arrays whose shape is none of those expected."""
-    for name, (array, expected) in given.items():
-        if tuple(array.shape) not in expected:
-            shapes = " or ".join(map(str, expected))
-            raise InputError(f"{name} has shape {tuple(array.shape)}; expected {shapes}")
-
-
 def perspective(
     fov_y: Any, aspect: Any = 1.0, near: Any = 0.1, far: Any = 100.0, principal_point: Any = (0.0, 0.0)
 ) -> Array:
@@ -67,10 +50,16 @@ def perspective(
         near: depth of the near plane, positive.
         far: depth of the far plane.
         principal_point: (2,) where the axis meets the image, NDC; (0, 0) is the middle.
+
+    Raises:
+        InputError: an angle, ratio or planes that make no image.
     """
-    check_range(near, far, positive=True)
-    if is_constant(fov_y) and not 0 < fov_y < 180:
-        raise InputError(f"fov_y is {fov_y}; expected degrees between 0 and 180")
+    check_planes(near, far, positive=True)
+    known = check_numbers("fov_y", fov_y, ())
+    if known is not None and not 0 < known < 180:
+        raise InputError(f"fov_y is {quoted(fov_y)}; expected degrees between 0 and 180")
+    check_positive("aspect", aspect)
+    check_numbers("principal_point", principal_point, (2,))
     xp, (fov, aspect, near, far, point) = promote(fov_y, aspect, near, far, principal_point)
     scale = 1 / xp.tan(fov * (math.pi / 360))
     depth = far - near
@@ -97,10 +86,14 @@ def orthographic(
         near: depth of the near plane; may be negative.
         far: depth of the far plane.
         principal_point: (2,) where the axis meets the image, NDC.
+
+    Raises:
+        InputError: a height, ratio or planes that make no image.
     """
-    check_range(near, far, positive=False)
-    if is_constant(height) and not (math.isfinite(height) and height > 0):
-        raise InputError(f"height is {height}; expected a positive number of world units")
+    check_planes(near, far, positive=False)
+    check_positive("height", height)
+    check_positive("aspect", aspect)
+    check_numbers("principal_point", principal_point, (2,))
     xp, (height, aspect, near, far, point) = promote(height, aspect, near, far, principal_point)
     scale, depth = 2 / height, far - near
     return matrix_of(
@@ -121,16 +114,20 @@ def look_at(eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0)) -> Array:
     Raises:
         InputError: eye and target coincide, or the direction of view is parallel to `up`.
     """
+    known = [check_numbers(name, x, (3,)) for name, x in (("eye", eye), ("target", target), ("up", up))]
+    if not any(x is None for x in known):
+        _check_upright(*(np.asarray(x, np.float64) for x in known))
     xp, (eye, target, up) = promote(eye, target, up)
-    check_shapes({"eye": (eye, ((3,),)), "target": (target, ((3,),)), "up": (up, ((3,),))})
-    if is_constant((eye, target, up)):
-        sideways = np.linalg.norm(np.cross(target - eye, up))
-        if not sideways > 1e-12 * np.linalg.norm(target - eye) * np.linalg.norm(up):
-            raise InputError(
-                f"a camera at {eye.tolist()} that looks at {target.tolist()} has no upright with up = {up.tolist()}; "
-                f"move the eye or give another up"
-            )
     back = unit(eye - target)
     right = unit(xp.linalg.cross(up, back))
     linear = xp.stack([right, xp.linalg.cross(back, right), back])
     return affine_matrix(linear, -matmul(linear, eye[:, None])[:, 0])
+
+
+def _check_upright(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
+    sideways = np.linalg.norm(np.cross(target - eye, up))
+    if not sideways > 1e-12 * np.linalg.norm(target - eye) * np.linalg.norm(up):
+        raise InputError(
+            f"a camera at {eye.tolist()} that looks at {target.tolist()} has no upright with up = {up.tolist()}; "
+            f"move the eye or give another up"
+        )

@@ -104,6 +104,19 @@ def _kind(tree: Tree) -> int:
     return kind
 
 
+def named_leaves(tree: Tree, name: str) -> Iterator[tuple[str, Any]]:
+    """The leaves, each with where it is, such as "theta['light']['color']"."""
+    if isinstance(tree, Mapping):
+        for key in sorted(tree):
+            yield from named_leaves(tree[key], f"{name}[{key!r}]")
+    elif isinstance(tree, (list, tuple)):
+        for i, item in enumerate(tree):
+            yield from named_leaves(item, f"{name}[{i}]")
+    else:
+        for leaf in leaves(tree):
+            yield name, leaf
+
+
 def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:
     """A copy of a tree with `fn` applied to each leaf, visited in the order of `leaves`."""
     kind = _KINDS.get(type(tree)) or _kind(tree)

@@ -32,7 +32,7 @@ class NumpyEngine(Engine):
     def constant(self, value: Any, like: Array | None = None) -> np.ndarray:
         """`value` as an array, floats in the dtype of `like`, else as they are."""
         array = np.asarray(value)
-        return array.astype(like.dtype) if like is not None and array.dtype.kind == "f" else array
+        return array.astype(like.dtype, copy=False) if like is not None and array.dtype.kind == "f" else array
 
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Array) -> tuple[np.ndarray, ...]:
         """Call `fn`: everything is on the host already."""

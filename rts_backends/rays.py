@@ -35,7 +35,8 @@ class Rays(Sampler):
         camera = map_leaves(engine.stop_gradient, constants(camera, engine, like))
         xp = namespace(camera.view)
 
-        engine.call_host(_checked, (ArraySpec((), np.int32),), camera.view, camera.projection)
+        transform = [] if part.transform is None else [engine.stop_gradient(constants(part.transform, engine, like))]
+        engine.call_host(_checked, (ArraySpec((), np.int32),), camera.view, camera.projection, *transform)
         near, far = camera.depth_range()
         rays = camera.rays(size)
         directions = xp.reshape(rays.directions, (-1, 3))
@@ -84,7 +85,7 @@ def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, 
     return hits
 
 
-def _checked(*matrices: np.ndarray) -> tuple[np.ndarray]:
+def _checked(view: np.ndarray, projection: np.ndarray, *transform: np.ndarray) -> tuple[np.ndarray]:
     """Refuse a camera that has no rays; in a compiled function, where nothing needs the result, this is left out."""
-    check_camera(Camera(*(np.asarray(m, np.float64) for m in matrices)))
+    check_camera(Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64)), *transform)
     return (np.asarray(0, np.int32),)

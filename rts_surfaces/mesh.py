@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rts.arguments import quoted
 from rts.arrays import described, shape_of, unit
 from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
@@ -18,6 +19,7 @@ from rts.operations.combine import interpolate
 from rts.operations.take import take
 from rts.records import Proxy, Samples
 from rts.sampling.cache import fingerprint
+from rts.topology import fixed, index_table
 from rts.trees import Array, Tree
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
@@ -34,31 +36,42 @@ class Mesh(TriangleSurface):
     no normals, smooth ones are computed from the positions, differentiably, if the shader reads them.
 
     Args:
-        faces: (T, 3) integers into θ["vertices"].
-        indices: attribute name → (T, 3) integers into θ[name], or None for one row a vertex.
+        faces: (T, 3) integers into θ["vertices"]; copied.
+        indices: attribute name → (T, 3) integers into θ[name], or None for one row a vertex; copied.
+
+    Raises:
+        InputError: tables of another shape, of no integers, or traced: topology is known while Python runs.
     """
 
     proxy_is_cheap = True
 
     def __init__(self, faces: Any, indices: Mapping[str, Any] | None = None):
-        self.faces = _index_table("faces", faces)
+        self.faces = index_table("faces", faces, 3)
         self.face_count = len(self.faces)
         self._tables = [self.faces]
         self._columns: dict[str, int] = dict.fromkeys(VERTEX_ATTRIBUTES, 0)
+        if indices is not None and not isinstance(indices, Mapping):
+            raise InputError(f"indices is {quoted(indices)}; expected a dict of name → (T, 3) integers")
         for name, table in (indices or {}).items():
             self._columns[name] = 0
             if table is not None:
-                table = _index_table(f"indices[{name!r}]", table)
+                table = index_table(f"indices[{name!r}]", table, 3)
                 if table.shape != self.faces.shape:
                     raise InputError(f"indices[{name!r}] has shape {table.shape}; expected {self.faces.shape} as faces")
                 if not np.array_equal(table, self.faces):
                     self._columns[name] = 3 * len(self._tables)
                     self._tables.append(table)
-        self._ids = self.faces if len(self._tables) == 1 else np.concatenate(self._tables, axis=1)
+        self._ids = self.faces if len(self._tables) == 1 else fixed(np.concatenate(self._tables, axis=1))
         self._extents = [int(t.max()) + 1 for t in self._tables]
         self.sample_widths = (self._ids.shape[1], 2)
         self._normals: tuple[tuple, np.ndarray] | None = None
         self._reads: dict[tuple, tuple[str, ...]] = {}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A copy's tables are fixed, too."""
+        vars(self).update(state)
+        for table in (*self._tables, self._ids):
+            fixed(table)
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.faces)} faces)"
@@ -146,16 +159,3 @@ class Mesh(TriangleSurface):
         face_normals = xp.linalg.cross(b - a, c - a)
         segments = self.faces.T.reshape(-1)
         return unit(engine.segment_sum(xp.concat([face_normals] * 3), segments, vertices.shape[0]))
-
-
-def _index_table(name: str, table: Any) -> np.ndarray:
-    array = np.asarray(table)
-    if array.ndim != 2 or array.shape[1] != 3 or not len(array):
-        raise InputError(f"{name} has shape {array.shape}; expected (T, 3) with at least one triangle")
-    if not np.issubdtype(array.dtype, np.integer):
-        raise InputError(f"{name} has dtype {array.dtype}; expected integers")
-    if array.min() < 0:
-        raise InputError(f"{name} holds the index {array.min()}; indices count from 0")
-    if array.max() >= 2**31:
-        raise InputError(f"{name} holds the index {array.max()}; expected less than 2**31")
-    return np.ascontiguousarray(array, dtype=np.int32)

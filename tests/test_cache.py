@@ -16,7 +16,7 @@ from rts.sampling.cache import KEPT, fingerprint
 
 pytestmark = pytest.mark.sampling
 
-CAMERA = Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=50, aspect=1.25)
+CAMERA = Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=50)
 SIZE = (16, 20)
 Mesh = rts.plugin("surfaces", "mesh")
 
@@ -483,7 +483,7 @@ def few(monkeypatch):
 
 def differentiable_camera():
     torch = pytest.importorskip("torch")
-    return Camera(*(torch.as_tensor(np.asarray(m, np.float32)) for m in CAMERA))
+    return CAMERA.map(lambda m: torch.as_tensor(np.asarray(m, np.float32)))
 
 
 def test_what_has_no_triangles_goes_to_rays(few):

@@ -1,9 +1,13 @@
 """Cameras: conventions of space, converters from other libraries, derivatives of the constructors."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from helpers import DIFFERENTIABLE, arrays, derivative, finite_difference, gradient, moved, rigid, rotation
 
+import rts
 from rts import Camera, InputError
 from rts.camera import look_at, orthographic, perspective
 
@@ -281,7 +285,7 @@ CONSTRUCTORS = {
         },
     ),
     "look_at, default planes": (
-        lambda a: Camera.look_at(a["eye"], a["target"]),
+        lambda a: Camera.look_at(a["eye"], a["target"]).for_size((20, 30)),
         {"eye": (1.0, 2.0, 5.0), "target": (0.1, 0.2, 0.3)},
     ),
     "orthographic": (
@@ -309,6 +313,10 @@ CONSTRUCTORS = {
     "from_opencv": (
         lambda a: Camera.from_opencv(a["K"], a["R"], a["t"], SIZE, near=a["near"], far=a["far"]),
         {"K": SKEWED_K, "R": rotation((1, 2, 3), 40), "t": (0.1, 0.2, 6.0), "near": 0.5, "far": 9.0},
+    ),
+    "from_mvp": (
+        lambda a: Camera.from_mvp(a["matrix"]),
+        {"matrix": CAMERAS["off-centre"].projection @ CAMERAS["off-centre"].view},
     ),
     "from_opengl": (
         lambda a: Camera.from_opengl(a["modelview"], a["projection"]),
@@ -432,7 +440,7 @@ def test_project_gradient_is_finite_on_the_plane_of_the_camera(target):
         (lambda: look_at((0, 5, 0), (0, 0, 0)), ("upright", "up")),
         (lambda: look_at((0, 5, 0), (0, 0, 1), (0, 0, 0)), ("upright",)),
         (lambda: look_at((0, 5), (0, 0, 0)), ("eye has shape (2,)", "expected (3,)")),
-        (lambda: look_at((0, float("nan"), 1), (0, 0, 0)), ("upright",)),
+        (lambda: look_at((0, float("nan"), 1), (0, 0, 0)), ("eye", "nan", "finite")),
         (lambda: Camera.look_at((0, 0, 5), (0, 0, 0), near=3, far=1), ("near < far",)),
         (lambda: Camera.orthographic((0, 0, 5), (0, 0, 0), height=-1), ("height",)),
         (
@@ -465,3 +473,185 @@ def test_bad_camera_is_an_input_error_that_says_what_was_given(call, words):
     assert "\n" not in message
     for word in words:
         assert word in message
+
+
+# ------------------------------------------------------------------------------------ one matrix for everything
+
+
+def two_layers():
+    """A red triangle in front of a green one, which it hides; seen from +z."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], np.float32)
+    vertices = np.concatenate([corners, corners * 1.5 - [0, 0, 1]]).astype(np.float32)
+    colors = np.repeat(np.eye(3, dtype=np.float32)[:2], 3, axis=0)
+    return rts.Part(
+        rts.plugin("surfaces", "mesh")([[0, 1, 2], [3, 4, 5]]), {"vertices": vertices, "colors": colors}, "unlit"
+    )
+
+
+@pytest.mark.parametrize("sampler", ["raster", "reference", "embree"])
+def test_a_product_as_projection_is_refused_and_taken_apart_it_gives_the_same_picture(sampler):
+    camera = Camera.look_at((0.5, 1, 3), (0, 0, 0), fov_y=50, aspect=1.5)
+    product = camera.projection @ camera.view
+    with pytest.raises(InputError, match=r"last row of the camera's projection .* Camera.from_mvp"):
+        rts.render(two_layers(), Camera(np.eye(4), product), SIZE, sampler=sampler)
+    expected = rts.render(two_layers(), camera, SIZE, sampler=sampler)
+    assert expected[20, 30].tolist() == [1, 0, 0, 1]
+    found = rts.render(two_layers(), Camera.from_mvp(product), SIZE, sampler=sampler)
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("scale", [1.0, 3.7, 1e-3])
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_from_mvp_has_the_pixels_depths_and_planes_of_the_camera_whose_product_it_is(camera, scale):
+    found = Camera.from_mvp(scale * (camera.projection @ camera.view))
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    expected, pixels = camera.project(points, SIZE), found.project(points, SIZE)
+    np.testing.assert_allclose(pixels[:, :2], expected[:, :2], atol=1e-8)
+    near, far = camera.depth_range()
+    if camera.projection[3, 2] == 0:  # Where parallel rays start does not show in their image.
+        expected[:, 2] -= near
+        near, far = 0, far - near
+    np.testing.assert_allclose(pixels[:, 2], expected[:, 2], rtol=1e-7)
+    np.testing.assert_allclose(found.depth_range(), (near, far), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(found.view[:3, :3] @ found.view[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def test_from_mvp_keeps_the_order_of_depth_of_a_clip_space_picture():
+    # Vertices in clip space, and z / w as a depth buffer has it: the golden order of what hides what.
+    camera = Camera.look_at((0.3, -2, 3), (0, 0, 0), (0, 0, 1), fov_y=35, aspect=1.5)
+    points = np.random.default_rng(1).uniform(-1, 1, (200, 3))
+    clip = np.concatenate([points, np.ones((200, 1))], axis=1) @ (camera.projection @ camera.view).T
+    depth = Camera.from_mvp(camera.projection @ camera.view).project(points, SIZE)[:, 2]
+    np.testing.assert_array_equal(np.argsort(depth), np.argsort(clip[:, 2] / clip[:, 3]))
+    np.testing.assert_allclose(depth, clip[:, 3], rtol=1e-9)
+
+
+@pytest.mark.parametrize("sampler", ["raster", "reference", "embree"])
+def test_a_camera_that_looks_along_plus_z_shows_what_is_in_front(sampler):
+    camera = Camera.look_at((0.5, 1, 3), (0, 0, 0), fov_y=50, aspect=1.5)
+    flip = np.diag([1.0, 1, -1, 1])
+    found = rts.render(two_layers(), Camera(flip @ camera.view, camera.projection @ flip), SIZE, sampler=sampler)
+    np.testing.assert_allclose(found, rts.render(two_layers(), camera, SIZE, sampler=sampler), atol=1e-6)
+
+
+def test_a_traced_projection_along_plus_z_is_refused():
+    jax = pytest.importorskip("jax")
+    camera = Camera.look_at((0.5, 1, 3), (0, 0, 0), aspect=1.5)
+    flip = np.diag([1.0, 1, -1, 1])
+    part = two_layers()
+    with pytest.raises(Exception, match=r"looks along \+z"):
+        jax.jit(lambda p: rts.render(part, Camera(flip @ camera.view, p), SIZE))(camera.projection @ flip)
+
+
+@pytest.mark.parametrize("last", [(1e-18, 0, 0, 1), (0, 3e-8, 0, 1), (0, 0, 0, 1 + 1e-7)])
+@pytest.mark.parametrize("where", ["view", "transform"])
+def test_a_last_row_that_is_affine_up_to_rounding_is_accepted(where, last):
+    camera = Camera.look_at((0.5, 1, 3), (0, 0, 0), aspect=1.5)
+    expected = rts.render(two_layers(), camera, SIZE)
+    rounded = np.concatenate([(camera.view if where == "view" else np.eye(4))[:3], [last]])
+    part = two_layers() if where == "view" else two_layers().replace(transform=rounded)
+    found = rts.render(part, camera.replace(view=rounded) if where == "view" else camera, SIZE)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_a_last_row_that_is_not_affine_is_refused():
+    camera = Camera.look_at((0.5, 1, 3), (0, 0, 0), aspect=1.5)
+    with pytest.raises(InputError, match="last row of the camera's view"):
+        rts.render(two_layers(), camera.replace(view=camera.view + np.eye(4)[3][:, None] * 1e-4), SIZE)
+
+
+# ------------------------------------------------------------------------------------------ width over height
+
+
+def square():
+    """A square of two units in the plane z = 0."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
+    return rts.Part(rts.plugin("surfaces", "mesh")([[0, 1, 2], [0, 2, 3]]), {"vertices": corners})
+
+
+@pytest.mark.parametrize("size", [(64, 128), (128, 64), (50, 50)])
+@pytest.mark.parametrize("make", [Camera.look_at, lambda *a: Camera.orthographic(*a, height=6.0)])
+def test_a_camera_without_a_ratio_takes_it_from_the_size_and_a_square_stays_square(make, size):
+    image = rts.render(square(), make((0, 0, 6), (0, 0, 0)), size, splatter="none", supersample=4)
+    height, width = image[..., 3].sum(axis=0).max(), image[..., 3].sum(axis=1).max()
+    assert height == pytest.approx(width, abs=0.6)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Camera.look_at((0, 0, 6), (0, 0, 0), aspect=1.5),
+        lambda: Camera.orthographic((0, 0, 6), (0, 0, 0), height=6.0, aspect=1.5),
+        lambda: Camera.from_opencv(SKEWED_K, np.eye(3), (0, 0, 6), SIZE),
+        lambda: Camera.from_pytorch3d(np.eye(3), (0, 0, 6), focal_length=2.0, size=SIZE),
+        lambda: Camera.from_blender(rigid((1, 0, 0), 0, (0, 0, 6)), SIZE, focal=50.0),
+    ],
+)
+def test_an_image_of_another_ratio_than_its_cameras_is_warned_of_with_both(make):
+    camera = make()
+    with pytest.warns(rts.AspectWarning, match=r"width / height = 1\.5, and size is \(40, 40\), of 1") as caught:
+        rts.render(square(), camera, (40, 40))
+    assert caught[0].filename == __file__
+    for size in (SIZE, (80, 120), (27, 40)):  # The last is the ratio up to a pixel.
+        rts.render(square(), camera, size)
+
+
+def test_a_camera_of_plain_matrices_is_compared_with_no_size():
+    camera = Camera.look_at((0, 0, 6), (0, 0, 0), aspect=1.5)
+    plain = Camera(camera.view, camera.projection)
+    np.testing.assert_array_equal(rts.render(square(), plain, (40, 40)), rts.render(square(), plain, (40, 40)))
+
+
+@pytest.mark.parametrize("use", ["unpacked", "to_opengl", "to_nvdiffrast"])
+def test_an_open_ratio_is_never_taken_for_a_square_without_a_word(use):
+    camera = Camera.look_at((0, 0, 6), (0, 0, 0))
+    with pytest.raises(InputError, match=r"ratio of width to height open .* for_size"):
+        tuple(camera) if use == "unpacked" else getattr(camera, use)()
+    expected = Camera.look_at((0, 0, 6), (0, 0, 0), aspect=1.5)
+    view, projection = camera.for_size(SIZE)
+    np.testing.assert_allclose(projection, expected.projection)
+    np.testing.assert_array_equal(view, expected.view)
+    if use != "unpacked":
+        for found, wanted in zip(getattr(camera, use)(size=SIZE), getattr(expected, use)(), strict=True):
+            np.testing.assert_allclose(found, wanted)
+
+
+def test_an_open_ratio_passes_through_transforms_of_the_engines():
+    jax = pytest.importorskip("jax")
+    camera = Camera.look_at((0, 0, 6), (0, 0, 0))
+    found = jax.jit(lambda c: rts.render(square(), c, (30, 60)))(camera)
+    np.testing.assert_allclose(found, rts.render(square(), camera, (30, 60)), atol=1e-5)
+
+
+def test_cameras_are_equal_if_their_matrices_and_ratios_are():
+    torch = pytest.importorskip("torch")
+    camera = Camera.look_at((0, 0, 6), (0, 0, 0))
+    assert (camera == Camera.look_at((0, 0, 6), (0, 0, 0))) is True
+    assert (camera == Camera.look_at((0, 0, 7), (0, 0, 0))) is False
+    assert (camera == Camera.look_at((0, 0, 6), (0, 0, 0), aspect=1.0)) is False
+    assert (camera == 3) is False
+    assert (camera.map(torch.tensor) == camera.map(torch.tensor)) is True
+    assert camera.map(torch.tensor) == camera
+    assert pickle.loads(pickle.dumps(camera)) == copy.deepcopy(camera) == camera
+
+
+# ------------------------------------------------------------------------------------------------- derivatives
+
+
+def test_forward_mode_through_a_scalar_that_was_divided_by_gives_the_derivative():
+    torch = pytest.importorskip("torch")
+    camera = Camera.look_at((0, 0, 6), (0, 0, 0), aspect=1.0)
+    lower = torch.tensor(camera.projection[1:], dtype=torch.float32)
+    part = square().replace(theta={"vertices": torch.tensor(square().theta["vertices"])})
+
+    def image(x):
+        # The tangent of 1 / x is in float64 where x is a scalar in float32, by torch's own rule.
+        first = torch.stack([1 / x, 0 * x, 0 * x, 0 * x])
+        return rts.render(part, Camera(camera.view, torch.cat([first[None], lower])), (32, 32)).sum()
+
+    x = torch.tensor(0.5)
+    _, along = torch.func.jvp(image, (x,), (torch.tensor(1.0),))
+    x.requires_grad_(True)
+    (slope,) = torch.autograd.grad(image(x), x)
+    assert along.dtype == torch.float32
+    assert float(along) == pytest.approx(float(slope), rel=1e-4)

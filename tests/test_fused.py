@@ -504,8 +504,9 @@ def test_other_dtypes_are_left_to_the_specification(dtypes):
 
 
 def test_other_devices_are_left_to_the_specification():
+    # Tensors without values stand for those of a device that is not at hand.
     scene = (torch.tensor(x).to("meta") for x in cells(2))
-    image = fused.Visible().splat(*scene)
+    image = fused.Visible().image(rts.Splats(*scene))
     assert image.device.type == "meta" and image.shape == (9, 11, 4)
 
 

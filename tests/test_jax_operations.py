@@ -259,7 +259,7 @@ def test_an_id_of_no_row_is_one_clear_error(wrong):
     ids = jnp.asarray(IDS).at[2, COLUMN + 1].set(wrong)
     for name, mode in MODES.items():
         kind = rts.InputError if name == "eager" else Exception  # Of jax's own, with our words in it.
-        with pytest.raises(kind, match=f"samples refer to row {wrong} of an array of {ROWS}; sample this surface anew"):
+        with pytest.raises(kind, match=f"refer to row {wrong} of {ROWS} rows; sample this surface anew"):
             jax.block_until_ready(mode(lambda r, w: interpolate(r, ids, COLUMN, w))(rows, weights))
 
 

@@ -85,8 +85,8 @@ def test_attributes_of_corners_are_read_through_their_own_indices(target):
         shader=heat_in_blue,
     )
     part, camera = arrays(target, (part, FRONT))
-    image = show(part, camera, (20, 20), splatter="none")
-    # FRONT stretches; the diagonal runs from the lower left to the upper right, triangle 0 is below it.
+    image = show(part, camera, (20, 24), splatter="none")
+    # The diagonal rises to the right, triangle 0 is below it.
     np.testing.assert_allclose(image[15, 15], (1, 0, 0.75, 1), atol=1e-6)
     np.testing.assert_allclose(image[5, 5], (0, 1, 0.25, 1), atol=1e-6)
 

@@ -343,7 +343,7 @@ def public(monkeypatch):
 
 
 def both(sampler, vertices, faces, camera, size=SIZE, layers=1, cull="none"):
-    camera = Camera(*(np.asarray(m, np.float64) for m in camera))
+    camera = Camera(np.asarray(camera.view, np.float64), np.asarray(camera.projection, np.float64))
     samplers = (sampler, rts.plugin("samplers", "reference")())
     return [s.rasterize(s.prepare(Proxy(vertices, faces)), camera, size, layers, cull) for s in samplers]
 

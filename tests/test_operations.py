@@ -99,7 +99,7 @@ def test_combine_refuses_what_does_not_fit_in_one_line():
     ):
         combine(rows, ids, weights[:, :1])
     for target in ALL:
-        with pytest.raises(rts.InputError, match="samples refer to row 9 of an array of 4; sample this surface anew"):
+        with pytest.raises(rts.InputError, match="refer to row 9 of 4 rows; sample this surface anew"):
             to_numpy(combine(*arrays(target, (rows, ids + 9, weights))))
 
 
@@ -373,8 +373,8 @@ def test_a_camera_of_numpy_and_of_another_engine_projects():
     points = RNG.normal(size=(5, 3))
     expected = camera.project(points, (8, 9))
     for mixed in (
-        camera._replace(projection=torch.tensor(camera.projection)),
-        camera._replace(view=torch.tensor(camera.view)),
+        camera.replace(projection=torch.tensor(camera.projection)),
+        camera.replace(view=torch.tensor(camera.view)),
     ):
         for given in (points, torch.tensor(points)):
             np.testing.assert_allclose(to_numpy(mixed.project(given, (8, 9))), expected, rtol=1e-10)

@@ -19,7 +19,7 @@ SAMPLERS = ("raster", "reference")
 
 def rasterize(name, vertices, faces, camera, size=SIZE, layers=1, cull="none"):
     sampler = rts.plugin("samplers", name)()
-    camera = Camera(*(np.asarray(m, np.float64) for m in camera))
+    camera = Camera(np.asarray(camera.view, np.float64), np.asarray(camera.projection, np.float64))
     return sampler.rasterize(sampler.prepare(Proxy(vertices, faces)), camera, size, layers, cull)
 
 
@@ -200,7 +200,7 @@ def grid(corner, step, count, depth=None):
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_a_grid_through_pixel_centres_covers_each_pixel_once(sampler, corner, step, flip):
     vertices, faces = grid(corner, step, int(np.ceil(34 / step)))
-    camera = PIXELS._replace(projection=np.diag([1.0, -1, 1, 1]) @ PIXELS.projection) if flip else PIXELS
+    camera = PIXELS.replace(projection=np.diag([1.0, -1, 1, 1]) @ PIXELS.projection) if flip else PIXELS
     found = rasterize(sampler, vertices, faces, camera, (32, 32), 2)
     assert (found.triangle_ids[0] >= 0).all()
     assert (found.triangle_ids[1] == -1).all()

@@ -46,7 +46,7 @@ def usable(name):
 
 
 def host(camera):
-    return Camera(*(np.asarray(m, np.float64) for m in camera))
+    return Camera(np.asarray(camera.view, np.float64), np.asarray(camera.projection, np.float64))
 
 
 def rasterize(name, vertices, faces, camera, size=SIZE, layers=1, cull="none"):

@@ -98,7 +98,7 @@ def test_layers_before_the_near_and_beyond_the_far_plane_are_dropped():
 def test_without_straight_planes_only_what_refine_dropped_is_dropped():
     oblique = PLANES.projection.copy()
     oblique[2, 1] = 0.2
-    assert column(0.5, 100.0, 9.5, camera=PLANES._replace(projection=oblique))[0] == [0, 2, 1]
+    assert column(0.5, 100.0, 9.5, camera=PLANES.replace(projection=oblique))[0] == [0, 2, 1]
 
 
 def test_settling_changes_rows_and_depths_only():

@@ -20,7 +20,7 @@ from rts import Camera, Part, PluginError
 pytestmark = pytest.mark.core
 
 Mesh = rts.plugin("surfaces", "mesh")
-CAMERA = Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=50, aspect=1.25)
+CAMERA = Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=50)
 TRIANGLE_SAMPLERS = ("raster", "reference", "embree", "opengl")
 SAMPLERS = (*TRIANGLE_SAMPLERS, "rays")
 

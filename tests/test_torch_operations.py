@@ -142,7 +142,7 @@ def test_points_without_an_image_are_finite_with_finite_gradients():
 
 def test_samples_of_another_mesh_are_one_clear_error():
     rows, weights = corners()
-    with pytest.raises(rts.InputError, match="samples refer to row 5 of an array of 3; sample this surface anew"):
+    with pytest.raises(rts.InputError, match="refer to row 5 of 3 rows; sample this surface anew"):
         interpolate(rows[:3], torch.full((7, 5), 5), COLUMN, weights)
     with pytest.raises(rts.InputError, match="row -1 of an array of 6"):
         interpolate(rows, torch.full((7, 5), -1), COLUMN, weights)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.arrays import from_numbers, shape_of
+from rts.arrays import described, from_numbers, shape_of
 from rts.engines import constants, engine_of, exemplar, namespace
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
@@ -23,8 +23,12 @@ def combine(rows: Array, ids: Array, weights: Array) -> Array:
     Raises:
         InputError: shapes that do not fit, or ids of no row.
     """
-    rows, weights = from_numbers(rows), from_numbers(weights)
+    rows, weights = from_numbers(rows, "rows"), from_numbers(weights, "weights")
+    ids = np.asarray(from_numbers(ids, "ids"), np.int32) if isinstance(ids, (list, tuple)) else from_numbers(ids, "ids")
     shapes = [shape_of(x) for x in (rows, ids, weights)]
+    for name, x in (("rows", rows), ("ids", ids), ("weights", weights)):
+        if not shape_of(x):
+            raise InputError(f"{name} {described(x)}; expected an array (V, C), (N, I) or (N, I)")
     for name, x in (("rows", rows), ("weights", weights)):
         if not engine_of(x).namespace.isdtype(x.dtype, "real floating"):
             raise InputError(f"{name} have dtype {x.dtype}; expected floating numbers")

@@ -21,7 +21,7 @@ def check(rows: np.ndarray, ids: np.ndarray, column: int, count: int) -> None:
         return
     for index in (named.max(), named.min()):
         if not 0 <= index < len(rows):
-            raise InputError(f"samples refer to row {index} of an array of {len(rows)}; sample this surface anew")
+            raise InputError(f"the ids of samples refer to row {index} of {len(rows)} rows; sample this surface anew")
 
 
 def forward(

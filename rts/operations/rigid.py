@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from rts.arguments import check_numbers
 from rts.arrays import promote, shape_of
 from rts.engines import engine_of, is_constant, namespace
-from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
 from rts.transforms import affine_matrix
 from rts.trees import Array
@@ -29,13 +29,14 @@ def rigid(pose: Any, center: Any = ORIGIN) -> Array:
     Raises:
         InputError: the pose has another shape.
     """
-    if isinstance(pose, (list, tuple)) and is_constant(pose):
-        pose = np.asarray(pose, np.float64)
-    shape = shape_of(pose)
-    if shape != (6,):
-        raise InputError(f"pose has shape {shape}; expected (6,): rotation vector, translation")
+    if shape_of(pose) != (6,):
+        check_numbers("pose", pose, (6,))
+        if is_constant(pose):
+            pose = np.asarray(pose, np.float64)
     if center is ORIGIN:
         center = engine_of(pose).constant(np.zeros(3), pose)
+    elif shape_of(center) != (3,):
+        check_numbers("center", center, (3,))
     _, (pose, center) = promote(pose, center)
     return RIGID(pose, center)
 

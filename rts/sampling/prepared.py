@@ -9,6 +9,8 @@ from rts.camera import Camera
 from rts.checks import check_sampler, check_scene, suited_sampler
 from rts.errors import InputError
 from rts.interfaces import Part
+from rts.records import Proxy
+from rts.sampling.cache import Entry
 
 
 class PreparedParts:
@@ -25,6 +27,16 @@ class PreparedParts:
     def __init__(self, parts: Sequence[Part], samplers: Sequence[Any], entries: Sequence[Any]):
         self.parts, self.samplers, self.entries = tuple(parts), tuple(samplers), tuple(entries)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but what samplers have built, of which the triangles are enough."""
+        return {**self.__dict__, "entries": [e.proxy if isinstance(e, Entry) else e for e in self.entries]}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Build it again."""
+        pairs = zip(state["samplers"], state["entries"], strict=True)
+        entries = tuple(_built(sampler, kept) if isinstance(kept, Proxy) else kept for sampler, kept in pairs)
+        self.__dict__.update(state, entries=entries)
+
     def replace(self, index: int = 0, **changes: Any) -> PreparedParts:
         """A copy with some fields of one part changed, such as its `transform`; the triangles are not looked at."""
         if "surface" in changes:
@@ -38,6 +50,10 @@ class PreparedParts:
         parts = list(self.parts)
         parts[index] = parts[index].replace(**changes)
         return PreparedParts(parts, self.samplers, self.entries)
+
+
+def _built(sampler: Any, proxy: Proxy) -> Entry:
+    return Entry(proxy, sampler.prepare(proxy) if len(proxy.faces) else None)
 
 
 def prepare(

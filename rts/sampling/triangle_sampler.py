@@ -17,7 +17,7 @@ from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.packing import lift, repack
 from rts.sampling.settling import refined, settle
-from rts.sampling.validation import check_camera, check_fragments, checked_proxy
+from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
 
 
@@ -44,8 +44,13 @@ class TriangleSampler(Sampler):
         self._keeper = Keeper()
         return self
 
+    def __getstate__(self) -> dict[str, Any]:
+        """The sampler's own settings: copies, and those in other processes, build anew."""
+        return {name: value for name, value in self.__dict__.items() if name != "_keeper"}
+
     def prepare(self, proxy: Proxy) -> Any:
         """Build what `rasterize` needs: an acceleration structure, device buffers. The default is the proxy itself."""
+        check_faces(proxy)
         return proxy
 
     def update(self, prepared: Any, proxy: Proxy) -> Any:
@@ -75,7 +80,8 @@ class TriangleSampler(Sampler):
         inputs = surface.proxy_inputs(_stopped(part.theta))
         inputs = map_leaves(engine_of(inputs).to_numpy, inputs)
         if camera is not None:
-            camera = Camera(*(engine_of(m).to_numpy(m) for m in camera.within(part.transform)))
+            camera = camera if size is None else camera.for_size(size)
+            camera = camera.within(part.transform).map(lambda m: engine_of(m).to_numpy(m))
         return self._built(surface, inputs, camera, size)
 
     def _built(self, surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Entry:
@@ -130,7 +136,7 @@ class TriangleSampler(Sampler):
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
         """
-        surface, theta = _of_triangles(part.surface), part.theta
+        surface, theta, camera = _of_triangles(part.surface), part.theta, camera.for_size(size)
         engine, like = suiting(theta, camera)
         shape = _Shape(layers, size, capacity)
         inputs = surface.proxy_inputs(_stopped(theta)) if entry is None or surface.refines else None
@@ -141,11 +147,13 @@ class TriangleSampler(Sampler):
         asked = None if shader is None else shader.reads
         attributes = _attribute_specs(surface, asked, host_theta, shape, like)
 
-        def host(view: np.ndarray, projection: np.ndarray, *host_leaves: np.ndarray) -> tuple[np.ndarray, ...]:
-            it = iter(host_leaves)
+        transform = [] if part.transform is None else [part.transform]
+
+        def host(view: np.ndarray, projection: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
+            it = iter(rest[len(transform) :])
             host_inputs = map_leaves(lambda _: next(it), inputs)
             host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
-            check_camera(host_camera)
+            host_camera = check_camera(host_camera, *rest[: len(transform)])
             found = self._found(surface, part.cull, host_inputs, host_camera, shape, tables, needed, entry)
             gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
             return (
@@ -159,7 +167,7 @@ class TriangleSampler(Sampler):
             )
 
         specs = *shape.specs(surface.sample_widths), *tables.values(), *attributes.values()
-        results = engine.call_host(host, specs, camera.view, camera.projection, *leaves(inputs))
+        results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *leaves(inputs))
         rest = 5 + len(tables)
         return Samples(
             *results[:5],

@@ -12,14 +12,13 @@ from rts.camera import Camera
 from rts.errors import InputError
 from rts.interfaces import TriangleSurface
 from rts.records import Fragments, Proxy, Samples
+from rts.topology import extent
 from rts.trees import Tree
 
 
 def checked_proxy(surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Proxy:
     """The proxy of a surface for host inputs, refused where it cannot be drawn."""
-    proxy = surface.proxy(inputs, camera, size)
-    if not surface.proxy_is_cheap:
-        proxy = _packed_proxy(proxy, surface)
+    proxy = _packed_proxy(surface.proxy(inputs, camera, size), surface)
     check_proxy(proxy, surface)
     return proxy
 
@@ -28,31 +27,48 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
     """The proxy with contiguous arrays of the right dtypes; triangles that would be read out of bounds are refused."""
     if not isinstance(proxy, Proxy):
         raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected an rts.Proxy")
-    vertices, faces = np.asarray(proxy.vertices), np.asarray(proxy.faces)
-    for name, array, kind in (("vertices", vertices, np.floating), ("faces", faces, np.integer)):
-        if array.ndim != 2 or array.shape[1] != 3 or not np.issubdtype(array.dtype, kind):
-            raise InputError(
-                f"the proxy of {surface!r} has {name} of shape {array.shape} and dtype {array.dtype}; "
-                f"expected (rows, 3) of {'float32' if kind is np.floating else 'int32'}"
-            )
-    if len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices):
+    vertices = _table(surface, "vertices", proxy.vertices, (3,), np.float32)
+    faces = _table(surface, "faces", proxy.faces, (3,), np.int32)
+    check_faces(Proxy(vertices, faces), f"the proxy of {surface!r}")
+    ids = None if proxy.ids is None else _table(surface, "ids", proxy.ids, (-1,), np.int32)
+    corners = proxy.corner_params
+    corners = None if corners is None else _table(surface, "corner_params", corners, (3, -1), np.float32)
+    width = 3 if ids is None else ids.shape[1]
+    if not surface.refines and width != surface.sample_widths[0]:
         raise InputError(
-            f"the proxy of {surface!r} has faces from {faces.min()} to {faces.max()}, but {len(vertices)} vertices"
+            f"the proxy of {surface!r} has {width} ids a triangle, but sample_widths says {surface.sample_widths[0]}"
         )
-    widths = faces.shape[1] if proxy.ids is None else np.shape(proxy.ids)[1]
-    if not surface.refines and widths != surface.sample_widths[0]:
-        raise InputError(
-            f"the proxy of {surface!r} has {widths} ids a triangle, but sample_widths says {surface.sample_widths[0]}"
-        )
-    for name, array in (("ids", proxy.ids), ("corner_params", proxy.corner_params)):
+    for name, array in (("ids", ids), ("corner_params", corners)):
         if array is not None and len(array) < len(faces):
             raise InputError(
-                f"the proxy of {surface!r} has {len(faces)} faces, but {name} of shape {np.shape(array)}; "
+                f"the proxy of {surface!r} has {len(faces)} faces, but {name} of shape {array.shape}; "
                 f"expected a row a face"
             )
-    return proxy._replace(
-        vertices=np.ascontiguousarray(vertices, np.float32), faces=np.ascontiguousarray(faces, np.int32)
-    )
+    return Proxy(vertices, faces, ids, corners)
+
+
+def check_faces(proxy: Proxy, name: str = "the proxy") -> None:
+    """Refuse triangles that name no vertex, before compiled code reads there."""
+    if not len(proxy.faces):
+        return
+    least, most = extent(proxy.faces)
+    if not 0 <= least <= most < len(proxy.vertices):
+        raise InputError(f"{name} has faces from {least} to {most}, but {len(proxy.vertices)} vertices")
+
+
+def _table(surface: Any, name: str, table: Any, widths: tuple[int, ...], dtype: type) -> np.ndarray:
+    """A table of a proxy, contiguous and of this dtype, refused where it has another number of columns or kind."""
+    kind = np.floating if dtype is np.float32 else np.integer
+    array = np.asarray(table)
+    fits = array.ndim == 1 + len(widths) and all(w in (-1, n) for w, n in zip(widths, array.shape[1:], strict=True))
+    if not fits or not np.issubdtype(array.dtype, kind):
+        columns = ", ".join("any" if w < 0 else str(w) for w in widths)
+        raise InputError(
+            f"the proxy of {surface!r} has {name} of shape {array.shape} and dtype {array.dtype}; "
+            f"expected (rows, {columns}) of {np.dtype(dtype)}"
+        )
+    with np.errstate(over="ignore"):  # What is too large becomes infinite, and is refused.
+        return np.ascontiguousarray(array, dtype)
 
 
 def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sampler: Any) -> None:
@@ -77,20 +93,50 @@ WELL_CONDITIONED = 1e-6
 """The `_spread` of rows from which on a matrix is far from singular."""
 
 
-def check_camera(camera: Camera) -> None:
-    """Refuse host matrices that are not finite, not invertible, or a view that is not affine."""
-    for name, matrix in zip(("view", "projection"), camera, strict=True):
+def check_camera(camera: Camera, transform: np.ndarray | None = None) -> Camera:
+    """The camera of host matrices, refused where it makes no image.
+
+    They must be finite and invertible, the view affine and the projection such that depth is read off the view.
+
+    Args:
+        camera: float64; its view is that of the camera times the part's transform.
+        transform: that transform, where there is one, to know what to blame.
+
+    Returns:
+        The camera, the last row of its view without rounding.
+    """
+    for name, matrix in (("view", camera.view), ("projection", camera.projection)):
         if not np.isfinite(matrix).all():
-            raise InputError(f"the camera's {name} matrix holds NaN or infinity; check how it was made")
+            bad = name == "view" and transform is not None and not np.isfinite(transform).all()
+            what = "transform of a part" if bad else f"camera's {name} matrix"
+            raise InputError(f"the {what} holds NaN or infinity; check how it was made")
     # Most are far from singular; singular values take longer.
     well = _spread(camera.view[:3, :3]) > WELL_CONDITIONED
     if not (well and _spread_of_projection(camera.projection.tobytes()) > WELL_CONDITIONED):
         _check_invertible(camera)
-    if camera.view[3].tolist() != [0, 0, 0, 1]:
+    x, y, z, w = camera.view[3].tolist()
+    if max(abs(x), abs(y), abs(z), abs(w - 1)) > ROUNDING:
         raise InputError(
-            f"the last row of the camera's view times the part's transform is {camera.view[3].tolist()}; "
-            f"expected 0, 0, 0, 1"
+            f"the last row of the camera's view times the part's transform is {[x, y, z, w]}; expected 0, 0, 0, 1"
         )
+    a, b, c, d = camera.projection[3].tolist()
+    if max(abs(a), abs(b)) > ROUNDING * max(abs(c), abs(d)):
+        raise InputError(
+            f"the last row of the camera's projection is {[a, b, c, d]}; expected (0, 0, ±c, d): if it is the product "
+            f"of projection and view, use Camera.from_mvp(matrix)"
+        )
+    if c > 0:
+        raise InputError(
+            f"the last row of the camera's projection is {[a, b, c, d]}: it looks along +z, which cannot be turned "
+            f"while it is traced; use Camera.from_mvp(projection @ view)"
+        )
+    if x == y == z == 0 and w == 1:
+        return camera
+    return camera.replace(view=np.concatenate([camera.view[:3], [[0.0, 0.0, 0.0, 1.0]]]))
+
+
+ROUNDING = 1e-6
+"""What entries of a last row may be off by, relative to its largest."""
 
 
 def _spread(m: np.ndarray) -> float:

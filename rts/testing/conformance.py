@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
+import pytest
+
 
 class Conformance:
     """Base of the kit's classes: only subclasses made outside the kit are collected by pytest."""
 
     __test__ = False
+    pytestmark = pytest.mark.filterwarnings("ignore::rts.EmptyImageWarning")  # The kit shows plugins nothing, too.
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

@@ -32,7 +32,7 @@ MISSED = 0.01
 def claim_refined(part: Part, surface: TriangleSurface, camera: Camera, view: str) -> None:
     """Fail unless `refine` leaves each sample on its ray, at its depth, or drops it."""
     sampler = registry.instance("rts.samplers", "reference")
-    local = Camera(*(np.asarray(m, np.float64) for m in camera.within(part.transform)))
+    local = camera.within(part.transform).map(lambda m: np.asarray(m, np.float64))
     inputs = map_leaves(np.asarray, surface.proxy_inputs(map_leaves(derivatives.single, part.theta)))
     proxy = surface.proxy(inputs, local, GRID)
     fragments = sampler.rasterize(proxy, local, GRID, LAYERS, part.cull)

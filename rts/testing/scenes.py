@@ -23,7 +23,7 @@ GRID = SIZE[0] + 2 * APRON, SIZE[1] + 2 * APRON
 
 def _rounded(camera: Camera) -> Camera:
     """The camera rounded to float32, so that every engine sees the same one."""
-    return Camera(*map(single, camera))
+    return camera.map(single)
 
 
 def _look(eye: tuple, at: tuple = (0, 0, 0), up: tuple = (0, 1, 0), **options: Any) -> Camera:

@@ -11,6 +11,7 @@ import numpy as np
 from rts.camera import Camera
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
+from rts.sampling.validation import check_faces
 from rts.threads import parallel
 from rts_backends.embree import embreex_fallback, library
 from rts_backends.embree.covers import Covers
@@ -49,6 +50,7 @@ class Embree(TriangleSampler):
 
     def prepare(self, proxy: Proxy) -> Structure:
         """Build the acceleration structure."""
+        check_faces(proxy)
         return Structure(proxy)
 
     def update(self, prepared: Structure, proxy: Proxy) -> Structure | None:

@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 
 from rts.engines import Engine
-from rts.errors import RtsError
+from rts.errors import InputError, RtsError
 from rts.operations.operation import Operation
 from rts.records import ArraySpec
 from rts.trees import STATIC_FIELDS, Tree, join_record, split_record
@@ -22,6 +22,10 @@ for _cls in STATIC_FIELDS:
     jax.tree_util.register_pytree_node(
         _cls, split_record, lambda static, arrays, cls=_cls: join_record(cls, tuple(arrays), static)
     )
+
+
+_REAL_KINDS = ("f", "i", "u", "b", "V")
+"""Kinds of NumPy's dtypes; "V" is that of bfloat16."""
 
 
 def bucket(rows: int) -> int:
@@ -104,6 +108,17 @@ class JaxEngine(Engine):
     def traced(self, x: jax.Array) -> bool:
         """Whether `x` is a tracer."""
         return isinstance(x, Tracer)
+
+    def admitted(self, x: jax.Array, name: str) -> jax.Array:
+        """`x`; complex numbers and keys of random numbers are refused."""
+        if getattr(x.dtype, "kind", None) not in _REAL_KINDS:
+            raise InputError(f"{name} has dtype {x.dtype}; expected real numbers")
+        return x
+
+    def known(self, x: jax.Array) -> np.ndarray | None:
+        """The value; under `grad` and `jvp` of what is eager, too."""
+        x = jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x
+        return None if isinstance(x, Tracer) else np.asarray(x)
 
     def on_host(self, *arrays: jax.Array) -> bool:
         """Whether all are on CPUs; of a tracer that is not known yet, and taken to be so."""

@@ -19,6 +19,7 @@ from rts.camera import Camera
 from rts.errors import InputError
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
+from rts.sampling.validation import check_faces
 from rts.threads import parallel
 from rts_backends.neighbours import corner_lists, places, settle
 from rts_backends.opengl.worker import LESS, Worker
@@ -92,6 +93,7 @@ class OpenGL(TriangleSampler):
 
     def prepare(self, proxy: Proxy) -> Buffers:
         """Move the triangles to the device."""
+        check_faces(proxy)
         return Buffers(self._worker, proxy)
 
     def rasterize(self, prepared: Buffers, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:

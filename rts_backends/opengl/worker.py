@@ -42,6 +42,10 @@ class Worker:
         self._start = threading.Lock()
         self.context: moderngl.Context | None = None
 
+    def __reduce__(self) -> tuple:
+        """A copy, or one in another process, has a thread and a context of its own."""
+        return Worker, ()
+
     def call(self, function: Callable, *args: Any) -> Any:
         """`function(context, *args)` on the worker's thread; its result, or its exception."""
         global _process

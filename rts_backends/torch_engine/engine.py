@@ -10,14 +10,16 @@ import torch
 import torch.utils.checkpoint
 from array_api_compat import torch as array_api
 from torch._C._functorch import get_unwrapped, is_functorch_wrapped_tensor, maybe_current_level
+from torch.autograd import forward_ad
 from torch.utils import _pytree
 
 from rts.engines import Engine
+from rts.errors import InputError
 from rts.operations.operation import Operation
 from rts.records import ArraySpec
 from rts.trees import STATIC_FIELDS, Tree, join_record, leaves, map_leaves, split_record
 from rts_backends.torch_engine import operations
-from rts_backends.torch_engine.functions import applied, transformed
+from rts_backends.torch_engine.functions import applied, foreign, tangent_alike, transformed
 
 for _cls in STATIC_FIELDS:
     _pytree.register_pytree_node(
@@ -127,6 +129,28 @@ class TorchEngine(Engine):
         """True for two arrays of one dtype on the CPU, outside of `torch.autocast`."""
         a, b = arrays
         return a.device.type == b.device.type == "cpu" and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
+
+    def admitted(self, x: torch.Tensor, name: str) -> torch.Tensor:
+        """`x`, its tangent in its own dtype. Sparse, quantized and complex tensors, and "meta", are refused."""
+        if x.layout is not torch.strided or x.is_quantized:
+            what = "quantized" if x.is_quantized else str(x.layout).removeprefix("torch.")
+            raise InputError(f"{name} is a {what} tensor; expected a dense one (to_dense(), dequantize())")
+        if x.is_meta:
+            raise InputError(f"{name} is a tensor on the device 'meta', which has no values; expected one that has")
+        if x.dtype.is_complex:
+            raise InputError(f"{name} has dtype {x.dtype}; expected real numbers")
+        return tangent_alike(x) if forward_ad._current_level >= 0 else x
+
+    def known(self, x: torch.Tensor) -> np.ndarray | None:
+        """The value, for all items of a batch; None while `torch.compile` looks on."""
+        if torch.compiler.is_compiling() or foreign(x):
+            return None
+        if not is_functorch_wrapped_tensor(x):
+            return _to_host(x)
+        while is_functorch_wrapped_tensor(x):
+            x = get_unwrapped(x)
+        with torch._C._DisableFuncTorch():  # Else it would be wrapped anew.
+            return _to_host(x)
 
     def padded(self, x: torch.Tensor) -> bool:
         """True under `torch.func` transforms: under `torch.vmap` each item has as many rows as the largest."""

@@ -41,6 +41,18 @@ def foreign(*tensors: Tensor | None) -> bool:
     return False
 
 
+def tangent_alike(x: Tensor) -> Tensor:
+    """A tensor whose tangent is of its own dtype.
+
+    Products and quotients of a scalar tensor in float32 and a number of Python's have tangents in float64, which
+    products of matrices refuse.
+    """
+    tangent = forward_ad.unpack_dual(x).tangent
+    if tangent is None or tangent.dtype == x.dtype:
+        return x
+    return x.to(torch.float64).to(x.dtype)  # One cast alone, to the dtype it has, would be skipped.
+
+
 def on_host(x: Tensor) -> np.ndarray:
     """The value of a tensor in the memory of the host, without a copy."""
     x = x.detach()

@@ -1,0 +1,64 @@
+"""Why nothing is seen in an image: words for a warning."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.engines import value_of
+from rts.interfaces import CheckedPart, TriangleSurface
+from rts.trees import Tree, map_leaves
+
+
+def why_empty(parts: Sequence[CheckedPart], camera: Camera) -> str:
+    """The likely cause, for each part, that an image has no sample, or none that is not transparent."""
+    causes = [_cause(part, camera) for part in parts]
+    if len(parts) == 1:
+        return causes[0].format("the part")
+    return "; ".join(cause.format(f"part {i}") for i, cause in enumerate(causes[:4])) + (
+        "; …" if len(parts) > 4 else ""
+    )
+
+
+def _cause(part: CheckedPart, camera: Camera) -> str:
+    if not isinstance(part.surface, TriangleSurface):
+        return "no ray meets {}, or its shader gives an alpha of 0"
+    known = _known((part.surface.proxy_inputs(part.theta), camera.within(part.transform)))
+    if known is None:
+        return "{} is not in sight, or its shader gives an alpha of 0"
+    inputs, local = known
+    proxy = part.surface.proxy(inputs, local, (1, 1))
+    if not len(proxy.faces):
+        return "{} has no triangles"
+    corners = proxy.vertices[np.unique(proxy.faces)].astype(np.float64)
+    at = np.concatenate([corners, np.ones((len(corners), 1))], axis=1) @ (local.projection @ local.view).T
+    depth = -(corners @ local.view[2, :3] + local.view[2, 3])
+    near, far = local.depth_range()
+    if (depth < near).all():
+        where = "behind the camera" if (at[:, 3] <= 0).all() else f"nearer than the near plane, at {near:.3g}"
+        return "{} lies " + where
+    if (depth > far).all():
+        return f"{{}} lies beyond the far plane, at {far:.3g}"
+    for axis, sign, side in ((0, 1, "right"), (0, -1, "left"), (1, 1, "top"), (1, -1, "bottom")):
+        if (sign * at[:, axis] > at[:, 3]).all():
+            return f"{{}} lies outside of the view, beyond its {side} edge"
+    if part.cull == "back":
+        return "all that is in sight of {} is seen from behind, which cull='back' leaves out"
+    if part.shader.opaque:
+        return "{} lies between the centres of pixels, or beside the view"
+    return "the shader of {} gives an alpha of 0, or it lies between the centres of pixels"
+
+
+def _known(tree: Tree) -> Tree | None:
+    """A tree with NumPy arrays in float64, None if one of them is traced or of a batch."""
+    found = []
+
+    def value(x: object) -> object:
+        known = value_of(x)
+        found.append(known is not None and known.shape == tuple(getattr(x, "shape", ())))
+        return known
+
+    host = map_leaves(value, tree)
+    return host if all(found) else None
