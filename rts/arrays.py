@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -30,7 +31,7 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
         return tree if tree.dtype in _ORDINARY else _ordinary(tree, name)
     owner = OWNERS.get(kind)
     if owner is not None:
-        return owner.admitted(tree, name)
+        return tree if owner.plain(tree) else owner.admitted(tree, name)
     if tree is None or kind in _NUMBERS:
         return tree
     if isinstance(tree, Mapping):
@@ -38,7 +39,7 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
         for key, value in tree.items():
             if not isinstance(key, str):
                 raise InputError(f"{name} has the key {key!r}; expected names")
-            found[key] = from_numbers(value, f"{name}[{key!r}]")
+            found[key] = value if _is_plain(value) else from_numbers(value, f"{name}[{key!r}]")
         return found
     if isinstance(tree, (list, tuple)):
         if tree and not is_named(tree) and all(isinstance(x, (bool, int, float)) for x in leaves(tree)):
@@ -63,6 +64,14 @@ def from_numbers(tree: Tree, name: str = "an array") -> Tree:
         what = " ".join(repr(tree).split())
         raise InputError(f"{name} is {what if len(what) <= 60 else kind_of(tree)}; expected an array") from None
     return engine.admitted(tree, name)
+
+
+def _is_plain(x: Any) -> bool:
+    """Whether an array is taken as it is."""
+    if type(x) is np.ndarray:
+        return x.dtype in _ORDINARY
+    owner = OWNERS.get(type(x))
+    return owner is not None and owner.plain(x)
 
 
 _NUMBERS = (bool, int, float)
@@ -149,8 +158,16 @@ def without_border(image: Array, border: int) -> Array:
     return image[border : height - border, border : width - border, ...] if border else image
 
 
-def is_finite(x: Array) -> bool:
+def is_finite(*arrays: Array) -> bool:
     """Whether all values are finite, as far as they are known; quick where they are."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        for x in arrays:
+            if not _is_finite(x):
+                return False
+    return True
+
+
+def _is_finite(x: Array) -> bool:
     engine = engine_of(x)
     if not engine.on_host(x):
         known = value_of(engine.namespace.all(engine.namespace.isfinite(x)))
@@ -159,6 +176,5 @@ def is_finite(x: Array) -> bool:
     if known is None:
         return True
     flat = known.reshape(-1)
-    with np.errstate(over="ignore", invalid="ignore"):
-        square = np.dot(flat, flat)  # Ten times as fast as to look at each.
-    return bool(np.isfinite(square)) or bool(np.isfinite(flat).all())
+    # The square is ten times as fast as to look at each; it may overflow.
+    return math.isfinite(np.dot(flat, flat)) or bool(np.isfinite(flat).all())

@@ -563,6 +563,8 @@ class Camera:
 
 def check_pixels(size: Any) -> tuple[int, int]:
     """(height, width) as integers, refused where they make no image."""
+    if type(size) is tuple and len(size) == 2 and type(size[0]) is int is type(size[1]) and min(size) > 0:
+        return size
     try:
         height, width = (int(s) for s in size if not isinstance(size, (set, frozenset, dict)))
         whole = (height, width) == tuple(size)

@@ -212,7 +212,7 @@ def check_splats(
         row: (K, H, W) of all parts.
         first: the row of all parts that is the first of this one.
     """
-    if is_finite(positions) and is_finite(rgba):
+    if is_finite(positions, rgba):
         return
     rows = value_of(row)
     if rows is None:

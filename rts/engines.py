@@ -92,6 +92,10 @@ class Engine(Plugin):
         """Whether an array has a shape but not yet a value."""
         return False
 
+    def plain(self, x: Array) -> bool:
+        """Whether `admitted` would give the array itself; asked of every array that a user gives."""
+        return False
+
     def admitted(self, x: Array, name: str) -> Array:
         """The array, or one like it that the library can work with.
 

@@ -446,11 +446,13 @@ def _move_normals(transform: Array, normals: Array) -> Array:
 
 def _seen(image: Array, scene: _Scene) -> Array:
     """The image, with a warning if nothing is seen in it."""
-    coarse = value_of(image[:: max(1, image.shape[0] // 16), :: max(1, image.shape[1] // 16), 3])
-    if coarse is None or coarse.any():
-        return image
-    alpha = value_of(image[..., 3])
-    if alpha is None or alpha.any():
+    engine, (height, width) = engine_of(image), image.shape[:2]
+    if not engine.on_host(image):
+        seen = value_of(engine.namespace.any(image[..., 3] > 0))
+        if seen is None or seen.any():
+            return image
+    known = engine.known(image)
+    if known is None or known[..., :: max(1, height // 8), :: max(1, width // 8), 3].any() or known[..., 3].any():
         return image
     warn(f"nothing is seen in the image: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
     return image

@@ -655,3 +655,64 @@ def test_forward_mode_through_a_scalar_that_was_divided_by_gives_the_derivative(
     (slope,) = torch.autograd.grad(image(x), x)
     assert along.dtype == torch.float32
     assert float(along) == pytest.approx(float(slope), rel=1e-4)
+
+
+# ----------------------------------------------------------------------------------- what makes no image at all
+
+NONSENSE = {
+    "aspect": (lambda a: Camera.look_at((0, 0, 4), (0, 0, 0), aspect=a(-1.0)), "aspect is .*-1.*; expected a positive"),
+    "fov_y": (lambda a: Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=a(180.0)), "fov_y is .*180.*degrees between"),
+    "planes": (lambda a: Camera.look_at((0, 0, 4), (0, 0, 0), near=a(2.0), far=a(1.0)), "near is .*near < far"),
+    "near": (lambda a: Camera.look_at((0, 0, 4), (0, 0, 0), near=a(-2.0), far=a(1.0)), "near is .*near > 0"),
+    "height": (lambda a: Camera.orthographic((0, 0, 4), (0, 0, 0), height=a(0.0)), "height is .*positive"),
+    "K": (lambda a: Camera.from_opencv(a(np.ones((3, 3))), np.eye(3), np.zeros(3), SIZE), "K is .*fx, skew"),
+    "K upside down": (
+        lambda a: Camera.from_opencv(a(SKEWED_K * [[1], [-1], [1]]), np.eye(3), np.zeros(3), SIZE),
+        "K is .*positive fx and fy",
+    ),
+    "R scaled": (lambda a: Camera.from_opencv(SKEWED_K, a(2 * np.eye(3)), np.zeros(3), SIZE), "R is off by 3"),
+    "R mirrored": (
+        lambda a: Camera.from_opencv(SKEWED_K, a(np.diag([1.0, 1, -1])), np.zeros(3), SIZE),
+        "R mirrors; expected a rotation",
+    ),
+    "R of PyTorch3D": (
+        lambda a: Camera.from_pytorch3d(a(2 * np.eye(3)), np.zeros(3), focal_length=1.0, size=SIZE),
+        "R is off by 3",
+    ),
+    "focal length": (
+        lambda a: Camera.from_pytorch3d(np.eye(3), np.zeros(3), focal_length=a(-1.0), size=SIZE),
+        "focal_length is .*positive",
+    ),
+    "principal point": (
+        lambda a: Camera.look_at((0, 0, 4), (0, 0, 0), principal_point=a(np.zeros(3))),
+        r"principal_point has shape \(3,\); expected \(2,\)",
+    ),
+    "singular pose": (lambda a: Camera.from_blender(a(np.diag([1.0, 1, 0, 1])), SIZE, focal=9.0), "is singular"),
+    "singular product": (lambda a: Camera.from_mvp(a(np.diag([1.0, 0, 1, 1]))), "matrix is singular"),
+    "upright": (lambda a: Camera.look_at(a(np.array([0.0, 4, 0])), (0, 0, 0)), "has no upright"),
+    "orthographic": (
+        lambda a: Camera.orthographic(a(np.array([0.0, 1, 4])), (0, 0, 0), height=2.0, aspect=1.5).to_opencv(SIZE),
+        "the camera is orthographic; to_opencv needs a perspective one",
+    ),
+    "orthographic for PyTorch3D": (
+        lambda a: Camera.orthographic(a(np.array([0.0, 1, 4])), (0, 0, 0), height=2.0, aspect=1.5).to_pytorch3d(SIZE),
+        "the camera is orthographic; to_pytorch3d",
+    ),
+}
+
+
+@pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
+@pytest.mark.parametrize("name", NONSENSE)
+def test_a_camera_of_nonsense_is_refused_of_numbers_and_of_arrays(name, target):
+    make, message = NONSENSE[name]
+    with pytest.raises(InputError, match=message) as error:
+        make(lambda value: arrays(target, np.array(value)))
+    assert "\n" not in str(error.value)
+
+
+def test_complex_matrices_are_refused():
+    camera = Camera.look_at((0, 0, 4), (0, 0, 0), aspect=1.5)
+    with pytest.raises(InputError, match="the camera's view has dtype complex128; expected real numbers"):
+        rts.render(square(), camera.replace(view=camera.view.astype(complex)), SIZE)
+    with pytest.raises(InputError, match="eye has dtype complex128"):
+        Camera.look_at(np.array([0, 0, 4j]), (0, 0, 0))

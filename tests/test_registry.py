@@ -289,3 +289,17 @@ def test_a_broken_plugin_does_not_break_the_others(install):
     )
     assert "broken" in rts.plugins("samplers")
     assert rts.plugin("samplers", "reference").__name__ == "Reference"
+
+
+@pytest.mark.parametrize("group", registry.GROUPS)
+def test_what_the_library_registers_are_classes_of_which_one_object_serves_a_name(group):
+    for name in rts.plugins(group):
+        try:
+            found = rts.plugin(group, name)
+        except rts.PluginError:  # An optional package is missing.
+            continue
+        if found.__module__.partition(".")[0] in ("rts", "rts_backends", "rts_surfaces"):
+            assert isinstance(found, type)
+        if group not in ("rts.surfaces", "rts.engines"):
+            assert registry.instance(group, name) is registry.instance(group, name)
+            assert isinstance(registry.instance(group, name), found)

@@ -29,7 +29,7 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
         raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected an rts.Proxy")
     vertices = _table(surface, "vertices", proxy.vertices, (3,), np.float32)
     faces = _table(surface, "faces", proxy.faces, (3,), np.int32)
-    check_faces(Proxy(vertices, faces), f"the proxy of {surface!r}")
+    check_faces(Proxy(vertices, faces), surface)
     ids = None if proxy.ids is None else _table(surface, "ids", proxy.ids, (-1,), np.int32)
     corners = proxy.corner_params
     corners = None if corners is None else _table(surface, "corner_params", corners, (3, -1), np.float32)
@@ -47,19 +47,22 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
     return Proxy(vertices, faces, ids, corners)
 
 
-def check_faces(proxy: Proxy, name: str = "the proxy") -> None:
+def check_faces(proxy: Proxy, surface: Any = None) -> None:
     """Refuse triangles that name no vertex, before compiled code reads there."""
     if not len(proxy.faces):
         return
     least, most = extent(proxy.faces)
     if not 0 <= least <= most < len(proxy.vertices):
+        name = "the proxy" if surface is None else f"the proxy of {surface!r}"
         raise InputError(f"{name} has faces from {least} to {most}, but {len(proxy.vertices)} vertices")
 
 
 def _table(surface: Any, name: str, table: Any, widths: tuple[int, ...], dtype: type) -> np.ndarray:
     """A table of a proxy, contiguous and of this dtype, refused where it has another number of columns or kind."""
-    kind = np.floating if dtype is np.float32 else np.integer
     array = np.asarray(table)
+    if array.dtype == dtype and array.shape[1:] == widths and array.flags.c_contiguous:
+        return array
+    kind = np.floating if dtype is np.float32 else np.integer
     fits = array.ndim == 1 + len(widths) and all(w in (-1, n) for w, n in zip(widths, array.shape[1:], strict=True))
     if not fits or not np.issubdtype(array.dtype, kind):
         columns = ", ".join("any" if w < 0 else str(w) for w in widths)

@@ -109,6 +109,10 @@ class JaxEngine(Engine):
         """Whether `x` is a tracer."""
         return isinstance(x, Tracer)
 
+    def plain(self, x: jax.Array) -> bool:
+        """Whether it is of real numbers."""
+        return getattr(x.dtype, "kind", None) in _REAL_KINDS
+
     def admitted(self, x: jax.Array, name: str) -> jax.Array:
         """`x`; complex numbers and keys of random numbers are refused."""
         if getattr(x.dtype, "kind", None) not in _REAL_KINDS:

@@ -30,6 +30,10 @@ for _cls in STATIC_FIELDS:
     )
 
 
+_REAL = {torch.float32, torch.float64, torch.int32, torch.int64, torch.bool, torch.uint8, torch.float16, torch.bfloat16}
+"""Dtypes of tensors that are taken as they are; others may be complex, or quantized."""
+
+
 def _tensor(value: Any, device: torch.device | None = None) -> torch.Tensor:
     array = np.asarray(value)
     if not (array.flags.c_contiguous and array.flags.writeable):
@@ -130,6 +134,10 @@ class TorchEngine(Engine):
         a, b = arrays
         return a.device.type == b.device.type == "cpu" and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
 
+    def plain(self, x: torch.Tensor) -> bool:
+        """Whether it is dense, of real numbers, has values, and no tangent."""
+        return x.layout is torch.strided and x.dtype in _REAL and not x.is_meta and forward_ad._current_level < 0
+
     def admitted(self, x: torch.Tensor, name: str) -> torch.Tensor:
         """`x`, its tangent in its own dtype. Sparse, quantized and complex tensors, and "meta", are refused."""
         if x.layout is not torch.strided or x.is_quantized:
@@ -145,11 +153,11 @@ class TorchEngine(Engine):
         """The value, for all items of a batch; None while `torch.compile` looks on."""
         if torch.compiler.is_compiling() or foreign(x):
             return None
-        if not is_functorch_wrapped_tensor(x):
+        if not torch._C._are_functorch_transforms_active():
             return _to_host(x)
         while is_functorch_wrapped_tensor(x):
             x = get_unwrapped(x)
-        with torch._C._DisableFuncTorch():  # Else it would be wrapped anew.
+        with torch._C._DisableFuncTorch():  # Else what is made of it would be wrapped.
             return _to_host(x)
 
     def padded(self, x: torch.Tensor) -> bool:
