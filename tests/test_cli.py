@@ -116,6 +116,15 @@ def test_warnings_are_lines_like_errors_in_the_installed_program(tmp_path):
     assert line.startswith("rts: warning: m.obj names the material library 'gone.mtl', but there is no file")
 
 
+def test_what_a_file_says_cannot_command_the_terminal(tmp_path):
+    (tmp_path / "m.obj").write_text(f"mtllib \x1b[2J.mtl\n{QUAD}f 1 2 \x1b[31m\n")
+    result = run("render", tmp_path / "m.obj")
+    assert result.exit_code == 1 and "\x1b" not in result.stderr and result.stderr.count("\n") == 1
+    (tmp_path / "m.obj").write_text(f"mtllib \x1b[2J.mtl\n{QUAD}f 1 2 3\n")
+    result = run("render", tmp_path / "m.obj", "-o", tmp_path / "a.png", "--size", 8)
+    assert result.exit_code == 0 and "\x1b" not in result.stderr and r"\x1b[2J.mtl" in result.stderr
+
+
 def test_each_warning_is_shown_once_and_in_one_line_whoever_warns(tmp_path, monkeypatch):
     (tmp_path / "m.obj").write_text(f"{QUAD}f 1 2 3 4\n")
     load = rts.load

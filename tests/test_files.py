@@ -1,6 +1,7 @@
 import base64
 import json
 import logging
+import os
 import subprocess
 import sys
 import warnings
@@ -344,6 +345,11 @@ def test_fractions_of_a_gltf_may_be_integers(tmp_path, dtype, component):
         ("m.ply", "ply\nformat ascii 1.0\nelement vertex 3\n", "cannot be read as PLY"),
         ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "m.off"),
         ("m.off", "", "cannot be read as OFF"),
+        ("m.off", "OFF\n0 0 0\n", "it promises no vertices"),
+        ("m.off", "OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n", "3 points but no faces"),
+        ("m.off", "OFF BINARY\n3 1 0\n", "it begins with 'OFF BINARY'"),
+        ("m.off", "4OFF\n3 1 0\n0 0 0 1\n1 0 0 1\n0 1 0 1\n3 0 1 2\n", "it begins with '4OFF'"),
+        ("m.off", "OFF\nthree 1 0\n", "'three 1 0' are no counts"),
         ("m.glb", "glTF", "cannot be read as GLB"),
         ("m.gltf", "{", "cannot be read as GLTF"),
         ("m.stl", "", "m.stl"),
@@ -605,6 +611,25 @@ def test_files_outside_the_folder_are_refused(tmp_path, name, line):
         rts.load(path)
 
 
+def test_names_in_a_file_that_no_file_can_have(tmp_path):
+    write(tmp_path / "m.mtl", f"newmtl m\nmap_Kd {'a' * 999}.png\n")
+    gltf = {"asset": {"version": "2.0"}, "buffers": [{"uri": f"{'a' * 999}.bin", "byteLength": 1}]}
+    for name, text in {
+        "a.obj": f"mtllib {'a' * 999}.mtl\n{QUAD}f 1 2 3\n",
+        "b.obj": f"mtllib m.mtl\n{QUAD}usemtl m\nf 1 2 3\n",
+        "c.gltf": json.dumps(gltf),
+    }.items():
+        with pytest.raises(InputError, match="refers to 'a{60}', which no file can be called; repair the file"):
+            rts.load(write(tmp_path / name, text))
+
+
+@pytest.mark.parametrize("kind", ["obj", "ply"])
+def test_what_is_no_regular_file_is_not_waited_for(tmp_path, kind):
+    os.mkfifo(tmp_path / f"m.{kind}")
+    with pytest.raises(InputError, match="is no regular file"):
+        rts.load(tmp_path / f"m.{kind}")
+
+
 def test_libraries_and_buffers_outside_the_folder_are_refused(tmp_path):
     write(tmp_path / "secret.mtl", "newmtl m\nKd 1 0 0\n")
     folder = tmp_path / "model"
@@ -662,6 +687,11 @@ def test_shapes_of_pictures(tmp_path, shape):
     np.testing.assert_array_equal(rts.load_image(tmp_path / "a.png"), np.ones((3, 5, 4), np.float32))
 
 
+def test_pictures_may_be_nested_lists(tmp_path):
+    rts.save_image(tmp_path / "a.png", [[0.0, 1.0, 0.0], (1.0, 1.0, 1.0)])
+    np.testing.assert_array_equal(rts.load_image(tmp_path / "a.png")[..., 0], [[0, 1, 0], [1, 1, 1]])
+
+
 def test_pictures_of_torch(tmp_path):
     torch = pytest.importorskip("torch")
     rts.save_image(tmp_path / "a.png", torch.full((2, 3, 3), 0.5, requires_grad=True))
@@ -696,7 +726,10 @@ def test_grey_pictures_of_16_bits(tmp_path):
         (None, "is None, a NoneType; expected an array"),
         ("hello", "is 'hello', a str; expected an array"),
         (3, "is 3, a int; expected an array"),
-        ([[0.5] * 99] * 99, r"is \[\[0.5, 0.5.{0,60}\.\.\., a list; expected an array"),
+        ([[0.5] * 99, [0.5]], r"is \[\[0.5, 0.5.{0,60}\.\.\., a list; expected an array"),
+        ([["a"]], "dtype <U1"),
+        ([[1, 2]], "dtype int"),
+        ([0.5], "shape"),
         ({"a": 1}, "a dict; expected an array"),
     ],
 )

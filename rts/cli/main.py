@@ -75,7 +75,7 @@ def _warnings_in_a_line() -> Iterator[None]:
     shown: set[str] = set()
 
     def show(message: Warning | str, category: type, *_: Any) -> None:
-        text = " ".join(str(message).split())
+        text = _line(str(message))
         if text not in shown:
             shown.add(text)
             typer.echo(f"rts: warning: {text}", err=True)
@@ -85,8 +85,13 @@ def _warnings_in_a_line() -> Iterator[None]:
         yield
 
 
+def _line(text: str) -> str:
+    """The text in one line, without what would command the terminal: it may quote a file from elsewhere."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
+
+
 def _fail(error: Exception, message: str, code: int) -> None:
-    typer.echo(f"rts: {' '.join(message.split())}", err=True)
+    typer.echo(f"rts: {_line(message)}", err=True)
     raise typer.Exit(code) from error
 
 

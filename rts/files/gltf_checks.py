@@ -28,7 +28,7 @@ MOST = 2**24
 
 
 def sound_glb(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
-    """The GLB, without what may follow its end; or one with floating numbers for integers that stand for fractions.
+    """The GLB, without what may follow its end; or one of the same, with numbers that trimesh reads rightly.
 
     Args:
         path: its path.
@@ -74,7 +74,7 @@ def sound_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> tuple[s
 
 
 def _checked(path: Path, text: bytes, binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes | None:
-    """Refuse what is not sound. A GLB with floating numbers, if there are integers that trimesh would misread."""
+    """Refuse what is not sound. A GLB of the same, if there are numbers that trimesh would misread."""
     try:
         tree = json.loads(text)
         if not isinstance(tree, dict):
@@ -83,32 +83,37 @@ def _checked(path: Path, text: bytes, binary: bytes | None, file: Callable[[str]
         views = [_view(i, v, buffers, fail) for i, v in enumerate(tree.get("bufferViews", []))]
         for index, accessor in enumerate(tree.get("accessors", [])):
             _check_accessor(index, accessor, tree.get("bufferViews", []), views, fail)
-        integers: set[int] = set()
+        changes: dict[int, str] = {}
         for m, mesh in enumerate(tree.get("meshes", [])):
             for primitive in mesh["primitives"]:
-                integers |= _check_primitive(path, f"mesh {m}", primitive, tree, views, fail)
+                changes |= _check_primitive(path, f"mesh {m}", primitive, tree, views, fail)
         for m, material in enumerate(tree.get("materials", [])):
             _check_material(path, f"material {m}", material, tree, views, file, fail)
         _check_nodes(tree.get("nodes", []), fail)
-        return _with_floats(tree, views, sorted(integers)) if integers else None
+        return _changed(tree, views, changes) if changes else None
     except InputError:
         raise
     except Exception as error:  # Anything may be missing, or of another kind.
         raise fail(f"{type(error).__name__}: {error}") from error
 
 
-def _with_floats(tree: dict[str, Any], views: list[bytes], integers: list[int]) -> bytes:
-    """A GLB in which these accessors, of integers that stand for fractions, hold the fractions."""
+def _changed(tree: dict[str, Any], views: list[bytes], changes: dict[int, str]) -> bytes:
+    """A GLB in which these accessors hold colours of 8 bits ("u1"), or the fractions that integers stand for ("f4")."""
     blocks = [content + bytes(-len(content) % 4) for content in views]
     descriptions = [dict(view, buffer=0) for view in tree["bufferViews"]]
-    for index in integers:
+    for index, kind in sorted(changes.items()):
         accessor = tree["accessors"][index]
         values = _rows(accessor, tree["bufferViews"], views)
-        fractions = np.maximum(values / np.float32(np.iinfo(values.dtype).max), -1).astype("<f4").tobytes()
+        if values.dtype.kind != "f":
+            values = np.maximum(values / np.float32(np.iinfo(values.dtype).max), -1)
+        if kind == "u1":
+            values = np.round(255 * np.clip(values, 0, 1))
+        content = values.astype("<" + kind).tobytes()
         kept = {key: value for key, value in accessor.items() if key not in ("byteOffset", "normalized", "min", "max")}
-        tree["accessors"][index] = {**kept, "componentType": 5126, "bufferView": len(blocks)}
-        blocks.append(fractions)
-        descriptions.append({"buffer": 0, "byteLength": len(fractions)})
+        types = {name: number for number, name in TYPES.items()}
+        tree["accessors"][index] = {**kept, "componentType": types[kind], "bufferView": len(blocks)}
+        blocks.append(content + bytes(-len(content) % 4))
+        descriptions.append({"buffer": 0, "byteLength": len(content)})
     ends = np.cumsum([len(block) for block in blocks]).tolist()
     tree["bufferViews"] = [
         {**view, "byteOffset": end - len(block)} for view, end, block in zip(descriptions, ends, blocks, strict=True)
@@ -190,8 +195,8 @@ def _rows(accessor: dict[str, Any], descriptions: list[dict[str, Any]], views: l
 
 def _check_primitive(
     path: Path, name: str, primitive: dict[str, Any], tree: dict[str, Any], views: list[bytes], fail: Any
-) -> set[int]:
-    """Refuse attributes that do not fit; which accessors hold integers that stand for fractions."""
+) -> dict[int, str]:
+    """Refuse attributes that do not fit; which accessors trimesh would misread, and as what it would not."""
     attributes = primitive["attributes"]
     used = {**attributes, **({"indices": primitive["indices"]} if "indices" in primitive else {})}
     found = {kind: tree["accessors"][_count(index)] for kind, index in used.items()}
@@ -212,14 +217,14 @@ def _check_primitive(
     colors = read.get("COLOR_0")
     if colors is not None and colors["componentType"] == 5126:
         _check_colors(path, f"COLOR_0 of {name}", _rows(colors, tree["bufferViews"], views), fail)
-    # Colours of 8 bits are what trimesh has itself.
-    return {
-        used[kind]
-        for kind, a in read.items()
-        if kind != "indices"
-        and a["componentType"] not in (5126, 5121 if kind == "COLOR_0" else 5126)
-        and (a.get("normalized") or kind == "COLOR_0")
-    }
+    changes = {}
+    for kind, accessor in read.items():
+        if kind == "COLOR_0":
+            if accessor["componentType"] != 5121:
+                changes[used[kind]] = "u1"
+        elif kind != "indices" and accessor.get("normalized") and accessor["componentType"] != 5126:
+            changes[used[kind]] = "f4"
+    return changes
 
 
 def _check_material(

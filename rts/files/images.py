@@ -5,6 +5,7 @@ Inside the library colours are linear and images premultiplied; files hold sRGB 
 
 from __future__ import annotations
 
+import contextlib
 import io
 import math
 import warnings
@@ -28,8 +29,8 @@ def save_image(path: Any, image: Array) -> None:
 
     Args:
         path: a name ending in .png; folders that do not exist are made.
-        image: (H, W, 4) premultiplied linear RGBA, (H, W, 3), (H, W, 1) or (H, W); values outside [0, 1] are
-            clipped.
+        image: (H, W, 4) premultiplied linear RGBA, (H, W, 3), (H, W, 1) or (H, W), floating numbers, an array of any
+            engine or nested lists; values outside [0, 1] are clipped.
 
     Raises:
         InputError: no array, another shape, integers, NaN or infinity, more than fits into memory, another extension,
@@ -156,20 +157,24 @@ def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
 def _host(image: Any, name: str) -> np.ndarray:
     """A checked image as NumPy floats, (H, W, 3 or 4) or (H, W)."""
     shapes = "(H, W, 4), (H, W, 3), (H, W, 1) or (H, W)"
-    if not hasattr(image, "shape"):
+    given: Any = image
+    if isinstance(image, (list, tuple)):
+        with contextlib.suppress(ValueError, TypeError, RuntimeError):  # Of rows of different lengths, for example.
+            given = np.asarray(image)
+    if not hasattr(given, "shape"):
         raise InputError(f"{name} is {_shown(image)}, a {type(image).__name__}; expected an array {shapes}")
     try:
-        engine = engine_of(image)
+        engine = engine_of(given)
     except EngineError as error:
         raise InputError(
             f"{name} is a {type(image).__name__}; expected an array {shapes} of NumPy, torch or jax"
         ) from error
-    shape = tuple(image.shape)
+    shape = tuple(given.shape)
     if len(shape) not in (2, 3) or 0 in shape or (len(shape) == 3 and shape[2] not in (1, 3, 4)):
         raise InputError(f"{name} has shape {shape}; expected {shapes}")
     if 100 * math.prod(shape) > MEMORY:  # A few copies in float64.
         raise InputError(f"{name} has shape {shape}, which does not fit into memory; write it in pieces")
-    array = np.asarray(engine.to_numpy(image))
+    array = np.asarray(engine.to_numpy(given))
     if array.ndim == 3 and array.shape[2] == 1:
         array = array[..., 0]
     if not np.issubdtype(array.dtype, np.floating):

@@ -204,6 +204,8 @@ def read_pieces(path: Path) -> list[Piece]:
         raise InputError(f"no file {path}; check the path (relative paths start at {Path.cwd()})")
     if path.is_dir():
         raise InputError(f"{path} is a folder; expected a model file inside it, such as {path / 'model.obj'}")
+    if not path.is_file():
+        raise InputError(f"{path} is no regular file, and may never end; copy what it gives into one")
     if extension == "obj":
         pieces = read_obj(path)
     else:

@@ -96,7 +96,7 @@ class _Lines:
         try:
             return int(token)
         except ValueError:
-            raise self.fail(number, f"{token!r} is no index") from None
+            raise self.fail(number, f"{token[:60]!r} is no index") from None
 
     def array(self, key: str, widths: tuple[int, ...]) -> np.ndarray:
         """The rows of one kind.
@@ -124,7 +124,7 @@ class _Lines:
         except ValueError:
             for number, row in zip(self.numbers[key], split, strict=True):
                 if not all(_is_number(x) for x in row[:width]):
-                    raise self.fail(number, f"{' '.join(row)!r} are not numbers") from None
+                    raise self.fail(number, f"{' '.join(row)[:60]!r} are not numbers") from None
             raise
 
     def triangles(self, points: np.ndarray, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
@@ -160,7 +160,7 @@ class _Lines:
         ):
             index = self.integer(part, number) if part or name == "vertices" else 0
             if part and not 1 <= index <= count:
-                raise self.fail(number, f"a face refers to number {part} of {count} {name} (indices count from 1)")
+                raise self.fail(number, f"a face refers to number {part[:60]} of {count} {name} (indices count from 1)")
             indices.append(index - 1)
         return tuple(indices)
 

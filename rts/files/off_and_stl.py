@@ -78,10 +78,12 @@ def plain_off(path: Path, data: bytes) -> bytes:
 
 
 def _vertices(rows: list[tuple[int, str]], fail: Fail) -> np.ndarray:
-    found = numbers_of(rows, fail) if rows else []
+    if not rows:
+        raise fail("it promises no vertices")
+    found = numbers_of(rows, fail)
     if isinstance(found, np.ndarray) and found.shape[1] >= 3:
         return found
-    usual = max(len(row) for row in found) if rows else 0
+    usual = max(len(row) for row in found)
     number = next((n for (n, _), row in zip(rows, found, strict=True) if len(row) < max(usual, 3)), 0)
     raise fail(f"line {number} ought to be a vertex, and has not as many numbers as others, or less than 3")
 

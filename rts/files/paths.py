@@ -90,7 +90,8 @@ def inside(folder: Path, name: str, referrer: Path) -> Path:
         referrer: the file that names it.
 
     Raises:
-        InputError: an absolute path, or one that leads out of the folder, symbolic links followed.
+        InputError: an absolute path, or one that leads out of the folder, symbolic links followed; or what no file can
+            be called.
     """
     plain = name.replace("\\", "/")
     absolute = plain.startswith("/") or PureWindowsPath(plain).drive or "\0" in plain
@@ -100,4 +101,7 @@ def inside(folder: Path, name: str, referrer: Path) -> Path:
             f"{referrer} refers to {name!r}, outside its own folder, which is refused; copy that file beside "
             f"the model and name it without a path"
         )
-    return target
+    try:
+        return as_path(target)
+    except InputError:
+        raise InputError(f"{referrer} refers to {name[:60]!r}, which no file can be called; repair the file") from None
