@@ -430,7 +430,8 @@ class Camera:
         """The camera for images of a size (height, width), if it leaves the ratio open; else the camera itself."""
         if self.aspect != "open":
             return self
-        aspect = size[1] / size[0]
+        height, width = check_pixels(size)
+        aspect = width / height
         columns = engine_of(self.projection).constant(np.array([1 / aspect, 1, 1, 1]), self.projection)
         return Camera(self.view, self.projection * columns, aspect)
 
@@ -442,6 +443,8 @@ class Camera:
         """This camera in the local space of a part, whose world-from-local transform is given."""
         if transform is None:
             return self
+        if shape_of(transform) != (4, 4):
+            check_numbers("transform", transform, (4, 4))
         _, (view, transform) = promote(self.view, transform)
         return self.replace(view=matmul(view, transform))
 

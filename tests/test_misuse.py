@@ -80,6 +80,14 @@ CALLS = {
     "render_samples.sampled": lambda v: rts.render_samples(v, PART, CAMERA),
     "render_samples.parts": lambda v: rts.render_samples(SAMPLED, v, CAMERA),
     "render_samples.camera": lambda v: rts.render_samples(SAMPLED, PART, v),
+    "sample.parts": lambda v: rts.sample(v, CAMERA, SIZE),
+    "sample.size": lambda v: rts.sample(PART, CAMERA, v),
+    "sample.layers": lambda v: rts.sample(PART, CAMERA, SIZE, layers=v),
+    "sample.splatter": lambda v: rts.sample(PART, CAMERA, SIZE, splatter=v),
+    "render_samples.splatter": lambda v: rts.render_samples(SAMPLED, PART, CAMERA, splatter=v),
+    "render_samples.background": lambda v: rts.render_samples(SAMPLED, PART, CAMERA, background=v),
+    "prepare.camera": lambda v: rts.prepare(PART, camera=v),
+    "prepare.size": lambda v: rts.prepare(PART, camera=CAMERA, size=v),
     "prepare.parts": lambda v: rts.prepare(v),
     "prepare.sampler": lambda v: rts.prepare(PART, v),
     "explain.parts": lambda v: rts.explain(v, CAMERA),
@@ -120,14 +128,26 @@ CALLS = {
     "from_opencv.t": lambda v: Camera.from_opencv(K, np.eye(3), v, SIZE),
     "from_opencv.size": lambda v: Camera.from_opencv(K, np.eye(3), np.zeros(3), v),
     "from_opencv.pixel_center": lambda v: Camera.from_opencv(K, np.eye(3), np.zeros(3), SIZE, pixel_center=v),
+    "from_opencv.near": lambda v: Camera.from_opencv(K, np.eye(3), np.zeros(3), SIZE, near=v, far=9.0),
     "from_mvp.matrix": Camera.from_mvp,
+    "from_opengl.projection": lambda v: Camera.from_opengl(np.eye(4), v),
+    "from_nvdiffrast.modelview": lambda v: Camera.from_nvdiffrast(v, np.eye(4)),
     "from_opengl.modelview": lambda v: Camera.from_opengl(v, np.eye(4)),
     "from_pytorch3d.R": lambda v: Camera.from_pytorch3d(v, np.zeros(3), focal_length=1.0, size=SIZE),
     "from_pytorch3d.T": lambda v: Camera.from_pytorch3d(np.eye(3), v, focal_length=1.0, size=SIZE),
     "from_pytorch3d.focal_length": lambda v: Camera.from_pytorch3d(np.eye(3), np.zeros(3), focal_length=v, size=SIZE),
+    "from_pytorch3d.principal_point": lambda v: Camera.from_pytorch3d(
+        np.eye(3), np.zeros(3), focal_length=1.0, principal_point=v, size=SIZE
+    ),
+    "from_pytorch3d.size": lambda v: Camera.from_pytorch3d(np.eye(3), np.zeros(3), focal_length=1.0, size=v),
+    "from_blender.size": lambda v: Camera.from_blender(np.eye(4), v, focal=9.0),
     "from_blender.camera_to_world": lambda v: Camera.from_blender(v, SIZE, focal=9.0),
     "from_blender.focal": lambda v: Camera.from_blender(np.eye(4), SIZE, focal=v),
     "to_opencv.size": lambda v: CAMERA.to_opencv(v),
+    "for_size.size": CAMERA.for_size,
+    "to_pytorch3d.size": lambda v: CAMERA.to_pytorch3d(v),
+    "to_blender.size": lambda v: CAMERA.to_blender(v),
+    "within.transform": CAMERA.within,
     "project.points": lambda v: CAMERA.project(v, SIZE),
     "project.size": lambda v: CAMERA.project(np.zeros((1, 3)), v),
     "rays.size": lambda v: CAMERA.rays(v),
@@ -135,6 +155,9 @@ CALLS = {
     "splat.rgba": lambda v: splatter().splat(np.ones((1, 3), np.float32), v, np.zeros((1, 2, 2), np.int32)),
     "splat.row": lambda v: splatter().splat(np.ones((1, 3), np.float32), np.ones((1, 4), np.float32), v),
     "splatter.sigma": lambda v: rts.plugin("splatters", "visible")(sigma=v),
+    "splatter.calibration": lambda v: rts.plugin("splatters", "visible")(calibration=v),
+    "exact_calibration.sigma": rts.exact_calibration,
+    "gradient.f": lambda v: rts.gradient(v, np.zeros((1, 3))),
     "combine.rows": lambda v: rts.combine(v, np.zeros((1, 1), np.int32), np.ones((1, 1), np.float32)),
     "combine.ids": lambda v: rts.combine(np.ones((2, 3), np.float32), v, np.ones((1, 1), np.float32)),
     "combine.weights": lambda v: rts.combine(np.ones((2, 3), np.float32), np.zeros((1, 1), np.int32), v),
@@ -151,21 +174,36 @@ def splatter():
 
 
 ACCEPTED = {
+    "a function": ["gradient.f"],
     # None is a default, or stands for "no such entry".
     "None": [
         *("render.background", "render.capacity", "render.engine", "Part.transform", "Mesh.indices", "look_at.aspect"),
-        *("look_at.near", "look_at.far"),
+        *(
+            "look_at.near",
+            "look_at.far",
+            "sample.splatter",
+            "render_samples.background",
+            "prepare.camera",
+            "prepare.size",
+        ),
+        *("within.transform", "splatter.calibration"),
     ],
     # A number like any other.
     "a fraction": [
         *("shader.specular", "shader.shininess", "shader.ambient", "look_at.fov_y", "look_at.aspect", "look_at.near"),
         *("look_at.far", "orthographic.height", "from_opencv.pixel_center", "from_pytorch3d.focal_length"),
-        *("from_blender.focal", "splatter.sigma"),
+        *(
+            "from_blender.focal",
+            "splatter.sigma",
+            "splatter.calibration",
+            "exact_calibration.sigma",
+            "from_opencv.near",
+        ),
     ],
     "minus one": ["from_opencv.pixel_center"],
-    # No points have no pixels, and sums of NaN are NaN.
+    # No points have no pixels; sums and products of NaN are NaN.
     "an empty array": ["project.points"],
-    "an array of NaN": ["combine.rows"],
+    "an array of NaN": ["combine.rows", "within.transform"],
 }
 """Wrong values of some arguments are right ones of others."""
 

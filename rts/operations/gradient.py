@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from rts.arguments import quoted
 from rts.engines import engine_of
 from rts.errors import InputError
 from rts.trees import Array
@@ -27,6 +28,8 @@ def gradient(f: Callable[[Array], Array], points: Array) -> Array:
     Raises:
         InputError: `f` gives another shape.
     """
+    if not callable(f) or isinstance(f, type):
+        raise InputError(f"f is {quoted(f)}; expected a function of points (N, 3)")
     engine = engine_of(points)
     if not engine.differentiates:
         return _differences(f, points)

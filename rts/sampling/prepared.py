@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rts.camera import Camera
+from rts.camera import Camera, check_pixels
 from rts.checks import check_sampler, check_scene, suited_sampler
 from rts.errors import InputError
 from rts.interfaces import Part
@@ -76,6 +76,7 @@ def prepare(
     """
     identity = Camera.look_at((0, 0, 1), (0, 0, 0))
     checked, _ = check_scene(parts, identity if camera is None else camera)
+    size = None if size is None else check_pixels(size)
     chosen = check_sampler(sampler)
     samplers = [suited_sampler(chosen, part, None) for part in checked]
     entries = [own.hold(part, camera, size) for own, part in zip(samplers, checked, strict=True)]
