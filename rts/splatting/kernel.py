@@ -55,9 +55,9 @@ class Kernel(Splatter):
         if not (is_real(self.sigma) and LEAST_SIGMA <= self.sigma <= LARGEST_SIGMA):
             raise InputError(f"sigma is {quoted(self.sigma)}; expected pixels, from {LEAST_SIGMA} to {LARGEST_SIGMA:g}")
         if not (is_real(self.epsilon) and 0 <= self.epsilon < math.inf):
-            raise InputError(f"epsilon is {self.epsilon}; expected a number of at least 0")
+            raise InputError(f"epsilon is {quoted(self.epsilon)}; expected a number of at least 0")
         if self.calibration is not None and not (is_real(self.calibration) and 0 < self.calibration < math.inf):
-            raise InputError(f"calibration is {quoted(self.calibration)}; expected a positive number, or None for the exact")
+            raise InputError(f"calibration is {quoted(self.calibration)}; expected a positive number, or None")
 
     def image(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
