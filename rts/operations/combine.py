@@ -54,7 +54,7 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
     Raises:
         InputError: these are no samples of the surface that the rows belong to.
     """
-    if ids.shape[1] < column + 3 or weights.shape[1] < 2 or ids.shape[0] != weights.shape[0]:
+    if not 0 <= column <= ids.shape[1] - 3 or weights.shape[1] < 2 or ids.shape[0] != weights.shape[0]:
         raise InputError(
             f"samples have ids of shape {tuple(ids.shape)} and parameters of shape {tuple(weights.shape)}; expected "
             f"(N, {column + 3}) and (N, 2), or more columns: sample this surface anew"
@@ -90,17 +90,28 @@ def _shape(rows: tuple[int, ...], weights: tuple[int, ...], ids: tuple[int, ...]
     return weights[0], rows[1]
 
 
+def _columns(operands: Arrays, column: int, count: int, affine: bool) -> Arrays:
+    """The operands, if ids and weights have the columns that are used."""
+    _, weights, ids = operands
+    if len(ids) != len(weights) or not 0 <= column <= ids.shape[1] - count or weights.shape[1] < count - affine:
+        raise InputError(
+            f"ids and weights have shapes {ids.shape} and {weights.shape}; expected (N, {column + count}) and "
+            f"(N, {count - affine}), or more columns"
+        )
+    return operands
+
+
 def _forward(operands: Arrays, out: np.ndarray, *, column: int, count: int, affine: bool) -> None:
     from rts.operations import combine_kernels
 
-    rows, weights, ids = operands
+    rows, weights, ids = _columns(operands, column, count, affine)
     combine_kernels.forward(rows, weights, ids, out, column, count, affine)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, column: int, count: int, affine: bool) -> None:
     from rts.operations import combine_kernels
 
-    rows, weights, ids = operands
+    rows, weights, ids = _columns(operands, column, count, affine)
     t_rows, t_weights = tangents
     combine_kernels.push(rows, weights, ids, t_rows, t_weights, out, column, count, affine)
 
@@ -108,7 +119,7 @@ def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, column: int, cou
 def _pull(operands: Arrays, g: np.ndarray, results: Some, *, column: int, count: int, affine: bool) -> None:
     from rts.operations import combine_kernels
 
-    rows, weights, ids = operands
+    rows, weights, ids = _columns(operands, column, count, affine)
     g_rows, g_weights = results
     combine_kernels.pull(rows, weights, ids, g, g_rows, g_weights, column, count, affine)
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from rts.engines import constants, engine_of, exemplar
+from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
 from rts.trees import Array
 
@@ -55,17 +56,24 @@ def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:
     return points[0], rows[0]
 
 
+def _fitting(operands: Arrays) -> Arrays:
+    rows, points = operands
+    if rows.shape[1] != 4 or points.shape[1] != 3:
+        raise InputError(f"rows and points have shapes {rows.shape} and {points.shape}; expected (R, 4) and (N, 3)")
+    return operands
+
+
 def _forward(operands: Arrays, out: np.ndarray) -> None:
     from rts.operations import linear_kernels
 
-    rows, points = operands
+    rows, points = _fitting(operands)
     linear_kernels.affine(rows, points, out)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
     from rts.operations import linear_kernels
 
-    rows, points = operands
+    rows, points = _fitting(operands)
     t_rows, t_points = tangents
     linear_kernels.affine_push(rows, points, t_rows, t_points, out)
 
@@ -73,7 +81,7 @@ def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
     from rts.operations import linear_kernels
 
-    rows, points = operands
+    rows, points = _fitting(operands)
     g_rows, g_points = results
     linear_kernels.affine_pull(rows, points, g, g_rows, g_points)
 

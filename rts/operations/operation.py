@@ -10,11 +10,24 @@ from typing import Any
 import numpy as np
 
 from rts.arrays import from_numbers
-from rts.engines import OWNERS, constants, engine_of, suiting
+from rts.engines import OWNERS, constants, engine_of, suiting, value_of
 from rts.errors import InputError
 from rts.trees import Array
 
 _SHAPE = attrgetter("shape")
+
+
+def known_value(x: Array) -> np.ndarray | None:
+    """The value of an array in the memory of the host; None where it is elsewhere, or not known while Python runs."""
+    if type(x) is np.ndarray:
+        return x
+    if not engine_of(x).on_host(x):
+        return None
+    try:
+        return value_of(x)
+    except RuntimeError:  # Inside some of its transforms torch gives no value.
+        return None
+
 
 Arrays = Sequence[np.ndarray]
 """Operands on the host, C-contiguous and read-only."""

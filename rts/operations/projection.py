@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.engines import namespace
+from rts.errors import InputError
 from rts.operations.linear import is_plain_product, specified_affine_map
 from rts.operations.operation import Arrays, Operation, Some
 from rts.trees import Array
@@ -33,17 +34,24 @@ def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:
     return points
 
 
+def _fitting(operands: Arrays) -> Arrays:
+    rows, points = operands
+    if rows.shape != (4, 4) or points.shape[1] != 3:
+        raise InputError(f"rows and points have shapes {rows.shape} and {points.shape}; expected (4, 4) and (N, 3)")
+    return operands
+
+
 def _forward(operands: Arrays, out: np.ndarray) -> None:
     from rts.operations import projection_kernels
 
-    rows, points = operands
+    rows, points = _fitting(operands)
     projection_kernels.project(rows, points, out)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
     from rts.operations import projection_kernels
 
-    rows, points = operands
+    rows, points = _fitting(operands)
     t_rows, t_points = tangents
     projection_kernels.push(rows, points, t_rows, t_points, out)
 
@@ -51,7 +59,7 @@ def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
     from rts.operations import projection_kernels
 
-    rows, points = operands
+    rows, points = _fitting(operands)
     g_rows, g_points = results
     projection_kernels.pull(rows, points, g, g_rows, g_points)
 

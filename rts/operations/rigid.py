@@ -9,6 +9,7 @@ import numpy as np
 from rts.arguments import check_numbers
 from rts.arrays import promote, shape_of
 from rts.engines import engine_of, is_constant, namespace
+from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
 from rts.transforms import affine_matrix
 from rts.trees import Array
@@ -71,6 +72,9 @@ def _computed(operands: Arrays) -> tuple[np.ndarray, np.ndarray]:
     """The matrix, and its Jacobian (16, 9), float64."""
     from rts.operations import rigid_kernels
 
+    pose, center = operands
+    if pose.shape != (6,) or center.shape != (3,):
+        raise InputError(f"pose and center have shapes {pose.shape} and {center.shape}; expected (6,) and (3,)")
     return rigid_kernels.rigid(*operands)
 
 

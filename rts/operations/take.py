@@ -9,7 +9,7 @@ import numpy as np
 
 from rts.engines import namespace
 from rts.errors import InputError
-from rts.operations.operation import Arrays, Operation, Some
+from rts.operations.operation import Arrays, Operation, Some, known_value
 from rts.trees import Array
 
 
@@ -19,7 +19,15 @@ def take(rows: Array, index: Array) -> Array:
 
 
 def _specification(rows: Array, index: Array) -> Array:
+    value = known_value(index)
+    if value is not None:
+        _check(value, rows.shape[0])
     return namespace(rows, index).take(rows, index, axis=0)
+
+
+def _check(index: np.ndarray, count: int) -> None:
+    if index.size and not 0 <= index.min() <= index.max() < count:
+        raise InputError(f"rows from {index.min()} to {index.max()} were asked for; expected 0 to {count - 1}")
 
 
 def _shape(rows: tuple[int, ...], index: tuple[int, ...]) -> tuple[int, ...]:
@@ -28,8 +36,7 @@ def _shape(rows: tuple[int, ...], index: tuple[int, ...]) -> tuple[int, ...]:
 
 def _forward(operands: Arrays, out: np.ndarray) -> None:
     rows, index = operands
-    if len(index) and not 0 <= index.min() <= index.max() < len(rows):
-        raise InputError(f"rows from {index.min()} to {index.max()} were asked for; expected 0 to {len(rows) - 1}")
+    _check(index, len(rows))
     np.take(rows, index, axis=0, out=out, mode="clip")
 
 

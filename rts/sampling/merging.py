@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 
 from rts.engines import engine_of, namespace
+from rts.errors import InputError
 from rts.records import ArraySpec, Sampled, Samples
 from rts.trees import Array
 
@@ -21,7 +22,8 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         only = samples[0]
         return Sampled(tuple(samples), only.row, only.depth, overflow)
     given = *(s.row for s in samples), *(s.depth for s in samples)
-    on_host, elsewhere = partial(_interleaved_on_the_host, layers), partial(_interleaved, layers)
+    sizes = tuple(s.ids.shape[0] for s in samples)
+    on_host, elsewhere = partial(_interleaved_on_the_host, layers, sizes=sizes), partial(_interleaved, layers)
     part, row, depth = engine_of(given).by_host(on_host, elsewhere, *given)
     xp, start = namespace(row), 0
     for i, s in enumerate(samples):
@@ -40,7 +42,7 @@ def _interleaved(layers: int, *given: Array) -> tuple[Array, ...]:
     return part, row, depth
 
 
-def _interleaved_on_the_host(layers: int, *given: Array) -> tuple[Array, ...]:
+def _interleaved_on_the_host(layers: int, *given: Array, sizes: Sequence[int] = ()) -> tuple[Array, ...]:
     """`_interleaved`, compiled: sorting many short columns takes array code far longer."""
     rows, depths = given[: len(given) // 2], given[len(given) // 2 :]
     shape = (min(layers, sum(r.shape[0] for r in rows)), *rows[0].shape[1:])
@@ -49,6 +51,9 @@ def _interleaved_on_the_host(layers: int, *given: Array) -> tuple[Array, ...]:
     def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
         from rts.sampling import merging_kernels
 
+        for i, (row, size) in enumerate(zip(arrays, sizes, strict=False)):
+            if row.max(initial=-1) >= size:
+                raise InputError(f"row of part {i} refers to sample {row.max()} of {size}; sample this scene anew")
         return merging_kernels.interleave(arrays[: len(rows)], arrays[len(rows) :], layers)
 
     specs = ArraySpec(shape, np.int32), ArraySpec(shape, np.int32), ArraySpec(shape, dtype)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from rts.errors import InputError
 from rts.records import Fragments, Proxy, Samples
 
 FAR = 20
@@ -32,6 +33,8 @@ def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None, kept: 
     """
     from rts.sampling import packing_kernels
 
+    if (least := fragments.triangle_ids.min(initial=-1)) < -1:
+        raise InputError(f"the sampler gave triangle {least} to a cell; expected indices, or -1 where it is empty")
     if kept is None or (len(kept) > 1 and too_far(largest(proxy.vertices), fragments.depth)):
         kept = fragments.triangle_ids >= 0
     table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)

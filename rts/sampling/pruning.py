@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from rts.adapting import adapted
-from rts.engines import engine_of, is_traced, namespace, value_of
+from rts.engines import engine_of, is_traced, namespace
 from rts.errors import InputError, LayersWarning, warn
 from rts.interfaces import AnyNeeded, CheckedPart, Needed, Splatter, TriangleSurface
+from rts.operations.operation import known_value
 from rts.records import ArraySpec, Sampled, Samples
 from rts.sampling.packing import largest, too_far
 from rts.trees import leaves
@@ -52,7 +53,7 @@ def _size(parts: Sequence[CheckedPart]) -> float | None:
     size = 0.0
     for part in parts:
         for x in leaves({name: part.theta[name] for name in part.surface.reads(part.theta)}):
-            value = value_of(x)
+            value = known_value(x)
             if value is None:
                 return None
             if value.dtype in (np.float32, np.float64):
@@ -146,6 +147,8 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
     offsets = np.cumsum([0, *sizes])
 
     def host(row: np.ndarray, depth: np.ndarray, *own_rows: np.ndarray) -> tuple[np.ndarray, ...]:
+        if row.max(initial=-1) >= offsets[-1]:
+            raise InputError(f"row refers to sample {row.max()} of {offsets[-1]}; sample this scene anew")
         used = np.zeros(offsets[-1], bool)
         used[row[needed(row >= 0, depth)]] = True
         # The order stays, so that neighbours in the image stay neighbours in memory.

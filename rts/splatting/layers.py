@@ -10,10 +10,24 @@ from typing import Any
 import numpy as np
 
 from rts.engines import namespace
+from rts.errors import InputError
+from rts.operations.operation import known_value
 from rts.trees import Array
 
 OFFSETS = (-1, 0, 1)
 NEIGHBOURS = [(u, v) for v in OFFSETS for u in OFFSETS]
+
+
+def check_rows(row: Array, count: int) -> None:
+    """Raise an InputError where `row`, on the host and not traced, refers to none of so many samples."""
+    value = known_value(row)
+    if value is None or not value.size:
+        return
+    low, high = value.min(), value.max()
+    if high >= count:
+        raise InputError(f"row refers to sample {high} of {count}; expected indices below, or -1 for an empty cell")
+    if low < -1:
+        raise InputError(f"row refers to sample {low}; expected indices of samples, or -1 for an empty cell")
 
 
 class Depths:
@@ -76,6 +90,7 @@ class Layers(Depths):
 
     def __init__(self, weights: Callable[[Array], Any], positions: Array, rgba: Array, row: Array):
         """Layers of packed samples (`rts.Splats`); `weights` is that of `rts.splatting.Kernel`."""
+        check_rows(row, positions.shape[0])
         cells = bordered(row)
         position = [unpack(positions, cells[k]) for k in range(row.shape[0])]
         super().__init__([p[..., 2] for p in position], cells >= 0)
@@ -92,6 +107,7 @@ class Layers(Depths):
 
 def nothing(rgba: Array, row: Array) -> Array:
     """The image (H, W, 4) of no samples: zeros."""
+    check_rows(row, 0)
     xp = namespace(rgba, row)
     return xp.stack([xp.zeros_like(row[0], dtype=rgba.dtype)] * 4, axis=-1)
 

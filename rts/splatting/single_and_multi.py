@@ -10,7 +10,18 @@ from rts.engines import namespace
 from rts.interfaces import Splatter
 from rts.records import Splats
 from rts.splatting.kernel import LEAST_EPSILON, Kernel
-from rts.splatting.layers import NEIGHBOURS, Depths, Layers, all_of, fronts, normalised, nothing, over, unpack
+from rts.splatting.layers import (
+    NEIGHBOURS,
+    Depths,
+    Layers,
+    all_of,
+    check_rows,
+    fronts,
+    normalised,
+    nothing,
+    over,
+    unpack,
+)
 from rts.trees import Array
 
 
@@ -22,6 +33,7 @@ class Plain(Splatter):
         positions, rgba, row = splats.positions, splats.rgba, splats.row
         if rgba.shape[0] == 0:
             return nothing(rgba, row)
+        check_rows(row, rgba.shape[0])
         xp = namespace(rgba)
         # Adds zero. It keeps the image connected to the positions, so that their derivative is there, and zero.
         image = 0 * xp.sum(positions)

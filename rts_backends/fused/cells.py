@@ -15,7 +15,7 @@ import numpy as np
 
 from rts.errors import InputError
 from rts.splatting.kernel import LEAST_EPSILON
-from rts.splatting.layers import OFFSETS
+from rts.splatting.layers import OFFSETS, check_rows
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only
 from rts_backends.fused import choices as listing
@@ -75,7 +75,7 @@ class Cells:
         choices: the choices for the same samples, if they are known.
 
     Raises:
-        InputError: `row` refers to a sample that is not there.
+        InputError: shapes that do not fit, or `row` refers to a sample that is not there.
     """
 
     def __init__(
@@ -86,9 +86,12 @@ class Cells:
         row: np.ndarray,
         choices: Choices | None = None,
     ):
+        if positions.shape[1:] != (3,) or rgba.shape != (len(positions), 4):
+            given = f"{positions.shape} and {rgba.shape}"
+            raise InputError(f"positions and rgba have shapes {given}; expected (N, 3) and (N, 4)")
         row = row[:1] if settings.kind == "single" else row
-        if choices is None and row.size and row.max() >= len(positions):
-            raise InputError(f"row refers to sample {row.max()} of {len(positions)}; expected indices below that")
+        if choices is None:
+            check_rows(row, len(positions))
         self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
         self.visible, self.border = settings.kind == "visible", settings.border
         self._numbers = tuple(map(positions.dtype.type, _scale_and_peak(settings) + (settings.gamma,)))
