@@ -243,9 +243,22 @@ def test_vertex_colors_of_floating_numbers_and_of_an_off(tmp_path):
         "normals.off": "CNOFF\n3 1 0\n" + rows.format(*["0 0 1 1 0 0.5 1"] * 3) + "3 0 1 2\n",
     }
     files["short.ply"] = files["short.ply"].replace("float blue", "ushort blue")
+    files["alpha.ply"] = files["unit.ply"].replace("float blue", "float blue\nproperty uchar alpha")
+    files["alpha.ply"] = files["alpha.ply"].replace("1 0 0.5", "1 0 0.5 255")
     for name, text in files.items():
         [part] = rts.load(write(tmp_path / name, text))
         np.testing.assert_allclose(part.theta["colors"], np.tile([1, 0, 0.2158605], (3, 1)), atol=1e-6, err_msg=name)
+
+
+def test_comments_of_a_ply_say_nothing_but_the_name_of_a_texture(tmp_path):
+    comments = "comment element vertex 7\ncomment\tend_header\nobj_info property int x\ncomment TextureFile a b.png\n"
+    Image.fromarray(np.full((8, 8, 3), (255, 0, 0), np.uint8)).save(tmp_path / "a b.png")
+    uv = "property float s\nproperty float t\nelement face"
+    header = PLY.replace("element vertex", comments + "element vertex", 1).replace("element face", uv)
+    rows = "".join(f"{x} {y} 0 {x} {y}\n" for x, y in [(0, 0), (1, 0), (0, 1)])
+    [part] = rts.load(write(tmp_path / "m.ply", header.format(3, 1) + rows + "3 0 1 2\n"))
+    assert part.theta["texture"].shape == (8, 8, 3)
+    np.testing.assert_allclose(part.theta["uv"], [(0, 0), (1, 0), (0, 1)])
 
 
 def test_numbers_after_the_corners_of_an_off_are_warned_of(tmp_path):

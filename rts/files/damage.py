@@ -38,8 +38,8 @@ def contents(path: Path) -> bytes:
 def gathered(path: Path) -> Iterator[list[str]]:
     """A list that has, once the block is left, one line for each thing that was warned of in it.
 
-    Other libraries warn in their own ways, and some only log: what they say is caught, and led back to the file. Threads
-    take turns.
+    Other libraries warn in their own ways, and some only log: what they say is caught, and led back to the file.
+    Threads take turns.
 
     Raises:
         InputError: NumPy came upon text among numbers.

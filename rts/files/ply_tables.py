@@ -64,14 +64,14 @@ class Mesh(NamedTuple):
         faces: corners of polygons, indices into the vertices; None where the file has no faces.
         per_face: columns (F,) by name.
         texcoord: two numbers for each corner of each face, (C, 2), or None.
-        comments: lines of the header, which may name a texture.
+        texture: the name of a picture, or "".
     """
 
     vertices: dict[str, np.ndarray]
     faces: Lists | None
     per_face: dict[str, np.ndarray]
     texcoord: np.ndarray | None = None
-    comments: tuple[str, ...] = ()
+    texture: str = ""
 
 
 Fail = Callable[[str], InputError]
@@ -94,11 +94,8 @@ def plain_ply(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
         return unreadable(path, "PLY", what)
 
     mesh = _mesh(path, data, fail)
-    for comment in mesh.comments:
-        at = comment.lower().find("texturefile")
-        name = comment[at + len("texturefile") :].strip() if at >= 0 else ""
-        if name and not is_image(file(name)):
-            raise fail(f"its texture {name} cannot be read as an image")
+    if mesh.texture and not is_image(file(mesh.texture)):
+        raise fail(f"its texture {mesh.texture} cannot be read as an image")
     return written(path, "PLY", mesh)
 
 
@@ -109,7 +106,9 @@ def written(path: Path, kind: str, mesh: Mesh) -> bytes:
         return unreadable(path, kind, what)
 
     count = len(mesh.vertices["x"])
-    lines = ["ply", "format binary_little_endian 1.0", *mesh.comments, f"element vertex {count}"]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment TextureFile {mesh.texture}"] if mesh.texture else []
+    lines.append(f"element vertex {count}")
     vertices = _with_colors(mesh.vertices, "vertex", fail)
     lines += [f"property {NAMES[c.dtype.str[1:]]} {name}" for name, c in vertices.items()]
     table = np.empty(count, [(name, "<" + c.dtype.str[1:]) for name, c in vertices.items()])
@@ -160,10 +159,11 @@ def _with_colors(columns: dict[str, np.ndarray], element: str, fail: Fail) -> di
     if not {"red", "green", "blue"} <= set(columns):
         return columns
     names = [name for name in COLORS if name in columns]
-    top = max(columns[name].max(initial=0) for name in names)
     found = dict(columns)
     for name in names:
-        values = np.asarray(columns[name], np.float64)
+        values, kind = np.asarray(columns[name], np.float64), columns[name].dtype.kind
+        # Alpha may be of another kind than the others.
+        top = max(columns[other].max(initial=0) for other in names if columns[other].dtype.kind == kind)
         limit = 65535.0 if columns[name].dtype == np.uint16 and top > 255 else 255.0
         wrong = ~((values >= 0) & (values <= limit))
         if wrong.any():
@@ -171,8 +171,7 @@ def _with_colors(columns: dict[str, np.ndarray], element: str, fail: Fail) -> di
             raise fail(
                 f"row {row} of {element} has {name} = {values[row]:g}; expected colours from 0 to 1, or from 0 to 255"
             )
-        floating = columns[name].dtype.kind == "f"
-        scale = 255.0 if floating and top <= 1 else 255 / limit
+        scale = 255.0 if kind == "f" and top <= 1 else 255 / limit
         found[name] = np.round(values * scale).astype(np.uint8)
     return found
 
@@ -181,7 +180,7 @@ def _with_colors(columns: dict[str, np.ndarray], element: str, fail: Fail) -> di
 
 
 def _mesh(path: Path, data: bytes, fail: Fail) -> Mesh:
-    elements, layout, comments, start = _header(data, fail)
+    elements, layout, texture, start = _header(data, fail)
     if layout == "ascii":
         tables = _text_tables(elements, data[:start].count(b"\n"), data[start:], fail)
     else:
@@ -193,7 +192,7 @@ def _mesh(path: Path, data: bytes, fail: Fail) -> Mesh:
     scalars = {name: column for name, column in face.items() if isinstance(column, np.ndarray)}
     lists = {name: column for name, column in face.items() if isinstance(column, tuple)}
     if "face" not in tables:
-        return Mesh(vertex, None, {}, None, comments)
+        return Mesh(vertex, None, {})
     named = [n for n in ("vertex_indices", "vertex_index") if n in lists] or list(lists)
     if not named:
         raise fail("its faces have no list vertex_indices")
@@ -206,24 +205,24 @@ def _mesh(path: Path, data: bytes, fail: Fail) -> Mesh:
             texcoord = values.reshape(-1, 2)
         else:
             warn(f"{path}: texcoord has not two numbers for each corner of each face; it is loaded without them")
-    return Mesh(vertex, faces, scalars, texcoord, comments)
+    return Mesh(vertex, faces, scalars, texcoord, texture)
 
 
-def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, tuple[str, ...], int]:
-    """What is promised: elements, layout, comments; and where the data begin."""
-    end = data.find(b"end_header")
+def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:
+    """What is promised: elements, layout, the name of a texture; and where the data begin."""
+    end = data.find(b"\nend_header") + 1
     after = data.find(b"\n", end)
-    if not data.startswith(b"ply") or end < 0 or after < 0 or data[end:after].strip() != b"end_header":
+    if not data.startswith(b"ply") or end == 0 or after < 0 or data[end:after].strip() != b"end_header":
         raise fail("it does not begin with a header from 'ply' to 'end_header'")
     lines = data[:end].decode("utf-8", "replace").splitlines()
     elements: list[Element] = []
-    layout, comments = "", []
+    layout = texture = ""
     for number, line in enumerate(lines[1:], start=2):
         match line.split():
-            case [] | ["obj_info", *_]:
+            case ["comment", name, _, *_] if name.lower() == "texturefile":
+                texture = line.strip()[len("comment") :].strip()[len(name) :].strip()
+            case [] | ["obj_info" | "comment", *_]:
                 pass
-            case ["comment", *_]:
-                comments.append(line.strip())
             case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as layout, "1.0"]:
                 pass
             case ["element", name, count] if count.isdecimal() and name not in {e.name for e in elements}:
@@ -241,7 +240,7 @@ def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, tuple[str, ...
     for element in elements:
         if len({p.name for p in element.properties}) < len(element.properties) or not element.properties:
             raise fail(f"its header gives {element.name!r} no properties, or one of them twice")
-    return elements, layout, tuple(comments), after + 1
+    return elements, layout, texture, after + 1
 
 
 def _joined(sizes: Any, entries: list[np.ndarray], dtype: str) -> Lists:
