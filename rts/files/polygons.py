@@ -32,7 +32,15 @@ def cut(points: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.
     start = (ends - sizes)[owner]
     triangles = np.stack([start, start + step + 1, start + step + 2], axis=1)
     forced = 0
-    for polygon in _turned(points, corners[triangles], owner, sizes):
+    turned = _turned(points, corners[triangles], owner, sizes)
+    # A quad has only one other diagonal; there may be many of them.
+    quads = turned[sizes[turned] == 4]
+    others = (ends - 4)[quads, None, None] + np.array([[1, 2, 3], [1, 3, 0]])
+    places = np.repeat(np.arange(len(quads)), 2)
+    worse = _turned(points, corners[others.reshape(-1, 3)], places, sizes[quads])
+    right = np.delete(np.arange(len(quads)), worse)
+    triangles[first[quads[right], None] + [0, 1]] = others[right]
+    for polygon in np.setdiff1d(turned, quads[right]):
         begin, count = ends[polygon] - sizes[polygon], sizes[polygon]
         found = _ears(points[corners[begin : begin + count]])
         if found is None:
