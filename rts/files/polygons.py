@@ -38,8 +38,8 @@ def cut(points: np.ndarray, corners: np.ndarray, sizes: np.ndarray) -> tuple[np.
     others = (ends - 4)[quads, None, None] + np.array([[1, 2, 3], [1, 3, 0]])
     places = np.repeat(np.arange(len(quads)), 2)
     worse = _turned(points, corners[others.reshape(-1, 3)], places, sizes[quads])
-    right = np.delete(np.arange(len(quads)), worse)
-    triangles[first[quads[right], None] + [0, 1]] = others[right]
+    right = np.setdiff1d(np.arange(len(quads)), worse)
+    triangles[first[quads[right]][:, None] + np.arange(2)] = others[right]
     for polygon in np.setdiff1d(turned, quads[right]):
         begin, count = ends[polygon] - sizes[polygon], sizes[polygon]
         found = _ears(points[corners[begin : begin + count]])
