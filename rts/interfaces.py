@@ -283,6 +283,7 @@ class Splatter(Plugin):
         reach: how many cells away from its own, along either axis, a sample may have an effect.
         prunes: whether it says which samples it needs; True in a class with its own `needed`.
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
+        averages: whether its normal equations may be asked for with a target of fewer pixels than there are cells.
     """
 
     FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}
@@ -291,6 +292,7 @@ class Splatter(Plugin):
     reach: int = 1
     prunes: bool = False
     sums_products: bool = False
+    averages: bool = False
 
     @abc.abstractmethod
     def image(self, splats: Splats) -> Array:
@@ -345,7 +347,8 @@ class Splatter(Plugin):
         """Normal equations of the n residuals weight · (image − target), without their Jacobian.
 
         Args:
-            splats: the samples; the image without their border has h × w pixels.
+            splats: the samples; without their border there are h × w cells, each a pixel. Where the class says
+                `averages` there may be s h × s w, and a pixel is the mean of s × s cells.
             t_positions: (T, N, 3), tangents of positions along T directions.
             t_rgba: (T, N, 4), tangents of colours; None for zeros.
             target: (h, w, C): alpha (C = 1), colours (3) or both (4).

@@ -158,6 +158,56 @@ def test_integer_parameters_are_refused():
             call(torch.tensor([1, 2, 3]))
 
 
+ALONG = {"color": [0, 0, 0], "shift": [1.0, 0, 0]}
+
+
+@pytest.mark.parametrize(
+    "call, said",
+    [
+        (lambda p: rts.check_gradient(None, p, SIZE), "scene is None; expected a function"),
+        (lambda p: rts.check_gradient(card, p, SIZE, loss="mse"), "loss is 'mse'; expected a function"),
+        (lambda p: rts.check_gradient(card, p, SIZE, tolerance="small"), "tolerance is 'small'; expected a number"),
+        (lambda p: rts.check_gradient(card, p, SIZE, tolerance=-1), "tolerance is -1; expected a number"),
+        (lambda p: rts.check_gradient(card, p, SIZE, samples="8"), "samples is '8'; expected an integer"),
+        (lambda p: rts.check_gradient(card, p, SIZE, entries=[1]), r"entries is \[1\]; expected an integer"),
+        (lambda p: rts.check_gradient(card, p, SIZE, sampels=3), "no option 'sampels'; expected sampler, splatter"),
+        (lambda p: rts.check_gradient(card, {"a": p["shift"], 1: p["color"]}, SIZE), "keys that cannot be sorted"),
+        (lambda p: rts.gradient_image(None, p, ALONG), "image is None; expected a function"),
+        (lambda p: rts.gradient_image(lambda q: np.zeros((3, 3, 3)), p, ALONG), "image gave a numpy.ndarray"),
+        (lambda p: rts.gradient_image(card, None), "parameters holds NumPy arrays, numbers or nothing"),
+        (lambda p: rts.gradient_image(card, p, ALONG, scale=np.ones((5, 9))), r"scale is a numpy.ndarray of shape"),
+    ],
+)
+def test_what_is_of_the_wrong_kind_is_refused_in_one_line(call, said):
+    with pytest.raises(rts.InputError, match=said) as error:
+        call(parameters_of("torch-cpu"))
+    assert "\n" not in str(error.value)
+
+
+def test_under_jit_there_is_nothing_to_look_at():
+    jax = pytest.importorskip("jax")
+    image = lambda q: rts.render(*card(q), SIZE)  # noqa: E731
+    for call, name in (
+        (lambda q: rts.check_gradient(card, q, SIZE).slopes[0].autodiff, "check_gradient"),
+        (lambda q: rts.gradient_image(image, q, ALONG).derivative, "gradient_image"),
+    ):
+        with pytest.raises(rts.InputError, match=f"parameters holds traced arrays; call rts.{name} outside") as error:
+            jax.jit(call)(parameters_of("jax"))
+        assert "\n" not in str(error.value)
+
+
+def test_images_that_jax_cannot_trace_and_arrays_of_two_engines():
+    torch = pytest.importorskip("torch")
+    parameters = parameters_of("jax")
+    for image, kind, said in (
+        (lambda q: rts.render(*card(q), SIZE) * float(q["shift"][0]), rts.InputError, "jax cannot trace the function"),
+        (lambda q: rts.render(*card(q), SIZE) * torch.ones(1), rts.EngineError, "torch and jax arrays met"),
+    ):
+        with pytest.raises(kind, match=said) as error:
+            rts.gradient_image(image, parameters, ALONG)
+        assert "\n" not in str(error.value)
+
+
 @pytest.mark.parametrize("scale", [0, -1.0, float("nan"), "1"])
 def test_a_scale_that_is_none_is_refused(scale):
     along = {"color": [0, 0, 0], "shift": [1.0, 0, 0]}

@@ -156,6 +156,69 @@ def test_jitted_and_with_few_rows(target):
     check(few, start(target), 1e-5)
 
 
+FINE_CASES = [
+    *((kind, *case, "torch-cpu", np.float64) for kind in KINDS for case in ((1, 2, 2), (3, 1, 3), (4, "auto", 4))),
+    ("visible", 4, 2, 2, "torch-cpu", np.float32),
+    ("visible", 1, 2, 3, "jax", np.float32),
+    ("multi", 3, 2, 2, "jax", np.float64),
+]
+"""Splatter, channels, layers, samples a pixel along each axis, engine and dtype."""
+
+
+@pytest.mark.filterwarnings("ignore::rts.LayersWarning")
+@pytest.mark.parametrize(("kind", "channels", "layers", "fine", "target", "dtype"), FINE_CASES)
+def test_supersampled_images_are_swept_to_the_normal_equations_of_their_jacobian(
+    kind, channels, layers, fine, target, dtype, monkeypatch
+):
+    sweeps = count_sweeps(monkeypatch)
+    goal, weights = fields(channels)
+    behind = np.random.default_rng(4).random((*SIZE, 4))
+    options = {"weights": weights, "splatter": kind, "layers": layers, "supersample": fine, "background": behind}
+    with precision(target, dtype):
+        residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, **options)
+        check(residuals, start(target, dtype), TOLERANCE[dtype])
+    assert len(sweeps) == 1 and residuals.supersample == fine
+
+
+@targets
+def test_bands_of_a_supersampled_image_add_up(target, monkeypatch):
+    goal, weights = fields(3)
+    residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, weights=weights, supersample=3)
+    whole = residuals.normal_equations(start(target))
+    sweeps = count_sweeps(monkeypatch)
+    monkeypatch.setattr(rts.rendering, "BAND", 3000)
+    found = check(residuals, start(target), 1e-4)
+    assert len(sweeps) == 6 and {len(args[3]) for args in sweeps} == {4, 5}  # Rows of unlike number.
+    for a, b in zip(map(to_numpy, found), map(to_numpy, whole), strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * np.abs(b).max())
+
+
+@pytest.mark.parametrize("side", [1, 7, 33])
+def test_supersampled_images_of_any_size(side):
+    """Pixels are cut at no tile: 32 cells hold 10 of them, or 6."""
+    size = side, 45 - side
+    camera = rts.Camera.look_at((0.3, 0.4, 1.5), (0, 0, 0), aspect=size[1] / size[0])
+    for fine in (3, 5):
+        goal = np.random.default_rng(0).random((*size, 4))
+        check(rts.ImageResiduals(scene, camera, size, goal, supersample=fine), start("torch-cpu", np.float64), 1e-10)
+
+
+def test_splatters_that_know_no_means_are_never_asked_for_them():
+    class Own(fused.Visible):
+        averages = False
+        asked = 0
+
+        def normal_equations(self, splats, t_positions, t_rgba, target, weights=None, background=None):
+            Own.asked += 1
+            return super().normal_equations(splats, t_positions, t_rgba, target, weights, background)
+
+    goal, _ = fields(3)
+    check(rts.ImageResiduals(scene, CAMERA, SIZE, goal, splatter=Own(), supersample=2), start("torch-cpu"), 1e-5)
+    assert Own.asked == 0
+    check(rts.ImageResiduals(scene, CAMERA, SIZE, goal, splatter=Own()), start("torch-cpu"), 1e-5)
+    assert Own.asked == 1 and not rts.Splatter.averages
+
+
 @torch_targets
 def test_shapes_of_target_and_weights(target):
     alpha, weights = fields(1)
@@ -233,7 +296,7 @@ def test_nothing_in_view_has_zero_derivatives(target):
     [
         ({"splatter": splatting.Visible()}, "torch-cpu"),
         ({"splatter": "none"}, "torch-cpu"),
-        ({"supersample": 2}, "torch-cpu"),
+        ({"supersample": 33}, "torch-cpu"),
     ],
 )
 def test_what_no_sweep_knows_is_done_by_the_jacobian(options, target, monkeypatch):
@@ -305,6 +368,23 @@ def test_results_are_bitwise_the_same_on_any_number_of_threads(kind, monkeypatch
     for one, other in itertools.pairwise(results):
         for a, b in zip(one, other, strict=True):
             np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_sweeps_of_means_are_products_of_pushed_means(kind):
+    splats, t_positions, t_rgba = splats_of(kind, 3, size=(40, 124))
+    image, rows = np.empty((36, 120, 4)), np.empty((3, 36, 120, 4))
+    splats.image(image)
+    splats.jvp(t_positions, t_rgba, rows)
+    for fine in (2, 3, 4, 6, 12):
+        size = 36 // fine, 120 // fine
+        mean = image.reshape(size[0], fine, size[1], fine, 4).mean(axis=(1, 3))
+        pushed = rows.reshape(3, size[0], fine, size[1], fine, 4).mean(axis=(2, 4)).reshape(3, -1)
+        goal = np.random.default_rng(1).random(mean.shape)
+        r = (mean - goal).ravel()
+        found = fused_normal.normal_equations(splats, t_positions, t_rgba, goal, None, None)
+        for own, expected in zip(found, (r @ r, pushed @ pushed.T, pushed @ r), strict=True):
+            np.testing.assert_allclose(own, expected / len(r), rtol=1e-10, atol=1e-13)
 
 
 def test_a_sweep_at_512_needs_little_memory():
@@ -437,7 +517,7 @@ def test_normal_equations_of_another_form_are_refused(target):
     [
         (np.zeros((26, 30)), {}, r"target has shape \(26, 30\); expected \(26, 31\) or \(26, 31, 1\)"),
         (np.zeros((26, 31, 2)), {}, r"target has shape \(26, 31, 2\)"),
-        ("mask.png", {}, "target is a str"),
+        ("mask.png", {}, "target is 'mask.png'; expected an array"),
         (np.zeros(SIZE, np.uint8), {}, "target has dtype uint8; expected floating"),
         (
             np.zeros((*SIZE, 3)),
@@ -447,11 +527,53 @@ def test_normal_equations_of_another_form_are_refused(target):
         (np.zeros(SIZE), {"weights": np.zeros(SIZE, np.int32)}, "weights has dtype int32"),
         (np.zeros(SIZE), {"background": np.zeros(2)}, r"background has shape \(2,\)"),
         (np.zeros(SIZE), {"layers": 0}, "layers is 0"),
+        (None, {}, "target is None; expected an array"),
+        (np.full(SIZE, np.nan), {}, "target holds NaN or infinity; expected finite numbers"),
+        (np.full((*SIZE, 3), np.inf), {}, "target holds NaN or infinity"),
+        (np.zeros(SIZE), {"weights": np.full(SIZE, np.nan)}, "weights holds NaN or infinity"),
+        (np.zeros(SIZE), {"weights": "mask"}, "weights is 'mask'; expected an array"),
+        (np.zeros(SIZE), {"background": [np.nan, 0.0, 0.0]}, "background holds NaN or infinity"),
+        (np.zeros(SIZE), {"scene": None}, "scene is None; expected a function: parameters → parts"),
+        (np.zeros(SIZE), {"scene": mesh(*box(0.5))}, "scene is Part.*; expected a function"),
+        (np.zeros(SIZE), {"camera": "front"}, "camera is 'front'; expected an rts.Camera, or None"),
+        (np.zeros(SIZE), {"size": 64}, "size is 64; expected"),
+        (np.zeros(SIZE), {"splatter": 3}, "the splatter is 3; expected"),
+        (np.zeros(SIZE), {"splatter": "mutli"}, "no splatter named 'mutli'"),
+        (np.zeros(SIZE), {"sampler": 3}, "the sampler is 3; expected"),
+        (np.zeros(SIZE), {"supersample": 1.5}, "supersample is 1.5"),
     ],
 )
 def test_wrong_arguments_say_what_was_expected(target, options, expected):
-    with pytest.raises(InputError, match=expected):
-        rts.ImageResiduals(scene, CAMERA, SIZE, target, **options)
+    given = {"scene": scene, "camera": CAMERA, "size": SIZE, **options}
+    with pytest.raises(InputError, match=expected) as error:
+        rts.ImageResiduals(given.pop("scene"), given.pop("camera"), given.pop("size"), target, **given)
+    assert "\n" not in str(error.value)
+
+
+@targets
+def test_targets_of_an_engine_must_be_finite_too(target):
+    goal = np.zeros(SIZE)
+    goal[3, 4] = np.nan
+    with pytest.raises(InputError, match="target holds NaN"):
+        rts.ImageResiduals(scene, CAMERA, SIZE, arrays(target, goal))
+
+
+@pytest.mark.parametrize("method", ["adam", "lm"])
+@pytest.mark.parametrize(
+    ("result", "said"),
+    [
+        (lambda: None, "scene gave None; expected an rts.Part or several, or a tuple"),
+        (lambda: (1, 2, 3), "scene gave a int, a int, a int"),
+        (lambda: (mesh(*box(0.5)), "front"), "scene gave a rts.interfaces.Part, a str"),
+        (lambda: np.zeros((26, 31, 4)), r"scene gave a numpy.ndarray of shape \(26, 31, 4\)"),
+        (lambda: [], "scene gave nothing"),
+    ],
+)
+def test_scenes_that_give_something_else(result, said, method):
+    residuals = rts.ImageResiduals(lambda p: result(), CAMERA, SIZE, np.zeros(SIZE))
+    with pytest.raises(InputError, match=said) as error:
+        rts.fit(residuals, start("torch-cpu"), method=method)
+    assert "\n" not in str(error.value)
 
 
 def test_a_camera_must_come_from_somewhere():

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import inspect
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.arguments import quoted
 from rts.arrays import from_numbers, kind_of
 from rts.camera import Camera
 from rts.checks import check_size, is_count, is_real
-from rts.engines import Engine, engine_of, is_constant, is_traced, namespace
+from rts.engines import Engine, engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.files.srgb import decode_srgb
+from rts.fitting.dependence import differentiable
+from rts.fitting.names import named_leaves
+from rts.fitting.run import untraceable
 from rts.interfaces import Part, Splatter
 from rts.records import Splats
 from rts.rendering import render
@@ -67,14 +73,15 @@ def gradient_image(
     Raises:
         InputError: parameters that have no derivative, or a direction of another structure.
     """
-    engine, parameters = _differentiable(parameters)
+    _check_function("image", image, "a function: parameters → (H, W, C)")
+    engine, parameters = _differentiable(parameters, "rts.gradient_image")
     if direction is None:
         if [math.prod(p.shape) for p in leaves(parameters)] != [1]:
             raise InputError("parameters holds more than one number; give the direction along which to differentiate")
         direction = map_leaves(lambda p: engine.namespace.ones_like(p), parameters)
     direction = _like(from_numbers(direction), parameters, engine)
     if scale is not None and not (is_real(scale) and 0 < scale < math.inf):
-        raise InputError(f"scale is {scale!r}; expected a positive number, or None for the largest change")
+        raise InputError(f"scale is {quoted(scale)}; expected a positive number, or None for the largest change")
 
     def checked(p: Tree) -> Array:
         found = image(p)
@@ -82,7 +89,8 @@ def gradient_image(
             raise InputError(f"image gave {kind_of(found)}; expected a {engine.name} array (H, W, C)")
         return found
 
-    derivative = engine.to_numpy(engine.jvp(checked, parameters, direction)[1])
+    with _traceable(engine):
+        derivative = engine.to_numpy(engine.jvp(checked, parameters, direction)[1])
     if not np.isfinite(derivative).all():
         raise InputError("the derivative of the image is not finite; check the parameters for NaN")
     largest = float(np.abs(derivative).max(initial=0.0))
@@ -174,10 +182,19 @@ def check_gradient(
     Raises:
         InputError: parameters that have no derivative, or arguments that `rts.render` refuses.
     """
-    engine, parameters = _differentiable(parameters)
-    size = check_size(size, 1, None, samples)
-    if not is_count(entries):
-        raise InputError(f"entries is {entries!r}; expected an integer of at least 1")
+    _check_function("scene", scene, "a function: parameters → (parts, camera)")
+    if loss is not None:
+        _check_function("loss", loss, "a function: image (H, W, 4) → scalar, or None")
+    engine, parameters = _differentiable(parameters, "rts.check_gradient")
+    size = check_size(size, 1, None, 1)
+    for name, count in (("samples", samples), ("entries", entries)):
+        if not is_count(count):
+            raise InputError(f"{name} is {quoted(count)}; expected an integer of at least 1")
+    if not (is_real(tolerance) and 0 <= tolerance < math.inf):
+        raise InputError(f"tolerance is {quoted(tolerance)}; expected a number, at least 0")
+    known = [n for n in inspect.signature(render).parameters if n not in ("parts", "camera", "size")]
+    if unknown := [name for name in options if name not in known]:
+        raise InputError(f"there is no option {unknown[0]!r}; expected {', '.join(known)}")
     loss = _scalar(_smooth_weighting(size, engine, parameters) if loss is None else loss, engine)
 
     def image(p: Tree, **changes: Any) -> Array:
@@ -186,11 +203,10 @@ def check_gradient(
             raise InputError(f"scene gave {kind_of(found)}; expected (parts, camera)")
         return render(*found, size, **{**options, **changes})
 
-    value, gradient = engine.value_and_grad(lambda p: loss(image(p)))(parameters)
-    if is_traced(value):
-        raise InputError("the parameters are traced; call check_gradient outside jit")
+    with _traceable(engine):
+        value, gradient = engine.value_and_grad(lambda p: loss(image(p)))(parameters)
     slopes = []
-    for number, ((name, value), slope) in enumerate(zip(_named(parameters), leaves(gradient), strict=True)):
+    for number, ((name, value), slope) in enumerate(zip(named_leaves(parameters), leaves(gradient), strict=True)):
         flat = engine.to_numpy(slope).reshape(-1)
         for index in _chosen(flat, entries):
             direction = _unit(engine, parameters, number, index)
@@ -208,19 +224,34 @@ def check_gradient(
 # --------------------------------------------------------------------------------------------------- parameters
 
 
-def _differentiable(parameters: Tree) -> tuple[Engine, Tree]:
+@contextlib.contextmanager
+def _traceable(engine: Engine) -> Iterator[None]:
+    """Errors of a framework that cannot trace the user's function are told in one line."""
+    try:
+        yield
+    except Exception as error:
+        told = untraceable(error, engine)
+        if told is None:
+            raise
+        raise told from error
+
+
+def _differentiable(parameters: Tree, caller: str) -> tuple[Engine, Tree]:
     """The engine of parameters that have derivatives, and the parameters, dicts in the order of `leaves`."""
-    if not any(True for _ in leaves(parameters)) or any(is_constant(x) for x in leaves(parameters)):
-        raise InputError("parameters holds NumPy arrays, numbers or nothing; expected torch or jax arrays")
-    for x in leaves(parameters):
-        if not namespace(x).isdtype(x.dtype, "real floating"):
-            raise InputError(f"parameters holds an array of dtype {x.dtype}; expected a floating one")
-    return engine_of(parameters), map_leaves(lambda p: p, parameters)
+    engine = differentiable(parameters)
+    if any(engine.traced(x) for x in leaves(parameters)):
+        raise InputError(f"parameters holds traced arrays; call {caller} outside jit and other transforms")
+    return engine, map_leaves(lambda p: p, parameters)
+
+
+def _check_function(name: str, given: Any, expected: str) -> None:
+    if not callable(given):
+        raise InputError(f"{name} is {quoted(given)}; expected {expected}")
 
 
 def _like(direction: Tree, parameters: Tree, engine: Engine) -> Tree:
     """The direction as arrays of the engine, of the parameters' names and shapes."""
-    given, wanted = ([(name, tuple(np.shape(x))) for name, x in _named(t)] for t in (direction, parameters))
+    given, wanted = ([(name, tuple(np.shape(x))) for name, x in named_leaves(t)] for t in (direction, parameters))
     if given != wanted:
         raise InputError(f"direction has arrays of shapes {given}; expected those of the parameters, {wanted}")
     if engine_of(direction, parameters) is not engine:  # Arrays of two engines are refused by `engine_of`.
@@ -246,18 +277,6 @@ def _scalar(loss: Callable[[Array], Array], engine: Engine) -> Callable[[Array],
         return value
 
     return call
-
-
-def _named(tree: Tree, name: str = "") -> Iterator[tuple[str, Array]]:
-    """Leaves with names, in the order of `leaves`."""
-    if isinstance(tree, Mapping):
-        for key in sorted(tree):
-            yield from _named(tree[key], f"{name}.{key}" if name else str(key))
-    elif isinstance(tree, (list, tuple)):
-        for i, item in enumerate(tree):
-            yield from _named(item, f"{name}.{i}" if name else str(i))
-    elif tree is not None:
-        yield name or "parameters", tree
 
 
 def _chosen(gradient: np.ndarray, count: int) -> list[int]:

@@ -11,12 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.adapting import adapted
+from rts.arguments import quoted
 from rts.arrays import kind_of
 from rts.checks import is_count, is_real
-from rts.engines import Engine, engine_of, is_constant
+from rts.engines import Engine
 from rts.errors import InputError
+from rts.fitting.dependence import differentiable, refuse_independent
 from rts.fitting.least_squares import levenberg_marquardt, mean_square
-from rts.fitting.run import Astray, Report, Run, progress_bar, require
+from rts.fitting.names import listed, named_leaves, one_line
+from rts.fitting.run import LONGEST_REASON, NO_GRADIENT, Astray, Report, Run, progress_bar, require
 from rts.interfaces import Residuals
 from rts.trees import Array, Tree, leaves, map_leaves
 
@@ -32,8 +35,12 @@ class Fit(NamedTuple):
         loss: that loss.
         history: the loss at the start and after each update; for Levenberg–Marquardt of each trial, accepted or not.
         steps: number of losses computed, the one at the start included.
-        reason: why it stopped.
+        reason: why it stopped, in one line; and what the residuals leave open: arrays whose gradient was zero
+            throughout and, for Levenberg–Marquardt, combinations of parameters that change nothing, such as
+            "light.direction along (0.30, 0.50, 0.81)". These stay as they were.
         seconds: wall time, compilation included.
+
+    Printed, it is three lines, without history and values.
     """
 
     parameters: Tree
@@ -42,6 +49,15 @@ class Fit(NamedTuple):
     steps: int
     reason: str
     seconds: float
+
+    def __repr__(self) -> str:
+        first = f"{self.history[0]:.4g} → " if self.history else ""
+        steps = "1 step" if self.steps == 1 else f"{self.steps} steps"
+        held = [f"{name} {tuple(x.shape)}" for name, x in named_leaves(self.parameters)]
+        return (
+            f"loss {first}{self.loss:.4g} in {steps} and {self.seconds:.3g} s\n"
+            f"{one_line(self.reason, LONGEST_REASON)}\nparameters: {listed(held, 6)}"
+        )
 
 
 def fit(
@@ -63,9 +79,12 @@ def fit(
     Where parameters go astray on the way, so that a loss or derivative is not finite or `residuals` raises an
     InputError, the fit stops, says so in its `reason`, and returns the best parameters met before.
 
+    "lm" takes the numbers of one array to be of like units: one that changes the residuals a million times less than
+    another of its array, in float32, stays as it is. Parameters of very different units belong in arrays of their own.
+
     Args:
-        residuals: parameters → array of any shape, such as an image difference; see `ImageResiduals` for one that
-            "lm" takes less time and memory for, and `rts.Residuals` for what makes it so.
+        residuals: parameters → array of any shape, of the parameters' engine, such as an image difference; see
+            `ImageResiduals` for one that "lm" takes less time and memory for, and `rts.Residuals` for what makes it so.
         parameters: a torch or jax array, or nested dicts and lists of them; where to start.
         method: "adam" or "sgd" (torch.optim or optax, on the gradient of the loss), or "lm": Levenberg–Marquardt on the
             sum of squares, by the forward-mode Jacobian, for up to some hundred unknowns.
@@ -79,103 +98,135 @@ def fit(
         jit: compile with jax (no effect on torch). Turn off if `residuals` cannot be traced.
 
     Raises:
-        InputError: an argument of the wrong kind, or a loss or derivative that is not finite at the start.
+        InputError: an argument of the wrong kind, residuals that do not depend on the parameters, or a loss or
+            derivative that is not finite at the start.
+        EngineError: parameters of two engines, or of none.
     """
+    known = _check_functions(residuals, loss, callback)
     _check_method(method, loss, steps, learning_rate)
     _check_limits(tolerance, patience)
     engine = _checked_engine(parameters)
+    names = [name for name, _ in named_leaves(parameters)]
     # Private copies: neither the caller's later changes nor the graph that made them may reach the result.
     parameters = map_leaves(partial(_copied, engine), parameters)
     start = time.perf_counter()
     run = Run(int(steps or STEPS[method]), callback, tolerance, patience)
     with progress_bar(progress, run.steps, method, run):
         try:
+            checked = _checked(residuals, engine, run)
             if method == "lm":
-                known = adapted(residuals, Residuals)
-                if known is None:
-                    raise InputError(f"residuals is {residuals!r}; expected a function of the parameters")
                 own = known.normal_equations if known.sums_products else None
-                levenberg_marquardt(_checked(residuals, engine), parameters, engine, run, jit, own)
+                supersample = getattr(residuals, "supersample", None)
+                levenberg_marquardt(checked, parameters, engine, run, jit, own, supersample)
             else:
                 rate = LEARNING_RATES[method] if learning_rate is None else float(learning_rate)
-                objective = _objective(_checked(residuals, engine), loss, engine)
-                _descend(objective, parameters, engine, method, rate, run, jit)
+                _descend(checked, _scalar(loss, engine), parameters, engine, method, rate, run, jit)
         except Astray as stop:
             run.stop(str(stop))
-    return Fit(run.best, run.best_loss, run.history, len(run.history), run.reason, time.perf_counter() - start)
+    return Fit(run.best, run.best_loss, run.history, len(run.history), run.told(names), time.perf_counter() - start)
 
 
 def _copied(engine: Engine, x: Array) -> Array:
-    return engine.namespace.astype(engine.constant(np.array(engine.to_numpy(x)), x), x.dtype, copy=False)
+    try:
+        values = np.array(engine.to_numpy(x))
+    except (TypeError, ValueError, RuntimeError) as error:  # Such as a sparse one.
+        raise InputError(f"parameters holds an array whose values cannot be read ({one_line(str(error))})") from None
+    return engine.namespace.astype(engine.constant(values, x), x.dtype, copy=False)
 
 
 def _descend(
-    objective: Callable, parameters: Tree, engine: Engine, method: str, rate: float, run: Run, jit: bool
+    residuals: Callable,
+    loss: Callable,
+    parameters: Tree,
+    engine: Engine,
+    method: str,
+    rate: float,
+    run: Run,
+    jit: bool,
 ) -> None:
     """Run Adam or SGD."""
     xp = engine.namespace
-    value_and_grad = engine.value_and_grad(objective)
+    value_and_grad = engine.value_and_grad(lambda p: loss(residuals(p)))
 
-    def evaluate(p: Tree) -> tuple[Array, Tree, list[Array]]:
+    def evaluate(p: Tree) -> tuple[Array, Tree, list[Array], list[Array]]:
         value, gradient = value_and_grad(p)
-        return value, gradient, [xp.all(xp.isfinite(g)) for g in leaves(gradient)]
+        found = list(leaves(gradient))
+        return value, gradient, [xp.all(xp.isfinite(g)) for g in found], [xp.any(g != 0) for g in found]
 
     evaluate = engine.jit(evaluate) if jit else evaluate
     step = engine.optimizer(method, rate, parameters)
     while True:
         start = not run.history
-        value, gradient, finite = run.attempt(engine, evaluate, parameters)
+        value, gradient, finite, mattered = run.attempt(engine, evaluate, parameters)
         require(math.isfinite(value), f"the loss is {float(value)}", start)
+        run.note_gradient([*map(bool, mattered)])
+        if start and not any(run.mattered):
+            refuse_independent(residuals, loss, parameters, engine)
         if not run.record(parameters, float(value)):
             return
         require(all(map(bool, finite)), "the gradient is not finite", start)
         if run.stalled():
-            run.stop(f"no gain in {run.patience} steps")
+            run.stop(f"no gain in {run.patience} steps" + ("" if any(run.mattered) else f": {_flat(run.best_loss)}"))
             return
         parameters = step(parameters, gradient)
+
+
+def _flat(loss: float) -> str:
+    """What to say of a gradient that was zero throughout."""
+    return "the loss is zero" if loss == 0 else NO_GRADIENT
 
 
 # -------------------------------------------------------------------------------------------------- checks
 
 
+def _check_functions(residuals: Any, loss: Any, callback: Any) -> Residuals:
+    """The residuals with all members of their base."""
+    known = adapted(residuals, Residuals)
+    if known is None:
+        raise InputError(f"residuals is {quoted(residuals)}; expected a function of the parameters")
+    if not callable(loss):
+        raise InputError(f"loss is {quoted(loss)}; expected a function of the residuals, or leave it out")
+    if callback is not None and not callable(callback):
+        raise InputError(f"callback is {quoted(callback)}; expected a function of step, parameters and loss, or None")
+    return known
+
+
 def _check_method(method: str, loss: Callable, steps: int | None, learning_rate: float | None) -> None:
-    if method not in STEPS:
-        raise InputError(f"method is {method!r}; expected one of {', '.join(STEPS)}")
+    if not isinstance(method, str) or method not in STEPS:
+        raise InputError(f"method is {quoted(method)}; expected one of {', '.join(STEPS)}")
     if method == "lm" and loss is not mean_square:
         raise InputError('method "lm" minimises the mean square and takes no other loss; use "adam", or leave out loss')
     if steps is not None:
         _check_count("steps", steps)
     if learning_rate is not None and not (is_real(learning_rate) and 0 < learning_rate < math.inf):
-        raise InputError(f"learning_rate is {learning_rate!r}; expected a positive number")
+        raise InputError(f"learning_rate is {quoted(learning_rate)}; expected a positive number")
 
 
 def _check_limits(tolerance: float, patience: int) -> None:
     if not (is_real(tolerance) and tolerance >= 0):
-        raise InputError(f"tolerance is {tolerance!r}; expected a number, at least 0")
+        raise InputError(f"tolerance is {quoted(tolerance)}; expected a number, at least 0")
     _check_count("patience", patience)
 
 
 def _check_count(name: str, value: Any) -> None:
     if not is_count(value):
-        raise InputError(f"{name} is {value!r}; expected a whole number, at least 1")
+        raise InputError(f"{name} is {quoted(value)}; expected a whole number, at least 1")
 
 
 def _checked_engine(parameters: Tree) -> Engine:
     """The engine of the parameters, which must be differentiable arrays."""
-    if not any(True for _ in leaves(parameters)) or any(is_constant(x) for x in leaves(parameters)):
-        raise InputError("parameters holds NumPy arrays, numbers or nothing; expected torch or jax arrays to optimise")
-    engine = engine_of(parameters)
-    for x in leaves(parameters):
-        if not engine.namespace.isdtype(x.dtype, "real floating"):
-            raise InputError(f"parameters holds an array of dtype {x.dtype}; expected a floating one to optimise")
+    engine = differentiable(parameters, " to optimise")
+    if any(engine.traced(x) for x in leaves(parameters)):
+        raise InputError("parameters holds traced arrays; call rts.fit outside jit and other transforms")
     return engine
 
 
-def _checked(residuals: Callable[[Tree], Array], engine: Engine) -> Callable[[Tree], Array]:
+def _checked(residuals: Callable[[Tree], Array], engine: Engine, run: Run) -> Callable[[Tree], Array]:
     """A function like `residuals` that refuses a result which is no floating array of the engine."""
 
     def call(parameters: Tree) -> Array:
         result = residuals(parameters)
+        run.residuals = math.prod(getattr(result, "shape", ()))
         if not engine.owns(result):
             raise InputError(
                 f"residuals gave {kind_of(result)}; expected one {engine.name} array, as the parameters are"
@@ -190,14 +241,16 @@ def _checked(residuals: Callable[[Tree], Array], engine: Engine) -> Callable[[Tr
     return call
 
 
-def _objective(residuals: Callable, loss: Callable, engine: Engine) -> Callable[[Tree], Array]:
-    """The loss as a function of parameters, refused if it is no scalar."""
+def _scalar(loss: Callable, engine: Engine) -> Callable[[Array], Array]:
+    """A function like `loss` that refuses a result which is no floating scalar of the engine."""
 
-    def call(parameters: Tree) -> Array:
-        value = loss(residuals(parameters))
-        if not engine.owns(value) or value.shape != ():
+    def call(residuals: Array) -> Array:
+        value = loss(residuals)
+        if not engine.owns(value) or tuple(value.shape) != ():
             what = f"an array of shape {tuple(value.shape)}" if engine.owns(value) else kind_of(value)
             raise InputError(f"loss gave {what}; expected a {engine.name} scalar, of shape ()")
+        if not engine.namespace.isdtype(value.dtype, "real floating"):
+            raise InputError(f"loss gave a number of dtype {value.dtype}; expected a floating one")
         return value
 
     return call

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
-from rts.arrays import described, from_numbers, shape_of
+from rts.arguments import quoted
+from rts.arrays import described, from_numbers, is_finite, kind_of, shape_of
 from rts.camera import Camera
-from rts.checks import check_background, check_floating, check_scene, check_size, check_splatter
+from rts.checks import check_background, check_floating, check_sampler, check_scene, check_size, check_splatter
 from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting
 from rts.errors import InputError
 from rts.fitting.least_squares import flatten, normal_equations
+from rts.fitting.names import one_line
 from rts.interfaces import CheckedPart, Part, Residuals, Splatter
 from rts.records import Splats
+from rts.rendering import _bands as bands_of
 from rts.rendering import render, sample, to_splats
 from rts.sampling.prepared import PreparedParts
 from rts.trees import Array, Tree
@@ -45,8 +48,13 @@ class ImageResiduals(Residuals):
         supersample: as in `render`.
         capacity: as in `render`.
 
+    Attributes:
+        size: (height, width).
+        supersample: samples a pixel along each axis.
+
     Raises:
-        InputError: shapes that do not fit, or integers as target.
+        InputError: an argument of the wrong kind, shapes that do not fit, integers as target, or a target, weights or
+            background that are not finite.
     """
 
     def __init__(
@@ -64,13 +72,17 @@ class ImageResiduals(Residuals):
         supersample: int = 1,
         capacity: int | None = None,
     ):
+        if not callable(scene):
+            raise InputError(f"scene is {quoted(scene)}; expected a function: parameters → parts, or (parts, camera)")
+        if camera is not None and not isinstance(camera, Camera):
+            raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera, or None where scene gives one")
         self.size = check_size(size, layers, capacity, supersample)
-        self._scene, self._camera, self._splatter = scene, camera, splatter
+        self._scene, self._camera, self._splatter = scene, camera, check_splatter(splatter)
         self._target, self._channels = _checked_target(target, self.size)
         self._weights = _checked_weights(weights, self._target.shape, self.size)
         self._background = check_background(background, self.size)
-        self._supersample = supersample
-        self._sampling = dict(sampler=sampler, layers=layers, capacity=capacity)
+        self.supersample = int(supersample)
+        self._sampling: dict[str, Any] = {"sampler": check_sampler(sampler), "layers": layers, "capacity": capacity}
 
     def __call__(self, parameters: Tree) -> Array:
         """`weights * (image − target)`, of the target's shape."""
@@ -80,7 +92,7 @@ class ImageResiduals(Residuals):
             camera,
             self.size,
             splatter=self._splatter,
-            supersample=self._supersample,
+            supersample=self.supersample,
             background=self._background,
             **self._sampling,
         )
@@ -96,6 +108,12 @@ class ImageResiduals(Residuals):
         found = self._scene(parameters)
         if isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Camera):
             return found[0], found[1]
+        given = found if isinstance(found, (list, tuple)) else [found]
+        if not given or not all(isinstance(part, (Part, PreparedParts)) for part in given):
+            kinds = ", ".join(map(kind_of, given)) or "nothing"
+            raise InputError(
+                f"scene gave {one_line(kinds)}; expected an rts.Part or several, or a tuple (parts, camera)"
+            )
         if self._camera is None:
             raise InputError(
                 "camera is None, and scene gives none; expected an rts.Camera, or (parts, camera) of scene"
@@ -105,28 +123,51 @@ class ImageResiduals(Residuals):
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
         """Mean square () of the n residuals, JᵀJ / n (U, U) and Jᵀr / n (U,) for the U numbers in the parameters."""
         engine = engine_of(parameters)
-        splatter = check_splatter(self._splatter)
-        found = None
-        if splatter.sums_products and self._supersample == 1 and engine.differentiates:
+        splatter, found = self._splatter, None
+        if splatter.sums_products and engine.differentiates and (self.supersample == 1 or splatter.averages):
             found = self._swept(splatter, parameters, engine)
         return normal_equations(self, parameters, engine) if found is None else found
 
     def _swept(self, splatter: Splatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
-        """`normal_equations` by those of the splatter; None where it gives none."""
+        """`normal_equations` by those of the splatter, in the bands that `render` takes; None where it gives none."""
+        total: list[Array] = []
+        for top, rows in bands_of(*self.size, self._sampling["layers"], self.supersample):
+            found = self._swept_band(splatter, parameters, engine, top, rows)
+            if found is None:
+                return None
+            # Means over a band, made its part in means over the image.
+            shares = [x * (rows / self.size[0]) for x in found]
+            total = shares if not total else [a + b for a, b in zip(total, shares, strict=True)]
+        value, matrix, gradient = total
+        return value, matrix, gradient
+
+    def _swept_band(
+        self, splatter: Splatter, parameters: Tree, engine: Engine, top: int, rows: int
+    ) -> tuple[Array, Array, Array] | None:
+        """`normal_equations` of some rows of the image alone."""
         vector, unflatten = flatten(parameters)
         parts, camera = self.scene(parameters)
-        sampled = sample(parts, camera, self.size, splatter=splatter, **self._sampling)
+        size = rows, self.size[1]
+
+        def window(camera: Camera) -> Camera:
+            camera = camera.for_size(self.size)
+            # A window is of no ratio of its own.
+            return camera if size == self.size else camera.window(self.size, (top, 0), size).replace(aspect=None)
+
+        sampled = sample(parts, window(camera), size, splatter=splatter, supersample=self.supersample, **self._sampling)
         colored = self._channels > 1 or not _all_opaque(parts, camera)
 
         def splats(v: Array) -> tuple[Array, Array]:
             parts, camera = _checked(*self.scene(unflatten(v)))
-            moved = to_splats(sampled, parts, camera, camera, *suiting(parts, camera, sampled, v))
+            seen = camera.for_size(self.size), window(camera)
+            moved = to_splats(sampled, parts, *seen, *suiting(parts, camera, sampled, v))
             positions, rgba = constants((moved.positions, moved.rgba), engine, v)
             # What is opaque has an alpha of one, whatever its colours.
             return positions, rgba if colored else engine.stop_gradient(rgba)
 
         (positions, rgba), (t_positions, t_rgba) = engine.jacobian(splats)(vector)
-        target, weights, background = self._constants(vector)
+        band = slice(top, top + rows)
+        target, weights, background = (None if x is None else x[band] for x in self._constants(vector))
         return splatter.normal_equations(
             Splats(positions, rgba, constants(sampled.row, engine, vector), border=sampled.apron),
             t_positions,
@@ -163,7 +204,9 @@ def _all_opaque(parts: Parts, camera: Camera) -> bool:
 
 def _checked_target(target: Any, size: tuple[int, int]) -> tuple[Array, int]:
     """The target, and its number of channels."""
-    target = from_numbers(target)
+    if target is None:
+        raise InputError("target is None; expected an array, such as what rts.load_image gives")
+    target = from_numbers(target, "target")
     shape = shape_of(target)
     if shape[:2] != size or shape[2:] not in ((), *((c,) for c in CHANNELS)):
         height, width = size
@@ -172,13 +215,14 @@ def _checked_target(target: Any, size: tuple[int, int]) -> tuple[Array, int]:
             f"with alpha, ({height}, {width}, 3) with colours, or ({height}, {width}, 4) with both"
         )
     check_floating("target", target)
+    _check_finite("target", target)
     return target, shape[2] if len(shape) > 2 else 1
 
 
 def _checked_weights(weights: Any, shape: tuple[int, ...], size: tuple[int, int]) -> Array | None:
     if weights is None:
         return None
-    weights = from_numbers(weights)
+    weights = from_numbers(weights, "weights")
     allowed = dict.fromkeys((size, (*size, 1), tuple(shape)))
     if shape_of(weights) not in allowed:
         raise InputError(f"weights {described(weights)}; expected {' or '.join(map(str, allowed))}")
@@ -186,4 +230,12 @@ def _checked_weights(weights: Any, shape: tuple[int, ...], size: tuple[int, int]
     if xp.isdtype(weights.dtype, "bool"):
         return xp.astype(weights, xp.float32)
     check_floating("weights", weights)
+    _check_finite("weights", weights)
     return weights
+
+
+def _check_finite(name: str, value: Array) -> None:
+    """Refuse NaN and infinity, where values are known."""
+    if not is_finite(value):
+        hint = "; where there is nothing to compare with, put any number and give it a weight of 0"
+        raise InputError(f"{name} holds NaN or infinity; expected finite numbers{hint if name == 'target' else ''}")

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rts.engines import Engine, namespace
 from rts.errors import InputError
-from rts.fitting.run import Run, require
+from rts.fitting.dependence import directions_in_words, refuse_independent
+from rts.fitting.names import named_leaves
+from rts.fitting.run import NO_GRADIENT, Run, require
 from rts.trees import Array, Tree, leaves, map_leaves
 
 FIRST_DAMPING = 1e-3
 LARGEST_DAMPING = 1e12
+TINY = 1e-300
+RESOLVED = 10.0
+"""As many roundings of the loss as a gain must be, at least, to be told from none."""
 
 
 def mean_square(residuals: Array) -> Array:
@@ -28,6 +33,7 @@ class _Linear(NamedTuple):
     value: float
     matrix: np.ndarray
     gradient: np.ndarray
+    rounding: float
 
     def checked(self, start: bool) -> _Linear:
         """Give itself back, or raise an error where it is not finite."""
@@ -36,12 +42,63 @@ class _Linear(NamedTuple):
         return self
 
 
+class _Model:
+    """The quadratic model of a loss, in the eigenspaces of JᵀJ that stand out of its rounding.
+
+    Unknowns are scaled so that JᵀJ has a diagonal of ones (Marquardt), but an unknown whose column is small beside
+    others of its array, by more than the square root of the rounding, as the largest of them times that: the numbers
+    of an array are taken to be of like units, and a column of rounding errors must not count. No step goes along
+    eigenvectors whose eigenvalue is below the rounding. Which of the steps that differ along these only is taken, the
+    model leaves open: the shortest, in units of each array. Such a direction is the length of a vector that is
+    normalised; were the step the shortest in Marquardt's units, it would run away along it.
+
+    Args:
+        linear: the normal equations.
+        sizes: how many numbers each array of the parameters has.
+    """
+
+    def __init__(self, linear: _Linear, sizes: Sequence[int]):
+        self.least = linear.rounding * len(linear.gradient)
+        diagonal = np.diag(linear.matrix).copy()
+        largest = np.concatenate(
+            [np.full(n, d.max(initial=0)) for n, d in zip(sizes, _split(diagonal, sizes), strict=True)]
+        )
+        scale = np.sqrt(np.maximum(diagonal, self.least * largest).clip(1e-12 * max(diagonal.sum(), TINY)))
+        values, vectors = np.linalg.eigh(linear.matrix / scale[:, None] / scale)
+        kept = values > self.least
+        self._values, self._directions = values[kept], vectors[:, kept] / scale[:, None]
+        self._downhill = -(linear.gradient @ self._directions)
+        self.open = vectors[:, ~kept] / scale[:, None]
+        self.units = np.sqrt(np.where(largest > 0, largest, 1.0))
+        self._open = np.linalg.qr(self.open * self.units[:, None])[0] if self.open.shape[1] else None
+
+    def step(self, damping: float) -> tuple[np.ndarray, float]:
+        """The step, and the gain that the model predicts of it."""
+        along = self._downhill / (self._values + damping)
+        step = self._directions @ along
+        if self._open is not None:
+            step = step * self.units
+            step = (step - self._open @ (self._open.T @ step)) / self.units
+        return step, float(along @ (damping * along + self._downhill))
+
+
+def _split(x: np.ndarray, sizes: Sequence[int]) -> list[np.ndarray]:
+    return np.split(x, np.cumsum(sizes)[:-1])
+
+
 def levenberg_marquardt(
-    residuals: Callable, parameters: Tree, engine: Engine, run: Run, jit: bool, own: Callable | None = None
+    residuals: Callable,
+    parameters: Tree,
+    engine: Engine,
+    run: Run,
+    jit: bool,
+    own: Callable | None = None,
+    supersample: int | None = None,
 ) -> None:
     """Minimise the mean square of residuals by normal equations.
 
-    With Marquardt's scaling and Nielsen's control of the damping (Madsen et al. 2004).
+    With Marquardt's scaling and Nielsen's control of the damping (Madsen et al. 2004), which is never below the
+    rounding of JᵀJ.
 
     Args:
         residuals: a checked function of the parameters.
@@ -50,36 +107,88 @@ def levenberg_marquardt(
         run: takes note of each step, and says when to stop.
         jit: whether to compile.
         own: the residuals' method `normal_equations`, where they have one; see `rts.Residuals`.
+        supersample: of residuals that are of an image, how many samples a pixel has along each axis.
     """
     vector, unflatten = flatten(parameters)
+    sizes = [math.prod(x.shape) for x in leaves(parameters)]
     linearize, loss_at = _least_squares(residuals, own, parameters, engine, run, jit)
-    here = linearize(vector).checked(start=True)
+
+    def taken(linear: _Linear, start: bool) -> tuple[_Linear, _Model]:
+        linear = linear.checked(start)
+        run.note_gradient([bool(d.any()) for d in _split(np.diag(linear.matrix), sizes)])
+        return linear, _Model(linear, sizes)
+
+    here, model = taken(linearize(vector), start=True)
     going = run.record(unflatten(vector), here.value)
     damping, growth = FIRST_DAMPING, 2.0
-    promising = True
+    promising, jumps = True, False
     while going:
-        if not (here.gradient.any() and here.matrix.any()):
-            run.stop("the gradient is zero")
-            return
-        delta, predicted, damping = _damped_step(here.matrix, here.gradient, damping)
+        if not here.matrix.any() and len(run.history) == 1:
+            refuse_independent(residuals, None, parameters, engine)
+        if not here.value or not here.gradient.any():
+            run.stop(
+                "the loss is zero" if not here.value else "the gradient is zero" if here.matrix.any() else NO_GRADIENT
+            )
+            break
+        damping = max(damping, model.least)
+        delta, predicted = model.step(damping)
         trial = vector + engine.constant(delta, vector)
         # A trial after one that was accepted probably is, too: its normal equations come with its loss.
         there = linearize(trial) if promising and run.left > 1 else None
         trial_value = loss_at(trial) if there is None else there.value
-        if not run.record(unflatten(trial), trial_value):
-            return
+        going = run.record(unflatten(trial), trial_value)
+        if not going:
+            break
         gain = here.value - trial_value
         promising = gain > 0  # False for a trial that is not finite, too.
         if not promising:
+            if damping >= 1 and predicted > RESOLVED * _loss_rounding(here, run.residuals):
+                jumps = math.isfinite(trial_value)
             damping, growth = damping * growth, growth * 2
-            going = damping <= LARGEST_DAMPING or run.stop("no step lowers the loss")
+            going = damping <= LARGEST_DAMPING or run.stop(_no_step(jumps, supersample))
         elif gain <= run.tolerance * here.value:
             going = run.stop(f"the last step gained less than {run.tolerance:g} of the loss")
         else:
             ratio = gain / max(predicted, gain)
             damping, growth = damping * max(1 / 3, 1 - (2 * ratio - 1) ** 3), 2.0
-            vector = trial
-            here = (there or linearize(vector)).checked(start=False)
+            vector, jumps = trial, False
+            here, model = taken(there or linearize(vector), start=False)
+    _note_open(model, parameters, sizes, run)
+
+
+def _loss_rounding(linear: _Linear, count: int) -> float:
+    """How far a mean of squares of `count` residuals may be off, whose terms are of the size of one."""
+    return linear.rounding * (linear.value + 2 * math.sqrt(linear.value / max(count, 1)))
+
+
+def _no_step(jumps: bool, supersample: int | None) -> str:
+    """Why no step lowers the loss.
+
+    Short steps along the gradient gain what it promises where the loss is smooth. Where they gain nothing, though
+    rounding would show it, the loss has jumps: as has that of an image with one sample a pixel, which is constant until
+    an outline passes a sample.
+    """
+    if not jumps:
+        return "no step lowers the loss: a local minimum"
+    if supersample is None:
+        return (
+            "no step lowers the loss, though the gradient promises it: the loss has jumps at this scale; where it is "
+            "of point-sampled images, a supersample of 2 to 4 goes further"
+        )
+    finer = "supersample=2, 3 or 4" if supersample == 1 else f"a supersample above {supersample}"
+    return f"no step lowers the loss: it is at the floor of point sampling; {finer} goes further"
+
+
+def _note_open(model: _Model, parameters: Tree, sizes: Sequence[int], run: Run) -> None:
+    """Tell the run which directions the residuals do not determine, but for arrays that never mattered at all."""
+    names, arrays = zip(*named_leaves(parameters), strict=True)
+    mattered = np.concatenate([np.full(n, m) for n, m in zip(sizes, run.mattered, strict=True)])
+    # Without those, columns may depend on each other.
+    columns, sizes_left, _ = np.linalg.svd(model.open * (model.units * mattered)[:, None], full_matrices=False)
+    columns = columns[:, sizes_left > 1e-6 * sizes_left.max(initial=0)] / model.units[:, None]
+    if columns.shape[1]:
+        shapes = [tuple(x.shape) for x in arrays]
+        run.remarks.append(f"not determined: {directions_in_words(columns, model.units, names, shapes)}")
 
 
 def normal_equations(
@@ -89,6 +198,7 @@ def normal_equations(
     xp = engine.namespace
     vector, unflatten = flatten(parameters)
     r, rows = engine.jacobian(lambda v: xp.reshape(residuals(unflatten(v)), (-1,)))(vector)
+    rows = xp.astype(rows, r.dtype, copy=False)  # torch may widen values of no axes under its transforms.
     return xp.mean(r * r), rows @ xp.matrix_transpose(rows) / r.shape[0], rows @ r / r.shape[0]
 
 
@@ -111,7 +221,9 @@ def _least_squares(
 
     def linearize(v: Array) -> _Linear:
         value, *rest = run.attempt(engine, equations, v)
-        return _Linear(float(value), *(engine.to_numpy(x).astype(np.float64) for x in rest))
+        rounding = float(engine.namespace.finfo(rest[0].dtype).eps)
+        matrix, gradient = (engine.to_numpy(x).astype(np.float64) for x in rest)
+        return _Linear(float(value), matrix, gradient, rounding)
 
     return linearize, lambda v: float(run.attempt(engine, loss, v))
 
@@ -127,20 +239,6 @@ def _checked_equations(found: Any, count: int, engine: Engine) -> tuple[Array, A
             f"mean square, JᵀJ / n, Jᵀr / n"
         )
     return given
-
-
-def _damped_step(matrix: np.ndarray, gradient: np.ndarray, damping: float) -> tuple[np.ndarray, float, float]:
-    """The step, the gain that the linear model predicts of it, and the damping that it took."""
-    from scipy.linalg import LinAlgError, cho_factor, cho_solve
-
-    scale = np.sqrt(np.diag(matrix).clip(1e-12 * np.trace(matrix)))
-    scaled, downhill = matrix / scale[:, None] / scale, -gradient / scale
-    while True:
-        try:
-            step = cho_solve(cho_factor(scaled + damping * np.eye(len(scale))), downhill)
-            return step / scale, float(step @ (damping * step + downhill)), damping
-        except LinAlgError:  # Rounding left the matrix with a negative eigenvalue.
-            damping *= 10
 
 
 def flatten(parameters: Tree) -> tuple[Array, Callable[[Array], Tree]]:

@@ -6,14 +6,20 @@ import contextlib
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from rts.engines import Engine
-from rts.errors import InputError, RtsError
+from rts.errors import EngineError, InputError, RtsError
+from rts.fitting.names import listed, one_line
 from rts.trees import Tree
 
 Report = Callable[[int, Tree, float], Any]
+
+NO_GRADIENT = (
+    "the gradient is exactly zero: nothing changes with the parameters here; is the object in view, and the splatter "
+    'other than "none"?'
+)
 
 
 class Astray(Exception):
@@ -21,14 +27,23 @@ class Astray(Exception):
 
 
 class Run:
-    """What a fit keeps as it goes: history, best parameters, and why it stopped."""
+    """What a fit keeps as it goes: history, best parameters, and why it stopped.
+
+    Attributes:
+        mattered: of each array of the parameters, whether its gradient was ever other than zero.
+        remarks: what else is to be told of the outcome, beside why it stopped.
+        residuals: how many numbers the residuals are, once that is known.
+    """
 
     def __init__(self, steps: int, callback: Report | None, tolerance: float, patience: int):
         self.steps, self.callback, self.tolerance, self.patience = steps, callback, tolerance, patience
         self.history: list[float] = []
         self.best: Tree = None
         self.best_loss = math.inf
-        self.reason = f"all {steps} steps made"
+        self.reason = f"all {steps} steps made" if steps > 1 else "the one step made"
+        self.mattered: list[bool] = []
+        self.remarks: list[str] = []
+        self.residuals = 0
         self.show: Callable[[float], None] = lambda loss: None
         self._last_gain, self._reference = 0, math.inf
 
@@ -44,6 +59,20 @@ class Run:
         if self.callback is not None and self.callback(len(self.history) - 1, parameters, loss):
             return self.stop("the callback asked to")
         return self.left > 0
+
+    def note_gradient(self, mattered: Sequence[bool]) -> None:
+        """Note which arrays of the parameters have a gradient other than zero."""
+        self.mattered = [a or b for a, b in zip(mattered, self.mattered or [False] * len(mattered), strict=True)]
+
+    def told(self, names: Sequence[str]) -> str:
+        """Why the fit stopped, and what is to be told beside, in one line; with the names of the arrays."""
+        lost = [name for name, mattered in zip(names, self.mattered, strict=False) if not mattered]
+        remarks = self.remarks
+        if lost and len(lost) < len(names):
+            remarks = [f"the gradient was zero throughout in {listed(lost)}", *remarks]
+        elif lost and self.best_loss and NO_GRADIENT not in self.reason:
+            remarks = [NO_GRADIENT, *remarks]
+        return one_line("; ".join([self.reason, *remarks]), LONGEST_REASON)
 
     @property
     def left(self) -> int:
@@ -66,7 +95,7 @@ class Run:
         try:
             return engine.block(call(*args))
         except Exception as error:
-            original = error if isinstance(error, RtsError) else engine.take_error()
+            original = error if isinstance(error, RtsError) else engine.take_error() or untraceable(error, engine)
             if original is None:
                 raise
             if self.history and isinstance(original, InputError):
@@ -74,6 +103,42 @@ class Run:
             if original is error:
                 raise
             raise original from error
+
+
+LONGEST_REASON = 500
+TRACING = ("JAXTypeError", "JAXIndexError")
+"""Bases of the errors of jax that say that a value is not known while a function is traced."""
+
+
+ENGINE_MARKS = {"torch": ("Tensor", "__dlpack"), "jax": ("ArrayImpl", "Tracer", "jit-wrapped")}
+"""What the frameworks call their arrays when they complain of those of another."""
+
+
+def untraceable(error: Exception, engine: Engine) -> RtsError | None:
+    """What to say of an error of a framework that could not trace a function, or met arrays of another framework.
+
+    None for any other error.
+    """
+    names = {c.__name__ for c in type(error).__mro__ if c.__module__.partition(".")[0] == "jax"}
+    first = one_line(str(error).strip().split("\n")[0]).rstrip(".")
+    if names.intersection(TRACING):
+        return InputError(
+            f"{engine.name} cannot trace the function ({type(error).__name__}: {first}); use {engine.name} arrays "
+            f"throughout and no values of them in Python, or pass jit=False where that is an argument"
+        )
+    if isinstance(error, RuntimeError) and first.startswith("vmap: "):
+        return InputError(
+            f"{engine.name} cannot take derivatives of the function along all unknowns at once ({first}); use "
+            f'no values of arrays in Python, or method="adam"'
+        )
+    if type(error) in (TypeError, AttributeError) and engine.name in ENGINE_MARKS:
+        met = [name for name, marks in ENGINE_MARKS.items() if any(m in str(error) for m in marks)]
+        if len(met) > 1:
+            return EngineError(
+                f"{' and '.join(met)} arrays met in the function ({first}); the parameters are {engine.name} arrays: "
+                f"convert the others, to NumPy for what is constant in a scene"
+            )
+    return None
 
 
 def require(finite: bool, what: str, start: bool) -> None:

@@ -3,6 +3,9 @@
 A sweep goes over bands of rows: the derivatives of a row of a tile along all unknowns are made as in `stencil.py`
 and `mixed.py`, multiplied with one another and with the residuals, and forgotten. Bands have a fixed height and are
 added in their order, so results do not depend on the number of threads.
+
+Of a supersampled image the rows of cells that make one row of pixels are swept one after the other, their derivatives
+added up to those of the pixels' means, and only these are multiplied.
 """
 
 from __future__ import annotations
@@ -31,13 +34,15 @@ from rts_backends.fused.rows import (
     kernel,
     normalised_sums,
     slot,
-    tile,
 )
 from rts_backends.fused.stencil import ALPHA, COLORS, TANGENT, add_tangent_row, load_around, load_tangent, tangent_row
 from rts_backends.fused.survey import BUSY, FLAT
 
 BAND = 16
 """Rows of the image whose products are added up together."""
+
+FINEST = TILE
+"""The most cells a pixel, along each axis, that fit into a tile."""
 
 OPACITY = 3 * PITCH
 """Place of alpha among the planes of a row."""
@@ -46,15 +51,19 @@ OPACITY = 3 * PITCH
 def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, ...] | None:
     """`normal_equations` of arrays of any engine on the host, traced or not; None for others.
 
+    None, too, where a pixel has more cells than a tile.
+
     Args:
         settings: the splatter, as numbers.
         engine: the engine of the arrays.
         *given: positions, rgba, row and the arguments of `normal_equations` from `t_positions`, arrays or None.
     """
-    positions, rgba, _, t_positions = given[:4]
+    positions, rgba, row, t_positions, _, target = given[:6]
     kind = {32: np.float32, 64: np.float64}.get(engine.namespace.finfo(positions.dtype).bits)
     there = [x for x in given if x is not None]
     if kind is None or rgba.dtype != positions.dtype or not engine.on_host(*there):
+        return None
+    if _cells_a_pixel(row.shape, settings.border, target.shape) > FINEST:
         return None
     present = [x is not None for x in given]
 
@@ -82,7 +91,7 @@ def normal_equations(
     """Mean square of the n residuals weight · (image − target), JᵀJ / n and Jᵀr / n, float64.
 
     Args:
-        cells: the samples.
+        cells: the samples, s · H times s · W without their border; a pixel of the image is the mean of s² of them.
         t_positions: (T, N, 2), or more columns, tangents of their positions along T directions.
         t_rgba: (T, N, 4) of their colours; None for zeros.
         target: (H, W, C), of alpha (C = 1), colours (3) or both (4).
@@ -94,13 +103,18 @@ def normal_equations(
         t_rgba = np.empty((count, 0, 4), dtype)
     tangents = read_only(t_positions, dtype), read_only(t_rgba, dtype)
     fields = (read_only(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
-    bands = -(-len(target) // BAND)
+    bands, fine = -(-len(target) // BAND), _cells_a_pixel(cells.row.shape, cells.border, target.shape)
     sums = np.zeros((bands, count + 1, count + 1))
-    given = cells.plain_arguments, cells.row, cells.choices, tangents, tuple(fields), cells.border
+    given = cells.plain_arguments, cells.row, cells.choices, tangents, tuple(fields), cells.border, fine
     parallel(_accumulate, bands, ALPHA if target.shape[2] == 1 else COLORS, *given, sums)
     total = sums.sum(axis=0) / max(target.size, 1)
     matrix = total[:count, :count]
     return total[count, count], matrix + np.tril(matrix, -1).T, total[count, :count]
+
+
+def _cells_a_pixel(row: tuple[int, ...], border: int, target: tuple[int, ...]) -> int:
+    """How many cells a pixel has along each axis, for the shapes of `row` (K, ·, ·) and of the target (H, W, C)."""
+    return max(1, (row[1] - 2 * border) // max(target[0], 1))
 
 
 def _any(tangents: np.ndarray) -> bool:
@@ -109,8 +123,11 @@ def _any(tangents: np.ndarray) -> bool:
 
 
 @kernel
-def _accumulate(start, stop, planes, plain, row, choices, tangents, fields, border, sums):
-    """Products (B, T + 1, T + 1) of tangents and, last, residuals in bands [start, stop); the lower triangles."""
+def _accumulate(start, stop, planes, plain, row, choices, tangents, fields, border, fine, sums):
+    """Products (B, T + 1, T + 1) of tangents and, last, residuals in bands [start, stop); the lower triangles.
+
+    Of rows of pixels that are means of `fine` rows and columns of cells.
+    """
     positions, rgba, fronts, scale, peak, gamma = plain
     t_positions, t_rgba = tangents
     target, layers, many = fields[0], len(fronts), len(t_positions)
@@ -124,24 +141,29 @@ def _accumulate(start, stop, planes, plain, row, choices, tangents, fields, bord
     products = np.empty((many + 1, channels * PITCH), positions.dtype)
     changes = np.empty((many, 3, 5), positions.dtype)
     loaded, least = np.empty(3, np.int64), FLAT if t_rgba.shape[1] > 0 else BUSY
+    mean, mean_change = (value, change) if fine == 1 else (np.empty_like(value), np.empty_like(change))
+    tiles = (width + TILE // fine - 1) // (TILE // fine)
     for band in range(start, stop):
         top, bottom = band * BAND, min(height, (band + 1) * BAND)
-        for t in range((width + TILE - 1) // TILE):
-            left, count = tile(width, t)
+        for t in range(tiles):
+            # Columns of pixels, and of cells.
+            own, pixels = width * t // tiles, width * (t + 1) // tiles - width * t // tiles
+            left, count = own * fine, pixels * fine
             loaded[:] = -9
-            for y in range(top, bottom):
+            changing = False
+            for y in range(top * fine, bottom * fine):
                 at = y + border, left + border
-                changing = busy(choices.states, *at, count, least) or busy(choices.mixed, *at, count, 1)
-                if changing:
+                moving_row = busy(choices.states, *at, count, least) or busy(choices.mixed, *at, count, 1)
+                if moving_row:
                     given = y + border, left + border - 1, count + 2
                     first = load_around(sources, loaded, positions, rgba, fronts, *given, scale, peak, gamma)
                     for v in range(first, y + border + 2):
                         for k in range(layers):
                             s = slot(sources, k, v, SOURCE)
                             for n in range(many):
-                                to, own = slot(moving[n], k, v, TANGENT), (t_positions[n], t_rgba[n])
+                                to, tangent = slot(moving[n], k, v, TANGENT), (t_positions[n], t_rgba[n])
                                 at = left + border - 1, count + 2
-                                load_tangent(to, s, *own, fronts, k, v, *at, slope, planes)
+                                load_tangent(to, s, *tangent, fronts, k, v, *at, slope, planes)
                     normalised_sums(value, sources, layers, y + border, count)
                     for n in range(many):
                         to = change[n]
@@ -156,7 +178,29 @@ def _accumulate(start, stop, planes, plain, row, choices, tangents, fields, bord
                     _mix(change, value, plain, row, choices, tangents, border, y, left, count, changes)
                 else:
                     fill(value, rgba, row[0, y + border, border:], choices.states[y + border, border:], left, count)
-                _multiply(sums[band], products, change, value, fields, y, left, count, changing)
+                if fine > 1:
+                    if y % fine == 0:
+                        mean[:] = kind(0)
+                        mean_change[:] = kind(0)
+                        changing = False
+                    _add_means(mean, value, fine, pixels)
+                    for n in range(many if moving_row else 0):
+                        _add_means(mean_change[n], change[n], fine, pixels)
+                changing = moving_row or (fine > 1 and changing)
+                if (y + 1) % fine == 0:
+                    _multiply(sums[band], products, mean_change, mean, fields, y // fine, own, pixels, changing)
+
+
+@compiled
+def _add_means(to, row, fine, count):
+    """Add what a row of cells has to the means of the pixels in it."""
+    share = to.dtype.type(1 / fine**2)
+    for c in range(4):
+        for j in range(count):
+            total, at = to.dtype.type(0), c * PITCH + j * fine
+            for i in range(fine):
+                total += row[at + i]
+            to[c * PITCH + j] += share * total
 
 
 @compiled

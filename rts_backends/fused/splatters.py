@@ -22,6 +22,7 @@ class _Fused(splatting.Kernel):
     """Base that makes `image` by compiled kernels; it stands before a class of `rts.splatting`, which it extends."""
 
     kind: ClassVar[str]
+    averages = True
 
     def image(self, splats: Splats) -> Array:
         """See `rts.splatting.Kernel`."""

@@ -1,0 +1,140 @@
+"""Whether a function depends on the parameters at all, and which directions of them it does not determine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from rts.engines import Engine, engine_of, is_constant
+from rts.errors import InputError
+from rts.fitting.names import listed
+from rts.trees import Array, Tree, leaves
+
+UNSEEN = 0.02
+"""Numbers below this share of a direction's largest are left out where it is told."""
+SHORT = 4
+"""Arrays of at most so many numbers are told as a vector."""
+
+NO_WAY = "no derivative leads from the one to the other"
+
+
+def differentiable(parameters: Tree, purpose: str = "") -> Engine:
+    """The engine of parameters that have derivatives.
+
+    Args:
+        parameters: what a user gave.
+        purpose: what an error adds to what it expects.
+
+    Raises:
+        InputError: no arrays that have derivatives.
+        EngineError: arrays of two engines, or of none.
+    """
+    try:
+        found = list(leaves(parameters))
+    except TypeError:  # Keys of several kinds have no order.
+        raise InputError("parameters has keys that cannot be sorted; expected names") from None
+    if not found or any(is_constant(x) for x in found):
+        raise InputError(f"parameters holds NumPy arrays, numbers or nothing; expected torch or jax arrays{purpose}")
+    engine = engine_of(parameters)
+    for x in found:
+        if not engine.namespace.isdtype(x.dtype, "real floating"):
+            raise InputError(f"parameters holds an array of dtype {x.dtype}; expected a floating one{purpose}")
+    if all(0 in x.shape for x in found):
+        raise InputError(f"parameters holds no number, only empty arrays; expected at least one{purpose}")
+    return engine
+
+
+def refuse_independent(residuals: Callable, loss: Callable | None, parameters: Tree, engine: Engine) -> None:
+    """Refuse functions whose results no derivative connects to the parameters; for those whose gradient is zero.
+
+    A result is connected where the engine marks it as it marks the parameters: in torch by the graph, in jax by being
+    traced. A gradient may be zero though all is connected, such as where nothing is in view.
+
+    Raises:
+        InputError: the residuals do not depend on the parameters, or the loss not on the residuals.
+    """
+    marks: dict[str, bool] = {}
+
+    def probe(p: Tree) -> Array:
+        given = next(x for x in leaves(p) if 0 not in x.shape)
+        marks["parameters"] = _marked(given, engine)
+        found = residuals(p)
+        marks["residuals"] = _marked(found, engine)
+        marks["loss"] = loss is None or _marked(loss(found), engine)
+        return engine.namespace.sum(given)
+
+    engine.value_and_grad(probe)(parameters)
+    if not marks["parameters"]:
+        return  # An engine that marks nothing: nobody can tell.
+    for what, of in (("residuals", "parameters"), ("loss", "residuals")):
+        if not marks[what]:
+            raise InputError(
+                f"{what} {'do' if what == 'residuals' else 'does'} not depend on the {of}: {NO_WAY}; compute with "
+                f"the {of} that the function is given, without detach, no_grad, stop_gradient, rounding or NumPy"
+            )
+
+
+def _marked(x: Array, engine: Engine) -> bool:
+    return bool(getattr(x, "requires_grad", False)) or engine.traced(x)
+
+
+def directions_in_words(basis: np.ndarray, units: np.ndarray, names: Sequence[str], shapes: Sequence[tuple]) -> str:
+    """Directions of the parameters, told by names and numbers.
+
+    Args:
+        basis: (U, k), linearly independent columns that span the directions, in numbers of the parameters.
+        units: (U,), what makes changes of different arrays comparable; positive.
+        names: of the arrays.
+        shapes: of the arrays.
+
+    Returns:
+        Such as "light.direction along (0.32, 0.53, 0.78), gain"; at most a few.
+    """
+    from scipy.linalg import qr
+
+    columns = basis * units[:, None]
+    # As many zeros as there are: one entry of each direction is 1 there, and 0 in the others.
+    pivots: Any = qr(columns.T, mode="economic", pivoting=True)[-1]
+    pivots = pivots[: columns.shape[1]]
+    columns = columns @ np.linalg.inv(columns[pivots])
+    columns[np.abs(columns) < UNSEEN * np.abs(columns).max(axis=0)] = 0
+    columns = columns / units[:, None]
+    columns /= np.linalg.norm(columns, axis=0)
+    starts = np.cumsum([0, *(int(np.prod(s)) for s in shapes)])
+    whole, found = [], []
+    single = (columns != 0).sum(axis=0) == 1
+    alone = (columns[:, single] != 0).any(axis=1)
+    for name, first, stop in zip(names, starts, starts[1:], strict=False):
+        if alone[first:stop].all() and stop > first:
+            whole.append((first, name))
+            alone[first:stop] = False
+    found += whole
+    for column in columns.T[[not s or bool(alone[c != 0].any()) for s, c in zip(single, columns.T, strict=True)]]:
+        column = column * np.sign(column[np.argmax(np.abs(column))])
+        terms = []
+        for name, shape, first, stop in zip(names, shapes, starts, starts[1:], strict=False):
+            terms += _terms(name, shape, column[first:stop])
+        found.append((int(np.flatnonzero(column)[0]), " with ".join([*terms[:3], *(["others"] if terms[3:] else [])])))
+    return listed([text for _, text in sorted(found)])
+
+
+def _terms(name: str, shape: tuple, part: np.ndarray) -> list[str]:
+    """The part of a direction that is in one array."""
+    used = np.flatnonzero(part)
+    if not len(used):
+        return []
+    alone = np.abs(part).max() > 1 - 1e-9
+    if len(used) == 1:
+        place = ", ".join(map(str, np.unravel_index(used[0], shape)))
+        entry = f"{name}[{place}]" if shape else name
+        return [entry if alone else f"{entry} ({_number(part[used[0]])})"]
+    if part.size <= SHORT:
+        return [f"{name} along ({', '.join(map(_number, part))})"]
+    largest = sorted(used, key=lambda i: -abs(part[i]))
+    return [_terms(name, shape, np.where(np.arange(part.size) == i, part, 0))[0] for i in largest]
+
+
+def _number(x: Any) -> str:
+    return f"{x:.2g}" if abs(x) < 0.01 and x else f"{x:.2f}"
