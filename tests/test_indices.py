@@ -247,3 +247,23 @@ def test_samples_made_by_hand_are_looked_at(wrong, splatter, target):
     part = part.replace(theta=arrays(target, dict(part.theta)))
     with refused("refers? to"):
         rts.render_samples(sampled, part, CAMERA, splatter=splatter)
+
+
+@pytest.mark.parametrize("name", ["raster", "reference", "embree", "opengl"])
+@pytest.mark.parametrize("wrong", [4, -1, 10**8])
+def test_corners_that_are_not_there_are_refused_of_proxies_that_count_as_cheap(wrong, name):
+    class Careless(MESH):
+        def proxy(self, inputs, camera, size):
+            proxy = super().proxy(inputs, camera, size)
+            faces = proxy.faces.copy()
+            faces[1, 2] = wrong
+            return proxy._replace(faces=faces)
+
+    part = card(0.0)
+    part = part.replace(surface=Careless(part.surface.faces))
+    try:
+        rts.render(card(0.0), CAMERA, SIZE, sampler=name)
+    except rts.PluginError as error:
+        pytest.skip(str(error))
+    with refused("has faces from .* but 4 vertices"):
+        rts.render(part, CAMERA, SIZE, sampler=name)
