@@ -6,7 +6,7 @@ from helpers import DIFFERENTIABLE, arrays, box, derivative, finite_difference, 
 from scipy.spatial.transform import Rotation
 
 import rts
-from rts.errors import EngineError, InputError, PluginError
+from rts.errors import InputError, PluginError
 from rts.fitting.least_squares import _Linear, _Model
 
 pytestmark = pytest.mark.fitting
@@ -441,8 +441,15 @@ def test_parameters_that_cannot_be_optimised(target):
             rts.fit(lambda p: p, wrong)
     with pytest.raises(InputError, match="dtype .*int"):
         rts.fit(lambda p: p, {"a": arrays(target, np.ones(3, np.int32))})
-    with pytest.raises(EngineError, match="belongs to no engine"):
-        rts.fit(lambda p: p, "pose")
+    for wrong, kind in (
+        ("pose", "a str"),
+        ({1, 2}, "a set"),
+        (object(), "a object"),
+        ([b"x"], "a bytes"),
+        (1j, "a comp"),
+    ):
+        with pytest.raises(InputError, match=f"parameters holds {kind}.*; expected torch or jax arrays to optimise"):
+            rts.fit(lambda p: p, wrong)
 
 
 def test_the_progress_bar(capsys):

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from rts.arrays import kind_of
 from rts.engines import Engine, engine_of, is_constant
-from rts.errors import InputError
+from rts.errors import EngineError, InputError
 from rts.fitting.names import listed
 from rts.trees import Array, Tree, leaves
 
@@ -29,12 +30,17 @@ def differentiable(parameters: Tree, purpose: str = "") -> Engine:
 
     Raises:
         InputError: no arrays that have derivatives.
-        EngineError: arrays of two engines, or of none.
+        EngineError: arrays of two engines.
     """
     try:
         found = list(leaves(parameters))
     except TypeError:  # Keys of several kinds have no order.
         raise InputError("parameters has keys that cannot be sorted; expected names") from None
+    for x in found:
+        try:
+            engine_of(x)
+        except EngineError:
+            raise InputError(f"parameters holds {kind_of(x)}; expected torch or jax arrays{purpose}") from None
     if not found or any(is_constant(x) for x in found):
         raise InputError(f"parameters holds NumPy arrays, numbers or nothing; expected torch or jax arrays{purpose}")
     engine = engine_of(parameters)

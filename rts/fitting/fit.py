@@ -100,7 +100,7 @@ def fit(
     Raises:
         InputError: an argument of the wrong kind, residuals that do not depend on the parameters, or a loss or
             derivative that is not finite at the start.
-        EngineError: parameters of two engines, or of none.
+        EngineError: parameters of two engines, or of another than the arrays that `residuals` holds.
     """
     known = _check_functions(residuals, loss, callback)
     _check_method(method, loss, steps, learning_rate)
