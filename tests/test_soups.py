@@ -19,7 +19,7 @@ pytestmark = pytest.mark.sampling
 
 pytest.importorskip("numba")
 
-FIRST, LAST = map(int, ("0:" + os.environ.get("RTS_SOUPS", "240")).split(":")[-2:])
+FIRST, LAST = map(int, ("0:" + os.environ.get("RTS_SOUPS", "180")).split(":")[-2:])
 STEP = 30
 groups = pytest.mark.parametrize("first", range(FIRST, LAST, STEP))
 MESH = rts.plugin("rts.surfaces", "mesh")
@@ -58,17 +58,19 @@ def test_samplers_find_what_the_reference_finds(name, first):
         if said:
             wrong[number] = said
     assert not wrong
-    assert seen > 10 * STEP or LAST - first < STEP
+    assert seen > 3 * STEP or LAST - first < STEP
 
 
 @groups
 def test_hardware_finds_what_the_reference_finds_but_for_outlines(first):
     wrong = {}
-    for number in list(numbers(first))[::3]:
+    for number in list(numbers(first))[:: 3 if LAST < 1000 else 1]:
         soup = soup_of(number, 1e2)
         known, count = hits_of(soup), len(soup.faces)
         found, every = rasterize("opengl", soup, count), rasterize("reference", soup, count)
-        rough = known.open | (known.outline < 1)
+        # Corners are snapped to fractions of a pixel, and planes cut in float32.
+        planes = [np.abs(known.depth - z) <= 1e-4 * abs(z) for z in soup.camera.depth_range()]
+        rough = known.open | (known.outline < 1) | planes[0] | planes[1]
         said = differences(soup, found, every, known, known.open)
         said = [x for x in said if "missing" not in x]
         said += [x for x in differences(soup, found, every, known, rough) if "missing" in x]
@@ -83,37 +85,43 @@ def colored(soup, number, vertices=None):
     return rts.Part(MESH(soup.faces), theta, "unlit", cull=soup.cull)
 
 
+def rendered(soup, number, needed, splatter, dtype):
+    """The image of what a splatter needs, or of all samples, and a gradient of the vertices, by torch."""
+    torch = pytest.importorskip("torch")
+    vertices = torch.tensor(soup.vertices, dtype=getattr(torch, dtype), requires_grad=True)
+    along = torch.tensor(np.random.default_rng(number).normal(size=(*soup.size, 4)), dtype=vertices.dtype)
+    part = colored(soup, number, vertices)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", rts.EmptyImageWarning)
+        sampled = sample(part, soup.camera, soup.size, sampler="raster", splatter=needed, layers=soup.layers)
+        image = rts.render_samples(sampled, part, soup.camera, splatter=splatter)
+    return to_numpy(image), to_numpy(torch.autograd.grad((image * along).sum(), vertices)[0])
+
+
 @groups
 @pytest.mark.parametrize("name", ["multi", "visible"])
 def test_images_are_finite_and_those_of_the_specification_pruned_or_not(name, first):
-    torch = pytest.importorskip("torch")
     wrong, seen = {}, 0
     specification = {"multi": splatting.Multi, "visible": splatting.Visible}[name]()
     for number in numbers(first):
-        soup = soup_of(number)
-        images, gradients = [], []
-        along = torch.tensor(np.random.default_rng(number).normal(size=(*soup.size, 4)), dtype=torch.float32)
-        for needed, splatter in ((None, specification), (None, name), (name, name)):
-            vertices = torch.tensor(soup.vertices, requires_grad=True)
-            part = colored(soup, number, vertices)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", rts.errors.EmptyImageWarning)
-                sampled = sample(part, soup.camera, soup.size, sampler="raster", splatter=needed, layers=soup.layers)
-                image = rts.render_samples(sampled, part, soup.camera, splatter=splatter)
-            gradients.append(to_numpy(torch.autograd.grad((image * along).sum(), vertices)[0]))
-            images.append(to_numpy(image))
-        seen += (images[0] > 0).sum()
-        size = max(1e-30, np.abs(gradients[1]).max(initial=0))
-        said = []
-        if not all(np.isfinite(x).all() for x in (*images, *gradients)):
+        soup, said = soup_of(number), []
+        specified, image, pruned = (
+            rendered(soup, number, *how, "float32") for how in ((None, specification), (None, name), (name, name))
+        )
+        # Gradients are compared in float64, since what is dropped adds zeros in another order.
+        exact = [rendered(soup, number, needed, name, "float64") for needed in (None, name)]
+        if not all(np.isfinite(x).all() for pair in (specified, image, pruned, *exact) for x in pair):
             said.append("not finite")
-        elif np.abs(images[1] - images[0]).max() > 1e-5:
-            said.append(f"off the specification by {np.abs(images[1] - images[0]).max():.2g}")
-        elif np.abs(images[2] - images[1]).max() > 1e-6:
-            said.append(f"pruned off by {np.abs(images[2] - images[1]).max():.2g}")
-        elif np.abs(gradients[2] - gradients[1]).max() > 1e-5 * size:  # Sums in float32.
-            said.append(f"pruned gradients off by {np.abs(gradients[2] - gradients[1]).max() / size:.2g}")
+        for what, found, expected, limit in (
+            ("specification", image[0], specified[0], 1e-5),
+            ("pruned", pruned[0], image[0], 1e-6),
+            ("pruned, float64", exact[1][0], exact[0][0], 1e-6),
+            ("gradients of what is pruned", exact[1][1], exact[0][1], 1e-6 * np.abs(exact[0][1]).max(initial=0)),
+        ):
+            if not np.abs(found - expected).max() <= limit:
+                said.append(f"{what}: off by {np.abs(found - expected).max():.2g}")
+        seen += (image[0] > 0).sum()
         if said:
             wrong[number] = said
     assert not wrong
-    assert seen > 10 * STEP or LAST - first < STEP
+    assert seen > 3 * STEP or LAST - first < STEP
