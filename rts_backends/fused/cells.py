@@ -71,7 +71,7 @@ class Cells:
         settings: the splatter, as numbers.
         positions: (N, 3) float32 or float64, pixel position and linear depth.
         rgba: (N, 4), of the same dtype, premultiplied colours.
-        row: (K, H, W) signed integers, the sample of each cell, negative where there is none.
+        row: (K, H, W) signed integers, the sample of each cell, or −1.
         choices: the choices for the same samples, if they are known.
 
     Raises:
