@@ -146,8 +146,8 @@ def test_the_default_light_is_fixed_to_the_camera():
 
 def test_blinn_phong_is_brightest_where_the_normal_halves_light_and_view():
     lit = {
-        "light": light(60, 0.0, (1, 1, 1)),
-        "color": (0, 0, 0),
+        "light": light(60, 0.0, (1.0, 1.0, 1.0)),
+        "color": (0.0, 0.0, 0.0),
         "specular": (0.9, 0.5, 0.1),
         "shininess": 20.0,
     }

@@ -144,7 +144,7 @@ def test_samples_of_another_mesh_are_one_clear_error():
     rows, weights = corners()
     with pytest.raises(rts.InputError, match="refer to row 5 of 3 rows; sample this surface anew"):
         interpolate(rows[:3], torch.full((7, 5), 5), COLUMN, weights)
-    with pytest.raises(rts.InputError, match="row -1 of an array of 6"):
+    with pytest.raises(rts.InputError, match="row -1 of 6 rows"):
         interpolate(rows, torch.full((7, 5), -1), COLUMN, weights)
     with pytest.raises(rts.InputError, match=r"ids of shape \(7, 3\).*expected \(N, 5\)"):
         interpolate(rows, torch.zeros((7, 3), dtype=torch.int32), COLUMN, weights)

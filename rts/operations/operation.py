@@ -21,12 +21,7 @@ def known_value(x: Array) -> np.ndarray | None:
     """The value of an array in the memory of the host; None where it is elsewhere, or not known while Python runs."""
     if type(x) is np.ndarray:
         return x
-    if not engine_of(x).on_host(x):
-        return None
-    try:
-        return value_of(x)
-    except RuntimeError:  # Inside some of its transforms torch gives no value.
-        return None
+    return value_of(x) if engine_of(x).on_host(x) else None
 
 
 Arrays = Sequence[np.ndarray]

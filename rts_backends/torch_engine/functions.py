@@ -47,8 +47,11 @@ def tangent_alike(x: Tensor) -> Tensor:
     Products and quotients of a scalar tensor in float32 and a number of Python's have tangents in float64, which
     products of matrices refuse.
     """
-    tangent = forward_ad.unpack_dual(x).tangent
-    if tangent is None or tangent.dtype == x.dtype:
+    try:
+        tangent = forward_ad.unpack_dual(x).tangent
+    except RuntimeError:  # Batches within forward mode: torch has no rule to unpack them.
+        tangent = torch.zeros((), dtype=torch.float64)
+    if not x.is_floating_point() or tangent is None or tangent.dtype == x.dtype:
         return x
     return x.to(torch.float64).to(x.dtype)  # One cast alone, to the dtype it has, would be skipped.
 
