@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -76,7 +75,11 @@ class Camera:
 
     def replace(self, **changes: Any) -> Camera:
         """A copy with some fields changed."""
-        return replace(self, **changes)
+        if not changes.keys() <= self.__dict__.keys():
+            raise TypeError(f"a camera has the fields {', '.join(self.__dict__)}, not {', '.join(changes)}")
+        made = object.__new__(Camera)  # Nothing is left to check, and cameras are copied often.
+        made.__dict__.update({**self.__dict__, **changes})
+        return made
 
     # ---------------------------------------------------------------------------------------- constructors
 
@@ -433,7 +436,7 @@ class Camera:
         height, width = check_pixels(size)
         aspect = width / height
         columns = engine_of(self.projection).constant(np.array([1 / aspect, 1, 1, 1]), self.projection)
-        return Camera(self.view, self.projection * columns, aspect)
+        return self.replace(projection=self.projection * columns, aspect=aspect)
 
     def map(self, f: Callable[[Array], Array]) -> Camera:
         """A copy with `f` applied to both matrices."""

@@ -53,8 +53,8 @@ def _check_camera(camera: Camera) -> Camera:
     view, projection = (check_matrix(f"the camera's {n}", getattr(camera, n)) for n in ("view", "projection"))
     if view is not camera.view or projection is not camera.projection:
         camera = camera.replace(view=view, projection=projection)
-    known = value_of(projection[3, 2])
-    return camera.turned() if known is not None and (known > 0).all() else camera
+    known = projection[3, 2] if isinstance(projection, np.ndarray) else value_of(projection[3, 2])
+    return camera.turned() if known is not None and np.all(known > 0) else camera
 
 
 def _check_part(index: int, part: Part) -> CheckedPart:
