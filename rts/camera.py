@@ -556,6 +556,10 @@ class Camera:
         directions = xp.stack([affine(linear[i, :], step) for i in range(3)], axis=-1)
         return Rays(origins, directions, self._spread(inverse, (height, width)))
 
+    def spread(self, size: tuple[int, int]) -> Array:
+        """The `spread` (2,) of `Rays`: a pixel at depth z is `spread[0] + spread[1] * z` wide, world units."""
+        return self.for_size(size)._spread(namespace(self.view).linalg.inv(self.view), size)
+
     def _spread(self, inverse: Array, size: tuple[int, int]) -> Array:
         """The `spread` (2,) of `Rays`; `inverse` is the inverse of the view."""
         xp, (inverse, p) = promote(inverse, self.projection)

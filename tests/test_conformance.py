@@ -33,7 +33,7 @@ pytestmark = pytest.mark.plugins
 
 Raster = rts.plugin("samplers", "raster")
 RASTER = Raster()
-Mesh = rts.plugin("surfaces", "mesh")
+Mesh, Bezier, BSpline = (rts.plugin("surfaces", name) for name in ("mesh", "bezier", "bspline"))
 
 
 class CheckedEllipsoid(Ellipsoid):
@@ -58,6 +58,18 @@ class TestMesh(SurfaceConformance):
     @pytest.fixture
     def part(self):
         return Mesh.example()
+
+
+class TestBezier(SurfaceConformance):
+    @pytest.fixture
+    def part(self):
+        return Bezier.example()
+
+
+class TestBSpline(SurfaceConformance):
+    @pytest.fixture
+    def part(self):
+        return BSpline.example()
 
 
 class TestEllipsoid(SurfaceConformance):

@@ -1,0 +1,119 @@
+"""Uniform bicubic B-spline surfaces on a grid of control points."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.arguments import quoted
+from rts.checks import is_count
+from rts.engines import engine_of, namespace
+from rts.errors import InputError
+from rts.interfaces import Part
+from rts.operations.linear import matmul
+from rts.topology import fixed
+from rts.trees import Array
+from rts_surfaces.parametric import TOLERANCE, Patches
+
+ENDS = ("open", "clamped", "periodic")
+
+
+class BSpline(Patches):
+    """A uniform bicubic B-spline surface.
+
+    θ["points"] (nu, nv, 3) are the control points. "colors" (nu, nv, 1, 3 or 4) and "uv" (nu, nv, 2) are attributes of
+    control points, interpolated as they are. The normal is that of the derivatives along u and v, in this order.
+
+    Args:
+        shape: (nu, nv), the numbers of control points, at least 4 in each direction.
+        ends: "open", "clamped" or "periodic", or one for each direction. A spline that is open ends between its control
+            points, one that is clamped ends in its first and last, one that is periodic is closed.
+        tolerance: pixels that triangles may be off the surface near outlines.
+
+    Raises:
+        InputError: fewer than 4 control points, other ends, or a tolerance that is not positive.
+    """
+
+    def __init__(self, shape: tuple[int, int], ends: str | tuple[str, str] = "clamped", tolerance: float = TOLERANCE):
+        if not (isinstance(shape, (tuple, list)) and len(shape) == 2 and all(map(is_count, shape)) and min(shape) >= 4):
+            raise InputError(f"shape is {quoted(shape)}; expected (nu, nv), two integers of at least 4")
+        both = (ends, ends) if isinstance(ends, str) else ends
+        if not (
+            isinstance(both, (tuple, list)) and len(both) == 2 and all(e in ENDS for e in both if isinstance(e, str))
+        ):
+            raise InputError(f"ends is {quoted(ends)}; expected one of {', '.join(ENDS)}, or two of them")
+        self.shape, self.ends = (int(shape[0]), int(shape[1])), (both[0], both[1])
+        self._along = [fixed(extraction(n, end)) for n, end in zip(self.shape, self.ends, strict=True)]
+        (mu, mv), steps = (len(m) for m in self._along), np.arange(4)
+        spans = [n if end == "periodic" else n - 3 for n, end in zip(self.shape, self.ends, strict=True)]
+        rows, columns = (3 * np.arange(s)[:, None] + steps for s in spans)
+        table = (rows % mu)[:, None, :, None] * mv + (columns % mv)[None, :, None, :]
+        super().__init__(table.reshape(-1, 16), tolerance)
+
+    def __repr__(self) -> str:
+        return f"BSpline({self.shape[0]} x {self.shape[1]} points, {' and '.join(dict.fromkeys(self.ends))})"
+
+    @classmethod
+    def example(cls) -> Part:
+        """A vase: clamped along its height, periodic around it."""
+        radii, heights = np.array([0.5, 0.9, 0.8, 0.3, 0.45, 0.75]), np.linspace(-1, 1, 6)
+        angle = 2 * np.pi * np.arange(8) / 8
+        around = np.stack([np.cos(angle), 0 * angle, -np.sin(angle)], axis=-1)
+        points = radii[:, None, None] * around + heights[:, None, None] * np.array([0, 1, 0])
+        points = points[::-1].astype(np.float32)
+        colors = 0.5 + 0.4 * np.sin(2 * points + [0, 1, 2])
+        return Part(
+            cls((6, 8), ("clamped", "periodic")), {"points": points, "colors": colors.astype(np.float32)}, "lambert"
+        )
+
+    def bezier_rows(self, values: Array) -> Array:
+        """Those of all patches, by knot insertion: sums of control points with weights of at least zero."""
+        xp, engine = namespace(values), engine_of(values)
+        a, b = (engine.constant(m, values) for m in self._along)
+        (nu, nv, width), (mu, mv) = values.shape, (len(m) for m in self._along)
+        rows = xp.reshape(matmul(a, xp.reshape(values, (nu, nv * width))), (mu, nv, width))
+        rows = xp.reshape(xp.permute_dims(rows, (1, 0, 2)), (nv, mu * width))
+        rows = xp.reshape(matmul(b, rows), (mv, mu, width))
+        return xp.reshape(xp.permute_dims(rows, (1, 0, 2)), (mu * mv, width))
+
+    def control_shape(self, shape: tuple[int, ...]) -> str | None:
+        """One row for each control point of the grid."""
+        return None if shape == self.shape else f"({self.shape[0]}, {self.shape[1]}, C)"
+
+
+def extraction(count: int, ends: str) -> np.ndarray:
+    """(M, count) weights that make the control points of the cubic Bézier pieces of a uniform cubic B-spline.
+
+    Pieces share their ends: M is three times their number, and one more unless periodic.
+
+    Args:
+        count: the number of control points.
+        ends: "open", "clamped" or "periodic".
+    """
+    if ends == "periodic":
+        rows = np.zeros((3 * count, count))
+        for k in range(count):
+            a, b, c = k, (k + 1) % count, (k + 2) % count
+            for row, weights in ((3 * k, (1, 4, 1)), (3 * k + 1, (0, 4, 2)), (3 * k + 2, (0, 2, 4))):
+                np.add.at(rows[row], [a, b, c], np.array(weights) / 6)
+        return rows
+    spans = count - 3
+    knots = np.arange(-3.0, spans + 4)
+    if ends == "clamped":
+        knots = knots.clip(0, spans)
+    rows = np.empty((3 * spans + 1, count))
+    for k in range(spans):
+        for i in range(4):
+            rows[3 * k + i] = _blossom(knots, k, [k] * (3 - i) + [k + 1] * i, count)
+    return rows
+
+
+def _blossom(knots: np.ndarray, span: int, arguments: list[int], count: int) -> np.ndarray:
+    """The weights (count,) of control points in the polar form of one piece, by de Boor's recursion."""
+    points = np.zeros((4, count))
+    points[np.arange(4), span + np.arange(4)] = 1
+    for level, t in enumerate(arguments, start=1):
+        for i in range(4 - level):
+            low, high = knots[span + i + level], knots[span + i + 4]
+            w = (t - low) / (high - low)
+            points[i] = (1 - w) * points[i] + w * points[i + 1]
+    return points[0]

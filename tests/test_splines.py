@@ -1,0 +1,349 @@
+"""Bézier and B-spline surfaces: against closed forms and an independent library, their triangles, their samples."""
+
+import numpy as np
+import pytest
+from helpers import DIFFERENTIABLE, arrays, to_numpy
+
+import rts
+from rts import Camera, InputError, Part, Samples
+
+pytestmark = pytest.mark.sampling
+
+Bezier, BSpline = (rts.plugin("surfaces", name) for name in ("bezier", "bspline"))
+SIZE = (60, 80)
+CAMERA = Camera.look_at((1.5, 1.8, 3.0), (0, 0, 0), fov_y=40)
+PATCH = np.arange(16)[None]
+
+
+def at(surface, points, patch, params):
+    """The G-buffer at parameters (N, 2) of patches (N,), in float64."""
+    none = np.full((1, 1, 1), -1, np.int32)
+    ids = np.asarray(patch, np.int32).reshape(-1, 1)
+    samples = Samples(ids, np.asarray(params, np.float64), none, np.zeros((1, 1, 1), np.float32), np.int32(0))
+    return surface.evaluate({"points": np.asarray(points, np.float64)}, samples)
+
+
+def derivatives(surface, points, patch, params):
+    """Points and derivatives along u and v, (N, 3, 3), as Newton's method has them."""
+    from rts_surfaces import parametric_kernels
+
+    out = np.empty((len(params), 3, 3))
+    parametric_kernels.points(0, len(params), surface.nets(points), np.asarray(patch, np.int64), params, out)
+    return out
+
+
+def grid(nu, nv, seed=0):
+    rng = np.random.default_rng(seed)
+    place = np.stack(np.meshgrid(np.linspace(-1, 1, nu), np.linspace(-1, 1, nv), indexing="ij"), axis=-1)
+    return np.concatenate([place, 0.2 * rng.normal(size=(nu, nv, 1))], axis=-1)
+
+
+def cubic(f, count=4):
+    """Bézier points (16, 3) of the graph of a polynomial of degree 3 at most in each of x, y over [0, 1]²."""
+    t = np.linspace(0, 1, count)
+    basis = np.stack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t * t * (1 - t), t**3], axis=-1)
+    x, y = np.meshgrid(t, t, indexing="ij")
+    values = np.stack([x, y, f(x, y)], axis=-1)
+    back = np.linalg.inv(basis)
+    return np.einsum("ai,bj,ijc->abc", back, back, values).reshape(16, 3)
+
+
+def paraboloid(x, y):
+    return x * x - 0.7 * y * y + 0.4 * x * y
+
+
+# ----------------------------------------------------------------------------------- against another library
+
+
+@pytest.mark.parametrize("shape", [(4, 4), (5, 8), (9, 6)])
+@pytest.mark.parametrize("ends", ["open", "clamped"])
+def test_points_and_derivatives_of_b_splines_are_those_of_geomdl(shape, ends):
+    geomdl = pytest.importorskip("geomdl.BSpline")
+    points, surface = grid(*shape), BSpline(shape, ends)
+    other = geomdl.Surface(normalize_kv=False)
+    other.degree_u = other.degree_v = 3
+    other.set_ctrlpts(points.reshape(-1, 3).tolist(), *shape)
+    spans = [n - 3 for n in shape]
+    knots = [np.arange(-3.0, s + 4) for s in spans]
+    if ends == "clamped":
+        knots = [k.clip(0, s) for k, s in zip(knots, spans, strict=True)]
+    other.knotvector_u, other.knotvector_v = (k.tolist() for k in knots)
+    rng = np.random.default_rng(1)
+    params = np.concatenate([rng.random((40, 2)), [(0.0, 0.0), (0.25, 0.5)]])
+    place = np.stack([rng.integers(0, s, len(params)) for s in spans], axis=-1)
+    patch = place[:, 0] * spans[1] + place[:, 1]
+    expected = np.array([other.derivatives(*(p + i), order=1) for p, i in zip(params, place, strict=True)], object)
+    expected = np.array([[d[0][0], d[1][0], d[0][1]] for d in expected], np.float64)
+    np.testing.assert_allclose(at(surface, points, patch, params)["position"], expected[:, 0], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(derivatives(surface, points, patch, params), expected, rtol=0, atol=1e-12)
+
+
+def test_points_and_derivatives_of_bezier_patches_are_those_of_geomdl():
+    geomdl = pytest.importorskip("geomdl.BSpline")
+    points = np.random.default_rng(0).normal(size=(16, 3))
+    other = geomdl.Surface()
+    other.degree_u = other.degree_v = 3
+    other.set_ctrlpts(points.tolist(), 4, 4)
+    other.knotvector_u = other.knotvector_v = [0, 0, 0, 0, 1, 1, 1, 1]
+    params = np.random.default_rng(1).random((40, 2))
+    expected = [other.derivatives(*p, order=1) for p in params]
+    expected = np.array([[d[0][0], d[1][0], d[0][1]] for d in expected])
+    zeros = np.zeros(40, int)
+    np.testing.assert_allclose(at(Bezier(PATCH), points, zeros, params)["position"], expected[:, 0], atol=1e-12)
+    np.testing.assert_allclose(derivatives(Bezier(PATCH), points, zeros, params), expected, rtol=0, atol=1e-12)
+    normal = np.cross(expected[:, 1], expected[:, 2])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    np.testing.assert_allclose(at(Bezier(PATCH), points, zeros, params)["normal"], normal, atol=1e-10)
+
+
+def test_a_periodic_spline_is_an_open_one_of_points_that_come_again():
+    points = grid(5, 6)
+    again = np.concatenate([points, points[:3]], axis=0)
+    periodic, plain = BSpline((5, 6), ("periodic", "open")), BSpline((8, 6), "open")
+    params = np.random.default_rng(1).random((30, 2))
+    patch = np.random.default_rng(2).integers(0, 15, 30)
+    np.testing.assert_allclose(
+        at(periodic, points, patch, params)["position"], at(plain, again, patch, params)["position"], atol=1e-14
+    )
+
+
+def test_attributes_that_are_affine_in_the_points_are_so_on_the_surface():
+    points, surface = grid(6, 5), BSpline((6, 5), "clamped")
+    theta = {"points": points, "colors": 0.5 + 0.3 * points, "uv": points[..., :2] * 2}
+    samples = rts.sample(Part(surface, theta), CAMERA, SIZE).samples[0]
+    gbuffer = surface.evaluate(theta, samples)
+    np.testing.assert_allclose(gbuffer["color"], 0.5 + 0.3 * gbuffer["position"], atol=1e-12)
+    np.testing.assert_allclose(gbuffer["uv"], 2 * gbuffer["position"][:, :2], atol=1e-12)
+
+
+# -------------------------------------------------------------------------------------------- closed forms
+
+
+@pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
+@pytest.mark.parametrize("camera", [CAMERA, Camera.orthographic((1.5, 1.8, 3.0), (0.4, 0.4, 0), height=2.5)])
+def test_samples_lie_on_the_graph_of_a_polynomial_with_its_normals(camera, target):
+    surface = Bezier(PATCH)
+    theta = {"points": cubic(paraboloid)}
+    samples = rts.sample(Part(surface, theta), camera, SIZE).samples[0]
+    used = np.unique(samples.row[samples.row >= 0])
+    assert len(used) > 300
+    gbuffer = surface.evaluate(arrays(target, theta, np.float64), samples)
+    position, normal = (to_numpy(gbuffer[name])[used].astype(np.float64) for name in ("position", "normal"))
+    x, y, z = position.T
+    atol = 1e-6 if target == "jax" else 1e-12
+    np.testing.assert_allclose(z, paraboloid(x, y), atol=atol)
+    expected = np.stack([-2 * x - 0.4 * y, 1.4 * y - 0.4 * x, np.ones_like(x)], axis=-1)
+    np.testing.assert_allclose(normal, expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=10 * atol)
+
+
+def test_samples_reproject_to_the_centres_of_their_pixels():
+    for part in (Bezier.example(), BSpline.example()):
+        sampled = rts.sample(part, CAMERA, SIZE)
+        position = at_samples(part, sampled.samples[0])
+        cells = np.argwhere(sampled.row >= 0)
+        wide = CAMERA.for_size(SIZE).with_apron(SIZE, 2)
+        pixels = wide.project(position[sampled.row[tuple(cells.T)]], (SIZE[0] + 4, SIZE[1] + 4))
+        off = np.abs(pixels[:, :2] - cells[:, :0:-1] - 0.5).max(axis=1)
+        # float32 for u and v; the compiled splatters ask for 2.5e-4.
+        assert off.max() < 2.5e-4
+        np.testing.assert_allclose(pixels[:, 2], sampled.depth[tuple(cells.T)], rtol=1e-6)
+
+
+def at_samples(part, samples):
+    return part.surface.evaluate({"points": part.theta["points"].astype(np.float64)}, samples)["position"]
+
+
+@pytest.mark.parametrize("side", range(4))
+def test_where_a_side_is_a_point_the_normal_is_the_limit(side):
+    # A dome of revolution about z, nearly: x and y grow with the distance from the side that is a point.
+    t = np.linspace(0, 1, 4)
+    arc = np.array([(1, 0), (1, 0.6), (0.6, 1), (0, 1)])
+    net = np.stack(
+        [np.concatenate([r * arc, np.full((4, 1), z)], axis=1) for r, z in zip(t, (1, 1, 0.8, 0.4), strict=True)]
+    )
+    turned = [net, net[::-1], net.transpose(1, 0, 2), net.transpose(1, 0, 2)[:, ::-1]][side]
+    outward = 1 if side in (0, 3) else -1
+    params = np.array([(d, v) for d in (0.0, 1e-12, 1e-7, 1e-5, 1e-3) for v in (0.0, 0.3, 1.0)])
+    params = [params, params * [-1, 1] + [1, 0], params[:, ::-1], params[:, ::-1] * [1, -1] + [0, 1]][side]
+    found = at(Bezier(PATCH), turned.reshape(16, 3), np.zeros(len(params), int), params)["normal"]
+    assert np.isfinite(found).all()
+    np.testing.assert_allclose(found * outward, np.tile([0.0, 0, 1], (len(params), 1)), atol=5e-3)
+    narrow = Bezier(PATCH).evaluate(
+        {"points": turned.reshape(16, 3).astype(np.float32)},
+        Samples(
+            np.zeros((len(params), 1), np.int32),
+            params.astype(np.float32),
+            np.full((1, 1, 1), -1, np.int32),
+            np.zeros((1, 1, 1), np.float32),
+            np.int32(0),
+        ),
+    )["normal"]
+    np.testing.assert_allclose(narrow, found, atol=5e-3)
+
+
+# ----------------------------------------------------------------------------------------------- triangles
+
+
+def open_edges(faces):
+    """Undirected edges of triangles that are not shared by exactly two, and whether any is run twice the same way."""
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    assert len(np.unique(directed, axis=0)) == len(directed)
+    edges, counts = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
+    return edges[counts != 2]
+
+
+VIEWS = {
+    "all in sight": CAMERA,
+    "near": Camera.look_at((0.9, 0.3, 0.9), (0, 0.3, 0), fov_y=30),
+    "inside": Camera.look_at((0, 0.2, 0), (0.4, 0.3, 0.1), fov_y=70, near=1e-3),
+    "parallel": Camera.orthographic((1.5, 1.8, 3.0), (0, 0, 0), height=3.0),
+    "far": Camera.look_at((100.0, 150.0, 200.0), (0, 0, 0), fov_y=1.0),
+}
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_triangles_meet_without_cracks_whatever_their_rates(view):
+    part = BSpline.example()
+    camera = VIEWS[view].for_size(SIZE)
+    proxy = part.surface.proxy(part.theta["points"], camera, SIZE)
+    # The vase is open at its two ends only.
+    ends = open_edges(proxy.faces)
+    heights = part.theta["points"][[0, -1], 0, 1]
+    assert np.abs(proxy.vertices[ends][..., 1][..., None] - heights).min(axis=-1).max() < 1e-6
+    points = at(part.surface, part.theta["points"], np.repeat(proxy.ids, 3), proxy.corner_params.reshape(-1, 2))
+    np.testing.assert_allclose(proxy.vertices[proxy.faces].reshape(-1, 3), points["position"], atol=1e-6)
+
+
+def test_what_is_out_of_view_is_one_facet_and_what_has_an_outline_is_fine():
+    surface, points = BSpline((16, 16)), grid(16, 16)
+    near = Camera.look_at((-0.8, -0.8, 0.9), (-0.8, -0.8, 0), fov_y=20).for_size(SIZE)
+    counts = np.bincount(surface.proxy(points, near, SIZE).ids[:, 0], minlength=13 * 13).reshape(13, 13)
+    assert (counts[6:, 6:] == 2).all() and counts[:2, :2].min() > 2
+    # From above no normal is across the view; seen flat, some are: there outlines may be.
+    above = Camera.orthographic((0, 0, 9.0), (0, 0, 0), (0, 1, 0), height=3.0).for_size(SIZE)
+    flat = Camera.orthographic((9.0, 0, 1.0), (0, 0, 0), (0, 0, 1), height=3.0).for_size(SIZE)
+    small = grid(16, 16) * [1, 1, 0.1]
+    assert len(surface.proxy(small, flat, SIZE).faces) > 3 * len(surface.proxy(small, above, SIZE).faces)
+
+
+@pytest.mark.parametrize("rate", [0.1, 0.01, 0.001])
+def test_tessellated_triangles_are_off_by_no_more_than_was_asked(rate):
+    part = BSpline.example()
+    vertices, faces = part.surface.tessellate(part.theta, rate)
+    fine, _ = part.surface.tessellate(part.theta, 96)
+    from scipy.spatial import cKDTree
+
+    weights = np.random.default_rng(0).dirichlet((1, 1, 1), 3 * len(faces))
+    places = np.einsum("nk,nkc->nc", weights, vertices[np.tile(faces, (3, 1))])
+    spacing = 0.03  # Of the points that stand for the surface: chords of it are off by far less than this.
+    distance = cKDTree(fine).query(places)[0]
+    assert distance.max() < 1.2 * rate + spacing
+    # Normal to the surface, at the parameters of the point.
+    proxy = part.surface._triangles(
+        part.surface.nets(part.theta["points"]), shapes_of(part), np.full(len(part.surface.table), rate)
+    )
+    params = np.einsum("nk,nkc->nc", weights[: len(proxy.faces)], proxy.corner_params[: len(weights)])
+    places = np.einsum("nk,nkc->nc", weights[: len(proxy.faces)], proxy.vertices[proxy.faces][: len(weights)])
+    there = at(part.surface, part.theta["points"], proxy.ids[: len(params), 0], params)
+    off = np.abs(((places - there["position"]) * there["normal"]).sum(axis=1))
+    assert off.max() < 1.2 * rate
+    assert off.max() > 0.1 * rate
+
+
+def shapes_of(part):
+    from rts_surfaces.parametric import _shapes
+
+    return _shapes(part.surface.nets(part.theta["points"]))
+
+
+def test_a_tessellation_by_rate_has_so_many_cuts():
+    part = Bezier.example()
+    vertices, faces = part.surface.tessellate(part.theta, 5)
+    # Three patches of 25 cells; five triangles at the dome's top have no area.
+    assert faces.shape == (3 * 50 - 5, 3) and vertices.dtype == np.float32
+    with pytest.raises(InputError, match="rate is -1"):
+        part.surface.tessellate(part.theta, -1)
+
+
+def test_images_do_not_depend_on_what_was_rendered_before():
+    part = BSpline.example()
+    views = [Camera.look_at((1.5, 1.8, 3.0 * 1.02**i), (0, 0, 0), fov_y=40) for i in range(40)]
+    sampler = rts.plugin("samplers", "embree")()
+    one_after_the_other = [rts.render(part, view, SIZE, sampler=sampler) for view in views]
+    for i in (0, 13, 39):
+        fresh = rts.render(part, views[i], SIZE, sampler=rts.plugin("samplers", "embree")())
+        np.testing.assert_array_equal(one_after_the_other[i], fresh)
+    keys = {part.surface.proxy_key(part.theta["points"], view.for_size(SIZE), SIZE) for view in views}
+    assert len(keys) < 25  # Views in cells: not one a view.
+
+
+def test_hardly_a_sample_is_lost_at_the_outline():
+    for part in (Bezier.example(), BSpline.example()):
+        fine = part.replace(surface=type(part.surface)(*made_of(part.surface), tolerance=0.005))
+        rows = [rts.sample(p, CAMERA, (120, 160), layers=4).row >= 0 for p in (part, fine)]
+        # At open edges some lie beyond, by less than 2 % of a patch.
+        assert (rows[0] & ~rows[1]).sum() <= 1e-3 * rows[1].sum()
+        assert (rows[1] & ~rows[0]).sum() <= 2e-3 * rows[1].sum()
+
+
+def made_of(surface):
+    return (surface.table,) if isinstance(surface, Bezier) else (surface.shape, surface.ends)
+
+
+def test_the_spread_of_a_camera_is_that_of_its_rays():
+    for camera in VIEWS.values():
+        np.testing.assert_allclose(camera.spread(SIZE), camera.rays(SIZE).spread, rtol=1e-12)
+
+
+# ----------------------------------------------------------------------------------------------- bad input
+
+POINTS = np.random.default_rng(0).normal(size=(16, 3)).astype(np.float32)
+WRONG = {
+    "index out of range": (lambda: show(Bezier(PATCH + 1), points=POINTS), "m of at least 17"),
+    "negative index": (lambda: Bezier(PATCH - 1), "indices holds the index -1"),
+    "fifteen points": (lambda: Bezier(PATCH[:, :15]), r"indices has shape \(1, 15\); expected \(T, 16\)"),
+    "no points": (lambda: show(Bezier(PATCH), vertices=POINTS), "has no 'points'"),
+    "flat points": (lambda: show(Bezier(PATCH), points=POINTS[:, :2]), r"theta\['points'\] .* has shape \(16, 2\)"),
+    "integers": (lambda: show(Bezier(PATCH), points=np.zeros((16, 3), int)), "has dtype int64"),
+    "wide colours": (
+        lambda: show(Bezier(PATCH), points=POINTS, colors=POINTS[:, :2]),
+        r"theta\['colors'\] .*1 or 3 or 4",
+    ),
+    "NaN": (lambda: show(Bezier(PATCH), points=POINTS * [[np.nan]] + POINTS), "16 control points .* NaN or infinite"),
+    "other grid": (lambda: show(BSpline((4, 4)), points=np.zeros((4, 5, 3), np.float32)), r"expected \(4, 4, C\)"),
+    "small grid": (lambda: BSpline((3, 5)), r"shape is \(3, 5\); expected \(nu, nv\), two integers of at least 4"),
+    "fractional grid": (lambda: BSpline((4.5, 5)), "shape is"),
+    "ends": (lambda: BSpline((4, 4), "closed"), "ends is 'closed'; expected one of open, clamped, periodic"),
+    "three ends": (lambda: BSpline((4, 4), ("open",) * 3), "ends is"),
+    "tolerance": (lambda: Bezier(PATCH, tolerance=0.0), "tolerance is 0.0; expected a positive number"),
+}
+
+
+def show(surface, **theta):
+    return rts.render(Part(surface, theta), CAMERA, SIZE)
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_bad_input_is_one_line_that_says_what_was_given(name):
+    call, message = WRONG[name]
+    with pytest.raises(InputError, match=message) as error:
+        call()
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.filterwarnings("ignore::rts.EmptyImageWarning")
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize("name", ["a point", "a line", "a fold"])
+def test_collapsed_patches_give_finite_images_and_gradients(name, target):
+    points = {
+        "a point": np.zeros((16, 3)),
+        "a line": np.repeat(np.linspace(-1, 1, 4)[:, None], 4, axis=0) * [[1.0, 0.5, 0.0]],
+        "a fold": cubic(lambda x, y: 0 * x)[[0, 1, 2, 3, 4, 5, 6, 7, 4, 5, 6, 7, 0, 1, 2, 3]],
+    }[name]
+    engine = rts.engine_of(arrays(target, points))
+
+    def total(p):
+        return rts.render(Part(Bezier(PATCH), {"points": p}, "lambert"), CAMERA, SIZE).sum()
+
+    value, gradient = engine.value_and_grad(total)(arrays(target, points))
+    assert np.isfinite(float(value)) and np.isfinite(to_numpy(gradient)).all()
