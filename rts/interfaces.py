@@ -8,8 +8,9 @@ Shapes use the letters of `rts.records`; conventions of space are in `rts.camera
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
@@ -77,6 +78,18 @@ class Surface(Evaluator):
         draw it.
         """
         return None
+
+    @classmethod
+    def load(cls, path: Path) -> Sequence[Part]:
+        """The parts of a file of a format that is this kind of surface's own; `rts.load(path, surface=…)` calls it.
+
+        Args:
+            path: a file that exists.
+
+        Raises:
+            InputError: there is no such format, or the file is damaged; one line that names it.
+        """
+        raise InputError(f"{cls.__name__} reads no files; expected a surface that does, such as 'mesh' or 'bezier'")
 
 
 class TriangleSurface(Surface):

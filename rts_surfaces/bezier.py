@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rts.errors import InputError
 from rts.interfaces import Part
 from rts.trees import Array
 from rts_surfaces.parametric import TOLERANCE, Patches, check_table
@@ -47,6 +50,33 @@ class Bezier(Patches):
         colors = 0.5 + 0.4 * np.sin(3 * points + [0, 1, 2])
         return Part(cls(indices), {"points": points, "colors": colors.astype(np.float32)}, "lambert")
 
+    @classmethod
+    def load(cls, path: Path) -> list[Part]:
+        """One part: the patches of a text file as Newell's teapot is in, or of an .npz.
+
+        The text has the number of patches, 16 numbers of points for each, from 1 on, separated by commas; then the
+        number of points, and three coordinates for each. An .npz has "indices" (n, 16), which count from 0, and
+        "points" (m, 3). Points that coincide exactly become one. In such files the derivatives along the first and the
+        second direction make a normal that points inside: the directions are exchanged.
+
+        Raises:
+            InputError: the file is damaged, or its indices refer to points that it lacks.
+        """
+        indices, points = _arrays(path) if path.suffix.lower() == ".npz" else _text(path)
+        if indices.ndim != 2 or indices.shape[1:] != (16,) or points.ndim != 2 or points.shape[1:] != (3,):
+            raise InputError(
+                f"{path} has indices of shape {indices.shape} and points of shape {points.shape}; expected (n, 16) "
+                f"and (m, 3)"
+            )
+        if not np.isfinite(points).all():
+            raise InputError(f"{path} has points that are NaN or infinite; export it again")
+        if indices.size == 0 or indices.min() < 0 or indices.max() >= len(points):
+            raise InputError(f"{path} has {len(points)} points, but indices from {_range(indices)}; export it again")
+        points, place = np.unique(points, axis=0, return_inverse=True)
+        table = place.reshape(-1)[indices].reshape(-1, 4, 4).transpose(0, 2, 1).reshape(-1, 16)
+        used, table = np.unique(table, return_inverse=True)
+        return [Part(cls(table.reshape(-1, 16)), {"points": points[used].astype(np.float32)}, "lambert")]
+
     def bezier_rows(self, values: Array) -> Array:
         """The control points themselves."""
         return values
@@ -54,3 +84,51 @@ class Bezier(Patches):
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
         """One row for each control point."""
         return None if len(shape) == 1 and shape[0] >= self._least else f"(m, C) with m of at least {self._least}"
+
+
+def _range(indices: np.ndarray) -> str:
+    return f"{indices.min()} to {indices.max()}" if indices.size else "none"
+
+
+def _arrays(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Indices and points of an .npz."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            indices, points = np.asarray(file["indices"]), np.asarray(file["points"], np.float64)
+    except Exception as error:  # NumPy and zipfile raise many kinds.
+        what = " ".join(str(error).split())[:80]
+        raise InputError(f"{path} is no .npz with 'indices' and 'points' ({what}); expected numpy.savez's") from error
+    if not np.issubdtype(indices.dtype, np.integer):
+        raise InputError(f"{path} has indices of dtype {indices.dtype}; expected integers")
+    return indices, points
+
+
+def _text(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Indices, from 0 on, and points of a text of patches."""
+    lines = [(i, t) for i, t in enumerate(path.read_bytes().decode(errors="replace").splitlines(), 1) if t.strip()]
+    at = 0
+
+    def rows(kind: Callable, width: int, what: str) -> list[list]:
+        nonlocal at
+        count = numbers(int, 1, f"the number of {what}")[0]
+        if count < 0 or count > len(lines) - at:
+            raise InputError(
+                f"{path}, line {lines[at - 1][0]}: {count} {what} are promised, {len(lines) - at} lines follow"
+            )
+        return [numbers(kind, width, what) for _ in range(count)]
+
+    def numbers(kind: Callable, width: int, what: str) -> list:
+        nonlocal at
+        if at >= len(lines):
+            raise InputError(f"{path} ends before {what}; the file may be cut short: export it again")
+        (line, text), at = lines[at], at + 1
+        try:
+            found = [kind(x) for x in text.replace(",", " ").split()]
+        except ValueError:
+            found = []
+        if len(found) != width:
+            raise InputError(f"{path}, line {line}: {text.strip()[:40]!r} is not {width} numbers, for {what}")
+        return found
+
+    indices = np.array(rows(int, 16, "patches"), np.int64).reshape(-1, 16) - 1
+    return indices, np.array(rows(float, 3, "points"), np.float64).reshape(-1, 3)

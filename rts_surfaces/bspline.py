@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
-from rts.arguments import quoted
+from rts.arguments import check_numbers, quoted
+from rts.arrays import from_numbers, shape_of
 from rts.checks import is_count
 from rts.engines import engine_of, namespace
 from rts.errors import InputError
 from rts.interfaces import Part
 from rts.operations.linear import matmul
 from rts.topology import fixed
-from rts.trees import Array
+from rts.trees import Array, Tree
 from rts_surfaces.parametric import TOLERANCE, Patches
 
 ENDS = ("open", "clamped", "periodic")
@@ -78,6 +82,62 @@ class BSpline(Patches):
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
         """One row for each control point of the grid."""
         return None if shape == self.shape else f"({self.shape[0]}, {self.shape[1]}, C)"
+
+
+class Revolution(BSpline):
+    """A profile curve swept around the y axis: a periodic B-spline, which is very nearly a surface of revolution.
+
+    θ["radii"] (n,) are the distances of the profile's control points from the axis. In planes through the axis and
+    control points the surface is the B-spline of radii and heights; between them it is nearer to the axis, by 0.12 %
+    with 8 points around, by 0.007 % with 16. "colors" (n, count, 1, 3 or 4) and "uv" (n, count, 2) are attributes of
+    control points. Normals point away from the axis where heights grow.
+
+    Args:
+        heights: (n,) numbers, the y of the profile's control points, at least 4.
+        count: how many control points there are around the axis, at least 4.
+        ends: "clamped" or "open", of the profile.
+        tolerance: pixels that triangles may be off the surface near outlines.
+
+    Raises:
+        InputError: fewer than 4 control points, other ends, or a tolerance that is not positive.
+    """
+
+    shaped_by = ("radii",)
+
+    def __init__(self, heights: Any, count: int = 8, ends: str = "clamped", tolerance: float = TOLERANCE):
+        if not is_count(count) or count < 4:
+            raise InputError(f"count is {quoted(count)}; expected an integer of at least 4")
+        given = shape_of(from_numbers(heights, "heights"))
+        if len(given) != 1 or given[0] < 4:
+            raise InputError(f"heights is {quoted(heights)}; expected (n,), at least 4 numbers")
+        heights = np.asarray(check_numbers("heights", heights, given), np.float64)
+        super().__init__((len(heights), count), (ends, "periodic"), tolerance)
+        angle = 2 * np.pi * np.arange(count) / count
+        # A closed spline runs inside its control points; a control point's own radius is met at its angle.
+        reach = 3 / (2 + np.cos(2 * np.pi / count))
+        around = np.stack([np.cos(angle), np.zeros(count), np.sin(angle)], axis=-1) * reach
+        self._around, self._up = fixed(around[None]), fixed(heights[:, None, None] * np.array([[[0.0, 1.0, 0.0]]]))
+
+    def __repr__(self) -> str:
+        return f"Revolution({self.shape[0]} radii)"
+
+    @classmethod
+    def example(cls) -> Part:
+        """A pawn."""
+        radii = np.array([0.7, 0.75, 0.3, 0.25, 0.2, 0.55, 0.5, 0.0], np.float32)
+        return Part(cls(np.linspace(-1, 1, 8)), {"radii": radii}, "normals")
+
+    def control_points(self, theta: Mapping[str, Tree]) -> Array:
+        """(n, count, 3)."""
+        radii = theta["radii"]
+        engine = engine_of(radii)
+        return radii[:, None, None] * engine.constant(self._around, radii) + engine.constant(self._up, radii)
+
+    def expected(self, name: str, shape: tuple[int, ...]) -> str | None:
+        """See `Patches`."""
+        if name != "radii":
+            return super().expected(name, shape)
+        return None if shape == self.shape[:1] else f"({self.shape[0]},)"
 
 
 def extraction(count: int, ends: str) -> np.ndarray:

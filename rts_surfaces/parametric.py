@@ -128,9 +128,13 @@ class Patches(TriangleSurface):
         table: (n, 16) integers, the control points of each Bézier patch, first along u, then along v; they name rows of
             what `bezier_rows` gives.
         tolerance: pixels that triangles may be off the surface near outlines.
+
+    Attributes:
+        shaped_by: the entries of θ that control points are made of.
     """
 
     sample_widths = (1, 2)
+    shaped_by: tuple[str, ...] = ("points",)
 
     def __init__(self, table: np.ndarray, tolerance: float = TOLERANCE):
         check_positive("tolerance", tolerance)
@@ -152,16 +156,24 @@ class Patches(TriangleSurface):
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
         """What is wrong with the shape of an entry of θ but for its last axis, in words; None for nothing."""
 
+    def control_points(self, theta: Mapping[str, Tree]) -> Array:
+        """The control points, as `bezier_rows` takes them."""
+        return theta["points"]
+
+    def expected(self, name: str, shape: tuple[int, ...]) -> str | None:
+        """What shape an entry of θ is to have, in words; None if it has it."""
+        wrong = self.control_shape(shape[:-1]) if shape else "an array"
+        widths = (3,) if name == "points" else ATTRIBUTES[name][1]
+        if wrong is None and shape[-1] not in widths:
+            return f"a last axis of {' or '.join(map(str, widths))}"
+        return wrong
+
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Refuse θ whose entries have wrong shapes or dtypes."""
-        if "points" not in theta:
-            raise InputError(f"theta of {self!r} has no 'points'; it has {sorted(theta)}")
         for name in self.reads(theta):
-            value, widths = theta[name], (3,) if name == "points" else ATTRIBUTES[name][1]
-            shape = shape_of(value)
-            wrong = self.control_shape(shape[:-1]) if shape else "no array"
-            if wrong is None and shape[-1] not in widths:
-                wrong = f"a last axis of {' or '.join(map(str, widths))}"
+            if name not in theta:
+                raise InputError(f"theta of {self!r} has no {name!r}; it has {sorted(theta)}")
+            value, wrong = theta[name], self.expected(name, shape_of(theta[name]))
             if wrong is not None:
                 raise InputError(f"theta[{name!r}] of {self!r} {described(value)}; expected {wrong}")
             if not namespace(value).isdtype(value.dtype, "real floating"):
@@ -169,11 +181,11 @@ class Patches(TriangleSurface):
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
         """The entries of θ that `evaluate` needs."""
-        return "points", *(name for name in ATTRIBUTES if name in theta)
+        return *self.shaped_by, *(name for name in ATTRIBUTES if name in theta)
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Array:
         """The control points."""
-        return theta["points"]
+        return self.control_points(theta)
 
     def nets(self, inputs: np.ndarray) -> np.ndarray:
         """(n, 4, 4, 3) float64 control points of the Bézier patches."""
@@ -226,8 +238,8 @@ class Patches(TriangleSurface):
             InputError: a rate of zero or less, or θ of another shape.
         """
         self.check(theta)
-        values = theta["points"]
-        nets = self.nets(np.asarray(engine_of(values).to_numpy(values)))
+        points = self.control_points(theta)
+        nets = self.nets(np.asarray(engine_of(points).to_numpy(points)))
         if is_count(rate):
             inner = np.full((len(nets), 2), min(int(rate), MOST), np.int32)
             proxy = self._cut(nets, inner, np.full(self._edges.shape[0], inner[0, 0], np.int32))
@@ -295,7 +307,7 @@ class Patches(TriangleSurface):
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Positions, normals, and the attributes of control points."""
-        points = theta["points"]
+        points = self.control_points(theta)
         engine = engine_of(points, samples.params)
         xp = engine.namespace
         if not engine.owns(points):

@@ -72,6 +72,12 @@ class TestBSpline(SurfaceConformance):
         return BSpline.example()
 
 
+class TestRevolution(SurfaceConformance):
+    @pytest.fixture
+    def part(self):
+        return rts.plugin("surfaces", "revolution").example()
+
+
 class TestEllipsoid(SurfaceConformance):
     @pytest.fixture
     def part(self):

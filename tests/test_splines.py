@@ -6,10 +6,11 @@ from helpers import DIFFERENTIABLE, arrays, to_numpy
 
 import rts
 from rts import Camera, InputError, Part, Samples
+from rts_surfaces.bspline import extraction
 
 pytestmark = pytest.mark.sampling
 
-Bezier, BSpline = (rts.plugin("surfaces", name) for name in ("bezier", "bspline"))
+Bezier, BSpline, Revolution = (rts.plugin("surfaces", name) for name in ("bezier", "bspline", "revolution"))
 SIZE = (60, 80)
 CAMERA = Camera.look_at((1.5, 1.8, 3.0), (0, 0, 0), fov_y=40)
 PATCH = np.arange(16)[None]
@@ -17,10 +18,7 @@ PATCH = np.arange(16)[None]
 
 def at(surface, points, patch, params):
     """The G-buffer at parameters (N, 2) of patches (N,), in float64."""
-    none = np.full((1, 1, 1), -1, np.int32)
-    ids = np.asarray(patch, np.int32).reshape(-1, 1)
-    samples = Samples(ids, np.asarray(params, np.float64), none, np.zeros((1, 1, 1), np.float32), np.int32(0))
-    return surface.evaluate({"points": np.asarray(points, np.float64)}, samples)
+    return at_theta(surface, {"points": np.asarray(points, np.float64)}, patch, np.asarray(params, np.float64))
 
 
 def derivatives(surface, points, patch, params):
@@ -290,6 +288,126 @@ def made_of(surface):
     return (surface.table,) if isinstance(surface, Bezier) else (surface.shape, surface.ends)
 
 
+# --------------------------------------------------------------------------------------------------- files
+
+ROWS = [",".join(map(str, range(1, 17))), ",".join(map(str, [*range(13, 17), *range(17, 29)]))]
+
+
+def text_of(points, rows=ROWS, promised=None):
+    lines = [str(promised or len(rows)), *rows, str(len(points)), *(",".join(map(str, p)) for p in points)]
+    return "\n".join(lines) + "\n"
+
+
+def test_patches_are_read_from_text_and_arrays_with_their_normals_outside(tmp_path):
+    points = np.random.default_rng(0).normal(size=(28, 3)).round(3)
+    points[20] = points[3]  # Two that coincide become one.
+    (tmp_path / "patches.txt").write_text(text_of(points))
+    indices = np.array([list(map(int, row.split(","))) for row in ROWS]) - 1
+    np.savez(tmp_path / "patches.npz", indices=indices, points=points)
+    for name in ("patches.txt", "patches.npz"):
+        (part,) = rts.load(tmp_path / name, surface="bezier")
+        assert len(part.theta["points"]) == 27
+        nets = part.surface.nets(part.theta["points"])
+        np.testing.assert_allclose(nets, points[indices].reshape(-1, 4, 4, 3).transpose(0, 2, 1, 3), atol=1e-6)
+
+
+BROKEN = {
+    "cut": (lambda p: text_of(p)[: -len(text_of(p)) // 3], "points are promised"),
+    "patches promised": (lambda p: text_of(p, promised=90), "90 patches are promised"),
+    "short row": (lambda p: text_of(p, [ROWS[0][:-3]]), "line 2: .* is not 16 numbers"),
+    "a word": (lambda p: text_of(p).replace("2,3,4", "2,x,4"), "line 2"),
+    "no point of that number": (lambda p: text_of(p[:20]), "20 points, but indices from 0 to 27"),
+    "NaN": (lambda p: text_of(p * [np.nan, 1, 1]), "NaN or infinite"),
+    "empty": (lambda p: "", "ends before the number of patches"),
+    "bytes": (lambda p: "\0\1\2", "line 1"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_damaged_patches_are_one_line_that_says_where(name, tmp_path):
+    make, message = BROKEN[name]
+    path = tmp_path / "patches.txt"
+    path.write_text(make(np.random.default_rng(0).normal(size=(28, 3))))
+    with pytest.raises(InputError, match=message) as error:
+        rts.load(path, surface="bezier")
+    assert "\n" not in str(error.value) and "patches.txt" in str(error.value)
+
+
+def test_what_is_no_file_of_patches_is_refused(tmp_path):
+    (tmp_path / "a.npz").write_bytes(b"PK nothing")
+    np.savez(tmp_path / "b.npz", indices=np.zeros((2, 15), int), points=np.zeros((3, 3)))
+    for name, message in (("a.npz", "is no .npz with"), ("b.npz", r"indices of shape \(2, 15\)"), ("c.npz", "no file")):
+        with pytest.raises(InputError, match=message):
+            rts.load(tmp_path / name, surface="bezier")
+    with pytest.raises(InputError, match="BSpline reads no files"):
+        rts.load(tmp_path / "b.npz", surface="bspline")
+    with pytest.raises(InputError, match="merge and weld are for meshes"):
+        rts.load(tmp_path / "b.npz", surface="bezier", merge=True)
+
+
+def test_newells_teapot_has_normals_outside_and_no_black_pole(data):
+    (part,) = rts.load(data / "bezier" / "teapot_patches.txt", surface="bezier")
+    (same,) = rts.load(data / "bezier" / "teapot_patches.npz", surface="bezier")
+    np.testing.assert_array_equal(part.theta["points"], same.theta["points"])
+    assert len(part.surface.table) == 32
+    camera = Camera.look_at((4, -7, 4.5), (0.2, 0, 1.4), (0, 0, 1), fov_y=40)
+    image = rts.render(part.replace(cull="back"), camera, (128, 128), layers=1)
+    np.testing.assert_allclose(
+        image[..., 3], rts.render(part, camera, (128, 128), layers=1, splatter="none")[..., 3], atol=1
+    )
+    above = Camera.orthographic((0, 0, 9), (0, 0, 0), (0, 1, 0), height=1.0)
+    lid = rts.render(part.replace(shader="normals"), above, (65, 65), layers=1, splatter="none")
+    # The top of the knob is the point of eight patches: its normals are upright, all around.
+    np.testing.assert_allclose(lid[30:35, 30:35, :3], np.broadcast_to([0.5, 0.5, 1.0], (5, 5, 3)), atol=0.1)
+
+
+# ----------------------------------------------------------------------------------------- swept profiles
+
+
+@pytest.mark.parametrize("count, off", [(4, 3e-2), (8, 1.2e-3), (16, 7e-5)])
+def test_a_swept_profile_is_nearly_a_surface_of_revolution(count, off):
+    surface = Revolution(np.linspace(-1, 1, 5), count)
+    vertices, _ = surface.tessellate({"radii": np.full(5, 0.8)}, 16)
+    radius = np.hypot(vertices[:, 0], vertices[:, 2])
+    np.testing.assert_allclose(radius, 0.8, rtol=off)
+    assert radius.max() > 0.8 - 1e-6 and vertices[:, 1].min() == -1 and vertices[:, 1].max() == 1
+
+
+def test_a_profile_is_the_b_spline_of_its_radii_and_heights_with_normals_outside():
+    radii, heights = np.array([0.3, 0.9, 0.5, 0.7, 0.4, 0.6]), np.linspace(-1, 1, 6)
+    surface = Revolution(heights, 8)
+    curve = extraction(6, "clamped") @ np.stack([radii, heights], axis=-1)
+    # Patches go along the profile first; the first of each eight starts in the plane of x and y.
+    v = np.linspace(0, 1, 7)
+    patch, params = np.repeat([0, 8, 16], 7), np.stack([np.tile(v, 3), np.zeros(21)], axis=-1)
+    gbuffer = at_theta(surface, {"radii": radii}, patch, params)
+    basis = np.stack([(1 - v) ** 3, 3 * v * (1 - v) ** 2, 3 * v * v * (1 - v), v**3], axis=-1)
+    expected = np.concatenate([basis @ curve[3 * k : 3 * k + 4] for k in range(3)])
+    found = gbuffer["position"]
+    # A periodic span starts at its second control point: an eighth of a turn on.
+    np.testing.assert_allclose(np.hypot(found[:, 0], found[:, 2]), expected[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(found[:, 1], expected[:, 1], atol=1e-12)
+    assert ((gbuffer["normal"] * found * [1, 0, 1]).sum(axis=1) > 0).all()
+
+
+def at_theta(surface, theta, patch, params):
+    none = np.full((1, 1, 1), -1, np.int32)
+    ids = np.asarray(patch, np.int32).reshape(-1, 1)
+    return surface.evaluate(theta, Samples(ids, params, none, np.zeros((1, 1, 1), np.float32), np.int32(0)))
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_radii_are_fitted_to_silhouettes(target):
+    heights = np.linspace(-1, 1, 8)
+    truth = np.array([0.7, 0.75, 0.3, 0.25, 0.2, 0.55, 0.5, 0.1], np.float32)
+    surface, camera = Revolution(heights), Camera.look_at((0, 0.3, 4.0), (0, 0, 0), fov_y=35)
+    mask = rts.render(Part(surface, {"radii": truth}), camera, (96, 96), supersample=2)[..., 3]
+    residuals = rts.ImageResiduals(lambda radii: Part(surface, {"radii": radii}), camera, (96, 96), mask, supersample=2)
+    start = arrays(target, np.full(8, 0.45))
+    found = rts.fit(residuals, start, method="lm", steps=40, jit=target != "jax")
+    np.testing.assert_allclose(to_numpy(found.parameters), truth, atol=0.02)
+
+
 def test_the_spread_of_a_camera_is_that_of_its_rays():
     for camera in VIEWS.values():
         np.testing.assert_allclose(camera.spread(SIZE), camera.rays(SIZE).spread, rtol=1e-12)
@@ -314,6 +432,9 @@ WRONG = {
     "small grid": (lambda: BSpline((3, 5)), r"shape is \(3, 5\); expected \(nu, nv\), two integers of at least 4"),
     "fractional grid": (lambda: BSpline((4.5, 5)), "shape is"),
     "ends": (lambda: BSpline((4, 4), "closed"), "ends is 'closed'; expected one of open, clamped, periodic"),
+    "three heights": (lambda: Revolution([0, 1, 2]), "heights is .*at least 4 numbers"),
+    "few around": (lambda: Revolution(np.arange(5.0), 3), "count is 3; expected an integer of at least 4"),
+    "radii": (lambda: show(Revolution(np.arange(5.0)), radii=np.ones(4, np.float32)), r"theta\['radii'\] .*\(5,\)"),
     "three ends": (lambda: BSpline((4, 4), ("open",) * 3), "ends is"),
     "tolerance": (lambda: Bezier(PATCH, tolerance=0.0), "tolerance is 0.0; expected a positive number"),
 }

@@ -24,7 +24,7 @@ from rts.interfaces import Part
 from rts.shading import Lambert, Textured
 
 
-def load(path: Any, *, merge: bool = False, weld: bool = True) -> list[Part]:
+def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "mesh") -> list[Part]:
     """The parts of a model file: OBJ with MTL and textures, PLY, STL, GLB, glTF, OFF, what trimesh reads.
 
     There is one part for each mesh of the scene or, in an OBJ, for each material. θ holds NumPy float32 arrays:
@@ -48,6 +48,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True) -> list[Part]:
         merge: join everything into one part, in the coordinates of the scene. Refused where textures differ.
         weld: leave out vertices without faces, and weld those that coincide; False keeps the vertices of the file,
             their number and order. (All parts of an OBJ share one table of vertices; each then holds all of it.)
+        surface: the name of a registered surface that reads the file, in a format of its own; "bezier" reads patches
+            (text as Newell's teapot is in, or .npz). All that is said above is of "mesh".
 
     Raises:
         InputError: the file is missing, damaged, of unknown kind, empty, holds other than it promises, or refers to
@@ -61,6 +63,12 @@ def load(path: Any, *, merge: bool = False, weld: bool = True) -> list[Part]:
     for name, flag in (("merge", merge), ("weld", weld)):
         if not isinstance(flag, (bool, np.bool_)):
             raise InputError(f"{name} is {' '.join(repr(flag).split())[:60]}; expected True or False")
+    if surface != "mesh":
+        reader = registry.plugin("rts.surfaces", surface)
+        if merge or not weld:
+            raise InputError(f"merge and weld are for meshes; the surface {surface!r} reads its files without them")
+        check_exists(path)
+        return list(reader.load(path))
     with gathered(path) as notes, np.errstate(over="ignore", invalid="ignore"):  # What overflows is refused by name.
         pieces = [_linear(piece) for piece in read_pieces(path)]
         if merge and (len(pieces) > 1 or pieces[0].transform is not None):
@@ -193,6 +201,16 @@ def _in_scene(piece: Piece) -> Piece:
     return piece._replace(vertices=vertices, faces=faces, attributes=attributes, transform=None)
 
 
+def check_exists(path: Path) -> None:
+    """Refuse what is no regular file."""
+    if not path.exists():
+        raise InputError(f"no file {path}; check the path (relative paths start at {Path.cwd()})")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; expected a model file inside it, such as {path / 'model.obj'}")
+    if not path.is_file():
+        raise InputError(f"{path} is no regular file, and may never end; copy what it gives into one")
+
+
 def read_pieces(path: Path) -> list[Piece]:
     """The meshes of a file, at least one, each with at least one face; indices and values are checked.
 
@@ -200,12 +218,7 @@ def read_pieces(path: Path) -> list[Piece]:
         InputError: the file cannot be read, or what it holds is not a sound mesh.
     """
     extension = path.suffix.lower().removeprefix(".")
-    if not path.exists():
-        raise InputError(f"no file {path}; check the path (relative paths start at {Path.cwd()})")
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; expected a model file inside it, such as {path / 'model.obj'}")
-    if not path.is_file():
-        raise InputError(f"{path} is no regular file, and may never end; copy what it gives into one")
+    check_exists(path)
     if extension == "obj":
         pieces = read_obj(path)
     else:

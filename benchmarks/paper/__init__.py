@@ -1,0 +1,1 @@
+"""The experiments of the paper, each with a figure and an animation."""
