@@ -22,7 +22,7 @@ from rts.engines import constants, engine_of, exemplar, namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.records import ArraySpec, Proxy, RayHits, Rays, Samples, Splats
-from rts.trees import Array, Tree, record
+from rts.trees import Array, Tree, map_leaves, record
 
 if TYPE_CHECKING:
     from rts.camera import Camera
@@ -156,6 +156,30 @@ class TriangleSurface(Surface):
             a table is dropped: `row` of its cell becomes −1, and `overflow` counts it.
         """
         return samples
+
+    def tessellate(self, theta: Mapping[str, Tree], rate: int | float) -> tuple[np.ndarray, np.ndarray]:
+        """A mesh whose vertices lie on the surface.
+
+        Args:
+            theta: θ, with values that are known.
+            rate: a whole number, of cuts along each side of a patch; or a float, the distance in the units of θ that
+                triangles may be off the surface. A surface that is made of triangles ignores it.
+
+        Returns:
+            Vertices (V, 3) float32 and faces (T, 3) int32.
+
+        Raises:
+            InputError: the surface cannot be made a mesh without a view of it, which is the default where triangles
+                depend on the view; else the default is what `proxy` gives.
+        """
+        if self.depends_on_view:
+            raise InputError(
+                f"{self!r} has no tessellate, and its triangles depend on the view; it cannot be made a mesh"
+            )
+        engine = engine_of(theta)
+        inputs = map_leaves(engine.to_numpy, self.proxy_inputs(theta))
+        proxy = self.proxy(inputs, None, (1, 1))  # pyright: ignore[reportArgumentType]  # It does not look at it.
+        return np.asarray(proxy.vertices, np.float32), np.asarray(proxy.faces, np.int32)
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
         """The `Samples.tables` that `refine` fills.

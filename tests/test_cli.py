@@ -55,7 +55,7 @@ def model(tmp_path):
 
 def test_help_shows_examples_for_every_command():
     assert "rts fit-pose bunny.obj photo.png -o found" in succeed("--help")
-    for command in ("render", "fit-pose", "demo"):
+    for command in ("render", "fit-pose", "export", "demo"):
         assert f"Example: rts {command}" in succeed(command, "--help").replace(
             "rts render bunny.obj -o mask", "rts fit-pose"
         )
@@ -129,7 +129,7 @@ def test_each_warning_is_shown_once_and_in_one_line_whoever_warns(tmp_path, monk
     (tmp_path / "m.obj").write_text(f"{QUAD}f 1 2 3 4\n")
     load = rts.load
 
-    def warning(path):
+    def warning(path, **options):
         for number in (1, 2, 1, 2):
             warnings.warn(f"odd\n  thing {number}", RuntimeWarning, stacklevel=number)
         np.float32(1e30) * np.float32(1e30)
@@ -497,3 +497,70 @@ def test_bounds_follow_transforms_and_refuse_a_point():
     np.testing.assert_allclose(bounds_of([part]).center, [1, 1, 1])
     with pytest.raises(InputError, match="in one point"):
         bounds_of([part.replace(theta={"vertices": np.zeros((3, 3))})])
+
+
+# -------------------------------------------------------------------------------------- export, other surfaces
+
+
+@pytest.fixture
+def patches(tmp_path):
+    """A cap of one Bézier patch, of about 0.7 in height."""
+    t = np.linspace(-1, 1, 4)
+    x, y = np.meshgrid(t, t, indexing="ij")
+    points = np.stack([x, y, 1.2 - 0.6 * (x * x + y * y)], axis=-1).reshape(16, 3)
+    # In files the directions are exchanged, for a normal outside.
+    indices = np.arange(16).reshape(1, 4, 4).transpose(0, 2, 1).reshape(1, 16)
+    path = tmp_path / "cap.npz"
+    np.savez(path, indices=indices, points=points)
+    return path
+
+
+def test_a_surface_of_patches_is_rendered_and_exported(patches, tmp_path):
+    (part,) = rts.load(patches, surface="bezier")
+    said = succeed("render", patches, "--surface", "bezier", "-o", tmp_path / "cap.png", "--up", "z", "--size", 64)
+    assert "Bezier(1 patches), 64 x 64 pixels" in said
+    assert rts.load_image(tmp_path / "cap.png")[..., 3].mean() > 0.1
+    for tolerance, least in ((0.05, 8), (0.001, 200)):
+        out = tmp_path / "new" / "cap.obj"
+        said = succeed("export", patches, "--surface", "bezier", "-o", out, "--tolerance", tolerance)
+        (mesh,) = rts.load(out)
+        assert mesh.surface.face_count >= least
+        assert f"{mesh.surface.face_count} triangles; wrote {out}" in said
+        radius = bounds_of([part]).radius
+        places = mesh.theta["vertices"][mesh.surface.faces].mean(axis=1)
+        # The graph over x and y: its points are no farther off along z than along the normal, times its slope.
+        fine = part.surface.tessellate(part.theta, 128)[0]
+        from scipy.spatial import cKDTree
+
+        height = fine[cKDTree(fine[:, :2]).query(places[:, :2])[1], 2]
+        assert np.abs(places[:, 2] - height).max() < 2.5 * tolerance * radius + 0.02
+
+
+@pytest.mark.parametrize("extension", ["obj", "ply", "stl", "glb", "off"])
+def test_a_mesh_is_exported_as_it_is(model, tmp_path, extension):
+    out = tmp_path / f"same.{extension}"
+    said = succeed("export", model, "-o", out)
+    (before,), (after,) = rts.load(model), rts.load(out)
+    assert "8 vertices and 12 triangles" in said
+    corners = [np.sort(p.theta["vertices"][p.surface.faces].reshape(12, -1), axis=0) for p in (before, after)]
+    np.testing.assert_allclose(corners[1], corners[0], atol=1e-6)
+
+
+def test_a_scene_is_exported_in_its_coordinates_with_mirrored_parts_outside_out(tmp_path):
+    scene = trimesh.Scene()
+    scene.add_geometry(trimesh.creation.box((1, 1, 1)), transform=np.diag([1.0, 1, -1, 1]) + np.eye(4, k=3) * 2)
+    scene.add_geometry(trimesh.creation.icosphere(1), transform=np.diag([0.5, 0.5, 0.5, 1]))
+    scene.export(tmp_path / "scene.glb")
+    succeed("export", tmp_path / "scene.glb", "-o", tmp_path / "one.ply")
+    whole = trimesh.load(tmp_path / "one.ply")
+    volumes = sorted(m.volume for m in whole.split())
+    sphere = trimesh.creation.icosphere(1).volume / 8
+    np.testing.assert_allclose(volumes, sorted([1.0, sphere]), rtol=1e-5)
+
+
+def test_what_cannot_be_exported_is_one_line(model, patches, tmp_path):
+    assert "ending in .obj, .ply, .stl, .glb or .off" in fail("export", model, "-o", tmp_path / "mesh.docx")
+    assert "no surface named 'bezzier'" in fail("export", patches, "--surface", "bezzier", "-o", tmp_path / "m.obj")
+    assert "BSpline reads no files" in fail("render", patches, "--surface", "bspline", "-o", tmp_path / "m.png")
+    for tolerance in ("0", "-1", "nan"):
+        assert "tolerance" in fail("export", model, "-o", tmp_path / "m.obj", "--tolerance", tolerance, code=2)

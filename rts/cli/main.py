@@ -1,4 +1,4 @@
-"""The command line: `rts plugins`, `rts render`, `rts fit-pose`, `rts demo`."""
+"""The command line: `rts plugins`, `rts render`, `rts fit-pose`, `rts export`, `rts demo`."""
 
 from __future__ import annotations
 
@@ -156,6 +156,9 @@ def _background(text: str) -> tuple[float, ...] | None:
         raise typer.BadParameter(f"{text!r} is no colour; expected a name, #rrggbb, or none") from None
 
 
+Surface = Annotated[
+    str, typer.Option(help="Name of the surface that reads the model: mesh, or such as bezier for patches.")
+]
 Camera_ = Annotated[
     str,
     typer.Option(
@@ -209,6 +212,7 @@ def plugins(
 def render(
     model: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, GLB, glTF, OFF, …", show_default=False)],
     output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("out.png"),
+    surface: Surface = "mesh",
     size: Annotated[str, typer.Option(help="Pixels: 256, or HEIGHTxWIDTH.")] = "256",
     camera: Camera_ = "30,20",
     fov: Fov = 40.0,
@@ -230,7 +234,7 @@ def render(
     shape, view, color = _size(size), _view(camera), _background(background)
     output_file(output, "picture", (".png",))
     chosen = registry.plugin("rts.engines", engine)()
-    parts = rts.load(model)
+    parts = rts.load(model, surface=surface)
     bounds = bounds_of(parts)
     seen = orbit(bounds, shape, *view, fov=fov, up=up)
     distance = float(np.linalg.norm(np.linalg.inv(seen.view)[:3, 3] - bounds.center))
@@ -273,6 +277,7 @@ def fit_pose(
         typer.Argument(help="The picture: its alpha is the silhouette, or its brightness where it is opaque."),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("pose"),
+    surface: Surface = "mesh",
     engine: Annotated[str, typer.Option(help="torch or jax; auto is whichever is installed.")] = "auto",
     method: Annotated[str, typer.Option(help="lm (Levenberg–Marquardt), adam or sgd.")] = "lm",
     steps: Annotated[int | None, typer.Option(help="At most so many at each of the resolutions.")] = None,
@@ -294,7 +299,7 @@ def fit_pose(
 
     view = _view(camera)
     output_folder(output)
-    parts = rts.load(model)
+    parts = rts.load(model, surface=surface)
     mask = silhouette_of(rts.load_image(target))
     bounds = bounds_of(parts)
     seen = orbit(bounds, mask.shape, *view, fov=fov, up=up)
@@ -309,6 +314,31 @@ def fit_pose(
     )
     _say_written(files)
     _say_skipped_plot(files)
+
+
+@app.command(epilog="Example: rts export teapot.txt --surface bezier -o teapot.obj --tolerance 0.0005")
+def export(
+    model: Annotated[Path, typer.Argument(help="The model.", show_default=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", help="The mesh: .obj, .ply, .stl, .glb or .off.")] = Path(
+        "mesh.obj"
+    ),
+    surface: Surface = "mesh",
+    tolerance: Annotated[
+        float, typer.Option(help="How far triangles may be off the surface, as a share of the object's radius.")
+    ] = 1e-3,
+) -> None:
+    """Make a mesh of a model's surface, its positions and triangles, and write it."""
+    import rts
+    from rts.cli.mesh_export import FORMATS, write_mesh
+    from rts.cli.views import bounds_of
+    from rts.files.paths import output_file
+
+    output_file(output, "mesh", FORMATS)
+    if not (np.isfinite(tolerance) and tolerance > 0):
+        raise typer.BadParameter(f"the tolerance is {tolerance}; expected a positive share of the radius")
+    parts = rts.load(model, surface=surface)
+    vertices, faces = write_mesh(output, parts, tolerance * bounds_of(parts).radius)
+    _say(escape(f"{vertices} vertices and {faces} triangles; wrote {output}"))
 
 
 @app.command(epilog="Example: rts demo -o out && open out/summary.md")

@@ -12,6 +12,8 @@ from rts.camera import Camera
 from rts.errors import InputError
 from rts.interfaces import Part
 
+ROUGHLY = 16
+"""Cuts along each side of a patch, to see how large a surface is."""
 MARGIN = 1.05
 """Radius of what the default view shows, over the radius of the object."""
 
@@ -32,10 +34,10 @@ class Bounds(NamedTuple):
 
 
 def bounds_of(parts: Sequence[Part]) -> Bounds:
-    """The bounding sphere of parts whose θ["vertices"] and transforms are NumPy arrays."""
+    """The bounding sphere of parts of NumPy arrays, of whose surfaces a mesh can be made."""
     points = []
     for part in parts:
-        vertices = np.asarray(part.theta["vertices"], np.float64)
+        vertices = np.asarray(part.surface.tessellate(part.theta, ROUGHLY)[0], np.float64)
         m = part.transform
         points.append(vertices if m is None else vertices @ m[:3, :3].T + m[:3, 3])
     everything = np.concatenate(points)
