@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +36,7 @@ def write_mesh(path: Path, parts: Sequence[Part], tolerance: float) -> tuple[int
         vertices, faces = part.surface.tessellate(part.theta, float(tolerance / scale))
         faces = faces[:, ::-1] if np.linalg.det(m[:3, :3]) < 0 else faces
         meshes.append(trimesh.Trimesh(vertices @ m[:3, :3].T + m[:3, 3], faces, process=False))
-    whole = trimesh.util.concatenate(meshes)
+    whole: Any = trimesh.util.concatenate(meshes)
     path.parent.mkdir(parents=True, exist_ok=True)
     whole.export(path)
     return len(whole.vertices), len(whole.faces)
