@@ -95,3 +95,26 @@ def check_rotation(name: str, matrix: Any) -> None:
 
 ROTATION_TOLERANCE = 2e-3
 """How far R Rᵀ may be from the identity: rotations that are written with three digits are accepted."""
+
+
+def is_invertible(matrix: np.ndarray) -> bool:
+    """Whether a matrix has an inverse; lengths of its rows and columns do not matter."""
+    for axis in (1, 0):
+        length = np.linalg.norm(matrix, axis=axis, keepdims=True)
+        matrix = matrix / np.where(length > 0, length, 1)
+    singular = np.linalg.svd(matrix, compute_uv=False)
+    return bool(singular[-1] > 1e-12 * singular[0])
+
+
+def check_pixels(size: Any) -> tuple[int, int]:
+    """(height, width) as integers, refused where they make no image."""
+    if type(size) is tuple and len(size) == 2 and type(size[0]) is int is type(size[1]) and min(size) > 0:
+        return size
+    try:
+        height, width = (int(s) for s in size if not isinstance(size, (set, frozenset, dict)))
+        whole = (height, width) == tuple(size)
+    except (TypeError, ValueError, OverflowError):
+        height, width, whole = 0, 0, False
+    if not whole or height <= 0 or width <= 0:
+        raise InputError(f"size is {quoted(size)}; expected (height, width), two positive integers")
+    return height, width

@@ -17,7 +17,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rts.arguments import check_numbers, check_planes, check_positive, check_rotation, quoted
+from rts.arguments import (
+    check_numbers,
+    check_pixels,
+    check_planes,
+    check_positive,
+    check_rotation,
+    is_invertible,
+)
 from rts.arrays import described, from_numbers, promote, shape_of, unit
 from rts.engines import constants, engine_of, is_constant, load_engines, namespace, value_of
 from rts.errors import InputError
@@ -217,7 +224,7 @@ class Camera:
             InputError: the matrix is singular.
         """
         known = check_numbers("matrix", matrix, (4, 4))
-        if known is not None and not _invertible(known):
+        if known is not None and not is_invertible(known):
             raise InputError("matrix is singular; expected an invertible product projection @ view")
         xp, (m,) = promote(matrix)
         x, y, z, w = (m[i, :3] for i in range(4))
@@ -333,7 +340,7 @@ class Camera:
             InputError: the matrix is not affine or singular, or planes are out of order.
         """
         known = check_numbers("camera_to_world", camera_to_world, (4, 4), (3, 4))
-        if known is not None and not (_is_affine(known) and _invertible(known[:3, :3])):
+        if known is not None and not (_is_affine(known) and is_invertible(known[:3, :3])):
             raise InputError(
                 "camera_to_world is singular, or its last row is not (0, 0, 0, 1); expected a rotation and a position"
             )
@@ -571,20 +578,6 @@ class Camera:
         return xp.sqrt(area) * scale * xp.stack([p[3, 3], -p[3, 2]])
 
 
-def check_pixels(size: Any) -> tuple[int, int]:
-    """(height, width) as integers, refused where they make no image."""
-    if type(size) is tuple and len(size) == 2 and type(size[0]) is int is type(size[1]) and min(size) > 0:
-        return size
-    try:
-        height, width = (int(s) for s in size if not isinstance(size, (set, frozenset, dict)))
-        whole = (height, width) == tuple(size)
-    except (TypeError, ValueError, OverflowError):
-        height, width, whole = 0, 0, False
-    if not whole or height <= 0 or width <= 0:
-        raise InputError(f"size is {quoted(size)}; expected (height, width), two positive integers")
-    return height, width
-
-
 ROUNDING = 1e-5
 """What entries of matrices that are to be zero or one may be off by."""
 PARALLEL = 1e-12
@@ -610,15 +603,6 @@ def _equal(a: Array, b: Array) -> bool:
 
 def _is_affine(matrix: np.ndarray) -> bool:
     return matrix.shape[0] == 3 or bool(np.abs(matrix[3] - [0, 0, 0, 1]).max() <= ROUNDING)
-
-
-def _invertible(matrix: np.ndarray) -> bool:
-    """Whether a matrix has an inverse; lengths of its rows and columns do not matter."""
-    for axis in (1, 0):
-        length = np.linalg.norm(matrix, axis=axis, keepdims=True)
-        matrix = matrix / np.where(length > 0, length, 1)
-    singular = np.linalg.svd(matrix, compute_uv=False)
-    return bool(singular[-1] > 1e-12 * singular[0])
 
 
 def _check_intrinsics(K: Any) -> None:

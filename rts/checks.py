@@ -12,14 +12,14 @@ import numpy as np
 
 from rts import registry
 from rts.adapting import adapted
-from rts.arguments import quoted
+from rts.arguments import check_pixels, quoted
 from rts.arrays import described, from_numbers, is_finite, shape_of
-from rts.camera import Camera, check_pixels
+from rts.camera import Camera
 from rts.engines import namespace, value_of
 from rts.errors import AspectWarning, InputError, warn
 from rts.gbuffer import GBuffer
 from rts.interfaces import CheckedPart, Part, Sampler, Shader, Splatter, as_surface
-from rts.trees import Array, named_leaves
+from rts.trees import Array, placed_leaves
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}
 """Rough memory of a cell of a layer through sampling, shading and splatting in array code; compiled, it is less."""
@@ -229,8 +229,9 @@ def check_splats(
 
     if not (wrong(positions) or wrong(rgba)):  # Rows that are allotted, but not used, may hold anything.
         return
-    for name, value in named_leaves(part.theta, "theta"):
+    for place, value in placed_leaves(part.theta):
         if wrong(value):
+            name = "theta" + "".join(f"[{key!r}]" for key in place)
             raise InputError(f"{name} of part {index} holds NaN or infinity; expected finite numbers")
     for name in gbuffer:
         if dict.__contains__(gbuffer, name) and wrong(gbuffer[name]):

@@ -104,17 +104,20 @@ def _kind(tree: Tree) -> int:
     return kind
 
 
-def named_leaves(tree: Tree, name: str) -> Iterator[tuple[str, Any]]:
-    """The leaves, each with where it is, such as "theta['light']['color']"."""
-    if isinstance(tree, Mapping):
-        for key in sorted(tree):
-            yield from named_leaves(tree[key], f"{name}[{key!r}]")
-    elif isinstance(tree, (list, tuple)):
+def placed_leaves(tree: Tree, place: tuple = ()) -> Iterator[tuple[tuple, Any]]:
+    """The leaves in the order of `leaves`, each with the keys, indices and names of fields that lead to it."""
+    kind = _KINDS.get(type(tree)) or _kind(tree)
+    if kind == _LEAF:
+        yield place, tree
+    elif kind == _RECORD:
+        for name in _ARRAY_FIELDS[type(tree)]:
+            yield from placed_leaves(getattr(tree, name), (*place, name))
+    elif kind == _SEQUENCE:
         for i, item in enumerate(tree):
-            yield from named_leaves(item, f"{name}[{i}]")
-    else:
-        for leaf in leaves(tree):
-            yield name, leaf
+            yield from placed_leaves(item, (*place, i))
+    elif kind == _MAPPING:
+        for key in sorted(tree):
+            yield from placed_leaves(tree[key], (*place, key))
 
 
 def map_leaves(fn: Callable[[Any], Any], tree: Tree) -> Tree:

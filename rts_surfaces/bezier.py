@@ -10,8 +10,9 @@ import numpy as np
 
 from rts.errors import InputError
 from rts.interfaces import Part
+from rts.topology import index_table
 from rts.trees import Array
-from rts_surfaces.parametric import TOLERANCE, Patches, check_table
+from rts_surfaces.parametric import TOLERANCE, Patches
 
 
 class Bezier(Patches):
@@ -30,7 +31,7 @@ class Bezier(Patches):
     """
 
     def __init__(self, indices: Any, tolerance: float = TOLERANCE):
-        super().__init__(check_table("indices", indices), tolerance)
+        super().__init__(index_table("indices", indices, 16), tolerance)
         self._least = int(self.table.max()) + 1
 
     def __repr__(self) -> str:

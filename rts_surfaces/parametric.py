@@ -11,7 +11,7 @@ import math
 from collections.abc import Hashable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -391,10 +391,3 @@ def _edges_of(table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     flips = np.take_along_axis(sides, place, 1)[:, 0] > np.take_along_axis(back, place, 1)[:, 0]
     edges, index = np.unique(np.where(flips[:, None], back, sides), axis=0, return_inverse=True)
     return fixed(index.reshape(-1, 4).astype(np.int32)), fixed(flips.reshape(-1, 4).copy()), fixed(edges.copy())
-
-
-def check_table(name: str, table: Any) -> np.ndarray:
-    """A table (n, 16) of indices of control points; anything else is refused."""
-    from rts.topology import index_table
-
-    return index_table(name, table, 16)

@@ -9,13 +9,10 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from rts.errors import InputError
+from rts import errors
+from rts.errors import FileWarning, InputError
 
 _ONE_AT_A_TIME = threading.RLock()  # Filters of warnings belong to the whole process.
-
-
-class FileWarning(UserWarning):
-    """Something about a file that its user ought to know; the message names the file."""
 
 
 def unreadable(path: Path, kind: str, what: str) -> InputError:
@@ -85,4 +82,4 @@ class _Lines(logging.Handler):
 
 def warn(text: str) -> None:
     """Warn of a file; inside `gathered`, from which the warning comes to the user."""
-    warnings.warn(text, FileWarning, stacklevel=3)
+    errors.warn(text, FileWarning)

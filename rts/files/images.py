@@ -8,17 +8,17 @@ from __future__ import annotations
 import contextlib
 import io
 import math
-import warnings
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from rts.arguments import quoted
 from rts.checks import MEMORY, is_real
 from rts.engines import engine_of
-from rts.errors import EngineError, InputError, PluginError
-from rts.files.damage import FileWarning, gathered
+from rts.errors import EngineError, FileWarning, InputError, PluginError, warn
+from rts.files.damage import gathered
 from rts.files.paths import as_path, output_file, writing
 from rts.files.srgb import decode_srgb, encode_srgb
 from rts.trees import Array
@@ -55,7 +55,7 @@ def load_image(path: Any) -> np.ndarray:
             range is not known.
 
     Warns:
-        UserWarning: Pillow found something wrong with it.
+        FileWarning: Pillow found something wrong with it.
     """
     path = as_path(path)
     if path.is_dir():
@@ -65,7 +65,7 @@ def load_image(path: Any) -> np.ndarray:
     with gathered(path) as notes:
         encoded = read_image(path)
     for note in notes:
-        warnings.warn(note, FileWarning, stacklevel=2)
+        warn(note, FileWarning)
     straight = decode_srgb(encoded)
     alpha = straight[..., 3:] if straight.shape[2] == 4 else np.ones_like(straight[..., :1])
     return np.concatenate([straight[..., :3] * alpha, alpha], axis=2)
@@ -90,7 +90,7 @@ def save_animation(path: Any, frames: Iterable[Array], fps: float = 20.0) -> Non
     path = output_file(path, "animation", (".gif", ".png", ".mp4"))
     kind = path.suffix.lower()
     if not (is_real(fps) and np.isfinite(fps) and fps > 0):
-        raise InputError(f"fps is {_shown(fps)}; expected a positive number of frames a second")
+        raise InputError(f"fps is {quoted(fps)}; expected a positive number of frames a second")
     duration = _duration(kind, float(fps))
     pictures = [_bytes(_on_white(_host(f, f"frame {i}"))) for i, f in enumerate(_each(frames))]
     if not pictures or len({p.shape for p in pictures}) > 1:
@@ -133,12 +133,6 @@ def _each(frames: Any) -> Iterable[Any]:
     return frames
 
 
-def _shown(value: Any) -> str:
-    """One short line of a value."""
-    text = " ".join(repr(value).split())
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
 def _write_mp4(path: Path, pictures: list[np.ndarray], fps: float) -> None:
     import imageio.v2 as imageio
 
@@ -162,7 +156,7 @@ def _host(image: Any, name: str) -> np.ndarray:
         with contextlib.suppress(ValueError, TypeError, RuntimeError):  # Of rows of different lengths, for example.
             given = np.asarray(image)
     if not hasattr(given, "shape"):
-        raise InputError(f"{name} is {_shown(image)}, a {type(image).__name__}; expected an array {shapes}")
+        raise InputError(f"{name} is {quoted(image)}, a {type(image).__name__}; expected an array {shapes}")
     try:
         engine = engine_of(given)
     except EngineError as error:

@@ -6,15 +6,15 @@ what a `Mesh` takes; every other format goes through trimesh.
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rts import registry
-from rts.errors import InputError
-from rts.files.damage import FileWarning, gathered
+from rts.arguments import quoted
+from rts.errors import FileWarning, InputError, warn
+from rts.files.damage import gathered
 from rts.files.obj_reader import read_obj
 from rts.files.paths import as_path
 from rts.files.pieces import Piece, check_piece
@@ -57,12 +57,12 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
             ones included; or `merge` or `weld` is neither True nor False.
 
     Warns:
-        UserWarning: something was left out or guessed, such as a library of materials that is not there.
+        FileWarning: something was left out or guessed, such as a library of materials that is not there.
     """
     path = as_path(path)
     for name, flag in (("merge", merge), ("weld", weld)):
         if not isinstance(flag, (bool, np.bool_)):
-            raise InputError(f"{name} is {' '.join(repr(flag).split())[:60]}; expected True or False")
+            raise InputError(f"{name} is {quoted(flag)}; expected True or False")
     if surface != "mesh":
         reader = registry.plugin("rts.surfaces", surface)
         if merge or not weld:
@@ -75,7 +75,7 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
             pieces = [_merged(path, pieces)]
         parts = [_part(path, piece, weld) for piece in pieces]
     for note in notes:
-        warnings.warn(note, FileWarning, stacklevel=2)
+        warn(note, FileWarning)
     return parts
 
 

@@ -2,31 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields
-from typing import Any
+from collections.abc import Iterator, Sequence
 
-from rts.trees import STATIC_FIELDS, Array, Tree
+from rts.trees import Array, Tree, placed_leaves
 
 
-def named_leaves(tree: Tree, name: str = "") -> Iterator[tuple[str, Array]]:
+def named_leaves(tree: Tree) -> Iterator[tuple[str, Array]]:
     """Leaves with names such as "light.direction", in the order of `leaves`; a single array is "parameters"."""
-
-    def at(key: Any) -> str:
-        return f"{name}.{key}" if name else str(key)
-
-    if isinstance(tree, Mapping):
-        for key in sorted(tree):
-            yield from named_leaves(tree[key], at(key))
-    elif isinstance(tree, (list, tuple)):
-        for i, item in enumerate(tree):
-            yield from named_leaves(item, at(i))
-    elif type(tree) in STATIC_FIELDS:
-        for field in fields(tree):
-            if field.name not in STATIC_FIELDS[type(tree)]:
-                yield from named_leaves(getattr(tree, field.name), at(field.name))
-    elif tree is not None:
-        yield name or "parameters", tree
+    for place, leaf in placed_leaves(tree):
+        yield ".".join(map(str, place)) or "parameters", leaf
 
 
 def one_line(text: str, longest: int = 200) -> str:

@@ -52,7 +52,7 @@ def _cause(part: CheckedPart, camera: Camera) -> str:
 
 
 def _known(tree: Tree) -> Tree | None:
-    """A tree with NumPy arrays in float64, None if one of them is traced or of a batch."""
+    """A tree with NumPy arrays, None if one of them is traced or of a batch."""
     found = []
 
     def value(x: object) -> object:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rts.camera import Camera, check_pixels
+from rts.arguments import check_pixels
+from rts.camera import Camera
 from rts.checks import check_sampler, check_scene, suited_sampler
 from rts.errors import InputError
 from rts.interfaces import Part

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rts.arguments import is_invertible
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.interfaces import TriangleSurface
@@ -158,17 +159,13 @@ def _spread_of_projection(data: bytes) -> float:
 
 
 def _check_invertible(camera: Camera) -> None:
-    # Far from the origin, or at lengths far from one, a matrix is none the worse: so rows and columns are scaled.
-    projection = camera.projection
-    for axis in (1, 0):
-        length = np.linalg.norm(projection, axis=axis, keepdims=True)
-        projection = projection / np.where(length > 0, length, 1)
-    for name, matrix in (("view", camera.view[:3, :3]), ("projection", projection)):
-        singular_values = np.linalg.svd(matrix, compute_uv=False)
-        if not singular_values[-1] > 1e-12 * singular_values[0]:
-            raise InputError(
-                f"the camera's {name} matrix is singular (times the part's transform, for view); it has no inverse"
-            )
+    # A view that flattens has no inverse, whatever its lengths; a projection is none the worse for its own.
+    singular = np.linalg.svd(camera.view[:3, :3], compute_uv=False)
+    sound = {"view": singular[-1] > 1e-12 * singular[0], "projection": is_invertible(camera.projection)}
+    for name in (name for name, ok in sound.items() if not ok):
+        raise InputError(
+            f"the camera's {name} matrix is singular (times the part's transform, for view); it has no inverse"
+        )
 
 
 def check_proxy(proxy: Proxy, surface: Any) -> None:
