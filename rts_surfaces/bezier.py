@@ -12,7 +12,8 @@ from rts.errors import InputError
 from rts.interfaces import Part
 from rts.topology import index_table
 from rts.trees import Array
-from rts_surfaces.parametric import TOLERANCE, Patches
+from rts_surfaces.parametric import TOLERANCE
+from rts_surfaces.patches import Patches
 
 
 class Bezier(Patches):

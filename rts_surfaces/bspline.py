@@ -16,7 +16,8 @@ from rts.interfaces import Part
 from rts.operations.linear import matmul
 from rts.topology import fixed
 from rts.trees import Array, Tree
-from rts_surfaces.parametric import TOLERANCE, Patches
+from rts_surfaces.parametric import TOLERANCE
+from rts_surfaces.patches import Patches
 
 ENDS = ("open", "clamped", "periodic")
 

@@ -50,13 +50,18 @@ def refined(
 
 
 def _rays_of(samples: Samples, camera: Camera, size: tuple[int, int]) -> Rays:
-    """The ray of each packed sample (N, 3); samples that no cell refers to get the first pixel's."""
-    rays = camera.rays(size)
-    pixel = np.zeros(len(samples.ids), np.int64)
-    flat = samples.row.reshape(-1)
-    cells = np.flatnonzero(flat >= 0)
-    pixel[flat[cells]] = cells % (size[0] * size[1])
-    return rays._replace(origins=rays.origins.reshape(-1, 3)[pixel], directions=rays.directions.reshape(-1, 3)[pixel])
+    """The ray of each packed sample (N, 3); where no cell has any, the first row gets the first pixel's."""
+    from rts.sampling import settling_kernels
+
+    matrices = np.ascontiguousarray(camera.projection, np.float64), np.linalg.inv(np.asarray(camera.view, np.float64))
+    ends = np.empty((len(samples.ids), 3)), np.empty((len(samples.ids), 3))
+    lines = read_only(samples.row, np.int32).reshape(-1, size[1])
+    if len(samples.ids) == 1:
+        first = np.full(lines.shape, -1, np.int32)
+        first[0, 0] = 0
+        settling_kernels.rays_of(0, 1, read_only(first), size[0], *matrices, *ends)
+    parallel(settling_kernels.rays_of, len(lines), lines, size[0], *matrices, *ends, work=20 * len(samples.ids))
+    return Rays(*ends, camera.spread(size))
 
 
 def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:

@@ -198,8 +198,7 @@ def checked_refined(found: Any, given: Samples, surface: TriangleSurface) -> Sam
     bad = covered & ~np.isfinite(depth)
     if bad.any():
         raise InputError(f"{who} gave {bad.sum()} depths that are not finite; set their rows to −1 where a ray misses")
-    used = params[row[covered]]
-    if not np.isfinite(used).all():
+    if not np.isfinite(params).all() and not np.isfinite(used := params[row[covered]]).all():
         count = (~np.isfinite(used).all(axis=1)).sum()
         raise InputError(f"{who} gave {count} samples whose params are not finite; set their rows to −1")
     tables = _checked_tables(found.tables, given, who)

@@ -1,0 +1,341 @@
+"""Bicubic patches on the host, compiled: points, where rays meet them, values and gradients.
+
+Patches come in two forms. *Powers* (n, 3, 4, 4) float64 are the coefficients of uⁱvʲ of each coordinate, for geometry
+without derivatives. A *table* (n, 16) names rows of Bézier control points, first along u, then along v, for values that
+are differentiated. It imports numba.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+compiled = numba.njit(nogil=True, fastmath={"contract"})
+kernel = numba.njit(nogil=True, cache=True, fastmath={"contract"})
+
+BEZIER = np.array([[1.0, 0, 0, 0], [-3, 3, 0, 0], [3, -6, 3, 0], [-1, 3, -3, 1]])
+"""Coefficients of 1, t, t², t³ (rows) from Bézier control points (columns)."""
+
+
+def powers(nets: np.ndarray) -> np.ndarray:
+    """Powers of patches of Bézier control points (n, 4, 4, 3), first along u, then along v."""
+    return np.ascontiguousarray(BEZIER @ nets.transpose(0, 3, 1, 2) @ BEZIER.T)
+
+
+@compiled
+def _cubic(a, t):
+    return a[0] + t * (a[1] + t * (a[2] + t * a[3]))
+
+
+@compiled
+def _slope(a, t):
+    return a[1] + t * (2 * a[2] + 3 * t * a[3])
+
+
+@compiled
+def _first(p, u, v):
+    """A coordinate, and its derivatives along u and v."""
+    a, b, c, d = _cubic(p[0], v), _cubic(p[1], v), _cubic(p[2], v), _cubic(p[3], v)
+    along_v = _slope(p[0], v) + u * (_slope(p[1], v) + u * (_slope(p[2], v) + u * _slope(p[3], v)))
+    return a + u * (b + u * (c + u * d)), b + u * (2 * c + 3 * u * d), along_v
+
+
+@compiled
+def _second(p, u, v):
+    """The second derivatives of a coordinate: in u, in u and v, in v."""
+    uu = 2 * _cubic(p[2], v) + 6 * u * _cubic(p[3], v)
+    uv = _slope(p[1], v) + u * (2 * _slope(p[2], v) + 3 * u * _slope(p[3], v))
+    a, b, c, d = 2 * p[0, 2], 2 * p[1, 2], 2 * p[2, 2], 2 * p[3, 2]
+    a, b, c, d = a + 6 * v * p[0, 3], b + 6 * v * p[1, 3], c + 6 * v * p[2, 3], d + 6 * v * p[3, 3]
+    return uu, uv, a + u * (b + u * (c + u * d))
+
+
+@kernel
+def points(start, stop, powers, patch, params, out):
+    """Fill `out` (N, 1, 3): points of patches (N,) at params (N, 2)."""
+    for n in range(start, stop):
+        for c in range(3):
+            out[n, 0, c] = _first(powers[patch[n], c], params[n, 0], params[n, 1])[0]
+
+
+@kernel
+def expansions(start, stop, powers, patch, params, out):
+    """Fill `out` (N, 6, 3): points of patches (N,) at params (N, 2), and derivatives in u, v, uu, uv, vv."""
+    for n in range(start, stop):
+        p, u, v, to = powers[patch[n]], params[n, 0], params[n, 1], out[n]
+        for c in range(3):
+            to[0, c], to[1, c], to[2, c] = _first(p[c], u, v)
+            to[3, c], to[4, c], to[5, c] = _second(p[c], u, v)
+
+
+@kernel
+def bounds(nets, out):
+    """Fill `out` (n, 3): bounds of the lengths of second derivatives: in u, in u and v, in v."""
+    for n in range(len(nets)):
+        out[n] = 0
+        for i in range(4):
+            for j in range(4):
+                uu, uv, vv = 0.0, 0.0, 0.0
+                for c in range(3):
+                    if i < 2:
+                        uu += (nets[n, i, j, c] - 2 * nets[n, i + 1, j, c] + nets[n, i + 2, j, c]) ** 2
+                    if j < 2:
+                        vv += (nets[n, i, j, c] - 2 * nets[n, i, j + 1, c] + nets[n, i, j + 2, c]) ** 2
+                    if i < 3 and j < 3:
+                        low, high = nets[n, i, j, c], nets[n, i + 1, j, c]
+                        uv += (low - high - nets[n, i, j + 1, c] + nets[n, i + 1, j + 1, c]) ** 2
+                out[n, 0] = max(out[n, 0], 6 * math.sqrt(uu))
+                out[n, 1] = max(out[n, 1], 9 * math.sqrt(uv))
+                out[n, 2] = max(out[n, 2], 6 * math.sqrt(vv))
+
+
+# ------------------------------------------------------------------------------------------- where rays meet
+
+
+@kernel
+def meet(start, stop, powers, bounds, ids, params, row, depth, origins, directions, spread, limits):
+    """Newton's method: move params so that points lie on their rays; see `rts_surfaces.parametric`.
+
+    Args:
+        start: first line of cells.
+        stop: one after the last.
+        powers: (n, 3, 4, 4).
+        bounds: (n, 3), see above: where they say that a step ends near enough, the surface is not looked at again.
+        ids: (N, 1) int32, the patches.
+        params: (N, 2) float32, where to start; changed.
+        row: (L, W) int32, the sample in each cell; becomes −1 where it does not meet its ray.
+        depth: (L, W) float32, changed.
+        origins: (N, 3) float64.
+        directions: (N, 3) float64; the point at depth z is `origin + z direction`.
+        spread: (2,), a pixel at depth z is `spread[0] + spread[1] z` wide.
+        limits: (4,): residual in pixels, largest number of steps, largest step in params, how far beyond the edge.
+    """
+    residual, steps, largest, beyond = limits[0], int(limits[1]), limits[2], limits[3]
+    for y in range(start, stop):
+        for x in range(row.shape[1]):
+            n = row[y, x]
+            if n < 0:
+                continue
+            row[y, x] = -1
+            patch, u, v = ids[n, 0], float(params[n, 0]), float(params[n, 1])
+            p, bound = powers[patch], bounds[patch]
+            dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
+            square = dx * dx + dy * dy + dz * dz
+            for step in range(steps + 1):
+                sx, ax, bx = _first(p[0], u, v)
+                sy, ay, by = _first(p[1], u, v)
+                sz, az, bz = _first(p[2], u, v)
+                # From the point to the ray's origin.
+                rx, ry, rz = origins[n, 0] - sx, origins[n, 1] - sy, origins[n, 2] - sz
+                z = -(rx * dx + ry * dy + rz * dz) / square
+                near = residual * abs(spread[0] + spread[1] * z)
+                cx, cy, cz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
+                met = cx * cx + cy * cy + cz * cz <= near * near * square
+                if not met:
+                    if step == steps:
+                        break
+                    # Where the ray meets the tangent plane, by Cramer's rule.
+                    hx, hy, hz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
+                    determinant = ax * hx + ay * hy + az * hz
+                    scale = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz) * square
+                    if not determinant * determinant > 1e-24 * scale:
+                        break
+                    qx, qy, qz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
+                    du = (rx * hx + ry * hy + rz * hz) / determinant
+                    dv = (dx * qx + dy * qy + dz * qz) / determinant
+                    size = max(abs(du), abs(dv))
+                    if size > largest:
+                        du, dv = du * largest / size, dv * largest / size
+                    else:
+                        off = bound[0] * du * du + 2 * bound[1] * abs(du * dv) + bound[2] * dv * dv
+                        if off <= 2 * near:
+                            met, z = True, (bx * qx + by * qy + bz * qz) / determinant
+                    u, v = u + du, v + dv
+                if met:
+                    if -beyond <= u <= 1 + beyond and -beyond <= v <= 1 + beyond:
+                        row[y, x], depth[y, x], params[n, 0], params[n, 1] = n, z, u, v
+                    break
+                u, v = min(max(u, -0.25), 1.25), min(max(v, -0.25), 1.25)
+            if row[y, x] < 0:
+                depth[y, x], params[n, 0], params[n, 1] = 0, 0, 0
+
+
+# ------------------------------------------------------------------------------------- values and gradients
+
+
+@compiled
+def _bernstein(t, value, slope):
+    """The cubic Bernstein polynomials (4,) and their derivatives, also beyond [0, 1]."""
+    one = value.dtype.type(1)
+    three, two = one + one + one, one + one
+    s = one - t
+    value[0], value[1], value[2], value[3] = s * s * s, three * s * s * t, three * s * t * t, t * t * t
+    slope[0], slope[1] = -three * s * s, three * s * (s - two * t)
+    slope[2], slope[3] = three * t * (two * s - t), three * t * t
+
+
+@kernel
+def gather(start, stop, rows, table, out):
+    """Fill `out` (n, 16, C) with the rows (V, C) of each patch."""
+    for n in range(start, stop):
+        for k in range(16):
+            for c in range(rows.shape[1]):
+                out[n, k, c] = rows[table[n, k], c]
+
+
+@kernel
+def scatter(table, found, out):
+    """Add to `out` (V, C) what patches have in `found` (n, 16, C)."""
+    for n in range(len(table)):
+        for k in range(16):
+            for c in range(out.shape[1]):
+                out[table[n, k], c] += found[n, k, c]
+
+
+@kernel
+def values(start, stop, nets, patch, params, out):
+    """Fill `out` (N, C) with sums of control points (n, 16, C) of patches (N,) at params (N, 2)."""
+    a, b, none = np.empty(4, nets.dtype), np.empty(4, nets.dtype), np.empty(4, nets.dtype)
+    for n in range(start, stop):
+        _bernstein(params[n, 0], a, none)
+        _bernstein(params[n, 1], b, none)
+        net = nets[patch[n]]
+        for c in range(nets.shape[2]):
+            total = nets.dtype.type(0)
+            for i in range(4):
+                k = 4 * i
+                total += a[i] * (b[0] * net[k, c] + b[1] * net[k + 1, c] + b[2] * net[k + 2, c] + b[3] * net[k + 3, c])
+            out[n, c] = total
+
+
+@kernel
+def pull_values(patch, params, g, found):
+    """Add to `found` (n, 16, C), of each patch's control points, what g (N, C) of the values pulls back."""
+    a, b, none = np.empty(4, g.dtype), np.empty(4, g.dtype), np.empty(4, g.dtype)
+    for n in range(len(patch)):
+        some = False
+        for c in range(g.shape[1]):
+            some |= g[n, c] != 0
+        if not some:
+            continue
+        _bernstein(params[n, 0], a, none)
+        _bernstein(params[n, 1], b, none)
+        to = found[patch[n]]
+        for i in range(4):
+            for j in range(4):
+                w = a[i] * b[j]
+                for c in range(g.shape[1]):
+                    to[4 * i + j, c] += w * g[n, c]
+
+
+@compiled
+def _tangents(net, u, v, collapsed, work):
+    """Fill `work` (7, 4): weights along u, their derivatives, along v, theirs; the tangents along u and v, the mixed.
+
+    Where one side of a patch is a single point, one tangent is zero there, and rounding beside it. It grows as the
+    mixed derivative, which then stands for it. Returned are the factors of that, zero where it does not.
+    """
+    a, da, b, db = work[0], work[1], work[2], work[3]
+    _bernstein(u, a, da)
+    _bernstein(v, b, db)
+    zero, one, half = net.dtype.type(0), net.dtype.type(1), net.dtype.type(0.5)
+    uu, vv = zero, zero
+    for c in range(3):
+        along_u, along_v, mixed = zero, zero, zero
+        for i in range(4):
+            value, slope = zero, zero
+            for j in range(4):
+                x = net[4 * i + j, c]
+                value += b[j] * x
+                slope += db[j] * x
+            along_u += da[i] * value
+            along_v += a[i] * slope
+            mixed += da[i] * slope
+        work[4, c], work[5, c], work[6, c] = along_u, along_v, mixed
+        uu += along_u * along_u
+        vv += along_v * along_v
+    # Along a side v = 0 that is a point, the derivative in u is zero; along u = 0, that in v.
+    first, second = zero, zero
+    if uu < collapsed * collapsed * vv:
+        first = one if v < half else -one
+        work[4] = first * work[6]
+    if vv < collapsed * collapsed * uu:
+        second = one if u < half else -one
+        work[5] = second * work[6]
+    return first, second
+
+
+@compiled
+def _unit_product(work, normal):
+    """Fill `normal` (3,) with the product of both tangents, of length one or zero; its length before."""
+    for c in range(3):
+        p, q = (c + 1) % 3, (c + 2) % 3
+        normal[c] = work[4, p] * work[5, q] - work[4, q] * work[5, p]
+    square = normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2]
+    length = np.sqrt(square) if square > 0 else square + normal.dtype.type(1)
+    for c in range(3):
+        normal[c] /= length
+    return length
+
+
+@kernel
+def normals(start, stop, nets, patch, params, collapsed, out):
+    """Fill `out` (N, 3) with unit normals; `collapsed` says which tangents are none, relative to the other."""
+    work = np.zeros((7, 4), nets.dtype)
+    for n in range(start, stop):
+        _tangents(nets[patch[n]], params[n, 0], params[n, 1], collapsed, work)
+        _unit_product(work, out[n])
+
+
+@kernel
+def push_normals(start, stop, nets, tangents, patch, params, collapsed, out):
+    """Fill `out` (N, 3) with the derivatives of unit normals along tangents (n, 16, 3) of control points."""
+    work, moved, normal = np.zeros((7, 4), nets.dtype), np.zeros((7, 4), nets.dtype), np.empty(3, nets.dtype)
+    for n in range(start, stop):
+        u, v = params[n, 0], params[n, 1]
+        first, second = _tangents(nets[patch[n]], u, v, collapsed, work)
+        # The same choice of tangents as at the points themselves.
+        _tangents(tangents[patch[n]], u, v, nets.dtype.type(0), moved)
+        if first != 0:
+            moved[4] = first * moved[6]
+        if second != 0:
+            moved[5] = second * moved[6]
+        length = _unit_product(work, normal)
+        along = nets.dtype.type(0)
+        for c in range(3):
+            p, q = (c + 1) % 3, (c + 2) % 3
+            x = moved[4, p] * work[5, q] - moved[4, q] * work[5, p]
+            x += work[4, p] * moved[5, q] - work[4, q] * moved[5, p]
+            out[n, c] = x / length
+            along += normal[c] * out[n, c]
+        for c in range(3):
+            out[n, c] -= along * normal[c]
+
+
+@kernel
+def pull_normals(nets, patch, params, collapsed, g, found):
+    """Add to `found` (n, 16, 3), of each patch's control points, what g (N, 3) of the normals pulls back."""
+    work, normal, across = np.zeros((7, 4), nets.dtype), np.empty(3, nets.dtype), np.empty(3, nets.dtype)
+    to_first, to_second = np.empty(3, nets.dtype), np.empty(3, nets.dtype)
+    for n in range(len(patch)):
+        if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:
+            continue
+        first, second = _tangents(nets[patch[n]], params[n, 0], params[n, 1], collapsed, work)
+        length = _unit_product(work, normal)
+        along = g[n, 0] * normal[0] + g[n, 1] * normal[1] + g[n, 2] * normal[2]
+        for c in range(3):
+            across[c] = (g[n, c] - along * normal[c]) / length
+        for c in range(3):
+            p, q = (c + 1) % 3, (c + 2) % 3
+            to_first[c] = work[5, p] * across[q] - work[5, q] * across[p]
+            to_second[c] = across[p] * work[4, q] - across[q] * work[4, p]
+        a, da, b, db, to = work[0], work[1], work[2], work[3], found[patch[n]]
+        for i in range(4):
+            for j in range(4):
+                mixed = da[i] * db[j]
+                w = da[i] * b[j] if first == 0 else first * mixed
+                x = a[i] * db[j] if second == 0 else second * mixed
+                for c in range(3):
+                    to[4 * i + j, c] += w * to_first[c] + x * to_second[c]

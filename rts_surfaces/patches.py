@@ -1,0 +1,208 @@
+"""Surfaces of bicubic patches, in Bézier form: 16 control points each, rows of a table that is linear in θ."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from functools import partial
+
+import numpy as np
+
+from rts.arrays import described, shape_of
+from rts.engines import constants, engine_of, namespace
+from rts.errors import InputError
+from rts.gbuffer import GBuffer
+from rts.records import Rays, Samples
+from rts.threads import parallel
+from rts.topology import fixed
+from rts.trees import Array, Tree
+from rts_surfaces.bicubic import normals, values
+from rts_surfaces.parametric import LIMITS, Geometry, Parametric
+from rts_surfaces.tiles import Tiles
+
+ENOUGH, FINEST, GRID = 500, 4, 3
+"""Few patches are looked at in tiles, so that they need not be as fine all over as they are at outlines: in so many
+tiles in all, in at most so many along a side of a patch, at so many points along a side of each."""
+
+ATTRIBUTES = {"colors": ("color", (1, 3, 4)), "uv": ("uv", (2,))}
+"""Entries of θ for control points: what the G-buffer calls them, and how wide they may be."""
+
+
+class Bicubic(Geometry):
+    """Patches of Bézier control points (n, 4, 4, 3) float64."""
+
+    def __init__(self, nets: np.ndarray):
+        from rts_surfaces import bicubic_kernels
+
+        self.nets, self.powers = nets, bicubic_kernels.powers(nets)
+
+    def points(self, patch: np.ndarray, params: np.ndarray, order: int) -> np.ndarray:
+        """See `Geometry`."""
+        from rts_surfaces import bicubic_kernels
+
+        kernel, width = (bicubic_kernels.expansions, 6) if order else (bicubic_kernels.points, 1)
+        out = np.empty((len(patch), width, 3))
+        parallel(kernel, len(patch), self.powers, patch, params, out, work=40 * width * len(patch))
+        return out
+
+    def meet(self, samples: Samples, rays: Rays) -> None:
+        """See `Geometry`."""
+        from rts_surfaces import bicubic_kernels
+
+        bounds = np.empty((len(self.nets), 3))
+        bicubic_kernels.bounds(self.nets, bounds)
+        lines = samples.row.reshape(-1, samples.row.shape[2]), samples.depth.reshape(-1, samples.row.shape[2])
+        ends = (np.ascontiguousarray(x, np.float64) for x in (rays.origins, rays.directions, rays.spread))
+        given = self.powers, bounds, samples.ids, samples.params, *lines, *ends, LIMITS
+        parallel(bicubic_kernels.meet, len(lines[0]), *given, work=200 * len(samples.ids))
+
+
+class Patches(Parametric):
+    """Base of surfaces of bicubic patches.
+
+    Args:
+        table: (n, 16) integers, the control points of each Bézier patch, first along u, then along v; they name rows of
+            what `bezier_rows` gives.
+        tolerance: pixels that triangles may be off the surface near outlines.
+
+    Attributes:
+        shaped_by: the entries of θ that control points are made of.
+    """
+
+    shaped_by: tuple[str, ...] = ("points",)
+
+    def __init__(self, table: np.ndarray, tolerance: float):
+        self.table = fixed(np.array(table, np.int32))
+        cuts = int(np.clip(np.sqrt(ENOUGH / len(self.table)), 1, FINEST))
+        super().__init__(_tiles(self.table, cuts), GRID, tolerance)
+
+    @property
+    def whole(self) -> Tiles:
+        """The patches themselves as tiles."""
+        return _tiles(self.table, 1)
+
+    @abc.abstractmethod
+    def bezier_rows(self, values: Array) -> Array:
+        """Rows of an entry of θ for the control points of the Bézier patches: (M, C), linear in the values.
+
+        It is asked of NumPy arrays in float64, too.
+        """
+
+    @abc.abstractmethod
+    def control_shape(self, shape: tuple[int, ...]) -> str | None:
+        """What is wrong with the shape of an entry of θ but for its last axis, in words; None for nothing."""
+
+    def control_points(self, theta: Mapping[str, Tree]) -> Array:
+        """The control points, as `bezier_rows` takes them."""
+        return theta["points"]
+
+    def expected(self, name: str, shape: tuple[int, ...]) -> str | None:
+        """What shape an entry of θ is to have, in words; None if it has it."""
+        wrong = self.control_shape(shape[:-1]) if shape else "an array"
+        widths = (3,) if name == "points" else ATTRIBUTES[name][1]
+        if wrong is None and shape[-1] not in widths:
+            return f"a last axis of {' or '.join(map(str, widths))}"
+        return wrong
+
+    def check(self, theta: Mapping[str, Tree]) -> None:
+        """Refuse θ whose entries have wrong shapes or dtypes."""
+        for name in self.reads(theta):
+            if name not in theta:
+                raise InputError(f"theta of {self!r} has no {name!r}; it has {sorted(theta)}")
+            value, wrong = theta[name], self.expected(name, shape_of(theta[name]))
+            if wrong is not None:
+                raise InputError(f"theta[{name!r}] of {self!r} {described(value)}; expected {wrong}")
+            if not namespace(value).isdtype(value.dtype, "real floating"):
+                raise InputError(f"theta[{name!r}] of {self!r} has dtype {value.dtype}; expected a floating one")
+
+    def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
+        """The entries of θ that `evaluate` needs."""
+        return *self.shaped_by, *(name for name in ATTRIBUTES if name in theta)
+
+    def nets(self, points: np.ndarray) -> np.ndarray:
+        """(n, 4, 4, 3) float64 control points of the Bézier patches."""
+        return self.bezier_rows(np.asarray(points, np.float64))[self.table].reshape(-1, 4, 4, 3)
+
+    def geometry(self, points: np.ndarray) -> Geometry:
+        """See `Parametric`."""
+        return Bicubic(self.nets(points))
+
+    def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
+        """Positions, normals, and the attributes of control points."""
+        points = self.control_points(theta)
+        engine = engine_of(points, samples.params)
+        if not engine.owns(points):
+            points = engine.constant(points, samples.params)
+        params, patch = constants((samples.params, samples.ids[:, 0]), engine, points)
+        params = engine.namespace.astype(params, points.dtype, copy=False)
+        where = engine.constant(self.table, points), patch, params
+        rows = self.bezier_rows(points)
+        gbuffer = GBuffer(position=values(rows, *where))
+        gbuffer.defer("normal", lambda: normals(rows, *where))
+        for name, (entry, _) in ATTRIBUTES.items():
+            if name in theta:
+                gbuffer.defer(entry, partial(self._attribute, theta[name], where))
+        return gbuffer
+
+    def _attribute(self, attribute: Array, where: tuple[Array, Array, Array]) -> Array:
+        return values(self.bezier_rows(attribute), *where)
+
+
+def _tiles(table: np.ndarray, cuts: int) -> Tiles:
+    """Patches (n, 16), each cut into so many tiles along each side; edges are shared where their control points are."""
+    net, count = table.reshape(-1, 4, 4), len(table)
+    # Sides run around the patch: v = 0, u = 1, v = 1 backwards, u = 0 backwards.
+    sides = np.stack([net[:, :, 0], net[:, 3, :], net[:, ::-1, 3], net[:, 0, ::-1]], axis=1).reshape(-1, 4)
+    # One direction for both patches beside an edge: that of the lesser control point first.
+    back = sides[:, ::-1]
+    place = (sides != back).argmax(axis=1)[:, None]
+    flips = np.take_along_axis(sides, place, 1)[:, 0] > np.take_along_axis(back, place, 1)[:, 0]
+    edges, edge = np.unique(np.where(flips[:, None], back, sides), axis=0, return_inverse=True)
+    edge, flips = edge.reshape(count, 4), flips.reshape(count, 4)
+    corners, pieces, backwards = _names(net[:, ::3, ::3], edge, flips, len(edges), int(table.max()) + 1, cuts)
+    i, j = (x.reshape(-1) for x in np.meshgrid(np.arange(cuts), np.arange(cuts), indexing="ij"))
+    frames = np.zeros((len(i), 3, 2))
+    frames[:, 0, 0], frames[:, 0, 1], frames[:, 1, 0], frames[:, 2, 1] = i / cuts, j / cuts, 1 / cuts, 1 / cuts
+    patch = np.repeat(np.arange(count), len(i))
+    return Tiles.of(patch, np.tile(frames, (count, 1, 1)), corners, pieces, backwards)
+
+
+def _names(
+    ends: np.ndarray, edge: np.ndarray, flips: np.ndarray, edges: int, points: int, cuts: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners, sides and flips (n cuts², 4) of the tiles of n patches.
+
+    Args:
+        ends: (n, 2, 2), the control points at the corners of patches.
+        edge: (n, 4), the edges of their sides, in order around them.
+        flips: (n, 4), whether a side runs against its edge.
+        edges: how many edges there are.
+        points: how many control points there are.
+        cuts: how many tiles a side of a patch has.
+    """
+    count, steps = len(edge), np.arange(cuts)
+    # Points of tiles: those within patches, those within edges, and control points at corners.
+    corner = points + edges * (cuts - 1) + np.arange(count * (cuts + 1) ** 2).reshape(count, cuts + 1, cuts + 1)
+    # Pieces of edges, then lines within patches, along u and along v.
+    first = edges * cuts + np.arange(count)[:, None, None] * 2 * cuts * (cuts + 1)
+    along_u = first + np.arange(cuts * (cuts + 1)).reshape(cuts, cuts + 1)
+    along_v = first + cuts * (cuts + 1) + np.arange(cuts * (cuts + 1)).reshape(cuts + 1, cuts)
+    against_u, against_v = np.zeros(along_u.shape, bool), np.zeros(along_v.shape, bool)
+    corner[:, ::cuts, ::cuts] = ends
+    for side in range(4):
+        # In the order of u or v, which sides 2 and 3 run against.
+        against = flips[:, side] ^ (side >= 2)
+        piece = np.where(against[:, None], cuts - 1 - steps, steps) + edge[:, side : side + 1] * cuts
+        within = np.where(against[:, None], cuts - 2 - steps[:-1], steps[:-1]) + edge[:, side : side + 1] * (cuts - 1)
+        end = cuts if side in (1, 2) else 0
+        if side % 2 == 0:
+            along_u[:, :, end], against_u[:, :, end] = piece, against[:, None]
+            corner[:, 1:-1, end] = points + within
+        else:
+            along_v[:, end, :], against_v[:, end, :] = piece, against[:, None]
+            corner[:, end, 1:-1] = points + within
+    corners = np.stack([corner[:, :-1, :-1], corner[:, 1:, :-1], corner[:, 1:, 1:], corner[:, :-1, 1:]], axis=-1)
+    pieces = np.stack([along_u[:, :, :-1], along_v[:, 1:, :], along_u[:, :, 1:], along_v[:, :-1, :]], axis=-1)
+    # Sides 2 and 3 of a tile run against u and v.
+    backwards = [against_u[:, :, :-1], against_v[:, 1:, :], ~against_u[:, :, 1:], ~against_v[:, :-1, :]]
+    return corners.reshape(-1, 4), pieces.reshape(-1, 4), np.stack(backwards, axis=-1).reshape(-1, 4)

@@ -1,0 +1,219 @@
+"""Patches in tiles, and triangles of these that meet without cracks whatever the rates at which tiles are cut.
+
+A tile is a quadrilateral or a triangle, with local coordinates (s, t): the unit square, or the triangle (0, 0), (1, 0),
+(0, 1). Tiles that share an edge share its points.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.records import Proxy
+from rts.threads import parallel
+from rts.topology import fixed
+from rts_surfaces.views import View
+
+MOST = 256
+"""The largest number of cuts along a side of a tile."""
+LEAST = {4: 2, 3: 3}
+"""How often a tile of so many sides is cut at least, where it is cut at all: so that points lie within it."""
+AT_ONCE = 2048
+"""Tiles whose shapes are looked at together."""
+
+Points = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
+"""(patches (N,) int32, parameters (N, 2) float64, order 0 or 2) → float64 (N, 1, 3), points; or (N, 6, 3), these and
+derivatives in u, v, uu, uv, vv."""
+
+_CORNERS = {4: np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float64), 3: np.array([(0, 0), (1, 0), (0, 1)], float)}
+
+
+class Tiles(NamedTuple):
+    """The tiles of a surface; k is 4, or 3. Host arrays, read-only.
+
+    Attributes:
+        patch: (n,) int32, the patch that each tile is of.
+        frames: (n, 3, 2) float64: its parameters are `frames[:, 0] + s * frames[:, 1] + t * frames[:, 2]`.
+        corners: (n, k) int32, the numbers of the tile's corners, counter-clockwise from (0, 0).
+        sides: (n, k) int32, the edge from each corner to the next.
+        flips: (n, k) bool, whether a side, which runs around the tile, runs against its edge.
+        corner_tiles: (C, 2) int32, for each corner a tile, and which of its corners it is.
+        edge_tiles: (E, 2) int32, for each edge a tile, and which of its sides it is.
+    """
+
+    patch: np.ndarray
+    frames: np.ndarray
+    corners: np.ndarray
+    sides: np.ndarray
+    flips: np.ndarray
+    corner_tiles: np.ndarray
+    edge_tiles: np.ndarray
+
+    @classmethod
+    def of(
+        cls, patch: np.ndarray, frames: np.ndarray, corners: np.ndarray, sides: np.ndarray, flips: np.ndarray
+    ) -> Tiles:
+        """Tiles whose corners and edges have any integers for names."""
+        corners, corner_tiles = _numbered(corners)
+        sides, edge_tiles = _numbered(sides)
+        patch, frames, flips = patch.astype(np.int32), frames.astype(np.float64), np.array(flips, bool)
+        return cls(*(fixed(x) for x in (patch, frames, corners, sides, flips, corner_tiles, edge_tiles)))
+
+    def params(self, tiles: np.ndarray, local: np.ndarray) -> np.ndarray:
+        """Parameters (N, 2) at local coordinates (N, 2) of tiles (N,)."""
+        frames = self.frames[tiles]
+        return frames[:, 0] + local[:, :1] * frames[:, 1] + local[:, 1:] * frames[:, 2]
+
+
+class Shapes(NamedTuple):
+    """What triangles by error need to know of tiles, float64.
+
+    Attributes:
+        normals: (n, G, G, 3) of unit length, or zero, at a grid of points.
+        places: (n, G, G, 3), where these are.
+        bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t.
+        curves: (n, k), the largest second derivatives of the sides across themselves.
+    """
+
+    normals: np.ndarray
+    places: np.ndarray
+    bends: np.ndarray
+    curves: np.ndarray
+
+
+def _numbered(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Names (n, k) as numbers from 0 on, and for each number a place (row, column) where it is."""
+    _, place, numbers = np.unique(names, return_index=True, return_inverse=True)
+    where = np.stack(np.divmod(place, names.shape[1]), axis=1).astype(np.int32)
+    return numbers.reshape(names.shape).astype(np.int32), where
+
+
+# ----------------------------------------------------------------------------------------------- how fine
+
+
+def shapes(tiles: Tiles, points: Points, grid: int) -> Shapes:
+    """The shapes of tiles, looked at in `grid` points along each side.
+
+    In triangles the grid is drawn together into the corner (1, 0): its points are (s, t (1 − s)).
+    """
+    from rts_surfaces import tiles_kernels
+
+    count, width = tiles.corners.shape
+    local, around, along = _looked_at(width, grid)
+    out = Shapes(*np.empty((2, count, grid, grid, 3)), np.empty((count, 3)), np.empty((count, width)))
+    for start in range(0, count, AT_ONCE):
+        frames = tiles.frames[start : start + AT_ONCE]
+        params = frames[:, None, 0] + local[:, :1] * frames[:, None, 1] + local[:, 1:] * frames[:, None, 2]
+        patch = np.repeat(tiles.patch[start : start + AT_ONCE], len(local))
+        found = points(patch, params.reshape(-1, 2), 2).reshape(len(frames), len(local), 6, 3)
+        part = [x[start : start + AT_ONCE] for x in out]
+        given = found, frames, along, around
+        parallel(tiles_kernels.shapes, len(frames), *given, *part, work=300 * grid * grid * len(frames))
+    return out
+
+
+def _looked_at(width: int, grid: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Local coordinates (P, 2), those on each side (k, grid), and the sides' directions (k, 2)."""
+    steps, corners = np.linspace(0, 1, grid), _CORNERS[width]
+    local = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1)
+    along = np.roll(corners, -1, axis=0) - corners
+    if width == 4:
+        numbers = np.arange(grid * grid).reshape(grid, grid)
+        return local.reshape(-1, 2), np.stack([numbers[:, 0], numbers[-1], numbers[:, -1], numbers[0]]), along
+    local[..., 1] *= 1 - local[..., 0]
+    sides = corners[:, None] + steps[:, None] * along[:, None]
+    numbers = grid * grid + np.arange(3 * grid).reshape(3, grid)
+    return np.concatenate([local.reshape(-1, 2), sides.reshape(-1, 2)]), numbers, along
+
+
+def chords(found: Shapes, view: View, fine: float, coarse: float) -> np.ndarray:
+    """(n,) how far triangles of each tile may be off the surface, in units of space; infinity where out of view.
+
+    Args:
+        found: the shapes of the tiles.
+        view: what the camera sees.
+        fine: pixels, where a tile may have an outline.
+        coarse: pixels elsewhere.
+    """
+    from rts_surfaces import tiles_kernels
+
+    allowed, angle = np.empty(len(found.bends)), min(view.angle, math.pi / 2)
+    cone = np.array([*view.axis, math.sin(angle), math.cos(angle)])
+    seen = view.eye, view.toward, view.parallel, view.aside, view.along, view.spread, cone, np.array([fine, coarse])
+    given = found.places, found.normals, found.bends, *seen
+    parallel(tiles_kernels.outlines, len(allowed), *given, allowed, work=500 * len(allowed))
+    return allowed
+
+
+def by_error(tiles: Tiles, found: Shapes, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rates of edges (E,) and of tiles (n, 2), int32, so that chords are off by no more than is allowed (n,)."""
+    from rts_surfaces import tiles_kernels
+
+    inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
+    tiles_kernels.rates(found.bends, found.curves, allowed, tiles.sides, len(edges), MOST, inner, edges)
+    return edges, inner
+
+
+def uniform(tiles: Tiles, rate: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rates of edges (E,) and of tiles (n, 2), int32, where all is cut alike."""
+    edges = np.full(len(tiles.edge_tiles), rate, np.int32)
+    least = 1 if rate == 1 else max(rate, LEAST[tiles.corners.shape[1]])
+    return edges, np.full((len(tiles.patch), 2), least, np.int32)
+
+
+# ----------------------------------------------------------------------------------------------- triangles
+
+
+def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray) -> Proxy:
+    """Triangles of tiles, without cracks, counter-clockwise where tiles are.
+
+    Args:
+        tiles: the tiles.
+        points: the surface.
+        edges: (E,) int32, into how many pieces each edge is cut.
+        inner: (n, 2) int32, into how many each tile is cut along s and t; of triangles the first counts. Where an edge
+            of a tile is cut they are at least those of `LEAST`; also where one of the two is more than 1.
+
+    Returns:
+        Vertices; ids (T, 1) are patches, parameters (T, 3, 2) those in the patch.
+    """
+    from rts_surfaces import tiles_kernels
+
+    count, width = tiles.corners.shape
+    within = (inner[:, 0] - 1) * (inner[:, 1] - 1) if width == 4 else (inner[:, 0] - 1) * (inner[:, 0] - 2) // 2
+    edge_first = len(tiles.corner_tiles) + np.concatenate([[0], np.cumsum(edges - 1)]).astype(np.int32)
+    inner_first = edge_first[-1] + np.concatenate([[0], np.cumsum(within)]).astype(np.int32)
+    vertices = points(*_places(tiles, edges, edge_first, inner, inner_first), 0)[:, 0].astype(np.float32)
+    first = np.zeros(count + 1, np.int32)
+    tiles_kernels.counts(inner, tiles.sides, edges, first)
+    total = int(first[-1])
+    out = np.empty((total, 3), np.int32), np.empty((total, 1), np.int32), np.empty((total, 3, 2), np.float32)
+    kernel = tiles_kernels.quadrilaterals if width == 4 else tiles_kernels.triangles
+    given = *tiles[:5], edges, edge_first, inner, inner_first, first
+    parallel(kernel, count, *given, out, work=30 * total)
+    return Proxy(vertices, *out)
+
+
+def _places(
+    tiles: Tiles, edges: np.ndarray, edge_first: np.ndarray, inner: np.ndarray, inner_first: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Patches (V,) and parameters (V, 2) of vertices: of corners, within edges, within tiles."""
+    from rts_surfaces import tiles_kernels
+
+    shape = _CORNERS[tiles.corners.shape[1]]
+    total = int(inner_first[-1])
+    patch, params = np.empty(total, np.int32), np.empty((total, 2))
+    tile, corner = tiles.corner_tiles.T
+    patch[: len(tile)], params[: len(tile)] = tiles.patch[tile], tiles.params(tile, shape[corner])
+    # From one end of an edge to the other, in its own direction.
+    tile, side = tiles.edge_tiles.T
+    back = tiles.flips[tile, side][:, None]
+    ends = tiles.params(tile, shape[side]), tiles.params(tile, np.roll(shape, -1, axis=0)[side])
+    ends = np.where(back, ends[1], ends[0]), np.where(back, ends[0], ends[1])
+    tiles_kernels.within_edges(tiles.patch[tile], *ends, edges, edge_first, patch, params)
+    kernel = tiles_kernels.within_quadrilaterals if len(shape) == 4 else tiles_kernels.within_triangles
+    kernel(tiles.patch, tiles.frames, inner, inner_first, patch, params)
+    return patch, params

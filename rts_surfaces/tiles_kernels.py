@@ -1,0 +1,430 @@
+"""How finely tiles are cut, and their triangles, compiled.
+
+Tiles, their tables and their local coordinates are those of `rts_surfaces.tiles.Tiles`. It imports numba.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+compiled = numba.njit(nogil=True)
+kernel = numba.njit(nogil=True, cache=True)
+
+COLLAPSED = 1e-6
+"""Derivatives that are parallel but for this share have no normal."""
+
+
+@compiled
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+# ------------------------------------------------------------------------------------------ points and counts
+
+
+@kernel
+def within_edges(owner, starts, ends, edges, edge_first, patch, params):
+    """Fill patch (V,) and params (V, 2) of the points within edges.
+
+    Args:
+        owner: (E,) int32, the patch that each edge is evaluated on.
+        starts: (E, 2) float64, its parameters where the edge starts.
+        ends: (E, 2) float64.
+        edges: (E,) int32, how often each edge is cut.
+        edge_first: (E + 1,) int32, the first of the points within each edge.
+        patch: (V,) int32.
+        params: (V, 2) float64.
+    """
+    for e in range(len(edges)):
+        for k in range(1, edges[e]):
+            v, x = edge_first[e] + k - 1, k / edges[e]
+            patch[v] = owner[e]
+            for c in range(2):
+                params[v, c] = starts[e, c] + x * (ends[e, c] - starts[e, c])
+
+
+@compiled
+def _put(frame, s, t, out):
+    for c in range(2):
+        out[c] = frame[0, c] + s * frame[1, c] + t * frame[2, c]
+
+
+@kernel
+def within_quadrilaterals(owner, frames, inner, inner_first, patch, params):
+    """Fill patch (V,) and params (V, 2) of the points within tiles: first along t, then along s."""
+    for n in range(len(inner)):
+        v, rs, rt = inner_first[n], inner[n, 0], inner[n, 1]
+        for i in range(1, rs):
+            for j in range(1, rt):
+                patch[v] = owner[n]
+                _put(frames[n], i / rs, j / rt, params[v])
+                v += 1
+
+
+@kernel
+def within_triangles(owner, frames, inner, inner_first, patch, params):
+    """Fill patch (V,) and params (V, 2) of the points within triangular tiles: first along s, then along t."""
+    for n in range(len(inner)):
+        v, r = inner_first[n], inner[n, 0]
+        for j in range(1, r):
+            for i in range(1, r - j):
+                patch[v] = owner[n]
+                _put(frames[n], i / r, j / r, params[v])
+                v += 1
+
+
+@kernel
+def counts(inner, sides, edges, first):
+    """Fill first (n + 1,): the number of the first triangle of each tile."""
+    width = sides.shape[1]
+    first[0] = 0
+    for n in range(len(inner)):
+        rs, rt = inner[n, 0], inner[n, 1]
+        if rs == 1:
+            total = width - 2
+        else:
+            total = 2 * (rs - 2) * (rt - 2) if width == 4 else (rs - 3) * (rs - 3)
+            for s in range(width):
+                total += edges[sides[n, s]] + ((rs if s % 2 == 0 else rt) - 2 if width == 4 else rs - 3)
+        first[n + 1] = first[n] + total
+
+
+# ------------------------------------------------------------------------------------------------- triangles
+
+
+@compiled
+def _set(faces, params, t, place, vertex, frame, x, y):
+    faces[t, place] = vertex
+    for c in range(2):
+        params[t, place, c] = frame[0, c] + x * frame[1, c] + y * frame[2, c]
+
+
+@compiled
+def _outer(faces, params, t, place, n, side, k, cuts, frame, corners, flips, base):
+    """The point number k of a side."""
+    width = corners.shape[1]
+    if k == 0 or k == cuts:
+        vertex = corners[n, side if k == 0 else (side + 1) % width]
+    else:
+        vertex = base + (cuts - k if flips[n, side] else k) - 1
+    z = k / cuts
+    if width == 3:
+        x, y = (z, 0.0) if side == 0 else (1 - z, z) if side == 1 else (0.0, 1 - z)
+    else:
+        x, y = (z, 0.0) if side == 0 else (1.0, z) if side == 1 else (1 - z, 1.0) if side == 2 else (0.0, 1 - z)
+    _set(faces, params, t, place, vertex, frame, x, y)
+
+
+@compiled
+def _square_point(faces, params, t, place, i, j, rs, rt, frame, base):
+    _set(faces, params, t, place, base + (i - 1) * (rt - 1) + j - 1, frame, i / rs, j / rt)
+
+
+@compiled
+def _square_ring(faces, params, t, place, side, m, rs, rt, frame, base):
+    """The point number m, from 1 on, of the ring within a tile, along a side."""
+    i = m if side == 0 else rs - 1 if side == 1 else rs - m if side == 2 else 1
+    j = 1 if side == 0 else m if side == 1 else rt - 1 if side == 2 else rt - m
+    _square_point(faces, params, t, place, i, j, rs, rt, frame, base)
+
+
+@kernel
+def quadrilaterals(
+    start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out
+):
+    """Fill the triangles of quadrilateral tiles.
+
+    Args:
+        start: first tile.
+        stop: one after the last.
+        owner: (n,) int32, patches of tiles.
+        frames: (n, 3, 2) float64.
+        corners: (n, 4) int32.
+        sides: (n, 4) int32.
+        flips: (n, 4) bool.
+        edges: (E,) int32, how often each edge is cut.
+        edge_first: (E + 1,) int32, the first of the vertices within each edge.
+        inner: (n, 2) int32, how often each tile is cut.
+        inner_first: (n + 1,) int32, the first of the vertices within each tile.
+        first: (n + 1,) int32, the first triangle of each tile.
+        out: faces (T, 3) int32, ids (T, 1) int32, params (T, 3, 2) float32.
+    """
+    faces, ids, params = out
+    for n in range(start, stop):
+        rs, rt, t, base, frame = inner[n, 0], inner[n, 1], first[n], inner_first[n], frames[n]
+        ids[t : first[n + 1], 0] = owner[n]
+        if rs == 1:
+            for half in range(2):
+                for k in range(3):
+                    _outer(faces, params, t + half, k, n, (k + 2 * half) % 4, 0, 1, frame, corners, flips, 0)
+            continue
+        for i in range(1, rs - 1):
+            for j in range(1, rt - 1):
+                for half in range(2):
+                    for k in range(3):
+                        # (0, 0), (1, 0), (1, 1) and (1, 1), (0, 1), (0, 0) of the cell.
+                        c = (k + 2 * half) % 4
+                        x, y = i + (1 if c == 1 or c == 2 else 0), j + (1 if c >= 2 else 0)
+                        _square_point(faces, params, t, k, x, y, rs, rt, frame, base)
+                    t += 1
+        for side in range(4):
+            e, count = sides[n, side], rs if side % 2 == 0 else rt
+            cuts = edges[e]
+            # Points of the side, 0 to `cuts`, and those of the ring within, 1 to `count` − 1; the nearer goes on.
+            k, m = 0, 1
+            while k < cuts or m < count - 1:
+                outward = m == count - 1 or (k < cuts and (k + 1) * count * 2 <= (2 * m + 1) * cuts)
+                _outer(faces, params, t, 0, n, side, k, cuts, frame, corners, flips, edge_first[e])
+                if outward:
+                    _outer(faces, params, t, 1, n, side, k + 1, cuts, frame, corners, flips, edge_first[e])
+                    k += 1
+                else:
+                    _square_ring(faces, params, t, 1, side, m + 1, rs, rt, frame, base)
+                _square_ring(faces, params, t, 2, side, m, rs, rt, frame, base)
+                if not outward:
+                    m += 1
+                t += 1
+
+
+@compiled
+def _triangle_point(faces, params, t, place, i, j, r, frame, base):
+    row = (j - 1) * (r - 1) - (j - 1) * j // 2
+    _set(faces, params, t, place, base + row + i - 1, frame, i / r, j / r)
+
+
+@compiled
+def _triangle_ring(faces, params, t, place, side, m, r, frame, base):
+    """The point number m, from 1 on, of the ring within a triangular tile, along a side."""
+    i = m if side == 0 else r - 1 - m if side == 1 else 1
+    j = 1 if side == 0 else m if side == 1 else r - 1 - m
+    _triangle_point(faces, params, t, place, i, j, r, frame, base)
+
+
+@kernel
+def triangles(start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out):
+    """Fill the triangles of triangular tiles; the arguments are as those of `quadrilaterals`, of three sides."""
+    faces, ids, params = out
+    for n in range(start, stop):
+        r, t, base, frame = inner[n, 0], first[n], inner_first[n], frames[n]
+        ids[t : first[n + 1], 0] = owner[n]
+        if r == 1:
+            for k in range(3):
+                _outer(faces, params, t, k, n, k, 0, 1, frame, corners, flips, 0)
+            continue
+        for j in range(1, r - 2):
+            for i in range(1, r - 1 - j):
+                _triangle_point(faces, params, t, 0, i, j, r, frame, base)
+                _triangle_point(faces, params, t, 1, i + 1, j, r, frame, base)
+                _triangle_point(faces, params, t, 2, i, j + 1, r, frame, base)
+                t += 1
+                if i + j < r - 2:
+                    _triangle_point(faces, params, t, 0, i + 1, j, r, frame, base)
+                    _triangle_point(faces, params, t, 1, i + 1, j + 1, r, frame, base)
+                    _triangle_point(faces, params, t, 2, i, j + 1, r, frame, base)
+                    t += 1
+        for side in range(3):
+            cuts = edges[sides[n, side]]
+            base_edge = edge_first[sides[n, side]]
+            # The ring's point m lies at (m + 1/2) / r along the side; there are r − 2.
+            k, m = 0, 1
+            while k < cuts or m < r - 2:
+                outward = m == r - 2 or (k < cuts and (k + 1) * r <= (m + 1) * cuts)
+                _outer(faces, params, t, 0, n, side, k, cuts, frame, corners, flips, base_edge)
+                if outward:
+                    _outer(faces, params, t, 1, n, side, k + 1, cuts, frame, corners, flips, base_edge)
+                    k += 1
+                else:
+                    _triangle_ring(faces, params, t, 1, side, m + 1, r, frame, base)
+                _triangle_ring(faces, params, t, 2, side, m, r, frame, base)
+                if not outward:
+                    m += 1
+                t += 1
+
+
+# ---------------------------------------------------------------------------------------------------- shapes
+
+
+@compiled
+def _local(found, frame, first, second):
+    """Derivatives along s, t (2, 3) and along ss, st, tt (3, 3), of those in face parameters (6, 3)."""
+    a, b, c, d = frame[1, 0], frame[1, 1], frame[2, 0], frame[2, 1]
+    for i in range(3):
+        u, v, uu, uv, vv = found[1, i], found[2, i], found[3, i], found[4, i], found[5, i]
+        first[0, i], first[1, i] = a * u + b * v, c * u + d * v
+        second[0, i] = a * a * uu + 2 * a * b * uv + b * b * vv
+        second[1, i] = a * c * uu + (a * d + b * c) * uv + b * d * vv
+        second[2, i] = c * c * uu + 2 * c * d * uv + d * d * vv
+
+
+@kernel
+def shapes(start, stop, found, frames, along, around, normals, places, bends, curves):
+    """Fill what is asked of the shape of tiles.
+
+    Args:
+        start: first tile.
+        stop: one after the last.
+        found: (n, P, 6, 3) float64, points and derivatives in parameters of patches: on a grid of G points a side,
+            then perhaps elsewhere.
+        frames: (n, 3, 2) float64.
+        along: (k, 2) float64, the direction of each side in local coordinates.
+        around: (k, G) integers, which of the P points are on each side.
+        normals: (n, G, G, 3), of unit length, or zero.
+        places: (n, G, G, 3), where these are.
+        bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t. Chords are off by those
+            alone: what lies along the surface only moves points within it.
+        curves: (n, k), the largest second derivatives of the sides across themselves.
+    """
+    grid = normals.shape[1]
+    first, second, normal, tangent, bend = np.empty((2, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    for n in range(start, stop):
+        bends[n] = 0
+        for k in range(grid * grid):
+            i, j = k // grid, k % grid
+            _local(found[n, k], frames[n], first, second)
+            for c in range(3):
+                places[n, i, j, c] = found[n, k, 0, c]
+                x, y = (c + 1) % 3, (c + 2) % 3
+                normal[c] = first[0, x] * first[1, y] - first[0, y] * first[1, x]
+            length = math.sqrt(_dot(normal, normal))
+            there = length > COLLAPSED * math.sqrt(_dot(first[0], first[0]) * _dot(first[1], first[1])) and length > 0
+            for c in range(3):
+                normals[n, i, j, c] = normal[c] / length if there else 0.0
+                size = abs(_dot(second[c], normal)) / length if there else math.sqrt(_dot(second[c], second[c]))
+                bends[n, c] = max(bends[n, c], size)
+        for side in range(len(along)):
+            a, b = along[side]
+            curves[n, side] = 0
+            for k in around[side]:
+                _local(found[n, k], frames[n], first, second)
+                for c in range(3):
+                    tangent[c] = a * first[0, c] + b * first[1, c]
+                    bend[c] = a * a * second[0, c] + 2 * a * b * second[1, c] + b * b * second[2, c]
+                square, own = _dot(tangent, tangent), _dot(bend, bend)
+                if square > 0:
+                    own -= _dot(tangent, bend) ** 2 / square
+                curves[n, side] = max(curves[n, side], math.sqrt(max(own, 0.0)))
+
+
+# ----------------------------------------------------------------------------------------------- how fine
+
+
+@kernel
+def outlines(start, stop, places, normals, bends, eye, toward, parallel, aside, depth, spread, cone, wanted, tolerance):
+    """Fill tolerance (n,): the chord error in units of space that a tile may have; infinity where out of view.
+
+    Args:
+        start: first tile.
+        stop: one after the last.
+        places: (n, G, G, 3), points at a grid.
+        normals: (n, G, G, 3).
+        bends: (n, 3), the largest second derivatives along the normal.
+        eye: (3,), or the direction towards the viewer if `parallel`.
+        toward: (3,) unit, from the middle of the surface to the eye.
+        parallel: whether rays are.
+        aside: how far the eye may be off sideways; where parallel, how far the direction.
+        depth: how far it may be off along `toward`.
+        spread: (2,), width of a pixel at depth z.
+        cone: (5,): the axis of the view, sine and cosine of its half angle with what the view may be off.
+        wanted: (2,) pixels: where a tile may have an outline, and elsewhere.
+        tolerance: (n,).
+    """
+    grid, move = places.shape[1], aside + depth
+    faces, view, middle = np.empty((grid, grid)), np.empty(3), np.empty(3)
+    for t in range(start, stop):
+        for c in range(3):
+            middle[c] = places[t, :, :, c].mean()
+        radius = 0.0
+        for i in range(grid):
+            for j in range(grid):
+                for c in range(3):
+                    view[c] = places[t, i, j, c] - middle[c]
+                radius = max(radius, _dot(view, view))
+        # Between points of the grid the surface bulges by less than over the whole tile.
+        radius = math.sqrt(radius) + (bends[t, 0] + 2 * bends[t, 1] + bends[t, 2]) / 8
+        nearest = np.inf
+        if not parallel:
+            for c in range(3):
+                view[c] = middle[c] - eye[c]
+            distance = math.sqrt(_dot(view, view))
+            if distance > radius + move:
+                along = _dot(view, cone)
+                across = math.sqrt(max(distance * distance - along * along, 0.0))
+                # Out of the cone by more than its own size, and that of the cell of views.
+                if across * cone[4] - along * cone[3] > radius + move:
+                    tolerance[t] = np.inf
+                    continue
+        least, most, jump = np.inf, -np.inf, 0.0
+        for i in range(grid):
+            for j in range(grid):
+                far, slack = 1.0, aside
+                for c in range(3):
+                    view[c] = eye[c] if parallel else eye[c] - places[t, i, j, c]
+                if not parallel:
+                    far = math.sqrt(_dot(view, view))
+                    nearest = min(nearest, far - move)
+                    # What moves along the line of sight does not turn it.
+                    ahead = _dot(view, toward)
+                    slack += depth * math.sqrt(max(far * far - ahead * ahead, 0.0)) / far if far > 0 else depth
+                faces[i, j] = _dot(normals[t, i, j], view) / far if far > 0 else 0.0
+                slack = 1.0 if far <= move and not parallel else min(1.0, slack / far)
+                least, most = min(least, faces[i, j] - slack), max(most, faces[i, j] + slack)
+        for i in range(grid):
+            for j in range(grid - 1):
+                jump = max(jump, abs(faces[i, j] - faces[i, j + 1]), abs(faces[j, i] - faces[j + 1, i]))
+        straddles = least - 0.25 * jump <= 0 <= most + 0.25 * jump
+        width = spread[0] if parallel else abs(spread[1] * max(nearest, 0.0))
+        # The eye may be at the tile: then as fine as its size asks for.
+        tolerance[t] = max(width * (wanted[0] if straddles else wanted[1]), 1e-4 * radius)
+
+
+@kernel
+def rates(bends, curves, tolerance, sides, edge_count, most, inner, edges):
+    """Fill how often tiles and their sides are cut: inner (n, 2) along s and t, edges (E,).
+
+    Args:
+        bends: (n, 3).
+        curves: (n, k).
+        tolerance: (n,), chord error; infinity where out of view.
+        sides: (n, k) int32, the edge of each side.
+        edge_count: E.
+        most: the largest rate.
+        inner: (n, 2) int32.
+        edges: (E,) int32.
+    """
+    fine, second, width = np.full(edge_count, np.inf), np.zeros(edge_count), sides.shape[1]
+    for t in range(len(bends)):
+        for s in range(width):
+            e = sides[t, s]
+            fine[e], second[e] = min(fine[e], tolerance[t]), max(second[e], curves[t, s])
+    for e in range(edge_count):
+        edges[e] = 1
+        if fine[e] < np.inf and second[e] > 0:
+            edges[e] = int(min(most, max(1.0, math.ceil(math.sqrt(second[e] / (8 * fine[e]))))))
+    for t in range(len(bends)):
+        allowed = tolerance[t]
+        ru, rv = 1.0, 1.0
+        if allowed < np.inf:
+            uu, uv, vv = bends[t, 0], bends[t, 1], bends[t, 2]
+            ru, rv = max(1.0, math.sqrt(uu / (4 * allowed))), max(1.0, math.sqrt(vv / (4 * allowed)))
+            # The error of a triangle's chord (Filip, Magedson, Markot 1986).
+            error = (uu / (ru * ru) + 2 * uv / (ru * rv) + vv / (rv * rv)) / 8
+            if error > allowed:
+                grow = math.sqrt(error / allowed)
+                ru, rv = ru * grow, rv * grow
+        if width == 3:
+            ru = rv = max(ru, rv)
+        inner[t, 0], inner[t, 1] = int(min(most, math.ceil(ru))), int(min(most, math.ceil(rv)))
+        for s in range(width):
+            # Cut alike, a side and what lies within make no long triangles.
+            if tolerance[t] <= fine[sides[t, s]] and allowed < np.inf:
+                edges[sides[t, s]] = max(edges[sides[t, s]], inner[t, s % 2])
+    least = 2 if width == 4 else 3
+    for t in range(len(bends)):
+        cut = inner[t, 0] > 1 or inner[t, 1] > 1
+        for s in range(width):
+            cut |= edges[sides[t, s]] > 1
+        if cut:
+            inner[t, 0], inner[t, 1] = max(inner[t, 0], least), max(inner[t, 1], least)

@@ -1,0 +1,88 @@
+"""Views in cells: triangles are made for a cell of views, so that images do not depend on earlier ones."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.camera import Camera
+
+STEP, CELLS = 1.1, 16
+"""Views whose distances and widths of pixels differ by less than this factor, and whose directions are in one cell of a
+cube's sides (`CELLS` from the middle of a side to its edge), have the same triangles."""
+
+
+class View(NamedTuple):
+    """What triangles depend on: a cell of views, by its middle and how far a view may be off it.
+
+    Attributes:
+        eye: (3,), or where rays are parallel the direction towards the viewer.
+        parallel: whether they are.
+        aside: how far the eye may be off sideways, local units; where parallel, how far the direction.
+        along: how far it may be off towards the surface and away from it.
+        toward: (3,) unit, from the surface to the eye.
+        spread: (2,), width of a pixel at depth z, at its least.
+        axis: (3,) what the camera looks along.
+        angle: half the angle of a cone around the axis that holds the view, radians.
+    """
+
+    eye: np.ndarray
+    parallel: bool
+    aside: float
+    along: float
+    toward: np.ndarray
+    spread: np.ndarray
+    axis: np.ndarray
+    angle: float
+
+
+def view_key(camera: Camera, size: tuple[int, int], center: np.ndarray) -> tuple:
+    """The cell of views that a camera belongs to, as whole numbers.
+
+    Args:
+        camera: NumPy, in the surface's local space.
+        size: (height, width).
+        center: (3,), of the surface.
+    """
+    inverse = np.linalg.inv(camera.view)
+    spread, axis = camera.spread(size), -inverse[:3, 2]
+    corner = math.hypot(*size) / 2
+    if camera.projection[3, 2] == 0:
+        return True, _cell(-axis), 0, _power(spread[0]), _cell(axis), 0
+    off = inverse[:3, 3] - center
+    distance = float(np.linalg.norm(off))
+    # The principal point may be beside the image: as wide a cone as reaches its farthest corner.
+    shift = float(np.hypot(*(camera.projection[:2, 2])))
+    wide = _power(spread[1] * corner * (1 + shift))
+    return False, _cell(off), _power(distance), _power(spread[1]), _cell(axis), wide
+
+
+def view_of(key: tuple, center: np.ndarray) -> View:
+    """The view in the middle of a cell."""
+    parallel, toward, distance, width, axis, wide = key
+    direction, half = _direction(toward), 0.75 / CELLS  # Of a cell's diagonal, the tangent at most.
+    narrow = STEP ** (width - 0.5)
+    if parallel:
+        return View(direction, True, half, 0.0, direction, np.array([narrow, 0.0]), _direction(axis), math.pi)
+    length = STEP**distance
+    angle = math.atan(STEP ** (wide + 0.5)) + half
+    moves = length * half, length * math.log(STEP) / 2
+    return View(center + length * direction, False, *moves, direction, np.array([0.0, narrow]), _direction(axis), angle)
+
+
+def _power(x: float) -> int:
+    return round(math.log(max(x, 1e-300)) / math.log(STEP))
+
+
+def _cell(vector: np.ndarray) -> tuple[int, int, int]:
+    """The cell of a direction on the sides of a cube."""
+    largest = float(np.abs(vector).max())
+    x, y, z = (round(CELLS * c / largest) for c in vector.tolist()) if largest > 0 else (0, 0, CELLS)
+    return x, y, z
+
+
+def _direction(cell: tuple[int, int, int]) -> np.ndarray:
+    vector = np.array(cell, np.float64)
+    return vector / np.linalg.norm(vector)
