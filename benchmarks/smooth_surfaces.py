@@ -51,6 +51,7 @@ class AsFound(Bezier):
 
     refines = False
     centered = False
+    coarse = 1.0
 
 
 class Contender(NamedTuple):
@@ -105,7 +106,7 @@ def patches(kind: str, table: np.ndarray, points: np.ndarray, tolerance: float) 
 
 
 class Product(torch.autograd.Function):
-    """A constant sparse matrix times (m, 3); its transpose is given, too, since torch would make it in each iteration."""
+    """A constant sparse matrix times (m, 3); its transpose is given, lest torch make it in each iteration."""
 
     @staticmethod
     def forward(ctx: Any, x: Any, matrix: Any, transposed: Any) -> Any:
@@ -119,44 +120,43 @@ class Product(torch.autograd.Function):
 
 def mesh(kind: str, table: np.ndarray, points: np.ndarray, rate: int) -> Contender:
     """A mesh of so many cuts along each side of each patch; its vertices are a sparse matrix times control points."""
-    # Each column of the matrix is the mesh of control points that are zero but for one.
-    units = np.eye(len(points))
-    columns = []
-    surface = Bezier(table)
-    for start in range(0, len(points), 3):
-        block = np.zeros((len(points), 3))
-        block[:, : units[:, start : start + 3].shape[1]] = units[:, start : start + 3]
-        columns.append(meshed(surface, block, rate)[0][:, : units[:, start : start + 3].shape[1]])
-    faces = meshed(surface, points.astype(np.float64), rate)[1]
-    matrix = csr_matrix(np.concatenate(columns, axis=1).astype(np.float32))
+    proxy = meshed(table, points, rate)
+    corners = proxy.faces.reshape(-1)
+    _, first = np.unique(corners, return_index=True)
+    patch, params = np.repeat(proxy.ids[:, 0], 3)[first], proxy.corner_params.reshape(-1, 2)[first].astype(np.float64)
+    a, b = (np.stack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t * t * (1 - t), t**3], axis=-1) for t in params.T)
+    weights = (a[:, :, None] * b[:, None, :]).astype(np.float32).reshape(-1)
+    # The sum of what entries for one row and column have: at poles one control point is named four times.
+    rows = np.repeat(np.arange(len(first)), 16)
+    matrix = csr_matrix((weights, (rows, table[patch].reshape(-1))), (len(first), len(points)))
     both = [
         torch.sparse_csr_tensor(*(torch.from_numpy(x) for x in (m.indptr, m.indices, m.data)), m.shape)
         for m in (matrix, matrix.T.tocsr())
     ]
-    made = rts.plugin("surfaces", "mesh")(faces)
+    made = rts.plugin("surfaces", "mesh")(proxy.faces)
 
     def part(p: Any, shader: str) -> rts.Part:
         return rts.Part(made, {"vertices": Product.apply(p, *both)}, shader)
 
     fixed = rts.Part(made, {"vertices": matrix @ points})
-    return Contender(kind, rate, part, lambda size: len(faces), lambda size: fixed)
+    return Contender(kind, rate, part, lambda size: len(proxy.faces), lambda size: fixed)
 
 
-def meshed(surface: Any, points: np.ndarray, rate: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices float32 and faces, also those without area."""
+def meshed(table: np.ndarray, points: np.ndarray, rate: int) -> rts.Proxy:
+    """All patches cut alike."""
     from rts_surfaces.tiles import triangles, uniform
 
-    proxy = triangles(surface.whole, surface.geometry(points).points, *uniform(surface.whole, rate))
-    return proxy.vertices, proxy.faces
+    surface = Bezier(table)
+    return triangles(surface.whole, surface.geometry(points.astype(np.float64)).points, *uniform(surface.whole, rate))
 
 
 def rate_of_a_pixel(table: np.ndarray, points: np.ndarray, size: tuple[int, int]) -> int:
     """The rate at which no side of a facet is longer than a pixel."""
-    vertices, faces = meshed(Bezier(table), points.astype(np.float64), 64)
-    pixels = np.asarray(camera().for_size(size).project(vertices.astype(np.float64), size))[:, :2]
-    # Of the triangles (0, 0), (1, 0), (1, 1) the first two sides go along u and v.
-    sides = np.linalg.norm(pixels[faces] - pixels[np.roll(faces, -1, axis=1)], axis=2)[:, :2]
-    return int(np.ceil(64 * sides.max()))
+    proxy = meshed(table, points, 64)
+    pixels = np.asarray(camera().for_size(size).project(proxy.vertices.astype(np.float64), size))[:, :2]
+    # Two sides of a triangle go along u or v, the longest is a diagonal.
+    sides = np.linalg.norm(pixels[proxy.faces] - pixels[np.roll(proxy.faces, -1, axis=1)], axis=2)
+    return int(np.ceil(64 * np.sort(sides, axis=1)[:, 1].max()))
 
 
 # --------------------------------------------------------------------------------------------------- measured
@@ -191,7 +191,7 @@ def covered(part: rts.Part, side: int) -> np.ndarray:
 
 
 def outline(mask: np.ndarray) -> float:
-    """Its length, in cells: sides of cells that it separates, times what a straight one of any direction has too many."""
+    """Its length, in cells: the sides of cells along it, of which a line of any direction has 4/π too many."""
     return ((mask[1:] != mask[:-1]).sum() + (mask[:, 1:] != mask[:, :-1]).sum()) * np.pi / 4
 
 

@@ -15,6 +15,9 @@ from rts.trees import Array
 COLLAPSED = 1e-4
 """A tangent is taken for zero, and the normal from the mixed derivative, where it is less than this share of the
 other."""
+SHARES = 4
+"""Parts of the samples whose gradients are added up by themselves: a fixed number, so that sums do not depend on how
+many threads there are."""
 
 
 def values(rows: Array, table: Array, patch: Array, params: Array) -> Array:
@@ -89,6 +92,11 @@ def _nets(rows: np.ndarray, operands: Arrays) -> np.ndarray:
     return nets
 
 
+def _shares(nets: np.ndarray) -> np.ndarray:
+    """Zeros (SHARES, n, 16, C) to add gradients to."""
+    return np.zeros((SHARES, *nets.shape), nets.dtype)
+
+
 def _value_shape(rows: tuple[int, ...], params: tuple[int, ...], *_: tuple[int, ...]) -> tuple[int, ...]:
     return params[0], rows[1]
 
@@ -113,8 +121,8 @@ def _pull_values(operands: Arrays, g: np.ndarray, results: Some) -> None:
 
     if results[0] is not None:
         _, params, patch, table = operands
-        found = np.zeros_like(_nets(results[0], operands))
-        bicubic_kernels.pull_values(patch, params, read_only(g), found)
+        found = _shares(_nets(results[0], operands))
+        parallel(bicubic_kernels.pull_values, len(found), patch, params, read_only(g), found, work=30 * len(g))
         bicubic_kernels.scatter(table, found, results[0])
 
 
@@ -145,8 +153,9 @@ def _pull_normals(operands: Arrays, g: np.ndarray, results: Some) -> None:
     if results[0] is not None:
         rows, params, patch, table = operands
         nets = _nets(rows, operands)
-        found = np.zeros_like(nets)
-        bicubic_kernels.pull_normals(nets, patch, params, rows.dtype.type(COLLAPSED), read_only(g), found)
+        found = _shares(nets)
+        given = nets, patch, params, rows.dtype.type(COLLAPSED), read_only(g), found
+        parallel(bicubic_kernels.pull_normals, len(found), *given, work=80 * len(g))
         bicubic_kernels.scatter(table, found, results[0])
 
 

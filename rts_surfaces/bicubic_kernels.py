@@ -187,11 +187,12 @@ def gather(start, stop, rows, table, out):
 
 @kernel
 def scatter(table, found, out):
-    """Add to `out` (V, C) what patches have in `found` (n, 16, C)."""
+    """Add to `out` (V, C) what patches have in all shares of `found` (S, n, 16, C)."""
     for n in range(len(table)):
         for k in range(16):
             for c in range(out.shape[1]):
-                out[table[n, k], c] += found[n, k, c]
+                for share in range(len(found)):
+                    out[table[n, k], c] += found[share, n, k, c]
 
 
 @kernel
@@ -211,10 +212,21 @@ def values(start, stop, nets, patch, params, out):
 
 
 @kernel
-def pull_values(patch, params, g, found):
-    """Add to `found` (n, 16, C), of each patch's control points, what g (N, C) of the values pulls back."""
+def pull_values(start, stop, patch, params, g, found):
+    """Add to `found` (S, n, 16, C), for each of S shares of the samples, what g (N, C) pulls back to control points."""
+    for share in range(start, stop):
+        _pull_values(*_share(share, len(found), len(patch)), patch, params, g, found[share])
+
+
+@compiled
+def _share(share, shares, count):
+    return share * count // shares, (share + 1) * count // shares
+
+
+@compiled
+def _pull_values(start, stop, patch, params, g, found):
     a, b, none = np.empty(4, g.dtype), np.empty(4, g.dtype), np.empty(4, g.dtype)
-    for n in range(len(patch)):
+    for n in range(start, stop):
         some = False
         for c in range(g.shape[1]):
             some |= g[n, c] != 0
@@ -315,11 +327,17 @@ def push_normals(start, stop, nets, tangents, patch, params, collapsed, out):
 
 
 @kernel
-def pull_normals(nets, patch, params, collapsed, g, found):
-    """Add to `found` (n, 16, 3), of each patch's control points, what g (N, 3) of the normals pulls back."""
+def pull_normals(start, stop, nets, patch, params, collapsed, g, found):
+    """Add to `found` (S, n, 16, 3), for each of S shares of the samples, what g (N, 3) pulls back to control points."""
+    for share in range(start, stop):
+        _pull_normals(*_share(share, len(found), len(patch)), nets, patch, params, collapsed, g, found[share])
+
+
+@compiled
+def _pull_normals(start, stop, nets, patch, params, collapsed, g, found):
     work, normal, across = np.zeros((7, 4), nets.dtype), np.empty(3, nets.dtype), np.empty(3, nets.dtype)
     to_first, to_second = np.empty(3, nets.dtype), np.empty(3, nets.dtype)
-    for n in range(len(patch)):
+    for n in range(start, stop):
         if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:
             continue
         first, second = _tangents(nets[patch[n]], params[n, 0], params[n, 1], collapsed, work)

@@ -23,9 +23,7 @@ from rts_surfaces.tiles import MOST, Tiles, by_error, chords, shapes, triangles,
 from rts_surfaces.views import view_key, view_of
 
 TOLERANCE = 0.1
-"""Pixels that a triangle may be off the surface where there may be an outline. Elsewhere samples find the surface from
-afar: Newton's method needs no better start than `COARSE` times as much."""
-COARSE = 10.0
+"""Pixels that a triangle may be off the surface where there may be an outline."""
 
 RESIDUAL, STEPS, LARGEST_STEP, BEYOND = 1e-4, 6, 0.25, 0.02
 """Newton's method: pixels a sample may be off its ray, the number of steps, the largest one, and how far a sample may
@@ -58,9 +56,14 @@ class Parametric(TriangleSurface):
         tiles: of all patches.
         grid: points along each side of a tile at which its shape is looked at.
         tolerance: pixels that triangles may be off the surface near outlines.
+
+    Attributes:
+        coarse: how many times as much they may be off elsewhere: samples find the surface from afar, since Newton's
+            method needs no better start.
     """
 
     sample_widths = (1, 2)
+    coarse = 10.0
 
     def __init__(self, tiles: Tiles, grid: int, tolerance: float):
         check_positive("tolerance", tolerance)
@@ -93,7 +96,7 @@ class Parametric(TriangleSurface):
         geometry, center = self.geometry(points), _center(points)
         found = shapes(self.tiles, geometry.points, self.grid)
         view = view_of(view_key(camera, size, center), center)
-        allowed = chords(found, view, self.tolerance, COARSE * self.tolerance)
+        allowed = chords(found, view, self.tolerance, self.coarse * self.tolerance)
         return triangles(self.tiles, geometry.points, *by_error(self.tiles, found, allowed))
 
     def tessellate(self, theta: Mapping[str, Tree], rate: int | float) -> tuple[np.ndarray, np.ndarray]:

@@ -103,7 +103,8 @@ def shapes(tiles: Tiles, points: Points, grid: int) -> Shapes:
 
     count, width = tiles.corners.shape
     local, around, along = _looked_at(width, grid)
-    out = Shapes(*np.empty((2, count, grid, grid, 3)), np.empty((count, 3)), np.empty((count, width)))
+    normals, places = np.empty((2, count, grid, grid, 3))
+    out = Shapes(normals, places, np.empty((count, 3)), np.empty((count, width)))
     for start in range(0, count, AT_ONCE):
         frames = tiles.frames[start : start + AT_ONCE]
         params = frames[:, None, 0] + local[:, :1] * frames[:, None, 1] + local[:, 1:] * frames[:, None, 2]

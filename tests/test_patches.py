@@ -1,0 +1,207 @@
+"""What patches are made of: values and normals as operations, tiles that meet, samples that are moved and pruned."""
+
+import numpy as np
+import pytest
+from helpers import ALL, DIFFERENTIABLE, arrays, derivative, gradient, to_numpy
+
+import rts
+from rts import Camera, InputError, Samples
+from rts.sampling import settling
+from rts.threads import read_only
+from rts_surfaces import bicubic, tiles
+
+pytestmark = pytest.mark.sampling
+
+Bezier, BSpline, Revolution = (rts.plugin("surfaces", name) for name in ("bezier", "bspline", "revolution"))
+RNG = np.random.default_rng(0)
+CAMERA = Camera.look_at((1.5, 1.8, 3.0), (0, 0, 0), fov_y=40)
+
+
+# --------------------------------------------------------------------------------------------- operations
+
+
+def patches(width=3, count=60):
+    """Rows, params, patches and table of three patches, one of which has a side that is a point."""
+    rows, table = RNG.normal(size=(40, width)), RNG.permuted(np.tile(np.arange(39), (3, 1)), axis=1)[:, :16]
+    table[1, :4] = 39
+    params = RNG.random((count, 2)) * 1.04 - 0.02
+    params[:3], params[3:6, 0] = [(0, 0), (1, 1), (0.5, 0.5)], [0, 1e-7, 1]
+    patch = RNG.integers(0, 3, count)
+    patch[3:6] = 1
+    return rows, params, patch.astype(np.int32), table.astype(np.int32)
+
+
+OPERATIONS = {"values": bicubic.VALUES, "normals": bicubic.NORMALS}
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_compiled_patches_are_those_of_the_specification(name):
+    operation, operands = OPERATIONS[name], [read_only(x) for x in patches()]
+    found, _ = operation.value_on_host(operands, {})
+    np.testing.assert_allclose(found, operation.specification(*operands), rtol=0, atol=1e-11)
+    if name == "normals":
+        np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_compiled_derivatives_are_those_of_differences_and_transposes_of_each_other(name):
+    operation, operands = OPERATIONS[name], [read_only(x) for x in patches()]
+    tangent, g = RNG.normal(size=(40, 3)), RNG.normal(size=(60, 3))
+    pushed, pulled = np.empty((1, 60, 3)), np.zeros((40, 3))
+    operation.push_on_host(operands, [tangent[None]], pushed, None, {})
+    operation.pull_on_host(operands, g, [pulled], None, {})
+    np.testing.assert_allclose((pushed * g).sum(), (pulled * tangent).sum(), rtol=1e-10)
+    ends = [operation.value_on_host([operands[0] + s * tangent, *operands[1:]], {})[0] for s in (1e-6, -1e-6)]
+    # Where one derivative is only nearly zero, a difference may choose the other tangent.
+    steady = np.ones(60, bool)
+    steady[3:6] = name == "values"
+    difference = (ends[0] - ends[1]) / 2e-6
+    np.testing.assert_allclose(pushed[0][steady], difference[steady], rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_engines_differentiate_patches_alike(name, target):
+    operation, (rows, params, patch, table) = OPERATIONS[name], patches()
+    tangent, g = RNG.normal(size=(40, 3)), RNG.normal(size=(60, 3))
+    rest = arrays(target, [params, patch, table])
+    factors = arrays(target, g)
+    pulled = gradient(target, lambda r: (operation(r, *rest) * factors).sum(), arrays(target, rows))
+    value, pushed = derivative(target, lambda r: operation(r, *rest), arrays(target, rows), arrays(target, tangent))
+    operands = [read_only(x) for x in (rows, params.astype(np.float32).astype(np.float64), patch, table)]
+    np.testing.assert_allclose(to_numpy(value), operation.value_on_host(operands, {})[0], atol=2e-4)
+    expected, expected_pull = np.empty((1, 60, 3)), np.zeros((40, 3))
+    operation.push_on_host(operands, [tangent[None]], expected, None, {})
+    operation.pull_on_host(operands, g, [expected_pull], None, {})
+    scale = np.abs(expected).max(), np.abs(expected_pull).max()
+    np.testing.assert_allclose(to_numpy(pushed), expected[0], atol=2e-3 * scale[0])
+    np.testing.assert_allclose(to_numpy(pulled), expected_pull, atol=2e-3 * scale[1])
+
+
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize("name", OPERATIONS)
+def test_patches_and_points_that_are_not_there_are_refused(name, target):
+    rows, params, patch, table = patches()
+    for given, message in (
+        ((rows, params, patch + 3, table), r"patches \d to 5 of 3; sample this surface anew"),
+        ((rows[:20], params, patch, table), r"control points \d to 39 of 20; sample this surface anew"),
+    ):
+        with pytest.raises(InputError, match=message):
+            to_numpy(OPERATIONS[name](*arrays(target, list(given))))
+    with pytest.raises(InputError, match=r"\(9, 2\) and \(60,\)"):
+        OPERATIONS[name](rows, params[:9], patch, table)
+
+
+# -------------------------------------------------------------------------------------------------- tiles
+
+
+def boundary(faces):
+    """Directed edges of triangles without one that runs the other way."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    there = {tuple(e) for e in edges.tolist()}
+    assert len(there) == len(edges)
+    return [e for e in there if e[::-1] not in there]
+
+
+@pytest.mark.parametrize("shape", [(4, 4), (5, 4), (20, 20)])
+@pytest.mark.parametrize("seed", range(3))
+def test_tiles_of_a_closed_surface_have_no_boundary_whatever_their_rates(shape, seed):
+    surface, rng = BSpline(shape, "periodic"), np.random.default_rng(seed)
+    u, v = (2 * np.pi * np.arange(n)[(slice(None), None)[:: 1 if i == 0 else -1]] / n for i, n in enumerate(shape))
+    points = np.stack([(2 + np.cos(v)) * np.cos(u), (2 + np.cos(v)) * np.sin(u), np.sin(v) + 0 * u], axis=-1)
+    for cut in (surface.tiles, surface.whole):
+        edges = rng.integers(1, 8, len(cut.edge_tiles)).astype(np.int32)
+        inner = rng.integers(2, 8, (len(cut.patch), 2)).astype(np.int32)
+        proxy = tiles.triangles(cut, surface.geometry(points).points, edges, inner)
+        assert boundary(proxy.faces) == []
+        assert len(np.unique(proxy.faces)) == len(proxy.vertices)
+        # Vertices are where the parameters of triangles say.
+        ids, params = np.repeat(proxy.ids[:, 0], 3), proxy.corner_params.reshape(-1, 2).astype(np.float64)
+        there = surface.geometry(points).points(ids, params, 0)[:, 0]
+        np.testing.assert_allclose(proxy.vertices[proxy.faces.reshape(-1)], there, atol=1e-5)
+
+
+def test_the_corners_of_a_patch_are_shared_however_many_tiles_it_has():
+    # Two patches beside each other, in all eight positions of the second.
+    first = np.arange(16).reshape(4, 4)
+    for turn in range(4):
+        for mirrored in (False, True):
+            second = np.concatenate([first[3:], np.arange(16, 28).reshape(3, 4)])
+            second = np.rot90(second.T if mirrored else second, turn)
+            surface = Bezier(np.stack([first.reshape(-1), second.reshape(-1)]))
+            corners, edges = len(surface.tiles.corner_tiles), len(surface.tiles.edge_tiles)
+            assert (corners, edges) == (2 * 25 - 5, 2 * 40 - 4)
+            assert len(surface.whole.corner_tiles) == 6 and len(surface.whole.edge_tiles) == 7
+
+
+# ------------------------------------------------------------------------------------------------ samples
+
+
+SKEW = np.array([[0, 0.1, 0.2, 0], [0.05, 0, -0.1, 0.3], [0, 0, 0, 0], [0, 0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        CAMERA,
+        Camera.orthographic((1.5, 1.8, 3.0), (0.4, 0.4, 0), height=2.5),
+        CAMERA.for_size((5, 7)).replace(projection=CAMERA.for_size((5, 7)).projection + SKEW),
+    ],
+)
+def test_rays_of_packed_samples_are_those_of_the_camera(camera):
+    size = (5, 7)
+    camera = camera.for_size(size)
+    row = RNG.permutation(70).reshape(2, *size).astype(np.int32)
+    row[row >= 50] = -1
+    none = np.zeros((50, 2), np.float32)
+    samples = Samples(np.zeros((50, 1), np.int32), none, row, np.zeros(row.shape, np.float32), np.int32(0))
+    found, expected = settling._rays_of(samples, camera, size), camera.rays(size)
+    for layer in range(2):
+        there = row[layer] >= 0
+        for part in ("origins", "directions"):
+            rays = getattr(found, part)[row[layer][there]]
+            np.testing.assert_allclose(rays, getattr(expected, part)[there], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.spread, expected.spread, rtol=1e-12)
+
+
+def test_without_a_covered_cell_there_is_a_ray_of_the_first_pixel():
+    size, row = (2, 3), np.full((1, 2, 3), -1, np.int32)
+    samples = Samples(np.zeros((1, 1), np.int32), np.zeros((1, 2), np.float32), row, 0.0 * row, np.int32(0))
+    found, expected = settling._rays_of(samples, CAMERA.for_size(size), size), CAMERA.rays(size)
+    np.testing.assert_allclose(found.directions[0], expected.directions[0, 0], atol=1e-12)
+
+
+PARTS = {"bezier": Bezier.example, "bspline": BSpline.example, "revolution": Revolution.example}
+
+
+@pytest.mark.parametrize("shader", ["silhouette", "lambert"])
+@pytest.mark.parametrize("name", PARTS)
+def test_images_are_the_same_without_hidden_samples(name, shader):
+    part, size = PARTS[name]().replace(shader=shader), (90, 110)
+    images, counts = [], []
+    for chosen in (None, "visible"):
+        sampled = rts.sample(part, CAMERA, size, splatter=chosen, layers=3)
+        images.append(rts.render_samples(sampled, part, CAMERA, splatter="visible"))
+        counts.append((sampled.row >= 0).sum())
+    np.testing.assert_allclose(images[1], images[0], rtol=0, atol=1e-6)
+    assert counts[1] < counts[0]
+
+
+def test_newells_teapot_has_few_triangles_and_samples_at_the_centres_of_pixels(data):
+    (part,) = rts.load(data / "bezier" / "teapot_patches.txt", surface="bezier")
+    camera, size = Camera.look_at((5, -11, 6), (0.2, 0, 1.4), (0, 0, 1), fov_y=30), (256, 256)
+    proxy = part.surface.proxy(part.theta["points"], camera.for_size(size), size)
+    sampled = rts.sample(part, camera, size, layers=2)
+    # One facet a pixel: two triangles for each, in front and behind.
+    assert len(proxy.faces) <= (sampled.row >= 0).sum()
+    theta = {"points": part.theta["points"].astype(np.float64)}
+    position = part.surface.evaluate(theta, sampled.samples[0])["position"]
+    layer, y, x = np.nonzero(sampled.row >= 0)
+    wide = camera.for_size(size).with_apron(size, 2)
+    pixels = wide.project(position[sampled.row[layer, y, x]], (260, 260))
+    off = np.abs(pixels[:, :2] - np.stack([x, y], axis=-1) - 0.5).max(axis=1)
+    assert off.max() < 1e-3
+    np.testing.assert_allclose(pixels[:, 2], sampled.depth[layer, y, x], rtol=1e-5)
+    both = sampled.row[1] >= 0
+    assert (sampled.depth[1] > sampled.depth[0])[both].all()
