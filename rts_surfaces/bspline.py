@@ -42,9 +42,7 @@ class BSpline(Patches):
         if not (isinstance(shape, (tuple, list)) and len(shape) == 2 and all(map(is_count, shape)) and min(shape) >= 4):
             raise InputError(f"shape is {quoted(shape)}; expected (nu, nv), two integers of at least 4")
         both = (ends, ends) if isinstance(ends, str) else ends
-        if not (
-            isinstance(both, (tuple, list)) and len(both) == 2 and all(e in ENDS for e in both if isinstance(e, str))
-        ):
+        if not (isinstance(both, (tuple, list)) and len(both) == 2 and all(map(_is_end, both))):
             raise InputError(f"ends is {quoted(ends)}; expected one of {', '.join(ENDS)}, or two of them")
         self.shape, self.ends = (int(shape[0]), int(shape[1])), (both[0], both[1])
         self._along = [fixed(extraction(n, end)) for n, end in zip(self.shape, self.ends, strict=True)]
@@ -139,6 +137,10 @@ class Revolution(BSpline):
         if name != "radii":
             return super().expected(name, shape)
         return None if shape == self.shape[:1] else f"({self.shape[0]},)"
+
+
+def _is_end(end: Any) -> bool:
+    return isinstance(end, str) and end in ENDS
 
 
 def extraction(count: int, ends: str) -> np.ndarray:

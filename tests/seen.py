@@ -24,7 +24,7 @@ def stages(part, camera, layers, size=SIZE):
     sampler, inputs = rts.plugin("samplers", "raster")(), part.theta["points"]
     proxy = part.surface.proxy(inputs, camera, size)
     lifted = lift(sampler.rasterize(sampler.prepare(proxy), camera, size, layers, "none"), proxy)
-    moved, rays = settling.refined(part.surface, inputs, lifted, camera, size, {})
+    moved, rays = settling.refined(part.surface, inputs, lifted, camera, {})
     return lifted, moved, settling.settle(moved, camera, rays.spread)
 
 

@@ -14,6 +14,8 @@ SIZE = (12, 16)
 CAMERA = Camera.look_at((0.4, 0.5, 4), (0, 0, 0))
 Mesh = rts.plugin("surfaces", "mesh")
 PART = Mesh.example()
+Bezier = rts.plugin("surfaces", "bezier")
+PATCH, VASE, PAWN = (rts.plugin("surfaces", name).example() for name in ("bezier", "bspline", "revolution"))
 SAMPLED = rts.sample(PART, CAMERA, SIZE)
 K = np.array([[14.0, 0, 8], [0, 14, 6], [0, 0, 1]])
 
@@ -163,7 +165,19 @@ CALLS = {
     "combine.weights": lambda v: rts.combine(np.ones((2, 3), np.float32), np.zeros((1, 1), np.int32), v),
     "rigid.pose": rts.rigid,
     "rigid.center": lambda v: rts.rigid(np.zeros(6), v),
+    "Bezier.indices": Bezier,
+    "Bezier.tolerance": lambda v: Bezier(PATCH.surface.table, tolerance=v),
+    "Bezier.points": lambda v: rts.render(PATCH.replace(theta={"points": v}), CAMERA, SIZE),
+    "tessellate.rate": lambda v: PATCH.surface.tessellate(PATCH.theta, v),
+    "BSpline.shape": rts.plugin("surfaces", "bspline"),
+    "BSpline.ends": lambda v: rts.plugin("surfaces", "bspline")((4, 4), v),
+    "BSpline.points": lambda v: rts.render(VASE.replace(theta={"points": v}), CAMERA, SIZE),
+    "BSpline.colors": lambda v: rts.render(VASE.replace(theta={**VASE.theta, "colors": v}), CAMERA, SIZE),
+    "Revolution.heights": rts.plugin("surfaces", "revolution"),
+    "Revolution.count": lambda v: rts.plugin("surfaces", "revolution")(np.arange(5.0), count=v),
+    "Revolution.radii": lambda v: rts.render(PAWN.replace(theta={"radii": v}), CAMERA, SIZE),
     "load.path": rts.load,
+    "load.surface": lambda v: rts.load("no such model.obj", surface=v),
     "load.merge": lambda v: rts.load("no such model.obj", merge=v),
     "load_image.path": rts.load_image,
     "save_image.path": lambda v: rts.save_image(v, np.zeros((2, 2, 4))),
@@ -223,7 +237,7 @@ NUMBERS = """
     shader.specular shader.shininess shader.ambient look_at.fov_y look_at.aspect look_at.near look_at.far
     orthographic.height from_opencv.near from_opencv.pixel_center from_pytorch3d.focal_length from_blender.focal
     splatter.sigma splatter.calibration exact_calibration.sigma save_animation.fps fit.learning_rate fit.tolerance
-    gradient_image.scale
+    gradient_image.scale Bezier.tolerance tessellate.rate
 """
 ACCEPTED = {
     "None": OPTIONAL.split(),

@@ -5,7 +5,7 @@ import pytest
 from helpers import ALL, DIFFERENTIABLE, arrays, derivative, gradient, to_numpy
 
 import rts
-from rts import Camera, InputError, Samples
+from rts import Camera, InputError, Part, Samples
 from rts.sampling import settling
 from rts.threads import read_only
 from rts_surfaces import bicubic, tiles
@@ -205,3 +205,32 @@ def test_newells_teapot_has_few_triangles_and_samples_at_the_centres_of_pixels(d
     np.testing.assert_allclose(pixels[:, 2], sampled.depth[layer, y, x], rtol=1e-5)
     both = sampled.row[1] >= 0
     assert (sampled.depth[1] > sampled.depth[0])[both].all()
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_the_nearest_sample_does_not_depend_on_how_many_are_asked_for(name):
+    coarse = Bezier.example().surface.table
+    part = PARTS[name]()
+    if name == "bezier":  # So coarse that triangles stand where the surface is not.
+        part = part.replace(surface=Bezier(coarse, tolerance=3.0))
+    found = [rts.sample(part, CAMERA, (120, 150), layers=k, splatter=None) for k in (1, 2, 6)]
+    covered = [(f.row >= 0).any(axis=0) for f in found]
+    for f, c in zip(found, covered, strict=True):
+        np.testing.assert_array_equal(f.row[0] >= 0, c)
+        np.testing.assert_array_equal(c, covered[-1])
+        np.testing.assert_allclose(f.depth[0], found[-1].depth[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_newells_teapot_has_no_holes(data, layers):
+    (part,) = rts.load(data / "bezier" / "teapot_patches.txt", surface="bezier")
+    vertices, faces = part.surface.tessellate(part.theta, 64)
+    mesh = Part(rts.plugin("surfaces", "mesh")(faces), {"vertices": vertices})
+    for eye in ((5, -11, 6), (8, -8, 4)):
+        camera = Camera.look_at(eye, (0.2, 0, 1.4), (0, 0, 1), fov_y=35)
+        rows = [rts.sample(p, camera, (256, 256), layers=layers, splatter=None).row[0] >= 0 for p in (part, mesh)]
+        inner = rows[1].copy()
+        for axis in (0, 1):
+            for step in (-1, 1):
+                inner &= np.roll(rows[1], step, axis)
+        assert not (inner & ~rows[0]).any()

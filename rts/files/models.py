@@ -63,6 +63,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
     for name, flag in (("merge", merge), ("weld", weld)):
         if not isinstance(flag, (bool, np.bool_)):
             raise InputError(f"{name} is {quoted(flag)}; expected True or False")
+    if not isinstance(surface, str):
+        raise InputError(f"surface is {quoted(surface)}; expected a name, such as 'mesh' or 'bezier'")
     if surface != "mesh":
         reader = registry.plugin("rts.surfaces", surface)
         if merge or not weld:

@@ -12,7 +12,8 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.interfaces import TriangleSurface
-from rts.records import ArraySpec, Rays, Samples
+from rts.records import ArraySpec, Fragments, Proxy, Rays, Samples
+from rts.sampling.packing import lift
 from rts.sampling.validation import checked_refined
 from rts.threads import parallel, read_only
 from rts.trees import Tree
@@ -21,13 +22,62 @@ SAME_ROOT_PIXELS, SAME_ROOT = 1e-2, 1e-6
 """Layers whose depths differ by less, in widths of a pixel and relative to the depth, are one root found twice."""
 
 
+def on_surface(
+    surface: TriangleSurface,
+    inputs: Tree,
+    fragments: Fragments,
+    proxy: Proxy,
+    camera: Camera,
+    layers: int,
+    tables: Mapping[str, ArraySpec],
+) -> Samples:
+    """The nearest samples on a surface that are near its triangles: refined, and in order.
+
+    Where triangles stand before the surface but rays miss it, layers are taken from behind: as many as `fragments` has
+    more than are asked for.
+
+    Args:
+        surface: the surface.
+        inputs: what its `proxy_inputs` gave, on the host.
+        fragments: where rays meet the triangles, in `layers` layers or more.
+        proxy: the triangles.
+        camera: host matrices.
+        layers: K.
+        tables: what the surface's `table_specs` allots.
+    """
+    first = Fragments(*(x[:layers] for x in fragments))
+    moved, rays = refined(surface, inputs, lift(first, proxy), camera, tables)
+    settled = settle(moved, camera, rays.spread)
+    if len(fragments.depth) == layers:
+        return settled
+    cells = np.nonzero((settled.row[-1] < 0) & (fragments.triangle_ids[layers] >= 0))
+    if not len(cells[0]):
+        return settled
+    # The cells where some are missing, as the only line of an image.
+    behind = Fragments(*(np.ascontiguousarray(x[layers:, *cells])[:, None] for x in fragments))
+    more, _ = refined(surface, inputs, lift(behind, proxy), camera, tables, size=settled.row.shape[1:], cells=cells)
+    count = len(settled.ids)
+    row, depth = (np.concatenate([a[:, *cells], b[:, 0]])[:, None] for a, b in _pairs(settled, more, count))
+    both = settle(replace(settled, row=row, depth=depth), camera, rays.spread)
+    row, depth = settled.row, settled.depth
+    row[:, *cells], depth[:, *cells] = both.row[:layers, 0], both.depth[:layers, 0]
+    ids, params = (np.concatenate(x) for x in ((settled.ids, more.ids), (settled.params, more.params)))
+    return replace(settled, ids=ids, params=params, row=row, depth=depth)
+
+
+def _pairs(settled: Samples, more: Samples, count: int) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Rows and depths of both, the rows of the second counted on."""
+    return (settled.row, np.where(more.row >= 0, more.row + np.int32(count), -1)), (settled.depth, more.depth)
+
+
 def refined(
     surface: TriangleSurface,
     inputs: Tree,
     lifted: Samples,
     camera: Camera,
-    size: tuple[int, int],
     tables: Mapping[str, ArraySpec],
+    size: tuple[int, ...] | None = None,
+    cells: tuple[np.ndarray, ...] | None = None,
 ) -> tuple[Samples, Rays]:
     """What `refine` of a surface makes of samples on its triangles, checked; and their rays.
 
@@ -36,32 +86,40 @@ def refined(
         inputs: what its `proxy_inputs` gave, on the host.
         lifted: the samples, a row for each covered cell.
         camera: host matrices.
-        size: (height, width).
         tables: what the surface's `table_specs` allots.
+        size: (height, width) of the image; None for that of the samples.
+        cells: lines and columns (M,) in it of the samples, which are (K, 1, M); None for all cells.
     """
     by_sample = tuple(name for name, spec in tables.items() if spec.by_sample)
     allotted = {
         name: np.zeros((len(lifted.ids) if name in by_sample else spec.shape[0], *spec.shape[1:]), spec.dtype)
         for name, spec in tables.items()
     }
-    lifted, rays = replace(lifted, tables=allotted, by_sample=by_sample), _rays_of(lifted, camera, size)
+    rays = _rays_of(lifted, camera, size or lifted.row.shape[1:], cells)
+    lifted = replace(lifted, tables=allotted, by_sample=by_sample)
     # `refine` gets a copy of `row`, so that the check sees what it has changed.
     return checked_refined(surface.refine(inputs, replace(lifted, row=lifted.row.copy()), rays), lifted, surface), rays
 
 
-def _rays_of(samples: Samples, camera: Camera, size: tuple[int, int]) -> Rays:
+def _rays_of(
+    samples: Samples, camera: Camera, size: tuple[int, ...], cells: tuple[np.ndarray, ...] | None = None
+) -> Rays:
     """The ray of each packed sample (N, 3); where no cell has any, the first row gets the first pixel's."""
     from rts.sampling import settling_kernels
 
     matrices = np.ascontiguousarray(camera.projection, np.float64), np.linalg.inv(np.asarray(camera.view, np.float64))
     ends = np.empty((len(samples.ids), 3)), np.empty((len(samples.ids), 3))
-    lines = read_only(samples.row, np.int32).reshape(-1, size[1])
+    height, width = size
+    given = (height, width), *matrices, *ends
     if len(samples.ids) == 1:
-        first = np.full(lines.shape, -1, np.int32)
-        first[0, 0] = 0
-        settling_kernels.rays_of(0, 1, read_only(first), size[0], *matrices, *ends)
-    parallel(settling_kernels.rays_of, len(lines), lines, size[0], *matrices, *ends, work=20 * len(samples.ids))
-    return Rays(*ends, camera.spread(size))
+        first = np.zeros((1, 1), np.int32)
+        settling_kernels.rays_of_cells(first, np.zeros(1, np.int64), np.zeros(1, np.int64), *given)
+    if cells is not None:
+        settling_kernels.rays_of_cells(samples.row[:, 0], *cells, *given)
+    else:
+        lines = read_only(samples.row, np.int32).reshape(-1, width)
+        parallel(settling_kernels.rays_of, len(lines), lines, *given, work=20 * len(samples.ids))
+    return Rays(*ends, camera.spread((height, width)))
 
 
 def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:

@@ -44,38 +44,48 @@ def settle_lines(start, stop, row, depth, limits, out_row, out_depth):
                 out_depth[k, y, x], out_row[k, y, x] = 0, -1
 
 
+@numba.njit(nogil=True)
+def _ray(x, y, p, inverse, origin, direction):
+    """The ray through a point of the image, in NDC. See `rts.Camera.rays`."""
+    a, b, across, lean = p[0, 0] - x * p[3, 0], p[0, 1] - x * p[3, 1], x * p[3, 3] - p[0, 3], p[0, 2] - x * p[3, 2]
+    c, d, down, fall = p[1, 0] - y * p[3, 0], p[1, 1] - y * p[3, 1], y * p[3, 3] - p[1, 3], p[1, 2] - y * p[3, 2]
+    determinant = a * d - b * c
+    right, up = (d * across - b * down) / determinant, (a * down - c * across) / determinant
+    toward_x, toward_y = (d * lean - b * fall) / determinant, (a * fall - c * lean) / determinant
+    for k in range(3):
+        origin[k] = inverse[k, 0] * right + inverse[k, 1] * up + inverse[k, 3]
+        direction[k] = inverse[k, 0] * toward_x + inverse[k, 1] * toward_y - inverse[k, 2]
+
+
 @numba.njit(cache=True, nogil=True)
-def rays_of(start, stop, row, height, projection, inverse, origins, directions):
+def rays_of(start, stop, row, size, projection, inverse, origins, directions):
     """Fill the rays of samples as `rts.Camera.rays` gives them; for lines `start` to `stop` of all layers.
 
     Args:
         start: the first line.
         stop: the line after the last.
         row: (K H, W) int32, the sample in each cell, or −1.
-        height: H.
+        size: (H, W).
         projection: (4, 4) float64.
         inverse: (4, 4) float64, of the view.
         origins: (N, 3) float64, to be filled where there is a cell.
         directions: (N, 3) float64, likewise.
     """
-    width, p = row.shape[1], projection
+    height, width = size
     for line in range(start, stop):
         y = 1 - (line % height + 0.5) * 2 / height
-        c, d, down, fall = p[1, 0] - y * p[3, 0], p[1, 1] - y * p[3, 1], y * p[3, 3] - p[1, 3], p[1, 2] - y * p[3, 2]
         for i in range(width):
             n = row[line, i]
-            if n < 0:
-                continue
-            x = (i + 0.5) * 2 / width - 1
-            a, b, across, lean = (
-                p[0, 0] - x * p[3, 0],
-                p[0, 1] - x * p[3, 1],
-                x * p[3, 3] - p[0, 3],
-                p[0, 2] - x * p[3, 2],
-            )
-            determinant = a * d - b * c
-            right, up = (d * across - b * down) / determinant, (a * down - c * across) / determinant
-            toward_x, toward_y = (d * lean - b * fall) / determinant, (a * fall - c * lean) / determinant
-            for k in range(3):
-                origins[n, k] = inverse[k, 0] * right + inverse[k, 1] * up + inverse[k, 3]
-                directions[n, k] = inverse[k, 0] * toward_x + inverse[k, 1] * toward_y - inverse[k, 2]
+            if n >= 0:
+                _ray((i + 0.5) * 2 / width - 1, y, projection, inverse, origins[n], directions[n])
+
+
+@numba.njit(cache=True, nogil=True)
+def rays_of_cells(row, lines, columns, size, projection, inverse, origins, directions):
+    """The same for a list of cells: row (K, M), in lines (M,) and columns (M,)."""
+    height, width = size
+    for k in range(len(row)):
+        for m in range(len(lines)):
+            n, x, y = row[k, m], (columns[m] + 0.5) * 2 / width - 1, 1 - (lines[m] + 0.5) * 2 / height
+            if n >= 0:
+                _ray(x, y, projection, inverse, origins[n], directions[n])

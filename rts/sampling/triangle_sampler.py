@@ -16,9 +16,13 @@ from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, Surface, Tr
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.packing import lift, repack
-from rts.sampling.settling import refined, settle
+from rts.sampling.settling import on_surface
 from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
+
+LEAST_LAYERS = 3
+"""Layers of triangles that are looked for at least where a surface refines its samples, and one more than is asked for:
+at an outline both sides of a fold may stand where the surface is not."""
 
 
 class TriangleSampler(Sampler):
@@ -190,11 +194,13 @@ class TriangleSampler(Sampler):
         entry: Entry | None,
     ) -> Samples:
         """The samples that are to be kept, on the host."""
-        grid = shape.layers, *shape.size
+        # Of tables there is but one set, so that no samples can be added later.
+        more = surface.refines and not tables
+        grid = max(shape.layers + 1, LEAST_LAYERS) if more else shape.layers, *shape.size
         with self._keeper.lock:
             found = entry or self._entry(surface, inputs, camera, shape.size)
             if len(found.proxy.faces):
-                fragments = self.rasterize(found.prepared, camera, shape.size, shape.layers, cull)
+                fragments = self.rasterize(found.prepared, camera, shape.size, grid[0], cull)
                 check_fragments(fragments, grid, len(found.proxy.faces), self)
             else:
                 fragments = _no_fragments(grid)
@@ -202,9 +208,7 @@ class TriangleSampler(Sampler):
         if not surface.refines:
             kept = covered if needed is None else needed(covered, fragments.depth)
             return lift(fragments, found.proxy, shape.capacity, kept)
-        lifted = lift(fragments, found.proxy, None, covered)
-        moved, rays = refined(surface, inputs, lifted, camera, shape.size, tables)
-        settled = settle(moved, camera, rays.spread)
+        settled = on_surface(surface, inputs, fragments, found.proxy, camera, shape.layers, tables)
         # `needed` is asked only now, since it goes by the final depths.
         left = kept = settled.row >= 0
         if needed is not None:

@@ -38,7 +38,7 @@ def claim_refined(part: Part, surface: TriangleSurface, camera: Camera, view: st
     fragments = sampler.rasterize(proxy, local, GRID, LAYERS, part.cull)
     lifted = lift(fragments, proxy)
     try:
-        found, rays = refined(surface, inputs, lifted, local, GRID, surface.table_specs(len(lifted.ids), None))
+        found, rays = refined(surface, inputs, lifted, local, surface.table_specs(len(lifted.ids), None))
     except InputError as error:
         raise AssertionError(f"{view}: {error}") from error
     cells = found.row >= 0
