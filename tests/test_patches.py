@@ -234,3 +234,20 @@ def test_newells_teapot_has_no_holes(data, layers):
             for step in (-1, 1):
                 inner &= np.roll(rows[1], step, axis)
         assert not (inner & ~rows[0]).any()
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_outlines_are_within_the_tolerance_wherever_a_view_is_in_its_cell(name):
+    part, rng, size = PARTS[name](), np.random.default_rng(0), (100, 120)
+    fine = type(part.surface).__new__(type(part.surface))
+    vars(fine).update(vars(part.surface) | {"tolerance": 0.005})
+    lost = length = 0
+    for _ in range(12):
+        direction = rng.normal(size=3)
+        eye = direction / np.linalg.norm(direction) * rng.uniform(2.5, 9)
+        camera = Camera.look_at(eye, rng.normal(size=3) * 0.2, fov_y=rng.uniform(20, 50))
+        rows = [rts.sample(part.replace(surface=s), camera, size, layers=2).row[0] >= 0 for s in (part.surface, fine)]
+        lost += (rows[1] & ~rows[0]).sum()
+        length += sum((rows[1] & ~np.roll(rows[1], step, axis)).sum() for step in (-1, 1) for axis in (0, 1)) / 2
+    assert length > 1000
+    assert lost <= 0.05 * length

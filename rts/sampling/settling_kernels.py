@@ -82,7 +82,7 @@ def rays_of(start, stop, row, size, projection, inverse, origins, directions):
 
 @numba.njit(cache=True, nogil=True)
 def rays_of_cells(row, lines, columns, size, projection, inverse, origins, directions):
-    """The same for a list of cells: row (K, M), in lines (M,) and columns (M,)."""
+    """Fill the rays of samples in some cells: row (K, M), in lines (M,) and columns (M,)."""
     height, width = size
     for k in range(len(row)):
         for m in range(len(lines)):
