@@ -9,6 +9,8 @@
 
 namespace {
 
+constexpr double EDGE = 1e-7;  // What float32 parameters may be off anyway.
+
 // A quadrilateral or triangular piece of a face: all of it, or a sub-face. Its coordinates x, y have the scale of the
 // face's u, v; they reach from 0 to `size`.
 struct Place {
@@ -139,8 +141,8 @@ bool meet(Points const& points, Place& at, double const* origin, double const* r
         double const low = -0.25 * at.size, high = 1.25 * at.size;
         at.x = std::min(std::max(at.x + du, low), high);
         at.y = std::min(std::max(at.y + dv, low), high);
-        if (crossed < crossings && excess(Kind(cage.kinds[at.face]), at, side) > limits[3] * at.size)
-            crossed += cross(cage, at, side);
+        // What lies beyond an edge is not extrapolated: patches about extraordinary vertices are much smaller than faces.
+        if (crossed < crossings && excess(Kind(cage.kinds[at.face]), at, side) > EDGE) crossed += cross(cage, at, side);
     }
     return false;
 }

@@ -1,0 +1,214 @@
+"""Faces of a cage as tiles, and triangles of these whose vertices lie on the limit surface.
+
+A tile is a quadrilateral, or for Loop a triangle, with local coordinates (s, t): the unit square, or the triangle
+(0, 0), (1, 0), (0, 1). Where any face is subdivided into sub-faces, whose parameters have gaps, all faces are: so each
+side of a tile is one edge, and tiles that share it share its points.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.records import Proxy
+from rts.threads import parallel
+from rts.topology import fixed
+from rts_surfaces.subdivision.binding import NONE, QUAD, SUBFACES, Limit, Points
+
+GRID = 5
+"""Points along each side of a tile at which its shape is looked at."""
+LEAST = {4: 2, 3: 3}
+"""How often a tile of so many sides is cut at least, where it is cut at all: so that points lie within it."""
+AT_ONCE = 2048
+"""Tiles whose shapes are looked at together."""
+
+_SQUARE = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float64)
+_TRIANGLE = np.array([(0, 0), (1, 0), (0, 1)], np.float64)
+
+
+class Tiles(NamedTuple):
+    """The tiles of a limit surface; k is 4, or 3 for Loop. Host arrays, read-only.
+
+    Attributes:
+        faces: (n,) int32, the face of each tile.
+        frames: (n, 3, 2) float64: face parameters are `frames[:, 0] + s * frames[:, 1] + t * frames[:, 2]`.
+        corners: (n, k) int32, the numbers of the tile's corners, counter-clockwise from (0, 0).
+        sides: (n, k) int32, the edge from each corner to the next.
+        flips: (n, k) bool, whether a side, which runs around the tile, runs against its edge.
+        corner_tiles: (C, 2) int32, for each corner a tile, and which of its corners it is.
+        edge_tiles: (E, 2) int32, for each edge a tile, and which of its sides it is.
+    """
+
+    faces: np.ndarray
+    frames: np.ndarray
+    corners: np.ndarray
+    sides: np.ndarray
+    flips: np.ndarray
+    corner_tiles: np.ndarray
+    edge_tiles: np.ndarray
+
+    def params(self, tiles: np.ndarray, local: np.ndarray) -> np.ndarray:
+        """Face parameters (N, 2) at local coordinates (N, 2) of tiles (N,)."""
+        frames = self.frames[tiles]
+        return frames[:, 0] + local[:, :1] * frames[:, 1] + local[:, 1:] * frames[:, 2]
+
+
+def tiles_of(limit: Limit) -> Tiles:
+    """The tiles of all faces that have a limit surface."""
+    cage = limit.cage
+    owner, start, end = cage.faces(), cage.indices.astype(np.int64), cage.indices[cage.next()].astype(np.int64)
+    count = int(start.max()) + 1
+    against = start > end
+    _, edge = np.unique(np.minimum(start, end) * count + np.maximum(start, end), return_inverse=True)
+    there = limit.kinds[owner] != NONE
+    if (limit.kinds == SUBFACES).any():
+        faces, frames = owner[there].astype(np.int32), _quarters(limit)[there]
+        before = np.empty(len(owner), np.int64)
+        before[cage.next()] = np.arange(len(owner))
+        # Corners: a vertex, the middle of the edge after it, that of the face, the middle of the edge before it.
+        edges, total = edge.max() + 1, len(owner)
+        corners = np.stack([start, count + edge, count + edges + owner, count + edge[before]], axis=1)[there]
+        # Edges: half k of edge e is 2 e + k, the first at the lesser vertex; then those to the middles of faces.
+        first, last = 2 * edge + against, (2 * edge + ~against)[before]
+        inner = 2 * edges + np.arange(total)
+        sides = np.stack([first, inner, inner[before], last], axis=1)[there]
+        no = np.zeros(total, bool)
+        flips = np.stack([against, no, ~no, against[before]], axis=1)[there]
+    else:
+        width = int(cage.sizes[0])
+        chosen = limit.kinds != NONE
+        faces = np.flatnonzero(chosen).astype(np.int32)
+        frames = np.broadcast_to(np.array([(0.0, 0), (1, 0), (0, 1)]), (len(faces), 3, 2)).copy()
+        corners, sides, flips = (x.reshape(-1, width)[chosen] for x in (start, edge, against))
+    corners, corner_tiles = _numbered(corners)
+    sides, edge_tiles = _numbered(sides)
+    return Tiles(*(fixed(x) for x in (faces, frames, corners, sides, flips.copy(), corner_tiles, edge_tiles)))
+
+
+def _quarters(limit: Limit) -> np.ndarray:
+    """Frames (H, 3, 2) of the quarter of a face at each of its corners."""
+    cage = limit.cage
+    frames = np.zeros((len(cage.indices), 3, 2))
+    frames[:, 0] = limit.corners
+    frames[:, 1, 0] = frames[:, 2, 1] = 0.5
+    # In a face of four corners the quarters share its parameters; their axes turn with them.
+    h = np.flatnonzero((limit.kinds == QUAD)[cage.faces()])
+    turn = h - cage.first[cage.faces()[h]]
+    along = np.array([(0.5, 0), (0, 0.5), (-0.5, 0), (0, -0.5)])
+    frames[h, 1], frames[h, 2] = along[turn], along[(turn + 1) % 4]
+    return frames
+
+
+def _numbered(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Names (n, k) as numbers from 0 on, and for each number a place (row, column) where it is."""
+    _, place, numbers = np.unique(names, return_index=True, return_inverse=True)
+    where = np.stack(np.divmod(place, names.shape[1]), axis=1).astype(np.int32)
+    return numbers.reshape(names.shape).astype(np.int32), where
+
+
+# ----------------------------------------------------------------------------------------------- triangles
+
+
+def uniform(tiles: Tiles, rate: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rates of edges (E,) and of tiles (n, 2), both int32, where all is cut alike."""
+    edges = np.full(len(tiles.edge_tiles), rate, np.int32)
+    least = 1 if rate == 1 else max(rate, LEAST[tiles.corners.shape[1]])
+    return edges, np.full((len(tiles.faces), 2), least, np.int32)
+
+
+def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray) -> Proxy:
+    """Triangles of tiles, without cracks, counter-clockwise where the cage is.
+
+    Args:
+        tiles: the tiles.
+        points: the limit surface.
+        edges: (E,) int32, into how many pieces each edge is cut.
+        inner: (n, 2) int32, into how many each tile is cut along s and t; of triangles the first counts. Where an edge
+            of a tile is cut they are at least 2, of triangles 3; also where one of the two is more than 1.
+
+    Returns:
+        Vertices; ids (T, 1) are faces of the cage, parameters (T, 3, 2) those of the face.
+    """
+    from rts_surfaces.subdivision import tessellation_kernels as kernels
+
+    count, width = tiles.corners.shape
+    within = (inner[:, 0] - 1) * (inner[:, 1] - 1) if width == 4 else (inner[:, 0] - 1) * (inner[:, 0] - 2) // 2
+    edge_first = len(tiles.corner_tiles) + np.concatenate([[0], np.cumsum(edges - 1)]).astype(np.int32)
+    inner_first = edge_first[-1] + np.concatenate([[0], np.cumsum(within)]).astype(np.int32)
+    vertices = _vertices(tiles, points, edges, edge_first, inner, inner_first)
+    first = np.zeros(count + 1, np.int32)
+    kernels.counts(inner, tiles.sides, edges, first)
+    total = int(first[-1])
+    out = np.empty((total, 3), np.int32), np.empty((total, 1), np.int32), np.empty((total, 3, 2), np.float32)
+    tables = tiles.faces, tiles.frames, tiles.corners, tiles.sides, tiles.flips
+    kernel = kernels.quadrilaterals if width == 4 else kernels.triangles
+    parallel(kernel, count, *tables, edges, edge_first, inner, inner_first, first, out, work=30 * total)
+    return Proxy(vertices, *out)
+
+
+def _vertices(
+    tiles: Tiles,
+    points: Points,
+    edges: np.ndarray,
+    edge_first: np.ndarray,
+    inner: np.ndarray,
+    inner_first: np.ndarray,
+) -> np.ndarray:
+    """Points (V, 3) float32: of corners, within edges, within tiles."""
+    from rts_surfaces.subdivision import tessellation_kernels as kernels
+
+    shape = _SQUARE if tiles.corners.shape[1] == 4 else _TRIANGLE
+    total = int(inner_first[-1])
+    faces, params = np.empty(total, np.int32), np.empty((total, 2))
+    tile, corner = tiles.corner_tiles.T
+    faces[: len(tile)], params[: len(tile)] = tiles.faces[tile], tiles.params(tile, shape[corner])
+    # From one end of an edge to the other, in its own direction.
+    tile, side = tiles.edge_tiles.T
+    back = tiles.flips[tile, side][:, None]
+    ends = tiles.params(tile, shape[side]), tiles.params(tile, np.roll(shape, -1, axis=0)[side])
+    ends = np.where(back, ends[1], ends[0]), np.where(back, ends[0], ends[1])
+    kernels.within_edges(tiles.faces[tile], *ends, edges, edge_first, faces, params)
+    kernel = kernels.within_quadrilaterals if len(shape) == 4 else kernels.within_triangles
+    kernel(tiles.faces, tiles.frames, inner, inner_first, faces, params)
+    return points.evaluate(faces, params)[:, 0].astype(np.float32)
+
+
+# ----------------------------------------------------------------------------------------------- shapes
+
+
+def shapes(tiles: Tiles, points: Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What triangles by error need to know of tiles.
+
+    Of triangles the grid is drawn together into the corner (1, 0): its points are (s, t (1 − s)).
+
+    Args:
+        tiles: the tiles.
+        points: the limit surface.
+
+    Returns:
+        Normals (n, GRID, GRID, 3) of unit length, or zero; places (n, GRID, GRID, 3), where these are; bends (n, 3),
+        the largest second derivatives along the normal, in s, in s and t, in t, of tiles in local coordinates; curves
+        (n, k), the largest second derivatives of the sides across themselves. All float64.
+    """
+    from rts_surfaces.subdivision import tessellation_kernels as kernels
+
+    count, width = tiles.corners.shape
+    grid = np.stack(np.meshgrid(*[np.linspace(0, 1, GRID)] * 2, indexing="ij"), axis=-1)
+    shape = _SQUARE if width == 4 else _TRIANGLE
+    if width == 3:
+        grid[..., 1] *= 1 - grid[..., 0]
+    along = np.roll(shape, -1, axis=0) - shape
+    # Sides of a square are rows of the grid; that of a triangle that is none of its axes has points of its own.
+    steps = np.linspace(0, 1, GRID)[:, None]
+    around = shape[:, None] + steps * along[:, None]
+    local = np.concatenate([grid.reshape(-1, 2), around.reshape(-1, 2)])
+    out = *np.empty((2, count, GRID, GRID, 3)), np.empty((count, 3)), np.empty((count, width))
+    for start in range(0, count, AT_ONCE):
+        tile = np.arange(start, min(start + AT_ONCE, count))
+        every = np.repeat(tile, len(local))
+        found = points.evaluate(tiles.faces[every], tiles.params(every, np.tile(local, (len(tile), 1))), 2)
+        found = found.reshape(len(tile), len(local), 6, 3)
+        part = [x[start : tile[-1] + 1] for x in out]
+        parallel(kernels.shapes, len(tile), found, tiles.frames[tile], along, *part, work=8000 * len(tile))
+    return out
