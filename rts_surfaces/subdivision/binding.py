@@ -129,8 +129,8 @@ class Limit:
         count = len(self.cage.sizes)
         if count * max(width, uv_width) > MOST_NUMBERS:
             raise InputError(
-                f"a face of the cage depends on {max(width, uv_width)} vertices, too many for a table of {count} faces; "
-                f"divide the faces with many corners, and those around vertices with many edges"
+                f"a face of the cage depends on {max(width, uv_width)} vertices, too many for a table of {count} "
+                f"faces; divide the faces with many corners, and those around vertices with many edges"
             )
         table = np.empty((count, width), np.int32)
         uv_table = None if uv_used is None else np.empty((count, uv_width), np.int32)

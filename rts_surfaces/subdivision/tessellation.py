@@ -117,6 +117,40 @@ def uniform(tiles: Tiles, rate: int) -> tuple[np.ndarray, np.ndarray]:
     return edges, np.full((len(tiles.faces), 2), least, np.int32)
 
 
+def rates(
+    tiles: Tiles, bends: np.ndarray, curves: np.ndarray, allowed: np.ndarray, most: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """How often edges (E,) and tiles (n, 2) are cut, int32, so that triangles are close to the surface.
+
+    Args:
+        tiles: the tiles.
+        bends: (n, 3), see `shapes`.
+        curves: (n, k), see `shapes`.
+        allowed: (n,), how far triangles may be off.
+        most: the largest rate.
+    """
+    width = tiles.corners.shape[1]
+    fine, second = np.full(len(tiles.edge_tiles), np.inf), np.zeros(len(tiles.edge_tiles))
+    np.minimum.at(fine, tiles.sides, allowed[:, None])
+    np.maximum.at(second, tiles.sides, curves)
+    edges = np.ceil(np.sqrt(second / (8 * fine)))
+    (ss, st, tt), least = bends.T, LEAST[width]
+    if width == 4:
+        along = np.maximum(np.sqrt(np.stack([ss, tt], axis=1) / (4 * allowed[:, None])), 1)
+        # The error of a triangle's chord (Filip, Magedson, Markot 1986).
+        error = (ss / along[:, 0] ** 2 + 2 * st / along.prod(axis=1) + tt / along[:, 1] ** 2) / 8
+        along *= np.sqrt(np.maximum(error / allowed, 1))[:, None]
+    else:
+        along = np.repeat(np.sqrt((ss + 2 * st + tt) / (8 * allowed))[:, None], 2, axis=1)
+    inner = np.clip(np.ceil(along), 1, most).astype(np.int32)
+    # Cut alike, a side and what lies within make no long triangles.
+    np.maximum.at(edges, tiles.sides, inner[:, np.arange(width) % 2])
+    edges = np.clip(edges, 1, most).astype(np.int32)
+    cut = (inner > 1).any(axis=1) | (edges[tiles.sides] > 1).any(axis=1)
+    inner[cut] = np.maximum(inner[cut], least)
+    return edges, inner
+
+
 def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray) -> Proxy:
     """Triangles of tiles, without cracks, counter-clockwise where the cage is.
 
