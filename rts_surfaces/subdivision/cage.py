@@ -86,8 +86,15 @@ def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = ()) 
     edges, crease_sharpness = _tags("creases", creases, ("a", "b", "sharpness"))
     marked, corner_sharpness = _tags("corners", corners, ("vertex", "sharpness"))
     _check_tags(cage, keys, edges, marked[:, 0])
-    tagged = edges.astype(np.int32), crease_sharpness, marked[:, 0].astype(np.int32), corner_sharpness
-    return Cage(*(x if isinstance(x, str) else fixed(np.array(x)) for x in (*cage[:5], *tagged)))
+    cage = cage._replace(
+        creases=edges.astype(np.int32),
+        crease_sharpness=crease_sharpness,
+        corners=marked[:, 0].astype(np.int32),
+        corner_sharpness=corner_sharpness,
+    )
+    for table in cage[1:]:
+        fixed(table)
+    return cage
 
 
 def checked_lists(name: str, lists: Any) -> tuple[np.ndarray, np.ndarray]:

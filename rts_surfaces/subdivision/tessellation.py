@@ -237,7 +237,8 @@ def shapes(tiles: Tiles, points: Points) -> tuple[np.ndarray, np.ndarray, np.nda
     steps = np.linspace(0, 1, GRID)[:, None]
     around = shape[:, None] + steps * along[:, None]
     local = np.concatenate([grid.reshape(-1, 2), around.reshape(-1, 2)])
-    out = *np.empty((2, count, GRID, GRID, 3)), np.empty((count, 3)), np.empty((count, width))
+    normals, places = np.empty((2, count, GRID, GRID, 3))
+    out = normals, places, np.empty((count, 3)), np.empty((count, width))
     for start in range(0, count, AT_ONCE):
         tile = np.arange(start, min(start + AT_ONCE, count))
         every = np.repeat(tile, len(local))
