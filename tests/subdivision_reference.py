@@ -1,4 +1,4 @@
-"""Catmull–Clark and Loop subdivision with creases, corners and boundaries, and limit masks: plain, slow, independent."""
+"""Catmull–Clark and Loop subdivision with creases, corners and boundaries, and limit masks: plain and slow."""
 
 from __future__ import annotations
 
@@ -114,7 +114,10 @@ class Cage:
         return (n - 2) / n * v[x] + (ends.sum(axis=0) + centers[near].sum(axis=0)) / n**2
 
     def limit(self):
-        """Points (V, 3) on the limit surface; sharpness must be none or for ever, and faces quadrilaterals or Loop's."""
+        """Points (V, 3) on the limit surface; sharpness must be none or for ever, and faces quadrilaterals or Loop's.
+
+        NaN where a crease ends: the mask of smooth vertices, which moves such a vertex, is not that of its limit.
+        """
         v, around = self.vertices, self.edges()
         assert all(s >= INFINITE for s in (*self.creases.values(), *self.corners.values()))
         edges, opposite = [{} for _ in v], [[] for _ in v]
@@ -131,7 +134,9 @@ class Cage:
                 continue
             ends = np.array([v[next(y for y in e if y != x)] for e in edges[x]])
             n = len(ends)
-            if kind == "crease":
+            if sum(s > 0 for s in edges[x].values()) == 1:
+                out[x] = np.nan
+            elif kind == "crease":
                 out[x] = (4 * v[x] + ends[[s > 0 for s in edges[x].values()]].sum(axis=0)) / 6
             elif self.scheme == "loop":
                 weight = 1 / (3 / (8 * beta(n)) + n)
