@@ -76,11 +76,10 @@ def tiles_of(limit: Limit) -> Tiles:
         no = np.zeros(total, bool)
         flips = np.stack([against, no, ~no, against[before]], axis=1)[there]
     else:
-        width = int(cage.sizes[0])
-        chosen = limit.kinds != NONE
-        faces = np.flatnonzero(chosen).astype(np.int32)
+        width = 3 if cage.scheme == "loop" else 4
+        faces = np.flatnonzero(limit.kinds != NONE).astype(np.int32)
         frames = np.broadcast_to(np.array([(0.0, 0), (1, 0), (0, 1)]), (len(faces), 3, 2)).copy()
-        corners, sides, flips = (x.reshape(-1, width)[chosen] for x in (start, edge, against))
+        corners, sides, flips = (x[there].reshape(-1, width) for x in (start, edge, against))
     corners, corner_tiles = _numbered(corners)
     sides, edge_tiles = _numbered(sides)
     return Tiles(*(fixed(x) for x in (faces, frames, corners, sides, flips.copy(), corner_tiles, edge_tiles)))
