@@ -102,17 +102,25 @@ def load() -> ctypes.CDLL:
         PluginError: something that it needs is missing, or does not work.
     """
     with _first_use:
-        return _opened(_compiled(find()))
+        return _opened(find())
 
 
-def _opened(path: Path) -> ctypes.CDLL:
+def _opened(tools: Tools) -> ctypes.CDLL:
+    path = _compiled(tools)
     try:
         library = ctypes.CDLL(str(path))
-        for name, (result, arguments) in _SIGNATURES.items():
-            function = getattr(library, name)
-            function.restype, function.argtypes = result, arguments
-    except (OSError, AttributeError) as error:
-        raise PluginError(f"{path} cannot be loaded ({_line(str(error))}); delete it, and {HELP}") from error
+    except OSError:  # Damaged, or made for an OpenSubdiv that is gone.
+        path.unlink(missing_ok=True)
+        path = _compiled(tools)
+        try:
+            library = ctypes.CDLL(str(path))
+        except OSError as error:
+            raise PluginError(
+                f"the library of subdivision surfaces does not load ({_line(str(error))}); {HELP}"
+            ) from error
+    for name, (result, arguments) in _SIGNATURES.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
     library.rts_start()
     return library
 
