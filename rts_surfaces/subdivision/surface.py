@@ -140,7 +140,7 @@ class Subdivision(TriangleSurface):
         corners = np.array([(x, y, z) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], np.float32)
         faces = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (1, 3, 7, 5), (3, 2, 6, 7), (2, 0, 4, 6)]
         creases = [(4, 5, 10), (5, 7, 10), (7, 6, 2), (6, 4, 2)]
-        theta = {"vertices": 1.1 * corners, "colors": 0.5 + 0.4 * corners}
+        theta = {"vertices": 1.15 * corners, "colors": 0.5 + 0.4 * corners}
         return Part(cls(faces, creases=creases), theta, "lambert")
 
     @classmethod
