@@ -27,6 +27,17 @@ CUBE, BALL = cube()[1], ball()[1]
 FAN = [[0, 1, 2, 3], [0, 4, 5, 6]]
 
 
+def spider(corners, legs):
+    """A polygon with a fan of triangles about each corner."""
+    free = iter(range(corners, 10**6))
+    faces = [list(range(corners))]
+    for i in range(corners):
+        tips = [next(free) for _ in range(legs + 1)]
+        faces += [[a, i, b] for a, b in zip(tips, tips[1:], strict=False)]
+        faces.append([(i + 1) % corners, i, tips[0]])
+    return faces
+
+
 def changed(faces, place, face):
     return [face if i == place else f for i, f in enumerate(faces)]
 
@@ -56,6 +67,9 @@ def changed(faces, place, face):
         ([[0, 1, 3, 2], [1, 0, 2, 3]], {}, "share|which is inside"),
         (FAN, {}, "vertex 0 joins 2 fans of faces"),
         ([*CUBE, [0, 8, 9, 10], [0, 10, 11, 12]], {}, "vertex 0 joins 2 fans"),
+        (prism(3000)[1], {}, "face 0 has 3000 corners; expected at most 256"),
+        ([[i, (i + 1) % 3000, 3000] for i in range(3000)], {}, "3000 faces meet at vertex 3000; expected at most 256"),
+        (spider(120, 40), {}, "the faces that touch face 0 have [0-9]+ corners; expected at most 2000"),
         (CUBE, {"creases": [(0, 3, 1)]}, "creases name the edge of vertices 0 and 3, but no face has it"),
         (CUBE, {"creases": [(0, 99, 1)]}, "creases name the edge of vertices 0 and 99"),
         (CUBE, {"creases": [(0, 1, np.nan)]}, "finite"),

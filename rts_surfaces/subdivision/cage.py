@@ -22,6 +22,10 @@ REPAIR = "repair the cage"
 INFINITE = 10
 """The sharpness from which on OpenSubdiv takes a crease or corner for infinitely sharp."""
 
+MOST, MOST_AROUND = 256, 2000
+"""Corners of a face and faces at a vertex; and corners of the faces that touch a face. With ten times as many
+OpenSubdiv takes minutes, or ends the process."""
+
 
 class Cage(NamedTuple):
     """The topology of a cage, sound. Host arrays, read-only.
@@ -83,6 +87,7 @@ def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = ()) 
     cage = cage._replace(twins=_twins(cage, order, keys))
     _check_pairs(cage)
     _check_fans(cage)
+    _check_sizes(cage)
     edges, crease_sharpness = _tags("creases", creases, ("a", "b", "sharpness"))
     marked, corner_sharpness = _tags("corners", corners, ("vertex", "sharpness"))
     _check_tags(cage, keys, edges, marked[:, 0])
@@ -232,6 +237,25 @@ def _check_fans(cage: Cage) -> None:
         raise InputError(
             f"vertex {vertex} joins {int((fans == vertex).sum())} fans of faces that share no edge there; expected "
             f"one: give each fan a vertex of its own"
+        )
+
+
+def _check_sizes(cage: Cage) -> None:
+    """Refuse faces and vertices with so many neighbours that OpenSubdiv does not cope."""
+    valence = np.bincount(cage.indices)
+    if cage.sizes.max() > MOST:
+        f = int(cage.sizes.argmax())
+        raise InputError(f"face {f} has {cage.sizes[f]} corners; expected at most {MOST}: divide it")
+    if valence.max() > MOST:
+        v = int(valence.argmax())
+        raise InputError(f"{valence[v]} faces meet at vertex {v}; expected at most {MOST}: divide the faces around it")
+    far = np.repeat(cage.sizes - 2, cage.sizes)
+    beyond = np.bincount(cage.indices, far)[cage.indices] - far
+    around = cage.sizes + np.bincount(cage.faces(), beyond)
+    if around.max() > MOST_AROUND:
+        f = int(around.argmax())
+        raise InputError(
+            f"the faces that touch face {f} have {int(around[f])} corners; expected at most {MOST_AROUND}: divide it"
         )
 
 
