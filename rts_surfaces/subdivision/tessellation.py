@@ -20,6 +20,9 @@ GRID = 5
 """Points along each side of a tile at which its shape is looked at."""
 LEAST = {4: 2, 3: 3}
 """How often a tile of so many sides is cut at least, where it is cut at all: so that points lie within it."""
+BESIDE = 1 / 16
+"""How far from the border of a tile it is looked at how it bends. At extraordinary vertices second derivatives have no
+bound, and at creases they are large, but both on so little of a tile that triangles are off by less than that."""
 AT_ONCE = 2048
 """Tiles whose shapes are looked at together."""
 
@@ -227,22 +230,34 @@ def shapes(tiles: Tiles, points: Points) -> tuple[np.ndarray, np.ndarray, np.nda
     from rts_surfaces.subdivision import tessellation_kernels as kernels
 
     count, width = tiles.corners.shape
-    grid = np.stack(np.meshgrid(*[np.linspace(0, 1, GRID)] * 2, indexing="ij"), axis=-1)
-    shape = _SQUARE if width == 4 else _TRIANGLE
-    if width == 3:
-        grid[..., 1] *= 1 - grid[..., 0]
+    shape, even = (_SQUARE if width == 4 else _TRIANGLE), np.linspace(0, 1, GRID)
     along = np.roll(shape, -1, axis=0) - shape
-    # Sides of a square are rows of the grid; that of a triangle that is none of its axes has points of its own.
-    steps = np.linspace(0, 1, GRID)[:, None]
-    around = shape[:, None] + steps * along[:, None]
-    local = np.concatenate([grid.reshape(-1, 2), around.reshape(-1, 2)])
+    sides = shape[:, None] + even.clip(BESIDE, 1 - BESIDE)[:, None] * along[:, None]
+    local, within = _grid(even, width), _grid(even.clip(BESIDE, 1 - BESIDE), width)
+    looked = np.concatenate([within, sides.reshape(-1, 2)])
     normals, places = np.empty((2, count, GRID, GRID, 3))
-    out = normals, places, np.empty((count, 3)), np.empty((count, width))
+    bends, curves = np.empty((count, 3)), np.empty((count, width))
     for start in range(0, count, AT_ONCE):
         tile = np.arange(start, min(start + AT_ONCE, count))
-        every = np.repeat(tile, len(local))
-        found = points.evaluate(tiles.faces[every], tiles.params(every, np.tile(local, (len(tile), 1))), 2)
-        found = found.reshape(len(tile), len(local), 6, 3)
-        part = [x[start : tile[-1] + 1] for x in out]
-        parallel(kernels.shapes, len(tile), found, tiles.frames[tile], along, *part, work=8000 * len(tile))
-    return out
+        some = slice(start, start + len(tile))
+        first, second = (
+            points.evaluate(np.repeat(tiles.faces[tile], len(at)), _everywhere(tiles, tile, at), order)
+            for at, order in ((local, 1), (looked, 2))
+        )
+        frames = tiles.frames[tile]
+        first, second = first.reshape(len(tile), -1, 3, 3), second.reshape(len(tile), -1, 6, 3)
+        parallel(kernels.normals, len(tile), first, frames, normals[some], places[some], work=1000 * len(tile))
+        out = bends[some], curves[some]
+        parallel(kernels.bends, len(tile), second, frames, along, GRID, *out, work=2000 * len(tile))
+    return normals, places, bends, curves
+
+
+def _grid(steps: np.ndarray, width: int) -> np.ndarray:
+    """Local coordinates (GRID², 2) of a grid in a tile of so many sides."""
+    s, t = np.meshgrid(steps, steps, indexing="ij")
+    return np.stack([s, t if width == 4 else t * (1 - s)], axis=-1).reshape(-1, 2)
+
+
+def _everywhere(tiles: Tiles, tile: np.ndarray, local: np.ndarray) -> np.ndarray:
+    """Face parameters of all the same local coordinates in some tiles."""
+    return tiles.params(np.repeat(tile, len(local)), np.tile(local, (len(tile), 1)))

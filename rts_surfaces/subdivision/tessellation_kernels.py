@@ -240,61 +240,90 @@ def triangles(start, stop, owner, frames, corners, sides, flips, edges, edge_fir
 
 
 @compiled
-def _local(found, frame, first, second):
-    """Derivatives along s, t (2, 3) and along ss, st, tt (3, 3), of those in face parameters (6, 3)."""
-    a, b, c, d = frame[1, 0], frame[1, 1], frame[2, 0], frame[2, 1]
-    for i in range(3):
-        u, v, uu, uv, vv = found[1, i], found[2, i], found[3, i], found[4, i], found[5, i]
-        first[0, i], first[1, i] = a * u + b * v, c * u + d * v
-        second[0, i] = a * a * uu + 2 * a * b * uv + b * b * vv
-        second[1, i] = a * c * uu + (a * d + b * c) * uv + b * d * vv
-        second[2, i] = c * c * uu + 2 * c * d * uv + d * d * vv
+def _slopes(found, frame, slopes):
+    """Derivatives along s and t (2, 3), of those in face parameters."""
+    for k in range(2):
+        for c in range(3):
+            slopes[k, c] = frame[1 + k, 0] * found[1, c] + frame[1 + k, 1] * found[2, c]
+
+
+@compiled
+def _second(found, a, b, c):
+    """The component c of the second derivative along two directions in face parameters."""
+    return a[0] * b[0] * found[3, c] + (a[0] * b[1] + a[1] * b[0]) * found[4, c] + a[1] * b[1] * found[5, c]
+
+
+@compiled
+def _normal(slopes, out):
+    """Fill the unit normal, and return whether there is one; else it is zero."""
+    for c in range(3):
+        x, y = (c + 1) % 3, (c + 2) % 3
+        out[c] = slopes[0, x] * slopes[1, y] - slopes[0, y] * slopes[1, x]
+    length = math.sqrt(np.sum(out * out))
+    there = length > 1e-6 * math.sqrt(np.sum(slopes[0] * slopes[0]) * np.sum(slopes[1] * slopes[1])) and length > 0
+    out /= length if there else np.inf
+    return there
 
 
 @kernel
-def shapes(start, stop, found, frames, along, normals, places, bends, curves):
-    """Fill what is asked of the shape of tiles.
+def normals(start, stop, found, frames, out, places):
+    """Fill unit normals, or zeros, and where they are.
 
     Args:
         start: first tile.
         stop: one after the last.
-        found: (n, G G + k G, 6, 3) float64, points and derivatives in face parameters: on a grid of G points a side,
-            then on G points of each side.
+        found: (n, G G, 3, 3) float64, points and derivatives along u and v.
+        frames: (n, 3, 2) float64.
+        out: (n, G, G, 3).
+        places: (n, G, G, 3).
+    """
+    grid, slopes = out.shape[1], np.empty((2, 3))
+    for n in range(start, stop):
+        for k in range(grid * grid):
+            _slopes(found[n, k], frames[n], slopes)
+            _normal(slopes, out[n, k // grid, k % grid])
+            places[n, k // grid, k % grid] = found[n, k, 0]
+
+
+@kernel
+def bends(start, stop, found, frames, along, grid, out, curves):
+    """Fill how tiles and their sides bend.
+
+    Args:
+        start: first tile.
+        stop: one after the last.
+        found: (n, M + k G, 6, 3) float64, points and derivatives in face parameters: at M places within, then on G
+            points of each side.
         frames: (n, 3, 2) float64.
         along: (k, 2) float64, the direction of each side in local coordinates.
-        normals: (n, G, G, 3), of unit length, or zero.
-        places: (n, G, G, 3), where these are.
-        bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t.
+        grid: G.
+        out: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t; where there is no normal,
+            their lengths.
         curves: (n, k), the largest second derivatives of the sides across themselves.
     """
-    grid = normals.shape[1]
-    first, second, normal = np.empty((2, 3)), np.empty((3, 3)), np.empty(3)
+    slopes, normal, bend, tangent = np.empty((2, 3)), np.empty(3), np.empty(3), np.empty(3)
+    width = len(along)
     for n in range(start, stop):
-        bends[n] = 0
-        for k in range(grid * grid):
-            i, j = k // grid, k % grid
-            _local(found[n, k], frames[n], first, second)
-            places[n, i, j] = found[n, k, 0]
-            for c in range(3):
-                x, y = (c + 1) % 3, (c + 2) % 3
-                normal[c] = first[0, x] * first[1, y] - first[0, y] * first[1, x]
-            length = math.sqrt(np.sum(normal * normal))
-            scale = math.sqrt(np.sum(first[0] * first[0]) * np.sum(first[1] * first[1]))
-            flat = length > 1e-6 * scale and length > 0
-            if flat:
-                normals[n, i, j] = normal / length
-            else:
-                normals[n, i, j] = 0
-            for c in range(3):
-                size = abs(np.sum(second[c] * normal)) / length if flat else math.sqrt(np.sum(second[c] * second[c]))
-                bends[n, c] = max(bends[n, c], size)
-        for side in range(len(along)):
-            a, b = along[side]
+        frame, around = frames[n], found.shape[1] - grid * width
+        out[n] = 0
+        for k in range(around):
+            _slopes(found[n, k], frame, slopes)
+            there = _normal(slopes, normal)
+            for m in range(3):
+                a, b = frame[1 if m < 2 else 2], frame[1 if m < 1 else 2]
+                size, straight = 0.0, 0.0
+                for c in range(3):
+                    x = _second(found[n, k], a, b, c)
+                    size, straight = size + x * x, straight + x * normal[c]
+                out[n, m] = max(out[n, m], abs(straight) if there else math.sqrt(size))
+        for side in range(width):
+            way = along[side, 0] * frame[1] + along[side, 1] * frame[2]
             curves[n, side] = 0
-            for k in range(grid):
-                _local(found[n, grid * grid + side * grid + k], frames[n], first, second)
-                tangent = a * first[0] + b * first[1]
-                bend = a * a * second[0] + 2 * a * b * second[1] + b * b * second[2]
+            for k in range(around + grid * side, around + grid * (side + 1)):
+                _slopes(found[n, k], frame, slopes)
+                for c in range(3):
+                    tangent[c] = along[side, 0] * slopes[0, c] + along[side, 1] * slopes[1, c]
+                    bend[c] = _second(found[n, k], way, way, c)
                 square, own = np.sum(tangent * tangent), np.sum(bend * bend)
                 if square > 0:
                     own -= np.sum(tangent * bend) ** 2 / square
