@@ -11,7 +11,7 @@ SOURCES := pyproject.toml constraints.txt
 EXAMPLE := tests/plugin_example
 
 # What tests need of the system, by Debian's names; installed where this is root or may use sudo.
-SYSTEM_PACKAGES := python3-venv libegl1 libgl1-mesa-dri
+SYSTEM_PACKAGES := python3-venv libegl1 libgl1-mesa-dri libosd-dev g++
 SUDO := $(shell if [ "$$(id -u)" = 0 ]; then echo env; elif sudo -n true 2>/dev/null; then echo sudo; fi)
 
 .PHONY: check demo test lint types wheel oldest clean system

@@ -78,6 +78,15 @@ class TestRevolution(SurfaceConformance):
         return rts.plugin("surfaces", "revolution").example()
 
 
+class TestSubdivision(SurfaceConformance):
+    @pytest.fixture
+    def part(self):
+        try:
+            return rts.plugin("surfaces", "subdivision").example()
+        except PluginError as error:
+            pytest.skip(str(error))
+
+
 class TestEllipsoid(SurfaceConformance):
     @pytest.fixture
     def part(self):

@@ -48,6 +48,7 @@ class _Lines:
         self.rows: dict[str, list[str]] = {"v": [], "vt": [], "vn": []}
         self.numbers: dict[str, list[int]] = {"v": [], "vt": [], "vn": []}
         self.faces: list[tuple[int, str, int]] = []
+        self.tags: list[tuple[int, str]] = []
         self.libraries: list[str] = []
         self.materials: dict[str | None, int] = {}
 
@@ -63,6 +64,8 @@ class _Lines:
                 self.numbers[key].append(number)
             elif key == "f":
                 self.faces.append((number, self._absolute(rest, number) if "-" in rest else rest, material))
+            elif key == "t":
+                self.tags.append((number, rest))
             elif key == "usemtl":
                 material = self.materials.setdefault(rest.strip(), len(self.materials))
             elif key == "mtllib":
@@ -127,10 +130,10 @@ class _Lines:
                     raise self.fail(number, f"{' '.join(row)[:60]!r} are not numbers") from None
             raise
 
-    def triangles(self, points: np.ndarray, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Zero-based indices of position, uv and normal (T, 3 corners, 3), and the material (T,).
+    def polygons(self, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Zero-based indices of position, uv and normal (H, 3) of all corners, and how many each face has (F,).
 
-        An index that is not given is −1. See `rts.files.polygons.cut`; `points` are the positions (V, 3).
+        An index that is not given is −1.
         """
         corners: list[tuple[int, ...]] = []
         sizes: list[int] = []
@@ -144,8 +147,15 @@ class _Lines:
                     known[token] = self._corner(token, number, counts)
                 corners.append(known[token])
             sizes.append(len(tokens))
-        table = np.array(corners, np.int64)
-        cut, owner, forced = polygons.cut(points, table[:, 0], np.array(sizes))
+        return np.array(corners, np.int64), np.array(sizes)
+
+    def triangles(self, points: np.ndarray, counts: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Zero-based indices of position, uv and normal (T, 3 corners, 3), and the material (T,).
+
+        See `rts.files.polygons.cut`; `points` are the positions (V, 3).
+        """
+        table, sizes = self.polygons(counts)
+        cut, owner, forced = polygons.cut(points, table[:, 0], sizes)
         if forced:
             warn(f"{self.path}: {forced} polygons cross themselves and may be cut wrongly; export triangles to be sure")
         return table[cut], np.array([material for _, _, material in self.faces], np.int64)[owner]
@@ -165,6 +175,60 @@ class _Lines:
         return tuple(indices)
 
 
+class Polygons(NamedTuple):
+    """The faces of an OBJ file as they are, all materials in one.
+
+    Attributes:
+        vertices: (V, 3) float64.
+        colors: (V, 3) float64 in [0, 1], sRGB, or None.
+        uv: (A, 2) float64.
+        sizes: (F,) int64, how many corners each face has.
+        corners: (H, 3) int64, position, uv and normal of the corners of all faces; −1 where one is not given.
+        tags: the statements "t", as OpenSubdiv's files have them, each with the number of its line.
+        material: the only material, or a plain one where there are several.
+        texture: (h, w, 3 or 4) float32 in [0, 1], sRGB, of that material; or None.
+    """
+
+    vertices: np.ndarray
+    colors: np.ndarray | None
+    uv: np.ndarray
+    sizes: np.ndarray
+    corners: np.ndarray
+    tags: list[tuple[int, str]]
+    material: Material
+    texture: np.ndarray | None
+
+
+def read_polygons(path: Path) -> Polygons:
+    """The faces of an OBJ file, not cut into triangles.
+
+    Raises:
+        InputError: the file is damaged, or holds no faces.
+    """
+    lines = _Lines(path).read()
+    v, vt, vn = _rows(lines)
+    used = {material for _, _, material in lines.faces}
+    found = [material for name, material in _materials(lines).items() if lines.materials.get(name) in used]
+    material = found[0] if len(used) == len(found) == 1 else Material()
+    corners, sizes = lines.polygons((len(v), len(vt), len(vn)))
+    texture = None if material.texture is None else read_texture(material.texture, path)
+    return Polygons(v[:, :3], _colors(v), vt, sizes, corners, lines.tags, material, texture)
+
+
+def _rows(lines: _Lines) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, perhaps with colours, texture coordinates and normals of a file that has faces."""
+    v, vt, vn = lines.array("v", (3, 6)), lines.array("vt", (2,)), lines.array("vn", (3,))
+    if not lines.faces:
+        what = f"{len(v)} vertices but no faces" if len(v) else "neither vertices nor faces"
+        raise InputError(f"{lines.path} holds {what}; expected a mesh with triangles or polygons")
+    return v, vt, vn
+
+
+def _colors(v: np.ndarray) -> np.ndarray | None:
+    """The colours (V, 3) of positions that have some."""
+    return v[:, 3:] / (255 if v[:, 3:].max() > 1 else 1) if v.shape[1] == 6 else None
+
+
 def read_obj(path: Path) -> list[Piece]:
     """One piece a material, in order of first use. See `rts.files.models.read_pieces`."""
     lines = _Lines(path).read()
@@ -175,10 +239,7 @@ def read_obj(path: Path) -> list[Piece]:
         for name, index in lines.materials.items()
         if index in used and (file := materials.get(name, Material()).texture) is not None
     }
-    v, vt, vn = lines.array("v", (3, 6)), lines.array("vt", (2,)), lines.array("vn", (3,))
-    if not lines.faces:
-        what = f"{len(v)} vertices but no faces" if len(v) else "neither vertices nor faces"
-        raise InputError(f"{path} holds {what}; expected a mesh with triangles or polygons")
+    v, vt, vn = _rows(lines)
     # One array, shared by all pieces, so that merging need not repeat it.
     vertices = v[:, :3]
     corners, owner = lines.triangles(vertices, (len(v), len(vt), len(vn)))
@@ -192,8 +253,9 @@ def read_obj(path: Path) -> list[Piece]:
             attributes["uv"] = (vt, uv)
         if (normals >= 0).all():
             attributes["normals"] = (vn, normals)
-        if v.shape[1] == 6:
-            attributes["colors"] = (v[:, 3:] / (255 if v[:, 3:].max() > 1 else 1), faces)
+        colors = _colors(v)
+        if colors is not None:
+            attributes["colors"] = (colors, faces)
         material = materials.get(name, Material())
         pieces.append(Piece(vertices, faces, attributes, textures.get(name), material.color))
     return pieces

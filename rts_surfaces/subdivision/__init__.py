@@ -1,0 +1,1 @@
+"""Limit surfaces of subdivision, by OpenSubdiv."""

@@ -1,0 +1,286 @@
+"""OpenSubdiv's limit surfaces with NumPy in and out: cages, weights of their control points, points, rays.
+
+All loops run without the interpreter lock, on all cores. What is made of a cage is only read afterwards.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.errors import InputError
+from rts.threads import parallel
+from rts.topology import fixed
+from rts_surfaces.subdivision import library
+from rts_surfaces.subdivision.cage import Cage
+
+SMOOTH, SHARP = 8, 8
+"""Levels to which Bfr isolates extraordinary vertices and creases, 10 at most. Its defaults are 2 and 6, which are off
+by up to 5e-3 of the extent. It isolates nothing further than the second says: 8 and 6 are as good as 6 and 6, off by up
+to 4e-4 at spot's ears; 8 and 8 by 1e-4, on a hundredth of a face."""
+MOST_NUMBERS = 2**28
+"""Numbers that the table of control points may have: a gigabyte."""
+
+SCHEMES = {"catmark": 1, "loop": 2}
+BOUNDARIES = {"none": 0, "edge_only": 1, "edge_and_corner": 2}
+UV_RULES = {"none": 0, "corners_only": 1, "corners_plus1": 2, "corners_plus2": 3, "boundaries": 4, "all": 5}
+"""Values of OpenSubdiv's options, by names as in USD."""
+
+NONE, QUAD, TRIANGLE, SUBFACES = -1, 0, 1, 2
+"""Kinds of faces: without a limit surface; with parameters in the unit square; in the triangle (0, 0), (1, 0), (0, 1);
+in sub-faces, one a corner, each a square of half the size."""
+VERTEX, UV = 0, 1
+"""What is subdivided: data of vertices, or face-varying."""
+
+
+class Rules(NamedTuple):
+    """How a cage is subdivided.
+
+    Attributes:
+        boundary: a key of `BOUNDARIES`.
+        chaikin: whether the sharpness of a crease is smoothed along it by Chaikin's rule.
+        uv: a key of `UV_RULES`: where face-varying data is interpolated linearly.
+        smooth: the level to which extraordinary vertices are isolated.
+        sharp: the level to which creases are.
+    """
+
+    boundary: str = "edge_and_corner"
+    chaikin: bool = False
+    uv: str = "corners_plus1"
+    smooth: int = SMOOTH
+    sharp: int = SHARP
+
+
+class _Description(ctypes.Structure):
+    _fields_ = [
+        *((name, ctypes.c_int) for name in ("scheme", "boundary", "chaikin", "uv_rule", "smooth", "sharp")),
+        *((name, ctypes.c_int) for name in ("vertices", "faces")),
+        *((name, ctypes.c_void_p) for name in ("sizes", "indices", "twins")),
+        *((name, ctypes.c_int) for name in ("creases", "corners")),
+        *((name, ctypes.c_void_p) for name in ("crease_pairs", "crease_sharpness")),
+        *((name, ctypes.c_void_p) for name in ("corner_vertices", "corner_sharpness")),
+        ("uv_rows", ctypes.c_int),
+        ("uv_indices", ctypes.c_void_p),
+    ]
+
+
+class Limit:
+    """The limit surface of a cage, whatever its control points. Freed when garbage-collected.
+
+    Args:
+        cage: a cage that has been checked.
+        rules: how it is subdivided.
+        uv: (H,) int32, the row of face-varying data of each corner of each face, or None.
+
+    Attributes:
+        table: (F, W) int32, the vertices that each face depends on, filled up with one of them; read-only.
+        uv_table: (F, W') int32, the rows of face-varying data that it depends on; None without such data.
+        kinds: (F,) int32.
+        corners: (H, 2) float64, parameters of the corners of each face; of sub-faces where they begin.
+
+    Raises:
+        InputError: OpenSubdiv refuses the cage, or its faces depend on too many vertices.
+        PluginError: OpenSubdiv cannot be used.
+    """
+
+    def __init__(self, cage: Cage, rules: Rules | None = None, uv: np.ndarray | None = None):
+        self._library, self.cage, rules = library.load(), cage, rules or Rules()
+        # Vertices and rows that no face refers to stay out of it.
+        used, indices = np.unique(cage.indices, return_inverse=True)
+        place = np.zeros(int(used[-1]) + 1, np.int32)
+        place[used] = np.arange(len(used), dtype=np.int32)
+        uv_used, uv_indices = (None, None) if uv is None else np.unique(uv, return_inverse=True)
+        arrays = {
+            "sizes": cage.sizes,
+            "indices": indices.reshape(-1).astype(np.int32),
+            "twins": cage.twins,
+            "crease_pairs": place[cage.creases],
+            "crease_sharpness": cage.crease_sharpness,
+            "corner_vertices": place[cage.corners],
+            "corner_sharpness": cage.corner_sharpness,
+        }
+        if uv_indices is not None:
+            arrays["uv_indices"] = uv_indices.reshape(-1).astype(np.int32)
+        arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+        description = _Description(
+            scheme=SCHEMES[cage.scheme],
+            boundary=BOUNDARIES[rules.boundary],
+            chaikin=rules.chaikin,
+            uv_rule=UV_RULES[rules.uv],
+            smooth=rules.smooth,
+            sharp=rules.sharp,
+            vertices=len(used),
+            faces=len(cage.sizes),
+            creases=len(cage.creases),
+            corners=len(cage.corners),
+            uv_rows=0 if uv_used is None else len(uv_used),
+            **{name: array.ctypes.data for name, array in arrays.items()},
+        )
+        handle, widths = ctypes.c_void_p(), (ctypes.c_int * 2)()
+        self._call("rts_cage", ctypes.byref(description), ctypes.byref(handle), widths)
+        self.handle = handle.value
+        weakref.finalize(self, self._library.rts_cage_free, self.handle)
+        self._used = used.astype(np.int32)
+        self._tables(widths[0], uv_used, widths[1])
+
+    def _tables(self, width: int, uv_used: np.ndarray | None, uv_width: int) -> None:
+        count = len(self.cage.sizes)
+        if count * max(width, uv_width) > MOST_NUMBERS:
+            raise InputError(
+                f"a face of the cage depends on {max(width, uv_width)} vertices, too many for a table of {count} "
+                f"faces; divide the faces with many corners, and those around vertices with many edges"
+            )
+        table = np.empty((count, width), np.int32)
+        uv_table = None if uv_used is None else np.empty((count, uv_width), np.int32)
+        self.kinds, self.corners = np.empty(count, np.int32), np.empty((len(self.cage.indices), 2))
+        uv_data = None if uv_table is None else uv_table.ctypes.data
+        self._call(
+            "rts_tables", self.handle, table.ctypes.data, uv_data, self.kinds.ctypes.data, self.corners.ctypes.data
+        )
+        self.table = fixed(self._used[table])
+        self.uv_table = None if uv_table is None or uv_used is None else fixed(uv_used.astype(np.int32)[uv_table])
+
+    def _call(self, name: str, *args: Any) -> None:
+        if getattr(self._library, name)(*args):
+            said = " ".join(self._library.rts_message().decode(errors="replace").split())
+            raise InputError(f"OpenSubdiv cannot work with this cage: {said}")
+
+    def stencils(
+        self, faces: np.ndarray, params: np.ndarray, dtype: Any = np.float64, channel: int = VERTEX
+    ) -> np.ndarray:
+        """Weights (N, W) of the control points in the table, for points on the limit surface.
+
+        Args:
+            faces: (N,) integers.
+            params: (N, 2) float.
+            dtype: float32 or float64.
+            channel: `VERTEX` or `UV`.
+
+        Raises:
+            InputError: there is no such face.
+        """
+        out = np.empty((len(faces), self._width(channel)), dtype)
+        self._stencils(faces, params, channel, out, None, None)
+        return out
+
+    def derivative_stencils(
+        self, faces: np.ndarray, params: np.ndarray, dtype: Any = np.float64
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Weights (N, W) for the derivatives along u and along v; see `stencils`.
+
+        Where they are parallel whatever the control points, as at the corner of a sheet with a smooth boundary, they
+        are those of a point beside it.
+        """
+        along_u, along_v = np.empty((2, len(faces), self._width(VERTEX)), dtype)
+        self._stencils(faces, params, VERTEX, None, along_u, along_v)
+        return along_u, along_v
+
+    def _width(self, channel: int) -> int:
+        table = self.table if channel == VERTEX else self.uv_table
+        assert table is not None
+        return table.shape[1]
+
+    def _stencils(self, faces: np.ndarray, params: np.ndarray, channel: int, *out: np.ndarray | None) -> None:
+        faces, params = self._samples(faces, params)
+        kind = next(x for x in out if x is not None)
+        name = "rts_stencils_float" if kind.dtype == np.float32 else "rts_stencils_double"
+        data = [None if x is None else x.ctypes.data for x in out]
+
+        def some(start: int, stop: int) -> None:
+            self._call(name, self.handle, channel, start, stop, faces.ctypes.data, params.ctypes.data, *data)
+
+        parallel(some, len(faces), work=500 * len(faces))
+
+    def _samples(self, faces: np.ndarray, params: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Faces and parameters as the library takes them."""
+        faces, params = np.ascontiguousarray(faces, np.int32), np.ascontiguousarray(params, np.float64)
+        if len(faces) and not 0 <= faces.min() <= faces.max() < len(self.kinds):
+            raise InputError(f"samples lie on faces {faces.min()} to {faces.max()} of {len(self.kinds)}; sample anew")
+        if not np.isfinite(params).all():
+            raise InputError("parameters of samples are NaN or infinite; expected finite numbers")
+        return faces, params
+
+    def points(self, vertices: np.ndarray) -> Points:
+        """The limit surface for vertices (V, 3), prepared to be evaluated many times."""
+        return Points(self, vertices)
+
+
+class Points:
+    """The limit surface of a cage whose vertices are known. Freed when garbage-collected.
+
+    Args:
+        limit: the limit surface.
+        vertices: (V, 3) float.
+    """
+
+    def __init__(self, limit: Limit, vertices: np.ndarray):
+        self.limit = limit  # It must live as long.
+        handle = ctypes.c_void_p()
+        limit._call("rts_points", limit.handle, ctypes.byref(handle))
+        self.handle = handle.value
+        weakref.finalize(self, limit._library.rts_points_free, self.handle)
+        rows = np.ascontiguousarray(np.asarray(vertices, np.float64)[limit._used])
+
+        def some(start: int, stop: int) -> None:
+            limit._call("rts_move", self.handle, start, stop, rows.ctypes.data)
+
+        parallel(some, len(limit.kinds), work=10_000 * len(limit.kinds))
+
+    def evaluate(self, faces: np.ndarray, params: np.ndarray, derivatives: int = 0) -> np.ndarray:
+        """Points and derivatives (N, 1, 3 or 6, 3) float64: the point; along u, v; along uu, uv, vv.
+
+        Args:
+            faces: (N,) integers.
+            params: (N, 2) float.
+            derivatives: 0, 1 or 2, up to which order. In OpenSubdiv 3.5.0 all second derivatives have the wrong sign in
+                those triangles of Loop's subdivision that are turned round, such as the middle one of four.
+
+        Raises:
+            InputError: there is no such face.
+        """
+        faces, params = self.limit._samples(faces, params)
+        out = np.empty((len(faces), (1, 3, 6)[derivatives], 3))
+
+        def some(start: int, stop: int) -> None:
+            data = faces.ctypes.data, params.ctypes.data, derivatives, out.ctypes.data
+            self.limit._call("rts_evaluate", self.handle, start, stop, *data)
+
+        parallel(some, len(faces), work=500 * len(faces))
+        return out
+
+    def newton(
+        self,
+        faces: np.ndarray,
+        params: np.ndarray,
+        origins: np.ndarray,
+        directions: np.ndarray,
+        spread: np.ndarray,
+        limits: tuple[float, int, float, float, int],
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Where rays meet the surface, from samples nearby.
+
+        Args:
+            faces: (N,) integers, where to start.
+            params: (N, 2) float.
+            origins: (N, 3) float.
+            directions: (N, 3) float; the point at depth z is `origin + z direction`.
+            spread: (2,), a pixel at depth z is `spread[0] + spread[1] z` wide.
+            limits: residual in pixels, largest number of steps, largest step, how far beyond the edge of a face, both
+                in units of the face or sub-face; and how many edges may be crossed.
+
+        Returns:
+            Faces (N,) int32, parameters (N, 2) float64, depth (N,) float64, and whether it met, (N,) bool.
+        """
+        faces, params = (x.copy() for x in self.limit._samples(faces, params))
+        rays = [np.ascontiguousarray(x, np.float64) for x in (origins, directions, spread, limits)]
+        depth, met = np.empty(len(faces)), np.empty(len(faces), bool)
+        data = [x.ctypes.data for x in (faces, params, *rays, depth, met)]
+
+        def some(start: int, stop: int) -> None:
+            self.limit._call("rts_newton", self.handle, start, stop, *data)
+
+        parallel(some, len(faces), work=2000 * len(faces))
+        return faces, params, depth, met

@@ -1,0 +1,43 @@
+// A cage with the limit surface of each of its faces, and the points of these for given vertices.
+
+#pragma once
+
+#include <algorithm>
+#include <vector>
+
+#include <opensubdiv/bfr/surface.h>
+
+using Surface = OpenSubdiv::Bfr::Surface<double>;
+
+enum Kind { NONE = -1, QUAD, TRIANGLE, SUBFACES };  // Of faces; the values of Bfr's Parameterization.
+
+// Half edge h = first[f] + i runs from corner i of face f to the next.
+struct Cage {
+    std::vector<Surface> surfaces[2];  // Of vertex data, and of face-varying data. Invalid where a face has no limit.
+    int width[2] = {0, 0};             // The largest number of control points of a face.
+    std::vector<int> first;            // (F + 1,), the first half edge of each face.
+    std::vector<int> twins;            // (H,), the half edge that runs the other way, or -1.
+    std::vector<int> kinds;            // (F,)
+
+    int size(int face) const { return first[face + 1] - first[face]; }
+};
+
+// Control points of every face, and the further points that its patches have, for given vertices.
+struct Points {
+    Cage const* cage;
+    std::vector<size_t> first;
+    std::vector<double> rows;
+
+    void evaluate(int face, double const* uv, double* out, int derivatives) const {
+        double const* own = rows.data() + 3 * first[face];
+        Surface const& surface = cage->surfaces[0][face];
+        if (!surface.IsValid())
+            std::fill(out, out + 3 * (derivatives == 2 ? 6 : derivatives == 1 ? 3 : 1), 0.0);
+        else if (derivatives == 2)
+            surface.Evaluate(uv, own, 3, out, out + 3, out + 6, out + 9, out + 12, out + 15);
+        else if (derivatives == 1)
+            surface.Evaluate(uv, own, 3, out, out + 3, out + 6);
+        else
+            surface.Evaluate(uv, own, 3, out);
+    }
+};

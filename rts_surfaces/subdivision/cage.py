@@ -1,0 +1,296 @@
+"""Cages of subdivision surfaces, checked: what OpenSubdiv would not survive never reaches it.
+
+Half edge h is the side of a face from its corner h to the next one; H is how many there are.
+"""
+
+from __future__ import annotations
+
+from itertools import chain
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from rts.arguments import check_numbers, quoted
+from rts.arrays import shape_of
+from rts.engines import value_of
+from rts.errors import EngineError, InputError
+from rts.topology import fixed
+
+REPAIR = "repair the cage"
+INFINITE = 10
+"""The sharpness from which on OpenSubdiv takes a crease or corner for infinitely sharp."""
+
+MOST, MOST_AROUND = 256, 2000
+"""Corners of a face and faces at a vertex; and corners of the faces that touch a face. With ten times as many
+OpenSubdiv takes minutes, or ends the process."""
+
+
+class Cage(NamedTuple):
+    """The topology of a cage, sound. Host arrays, read-only.
+
+    Attributes:
+        scheme: "catmark" or "loop".
+        sizes: (F,) int32, how many corners each face has.
+        first: (F + 1,) int32, the first half edge of each face.
+        indices: (H,) int32, the vertices at the corners of all faces.
+        twins: (H,) int32, the half edge that runs the other way, or −1 at a boundary.
+        creases: (C, 2) int32, the ends of sharp edges.
+        crease_sharpness: (C,) float32.
+        corners: (D,) int32, sharp vertices.
+        corner_sharpness: (D,) float32.
+    """
+
+    scheme: str
+    sizes: np.ndarray
+    first: np.ndarray
+    indices: np.ndarray
+    twins: np.ndarray
+    creases: np.ndarray
+    crease_sharpness: np.ndarray
+    corners: np.ndarray
+    corner_sharpness: np.ndarray
+
+    def next(self) -> np.ndarray:
+        """(H,) int64, the half edge that follows each in its face."""
+        after = np.arange(1, len(self.indices) + 1)
+        after[self.first[1:] - 1] = self.first[:-1]
+        return after
+
+    def faces(self) -> np.ndarray:
+        """(H,) int64, the face of each half edge."""
+        return np.repeat(np.arange(len(self.sizes)), self.sizes)
+
+
+def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = ()) -> Cage:
+    """The cage of these faces.
+
+    Args:
+        faces: lists of vertex numbers, counter-clockwise seen from outside; or an array (F, n).
+        scheme: "catmark" or "loop".
+        creases: rows (a, b, sharpness), an edge by its vertices.
+        corners: rows (vertex, sharpness).
+
+    Raises:
+        InputError: the cage is none that has a limit surface; one line that says what is wrong where.
+    """
+    if scheme not in ("catmark", "loop"):
+        raise InputError(f"scheme is {quoted(scheme)}; expected 'catmark' or 'loop'")
+    sizes, indices = checked_lists("faces", faces)
+    first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
+    none = np.zeros(0, np.int32)
+    tagged = none.reshape(0, 2), none.astype(np.float32), none, none.astype(np.float32)
+    cage = Cage(scheme, sizes, first, indices, none, *tagged)
+    _check_faces(cage)
+    order, keys = _sorted_edges(cage)
+    cage = cage._replace(twins=_twins(cage, order, keys))
+    _check_pairs(cage)
+    _check_fans(cage)
+    _check_sizes(cage)
+    edges, crease_sharpness = _tags("creases", creases, ("a", "b", "sharpness"))
+    marked, corner_sharpness = _tags("corners", corners, ("vertex", "sharpness"))
+    _check_tags(cage, keys, edges, marked[:, 0])
+    cage = cage._replace(
+        creases=edges.astype(np.int32),
+        crease_sharpness=crease_sharpness,
+        corners=marked[:, 0].astype(np.int32),
+        corner_sharpness=corner_sharpness,
+    )
+    for table in cage[1:]:
+        fixed(table)
+    return cage
+
+
+def checked_lists(name: str, lists: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Lengths (F,) and numbers (H,) of lists of indices, both int32.
+
+    Raises:
+        InputError: they are no lists of integers from 0 on, or there are none.
+    """
+    wrong = InputError(f"{name} is {quoted(lists)}; expected lists of integers, one for each face, or an array (F, n)")
+    if isinstance(lists, (list, tuple)):
+        try:
+            sizes = np.fromiter(map(len, lists), np.int64, len(lists))
+            flat = np.array(list(chain.from_iterable(lists)))
+        except Exception:  # Numbers in place of lists, texts, traced values, lists within lists.
+            raise wrong from None
+    else:
+        flat = _known(name, lists, wrong)
+        if flat.ndim != 2:
+            raise InputError(f"{name} has shape {flat.shape}; expected (F, n), or lists of indices")
+        sizes, flat = np.full(len(flat), flat.shape[1]), flat.reshape(-1)
+    if not len(sizes):
+        raise InputError(f"{name} is empty; expected at least one face")
+    if not flat.size:
+        raise InputError(f"{name} has {len(sizes)} faces without corners; expected at least 3 corners a face")
+    if flat.ndim != 1 or not np.issubdtype(flat.dtype, np.integer):
+        raise InputError(f"{name} holds {quoted(flat.reshape(-1)[0])}; expected integers that name rows")
+    for bad, expected in ((flat.min(), "indices count from 0"), (flat.max(), "expected less than 2**31")):
+        if not 0 <= bad < 2**31:
+            raise InputError(f"{name} holds the index {bad}; {expected}")
+    return sizes.astype(np.int32), flat.astype(np.int32)
+
+
+def _known(name: str, table: Any, wrong: InputError) -> np.ndarray:
+    try:
+        known = np.asarray(table) if isinstance(table, np.ndarray) else value_of(table)
+    except EngineError:
+        raise wrong from None
+    if known is None or known.shape != shape_of(table):
+        raise InputError(f"{name} is traced, and topology must be known while Python runs; give it NumPy indices")
+    if known.ndim == 0:
+        raise wrong
+    return known
+
+
+def _check_faces(cage: Cage) -> None:
+    """Refuse faces that are no polygons of the scheme."""
+    least, most = cage.sizes.min(), cage.sizes.max()
+    if least < 3:
+        f = int(cage.sizes.argmin())
+        raise InputError(f"face {f} of the cage has {least} corners; expected at least 3: {REPAIR}")
+    if cage.scheme == "loop" and most > 3:
+        f = int(cage.sizes.argmax())
+        raise InputError(f"face {f} has {most} corners, and Loop needs triangles; cut it, or use scheme='catmark'")
+    keys = cage.faces() * (int(cage.indices.max()) + 1) + cage.indices
+    keys.sort()
+    same = np.flatnonzero(keys[1:] == keys[:-1])
+    if len(same):
+        f, vertex = divmod(int(keys[same[0]]), int(cage.indices.max()) + 1)
+        raise InputError(f"face {f} of the cage has the vertex {vertex} at two corners; expected each once: {REPAIR}")
+
+
+def _ends(cage: Cage) -> tuple[np.ndarray, np.ndarray]:
+    return cage.indices, cage.indices[cage.next()]
+
+
+def _key(a: np.ndarray, b: np.ndarray, count: int) -> np.ndarray:
+    """A number for each edge between two vertices, whichever way it runs."""
+    return np.minimum(a, b).astype(np.int64) * count + np.maximum(a, b)
+
+
+def _sorted_edges(cage: Cage) -> tuple[np.ndarray, np.ndarray]:
+    """Half edges in the order of their edges (H,), and the keys of these, sorted (H,)."""
+    keys = _key(*_ends(cage), int(cage.indices.max()) + 1)
+    order = np.argsort(keys, kind="stable")
+    return order, keys[order]
+
+
+def _twins(cage: Cage, order: np.ndarray, keys: np.ndarray) -> np.ndarray:
+    """The half edge that runs the other way, or −1; what is no manifold is refused."""
+    same = keys[1:] == keys[:-1]
+    thrice = np.flatnonzero(same[1:] & same[:-1])
+    (a, b), owner = _ends(cage), cage.faces()
+    if len(thrice):
+        h = order[thrice[0]]
+        count = int((keys == keys[thrice[0]]).sum())
+        raise InputError(f"{count} faces share the edge of vertices {a[h]} and {b[h]}; expected at most 2: {REPAIR}")
+    left = np.flatnonzero(same)
+    one, two = order[left], order[left + 1]
+    aligned = np.flatnonzero(a[one] == a[two])
+    if len(aligned):
+        h, k = one[aligned[0]], two[aligned[0]]
+        raise InputError(
+            f"faces {owner[h]} and {owner[k]} both run from vertex {a[h]} to {b[h]}; expected one orientation: turn "
+            f"one of them round"
+        )
+    twins = np.full(len(a), -1, np.int32)
+    twins[one], twins[two] = two, one
+    return twins
+
+
+def _check_pairs(cage: Cage) -> None:
+    """Refuse two faces that share two edges: around a vertex between them, or elsewhere."""
+    owner, inner = cage.faces(), cage.twins >= 0
+    pairs = owner * len(cage.sizes) + np.where(inner, owner[cage.twins], 0)
+    pairs, count = np.unique(pairs[inner], return_counts=True)
+    twice = np.flatnonzero(count > 1)
+    if not len(twice):
+        return
+    f, g = divmod(int(pairs[twice[0]]), len(cage.sizes))
+    valence = np.bincount(cage.indices)
+    outer = np.zeros(len(valence), bool)
+    for ends in _ends(cage):
+        outer[ends[~inner]] = True
+    between = cage.indices[(owner == f) & (valence[cage.indices] == 2) & ~outer[cage.indices]]
+    if len(between):
+        raise InputError(
+            f"only faces {f} and {g} meet at vertex {between[0]}, which is inside the cage; expected 3 faces or more "
+            f"there: leave the vertex out"
+        )
+    raise InputError(f"faces {f} and {g} share {count[twice[0]]} edges; expected at most one: divide one of them")
+
+
+def _check_fans(cage: Cage) -> None:
+    """Refuse vertices where faces meet that are not neighbours through edges."""
+    count = len(cage.indices)
+    h = np.flatnonzero(cage.twins >= 0)
+    # Around a vertex, from the half edge that leaves it to the one that leaves it in the face beside.
+    beside = cage.next()[cage.twins[h]]
+    graph = coo_array((np.ones(len(h), bool), (h, beside)), shape=(count, count))
+    _, fan = connected_components(graph, directed=False)
+    fans = np.unique(np.stack([cage.indices, fan]), axis=1)[0]
+    twice = np.flatnonzero(fans[1:] == fans[:-1])
+    if len(twice):
+        vertex = int(fans[twice[0]])
+        raise InputError(
+            f"vertex {vertex} joins {int((fans == vertex).sum())} fans of faces that share no edge there; expected "
+            f"one: give each fan a vertex of its own"
+        )
+
+
+def _check_sizes(cage: Cage) -> None:
+    """Refuse faces and vertices with so many neighbours that OpenSubdiv does not cope."""
+    valence = np.bincount(cage.indices)
+    if cage.sizes.max() > MOST:
+        f = int(cage.sizes.argmax())
+        raise InputError(f"face {f} has {cage.sizes[f]} corners; expected at most {MOST}: divide it")
+    if valence.max() > MOST:
+        v = int(valence.argmax())
+        raise InputError(f"{valence[v]} faces meet at vertex {v}; expected at most {MOST}: divide the faces around it")
+    far = np.repeat(cage.sizes - 2, cage.sizes)
+    beyond = np.bincount(cage.indices, far)[cage.indices] - far
+    around = cage.sizes + np.bincount(cage.faces(), beyond)
+    if around.max() > MOST_AROUND:
+        f = int(around.argmax())
+        raise InputError(
+            f"the faces that touch face {f} have {int(around[f])} corners; expected at most {MOST_AROUND}: divide it"
+        )
+
+
+def _tags(name: str, rows: Any, columns: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Indices (n, columns − 1) int64 and sharpness (n,) float32 of rows."""
+    expected = f"rows ({', '.join(columns)})"
+    if shape_of(rows)[:1] == (0,) or (isinstance(rows, (list, tuple)) and not rows):
+        return np.zeros((0, len(columns) - 1), np.int64), np.zeros(0, np.float32)
+    try:
+        shape = shape_of(rows) or np.shape(rows)
+    except Exception:  # Rows of different lengths, and of traced values.
+        shape = ()
+    if len(shape) != 2 or shape[1] != len(columns):
+        raise InputError(f"{name} is {quoted(rows)}; expected {expected}")
+    values = check_numbers(name, rows, shape)
+    if values is None:
+        raise InputError(f"{name} is traced, and topology must be known while Python runs; give it numbers")
+    indices, sharpness = values[:, :-1].astype(np.float64), values[:, -1].astype(np.float64)
+    wrong = ((indices != np.floor(indices)) | (indices < 0) | (indices >= 2**31)).any(axis=1)
+    if wrong.any():
+        raise InputError(f"{name} name the vertices {indices[wrong][0].tolist()}; expected {expected}, whole numbers")
+    if sharpness.min() < 0:
+        raise InputError(f"{name} have the sharpness {sharpness.min():g}; expected 0 or more, 10 for infinitely sharp")
+    return indices.astype(np.int64), np.minimum(sharpness, INFINITE).astype(np.float32)
+
+
+def _check_tags(cage: Cage, keys: np.ndarray, edges: np.ndarray, corners: np.ndarray) -> None:
+    """Refuse sharpness of edges and vertices that there are not."""
+    count = int(cage.indices.max()) + 1
+    wanted = _key(edges[:, 0], edges[:, 1], count)
+    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    missing = (keys[place] != wanted) | (edges.max(axis=1, initial=0) >= count)
+    if missing.any():
+        a, b = edges[missing][0]
+        raise InputError(f"creases name the edge of vertices {a} and {b}, but no face has it; name edges of the cage")
+    unknown = corners[~np.isin(corners, cage.indices)]
+    if len(unknown):
+        raise InputError(f"corners name the vertex {unknown[0]}, but no face has it; name vertices of the cage")

@@ -1,0 +1,187 @@
+"""The C++ part of subdivision surfaces: compiled when it is first needed, and kept in the user's cache.
+
+It needs the headers and the library of OpenSubdiv and a C++ compiler, as numba's kernels need nothing but numba. What
+is kept goes by the sources, the version of the headers and the compiler.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from typing import NamedTuple
+
+from rts.errors import PluginError
+
+SOURCES = ("opensubdiv.cpp", "cage.h", "newton.h")
+PREFIXES = ("/usr", "/usr/local", "/opt/homebrew", "/usr/local/opt/opensubdiv")
+COMPILERS = ("c++", "g++", "clang++")
+FLAGS = ("-std=c++17", "-O2", "-fPIC", "-shared")
+OLDEST = (3, 5)
+"""The first version with Bfr."""
+
+HELP = (
+    "install OpenSubdiv and a C++ compiler: Debian's packages libosd-dev and g++, or opensubdiv of conda-forge or "
+    "Homebrew; RTS_OPENSUBDIV names the folder that holds its include and lib"
+)
+
+_POINTER, _INT, _LONG = ctypes.c_void_p, ctypes.c_int, ctypes.c_long
+_RANGE = [_POINTER, _LONG, _LONG]
+_SIGNATURES = {
+    "rts_message": (ctypes.c_char_p, []),
+    "rts_start": (None, []),
+    "rts_cage": (_INT, [_POINTER, _POINTER, _POINTER]),
+    "rts_cage_free": (None, [_POINTER]),
+    "rts_tables": (_INT, [_POINTER] * 5),
+    "rts_stencils_float": (_INT, [_POINTER, _INT, _LONG, _LONG, *[_POINTER] * 5]),
+    "rts_stencils_double": (_INT, [_POINTER, _INT, _LONG, _LONG, *[_POINTER] * 5]),
+    "rts_points": (_INT, [_POINTER, _POINTER]),
+    "rts_points_free": (None, [_POINTER]),
+    "rts_move": (_INT, [*_RANGE, _POINTER]),
+    "rts_evaluate": (_INT, [*_RANGE, _POINTER, _POINTER, _INT, _POINTER]),
+    "rts_newton": (_INT, [*_RANGE, *[_POINTER] * 8]),
+}
+
+_first_use = threading.Lock()
+
+
+class Tools(NamedTuple):
+    """What the library is made with.
+
+    Attributes:
+        compiler: the command, perhaps with options.
+        prefix: the folder that holds OpenSubdiv's include and lib.
+        version: the text of the header that tells OpenSubdiv's version.
+    """
+
+    compiler: tuple[str, ...]
+    prefix: Path
+    version: str
+
+
+def find() -> Tools:
+    """The compiler and OpenSubdiv.
+
+    Raises:
+        PluginError: one is missing, or OpenSubdiv is older than 3.5.
+    """
+    places = [os.environ.get(name, "") for name in ("RTS_OPENSUBDIV", "CONDA_PREFIX")]
+    old = ""
+    for prefix in (Path(p) for p in (*places, *PREFIXES) if p):
+        try:
+            version = (prefix / "include/opensubdiv/version.h").read_text()
+        except OSError:
+            continue
+        if (prefix / "include/opensubdiv/bfr/refinerSurfaceFactory.h").is_file():
+            break
+        old = f", and that in {prefix} is older than {'.'.join(map(str, OLDEST))}"
+    else:
+        raise PluginError(f"subdivision surfaces need OpenSubdiv, whose headers are not found{old}; {HELP}")
+    given = shlex.split(os.environ.get("CXX", ""))
+    for command in [given] if given else [[name] for name in COMPILERS]:
+        found = shutil.which(command[0])
+        if found:
+            return Tools((found, *command[1:]), prefix, version)
+    missing = f"that CXX names, {given[0]!r}, is not found" if given else "is not found"
+    raise PluginError(f"subdivision surfaces need a C++ compiler, and one {missing}; {HELP}")
+
+
+@functools.cache
+def load() -> ctypes.CDLL:
+    """The library with its signatures, compiled if it has to be.
+
+    Raises:
+        PluginError: something that it needs is missing, or does not work.
+    """
+    with _first_use:
+        return _opened(find())
+
+
+def _opened(tools: Tools) -> ctypes.CDLL:
+    path = _compiled(tools)
+    try:
+        library = ctypes.CDLL(str(path))
+    except OSError:  # Damaged, or made for an OpenSubdiv that is gone.
+        path.unlink(missing_ok=True)
+        path = _compiled(tools)
+        try:
+            library = ctypes.CDLL(str(path))
+        except OSError as error:
+            raise PluginError(
+                f"the library of subdivision surfaces does not load ({_line(str(error))}); {HELP}"
+            ) from error
+    for name, (result, arguments) in _SIGNATURES.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    library.rts_start()
+    return library
+
+
+def _compiled(tools: Tools) -> Path:
+    """The library for these tools: as kept, or made now."""
+    folder, name = cache_folder(), f"opensubdiv-{_key(tools)}.so"
+    kept = folder / name
+    if kept.is_file():
+        return kept
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, draft = tempfile.mkstemp(suffix=".so", dir=folder)
+    except OSError:  # A cache that cannot be written to: made anew in each process.
+        folder = Path(_own_folder().name)
+        handle, draft = tempfile.mkstemp(suffix=".so", dir=folder)
+    os.close(handle)
+    try:
+        _compile(tools, Path(draft))
+        # In one step: another process that makes it at this moment finds it whole, or not at all.
+        os.replace(draft, folder / name)
+    except BaseException:
+        Path(draft).unlink(missing_ok=True)
+        raise
+    return folder / name
+
+
+def cache_folder() -> Path:
+    """Where compiled libraries are kept."""
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "rts"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rts"
+
+
+@functools.cache
+def _own_folder() -> tempfile.TemporaryDirectory:
+    """A folder of this process alone, which is removed at its end."""
+    return tempfile.TemporaryDirectory(prefix="rts-")
+
+
+def _key(tools: Tools) -> str:
+    compiler = Path(tools.compiler[0]).resolve()
+    stat = compiler.stat()
+    known = (*tools.compiler, compiler, stat.st_size, stat.st_mtime_ns, tools.prefix, tools.version, FLAGS, os.uname())
+    text = b"".join((Path(__file__).parent / name).read_bytes() for name in SOURCES)
+    return hashlib.sha256(repr(known).encode() + text).hexdigest()[:20]
+
+
+def _compile(tools: Tools, out: Path) -> None:
+    library = tools.prefix / "lib"
+    command = [*tools.compiler, *FLAGS, f"-I{tools.prefix / 'include'}", str(Path(__file__).parent / SOURCES[0])]
+    command += ["-o", str(out), f"-L{library}", f"-Wl,-rpath,{library}", "-losdCPU"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        said = done.stderr.splitlines()
+        # The first error tells more than the last lines do.
+        first = next((line for line in said if "error" in line or "cannot find" in line), said[-1] if said else "")
+        raise PluginError(
+            f"{tools.compiler[0]} fails to compile the library of subdivision surfaces ({_line(first)}); {HELP}"
+        )
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())[:200]

@@ -1,0 +1,135 @@
+"""Cages from OBJ files: polygons, uv, and the statements "t" by which OpenSubdiv's files tag edges and vertices.
+
+`t name i/f/s …` has so many integers, floats and words. The vertices in them count from 0, those of faces from 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.errors import FileWarning, InputError, warn
+from rts.files.obj_reader import Polygons, read_polygons
+from rts.files.srgb import decode_srgb
+from rts.interfaces import Shader
+from rts.shading import Lambert, Textured
+from rts.trees import Tree
+from rts_surfaces.subdivision.binding import UV_RULES
+
+_BOUNDARIES = ("none", "edge_and_corner", "edge_only")
+"""What interpolateboundary 0, 1 and 2 stand for."""
+
+
+class CageFile(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        faces: lists of vertices.
+        options: keywords of `Subdivision`.
+        theta: "vertices" (V, 3) and what the file has of "uv", "colors", "texture" and "color", float32, linear.
+        shader: a shader for it.
+    """
+
+    faces: list[list[int]]
+    options: dict[str, Any]
+    theta: dict[str, Tree]
+    shader: Shader
+
+
+def read_cage(path: Path) -> CageFile:
+    """The cage of an OBJ file.
+
+    Raises:
+        InputError: it is no OBJ file, or damaged.
+
+    Warns:
+        FileWarning: a statement is not followed.
+    """
+    if path.suffix.lower() != ".obj":
+        raise InputError(f"{path} is no OBJ file; cages of subdivision surfaces are read from .obj")
+    found = read_polygons(path)
+    with np.errstate(over="ignore"):  # What overflows is refused.
+        theta: dict[str, Any] = {"vertices": found.vertices.astype(np.float32)}
+        options = _tagged(path, found.tags)
+        if (found.corners[:, 1] >= 0).all():
+            theta["uv"] = found.uv.astype(np.float32)
+            options["indices"] = {"uv": _lists(found.corners[:, 1], found.sizes)}
+        if found.colors is not None:
+            theta["colors"] = decode_srgb(found.colors).astype(np.float32)
+    opaque = _material(found, theta)
+    for name, values in theta.items():
+        bad = np.argwhere(~np.isfinite(values))
+        if len(bad):
+            raise InputError(
+                f"{path}: row {bad[0][0]} of {name} is NaN, infinite or too large for float32; repair the file"
+            )
+    shader = (Textured if "texture" in theta else Lambert)(opaque=opaque)
+    return CageFile(_lists(found.corners[:, 0], found.sizes), options, theta, shader)
+
+
+def _lists(indices: np.ndarray, sizes: np.ndarray) -> list[list[int]]:
+    return [part.tolist() for part in np.split(indices, np.cumsum(sizes)[:-1])]
+
+
+def _material(found: Polygons, theta: dict[str, Any]) -> bool:
+    """Add colour and texture of the material to θ; whether all is opaque."""
+    color = found.material.color
+    opaque = color is None or len(color) < 4 or color[3] >= 1
+    if found.texture is not None and "uv" in theta:
+        theta["texture"] = decode_srgb(found.texture).astype(np.float32)
+        opaque = opaque and found.texture.shape[-1] < 4
+    if color is not None and (color < 1).any():
+        theta["color"] = decode_srgb(color)[: 3 if (color[3:] >= 1).all() else 4].astype(np.float32)
+    return bool(opaque)
+
+
+def _tagged(path: Path, tags: list[tuple[int, str]]) -> dict[str, Any]:
+    """Keywords of `Subdivision` that tags stand for."""
+    options: dict[str, Any] = {"creases": [], "corners": []}
+    for number, text in tags:
+        name, whole, real, words = _split(path, number, text)
+        if name == "crease" and len(whole) >= 2 and len(whole) % 2 == 0 and len(real) in (1, len(whole) // 2):
+            pairs = zip(whole[::2], whole[1::2], strict=True)
+            sharp = real * (len(whole) // 2 // len(real))
+            options["creases"] += [(a, b, max(s, 0.0)) for (a, b), s in zip(pairs, sharp, strict=True)]
+        elif name == "corner" and whole and len(real) in (1, len(whole)):
+            sharp = real * (len(whole) // len(real))
+            options["corners"] += [(v, max(s, 0.0)) for v, s in zip(whole, sharp, strict=True)]
+        elif name == "interpolateboundary" and len(whole) == 1 and 0 <= whole[0] < 3:
+            options["boundary"] = _BOUNDARIES[whole[0]]
+        elif name == "facevaryinginterpolateboundary" and len(whole) == 1 and 0 <= whole[0] < len(UV_RULES):
+            options["uv_rule"] = list(UV_RULES)[whole[0]]
+        elif name == "creasemethod" and words in (["normal"], ["chaikin"]):
+            options["chaikin"] = words == ["chaikin"]
+        elif name in ("crease", "corner", "interpolateboundary", "facevaryinginterpolateboundary", "creasemethod"):
+            raise _damaged(path, number, text)
+        else:
+            warn(f"{path}, line {number}: the tag {name[:40]!r} is not followed", FileWarning)
+    return options
+
+
+def _split(path: Path, number: int, text: str) -> tuple[str, list[int], list[float], list[str]]:
+    """Name, integers, floats and words of a tag."""
+    name, counts, *rest = [*text.split(), "", ""][: max(2, len(text.split()))]
+    try:
+        i, f, s = (int(x) for x in counts.split("/"))
+        kinds: list[tuple[int, Callable[[str], Any]]] = [(i, int), (f, float), (s, str)]
+        if min(i, f, s) < 0 or i + f + s != len(rest):
+            raise ValueError
+        values = iter(rest)
+        whole, real, words = ([kind(next(values)) for _ in range(count)] for count, kind in kinds)
+    except ValueError:
+        raise _damaged(path, number, text) from None
+    if not np.isfinite(real).all():
+        raise _damaged(path, number, text)
+    return name, whole, real, words
+
+
+def _damaged(path: Path, number: int, text: str) -> InputError:
+    return InputError(
+        f"{path}, line {number}: {' '.join(text.split())[:60]!r} is no tag; expected a name, numbers of integers, "
+        f"floats and words as 2/1/0, and these: repair the file"
+    )

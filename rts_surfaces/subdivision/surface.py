@@ -1,0 +1,306 @@
+"""Subdivision surfaces: the limit of Catmull–Clark or Loop subdivision of a cage, by OpenSubdiv.
+
+A sample is a face of the cage and Bfr's (u, v) in it. Points are sums of control points with weights that depend on the
+sample alone: linear in θ, and exactly differentiable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rts.arguments import check_positive, quoted
+from rts.arrays import described, shape_of, unit
+from rts.checks import is_count
+from rts.engines import constants, engine_of, namespace
+from rts.errors import InputError
+from rts.gbuffer import GBuffer
+from rts.interfaces import Part, TriangleSurface
+from rts.operations.combine import combine
+from rts.operations.take import take
+from rts.records import ArraySpec, Proxy, Rays, Samples
+from rts.sampling.cache import fingerprint
+from rts.topology import fixed
+from rts.trees import Array, Tree
+from rts_surfaces.parametric import BEYOND, LARGEST_STEP, MOST, RESIDUAL, STEPS
+from rts_surfaces.subdivision import library, tessellation
+from rts_surfaces.subdivision.binding import BOUNDARIES, UV, UV_RULES, VERTEX, Limit, Points, Rules
+from rts_surfaces.subdivision.cage import checked_cage, checked_lists
+
+library.find()  # Without OpenSubdiv there is no such plugin.
+
+RATE = 8
+"""Cuts along each side of a face, for the triangles that samples start from."""
+CROSSINGS = 4
+"""Edges of faces that Newton's method may cross."""
+
+G_BUFFER_NAMES = {"colors": "color"}
+VERTEX_ATTRIBUTES = ("colors", "uv")
+WIDTHS = {"vertices": (3,), "uv": (2,), "colors": (1, 3, 4)}
+
+
+class Subdivision(TriangleSurface):
+    """The limit surface of a cage.
+
+    θ["vertices"] (V, 3) are the control points. Attributes of control points are further entries of θ, each (A, C):
+    "colors" (1, 3 or 4 wide) and "uv" (2 wide) are known, others are declared by `indices`; they are subdivided as
+    positions are. In the G-buffer "colors" becomes "color". Normals are those of the limit surface.
+
+    Args:
+        faces: lists of integers into θ["vertices"], counter-clockwise seen from outside; or an array (F, n).
+        scheme: "catmark" (Catmull–Clark, any polygons) or "loop" (triangles).
+        creases: rows (a, b, sharpness): edges by their vertices. Sharpness s is sharp for s steps of subdivision; 10 is
+            for ever.
+        corners: rows (vertex, sharpness).
+        boundary: what becomes of edges with one face: "edge_and_corner" (the surface ends there, and vertices of one
+            face are corners), "edge_only" (no corners), "none" (faces at the boundary have no surface).
+        chaikin: whether the sharpness of creases is smoothed along them.
+        indices: attribute name → None for one row a vertex, which is how others than the known ones are declared; and
+            for "uv" lists of integers into θ["uv"], as `faces` are: a face-varying map with seams.
+        uv_rule: where a face-varying uv is linear rather than smooth: "none", "corners_only", "corners_plus1",
+            "corners_plus2", "boundaries" or "all", as in OpenSubdiv and USD.
+        rate: cuts along each side of a face, for the triangles that samples start from.
+
+    Raises:
+        InputError: the cage has no limit surface that can be computed, or an option is none of these.
+        PluginError: OpenSubdiv does not work.
+    """
+
+    sample_widths = (1, 2)
+
+    def __init__(
+        self,
+        faces: Any,
+        scheme: str = "catmark",
+        *,
+        creases: Any = (),
+        corners: Any = (),
+        boundary: str = "edge_and_corner",
+        chaikin: bool = False,
+        indices: Mapping[str, Any] | None = None,
+        uv_rule: str = "corners_plus1",
+        rate: int = RATE,
+    ):
+        for name, given, known in (("boundary", boundary, BOUNDARIES), ("uv_rule", uv_rule, UV_RULES)):
+            if not isinstance(given, str) or given not in known:
+                raise InputError(f"{name} is {quoted(given)}; expected one of {', '.join(map(repr, known))}")
+        if not isinstance(chaikin, (bool, np.bool_)):
+            raise InputError(f"chaikin is {quoted(chaikin)}; expected True or False")
+        if not is_count(rate) or not 1 <= rate <= MOST:
+            raise InputError(f"rate is {quoted(rate)}; expected a whole number from 1 to {MOST}")
+        self.rate, self._rules = int(rate), Rules(boundary, bool(chaikin), uv_rule)
+        self.cage = checked_cage(faces, scheme, creases, corners)
+        self._declared, self._uv = self._attribute_indices(indices)
+        self._count = int(self.cage.indices.max()) + 1
+        self._prepare()
+
+    def _attribute_indices(self, indices: Mapping[str, Any] | None) -> tuple[tuple[str, ...], np.ndarray | None]:
+        """Names of attributes, and the rows of a face-varying uv (H,) or None."""
+        if indices is not None and not isinstance(indices, Mapping):
+            raise InputError(f"indices is {quoted(indices)}; expected a dict of name → None, or lists for 'uv'")
+        uv = None
+        for name, lists in (indices or {}).items():
+            if lists is None:
+                continue
+            if name != "uv":
+                raise InputError(f"indices[{name!r}] is {quoted(lists)}; expected None; only 'uv' has lists")
+            sizes, uv = checked_lists("indices['uv']", lists)
+            if not np.array_equal(sizes, self.cage.sizes):
+                raise InputError("indices['uv'] has faces of other sizes than the cage; expected a row for each corner")
+            uv = fixed(uv)
+        return tuple(dict.fromkeys((*VERTEX_ATTRIBUTES, *(indices or {})))), uv
+
+    def _prepare(self) -> None:
+        """Make what is not kept in a copy."""
+        self.limit = Limit(self.cage, self._rules, self._uv)
+        if not len(self.limit.table) or (self.limit.kinds < 0).all():
+            raise InputError("no face of the cage has a surface: all are at its boundary; use another boundary rule")
+        self.tiles = tessellation.tiles_of(self.limit)
+        self._points: tuple[tuple, Points] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy is made of: the library's objects stay in this process."""
+        return {name: value for name, value in vars(self).items() if name not in ("limit", "tiles", "_points")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._prepare()
+
+    def __repr__(self) -> str:
+        return f"Subdivision({len(self.cage.sizes)} faces, {self.cage.scheme})"
+
+    @classmethod
+    def example(cls) -> Part:
+        """A coloured cube whose top is creased."""
+        corners = np.array([(x, y, z) for z in (-1, 1) for y in (-1, 1) for x in (-1, 1)], np.float32)
+        faces = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (1, 3, 7, 5), (3, 2, 6, 7), (2, 0, 4, 6)]
+        creases = [(4, 5, 10), (5, 7, 10), (7, 6, 2), (6, 4, 2)]
+        theta = {"vertices": 1.15 * corners, "colors": 0.5 + 0.4 * corners}
+        return Part(cls(faces, creases=creases), theta, "lambert")
+
+    @classmethod
+    def load(cls, path: Path) -> list[Part]:
+        """One part: the cage in an OBJ file, with its uv, and OpenSubdiv's statements "t" for creases and corners.
+
+        Raises:
+            InputError: the file is no OBJ, is damaged, or its cage is not sound.
+
+        Warns:
+            FileWarning: a statement is not followed.
+        """
+        from rts_surfaces.subdivision.obj_cages import read_cage
+
+        found = read_cage(path)
+        try:
+            surface = cls(found.faces, **found.options)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+        return [Part(surface, found.theta, found.shader)]
+
+    # ---------------------------------------------------------------------------------------------- checks
+
+    def check(self, theta: Mapping[str, Tree]) -> None:
+        """Refuse θ whose entries have wrong shapes or dtypes."""
+        for name in self.reads(theta):
+            if name not in theta:
+                raise InputError(f"theta of {self!r} has no {name!r}; it has {sorted(theta)}")
+            value, widths = theta[name], WIDTHS.get(name)
+            varying = name == "uv" and self._uv is not None
+            rows = int(self._uv.max()) + 1 if varying and self._uv is not None else self._count
+            shape = shape_of(value)
+            if len(shape) != 2 or (widths and shape[1] not in widths):
+                expected = f"(rows, {' or '.join(map(str, widths or 'C'))})"
+                raise InputError(f"theta[{name!r}] of {self!r} {described(value)}; expected {expected}")
+            if not namespace(value).isdtype(value.dtype, "real floating"):
+                raise InputError(f"theta[{name!r}] of {self!r} has dtype {value.dtype}; expected a floating one")
+            if shape[0] < rows:
+                raise InputError(
+                    f"theta[{name!r}] of {self!r} has {shape[0]} rows, but its faces refer to row {rows - 1}; check "
+                    f"the indices (they count from 0)"
+                )
+
+    def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
+        """The entries of θ that `evaluate` needs."""
+        known = (name for name in self._declared if name in theta or name not in VERTEX_ATTRIBUTES)
+        return "vertices", *known
+
+    # -------------------------------------------------------------------------------------------- sampling
+
+    def proxy_inputs(self, theta: Mapping[str, Tree]) -> Array:
+        """The control points."""
+        return theta["vertices"]
+
+    def points(self, inputs: np.ndarray) -> Points:
+        """The limit surface for control points (V, 3), made once while they stay."""
+        vertices = np.asarray(inputs, np.float64)
+        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=-1))
+        if len(bad):
+            raise InputError(
+                f"{len(bad)} control points of {self!r} are NaN or infinite, the first is {bad[0]}; check the input, "
+                f"or lower the step size if an optimisation led here"
+            )
+        key, kept = fingerprint(vertices), self._points
+        if kept is None or kept[0] != key:
+            kept = self._points = key, self.limit.points(vertices)
+        return kept[1]
+
+    def proxy(self, inputs: np.ndarray, camera: Any, size: tuple[int, int]) -> Proxy:
+        """Triangles whose vertices lie on the surface."""
+        return self._cut(self.points(inputs), self.rate)
+
+    def _cut(self, points: Points, rate: int) -> Proxy:
+        # Where faces are cut into quarters, each has half of a side.
+        whole = len(self.tiles.faces) == np.count_nonzero(self.limit.kinds >= 0)
+        edges, inner = tessellation.uniform(self.tiles, rate if whole else -(-rate // 2))
+        return tessellation.triangles(self.tiles, points, edges, inner)
+
+    def tessellate(self, theta: Mapping[str, Tree], rate: int | float) -> tuple[np.ndarray, np.ndarray]:
+        """A mesh whose vertices lie on the surface.
+
+        Args:
+            theta: θ, with values that are known.
+            rate: a whole number, of cuts along each side of a face; or a float, the distance in the units of θ that
+                triangles may be off the surface.
+
+        Returns:
+            Vertices (V, 3) float32 and faces (T, 3) int32, without cracks.
+
+        Raises:
+            InputError: a rate of zero or less, or θ of another shape.
+        """
+        self.check(theta)
+        vertices = theta["vertices"]
+        points = self.points(np.asarray(engine_of(vertices).to_numpy(vertices)))
+        if is_count(rate):
+            proxy = self._cut(points, min(int(rate), MOST))
+        else:
+            check_positive("rate", rate)
+            bends, curves = tessellation.shapes(self.tiles, points)[2:]
+            allowed = np.full(len(self.tiles.faces), float(rate))
+            rates = tessellation.rates(self.tiles, bends, curves, allowed, MOST)
+            proxy = tessellation.triangles(self.tiles, points, *rates)
+        a, b, c = (proxy.vertices[proxy.faces[:, i]] for i in range(3))
+        return proxy.vertices, proxy.faces[(np.cross(b - a, c - a) != 0).any(axis=1)]
+
+    def refine(self, inputs: np.ndarray, samples: Samples, rays: Rays) -> Samples:
+        """Face, (u, v) and depth where rays meet the surface, by Newton's method; what does not meet is dropped."""
+        limits = RESIDUAL, STEPS + CROSSINGS, LARGEST_STEP, BEYOND, CROSSINGS
+        ends = rays.origins, rays.directions, rays.spread
+        faces, params, depth, met = self.points(inputs).newton(samples.ids[:, 0], samples.params, *ends, limits)
+        kept = samples.row >= 0
+        kept &= met[samples.row]
+        faces[~met], params[~met] = 0, 0
+        row = np.where(kept, samples.row, -1)
+        depth = np.where(kept, depth[samples.row], 0)
+        return replace(samples, ids=faces[:, None], params=params, row=row, depth=depth)
+
+    # ------------------------------------------------------------------------------------------ evaluation
+
+    def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
+        """Positions, normals, and attributes of control points; see the class for their names."""
+        vertices = theta["vertices"]
+        engine = engine_of(vertices, samples.params)
+        if not engine.owns(vertices):
+            vertices = engine.constant(vertices, samples.params)
+        params, faces = constants((samples.params, samples.ids[:, 0]), engine, vertices)
+        at = partial(self._weights, vertices, faces, params)
+        ids = take(engine.constant(self.limit.table, vertices), faces)
+        (weights,) = at(VERTEX, False)
+        gbuffer = GBuffer(position=combine(vertices, ids, weights))
+
+        def normal() -> Array:
+            along_u, along_v = (combine(vertices, ids, w) for w in at(VERTEX, True))
+            return unit(engine.namespace.linalg.cross(along_u, along_v))
+
+        def varying() -> Array:
+            (own,) = at(UV, False)
+            return combine(theta["uv"], take(engine.constant(self.limit.uv_table, vertices), faces), own)
+
+        gbuffer.defer("normal", normal)
+        for name in self.reads(theta)[1:]:
+            entry = G_BUFFER_NAMES.get(name, name)
+            if name == "uv" and self._uv is not None:
+                gbuffer.defer(entry, varying)
+            else:
+                gbuffer.defer(entry, partial(combine, theta[name], ids, weights))
+        return gbuffer
+
+    def _weights(self, like: Array, faces: Array, params: Array, channel: int, derivatives: bool) -> tuple[Array, ...]:
+        """Weights (N, W) of control points; for derivatives those along u, and those along v."""
+        engine = engine_of(like, params)
+        dtype = np.float64 if engine.namespace.finfo(like.dtype).bits == 64 else np.float32
+        table = self.limit.table if channel == VERTEX else self.limit.uv_table
+        assert table is not None
+        spec = ArraySpec((shape_of(faces)[0], table.shape[1]), dtype)
+
+        def host(faces: np.ndarray, params: np.ndarray) -> tuple[np.ndarray, ...]:
+            if derivatives:
+                return self.limit.derivative_stencils(faces, params, dtype)
+            return (self.limit.stencils(faces, params, dtype, channel),)
+
+        return engine.call_host(host, [spec] * (1 + derivatives), faces, params)

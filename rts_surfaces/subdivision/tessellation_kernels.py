@@ -1,0 +1,330 @@
+"""Triangles of tiles on the host, compiled, and what they must know of a tile's shape.
+
+Tiles, their tables and their local coordinates are those of `tessellation.Tiles`. It imports numba.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+compiled = numba.njit(nogil=True)
+kernel = numba.njit(nogil=True, cache=True)
+
+
+# ------------------------------------------------------------------------------------------ points and counts
+
+
+@kernel
+def within_edges(owner, starts, ends, edges, edge_first, faces, params):
+    """Fill faces (V,) and params (V, 2) of the points within edges.
+
+    Args:
+        owner: (E,) int32, the face that each edge is evaluated on.
+        starts: (E, 2) float64, its parameters where the edge starts.
+        ends: (E, 2) float64.
+        edges: (E,) int32, how often each edge is cut.
+        edge_first: (E + 1,) int32, the first of the points within each edge.
+        faces: (V,) int32.
+        params: (V, 2) float64.
+    """
+    for e in range(len(edges)):
+        for k in range(1, edges[e]):
+            v, x = edge_first[e] + k - 1, k / edges[e]
+            faces[v] = owner[e]
+            for c in range(2):
+                params[v, c] = starts[e, c] + x * (ends[e, c] - starts[e, c])
+
+
+@compiled
+def _put(frame, s, t, out):
+    for c in range(2):
+        out[c] = frame[0, c] + s * frame[1, c] + t * frame[2, c]
+
+
+@kernel
+def within_quadrilaterals(owner, frames, inner, inner_first, faces, params):
+    """Fill faces (V,) and params (V, 2) of the points within tiles: first along t, then along s."""
+    for n in range(len(inner)):
+        v, rs, rt = inner_first[n], inner[n, 0], inner[n, 1]
+        for i in range(1, rs):
+            for j in range(1, rt):
+                faces[v] = owner[n]
+                _put(frames[n], i / rs, j / rt, params[v])
+                v += 1
+
+
+@kernel
+def within_triangles(owner, frames, inner, inner_first, faces, params):
+    """Fill faces (V,) and params (V, 2) of the points within triangular tiles: first along s, then along t."""
+    for n in range(len(inner)):
+        v, r = inner_first[n], inner[n, 0]
+        for j in range(1, r):
+            for i in range(1, r - j):
+                faces[v] = owner[n]
+                _put(frames[n], i / r, j / r, params[v])
+                v += 1
+
+
+@kernel
+def counts(inner, sides, edges, first):
+    """Fill first (n + 1,): the number of the first triangle of each tile."""
+    width = sides.shape[1]
+    first[0] = 0
+    for n in range(len(inner)):
+        rs, rt = inner[n, 0], inner[n, 1]
+        if rs == 1:
+            total = width - 2
+        else:
+            total = 2 * (rs - 2) * (rt - 2) if width == 4 else (rs - 3) * (rs - 3)
+            for s in range(width):
+                total += edges[sides[n, s]] + ((rs if s % 2 == 0 else rt) - 2 if width == 4 else rs - 3)
+        first[n + 1] = first[n] + total
+
+
+# ------------------------------------------------------------------------------------------------- triangles
+
+
+@compiled
+def _set(faces, params, t, place, vertex, frame, x, y):
+    faces[t, place] = vertex
+    for c in range(2):
+        params[t, place, c] = frame[0, c] + x * frame[1, c] + y * frame[2, c]
+
+
+@compiled
+def _outer(faces, params, t, place, n, side, k, cuts, frame, corners, flips, base):
+    """The point number k of a side."""
+    width = corners.shape[1]
+    if k == 0 or k == cuts:
+        vertex = corners[n, side if k == 0 else (side + 1) % width]
+    else:
+        vertex = base + (cuts - k if flips[n, side] else k) - 1
+    z = k / cuts
+    if width == 3:
+        x, y = (z, 0.0) if side == 0 else (1 - z, z) if side == 1 else (0.0, 1 - z)
+    else:
+        x, y = (z, 0.0) if side == 0 else (1.0, z) if side == 1 else (1 - z, 1.0) if side == 2 else (0.0, 1 - z)
+    _set(faces, params, t, place, vertex, frame, x, y)
+
+
+@compiled
+def _square_point(faces, params, t, place, i, j, rs, rt, frame, base):
+    _set(faces, params, t, place, base + (i - 1) * (rt - 1) + j - 1, frame, i / rs, j / rt)
+
+
+@compiled
+def _square_ring(faces, params, t, place, side, m, rs, rt, frame, base):
+    """The point number m, from 1 on, of the ring within a tile, along a side."""
+    i = m if side == 0 else rs - 1 if side == 1 else rs - m if side == 2 else 1
+    j = 1 if side == 0 else m if side == 1 else rt - 1 if side == 2 else rt - m
+    _square_point(faces, params, t, place, i, j, rs, rt, frame, base)
+
+
+@kernel
+def quadrilaterals(
+    start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out
+):
+    """Fill the triangles of quadrilateral tiles.
+
+    Args:
+        start: first tile.
+        stop: one after the last.
+        owner: (n,) int32, faces of tiles.
+        frames: (n, 3, 2) float64.
+        corners: (n, 4) int32.
+        sides: (n, 4) int32.
+        flips: (n, 4) bool.
+        edges: (E,) int32, how often each edge is cut.
+        edge_first: (E + 1,) int32, the first of the vertices within each edge.
+        inner: (n, 2) int32, how often each tile is cut.
+        inner_first: (n + 1,) int32, the first of the vertices within each tile.
+        first: (n + 1,) int32, the first triangle of each tile.
+        out: faces (T, 3) int32, ids (T, 1) int32, params (T, 3, 2) float32.
+    """
+    faces, ids, params = out
+    for n in range(start, stop):
+        rs, rt, t, base, frame = inner[n, 0], inner[n, 1], first[n], inner_first[n], frames[n]
+        ids[t : first[n + 1], 0] = owner[n]
+        if rs == 1:
+            for half in range(2):
+                for k in range(3):
+                    _outer(faces, params, t + half, k, n, (k + 2 * half) % 4, 0, 1, frame, corners, flips, 0)
+            continue
+        for i in range(1, rs - 1):
+            for j in range(1, rt - 1):
+                for half in range(2):
+                    for k in range(3):
+                        # (0, 0), (1, 0), (1, 1) and (1, 1), (0, 1), (0, 0) of the cell.
+                        c = (k + 2 * half) % 4
+                        x, y = i + (1 if c == 1 or c == 2 else 0), j + (1 if c >= 2 else 0)
+                        _square_point(faces, params, t, k, x, y, rs, rt, frame, base)
+                    t += 1
+        for side in range(4):
+            e, count = sides[n, side], rs if side % 2 == 0 else rt
+            cuts = edges[e]
+            # Points of the side, 0 to `cuts`, and those of the ring within, 1 to `count` − 1; the nearer goes on.
+            k, m = 0, 1
+            while k < cuts or m < count - 1:
+                outward = m == count - 1 or (k < cuts and (k + 1) * count * 2 <= (2 * m + 1) * cuts)
+                _outer(faces, params, t, 0, n, side, k, cuts, frame, corners, flips, edge_first[e])
+                if outward:
+                    _outer(faces, params, t, 1, n, side, k + 1, cuts, frame, corners, flips, edge_first[e])
+                    k += 1
+                else:
+                    _square_ring(faces, params, t, 1, side, m + 1, rs, rt, frame, base)
+                _square_ring(faces, params, t, 2, side, m, rs, rt, frame, base)
+                if not outward:
+                    m += 1
+                t += 1
+
+
+@compiled
+def _triangle_point(faces, params, t, place, i, j, r, frame, base):
+    row = (j - 1) * (r - 1) - (j - 1) * j // 2
+    _set(faces, params, t, place, base + row + i - 1, frame, i / r, j / r)
+
+
+@compiled
+def _triangle_ring(faces, params, t, place, side, m, r, frame, base):
+    """The point number m, from 1 on, of the ring within a triangular tile, along a side."""
+    i = m if side == 0 else r - 1 - m if side == 1 else 1
+    j = 1 if side == 0 else m if side == 1 else r - 1 - m
+    _triangle_point(faces, params, t, place, i, j, r, frame, base)
+
+
+@kernel
+def triangles(start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out):
+    """Fill the triangles of triangular tiles; the arguments are as those of `quadrilaterals`, of three sides."""
+    faces, ids, params = out
+    for n in range(start, stop):
+        r, t, base, frame = inner[n, 0], first[n], inner_first[n], frames[n]
+        ids[t : first[n + 1], 0] = owner[n]
+        if r == 1:
+            for k in range(3):
+                _outer(faces, params, t, k, n, k, 0, 1, frame, corners, flips, 0)
+            continue
+        for j in range(1, r - 2):
+            for i in range(1, r - 1 - j):
+                _triangle_point(faces, params, t, 0, i, j, r, frame, base)
+                _triangle_point(faces, params, t, 1, i + 1, j, r, frame, base)
+                _triangle_point(faces, params, t, 2, i, j + 1, r, frame, base)
+                t += 1
+                if i + j < r - 2:
+                    _triangle_point(faces, params, t, 0, i + 1, j, r, frame, base)
+                    _triangle_point(faces, params, t, 1, i + 1, j + 1, r, frame, base)
+                    _triangle_point(faces, params, t, 2, i, j + 1, r, frame, base)
+                    t += 1
+        for side in range(3):
+            cuts = edges[sides[n, side]]
+            base_edge = edge_first[sides[n, side]]
+            # The ring's point m lies at (m + 1/2) / r along the side; there are r − 2.
+            k, m = 0, 1
+            while k < cuts or m < r - 2:
+                outward = m == r - 2 or (k < cuts and (k + 1) * r <= (m + 1) * cuts)
+                _outer(faces, params, t, 0, n, side, k, cuts, frame, corners, flips, base_edge)
+                if outward:
+                    _outer(faces, params, t, 1, n, side, k + 1, cuts, frame, corners, flips, base_edge)
+                    k += 1
+                else:
+                    _triangle_ring(faces, params, t, 1, side, m + 1, r, frame, base)
+                _triangle_ring(faces, params, t, 2, side, m, r, frame, base)
+                if not outward:
+                    m += 1
+                t += 1
+
+
+# ---------------------------------------------------------------------------------------------------- shapes
+
+
+@compiled
+def _slopes(found, frame, slopes):
+    """Derivatives along s and t (2, 3), of those in face parameters."""
+    for k in range(2):
+        for c in range(3):
+            slopes[k, c] = frame[1 + k, 0] * found[1, c] + frame[1 + k, 1] * found[2, c]
+
+
+@compiled
+def _second(found, a, b, c):
+    """The component c of the second derivative along two directions in face parameters."""
+    return a[0] * b[0] * found[3, c] + (a[0] * b[1] + a[1] * b[0]) * found[4, c] + a[1] * b[1] * found[5, c]
+
+
+@compiled
+def _normal(slopes, out):
+    """Fill the unit normal, and return whether there is one; else it is zero."""
+    for c in range(3):
+        x, y = (c + 1) % 3, (c + 2) % 3
+        out[c] = slopes[0, x] * slopes[1, y] - slopes[0, y] * slopes[1, x]
+    length = math.sqrt(np.sum(out * out))
+    there = length > 1e-6 * math.sqrt(np.sum(slopes[0] * slopes[0]) * np.sum(slopes[1] * slopes[1])) and length > 0
+    out /= length if there else np.inf
+    return there
+
+
+@kernel
+def normals(start, stop, found, frames, out, places):
+    """Fill unit normals, or zeros, and where they are.
+
+    Args:
+        start: first tile.
+        stop: one after the last.
+        found: (n, G G, 3, 3) float64, points and derivatives along u and v.
+        frames: (n, 3, 2) float64.
+        out: (n, G, G, 3).
+        places: (n, G, G, 3).
+    """
+    grid, slopes = out.shape[1], np.empty((2, 3))
+    for n in range(start, stop):
+        for k in range(grid * grid):
+            _slopes(found[n, k], frames[n], slopes)
+            _normal(slopes, out[n, k // grid, k % grid])
+            places[n, k // grid, k % grid] = found[n, k, 0]
+
+
+@kernel
+def bends(start, stop, found, frames, along, grid, out, curves):
+    """Fill how tiles and their sides bend.
+
+    Args:
+        start: first tile.
+        stop: one after the last.
+        found: (n, M + k G, 6, 3) float64, points and derivatives in face parameters: at M places within, then on G
+            points of each side.
+        frames: (n, 3, 2) float64.
+        along: (k, 2) float64, the direction of each side in local coordinates.
+        grid: G.
+        out: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t; where there is no normal,
+            their lengths.
+        curves: (n, k), the largest second derivatives of the sides across themselves.
+    """
+    slopes, normal, bend, tangent = np.empty((2, 3)), np.empty(3), np.empty(3), np.empty(3)
+    width = len(along)
+    for n in range(start, stop):
+        frame, around = frames[n], found.shape[1] - grid * width
+        out[n] = 0
+        for k in range(around):
+            _slopes(found[n, k], frame, slopes)
+            there = _normal(slopes, normal)
+            for m in range(3):
+                a, b = frame[1 if m < 2 else 2], frame[1 if m < 1 else 2]
+                size, straight = 0.0, 0.0
+                for c in range(3):
+                    x = _second(found[n, k], a, b, c)
+                    size, straight = size + x * x, straight + x * normal[c]
+                out[n, m] = max(out[n, m], abs(straight) if there else math.sqrt(size))
+        for side in range(width):
+            way = along[side, 0] * frame[1] + along[side, 1] * frame[2]
+            curves[n, side] = 0
+            for k in range(around + grid * side, around + grid * (side + 1)):
+                _slopes(found[n, k], frame, slopes)
+                for c in range(3):
+                    tangent[c] = along[side, 0] * slopes[0, c] + along[side, 1] * slopes[1, c]
+                    bend[c] = _second(found[n, k], way, way, c)
+                square, own = np.sum(tangent * tangent), np.sum(bend * bend)
+                if square > 0:
+                    own -= np.sum(tangent * bend) ** 2 / square
+                curves[n, side] = max(curves[n, side], math.sqrt(max(own, 0.0)))

@@ -1,0 +1,293 @@
+"""Cages that have no limit surface are refused in one line; random ones never end the process.
+
+A share of random cages is tried. `RTS_CAGES=10000` tries that many.
+"""
+
+import os
+import resource
+import sys
+
+import numpy as np
+import pytest
+from test_subdivision import ball, cube, prism, sheet, somewhere
+
+import rts
+from rts import InputError
+
+pytestmark = pytest.mark.sampling
+
+Subdivision = rts.plugin("surfaces", "subdivision")
+
+from rts_surfaces.subdivision.binding import Limit, Rules  # noqa: E402
+from rts_surfaces.subdivision.cage import checked_cage  # noqa: E402
+
+COUNT = int(os.environ.get("RTS_CAGES", "600"))
+STEP = 200
+CUBE, BALL = cube()[1], ball()[1]
+FAN = [[0, 1, 2, 3], [0, 4, 5, 6]]
+
+
+def spider(corners, legs):
+    """A polygon with a fan of triangles about each corner."""
+    free = iter(range(corners, 10**6))
+    faces = [list(range(corners))]
+    for i in range(corners):
+        tips = [next(free) for _ in range(legs + 1)]
+        faces += [[a, i, b] for a, b in zip(tips, tips[1:], strict=False)]
+        faces.append([(i + 1) % corners, i, tips[0]])
+    return faces
+
+
+def changed(faces, place, face):
+    return [face if i == place else f for i, f in enumerate(faces)]
+
+
+@pytest.mark.parametrize(
+    "faces, options, expected",
+    [
+        ([], {}, "faces is empty"),
+        ([[]], {}, "faces without corners"),
+        ("abc", {}, "faces is 'abc'; expected lists of integers"),
+        ([[0, 1, 2], 7], {}, "expected lists of integers"),
+        ([[0, 1, 2.5]], {}, "expected integers"),
+        ([[0, 1, "a"]], {}, "expected integers|expected lists"),
+        (np.zeros(3, int), {}, r"has shape \(3,\)"),
+        (np.zeros((2, 4)), {}, "expected integers"),
+        ([[0, 1, -2]], {}, "holds the index -2; indices count from 0"),
+        ([[0, 1, 2**31]], {}, r"less than 2\*\*31"),
+        ([[0, 1], *CUBE], {}, "face 0 of the cage has 2 corners"),
+        ([[0, 1, 2, 1]], {}, "face 0 of the cage has the vertex 1 at two corners"),
+        (CUBE, {"scheme": "loop"}, "Loop needs triangles"),
+        (CUBE, {"scheme": "bilinear"}, "scheme is 'bilinear'"),
+        ([*CUBE, [0, 2, 9, 8]], {}, "3 faces share the edge of vertices"),
+        (changed(CUBE, 2, CUBE[2][::-1]), {}, "both run from vertex"),
+        ([[0, 1, 2], [2, 1, 0]], {}, "faces 0 and 1 share 3 edges|which is inside"),
+        ([[0, 1, 2, 3], [2, 1, 4, 0], [3, 2, 0, 4]], {}, "only faces|share"),
+        ([[0, 1, 5, 4], [1, 0, 4, 5]], {}, "share|which is inside"),
+        ([[0, 1, 3, 2], [1, 0, 2, 3]], {}, "share|which is inside"),
+        (FAN, {}, "vertex 0 joins 2 fans of faces"),
+        ([*CUBE, [0, 8, 9, 10], [0, 10, 11, 12]], {}, "vertex 0 joins 2 fans"),
+        (prism(3000)[1], {}, "face 0 has 3000 corners; expected at most 256"),
+        ([[i, (i + 1) % 3000, 3000] for i in range(3000)], {}, "3000 faces meet at vertex 3000; expected at most 256"),
+        (spider(120, 40), {}, "the faces that touch face 0 have [0-9]+ corners; expected at most 2000"),
+        (CUBE, {"creases": [(0, 3, 1)]}, "creases name the edge of vertices 0 and 3, but no face has it"),
+        (CUBE, {"creases": [(0, 99, 1)]}, "creases name the edge of vertices 0 and 99"),
+        (CUBE, {"creases": [(0, 1, np.nan)]}, "finite"),
+        (CUBE, {"creases": [(0, 1, np.inf)]}, "finite"),
+        (CUBE, {"creases": [(0, 1, -1)]}, "sharpness -1"),
+        (CUBE, {"creases": [(0, 1)]}, "expected rows"),
+        (CUBE, {"creases": [(0.5, 1, 1)]}, "whole numbers"),
+        (CUBE, {"creases": 3}, "expected rows"),
+        (CUBE, {"corners": [(9, 1)]}, "corners name the vertex 9, but no face has it"),
+        (CUBE, {"corners": [(0, 1), (2,)]}, "expected rows"),
+        (CUBE, {"corners": [(-1, 1)]}, "whole numbers"),
+        (CUBE, {"boundary": "soft"}, "boundary is 'soft'; expected one of 'none', 'edge_only', 'edge_and_corner'"),
+        (CUBE, {"boundary": 3}, "boundary is 3"),
+        (CUBE, {"uv_rule": "x"}, "uv_rule is 'x'"),
+        (CUBE, {"chaikin": "yes"}, "expected True or False"),
+        (CUBE, {"rate": 0}, "rate is 0"),
+        (CUBE, {"rate": 2.5}, "rate is 2.5"),
+        (CUBE, {"indices": [1]}, "expected a dict"),
+        (CUBE, {"indices": {"colors": CUBE}}, "expected None; only 'uv' has lists"),
+        (CUBE, {"indices": {"uv": CUBE[:5]}}, "faces of other sizes"),
+        (CUBE, {"indices": {"uv": changed(CUBE, 0, [0, 1, 2, -1])}}, r"indices\['uv'\] holds the index -1"),
+    ],
+)
+def test_what_has_no_limit_surface_is_refused_in_one_line(faces, options, expected):
+    with pytest.raises(InputError, match=expected) as error:
+        Subdivision(faces, **options)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 250
+
+
+def test_faces_that_share_two_edges_around_a_vertex_are_told_from_others():
+    with pytest.raises(InputError, match="only faces 0 and 1 meet at vertex 4, which is inside the cage"):
+        Subdivision([[0, 1, 4, 3], [1, 2, 3, 4]])
+    # A ring of two faces.
+    with pytest.raises(InputError, match="faces 0 and 1 share 2 edges; expected at most one"):
+        Subdivision([[0, 1, 2, 3], [1, 0, 4, 3, 2, 5]])
+
+
+@pytest.mark.parametrize("target", ["torch", "jax"])
+def test_indices_of_every_engine_are_taken(target):
+    faces = np.array(CUBE)
+    given = (
+        pytest.importorskip(target).tensor(faces)
+        if target == "torch"
+        else pytest.importorskip("jax").numpy.asarray(faces)
+    )
+    np.testing.assert_array_equal(Subdivision(given).cage.indices, faces.reshape(-1))
+
+
+def test_traced_indices_are_refused():
+    jax = pytest.importorskip("jax")
+    with pytest.raises(InputError, match="traced"):
+        jax.jit(lambda faces: Subdivision(faces) and 0)(np.array(CUBE))
+
+
+@pytest.mark.parametrize(
+    "theta, expected",
+    [
+        ({}, "has no 'vertices'"),
+        ({"vertices": np.zeros((7, 3), np.float32)}, "7 rows, but its faces refer to row 7"),
+        ({"vertices": np.zeros((8, 2), np.float32)}, "expected \\(rows, 3\\)"),
+        ({"vertices": np.zeros((8, 3), int)}, "floating"),
+        ({"vertices": np.full((8, 3), np.nan, np.float32)}, "8 control points"),
+        ({"vertices": cube()[0], "colors": np.zeros((8, 2))}, "expected \\(rows, 1 or 3 or 4\\)"),
+        ({"vertices": cube()[0], "uv": np.zeros((8, 2))}, "8 rows, but its faces refer to row 23"),
+    ],
+)
+def test_parameters_that_do_not_fit_are_refused(theta, expected):
+    surface = Subdivision(CUBE, indices={"uv": np.arange(24).reshape(6, 4)})
+    part = rts.Part(surface, theta, "silhouette")
+    with pytest.raises(InputError, match=expected):
+        rts.render(part, rts.Camera.look_at((0, 0, 5), (0, 0, 0)), (8, 8))
+
+
+# ------------------------------------------------------------------------------------------------ random cages
+
+
+def base(rng):
+    kind = rng.integers(5)
+    vertices, faces = (
+        cube()
+        if kind == 0
+        else ball()
+        if kind == 1
+        else prism(int(rng.integers(3, 9)))
+        if kind == 2
+        else sheet(*map(int, rng.integers(2, 6, 2)))
+    )
+    scheme = "loop" if kind == 1 and rng.random() < 0.7 else "catmark"
+    faces = [list(f) for f in faces]
+    if rng.random() < 0.4:
+        for _ in range(rng.integers(1, 4)):
+            if len(faces) > 1:
+                faces.pop(int(rng.integers(len(faces))))
+    if scheme == "catmark" and rng.random() < 0.5:  # Some faces in two: a quadrilateral into triangles, and so on.
+        for i in range(len(faces)):
+            f = faces[i]
+            if len(f) > 3 and rng.random() < 0.3:
+                cut = int(rng.integers(2, len(f) - 1))
+                faces[i], more = f[: cut + 1], [*f[cut:], f[0]]
+                faces.append(more)
+    return vertices, faces, scheme
+
+
+def tags(rng, faces):
+    sharp = [0.3, 1.0, 2.7, 4.0, 10.0]
+    sides = [(f[i], f[(i + 1) % len(f)]) for f in faces for i in range(len(f))]
+    creases = [(*sides[i], rng.choice(sharp)) for i in rng.integers(0, len(sides), rng.integers(0, 6))]
+    corners = [(rng.choice(faces[i]), rng.choice(sharp)) for i in rng.integers(0, len(faces), rng.integers(0, 3))]
+    return creases, corners
+
+
+def broken(rng, faces, creases, corners):
+    """A rule broken, or perhaps not: it may be that all is still well."""
+    i, top = int(rng.integers(len(faces))), max(map(max, faces)) + 1
+    kind = rng.integers(14)
+    if kind == 0:
+        faces[i][0] = faces[i][-1]
+    elif kind == 1:
+        faces[i] = faces[i][:2]
+    elif kind == 2:
+        faces[i] = faces[i][::-1]
+    elif kind == 3:
+        faces.append(list(faces[i]))
+    elif kind == 4:
+        faces.append([faces[i][0], top, top + 1])
+    elif kind == 5:
+        faces.append([faces[i][1], faces[i][0], top, top + 1][: 3 + int(rng.integers(2))])
+    elif kind == 6:  # A vertex on an edge, in the faces beside it: of valence 2.
+        a, b = faces[i][:2]
+        for f in faces:
+            for k in range(len(f)):
+                if {f[k], f[(k + 1) % len(f)]} == {a, b}:
+                    f.insert(k + 1, top)
+                    break
+    elif kind == 7:
+        creases.append((int(rng.integers(-1, top + 2)), int(rng.integers(top + 2)), 1.0))
+    elif kind == 8:
+        creases.append((faces[i][0], faces[i][1], rng.choice([np.nan, np.inf, -1.0])))
+    elif kind == 9:
+        corners.append((int(rng.integers(-1, top + 2)), rng.choice([1.0, np.nan])))
+    elif kind == 10:
+        faces[i][0] = int(rng.choice([-1, 2**31, 10**6]))
+    elif kind == 11:  # Two vertices become one.
+        a, b = rng.integers(0, top, 2)
+        faces = [[a if v == b else v for v in f] for f in faces]
+    elif kind == 12:
+        faces[i] = []
+    else:  # The face beside is the same one, folded.
+        faces.append(faces[i][::-1])
+    return faces, creases, corners
+
+
+@pytest.mark.parametrize("first", range(0, COUNT, STEP))
+def test_random_cages_give_a_clear_line_or_finite_points(first):
+    refused = made = 0
+    for number in range(first, min(first + STEP, COUNT)):
+        rng = np.random.default_rng(number)
+        _, faces, scheme = base(rng)
+        creases, corners = tags(rng, faces)
+        if number % 2:
+            faces, creases, corners = broken(rng, faces, creases, corners)
+        boundary = str(rng.choice(["none", "edge_only", "edge_and_corner"], p=[0.1, 0.3, 0.6]))
+        sizes = [len(f) for f in faces]
+        rows = np.split(rng.integers(0, 9, sum(sizes)), np.cumsum(sizes)[:-1])
+        uv = {"uv": [r.tolist() for r in rows]} if rng.random() < 0.3 else None
+        try:
+            surface = Subdivision(
+                faces, scheme, creases=creases, corners=corners, boundary=boundary, chaikin=bool(number % 3), indices=uv
+            )
+        except InputError as error:
+            refused += 1
+            assert "\n" not in str(error), number
+            continue
+        made += 1
+        count = max(map(max, faces)) + 1
+        vertices = rng.normal(size=(count, 3))
+        face, params = somewhere(surface.limit, 30, number)
+        points = surface.limit.points(vertices)
+        found = points.evaluate(face, params, 2)
+        weights = np.array([surface.limit.stencils(face, params), *surface.limit.derivative_stencils(face, params)])
+        assert np.isfinite(found).all() and np.isfinite(weights).all(), number
+        np.testing.assert_allclose(weights.sum(axis=2), np.array([1, 0, 0])[:, None] + np.zeros((1, 30)), atol=1e-6)
+        directions = rng.normal(size=(30, 3))
+        points.newton(
+            face, params, found[:, 0] - directions, directions, np.array([1e-3, 0]), (1e-4, 10, 0.25, 0.02, 4)
+        )
+        assert len(surface.tessellate({"vertices": vertices}, 2)[1])
+        if uv:
+            assert np.isfinite(surface.limit.stencils(face, params, channel=1)).all()
+    assert made > STEP / 8 and refused > STEP / 8
+
+
+def test_cages_that_are_made_and_freed_leave_nothing_behind():
+    vertices, faces = cube()
+    cage = checked_cage(faces, "catmark", [(0, 1, 2.5), (1, 3, 10)])
+
+    def memory():
+        if sys.platform != "linux":
+            return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        with open("/proc/self/statm") as file:
+            return int(file.read().split()[1]) * resource.getpagesize()
+
+    def some(count):
+        for _ in range(count):
+            limit = Limit(cage, Rules())
+            limit.points(vertices).evaluate(np.zeros(1, int), np.zeros((1, 2)))
+
+    some(200)
+    before = memory()
+    some(1000)
+    # A cage of these takes a hundred kilobytes.
+    assert memory() - before < 10e6
+
+
+def test_points_outlive_the_name_of_their_surface():
+    points = Limit(checked_cage(CUBE, "catmark")).points(cube()[0])
+    assert np.isfinite(points.evaluate(np.zeros(9, int), np.zeros((9, 2)))).all()
+    with pytest.raises(InputError, match="faces 6 to 6 of 6"):
+        points.evaluate(np.array([6]), np.zeros((1, 2)))
+    with pytest.raises(InputError, match="NaN"):
+        points.evaluate(np.array([0]), np.full((1, 2), np.nan))
