@@ -144,10 +144,10 @@ def mesh(kind: str, table: np.ndarray, points: np.ndarray, rate: int) -> Contend
 
 def meshed(table: np.ndarray, points: np.ndarray, rate: int) -> rts.Proxy:
     """All patches cut alike."""
-    from rts_surfaces.tiles import triangles, uniform
+    from rts_surfaces.tiles import triangles
 
     surface = Bezier(table)
-    return triangles(surface.whole, surface.geometry(points.astype(np.float64)).points, *uniform(surface.whole, rate))
+    return triangles(surface.whole, surface.geometry(points.astype(np.float64)).points, *surface.uniform(rate))
 
 
 def rate_of_a_pixel(table: np.ndarray, points: np.ndarray, size: tuple[int, int]) -> int:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Hashable, Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from rts.errors import InputError
 from rts.interfaces import TriangleSurface
 from rts.records import Proxy, Rays, Samples
 from rts.trees import Array, Tree
-from rts_surfaces.tiles import MOST, Tiles, by_error, chords, shapes, triangles, uniform
+from rts_surfaces.tiles import MOST, Shapes, Tiles, by_error, chords, shapes, split, triangles, uniform
 from rts_surfaces.views import view_key, view_of
 
 TOLERANCE = 0.1
@@ -39,13 +38,15 @@ class Geometry(abc.ABC):
         """Points and derivatives; see `rts_surfaces.tiles.Points`."""
 
     @abc.abstractmethod
-    def meet(self, samples: Samples, rays: Rays) -> None:
-        """Move samples onto their rays, in place, by Newton's method with `LIMITS`.
+    def meet(self, samples: Samples, rays: Rays) -> Samples:
+        """Samples on their rays, by Newton's method with `LIMITS`.
 
         Args:
-            samples: ids (N, 1) int32; and params (N, 2) float32, row and depth (K, H, W), which may be changed. `row`
-                becomes −1 and params zero where a ray does not meet the surface.
+            samples: ids (N, 1), params (N, 2), row and depth (K, H, W), where to start.
             rays: of each row, float64.
+
+        Returns:
+            Samples whose `row` is −1, and whose params are zero, where a ray does not meet the surface.
         """
 
 
@@ -53,26 +54,29 @@ class Parametric(TriangleSurface):
     """Base of surfaces of parametric patches.
 
     Args:
-        tiles: of all patches.
-        grid: points along each side of a tile at which its shape is looked at.
+        tiles: all patches.
         tolerance: pixels that triangles may be off the surface near outlines.
 
     Attributes:
+        whole: the patches as tiles.
+        tiles: the same, in smaller tiles where they are few.
         coarse: how many times as much they may be off elsewhere: samples find the surface from afar, since Newton's
             method needs no better start.
+        beside: how far from the border of a tile to look how it bends, a share of its size: where second derivatives
+            have no bound there, or are large on very little of a tile.
     """
 
     sample_widths = (1, 2)
     coarse = 10.0
+    beside = 0.0
 
-    def __init__(self, tiles: Tiles, grid: int, tolerance: float):
+    def __init__(self, tiles: Tiles, tolerance: float):
         check_positive("tolerance", tolerance)
-        self.tiles, self.grid, self.tolerance = tiles, grid, float(tolerance)
+        self.whole, self.tiles, self.tolerance = tiles, split(tiles), float(tolerance)
 
-    @property
-    def whole(self) -> Tiles:
-        """The patches themselves as tiles."""
-        return self.tiles
+    def uniform(self, rate: int) -> tuple[np.ndarray, np.ndarray]:
+        """Rates of the edges of `whole` and within it, for so many cuts along each side of a patch."""
+        return uniform(self.whole, rate)
 
     @abc.abstractmethod
     def control_points(self, theta: Mapping[str, Tree]) -> Array:
@@ -94,10 +98,14 @@ class Parametric(TriangleSurface):
         """Triangles that are off the surface by less than `tolerance` pixels near outlines, and coarse elsewhere."""
         points = self.finite(inputs)
         geometry, center = self.geometry(points), _center(points)
-        found = shapes(self.tiles, geometry.points, self.grid)
+        found = self.shapes(geometry)
         view = view_of(view_key(camera, size, center), center)
         allowed = chords(found, view, self.tolerance, self.coarse * self.tolerance)
         return triangles(self.tiles, geometry.points, *by_error(self.tiles, found, allowed))
+
+    def shapes(self, geometry: Geometry) -> Shapes:
+        """The shapes of the tiles."""
+        return shapes(self.tiles, geometry.points, self.beside)
 
     def tessellate(self, theta: Mapping[str, Tree], rate: int | float) -> tuple[np.ndarray, np.ndarray]:
         """A mesh whose vertices lie on the surface.
@@ -117,12 +125,10 @@ class Parametric(TriangleSurface):
         points = self.control_points(theta)
         geometry = self.geometry(self.finite(np.asarray(engine_of(points).to_numpy(points))))
         if is_count(rate):
-            tiles = self.whole
-            cuts = uniform(tiles, min(int(rate), MOST))
+            tiles, cuts = self.whole, self.uniform(min(int(rate), MOST))
         else:
             check_positive("rate", rate)
-            tiles = self.tiles
-            found = shapes(tiles, geometry.points, self.grid)
+            tiles, found = self.tiles, self.shapes(geometry)
             cuts = by_error(tiles, found, np.full(len(found.bends), float(rate)))
         proxy = triangles(tiles, geometry.points, *cuts)
         a, b, c = (proxy.vertices[proxy.faces[:, i]] for i in range(3))
@@ -130,9 +136,7 @@ class Parametric(TriangleSurface):
 
     def refine(self, inputs: np.ndarray, samples: Samples, rays: Rays) -> Samples:
         """(u, v) and depth where rays meet the patches, by Newton's method; what does not meet is dropped."""
-        moved = replace(samples, params=samples.params.copy(), row=samples.row.copy(), depth=samples.depth.copy())
-        self.geometry(self.finite(inputs)).meet(moved, rays)
-        return moved
+        return self.geometry(self.finite(inputs)).meet(samples, rays)
 
     def finite(self, inputs: np.ndarray) -> np.ndarray:
         """The control points in float64, refused where one is no number."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -19,10 +20,6 @@ from rts.trees import Array, Tree
 from rts_surfaces.bicubic import normals, values
 from rts_surfaces.parametric import LIMITS, Geometry, Parametric
 from rts_surfaces.tiles import Tiles
-
-ENOUGH, FINEST, GRID = 500, 4, 3
-"""Few patches are looked at in tiles, so that they need not be as fine all over as they are at outlines: in so many
-tiles in all, in at most so many along a side of a patch, at so many points along a side of each."""
 
 ATTRIBUTES = {"colors": ("color", (1, 3, 4)), "uv": ("uv", (2,))}
 """Entries of θ for control points: what the G-buffer calls them, and how wide they may be."""
@@ -45,16 +42,18 @@ class Bicubic(Geometry):
         parallel(kernel, len(patch), self.powers, patch, params, out, work=40 * width * len(patch))
         return out
 
-    def meet(self, samples: Samples, rays: Rays) -> None:
+    def meet(self, samples: Samples, rays: Rays) -> Samples:
         """See `Geometry`."""
         from rts_surfaces import bicubic_kernels
 
         bounds = np.empty((len(self.nets), 3))
         bicubic_kernels.bounds(self.nets, bounds)
-        lines = samples.row.reshape(-1, samples.row.shape[2]), samples.depth.reshape(-1, samples.row.shape[2])
+        params, row, depth = (np.array(x) for x in (samples.params, samples.row, samples.depth))
+        lines = row.reshape(-1, row.shape[2]), depth.reshape(-1, row.shape[2])
         ends = (np.ascontiguousarray(x, np.float64) for x in (rays.origins, rays.directions, rays.spread))
-        given = self.powers, bounds, samples.ids, samples.params, *lines, *ends, LIMITS
+        given = self.powers, bounds, samples.ids, params, *lines, *ends, LIMITS
         parallel(bicubic_kernels.meet, len(lines[0]), *given, work=200 * len(samples.ids))
+        return replace(samples, params=params, row=row, depth=depth)
 
 
 class Patches(Parametric):
@@ -73,13 +72,7 @@ class Patches(Parametric):
 
     def __init__(self, table: np.ndarray, tolerance: float):
         self.table = fixed(np.array(table, np.int32))
-        cuts = int(np.clip(np.sqrt(ENOUGH / len(self.table)), 1, FINEST))
-        super().__init__(_tiles(self.table, cuts), GRID, tolerance)
-
-    @property
-    def whole(self) -> Tiles:
-        """The patches themselves as tiles."""
-        return _tiles(self.table, 1)
+        super().__init__(_tiles(self.table), tolerance)
 
     @abc.abstractmethod
     def bezier_rows(self, values: Array) -> Array:
@@ -148,8 +141,8 @@ class Patches(Parametric):
         return values(self.bezier_rows(attribute), *where)
 
 
-def _tiles(table: np.ndarray, cuts: int) -> Tiles:
-    """Patches (n, 16), each cut into so many tiles along each side; edges are shared where their control points are."""
+def _tiles(table: np.ndarray) -> Tiles:
+    """Patches (n, 16) as tiles; edges are shared where their control points are."""
     net, count = table.reshape(-1, 4, 4), len(table)
     # Sides run around the patch: v = 0, u = 1, v = 1 backwards, u = 0 backwards.
     sides = np.stack([net[:, :, 0], net[:, 3, :], net[:, ::-1, 3], net[:, 0, ::-1]], axis=1).reshape(-1, 4)
@@ -157,52 +150,7 @@ def _tiles(table: np.ndarray, cuts: int) -> Tiles:
     back = sides[:, ::-1]
     place = (sides != back).argmax(axis=1)[:, None]
     flips = np.take_along_axis(sides, place, 1)[:, 0] > np.take_along_axis(back, place, 1)[:, 0]
-    edges, edge = np.unique(np.where(flips[:, None], back, sides), axis=0, return_inverse=True)
-    edge, flips = edge.reshape(count, 4), flips.reshape(count, 4)
-    corners, pieces, backwards = _names(net[:, ::3, ::3], edge, flips, len(edges), int(table.max()) + 1, cuts)
-    i, j = (x.reshape(-1) for x in np.meshgrid(np.arange(cuts), np.arange(cuts), indexing="ij"))
-    frames = np.zeros((len(i), 3, 2))
-    frames[:, 0, 0], frames[:, 0, 1], frames[:, 1, 0], frames[:, 2, 1] = i / cuts, j / cuts, 1 / cuts, 1 / cuts
-    patch = np.repeat(np.arange(count), len(i))
-    return Tiles.of(patch, np.tile(frames, (count, 1, 1)), corners, pieces, backwards)
-
-
-def _names(
-    ends: np.ndarray, edge: np.ndarray, flips: np.ndarray, edges: int, points: int, cuts: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners, sides and flips (n cuts², 4) of the tiles of n patches.
-
-    Args:
-        ends: (n, 2, 2), the control points at the corners of patches.
-        edge: (n, 4), the edges of their sides, in order around them.
-        flips: (n, 4), whether a side runs against its edge.
-        edges: how many edges there are.
-        points: how many control points there are.
-        cuts: how many tiles a side of a patch has.
-    """
-    count, steps = len(edge), np.arange(cuts)
-    # Points of tiles: those within patches, those within edges, and control points at corners.
-    corner = points + edges * (cuts - 1) + np.arange(count * (cuts + 1) ** 2).reshape(count, cuts + 1, cuts + 1)
-    # Pieces of edges, then lines within patches, along u and along v.
-    first = edges * cuts + np.arange(count)[:, None, None] * 2 * cuts * (cuts + 1)
-    along_u = first + np.arange(cuts * (cuts + 1)).reshape(cuts, cuts + 1)
-    along_v = first + cuts * (cuts + 1) + np.arange(cuts * (cuts + 1)).reshape(cuts + 1, cuts)
-    against_u, against_v = np.zeros(along_u.shape, bool), np.zeros(along_v.shape, bool)
-    corner[:, ::cuts, ::cuts] = ends
-    for side in range(4):
-        # In the order of u or v, which sides 2 and 3 run against.
-        against = flips[:, side] ^ (side >= 2)
-        piece = np.where(against[:, None], cuts - 1 - steps, steps) + edge[:, side : side + 1] * cuts
-        within = np.where(against[:, None], cuts - 2 - steps[:-1], steps[:-1]) + edge[:, side : side + 1] * (cuts - 1)
-        end = cuts if side in (1, 2) else 0
-        if side % 2 == 0:
-            along_u[:, :, end], against_u[:, :, end] = piece, against[:, None]
-            corner[:, 1:-1, end] = points + within
-        else:
-            along_v[:, end, :], against_v[:, end, :] = piece, against[:, None]
-            corner[:, end, 1:-1] = points + within
-    corners = np.stack([corner[:, :-1, :-1], corner[:, 1:, :-1], corner[:, 1:, 1:], corner[:, :-1, 1:]], axis=-1)
-    pieces = np.stack([along_u[:, :, :-1], along_v[:, 1:, :], along_u[:, :, 1:], along_v[:, :-1, :]], axis=-1)
-    # Sides 2 and 3 of a tile run against u and v.
-    backwards = [against_u[:, :, :-1], against_v[:, 1:, :], ~against_u[:, :, 1:], ~against_v[:, :-1, :]]
-    return corners.reshape(-1, 4), pieces.reshape(-1, 4), np.stack(backwards, axis=-1).reshape(-1, 4)
+    _, edge = np.unique(np.where(flips[:, None], back, sides), axis=0, return_inverse=True)
+    frames = np.broadcast_to(np.array([(0.0, 0), (1, 0), (0, 1)]), (count, 3, 2))
+    corners = table[:, [0, 12, 15, 3]]
+    return Tiles.of(np.arange(count), frames, corners, edge.reshape(count, 4), flips.reshape(count, 4))

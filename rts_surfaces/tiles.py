@@ -23,6 +23,11 @@ LEAST = {4: 2, 3: 3}
 """How often a tile of so many sides is cut at least, where it is cut at all: so that points lie within it."""
 AT_ONCE = 2048
 """Tiles whose shapes are looked at together."""
+GRID = {4: 3, 3: 5}
+"""Points along each side of a tile of so many sides at which its shape is looked at."""
+ENOUGH, FINEST = 500, 4
+"""Where patches are fewer than this, they are looked at in smaller tiles, at most so many along a side: so that they
+need not be as fine all over as they are at outlines."""
 
 Points = Callable[[np.ndarray, np.ndarray, int], np.ndarray]
 """(patches (N,) int32, parameters (N, 2) float64, order 0 or 2) → float64 (N, 1, 3), points; or (N, 6, 3), these and
@@ -91,18 +96,66 @@ def _numbered(names: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return numbers.reshape(names.shape).astype(np.int32), where
 
 
+def split(tiles: Tiles) -> Tiles:
+    """Tiles of quadrilaterals cut into smaller ones, all alike, if they are few; triangles stay."""
+    count, width = tiles.corners.shape
+    cuts = int(np.clip(np.sqrt(ENOUGH / count), 1, FINEST))
+    if width == 3 or cuts == 1:
+        return tiles
+    corners, pieces, backwards = _pieces(tiles, cuts)
+    i, j = (x.reshape(-1) for x in np.meshgrid(np.arange(cuts), np.arange(cuts), indexing="ij"))
+    frames = np.repeat(tiles.frames[:, None] / [[1.0], [cuts], [cuts]], len(i), axis=1)
+    frames[:, :, 0] += i[:, None] * frames[:, :, 1] + j[:, None] * frames[:, :, 2]
+    return Tiles.of(np.repeat(tiles.patch, len(i)), frames.reshape(-1, 3, 2), corners, pieces, backwards)
+
+
+def _pieces(tiles: Tiles, cuts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners, sides and flips (n cuts², 4) of so many tiles along each side of quadrilaterals, by any names."""
+    count, points, edges, steps = len(tiles.corners), len(tiles.corner_tiles), len(tiles.edge_tiles), np.arange(cuts)
+    # Points: the corners, those within edges, those within tiles.
+    corner = points + edges * (cuts - 1) + np.arange(count * (cuts + 1) ** 2).reshape(count, cuts + 1, cuts + 1)
+    corner[:, ::cuts, ::cuts] = tiles.corners[:, [[0, 3], [1, 2]]]
+    # Pieces of edges, then lines within tiles, along s and along t.
+    first = edges * cuts + np.arange(count)[:, None, None] * 2 * cuts * (cuts + 1)
+    along_s = first + np.arange(cuts * (cuts + 1)).reshape(cuts, cuts + 1)
+    along_t = first + cuts * (cuts + 1) + np.arange(cuts * (cuts + 1)).reshape(cuts + 1, cuts)
+    against_s, against_t = np.zeros(along_s.shape, bool), np.zeros(along_t.shape, bool)
+    for side in range(4):
+        # In the order of s or t, which sides 2 and 3 run against.
+        edge, against = tiles.sides[:, side, None], tiles.flips[:, side, None] ^ (side >= 2)
+        piece = np.where(against, cuts - 1 - steps, steps) + edge * cuts
+        within = np.where(against, cuts - 2 - steps[:-1], steps[:-1]) + edge * (cuts - 1)
+        end = cuts if side in (1, 2) else 0
+        if side % 2 == 0:
+            along_s[:, :, end], against_s[:, :, end], corner[:, 1:-1, end] = piece, against, points + within
+        else:
+            along_t[:, end, :], against_t[:, end, :], corner[:, end, 1:-1] = piece, against, points + within
+    corners = np.stack([corner[:, :-1, :-1], corner[:, 1:, :-1], corner[:, 1:, 1:], corner[:, :-1, 1:]], axis=-1)
+    pieces = np.stack([along_s[:, :, :-1], along_t[:, 1:, :], along_s[:, :, 1:], along_t[:, :-1, :]], axis=-1)
+    # Sides 2 and 3 of a tile run against s and t.
+    backwards = [against_s[:, :, :-1], against_t[:, 1:, :], ~against_s[:, :, 1:], ~against_t[:, :-1, :]]
+    return corners.reshape(-1, 4), pieces.reshape(-1, 4), np.stack(backwards, axis=-1).reshape(-1, 4)
+
+
 # ----------------------------------------------------------------------------------------------- how fine
 
 
-def shapes(tiles: Tiles, points: Points, grid: int) -> Shapes:
-    """The shapes of tiles, looked at in `grid` points along each side.
+def shapes(tiles: Tiles, points: Points, beside: float = 0.0) -> Shapes:
+    """The shapes of tiles, looked at in points of a grid.
 
     In triangles the grid is drawn together into the corner (1, 0): its points are (s, t (1 − s)).
+
+    Args:
+        tiles: the tiles.
+        points: the surface.
+        beside: how far from the border of a tile to look how it bends, a share of its size.
     """
     from rts_surfaces import tiles_kernels
 
     count, width = tiles.corners.shape
-    local, around, along = _looked_at(width, grid)
+    grid = GRID[width]
+    local, *which = _looked_at(width, grid, beside)
+    along = np.roll(_CORNERS[width], -1, axis=0) - _CORNERS[width]
     normals, places = np.empty((2, count, grid, grid, 3))
     out = Shapes(normals, places, np.empty((count, 3)), np.empty((count, width)))
     for start in range(0, count, AT_ONCE):
@@ -111,23 +164,29 @@ def shapes(tiles: Tiles, points: Points, grid: int) -> Shapes:
         patch = np.repeat(tiles.patch[start : start + AT_ONCE], len(local))
         found = points(patch, params.reshape(-1, 2), 2).reshape(len(frames), len(local), 6, 3)
         part = [x[start : start + AT_ONCE] for x in out]
-        given = found, frames, along, around
-        parallel(tiles_kernels.shapes, len(frames), *given, *part, work=300 * grid * grid * len(frames))
+        given = found, frames, along, *which
+        parallel(tiles_kernels.shapes, len(frames), *given, *part, work=100 * len(local) * len(frames))
     return out
 
 
-def _looked_at(width: int, grid: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Local coordinates (P, 2), those on each side (k, grid), and the sides' directions (k, 2)."""
-    steps, corners = np.linspace(0, 1, grid), _CORNERS[width]
-    local = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1)
-    along = np.roll(corners, -1, axis=0) - corners
-    if width == 4:
-        numbers = np.arange(grid * grid).reshape(grid, grid)
-        return local.reshape(-1, 2), np.stack([numbers[:, 0], numbers[-1], numbers[:, -1], numbers[0]]), along
-    local[..., 1] *= 1 - local[..., 0]
-    sides = corners[:, None] + steps[:, None] * along[:, None]
-    numbers = grid * grid + np.arange(3 * grid).reshape(3, grid)
-    return np.concatenate([local.reshape(-1, 2), sides.reshape(-1, 2)]), numbers, along
+def _looked_at(width: int, grid: int, beside: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Local coordinates (P, 2), a grid first; which of them (M,) tell how a tile bends, and (k, G) how its sides do."""
+    even, corners = np.linspace(0, 1, grid), _CORNERS[width]
+    local = _grid(even, width)
+    numbers = np.arange(len(local)).reshape(grid, grid)
+    if width == 4 and not beside:
+        return local, numbers.reshape(-1), np.stack([numbers[:, 0], numbers[-1], numbers[:, -1], numbers[0]])
+    steps = even.clip(beside, 1 - beside)
+    sides = corners[:, None] + steps[:, None] * (np.roll(corners, -1, axis=0) - corners)[:, None]
+    within = _grid(steps, width)
+    around = 2 * len(local) + np.arange(width * grid).reshape(width, grid)
+    return np.concatenate([local, within, sides.reshape(-1, 2)]), len(local) + numbers.reshape(-1), around
+
+
+def _grid(steps: np.ndarray, width: int) -> np.ndarray:
+    """Local coordinates (G², 2) of a grid in a tile of so many sides."""
+    s, t = np.meshgrid(steps, steps, indexing="ij")
+    return np.stack([s, t if width == 4 else t * (1 - s)], axis=-1).reshape(-1, 2)
 
 
 def chords(found: Shapes, view: View, fine: float, coarse: float) -> np.ndarray:

@@ -248,19 +248,34 @@ def triangles(start, stop, owner, frames, corners, sides, flips, edges, edge_fir
 
 
 @compiled
-def _local(found, frame, first, second):
-    """Derivatives along s, t (2, 3) and along ss, st, tt (3, 3), of those in face parameters (6, 3)."""
-    a, b, c, d = frame[1, 0], frame[1, 1], frame[2, 0], frame[2, 1]
-    for i in range(3):
-        u, v, uu, uv, vv = found[1, i], found[2, i], found[3, i], found[4, i], found[5, i]
-        first[0, i], first[1, i] = a * u + b * v, c * u + d * v
-        second[0, i] = a * a * uu + 2 * a * b * uv + b * b * vv
-        second[1, i] = a * c * uu + (a * d + b * c) * uv + b * d * vv
-        second[2, i] = c * c * uu + 2 * c * d * uv + d * d * vv
+def _slopes(found, frame, slopes):
+    """Derivatives along s and t (2, 3), of those in parameters of the patch."""
+    for k in range(2):
+        for c in range(3):
+            slopes[k, c] = frame[1 + k, 0] * found[1, c] + frame[1 + k, 1] * found[2, c]
+
+
+@compiled
+def _second(found, a, b, c):
+    """The component c of the second derivative along two directions in parameters of the patch."""
+    return a[0] * b[0] * found[3, c] + (a[0] * b[1] + a[1] * b[0]) * found[4, c] + a[1] * b[1] * found[5, c]
+
+
+@compiled
+def _normal(slopes, out):
+    """Fill the unit normal, and return whether there is one; else it is zero."""
+    for c in range(3):
+        x, y = (c + 1) % 3, (c + 2) % 3
+        out[c] = slopes[0, x] * slopes[1, y] - slopes[0, y] * slopes[1, x]
+    length = math.sqrt(_dot(out, out))
+    there = length > COLLAPSED * math.sqrt(_dot(slopes[0], slopes[0]) * _dot(slopes[1], slopes[1])) and length > 0
+    for c in range(3):
+        out[c] = out[c] / length if there else 0.0
+    return there
 
 
 @kernel
-def shapes(start, stop, found, frames, along, around, normals, places, bends, curves):
+def shapes(start, stop, found, frames, along, bent, around, normals, places, bends, curves):
     """Fill what is asked of the shape of tiles.
 
     Args:
@@ -270,38 +285,42 @@ def shapes(start, stop, found, frames, along, around, normals, places, bends, cu
             then perhaps elsewhere.
         frames: (n, 3, 2) float64.
         along: (k, 2) float64, the direction of each side in local coordinates.
-        around: (k, G) integers, which of the P points are on each side.
+        bent: (M,) integers, at which of the P points to look how the tile bends.
+        around: (k, G) integers, and how each side does.
         normals: (n, G, G, 3), of unit length, or zero.
         places: (n, G, G, 3), where these are.
-        bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t. Chords are off by those
-            alone: what lies along the surface only moves points within it.
+        bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t; without a normal, their
+            lengths. Chords are off by those alone: what lies along the surface only moves points within it.
         curves: (n, k), the largest second derivatives of the sides across themselves.
     """
     grid = normals.shape[1]
-    first, second, normal, tangent, bend = np.empty((2, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
+    slopes, normal, tangent, bend = np.empty((2, 3)), np.empty(3), np.empty(3), np.empty(3)
     for n in range(start, stop):
-        bends[n] = 0
+        frame = frames[n]
         for k in range(grid * grid):
-            i, j = k // grid, k % grid
-            _local(found[n, k], frames[n], first, second)
+            _slopes(found[n, k], frame, slopes)
+            _normal(slopes, normals[n, k // grid, k % grid])
             for c in range(3):
-                places[n, i, j, c] = found[n, k, 0, c]
-                x, y = (c + 1) % 3, (c + 2) % 3
-                normal[c] = first[0, x] * first[1, y] - first[0, y] * first[1, x]
-            length = math.sqrt(_dot(normal, normal))
-            there = length > COLLAPSED * math.sqrt(_dot(first[0], first[0]) * _dot(first[1], first[1])) and length > 0
-            for c in range(3):
-                normals[n, i, j, c] = normal[c] / length if there else 0.0
-                size = abs(_dot(second[c], normal)) / length if there else math.sqrt(_dot(second[c], second[c]))
-                bends[n, c] = max(bends[n, c], size)
+                places[n, k // grid, k % grid, c] = found[n, k, 0, c]
+        bends[n] = 0
+        for k in bent:
+            _slopes(found[n, k], frame, slopes)
+            there = _normal(slopes, normal)
+            for m in range(3):
+                a, b = frame[1 if m < 2 else 2], frame[1 if m < 1 else 2]
+                size, straight = 0.0, 0.0
+                for c in range(3):
+                    x = _second(found[n, k], a, b, c)
+                    size, straight = size + x * x, straight + x * normal[c]
+                bends[n, m] = max(bends[n, m], abs(straight) if there else math.sqrt(size))
         for side in range(len(along)):
-            a, b = along[side]
+            way = along[side, 0] * frame[1] + along[side, 1] * frame[2]
             curves[n, side] = 0
             for k in around[side]:
-                _local(found[n, k], frames[n], first, second)
+                _slopes(found[n, k], frame, slopes)
                 for c in range(3):
-                    tangent[c] = a * first[0, c] + b * first[1, c]
-                    bend[c] = a * a * second[0, c] + 2 * a * b * second[1, c] + b * b * second[2, c]
+                    tangent[c] = along[side, 0] * slopes[0, c] + along[side, 1] * slopes[1, c]
+                    bend[c] = _second(found[n, k], way, way, c)
                 square, own = _dot(tangent, tangent), _dot(bend, bend)
                 if square > 0:
                     own -= _dot(tangent, bend) ** 2 / square

@@ -132,7 +132,8 @@ def test_the_corners_of_a_patch_are_shared_however_many_tiles_it_has():
             surface = Bezier(np.stack([first.reshape(-1), second.reshape(-1)]))
             corners, edges = len(surface.tiles.corner_tiles), len(surface.tiles.edge_tiles)
             assert (corners, edges) == (2 * 25 - 5, 2 * 40 - 4)
-            assert len(surface.whole.corner_tiles) == 6 and len(surface.whole.edge_tiles) == 7
+            whole = surface.whole
+            assert len(whole.corner_tiles) == 6 and len(whole.edge_tiles) == 7
 
 
 # ------------------------------------------------------------------------------------------------ samples

@@ -112,10 +112,10 @@ def _rays_of(
     height, width = size
     given = (height, width), *matrices, *ends
     if len(samples.ids) == 1:
-        first = np.zeros((1, 1), np.int32)
-        settling_kernels.rays_of_cells(first, np.zeros(1, np.int64), np.zeros(1, np.int64), *given)
+        none = np.zeros(1, np.int64)
+        settling_kernels.rays_of_cells(np.zeros((1, 1), np.int32), none, none, *given)
     if cells is not None:
-        settling_kernels.rays_of_cells(samples.row[:, 0], *cells, *given)
+        settling_kernels.rays_of_cells(samples.row[:, 0], cells[0], cells[1], *given)
     else:
         lines = read_only(samples.row, np.int32).reshape(-1, width)
         parallel(settling_kernels.rays_of, len(lines), lines, *given, work=20 * len(samples.ids))

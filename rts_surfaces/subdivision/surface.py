@@ -14,37 +14,60 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import check_positive, quoted
+from rts.arguments import quoted
 from rts.arrays import described, shape_of, unit
-from rts.checks import is_count
 from rts.engines import constants, engine_of, namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.interfaces import Part, TriangleSurface
+from rts.interfaces import Part
 from rts.operations.combine import combine
 from rts.operations.take import take
-from rts.records import ArraySpec, Proxy, Rays, Samples
+from rts.records import ArraySpec, Rays, Samples
 from rts.sampling.cache import fingerprint
 from rts.topology import fixed
 from rts.trees import Array, Tree
-from rts_surfaces.parametric import BEYOND, LARGEST_STEP, MOST, RESIDUAL, STEPS
-from rts_surfaces.subdivision import library, tessellation
+from rts_surfaces.parametric import BEYOND, LARGEST_STEP, RESIDUAL, STEPS, TOLERANCE, Geometry, Parametric
+from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.binding import BOUNDARIES, UV, UV_RULES, VERTEX, Limit, Points, Rules
 from rts_surfaces.subdivision.cage import checked_cage, checked_lists
+from rts_surfaces.subdivision.face_tiles import tiles_of
 
 library.find()  # Without OpenSubdiv there is no such plugin.
 
-RATE = 8
-"""Cuts along each side of a face, for the triangles that samples start from."""
+BESIDE = 1 / 16
+"""How far from the border of a tile it is looked at how it bends. At extraordinary vertices second derivatives have no
+bound, and at creases they are large, but both on so little of a tile that triangles are off by less than that."""
 CROSSINGS = 4
 """Edges of faces that Newton's method may cross."""
+LIMITS = RESIDUAL, STEPS + CROSSINGS, LARGEST_STEP, BEYOND, CROSSINGS
 
 G_BUFFER_NAMES = {"colors": "color"}
 VERTEX_ATTRIBUTES = ("colors", "uv")
 WIDTHS = {"vertices": (3,), "uv": (2,), "colors": (1, 3, 4)}
 
 
-class Subdivision(TriangleSurface):
+class LimitGeometry(Geometry):
+    """The limit surface of control points."""
+
+    def __init__(self, points: Points):
+        self._points = points
+
+    def points(self, patch: np.ndarray, params: np.ndarray, order: int) -> np.ndarray:
+        """See `Geometry`."""
+        return self._points.evaluate(patch, params, order)
+
+    def meet(self, samples: Samples, rays: Rays) -> Samples:
+        """See `Geometry`; samples may go on to other faces."""
+        ends = rays.origins, rays.directions, rays.spread
+        faces, params, depth, met = self._points.newton(samples.ids[:, 0], samples.params, *ends, LIMITS)
+        kept = samples.row >= 0
+        kept &= met[samples.row]
+        faces[~met], params[~met] = 0, 0
+        row = np.where(kept, samples.row, -1)
+        return replace(samples, ids=faces[:, None], params=params, row=row, depth=np.where(kept, depth[samples.row], 0))
+
+
+class Subdivision(Parametric):
     """The limit surface of a cage.
 
     θ["vertices"] (V, 3) are the control points. Attributes of control points are further entries of θ, each (A, C):
@@ -64,14 +87,14 @@ class Subdivision(TriangleSurface):
             for "uv" lists of integers into θ["uv"], as `faces` are: a face-varying map with seams.
         uv_rule: where a face-varying uv is linear rather than smooth: "none", "corners_only", "corners_plus1",
             "corners_plus2", "boundaries" or "all", as in OpenSubdiv and USD.
-        rate: cuts along each side of a face, for the triangles that samples start from.
+        tolerance: pixels that triangles may be off the surface near outlines.
 
     Raises:
         InputError: the cage has no limit surface that can be computed, or an option is none of these.
         PluginError: OpenSubdiv does not work.
     """
 
-    sample_widths = (1, 2)
+    beside = BESIDE
 
     def __init__(
         self,
@@ -84,20 +107,19 @@ class Subdivision(TriangleSurface):
         chaikin: bool = False,
         indices: Mapping[str, Any] | None = None,
         uv_rule: str = "corners_plus1",
-        rate: int = RATE,
+        tolerance: float = TOLERANCE,
     ):
         for name, given, known in (("boundary", boundary, BOUNDARIES), ("uv_rule", uv_rule, UV_RULES)):
             if not isinstance(given, str) or given not in known:
                 raise InputError(f"{name} is {quoted(given)}; expected one of {', '.join(map(repr, known))}")
         if not isinstance(chaikin, (bool, np.bool_)):
             raise InputError(f"chaikin is {quoted(chaikin)}; expected True or False")
-        if not is_count(rate) or not 1 <= rate <= MOST:
-            raise InputError(f"rate is {quoted(rate)}; expected a whole number from 1 to {MOST}")
-        self.rate, self._rules = int(rate), Rules(boundary, bool(chaikin), uv_rule)
+        self._rules = Rules(boundary, bool(chaikin), uv_rule)
         self.cage = checked_cage(faces, scheme, creases, corners)
         self._declared, self._uv = self._attribute_indices(indices)
         self._count = int(self.cage.indices.max()) + 1
         self._prepare()
+        super().__init__(tiles_of(self.limit), tolerance)
 
     def _attribute_indices(self, indices: Mapping[str, Any] | None) -> tuple[tuple[str, ...], np.ndarray | None]:
         """Names of attributes, and the rows of a face-varying uv (H,) or None."""
@@ -120,12 +142,11 @@ class Subdivision(TriangleSurface):
         self.limit = Limit(self.cage, self._rules, self._uv)
         if not len(self.limit.table) or (self.limit.kinds < 0).all():
             raise InputError("no face of the cage has a surface: all are at its boundary; use another boundary rule")
-        self.tiles = tessellation.tiles_of(self.limit)
         self._points: tuple[tuple, Points] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """What a copy is made of: the library's objects stay in this process."""
-        return {name: value for name, value in vars(self).items() if name not in ("limit", "tiles", "_points")}
+        return {name: value for name, value in vars(self).items() if name not in ("limit", "_points")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state)
@@ -191,73 +212,22 @@ class Subdivision(TriangleSurface):
 
     # -------------------------------------------------------------------------------------------- sampling
 
-    def proxy_inputs(self, theta: Mapping[str, Tree]) -> Array:
-        """The control points."""
+    def control_points(self, theta: Mapping[str, Tree]) -> Array:
+        """The vertices of the cage."""
         return theta["vertices"]
 
-    def points(self, inputs: np.ndarray) -> Points:
-        """The limit surface for control points (V, 3), made once while they stay."""
-        vertices = np.asarray(inputs, np.float64)
-        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=-1))
-        if len(bad):
-            raise InputError(
-                f"{len(bad)} control points of {self!r} are NaN or infinite, the first is {bad[0]}; check the input, "
-                f"or lower the step size if an optimisation led here"
-            )
-        key, kept = fingerprint(vertices), self._points
+    def geometry(self, points: np.ndarray) -> Geometry:
+        """See `Parametric`; made once while the vertices stay."""
+        key, kept = fingerprint(points), self._points
         if kept is None or kept[0] != key:
-            kept = self._points = key, self.limit.points(vertices)
-        return kept[1]
+            kept = self._points = key, self.limit.points(points)
+        return LimitGeometry(kept[1])
 
-    def proxy(self, inputs: np.ndarray, camera: Any, size: tuple[int, int]) -> Proxy:
-        """Triangles whose vertices lie on the surface."""
-        return self._cut(self.points(inputs), self.rate)
-
-    def _cut(self, points: Points, rate: int) -> Proxy:
+    def uniform(self, rate: int) -> tuple[np.ndarray, np.ndarray]:
+        """See `Parametric`."""
         # Where faces are cut into quarters, each has half of a side.
-        whole = len(self.tiles.faces) == np.count_nonzero(self.limit.kinds >= 0)
-        edges, inner = tessellation.uniform(self.tiles, rate if whole else -(-rate // 2))
-        return tessellation.triangles(self.tiles, points, edges, inner)
-
-    def tessellate(self, theta: Mapping[str, Tree], rate: int | float) -> tuple[np.ndarray, np.ndarray]:
-        """A mesh whose vertices lie on the surface.
-
-        Args:
-            theta: θ, with values that are known.
-            rate: a whole number, of cuts along each side of a face; or a float, the distance in the units of θ that
-                triangles may be off the surface.
-
-        Returns:
-            Vertices (V, 3) float32 and faces (T, 3) int32, without cracks.
-
-        Raises:
-            InputError: a rate of zero or less, or θ of another shape.
-        """
-        self.check(theta)
-        vertices = theta["vertices"]
-        points = self.points(np.asarray(engine_of(vertices).to_numpy(vertices)))
-        if is_count(rate):
-            proxy = self._cut(points, min(int(rate), MOST))
-        else:
-            check_positive("rate", rate)
-            bends, curves = tessellation.shapes(self.tiles, points)[2:]
-            allowed = np.full(len(self.tiles.faces), float(rate))
-            rates = tessellation.rates(self.tiles, bends, curves, allowed, MOST)
-            proxy = tessellation.triangles(self.tiles, points, *rates)
-        a, b, c = (proxy.vertices[proxy.faces[:, i]] for i in range(3))
-        return proxy.vertices, proxy.faces[(np.cross(b - a, c - a) != 0).any(axis=1)]
-
-    def refine(self, inputs: np.ndarray, samples: Samples, rays: Rays) -> Samples:
-        """Face, (u, v) and depth where rays meet the surface, by Newton's method; what does not meet is dropped."""
-        limits = RESIDUAL, STEPS + CROSSINGS, LARGEST_STEP, BEYOND, CROSSINGS
-        ends = rays.origins, rays.directions, rays.spread
-        faces, params, depth, met = self.points(inputs).newton(samples.ids[:, 0], samples.params, *ends, limits)
-        kept = samples.row >= 0
-        kept &= met[samples.row]
-        faces[~met], params[~met] = 0, 0
-        row = np.where(kept, samples.row, -1)
-        depth = np.where(kept, depth[samples.row], 0)
-        return replace(samples, ids=faces[:, None], params=params, row=row, depth=depth)
+        quarters = len(self.whole.patch) != np.count_nonzero(self.limit.kinds >= 0)
+        return super().uniform(-(-rate // 2) if quarters else rate)
 
     # ------------------------------------------------------------------------------------------ evaluation
 
