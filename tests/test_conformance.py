@@ -81,10 +81,41 @@ class TestRevolution(SurfaceConformance):
 class TestSubdivision(SurfaceConformance):
     @pytest.fixture
     def part(self):
-        try:
-            return rts.plugin("surfaces", "subdivision").example()
-        except PluginError as error:
-            pytest.skip(str(error))
+        return subdivision().example()
+
+
+class TestSubdivisionOfPolygons(SurfaceConformance):
+    """Sub-faces, creases that end, and a face-varying map, open at one end."""
+
+    @pytest.fixture
+    def part(self):
+        turn = np.arange(5) * 2 * np.pi / 5
+        ring = [np.stack([r * np.cos(turn), r * np.sin(turn), np.full(5, z)], axis=1) for r, z in ((1, -0.8), (0.8, 1))]
+        around = [[i, (i + 1) % 5, 5 + (i + 1) % 5, 5 + i] for i in range(5)]
+        surface = subdivision()(
+            [[5, 6, 7, 8, 9], *around],
+            creases=[(5, 6, 10), (6, 7, 2.5), (7, 8, 0.5)],
+            corners=[(0, 1.5)],
+            indices={"uv": [[12, 13, 14, 15, 16], *([i, i + 1, i + 7, i + 6] for i in range(5))]},
+        )
+        vertices, rng = np.concatenate(ring), np.random.default_rng(0)
+        theta = {"vertices": vertices, "colors": 0.5 + 0.4 * np.sin(3 * vertices), "uv": rng.random((17, 2))}
+        theta["texture"] = rng.random((8, 8, 3))
+        return Part(surface, {name: value.astype(np.float32) for name, value in theta.items()}, "lambert")
+
+
+class TestLoop(SurfaceConformance):
+    @pytest.fixture
+    def part(self):
+        part = Mesh.example()
+        return part.replace(surface=subdivision()(part.surface.faces, "loop"))
+
+
+def subdivision():
+    try:
+        return rts.plugin("surfaces", "subdivision")
+    except PluginError as error:
+        pytest.skip(str(error))
 
 
 class TestEllipsoid(SurfaceConformance):

@@ -230,7 +230,7 @@ def _check_fans(cage: Cage) -> None:
     beside = cage.next()[cage.twins[h]]
     graph = coo_array((np.ones(len(h), bool), (h, beside)), shape=(count, count))
     _, fan = connected_components(graph, directed=False)
-    fans = np.unique(np.stack([cage.indices, fan]), axis=1)[0]
+    fans = np.unique(cage.indices.astype(np.int64) * count + fan) // count
     twice = np.flatnonzero(fans[1:] == fans[:-1])
     if len(twice):
         vertex = int(fans[twice[0]])

@@ -1,7 +1,7 @@
 """The C++ part of subdivision surfaces: compiled when it is first needed, and kept in the user's cache.
 
-It needs the headers and the library of OpenSubdiv and a C++ compiler, as numba's kernels need nothing but numba. What
-is kept goes by the sources, the version of the headers and the compiler.
+So the package stays pure Python, and what it is compiled with fits the OpenSubdiv that is installed. What is kept goes
+by the sources, the version of the headers and the compiler.
 """
 
 from __future__ import annotations

@@ -135,6 +135,12 @@ void stencils(Cage const& cage, int channel, long start, long stop, int const* f
     for (long n = start; n < stop; ++n) {
         Surface const& surface = cage.surfaces[channel][faces[n]];
         double const* uv = params + 2 * n;
+        if (n > start && faces[n] == faces[n - 1] && uv[0] == uv[-2] && uv[1] == uv[-1]) {
+            // Rows that are allotted but not used are all alike.
+            for (Real* rows : {point, along_u, along_v})
+                if (rows) std::copy(rows + (n - 1) * width, rows + n * width, rows + n * width);
+            continue;
+        }
         int count = 0;
         if (surface.IsValid() && along_u) {
             count = surface.EvaluateStencil(uv, p, du, dv);
