@@ -6,9 +6,9 @@ import numpy as np
 
 import rts
 from rts import Samples
-from rts_surfaces.subdivision import tessellation
 from rts_surfaces.subdivision.binding import Limit, Rules
 from rts_surfaces.subdivision.cage import checked_cage
+from rts_surfaces.subdivision.face_tiles import tiles_of
 
 
 def cube():
@@ -64,12 +64,12 @@ def limit_of(name, **levels):
 def somewhere(limit, count, seed=0, margin=0.0):
     """Random faces and parameters within them, away from their edges."""
     rng = np.random.default_rng(seed)
-    tiles = tessellation.tiles_of(limit)
-    tile, local = rng.integers(0, len(tiles.faces), count), margin + (1 - 2 * margin) * rng.random((count, 2))
+    tiles = tiles_of(limit)
+    tile, local = rng.integers(0, len(tiles.patch), count), margin + (1 - 2 * margin) * rng.random((count, 2))
     if tiles.corners.shape[1] == 3:
         local = np.sort(local, axis=1)
         local = np.stack([local[:, 0], 1 - local[:, 1]], axis=1)
-    return tiles.faces[tile], tiles.params(tile, local)
+    return tiles.patch[tile], tiles.params(tile, local)
 
 
 def samples_at(face, params):

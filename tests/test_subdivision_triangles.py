@@ -15,10 +15,11 @@ try:
 except rts.PluginError as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
-from rts_surfaces.subdivision import tessellation  # noqa: E402
+from rts_surfaces import tiles as tiling  # noqa: E402
+from rts_surfaces.subdivision.face_tiles import tiles_of  # noqa: E402
+from rts_surfaces.subdivision.surface import BESIDE, LIMITS  # noqa: E402
 
 CAMERA = Camera.look_at((1.5, 1.8, 4.0), (0, 0, 0), fov_y=40)
-LIMITS = 1e-4, 10, 0.25, 0.02, 4
 cages = pytest.mark.parametrize("name", CAGES)
 
 
@@ -36,14 +37,14 @@ def open_edges(faces):
 @pytest.mark.parametrize("rate", [1, 2, 5, "random"])
 def test_triangles_meet_without_cracks_whatever_their_rates(name, rate):
     vertices, limit = limit_of(name)
-    points, tiles = limit.points(vertices), tessellation.tiles_of(limit)
+    points, tiles = limit.points(vertices), tiles_of(limit)
     if rate == "random":
         rng = np.random.default_rng(0)
         edges = rng.integers(1, 9, len(tiles.edge_tiles)).astype(np.int32)
-        inner = rng.integers(3, 9, (len(tiles.faces), 2)).astype(np.int32)
+        inner = rng.integers(3, 9, (len(tiles.patch), 2)).astype(np.int32)
     else:
-        edges, inner = tessellation.uniform(tiles, rate)
-    proxy = tessellation.triangles(tiles, points, edges, inner)
+        edges, inner = tiling.uniform(tiles, rate)
+    proxy = tiling.triangles(tiles, points.evaluate, edges, inner)
     assert len(np.unique(proxy.faces)) == len(proxy.vertices)
     corners = proxy.corner_params.reshape(-1, 2)
     there = points.evaluate(np.repeat(proxy.ids[:, 0], 3), corners)[:, 0]
@@ -63,21 +64,21 @@ def test_triangles_meet_without_cracks_whatever_their_rates(name, rate):
 @cages
 def test_shapes_are_those_of_finite_differences_in_tiles(name):
     vertices, limit = limit_of(name)
-    points, tiles = limit.points(vertices), tessellation.tiles_of(limit)
-    normals, places, bends, curves = tessellation.shapes(tiles, points)
-    assert curves.shape == tiles.corners.shape and bends.shape == (len(tiles.faces), 3)
-    tile, step = np.arange(len(tiles.faces)), 1e-3
+    points, tiles = limit.points(vertices), tiles_of(limit)
+    normals, places, bends, curves = tiling.shapes(tiles, points.evaluate, BESIDE)
+    assert curves.shape == tiles.corners.shape and bends.shape == (len(tiles.patch), 3)
+    tile, step = np.arange(len(tiles.patch)), 1e-3
 
     def at(s, t):
-        return points.evaluate(tiles.faces, tiles.params(tile, np.broadcast_to((s, t), (len(tile), 2))))[:, 0]
+        return points.evaluate(tiles.patch, tiles.params(tile, np.broadcast_to((s, t), (len(tile), 2))))[:, 0]
 
-    middle = (0.5, 0.5) if normals.shape[1] and tiles.corners.shape[1] == 4 else (0.5, 0.25)
-    np.testing.assert_allclose(places[:, 2, 2], at(*middle), atol=1e-12)
+    middle, k = ((0.5, 0.5) if tiles.corners.shape[1] == 4 else (0.5, 0.25)), normals.shape[1] // 2
+    np.testing.assert_allclose(places[:, k, k], at(*middle), atol=1e-12)
     s, t = middle
     along_s, along_t = (at(s + step, t) - at(s - step, t)), (at(s, t + step) - at(s, t - step))
     normal = np.cross(along_s, along_t)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    np.testing.assert_allclose(normals[:, 2, 2], normal, atol=1e-4)
+    np.testing.assert_allclose(normals[:, k, k], normal, atol=1e-4)
     for i, (ds, dt) in enumerate(((step, 0), (0, step))):
         second = (at(s + ds, t + dt) - 2 * at(s, t) + at(s - ds, t - dt)) / step**2
         assert (np.abs((second * normal).sum(axis=1)) < bends[:, 2 * i] + 1e-2 * (1 + bends[:, 2 * i])).all()
@@ -119,8 +120,8 @@ def test_newtons_method_finds_the_rays_and_crosses_edges(name):
     directions = -(normal + tilt)
     origins = known[:, 0] - 3 * directions
     # Begin beside the root: at that place of the nearest triangle's corner which is not on the same face, if there is.
-    tiles = tessellation.tiles_of(limit)
-    proxy = tessellation.triangles(tiles, points, *tessellation.uniform(tiles, 8))
+    tiles = tiles_of(limit)
+    proxy = tiling.triangles(tiles, points.evaluate, *tiling.uniform(tiles, 8))
     corner = proxy.faces.reshape(-1)
     near = cKDTree(proxy.vertices[corner]).query(known[:, 0], 12)[1]
     owner = proxy.ids[near // 3, 0]
@@ -145,9 +146,13 @@ def test_newtons_method_finds_the_rays_and_crosses_edges(name):
 @pytest.mark.parametrize("surface", ["cube", "five corners", "loop"])
 def test_no_sample_is_lost_within_a_closed_surface(surface):
     vertices, faces, scheme, tags = CAGES[surface]
-    part = Part(Subdivision(faces, scheme, rate=3, **tags), {"vertices": vertices.astype(np.float32)}, "silhouette")
+    part = Part(
+        Subdivision(faces, scheme, tolerance=3.0, **tags), {"vertices": vertices.astype(np.float32)}, "silhouette"
+    )
     rough = rts.render(part, CAMERA, (200, 200))[..., 3]
-    fine = rts.render(part.replace(surface=Subdivision(faces, scheme, rate=24, **tags)), CAMERA, (200, 200))[..., 3]
+    fine = rts.render(part.replace(surface=Subdivision(faces, scheme, tolerance=0.02, **tags)), CAMERA, (200, 200))[
+        ..., 3
+    ]
     eroded = np.lib.stride_tricks.sliding_window_view(fine, (9, 9)).min(axis=(2, 3)) > 0.999
     hull = np.lib.stride_tricks.sliding_window_view(rough, (9, 9)).max(axis=(2, 3)) > 0.5
     core = np.pad(eroded & hull, 4)
