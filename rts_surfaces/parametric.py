@@ -62,8 +62,8 @@ class Parametric(TriangleSurface):
         tiles: the same, in smaller tiles where they are few.
         coarse: how many times as much they may be off elsewhere: samples find the surface from afar, since Newton's
             method needs no better start.
-        beside: how far from the border of a tile to look how it bends, a share of its size: where second derivatives
-            have no bound there, or are large on very little of a tile.
+        beside: how far from the border of a tile to look at its shape, a share of its size: where second derivatives
+            have no bound at the border, or are large on very little of a tile.
     """
 
     sample_widths = (1, 2)

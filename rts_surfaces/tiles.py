@@ -80,7 +80,7 @@ class Shapes(NamedTuple):
         normals: (n, G, G, 3) of unit length, or zero, at a grid of points.
         places: (n, G, G, 3), where these are.
         bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t.
-        curves: (n, k), the largest second derivatives of the sides across themselves.
+        curves: (E,), the largest second derivatives of edges across themselves.
     """
 
     normals: np.ndarray
@@ -141,52 +141,49 @@ def _pieces(tiles: Tiles, cuts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def shapes(tiles: Tiles, points: Points, beside: float = 0.0) -> Shapes:
-    """The shapes of tiles, looked at in points of a grid.
+    """The shapes of tiles and of their edges.
 
     In triangles the grid is drawn together into the corner (1, 0): its points are (s, t (1 − s)).
 
     Args:
         tiles: the tiles.
         points: the surface.
-        beside: how far from the border of a tile to look how it bends, a share of its size.
+        beside: how far from the border of a tile, and from the ends of an edge, its grid begins, a share of its size.
     """
     from rts_surfaces import tiles_kernels
 
-    count, width = tiles.corners.shape
+    (count, width), edges = tiles.corners.shape, len(tiles.edge_tiles)
     grid = GRID[width]
-    local, *which = _looked_at(width, grid, beside)
-    along = np.roll(_CORNERS[width], -1, axis=0) - _CORNERS[width]
+    steps = np.linspace(0, 1, grid).clip(beside, 1 - beside)
+    s, t = np.meshgrid(steps, steps, indexing="ij")
+    local = np.stack([s, t if width == 4 else t * (1 - s)], axis=-1).reshape(-1, 2)
     normals, places = np.empty((2, count, grid, grid, 3))
-    out = Shapes(normals, places, np.empty((count, 3)), np.empty((count, width)))
-    for start in range(0, count, AT_ONCE):
-        frames = tiles.frames[start : start + AT_ONCE]
-        params = frames[:, None, 0] + local[:, :1] * frames[:, None, 1] + local[:, 1:] * frames[:, None, 2]
-        patch = np.repeat(tiles.patch[start : start + AT_ONCE], len(local))
-        found = points(patch, params.reshape(-1, 2), 2).reshape(len(frames), len(local), 6, 3)
-        part = [x[start : start + AT_ONCE] for x in out]
-        given = found, frames, along, *which
-        parallel(tiles_kernels.shapes, len(frames), *given, *part, work=100 * len(local) * len(frames))
+    out = Shapes(normals, places, np.empty((count, 3)), np.empty(edges))
+    for some in _slices(count):
+        found = _expanded(tiles, points, np.arange(count)[some], local[None])
+        part = out.normals[some], out.places[some], out.bends[some]
+        work = 100 * len(local) * len(found)
+        parallel(tiles_kernels.shapes, len(found), found, tiles.frames[some], *part, work=work)
+    corners = _CORNERS[width]
+    along = np.roll(corners, -1, axis=0) - corners
+    for some in _slices(edges):
+        tile, side = tiles.edge_tiles[some].T
+        found = _expanded(tiles, points, tile, corners[side][:, None] + steps[:, None] * along[side][:, None])
+        given = found, tiles.frames[tile], along[side], out.curves[some]
+        parallel(tiles_kernels.curves, len(found), *given, work=100 * grid * len(found))
     return out
 
 
-def _looked_at(width: int, grid: int, beside: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Local coordinates (P, 2), a grid first; which of them (M,) tell how a tile bends, and (k, G) how its sides do."""
-    even, corners = np.linspace(0, 1, grid), _CORNERS[width]
-    local = _grid(even, width)
-    numbers = np.arange(len(local)).reshape(grid, grid)
-    if width == 4 and not beside:
-        return local, numbers.reshape(-1), np.stack([numbers[:, 0], numbers[-1], numbers[:, -1], numbers[0]])
-    steps = even.clip(beside, 1 - beside)
-    sides = corners[:, None] + steps[:, None] * (np.roll(corners, -1, axis=0) - corners)[:, None]
-    within = _grid(steps, width)
-    around = 2 * len(local) + np.arange(width * grid).reshape(width, grid)
-    return np.concatenate([local, within, sides.reshape(-1, 2)]), len(local) + numbers.reshape(-1), around
+def _slices(count: int) -> list[slice]:
+    return [slice(start, start + AT_ONCE) for start in range(0, count, AT_ONCE)]
 
 
-def _grid(steps: np.ndarray, width: int) -> np.ndarray:
-    """Local coordinates (G², 2) of a grid in a tile of so many sides."""
-    s, t = np.meshgrid(steps, steps, indexing="ij")
-    return np.stack([s, t if width == 4 else t * (1 - s)], axis=-1).reshape(-1, 2)
+def _expanded(tiles: Tiles, points: Points, tile: np.ndarray, local: np.ndarray) -> np.ndarray:
+    """Points and derivatives (n, P, 6, 3) of tiles (n,) at local coordinates (n or 1, P, 2)."""
+    frames, width = tiles.frames[tile][:, None], local.shape[1]
+    params = frames[:, :, 0] + local[..., :1] * frames[:, :, 1] + local[..., 1:] * frames[:, :, 2]
+    found = points(np.repeat(tiles.patch[tile], width), params.reshape(-1, 2), 2)
+    return found.reshape(len(tile), width, 6, 3)
 
 
 def chords(found: Shapes, view: View, fine: float, coarse: float) -> np.ndarray:
@@ -213,7 +210,7 @@ def by_error(tiles: Tiles, found: Shapes, allowed: np.ndarray) -> tuple[np.ndarr
     from rts_surfaces import tiles_kernels
 
     inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
-    tiles_kernels.rates(found.bends, found.curves, allowed, tiles.sides, len(edges), MOST, inner, edges)
+    tiles_kernels.rates(found.bends, found.curves, allowed, tiles.sides, MOST, inner, edges)
     return edges, inner
 
 

@@ -275,37 +275,29 @@ def _normal(slopes, out):
 
 
 @kernel
-def shapes(start, stop, found, frames, along, bent, around, normals, places, bends, curves):
+def shapes(start, stop, found, frames, normals, places, bends):
     """Fill what is asked of the shape of tiles.
 
     Args:
         start: first tile.
         stop: one after the last.
-        found: (n, P, 6, 3) float64, points and derivatives in parameters of patches: on a grid of G points a side,
-            then perhaps elsewhere.
+        found: (n, G G, 6, 3) float64, points and derivatives in parameters of patches, on a grid of G points a side.
         frames: (n, 3, 2) float64.
-        along: (k, 2) float64, the direction of each side in local coordinates.
-        bent: (M,) integers, at which of the P points to look how the tile bends.
-        around: (k, G) integers, and how each side does.
         normals: (n, G, G, 3), of unit length, or zero.
         places: (n, G, G, 3), where these are.
         bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t; without a normal, their
             lengths. Chords are off by those alone: what lies along the surface only moves points within it.
-        curves: (n, k), the largest second derivatives of the sides across themselves.
     """
-    grid = normals.shape[1]
-    slopes, normal, tangent, bend = np.empty((2, 3)), np.empty(3), np.empty(3), np.empty(3)
+    grid, slopes = normals.shape[1], np.empty((2, 3))
     for n in range(start, stop):
         frame = frames[n]
-        for k in range(grid * grid):
-            _slopes(found[n, k], frame, slopes)
-            _normal(slopes, normals[n, k // grid, k % grid])
-            for c in range(3):
-                places[n, k // grid, k % grid, c] = found[n, k, 0, c]
         bends[n] = 0
-        for k in bent:
+        for k in range(grid * grid):
+            normal = normals[n, k // grid, k % grid]
             _slopes(found[n, k], frame, slopes)
             there = _normal(slopes, normal)
+            for c in range(3):
+                places[n, k // grid, k % grid, c] = found[n, k, 0, c]
             for m in range(3):
                 a, b = frame[1 if m < 2 else 2], frame[1 if m < 1 else 2]
                 size, straight = 0.0, 0.0
@@ -313,18 +305,33 @@ def shapes(start, stop, found, frames, along, bent, around, normals, places, ben
                     x = _second(found[n, k], a, b, c)
                     size, straight = size + x * x, straight + x * normal[c]
                 bends[n, m] = max(bends[n, m], abs(straight) if there else math.sqrt(size))
-        for side in range(len(along)):
-            way = along[side, 0] * frame[1] + along[side, 1] * frame[2]
-            curves[n, side] = 0
-            for k in around[side]:
-                _slopes(found[n, k], frame, slopes)
-                for c in range(3):
-                    tangent[c] = along[side, 0] * slopes[0, c] + along[side, 1] * slopes[1, c]
-                    bend[c] = _second(found[n, k], way, way, c)
-                square, own = _dot(tangent, tangent), _dot(bend, bend)
-                if square > 0:
-                    own -= _dot(tangent, bend) ** 2 / square
-                curves[n, side] = max(curves[n, side], math.sqrt(max(own, 0.0)))
+
+
+@kernel
+def curves(start, stop, found, frames, along, out):
+    """Fill out (E,), the largest second derivatives of edges across themselves.
+
+    Args:
+        start: first edge.
+        stop: one after the last.
+        found: (E, G, 6, 3) float64, points and derivatives in parameters of the patch of one of its tiles.
+        frames: (E, 3, 2) float64, of that tile.
+        along: (E, 2) float64, the direction of the edge in the tile's local coordinates.
+        out: (E,) float64.
+    """
+    tangent, bend, way = np.empty(3), np.empty(3), np.empty(2)
+    for e in range(start, stop):
+        for i in range(2):
+            way[i] = along[e, 0] * frames[e, 1, i] + along[e, 1] * frames[e, 2, i]
+        out[e] = 0
+        for k in range(found.shape[1]):
+            for c in range(3):
+                tangent[c] = way[0] * found[e, k, 1, c] + way[1] * found[e, k, 2, c]
+                bend[c] = _second(found[e, k], way, way, c)
+            square, own = _dot(tangent, tangent), _dot(bend, bend)
+            if square > 0:
+                own -= _dot(tangent, bend) ** 2 / square
+            out[e] = max(out[e], math.sqrt(max(own, 0.0)))
 
 
 # ----------------------------------------------------------------------------------------------- how fine
@@ -400,28 +407,27 @@ def outlines(start, stop, places, normals, bends, eye, toward, parallel, aside, 
 
 
 @kernel
-def rates(bends, curves, tolerance, sides, edge_count, most, inner, edges):
+def rates(bends, curves, tolerance, sides, most, inner, edges):
     """Fill how often tiles and their sides are cut: inner (n, 2) along s and t, edges (E,).
 
     Args:
         bends: (n, 3).
-        curves: (n, k).
+        curves: (E,).
         tolerance: (n,), chord error; infinity where out of view.
         sides: (n, k) int32, the edge of each side.
-        edge_count: E.
         most: the largest rate.
         inner: (n, 2) int32.
         edges: (E,) int32.
     """
-    fine, second, width = np.full(edge_count, np.inf), np.zeros(edge_count), sides.shape[1]
+    fine, width = np.full(len(edges), np.inf), sides.shape[1]
     for t in range(len(bends)):
         for s in range(width):
             e = sides[t, s]
-            fine[e], second[e] = min(fine[e], tolerance[t]), max(second[e], curves[t, s])
-    for e in range(edge_count):
+            fine[e] = min(fine[e], tolerance[t])
+    for e in range(len(edges)):
         edges[e] = 1
-        if fine[e] < np.inf and second[e] > 0:
-            edges[e] = int(min(most, max(1.0, math.ceil(math.sqrt(second[e] / (8 * fine[e]))))))
+        if fine[e] < np.inf and curves[e] > 0:
+            edges[e] = int(min(most, max(1.0, math.ceil(math.sqrt(curves[e] / (8 * fine[e]))))))
     for t in range(len(bends)):
         allowed = tolerance[t]
         ru, rv = 1.0, 1.0
