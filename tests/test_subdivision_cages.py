@@ -293,3 +293,38 @@ def test_points_outlive_the_name_of_their_surface():
         points.evaluate(np.array([6]), np.zeros((1, 2)))
     with pytest.raises(InputError, match="NaN"):
         points.evaluate(np.array([0]), np.full((1, 2), np.nan))
+
+
+@pytest.mark.parametrize("corners", [3, 4, 5, 11])
+def test_parameters_far_outside_of_a_face_are_refused(corners):
+    vertices, faces = prism(corners)
+    limit = Limit(checked_cage(faces, "catmark"))
+    points = limit.points(vertices)
+    rays = np.zeros((1, 3)), np.array([[0.0, 0, 1]]), np.array([1e-3, 0]), (1e-4, 6, 0.25, 0.02, 4)
+    refused = 0
+    for x in (-1e30, -7.0, -0.2, 0.7, 1.6, 2.4, 3.4, 4.0, 255.0, 1e5, 1e30):
+        for y in (0.1, x):
+            for call in (
+                lambda at: points.evaluate([0], at, 2),
+                lambda at: limit.stencils([0], at),
+                lambda at: limit.derivative_stencils([0], at),
+                lambda at: points.newton([0], at, *rays),
+            ):
+                try:
+                    assert all(np.isfinite(found).all() for found in call([[x, y]]))
+                except InputError as error:
+                    refused += "far outside" in str(error)
+    assert refused >= 4 * 12
+
+
+def test_what_is_huge_or_flat_is_not_met_and_harms_nothing():
+    vertices, faces = prism(5)
+    limit = Limit(checked_cage(faces, "catmark"))
+    face, params = somewhere(limit, 50)
+    directions = np.random.default_rng(0).normal(size=(50, 3))
+    for scale in (0.0, 1e-200, 1e-30, 1e30, 1e150, 1e200):
+        points = limit.points(scale * vertices)
+        limits = np.array([1e-3 * scale, 0]), (1e-4, 10, 0.25, 0.02, 4)
+        found, at, depth, met = points.newton(face, params, -directions, directions, *limits)
+        assert np.isin(found, range(7)).all() and np.isfinite(at).all()
+        assert np.isfinite(depth[met]).all()

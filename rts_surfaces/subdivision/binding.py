@@ -146,7 +146,7 @@ class Limit:
     def _call(self, name: str, *args: Any) -> None:
         if getattr(self._library, name)(*args):
             said = " ".join(self._library.rts_message().decode(errors="replace").split())
-            raise InputError(f"OpenSubdiv cannot work with this cage: {said}")
+            raise InputError(f"the subdivision surface cannot be computed: {said}")
 
     def stencils(
         self, faces: np.ndarray, params: np.ndarray, dtype: Any = np.float64, channel: int = VERTEX
@@ -160,7 +160,7 @@ class Limit:
             channel: `VERTEX` or `UV`.
 
         Raises:
-            InputError: there is no such face.
+            InputError: there is no such face, or parameters lie far outside of theirs.
         """
         out = np.empty((len(faces), self._width(channel)), dtype)
         self._stencils(faces, params, channel, out, None, None)
@@ -239,7 +239,7 @@ class Points:
                 those triangles of Loop's subdivision that are turned round, such as the middle one of four.
 
         Raises:
-            InputError: there is no such face.
+            InputError: there is no such face, or parameters lie far outside of theirs.
         """
         faces, params = self.limit._samples(faces, params)
         out = np.empty((len(faces), (1, 3, 6)[derivatives], 3))

@@ -3,6 +3,8 @@
 #pragma once
 
 #include <algorithm>
+#include <cmath>
+#include <stdexcept>
 #include <vector>
 
 #include <opensubdiv/bfr/surface.h>
@@ -20,6 +22,23 @@ struct Cage {
     std::vector<int> kinds;            // (F,)
 
     int size(int face) const { return first[face + 1] - first[face]; }
+
+    // Refuse parameters that lie far outside a face: Bfr would look for patches that there are not.
+    void check(int face, double const* uv) const {
+        Surface const& surface = surfaces[0][face];
+        if (!surface.IsValid()) return;
+        auto domain = surface.GetParameterization();
+        double origin[2] = {0, 0};
+        bool inside = std::max(std::abs(uv[0]), std::abs(uv[1])) < 1000;
+        if (inside && domain.HasSubFaces()) {
+            int part = domain.GetSubFace(uv);
+            inside = 0 <= part && part < size(face);
+            if (inside) domain.GetVertexCoord(part, origin);
+        }
+        double least = std::min(uv[0] - origin[0], uv[1] - origin[1]);
+        double most = std::max(uv[0] - origin[0], uv[1] - origin[1]);
+        if (!inside || !(least >= -0.3 && most <= 1.3)) throw std::out_of_range("parameters lie far outside their face");
+    }
 };
 
 // Control points of every face, and the further points that its patches have, for given vertices.

@@ -136,6 +136,7 @@ bool meet(Points const& points, Place& at, double const* origin, double const* r
         double determinant = fu * gv - fv * gu, scale = (fu * fu + gu * gu) * (fv * fv + gv * gv);
         if (!(determinant * determinant > 1e-24 * scale)) return false;
         double du = (fv * g - gv * f) / determinant, dv = (gu * f - fu * g) / determinant;
+        if (!std::isfinite(du) || !std::isfinite(dv)) return false;
         double size = std::max(std::abs(du), std::abs(dv)), largest = limits[2] * at.size;
         if (size > largest) du *= largest / size, dv *= largest / size;
         double const low = -0.25 * at.size, high = 1.25 * at.size;

@@ -141,6 +141,7 @@ void stencils(Cage const& cage, int channel, long start, long stop, int const* f
                 if (rows) std::copy(rows + (n - 1) * width, rows + n * width, rows + n * width);
             continue;
         }
+        cage.check(faces[n], uv);
         int count = 0;
         if (surface.IsValid() && along_u) {
             count = surface.EvaluateStencil(uv, p, du, dv);
@@ -252,8 +253,10 @@ int rts_evaluate(Points const* points, long start, long stop, int const* faces, 
                  double* out) {
     return guarded([&] {
         int const width = 3 * (derivatives == 2 ? 6 : derivatives == 1 ? 3 : 1);
-        for (long n = start; n < stop; ++n)
+        for (long n = start; n < stop; ++n) {
+            points->cage->check(faces[n], params + 2 * n);
             points->evaluate(faces[n], params + 2 * n, out + n * width, derivatives);
+        }
     });
 }
 
@@ -266,6 +269,7 @@ int rts_newton(Points const* points, long start, long stop, int* faces, double* 
         for (long n = start; n < stop; ++n) {
             met[n] = false, depth[n] = 0;
             if (cage.kinds[faces[n]] == NONE) continue;
+            cage.check(faces[n], params + 2 * n);
             Place at = place(cage, faces[n], params + 2 * n);
             met[n] = meet(*points, at, origins + 3 * n, directions + 3 * n, spread, limits, depth[n]);
             if (!met[n]) continue;
