@@ -18,7 +18,7 @@ from rts.errors import InputError
 from rts.interfaces import TriangleSurface
 from rts.records import Proxy, Rays, Samples
 from rts.trees import Array, Tree
-from rts_surfaces.tiles import MOST, Shapes, Tiles, by_error, chords, shapes, split, triangles, uniform
+from rts_surfaces.tiles import MOST, Allowed, Shapes, Tiles, allowed_in, by_error, shapes, split, triangles, uniform
 from rts_surfaces.views import view_key, view_of
 
 TOLERANCE = 0.1
@@ -100,7 +100,7 @@ class Parametric(TriangleSurface):
         geometry, center = self.geometry(points), _center(points)
         found = self.shapes(geometry)
         view = view_of(view_key(camera, size, center), center)
-        allowed = chords(found, view, self.tolerance, self.coarse * self.tolerance)
+        allowed = allowed_in(view, found, self.tolerance, self.coarse * self.tolerance)
         return triangles(self.tiles, geometry.points, *by_error(self.tiles, found, allowed))
 
     def shapes(self, geometry: Geometry) -> Shapes:
@@ -129,7 +129,7 @@ class Parametric(TriangleSurface):
         else:
             check_positive("rate", rate)
             tiles, found = self.tiles, self.shapes(geometry)
-            cuts = by_error(tiles, found, np.full(len(found.bends), float(rate)))
+            cuts = by_error(tiles, found, Allowed.everywhere(len(found.bends), float(rate)))
         proxy = triangles(tiles, geometry.points, *cuts)
         a, b, c = (proxy.vertices[proxy.faces[:, i]] for i in range(3))
         return proxy.vertices, proxy.faces[(np.cross(b - a, c - a) != 0).any(axis=1)]

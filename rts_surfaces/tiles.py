@@ -186,31 +186,51 @@ def _expanded(tiles: Tiles, points: Points, tile: np.ndarray, local: np.ndarray)
     return found.reshape(len(tile), width, 6, 3)
 
 
-def chords(found: Shapes, view: View, fine: float, coarse: float) -> np.ndarray:
-    """(n,) how far triangles of each tile may be off the surface, in units of space; infinity where out of view.
+class Allowed(NamedTuple):
+    """How far triangles may be off the surface, in units of space; infinity where out of view.
+
+    Attributes:
+        chord: (n,), of each tile.
+        edge: (n,), those at its edges, should they be outlines.
+        facing: (n,) int8: 1 where all of a tile faces the viewer, −1 where none does, else 0.
+    """
+
+    chord: np.ndarray
+    edge: np.ndarray
+    facing: np.ndarray
+
+    @classmethod
+    def everywhere(cls, count: int, chord: float) -> Allowed:
+        """So many tiles alike."""
+        return cls(np.full(count, chord), np.full(count, chord), np.zeros(count, np.int8))
+
+
+def allowed_in(view: View, found: Shapes, fine: float, coarse: float) -> Allowed:
+    """How far triangles may be off in a view.
 
     Args:
-        found: the shapes of the tiles.
         view: what the camera sees.
-        fine: pixels, where a tile may have an outline.
+        found: the shapes of the tiles.
+        fine: pixels, where a tile or an edge may have an outline.
         coarse: pixels elsewhere.
     """
     from rts_surfaces import tiles_kernels
 
-    allowed, angle = np.empty(len(found.bends)), min(view.angle, math.pi / 2)
+    count, angle = len(found.bends), min(view.angle, math.pi / 2)
+    allowed = Allowed(np.empty(count), np.empty(count), np.empty(count, np.int8))
     cone = np.array([*view.axis, math.sin(angle), math.cos(angle)])
     seen = view.eye, view.toward, view.parallel, view.aside, view.along, view.spread, cone, np.array([fine, coarse])
     given = found.places, found.normals, found.bends, *seen
-    parallel(tiles_kernels.outlines, len(allowed), *given, allowed, work=500 * len(allowed))
+    parallel(tiles_kernels.outlines, count, *given, *allowed, work=500 * count)
     return allowed
 
 
-def by_error(tiles: Tiles, found: Shapes, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rates of edges (E,) and of tiles (n, 2), int32, so that chords are off by no more than is allowed (n,)."""
+def by_error(tiles: Tiles, found: Shapes, allowed: Allowed) -> tuple[np.ndarray, np.ndarray]:
+    """Rates of edges (E,) and of tiles (n, 2), int32, so that triangles are off by no more than is allowed."""
     from rts_surfaces import tiles_kernels
 
     inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
-    tiles_kernels.rates(found.bends, found.curves, allowed, tiles.sides, MOST, inner, edges)
+    tiles_kernels.rates(found.bends, found.curves, *allowed, tiles.sides, MOST, inner, edges)
     return edges, inner
 
 

@@ -338,8 +338,10 @@ def curves(start, stop, found, frames, along, out):
 
 
 @kernel
-def outlines(start, stop, places, normals, bends, eye, toward, parallel, aside, depth, spread, cone, wanted, tolerance):
-    """Fill tolerance (n,): the chord error in units of space that a tile may have; infinity where out of view.
+def outlines(
+    start, stop, places, normals, bends, eye, toward, parallel, aside, depth, spread, cone, wanted, chord, edge, facing
+):
+    """Fill how far triangles of tiles may be off the surface, in units of space; infinity where out of view.
 
     Args:
         start: first tile.
@@ -355,7 +357,9 @@ def outlines(start, stop, places, normals, bends, eye, toward, parallel, aside, 
         spread: (2,), width of a pixel at depth z.
         cone: (5,): the axis of the view, sine and cosine of its half angle with what the view may be off.
         wanted: (2,) pixels: where a tile may have an outline, and elsewhere.
-        tolerance: (n,).
+        chord: (n,), of each tile.
+        edge: (n,), of its edges, should they be outlines.
+        facing: (n,) int8: 1 where all of it faces the viewer, −1 where none does, else 0.
     """
     grid, move = places.shape[1], aside + depth
     faces, view, middle = np.empty((grid, grid)), np.empty(3), np.empty(3)
@@ -380,7 +384,7 @@ def outlines(start, stop, places, normals, bends, eye, toward, parallel, aside, 
                 across = math.sqrt(max(distance * distance - along * along, 0.0))
                 # Out of the cone by more than its own size, and that of the cell of views.
                 if across * cone[4] - along * cone[3] > radius + move:
-                    tolerance[t] = np.inf
+                    chord[t], edge[t], facing[t] = np.inf, np.inf, 0
                     continue
         least, most, jump = np.inf, -np.inf, 0.0
         for i in range(grid):
@@ -400,36 +404,46 @@ def outlines(start, stop, places, normals, bends, eye, toward, parallel, aside, 
         for i in range(grid):
             for j in range(grid - 1):
                 jump = max(jump, abs(faces[i, j] - faces[i, j + 1]), abs(faces[j, i] - faces[j + 1, i]))
-        straddles = least - 0.25 * jump <= 0 <= most + 0.25 * jump
+        facing[t] = 1 if least - 0.25 * jump > 0 else -1 if most + 0.25 * jump < 0 else 0
         width = spread[0] if parallel else abs(spread[1] * max(nearest, 0.0))
         # The eye may be at the tile: then as fine as its size asks for.
-        tolerance[t] = max(width * (wanted[0] if straddles else wanted[1]), 1e-4 * radius)
+        edge[t] = max(width * wanted[0], 1e-4 * radius)
+        chord[t] = edge[t] if facing[t] == 0 else max(width * wanted[1], 1e-4 * radius)
 
 
 @kernel
-def rates(bends, curves, tolerance, sides, most, inner, edges):
+def rates(bends, curves, chord, edge, facing, sides, most, inner, edges):
     """Fill how often tiles and their sides are cut: inner (n, 2) along s and t, edges (E,).
 
     Args:
         bends: (n, 3).
         curves: (E,).
-        tolerance: (n,), chord error; infinity where out of view.
+        chord: (n,), how far triangles of a tile may be off; infinity where out of view.
+        edge: (n,), how far those at its edges may be, should they be outlines.
+        facing: (n,) int8: 1 where all of it faces the viewer, −1 where none does, else 0.
         sides: (n, k) int32, the edge of each side.
         most: the largest rate.
         inner: (n, 2) int32.
         edges: (E,) int32.
     """
-    fine, width = np.full(len(edges), np.inf), sides.shape[1]
+    fine, finest, width = np.full(len(edges), np.inf), np.full(len(edges), np.inf), sides.shape[1]
+    beside, front, back = np.zeros(len(edges), np.int32), np.zeros(len(edges), np.bool_), np.zeros(len(edges), np.bool_)
     for t in range(len(bends)):
         for s in range(width):
             e = sides[t, s]
-            fine[e] = min(fine[e], tolerance[t])
+            fine[e], finest[e] = min(fine[e], chord[t]), min(finest[e], edge[t])
+            beside[e] += 1
+            front[e] |= facing[t] > 0
+            back[e] |= facing[t] < 0
     for e in range(len(edges)):
+        # Where the surface ends, and at creases between front and back, the edge itself is an outline.
+        if beside[e] == 1 or (front[e] and back[e]):
+            fine[e] = min(fine[e], finest[e])
         edges[e] = 1
         if fine[e] < np.inf and curves[e] > 0:
             edges[e] = int(min(most, max(1.0, math.ceil(math.sqrt(curves[e] / (8 * fine[e]))))))
     for t in range(len(bends)):
-        allowed = tolerance[t]
+        allowed = chord[t]
         ru, rv = 1.0, 1.0
         if allowed < np.inf:
             uu, uv, vv = bends[t, 0], bends[t, 1], bends[t, 2]
@@ -444,7 +458,7 @@ def rates(bends, curves, tolerance, sides, most, inner, edges):
         inner[t, 0], inner[t, 1] = int(min(most, math.ceil(ru))), int(min(most, math.ceil(rv)))
         for s in range(width):
             # Cut alike, a side and what lies within make no long triangles.
-            if tolerance[t] <= fine[sides[t, s]] and allowed < np.inf:
+            if chord[t] <= fine[sides[t, s]] and allowed < np.inf:
                 edges[sides[t, s]] = max(edges[sides[t, s]], inner[t, s % 2])
     least = 2 if width == 4 else 3
     for t in range(len(bends)):

@@ -252,3 +252,18 @@ def test_outlines_are_within_the_tolerance_wherever_a_view_is_in_its_cell(name):
         length += sum((rows[1] & ~np.roll(rows[1], step, axis)).sum() for step in (-1, 1) for axis in (0, 1)) / 2
     assert length > 1000
     assert lost <= 0.05 * length
+
+
+def test_the_edge_of_a_flat_patch_is_as_fine_as_an_outline():
+    x, y = np.meshgrid([-1.0, -0.4, 0.4, 1.0], [-1.0, -0.4, 0.4, 1.0], indexing="ij")
+    x, y = x + 0.8 * x * (np.abs(y) < 1), y + 0.5 * y * (np.abs(x) < 1)
+    points = np.stack([x, y, 0 * x], axis=-1).reshape(16, 3)
+    camera, table = Camera.orthographic((0, 0, 3), (0, 0, 0), height=4.5), np.arange(16)[None]
+    parts = [Part(Bezier(table, tolerance=t), {"points": points}) for t in (0.1, 0.001)]
+    rows = [rts.sample(p, camera, (400, 400), layers=1).row[0] >= 0 for p in parts]
+    length = sum((rows[1] & ~np.roll(rows[1], step, axis)).sum() for step in (-1, 1) for axis in (0, 1)) / 2
+    # Chords are off by two thirds of the tolerance on average, at most.
+    assert 0 < (rows[1] & ~rows[0]).sum() <= 0.07 * length
+    # Its inside is flat: there are few triangles but at the edge.
+    proxy = parts[0].surface.proxy(points, camera.for_size((400, 400)), (400, 400))
+    assert len(proxy.faces) < 1500

@@ -236,7 +236,7 @@ def test_tessellated_triangles_are_off_by_no_more_than_was_asked(rate):
     # Normal to the surface, at the parameters of the point.
     geometry = part.surface.geometry(part.theta["points"].astype(np.float64))
     found = part.surface.shapes(geometry)
-    cuts = tiles.by_error(part.surface.tiles, found, np.full(len(found.bends), rate))
+    cuts = tiles.by_error(part.surface.tiles, found, tiles.Allowed.everywhere(len(found.bends), rate))
     proxy = tiles.triangles(part.surface.tiles, geometry.points, *cuts)
     params = np.einsum("nk,nkc->nc", weights[: len(proxy.faces)], proxy.corner_params[: len(weights)])
     places = np.einsum("nk,nkc->nc", weights[: len(proxy.faces)], proxy.vertices[proxy.faces][: len(weights)])
