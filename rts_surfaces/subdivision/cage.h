@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <memory>
 #include <stdexcept>
 #include <vector>
 
@@ -45,10 +46,10 @@ struct Cage {
 struct Points {
     Cage const* cage;
     std::vector<size_t> first;
-    std::vector<double> rows;
+    std::unique_ptr<double[]> rows;  // Not a vector, which would be filled with zeros first.
 
     void evaluate(int face, double const* uv, double* out, int derivatives) const {
-        double const* own = rows.data() + 3 * first[face];
+        double const* own = rows.get() + 3 * first[face];
         Surface const& surface = cage->surfaces[0][face];
         if (!surface.IsValid())
             std::fill(out, out + 3 * (derivatives == 2 ? 6 : derivatives == 1 ? 3 : 1), 0.0);

@@ -230,7 +230,7 @@ int rts_points(Cage const* cage, Points** made) {
         points->first.push_back(0);
         for (Surface const& surface : cage->surfaces[0])
             points->first.push_back(points->first.back() + (surface.IsValid() ? surface.GetNumPatchPoints() : 0));
-        points->rows.resize(3 * points->first.back());
+        points->rows.reset(new double[3 * points->first.back()]);
         *made = points.release();
     });
 }
@@ -243,7 +243,7 @@ int rts_move(Points* points, long start, long stop, double const* vertices) {
         for (long f = start; f < stop; ++f) {
             Surface const& surface = points->cage->surfaces[0][f];
             if (surface.IsValid())
-                surface.PreparePatchPoints(vertices, 3, points->rows.data() + 3 * points->first[f], 3);
+                surface.PreparePatchPoints(vertices, 3, points->rows.get() + 3 * points->first[f], 3);
         }
     });
 }
