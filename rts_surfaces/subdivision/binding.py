@@ -121,8 +121,10 @@ class Limit:
         )
         handle, widths = ctypes.c_void_p(), (ctypes.c_int * 2)()
         self._call("rts_cage", ctypes.byref(description), ctypes.byref(handle), widths)
-        self.handle = handle.value
-        weakref.finalize(self, self._library.rts_cage_free, self.handle)
+        self.handle = handle.value or 0
+        # What a `Points` leaves behind: the next one's memory need not be asked of the system, page by page.
+        self._left: list[int] = []
+        weakref.finalize(self, _free, self._library, self.handle, self._left)
         self._used = used.astype(np.int32)
         self._tables(widths[0], uv_used, widths[1])
 
@@ -218,10 +220,13 @@ class Points:
 
     def __init__(self, limit: Limit, vertices: np.ndarray):
         self.limit = limit  # It must live as long.
-        handle = ctypes.c_void_p()
-        limit._call("rts_points", limit.handle, ctypes.byref(handle))
-        self.handle = handle.value
-        weakref.finalize(self, limit._library.rts_points_free, self.handle)
+        try:
+            self.handle = limit._left.pop()
+        except IndexError:
+            handle = ctypes.c_void_p()
+            limit._call("rts_points", limit.handle, ctypes.byref(handle))
+            self.handle = handle.value or 0
+        weakref.finalize(self, _leave, limit._library, limit._left, self.handle)
         rows = np.ascontiguousarray(np.asarray(vertices, np.float64)[limit._used])
 
         def some(start: int, stop: int) -> None:
@@ -284,3 +289,17 @@ class Points:
 
         parallel(some, len(faces), work=2000 * len(faces))
         return faces, params, depth, met
+
+
+def _leave(library: ctypes.CDLL, left: list[int], points: int) -> None:
+    """Keep the memory of one `Points`."""
+    if left:
+        library.rts_points_free(points)
+    else:
+        left.append(points)
+
+
+def _free(library: ctypes.CDLL, cage: int, left: list[int]) -> None:
+    for points in left:
+        library.rts_points_free(points)
+    library.rts_cage_free(cage)
