@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rts.arguments import quoted
-from rts.arrays import described, shape_of, unit
+from rts.arrays import unit
 from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
@@ -21,10 +21,9 @@ from rts.records import Proxy, Samples
 from rts.sampling.cache import fingerprint
 from rts.topology import fixed, index_table
 from rts.trees import Array, Tree
+from rts_surfaces.entries import G_BUFFER_NAMES, check_rows
 
-G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv")
-WIDTHS = {"vertices": (3,), "normals": (3,), "uv": (2,), "colors": (1, 3, 4)}
 
 
 class Mesh(TriangleSurface):
@@ -93,23 +92,8 @@ class Mesh(TriangleSurface):
 
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Refuse θ whose entries have wrong shapes or dtypes."""
-        for name in ("vertices", *self._attributes(theta)):
-            if name not in theta:
-                raise InputError(f"theta of a mesh has no {name!r}; it has {sorted(theta)}")
-            value, rows = theta[name], self._extents[self._columns.get(name, 0) // 3]
-            shape, widths = shape_of(value), WIDTHS.get(name)
-            if not shape:
-                raise InputError(f"theta[{name!r}] of a mesh {described(value)}; expected an array")
-            if len(shape) != 2 or (widths and shape[1] not in widths):
-                expected = " or ".join(map(str, widths or "C"))
-                raise InputError(f"theta[{name!r}] of a mesh has shape {shape}; expected (rows, {expected})")
-            if not namespace(value).isdtype(value.dtype, "real floating"):
-                raise InputError(f"theta[{name!r}] of a mesh has dtype {value.dtype}; expected a floating one")
-            if shape[0] < rows:
-                raise InputError(
-                    f"theta[{name!r}] of a mesh has {shape[0]} rows, but its faces refer to row {rows - 1}; "
-                    f"check the indices (they count from 0)"
-                )
+        for name in self.reads(theta):
+            check_rows("a mesh", theta, name, self._extents[self._columns.get(name, 0) // 3])
 
     def _attributes(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
         return self.reads(theta)[1:]

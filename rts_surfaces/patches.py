@@ -9,20 +9,19 @@ from functools import partial
 
 import numpy as np
 
-from rts.arrays import described, shape_of
-from rts.engines import constants, engine_of, namespace
-from rts.errors import InputError
+from rts.engines import constants, engine_of
 from rts.gbuffer import GBuffer
 from rts.records import Rays, Samples
 from rts.threads import parallel
 from rts.topology import fixed
 from rts.trees import Array, Tree
 from rts_surfaces.bicubic import normals, values
+from rts_surfaces.entries import G_BUFFER_NAMES, WIDTHS, check_entry
 from rts_surfaces.parametric import LIMITS, Geometry, Parametric
 from rts_surfaces.tiles import Tiles
 
-ATTRIBUTES = {"colors": ("color", (1, 3, 4)), "uv": ("uv", (2,))}
-"""Entries of θ for control points: what the G-buffer calls them, and how wide they may be."""
+ATTRIBUTES = ("colors", "uv")
+"""Entries of θ for control points."""
 
 
 class Bicubic(Geometry):
@@ -92,21 +91,14 @@ class Patches(Parametric):
     def expected(self, name: str, shape: tuple[int, ...]) -> str | None:
         """What shape an entry of θ is to have, in words; None if it has it."""
         wrong = self.control_shape(shape[:-1]) if shape else "an array"
-        widths = (3,) if name == "points" else ATTRIBUTES[name][1]
-        if wrong is None and shape[-1] not in widths:
-            return f"a last axis of {' or '.join(map(str, widths))}"
+        if wrong is None and shape[-1] not in WIDTHS[name]:
+            return f"a last axis of {' or '.join(map(str, WIDTHS[name]))}"
         return wrong
 
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Refuse θ whose entries have wrong shapes or dtypes."""
         for name in self.reads(theta):
-            if name not in theta:
-                raise InputError(f"theta of {self!r} has no {name!r}; it has {sorted(theta)}")
-            value, wrong = theta[name], self.expected(name, shape_of(theta[name]))
-            if wrong is not None:
-                raise InputError(f"theta[{name!r}] of {self!r} {described(value)}; expected {wrong}")
-            if not namespace(value).isdtype(value.dtype, "real floating"):
-                raise InputError(f"theta[{name!r}] of {self!r} has dtype {value.dtype}; expected a floating one")
+            check_entry(repr(self), theta, name, partial(self.expected, name))
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
         """The entries of θ that `evaluate` needs."""
@@ -132,9 +124,9 @@ class Patches(Parametric):
         rows = self.bezier_rows(points)
         gbuffer = GBuffer(position=values(rows, *where))
         gbuffer.defer("normal", lambda: normals(rows, *where))
-        for name, (entry, _) in ATTRIBUTES.items():
+        for name in ATTRIBUTES:
             if name in theta:
-                gbuffer.defer(entry, partial(self._attribute, theta[name], where))
+                gbuffer.defer(G_BUFFER_NAMES.get(name, name), partial(self._attribute, theta[name], where))
         return gbuffer
 
     def _attribute(self, attribute: Array, where: tuple[Array, Array, Array]) -> Array:

@@ -49,7 +49,7 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
         weld: leave out vertices without faces, and weld those that coincide; False keeps the vertices of the file,
             their number and order. (All parts of an OBJ share one table of vertices; each then holds all of it.)
         surface: the name of a registered surface that reads the file, in a format of its own; "bezier" reads patches
-            (text as Newell's teapot is in, or .npz), "subdivision" the cage in an OBJ. All that is said above is of "mesh".
+            (text as Newell's teapot is in, or .npz), "subdivision" the cage in an OBJ. What is said above is of "mesh".
 
     Raises:
         InputError: the file is missing, damaged, of unknown kind, empty, holds other than it promises, or refers to

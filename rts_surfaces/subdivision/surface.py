@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from rts.arguments import quoted
-from rts.arrays import described, shape_of, unit
-from rts.engines import constants, engine_of, namespace
+from rts.arrays import shape_of, unit
+from rts.engines import constants, engine_of
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part
@@ -26,6 +26,7 @@ from rts.records import ArraySpec, Rays, Samples
 from rts.sampling.cache import fingerprint
 from rts.topology import fixed
 from rts.trees import Array, Tree
+from rts_surfaces.entries import G_BUFFER_NAMES, check_rows
 from rts_surfaces.parametric import BEYOND, LARGEST_STEP, RESIDUAL, STEPS, TOLERANCE, Geometry, Parametric
 from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.binding import BOUNDARIES, UV, UV_RULES, VERTEX, Limit, Points, Rules
@@ -41,9 +42,7 @@ CROSSINGS = 4
 """Edges of faces that Newton's method may cross."""
 LIMITS = RESIDUAL, STEPS + CROSSINGS, LARGEST_STEP, BEYOND, CROSSINGS
 
-G_BUFFER_NAMES = {"colors": "color"}
 VERTEX_ATTRIBUTES = ("colors", "uv")
-WIDTHS = {"vertices": (3,), "uv": (2,), "colors": (1, 3, 4)}
 
 
 class LimitGeometry(Geometry):
@@ -188,22 +187,8 @@ class Subdivision(Parametric):
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Refuse θ whose entries have wrong shapes or dtypes."""
         for name in self.reads(theta):
-            if name not in theta:
-                raise InputError(f"theta of {self!r} has no {name!r}; it has {sorted(theta)}")
-            value, widths = theta[name], WIDTHS.get(name)
-            varying = name == "uv" and self._uv is not None
-            rows = int(self._uv.max()) + 1 if varying and self._uv is not None else self._count
-            shape = shape_of(value)
-            if len(shape) != 2 or (widths and shape[1] not in widths):
-                expected = f"(rows, {' or '.join(map(str, widths or 'C'))})"
-                raise InputError(f"theta[{name!r}] of {self!r} {described(value)}; expected {expected}")
-            if not namespace(value).isdtype(value.dtype, "real floating"):
-                raise InputError(f"theta[{name!r}] of {self!r} has dtype {value.dtype}; expected a floating one")
-            if shape[0] < rows:
-                raise InputError(
-                    f"theta[{name!r}] of {self!r} has {shape[0]} rows, but its faces refer to row {rows - 1}; check "
-                    f"the indices (they count from 0)"
-                )
+            varying = self._uv if name == "uv" else None
+            check_rows(repr(self), theta, name, self._count if varying is None else int(varying.max()) + 1)
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
         """The entries of θ that `evaluate` needs."""
