@@ -226,7 +226,7 @@ class Needed(Plugin):
         """Which samples to keep, (K, H, W) bool, where covered (K, H, W) bool lie at depth (K, H, W)."""
 
     def ran_out(self, cells: int) -> None:
-        """Take note of how many cells had K layers of triangles, of which fewer were left after `refine`."""
+        """Take note of how many cells had all layers of triangles that were looked for, and too few after `refine`."""
 
 
 AnyNeeded = Callable[[np.ndarray, np.ndarray], np.ndarray]

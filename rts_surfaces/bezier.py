@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.errors import InputError
 from rts.interfaces import Part
-from rts.topology import index_table
+from rts.topology import fixed, index_table
 from rts.trees import Array
 from rts_surfaces.parametric import TOLERANCE
 from rts_surfaces.patches import Patches
@@ -32,7 +32,8 @@ class Bezier(Patches):
     """
 
     def __init__(self, indices: Any, tolerance: float = TOLERANCE):
-        super().__init__(index_table("indices", indices, 16), tolerance)
+        table = index_table("indices", indices, 16)
+        super().__init__(table, tolerance, fixed(np.unique(table)))
         self._least = int(self.table.max()) + 1
 
     def __repr__(self) -> str:

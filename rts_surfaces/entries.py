@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from rts.arrays import described, shape_of
 from rts.engines import namespace
@@ -13,6 +13,16 @@ G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
 """What the G-buffer calls an entry, if not by its own name."""
 WIDTHS = {"vertices": (3,), "points": (3,), "normals": (3,), "uv": (2,), "colors": (1, 3, 4)}
 """How many numbers there are for each vertex or control point."""
+
+RESERVED = ("vertices", "points", "position", "normal")
+"""Names that no further attribute may have."""
+
+
+def check_names(names: Iterable[str], taken: Sequence[str] = ()) -> None:
+    """Refuse names of attributes that mean something else, or are among those that are taken."""
+    for name in names:
+        if name in RESERVED or name in taken:
+            raise InputError(f"indices declares {name!r}, which is no further attribute; expected another name")
 
 
 def check_entry(

@@ -21,7 +21,7 @@ from rts.records import Proxy, Samples
 from rts.sampling.cache import fingerprint
 from rts.topology import fixed, index_table
 from rts.trees import Array, Tree
-from rts_surfaces.entries import G_BUFFER_NAMES, check_rows
+from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows
 
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv")
 
@@ -51,6 +51,7 @@ class Mesh(TriangleSurface):
         self._columns: dict[str, int] = dict.fromkeys(VERTEX_ATTRIBUTES, 0)
         if indices is not None and not isinstance(indices, Mapping):
             raise InputError(f"indices is {quoted(indices)}; expected a dict of name → (T, 3) integers")
+        check_names(indices or ())
         for name, table in (indices or {}).items():
             self._columns[name] = 0
             if table is not None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Hashable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from rts.engines import engine_of
 from rts.errors import InputError
 from rts.interfaces import TriangleSurface
 from rts.records import Proxy, Rays, Samples
+from rts.topology import fixed
 from rts.trees import Array, Tree
 from rts_surfaces.tiles import MOST, Allowed, Shapes, Tiles, allowed_in, by_error, shapes, split, triangles, uniform
 from rts_surfaces.views import view_key, view_of
@@ -56,6 +58,7 @@ class Parametric(TriangleSurface):
     Args:
         tiles: all patches.
         tolerance: pixels that triangles may be off the surface near outlines.
+        used: the control points that patches have, as rows of all; None for all of them.
 
     Attributes:
         whole: the patches as tiles.
@@ -70,9 +73,17 @@ class Parametric(TriangleSurface):
     coarse = 10.0
     beside = 0.0
 
-    def __init__(self, tiles: Tiles, tolerance: float):
+    def __init__(self, tiles: Tiles, tolerance: float, used: np.ndarray | None = None):
         check_positive("tolerance", tolerance)
-        self.whole, self.tiles, self.tolerance = tiles, split(tiles), float(tolerance)
+        self.whole, self.tiles, self.tolerance, self.used = tiles, split(tiles), float(tolerance), used
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A copy's tables are fixed, too."""
+        vars(self).update(state)
+        for value in state.values():
+            for array in value if isinstance(value, tuple) else (value,):
+                if isinstance(array, np.ndarray):
+                    fixed(array)
 
     def uniform(self, rate: int) -> tuple[np.ndarray, np.ndarray]:
         """Rates of the edges of `whole` and within it, for so many cuts along each side of a patch."""
@@ -92,12 +103,12 @@ class Parametric(TriangleSurface):
 
     def proxy_key(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Hashable:
         """The cell of views: so images do not depend on what was rendered before."""
-        return view_key(camera, size, _center(self.finite(inputs)))
+        return view_key(camera, size, self._center(self.finite(inputs)))
 
     def proxy(self, inputs: np.ndarray, camera: Camera, size: tuple[int, int]) -> Proxy:
         """Triangles that are off the surface by less than `tolerance` pixels near outlines, and coarse elsewhere."""
         points = self.finite(inputs)
-        geometry, center = self.geometry(points), _center(points)
+        geometry, center = self.geometry(points), self._center(points)
         found = self.shapes(geometry)
         view = view_of(view_key(camera, size, center), center)
         allowed = allowed_in(view, found, self.tolerance, self.coarse * self.tolerance)
@@ -112,8 +123,8 @@ class Parametric(TriangleSurface):
 
         Args:
             theta: θ, with values that are known.
-            rate: a whole number, of cuts along each side of a patch; or a float, the distance in the units of θ that
-                triangles may be off the surface.
+            rate: a whole number, of cuts along each side of a patch, at most `tiles.MOST`; or a float, the distance in
+            the units of θ that     triangles may be off the surface.
 
         Returns:
             Vertices (V, 3) float32 and faces (T, 3) int32, without cracks between patches that share control points.
@@ -149,7 +160,7 @@ class Parametric(TriangleSurface):
             )
         return points
 
-
-def _center(points: np.ndarray) -> np.ndarray:
-    flat = points.reshape(-1, 3)
-    return (flat.min(axis=0) + flat.max(axis=0)) / 2
+    def _center(self, points: np.ndarray) -> np.ndarray:
+        rows = points.reshape(-1, 3)
+        rows = rows if self.used is None else rows[self.used]
+        return (rows.min(axis=0) + rows.max(axis=0)) / 2

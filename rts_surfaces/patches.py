@@ -62,6 +62,7 @@ class Patches(Parametric):
         table: (n, 16) integers, the control points of each Bézier patch, first along u, then along v; they name rows of
             what `bezier_rows` gives.
         tolerance: pixels that triangles may be off the surface near outlines.
+        used: see `Parametric`.
 
     Attributes:
         shaped_by: the entries of θ that control points are made of.
@@ -69,9 +70,9 @@ class Patches(Parametric):
 
     shaped_by: tuple[str, ...] = ("points",)
 
-    def __init__(self, table: np.ndarray, tolerance: float):
+    def __init__(self, table: np.ndarray, tolerance: float, used: np.ndarray | None = None):
         self.table = fixed(np.array(table, np.int32))
-        super().__init__(_tiles(self.table), tolerance)
+        super().__init__(_tiles(self.table), tolerance, used)
 
     @abc.abstractmethod
     def bezier_rows(self, values: Array) -> Array:

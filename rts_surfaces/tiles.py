@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rts.errors import InputError
 from rts.records import Proxy
 from rts.threads import parallel
 from rts.topology import fixed
@@ -19,6 +20,8 @@ from rts_surfaces.views import View
 
 MOST = 256
 """The largest number of cuts along a side of a tile."""
+MOST_TRIANGLES = 2**27
+"""The largest number of triangles: 8 GiB."""
 LEAST = {4: 2, 3: 3}
 """How often a tile of so many sides is cut at least, where it is cut at all: so that points lie within it."""
 AT_ONCE = 2048
@@ -230,7 +233,9 @@ def by_error(tiles: Tiles, found: Shapes, allowed: Allowed) -> tuple[np.ndarray,
     from rts_surfaces import tiles_kernels
 
     inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
-    tiles_kernels.rates(found.bends, found.curves, *allowed, tiles.sides, MOST, inner, edges)
+    tiles_kernels.rates(
+        found.bends, found.curves, *allowed, tiles.sides, LEAST[tiles.sides.shape[1]], MOST, inner, edges
+    )
     return edges, inner
 
 
@@ -256,17 +261,22 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
 
     Returns:
         Vertices; ids (T, 1) are patches, parameters (T, 3, 2) those in the patch.
+
+    Raises:
+        InputError: so many triangles that memory would not do.
     """
     from rts_surfaces import tiles_kernels
 
     count, width = tiles.corners.shape
+    total = int(tiles_kernels.counted(inner, tiles.sides, edges))
+    if total > MOST_TRIANGLES:
+        raise InputError(f"{count} patches make {total} triangles; expected fewer, so cut them less finely")
     within = (inner[:, 0] - 1) * (inner[:, 1] - 1) if width == 4 else (inner[:, 0] - 1) * (inner[:, 0] - 2) // 2
     edge_first = len(tiles.corner_tiles) + np.concatenate([[0], np.cumsum(edges - 1)]).astype(np.int32)
     inner_first = edge_first[-1] + np.concatenate([[0], np.cumsum(within)]).astype(np.int32)
     vertices = points(*_places(tiles, edges, edge_first, inner, inner_first), 0)[:, 0].astype(np.float32)
     first = np.zeros(count + 1, np.int32)
     tiles_kernels.counts(inner, tiles.sides, edges, first)
-    total = int(first[-1])
     out = np.empty((total, 3), np.int32), np.empty((total, 1), np.int32), np.empty((total, 3, 2), np.float32)
     kernel = tiles_kernels.quadrilaterals if width == 4 else tiles_kernels.triangles
     given = *tiles[:5], edges, edge_first, inner, inner_first, first

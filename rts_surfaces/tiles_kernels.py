@@ -76,20 +76,33 @@ def within_triangles(owner, frames, inner, inner_first, patch, params):
                 v += 1
 
 
+@compiled
+def _count(rates, sides, edges):
+    """How many triangles a tile has."""
+    width, rs, rt = len(sides), rates[0], rates[1]
+    if rs == 1:
+        return width - 2
+    total = 2 * (rs - 2) * (rt - 2) if width == 4 else (rs - 3) * (rs - 3)
+    for s in range(width):
+        total += edges[sides[s]] + ((rs if s % 2 == 0 else rt) - 2 if width == 4 else rs - 3)
+    return total
+
+
+@kernel
+def counted(inner, sides, edges):
+    """How many triangles there are."""
+    total = 0
+    for n in range(len(inner)):
+        total += _count(inner[n], sides[n], edges)
+    return total
+
+
 @kernel
 def counts(inner, sides, edges, first):
     """Fill first (n + 1,): the number of the first triangle of each tile."""
-    width = sides.shape[1]
     first[0] = 0
     for n in range(len(inner)):
-        rs, rt = inner[n, 0], inner[n, 1]
-        if rs == 1:
-            total = width - 2
-        else:
-            total = 2 * (rs - 2) * (rt - 2) if width == 4 else (rs - 3) * (rs - 3)
-            for s in range(width):
-                total += edges[sides[n, s]] + ((rs if s % 2 == 0 else rt) - 2 if width == 4 else rs - 3)
-        first[n + 1] = first[n] + total
+        first[n + 1] = first[n] + _count(inner[n], sides[n], edges)
 
 
 # ------------------------------------------------------------------------------------------------- triangles
@@ -412,7 +425,7 @@ def outlines(
 
 
 @kernel
-def rates(bends, curves, chord, edge, facing, sides, most, inner, edges):
+def rates(bends, curves, chord, edge, facing, sides, least, most, inner, edges):
     """Fill how often tiles and their sides are cut: inner (n, 2) along s and t, edges (E,).
 
     Args:
@@ -422,6 +435,7 @@ def rates(bends, curves, chord, edge, facing, sides, most, inner, edges):
         edge: (n,), how far those at its edges may be, should they be outlines.
         facing: (n,) int8: 1 where all of it faces the viewer, −1 where none does, else 0.
         sides: (n, k) int32, the edge of each side.
+        least: the least rate of a tile that is cut.
         most: the largest rate.
         inner: (n, 2) int32.
         edges: (E,) int32.
@@ -460,7 +474,6 @@ def rates(bends, curves, chord, edge, facing, sides, most, inner, edges):
             # Cut alike, a side and what lies within make no long triangles.
             if chord[t] <= fine[sides[t, s]] and allowed < np.inf:
                 edges[sides[t, s]] = max(edges[sides[t, s]], inner[t, s % 2])
-    least = 2 if width == 4 else 3
     for t in range(len(bends)):
         cut = inner[t, 0] > 1 or inner[t, 1] > 1
         for s in range(width):

@@ -12,6 +12,8 @@ from rts.camera import Camera
 STEP, CELLS = 1.1, 16
 """Views whose distances and widths of pixels differ by less than this factor, and whose directions are in one cell of a
 cube's sides (`CELLS` from the middle of a side to its edge), have the same triangles."""
+EVEN = 0.5
+"""Views that scale axes more differently than by this factor have finer triangles."""
 
 
 class View(NamedTuple):
@@ -23,7 +25,7 @@ class View(NamedTuple):
         aside: how far the eye may be off sideways, local units; where parallel, how far the direction.
         along: how far it may be off towards the surface and away from it.
         toward: (3,) unit, from the surface to the eye.
-        spread: (2,), width of a pixel at depth z, at its least.
+        spread: (2,): at distance d from the eye a pixel is `spread[0] + spread[1] d` wide, at its least.
         axis: (3,) what the camera looks along.
         angle: half the angle of a cone around the axis that holds the view, radians.
     """
@@ -48,15 +50,19 @@ def view_key(camera: Camera, size: tuple[int, int], center: np.ndarray) -> tuple
     """
     inverse = np.linalg.inv(camera.view)
     spread, axis = camera.spread(size), -inverse[:3, 2]
-    corner = math.hypot(*size) / 2
+    scales = np.linalg.svd(camera.view[:3, :3], compute_uv=False)
+    # Where axes are scaled differently, as narrow a pixel, and as wide a cone, as in any direction.
+    evenness = scales[2] / scales[0] if scales[2] < EVEN * scales[0] else 1.0
     if camera.projection[3, 2] == 0:
-        return True, _cell(-axis), 0, _power(spread[0]), _cell(axis), 0
+        return True, _cell(-axis), 0, _power(spread[0] * evenness), _cell(axis), 0
     off = inverse[:3, 3] - center
-    distance = float(np.linalg.norm(off))
+    # Depth is in the camera's units, distance in the surface's.
+    width = spread[1] * float(np.prod(scales)) ** (1 / 3)
     # The principal point may be beside the image: as wide a cone as reaches its farthest corner.
     shift = float(np.hypot(*(camera.projection[:2, 2])))
-    wide = _power(spread[1] * corner * (1 + shift))
-    return False, _cell(off), _power(distance), _power(spread[1]), _cell(axis), wide
+    wide = width * math.hypot(*size) / 2 * (1 + shift) / evenness
+    distance = float(np.linalg.norm(off))
+    return False, _cell(off), _power(distance), _power(width * evenness), _cell(axis), _power(wide)
 
 
 def view_of(key: tuple, center: np.ndarray) -> View:

@@ -1,5 +1,8 @@
 """What patches are made of: values and normals as operations, tiles that meet, samples that are moved and pruned."""
 
+import copy
+import pickle
+
 import numpy as np
 import pytest
 from helpers import ALL, DIFFERENTIABLE, arrays, derivative, gradient, to_numpy
@@ -268,3 +271,50 @@ def test_the_edge_of_a_flat_patch_is_as_fine_as_an_outline():
     # Its inside is flat: there are few triangles but at the edge.
     proxy = parts[0].surface.proxy(points, camera.for_size((400, 400)), (400, 400))
     assert len(proxy.faces) < 1500
+
+
+NAMES = [*PARTS, "subdivision"]
+
+
+def example(name):
+    try:
+        return rts.plugin("surfaces", name).example()
+    except rts.PluginError as missing:
+        pytest.skip(str(missing))
+
+
+@pytest.mark.parametrize("name", ["bezier", "bspline", "subdivision"])
+@pytest.mark.parametrize("scale", [(1e-3,) * 3, (1e3,) * 3, (1.0, 0.2, 1.0)])
+def test_triangles_are_as_fine_where_a_transform_scales(name, scale):
+    part, size = example(name), (150, 150)
+    camera = Camera.look_at((1.5, 1.8, 4.5), (0, 0, 0), fov_y=40)
+    entry = "vertices" if name == "subdivision" else "points"
+    points = part.theta[entry].astype(np.float64)
+    plain = part.replace(theta={entry: points}, shader="silhouette")
+    scaled = plain.replace(theta={entry: points / scale}, transform=np.diag([*scale, 1.0]))
+    rows = [rts.sample(p, camera, size, layers=2).row[0] >= 0 for p in (plain, scaled)]
+    assert (rows[0] ^ rows[1]).sum() <= 0.005 * rows[0].sum()
+    within = camera.for_size(size).within(scaled.transform)
+    one = len(plain.surface.proxy(points, camera.for_size(size), size).faces)
+    other = len(scaled.surface.proxy(points / scale, within, size).faces)
+    assert 0.5 < other / one < (2 if scale[0] == scale[1] else 20)
+
+
+@pytest.mark.parametrize("name", ["bezier", "subdivision"])
+def test_points_of_no_patch_do_not_count(name):
+    part = example(name)
+    entry = "points" if name == "bezier" else "vertices"
+    more = {e: np.concatenate([part.theta[e], part.theta[e][:1] + 1e5]) for e in (entry, "colors")}
+    camera, size = CAMERA.for_size((100, 100)), (100, 100)
+    one, other = (part.surface.proxy(t[entry].astype(float), camera, size) for t in (part.theta, more))
+    np.testing.assert_array_equal(one.faces, other.faces)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda part: pickle.loads(pickle.dumps(part))])
+def test_tables_of_copies_are_fixed_and_images_alike(name, copied):
+    part = example(name)
+    other = copied(part)
+    for table in (*other.surface.tiles, *other.surface.whole):
+        assert not table.flags.writeable
+    np.testing.assert_array_equal(rts.render(other, CAMERA, (40, 50)), rts.render(part, CAMERA, (40, 50)))

@@ -103,16 +103,36 @@ def test_a_compiler_that_fails_is_one_line(opensubdiv, compiler, tmp_path, monke
     monkeypatch.setenv("CXX", compiler)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with pytest.raises(PluginError, match="fails to compile") as error:
-        library._compiled(library.find())
+        library._compiled(library.find(), library.cache_folder())
     assert "\n" not in str(error.value) and not list((tmp_path / "rts").iterdir())
 
 
 def test_a_library_that_is_damaged_is_made_anew(opensubdiv, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    path = library._compiled(library.find())
+    path = library._compiled(library.find(), library.cache_folder())
     path.write_bytes(b"cut short")
     assert library._opened(opensubdiv).rts_message() == b""
     assert path.stat().st_size > 10_000
+
+
+def test_a_damaged_library_that_cannot_be_removed_is_made_elsewhere(opensubdiv, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    library._compiled(library.find(), library.cache_folder()).write_bytes(b"cut short")
+
+    def refused(self, missing_ok=False):
+        raise PermissionError("read-only")
+
+    monkeypatch.setattr(Path, "unlink", refused)
+    assert library._opened(opensubdiv).rts_message() == b""
+
+
+def test_without_a_home_the_library_is_made_elsewhere(monkeypatch):
+    def refused():
+        raise RuntimeError("no home")
+
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", refused)
+    assert library.cache_folder().is_dir()
 
 
 def test_another_compiler_is_another_library(opensubdiv, monkeypatch):

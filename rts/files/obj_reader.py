@@ -185,6 +185,7 @@ class Polygons(NamedTuple):
         sizes: (F,) int64, how many corners each face has.
         corners: (H, 3) int64, position, uv and normal of the corners of all faces; −1 where one is not given.
         tags: the statements "t", as OpenSubdiv's files have them, each with the number of its line.
+        materials: how many materials faces have.
         material: the only material, or a plain one where there are several.
         texture: (h, w, 3 or 4) float32 in [0, 1], sRGB, of that material; or None.
     """
@@ -195,6 +196,7 @@ class Polygons(NamedTuple):
     sizes: np.ndarray
     corners: np.ndarray
     tags: list[tuple[int, str]]
+    materials: int
     material: Material
     texture: np.ndarray | None
 
@@ -212,7 +214,7 @@ def read_polygons(path: Path) -> Polygons:
     material = found[0] if len(used) == len(found) == 1 else Material()
     corners, sizes = lines.polygons((len(v), len(vt), len(vn)))
     texture = None if material.texture is None else read_texture(material.texture, path)
-    return Polygons(v[:, :3], _colors(v), vt, sizes, corners, lines.tags, material, texture)
+    return Polygons(v[:, :3], _colors(v), vt, sizes, corners, lines.tags, len(used), material, texture)
 
 
 def _rows(lines: _Lines) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -31,10 +31,10 @@ def on_surface(
     layers: int,
     tables: Mapping[str, ArraySpec],
 ) -> Samples:
-    """The nearest samples on a surface that are near its triangles: refined, and in order.
+    """Samples on a surface where rays meet its nearest triangles: refined, and in order.
 
-    Where triangles stand before the surface but rays miss it, layers are taken from behind: as many as `fragments` has
-    more than are asked for.
+    Where triangles stand before the surface but rays miss it, and fewer layers are left than were asked for, more are
+    taken from behind: as many as `fragments` has.
 
     Args:
         surface: the surface.
@@ -56,18 +56,15 @@ def on_surface(
     # The cells where some are missing, as the only line of an image.
     behind = Fragments(*(np.ascontiguousarray(x[layers:, *cells])[:, None] for x in fragments))
     more, _ = refined(surface, inputs, lift(behind, proxy), camera, tables, size=settled.row.shape[1:], cells=cells)
-    count = len(settled.ids)
-    row, depth = (np.concatenate([a[:, *cells], b[:, 0]])[:, None] for a, b in _pairs(settled, more, count))
+    added = np.where(more.row >= 0, more.row + np.int32(len(settled.ids)), -1)
+    pairs = (settled.row, added), (settled.depth, more.depth)
+    row, depth = (np.concatenate([a[:, *cells], b[:, 0]])[:, None] for a, b in pairs)
     both = settle(replace(settled, row=row, depth=depth), camera, rays.spread)
     row, depth = settled.row, settled.depth
     row[:, *cells], depth[:, *cells] = both.row[:layers, 0], both.depth[:layers, 0]
     ids, params = (np.concatenate(x) for x in ((settled.ids, more.ids), (settled.params, more.params)))
-    return replace(settled, ids=ids, params=params, row=row, depth=depth)
-
-
-def _pairs(settled: Samples, more: Samples, count: int) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    """Rows and depths of both, the rows of the second counted on."""
-    return (settled.row, np.where(more.row >= 0, more.row + np.int32(count), -1)), (settled.depth, more.depth)
+    overflow = np.asarray(settled.overflow + more.overflow, np.int32)
+    return replace(settled, ids=ids, params=params, row=row, depth=depth, overflow=overflow)
 
 
 def refined(

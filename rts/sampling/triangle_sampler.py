@@ -21,8 +21,8 @@ from rts.sampling.validation import check_camera, check_faces, check_fragments, 
 from rts.trees import Array, Tree, leaves, map_leaves
 
 LEAST_LAYERS = 3
-"""Layers of triangles that are looked for at least where a surface refines its samples, and one more than is asked for:
-at an outline both sides of a fold may stand where the surface is not."""
+"""Where a surface refines its samples, so many layers of triangles are looked for, or one more than samples are asked
+for, if that is more: at an outline both sides of a fold may stand where the surface is not."""
 
 
 class TriangleSampler(Sampler):

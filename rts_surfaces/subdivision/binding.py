@@ -79,6 +79,7 @@ class Limit:
         table: (F, W) int32, the vertices that each face depends on, filled up with one of them; read-only.
         uv_table: (F, W') int32, the rows of face-varying data that it depends on; None without such data.
         kinds: (F,) int32.
+        used: the vertices that faces refer to, in order; read-only.
         corners: (H, 2) float64, parameters of the corners of each face; of sub-faces where they begin.
 
     Raises:
@@ -125,7 +126,7 @@ class Limit:
         # What a `Points` leaves behind: the next one's memory need not be asked of the system, page by page.
         self._left: list[int] = []
         weakref.finalize(self, _free, self._library, self.handle, self._left)
-        self._used = used.astype(np.int32)
+        self.used = fixed(used.astype(np.int32))
         self._tables(widths[0], uv_used, widths[1])
 
     def _tables(self, width: int, uv_used: np.ndarray | None, uv_width: int) -> None:
@@ -142,7 +143,7 @@ class Limit:
         self._call(
             "rts_tables", self.handle, table.ctypes.data, uv_data, self.kinds.ctypes.data, self.corners.ctypes.data
         )
-        self.table = fixed(self._used[table])
+        self.table = fixed(self.used[table])
         self.uv_table = None if uv_table is None or uv_used is None else fixed(uv_used.astype(np.int32)[uv_table])
 
     def _call(self, name: str, *args: Any) -> None:
@@ -201,6 +202,8 @@ class Limit:
         faces, params = np.ascontiguousarray(faces, np.int32), np.ascontiguousarray(params, np.float64)
         if len(faces) and not 0 <= faces.min() <= faces.max() < len(self.kinds):
             raise InputError(f"samples lie on faces {faces.min()} to {faces.max()} of {len(self.kinds)}; sample anew")
+        if params.shape != (len(faces), 2):
+            raise InputError(f"samples have {len(faces)} faces and parameters of shape {params.shape}; sample anew")
         if not np.isfinite(params).all():
             raise InputError("parameters of samples are NaN or infinite; expected finite numbers")
         return faces, params
@@ -220,6 +223,10 @@ class Points:
 
     def __init__(self, limit: Limit, vertices: np.ndarray):
         self.limit = limit  # It must live as long.
+        if np.ndim(vertices) != 2 or np.shape(vertices)[1] != 3 or len(vertices) <= limit.used[-1]:
+            raise InputError(
+                f"vertices have shape {np.shape(vertices)}; expected (V, 3), V at least {limit.used[-1] + 1}"
+            )
         try:
             self.handle = limit._left.pop()
         except IndexError:
@@ -227,7 +234,7 @@ class Points:
             limit._call("rts_points", limit.handle, ctypes.byref(handle))
             self.handle = handle.value or 0
         weakref.finalize(self, _leave, limit._library, limit._left, self.handle)
-        rows = np.ascontiguousarray(np.asarray(vertices, np.float64)[limit._used])
+        rows = np.ascontiguousarray(np.asarray(vertices, np.float64)[limit.used])
 
         def some(start: int, stop: int) -> None:
             limit._call("rts_move", self.handle, start, stop, rows.ctypes.data)
@@ -281,6 +288,9 @@ class Points:
         """
         faces, params = (x.copy() for x in self.limit._samples(faces, params))
         rays = [np.ascontiguousarray(x, np.float64) for x in (origins, directions, spread, limits)]
+        shapes = [x.shape for x in rays]
+        if shapes != [(len(faces), 3), (len(faces), 3), (2,), (5,)]:
+            raise InputError(f"rays and limits have shapes {shapes}; expected (N, 3), (N, 3), (2,) and (5,)")
         depth, met = np.empty(len(faces)), np.empty(len(faces), bool)
         data = [x.ctypes.data for x in (faces, params, *rays, depth, met)]
 
@@ -302,4 +312,5 @@ def _leave(library: ctypes.CDLL, left: list[int], points: int) -> None:
 def _free(library: ctypes.CDLL, cage: int, left: list[int]) -> None:
     for points in left:
         library.rts_points_free(points)
+    left[:] = [0]  # Of points that are freed later, in a cycle, nothing is kept.
     library.rts_cage_free(cage)

@@ -126,8 +126,8 @@ def checked_lists(name: str, lists: Any) -> tuple[np.ndarray, np.ndarray]:
         raise InputError(f"{name} has {len(sizes)} faces without corners; expected at least 3 corners a face")
     if flat.ndim != 1 or not np.issubdtype(flat.dtype, np.integer):
         raise InputError(f"{name} holds {quoted(flat.reshape(-1)[0])}; expected integers that name rows")
-    for bad, expected in ((flat.min(), "indices count from 0"), (flat.max(), "expected less than 2**31")):
-        if not 0 <= bad < 2**31:
+    for bad, expected in ((flat.min(), "indices count from 0"), (flat.max(), "expected less than 2**27")):
+        if not 0 <= bad < 2**27:
             raise InputError(f"{name} holds the index {bad}; {expected}")
     return sizes.astype(np.int32), flat.astype(np.int32)
 

@@ -106,12 +106,15 @@ def load() -> ctypes.CDLL:
 
 
 def _opened(tools: Tools) -> ctypes.CDLL:
-    path = _compiled(tools)
+    path = _compiled(tools, cache_folder())
     try:
         library = ctypes.CDLL(str(path))
     except OSError:  # Damaged, or made for an OpenSubdiv that is gone.
-        path.unlink(missing_ok=True)
-        path = _compiled(tools)
+        try:
+            path.unlink(missing_ok=True)
+            path = _compiled(tools, cache_folder())
+        except OSError:  # It cannot be removed.
+            path = _compiled(tools, Path(_own_folder().name))
         try:
             library = ctypes.CDLL(str(path))
         except OSError as error:
@@ -125,9 +128,9 @@ def _opened(tools: Tools) -> ctypes.CDLL:
     return library
 
 
-def _compiled(tools: Tools) -> Path:
-    """The library for these tools: as kept, or made now."""
-    folder, name = cache_folder(), f"opensubdiv-{_key(tools)}.so"
+def _compiled(tools: Tools, folder: Path) -> Path:
+    """The library for these tools: as kept in a folder, or made now."""
+    name = f"opensubdiv-{_key(tools)}.so"
     kept = folder / name
     if kept.is_file():
         return kept
@@ -150,9 +153,12 @@ def _compiled(tools: Tools) -> Path:
 
 def cache_folder() -> Path:
     """Where compiled libraries are kept."""
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "rts"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rts"
+    try:
+        if sys.platform == "darwin":
+            return Path.home() / "Library" / "Caches" / "rts"
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rts"
+    except RuntimeError:  # There is no home.
+        return Path(_own_folder().name)
 
 
 @functools.cache

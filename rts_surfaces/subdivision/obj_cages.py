@@ -51,6 +51,8 @@ def read_cage(path: Path) -> CageFile:
     if path.suffix.lower() != ".obj":
         raise InputError(f"{path} is no OBJ file; cages of subdivision surfaces are read from .obj")
     found = read_polygons(path)
+    if found.materials > 1:
+        warn(f"{path} has {found.materials} materials, of which a cage can have but one; none is taken", FileWarning)
     with np.errstate(over="ignore"):  # What overflows is refused.
         theta: dict[str, Any] = {"vertices": found.vertices.astype(np.float32)}
         options = _tagged(path, found.tags)

@@ -26,7 +26,7 @@ from rts.records import ArraySpec, Rays, Samples
 from rts.sampling.cache import fingerprint
 from rts.topology import fixed
 from rts.trees import Array, Tree
-from rts_surfaces.entries import G_BUFFER_NAMES, check_rows
+from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows
 from rts_surfaces.parametric import BEYOND, LARGEST_STEP, RESIDUAL, STEPS, TOLERANCE, Geometry, Parametric
 from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.binding import BOUNDARIES, UV, UV_RULES, VERTEX, Limit, Points, Rules
@@ -117,13 +117,15 @@ class Subdivision(Parametric):
         self.cage = checked_cage(faces, scheme, creases, corners)
         self._declared, self._uv = self._attribute_indices(indices)
         self._count = int(self.cage.indices.max()) + 1
+        self._uv_count = self._count if self._uv is None else int(self._uv.max()) + 1
         self._prepare()
-        super().__init__(tiles_of(self.limit), tolerance)
+        super().__init__(tiles_of(self.limit), tolerance, self.limit.used)
 
     def _attribute_indices(self, indices: Mapping[str, Any] | None) -> tuple[tuple[str, ...], np.ndarray | None]:
         """Names of attributes, and the rows of a face-varying uv (H,) or None."""
         if indices is not None and not isinstance(indices, Mapping):
             raise InputError(f"indices is {quoted(indices)}; expected a dict of name → None, or lists for 'uv'")
+        check_names(indices or (), ("normals",))
         uv = None
         for name, lists in (indices or {}).items():
             if lists is None:
@@ -148,7 +150,7 @@ class Subdivision(Parametric):
         return {name: value for name, value in vars(self).items() if name not in ("limit", "_points")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
+        super().__setstate__(state)
         self._prepare()
 
     def __repr__(self) -> str:
@@ -187,8 +189,7 @@ class Subdivision(Parametric):
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Refuse θ whose entries have wrong shapes or dtypes."""
         for name in self.reads(theta):
-            varying = self._uv if name == "uv" else None
-            check_rows(repr(self), theta, name, self._count if varying is None else int(varying.max()) + 1)
+            check_rows(repr(self), theta, name, self._uv_count if name == "uv" else self._count)
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
         """The entries of θ that `evaluate` needs."""
