@@ -5,7 +5,7 @@ is kept back and only measured. The cow has its texture, with seams, and is fitt
 unknowns are all vertices of the cage, by Adam in torch and jax. Written are a figure, animations and the numbers:
 
     python -m benchmarks.paper.subdivision -o out/subdivision
-    python -m benchmarks.paper.subdivision --quick       # 128² instead of 192², one engine
+    python -m benchmarks.paper.subdivision --quick       # 80² instead of 160², one engine
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from rts.engines import engine_named
 AZIMUTHS, HELD_BACK, ELEVATION = (0.0, 120.0, 240.0), 90.0, 15.0
 """Degrees. A view and the one from behind have almost the same outline: as lines, these three are 60° apart, and the
 view that is kept back is 30° from the nearest two, as far as it can be."""
-PIECE_STAGES = ((50.0, 0.05, 50), (10.0, 0.01, 50), (2.0, 0.004, 70), (0.5, 0.002, 60))
+PIECE_STAGES = ((50.0, 0.02, 60), (10.0, 0.01, 60), (2.0, 0.004, 70), (0.5, 0.002, 60))
 COW_STAGES = ((10.0, 0.02, 60), (2.0, 0.005, 60), (0.5, 0.002, 40))
 """Smoothness, rate of Adam and number of steps, from coarse to fine; each stage starts where the one before ended."""
 UPRIGHT = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -247,7 +247,7 @@ def run(folder: Path, side: int, engines: list[str]) -> list[dict[str, Any]]:
     (folder / "subdivision.json").write_text(json.dumps(rows, indent=2) + "\n")
     shown = {task.name: outcomes[task.name, engines[0]] for task in known}
     draw(folder / "subdivision.png", known, outcomes, rows, side)
-    rts.save_animation(folder / "subdivision.gif", frames(known, shown, 160), fps=10)
+    rts.save_animation(folder / "subdivision.gif", frames(known, shown, 128), fps=10)
     return rows
 
 
@@ -332,7 +332,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true")
     args = parser.parse_args()
     engines = args.engines or (["torch"] if args.quick else ["torch", "jax"])
-    run(args.output, 128 if args.quick else 192, engines)
+    run(args.output, 80 if args.quick else 160, engines)
 
 
 if __name__ == "__main__":
