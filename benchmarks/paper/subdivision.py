@@ -27,12 +27,11 @@ AZIMUTHS, HELD_BACK, ELEVATION = (0.0, 120.0, 240.0), 90.0, 15.0
 view that is kept back is 30° from the nearest two, as far as it can be."""
 PIECE_STAGES = ((50.0, 0.02, 60), (10.0, 0.01, 60), (2.0, 0.004, 70), (0.5, 0.002, 60))
 COW_STAGES = ((10.0, 0.02, 60), (2.0, 0.005, 60), (0.5, 0.002, 40))
-"""Smoothness, rate of Adam and number of steps, from coarse to fine; each stage starts where the one before ended."""
+"""Smoothness, rate of Adam and number of steps, coarse to fine; each stage starts where the one before was best."""
 UPRIGHT = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
 BEND = 0.4
 TEXTURE = 256
 WRONG, MISSING, RIGHT = (0.85, 0.15, 0.1), (0.1, 0.6, 0.2), (0.01, 0.01, 0.012)
-WHITE = (1.0, 1.0, 1.0)
 
 
 class Cage(NamedTuple):
@@ -174,16 +173,12 @@ def fitted(engine: str, task: Task, side: int) -> Outcome:
         def moved(unknowns: Any, at: np.ndarray = at, host: np.ndarray = host) -> np.ndarray:
             return at + host @ np.array(chosen.to_numpy(unknowns), np.float64)
 
-        def keep(_step: int, unknowns: Any, _loss: float, moved: Any = moved) -> bool:
-            trail.append(moved(unknowns))
-            return False
-
         found = rts.fit(
             residuals,
             chosen.constant(np.zeros_like(at, dtype=np.float32)),
             steps=steps,
             learning_rate=rate,
-            callback=keep,
+            callback=lambda _step, unknowns, _loss, moved=moved: trail.append(moved(unknowns)) and False,
             progress=False,
             jit=False,
         )
@@ -262,17 +257,16 @@ def line(row: dict[str, Any]) -> str:
     return text
 
 
-def lit(cage: Cage, vertices: np.ndarray, azimuth: float, side: int) -> np.ndarray:
+def lit(cage: Cage, vertices: np.ndarray, azimuth: float, side: int, shader: str = "lambert") -> np.ndarray:
     """(H, W, 3) on white."""
-    made = image(cage, vertices, azimuth, side, 2, "lambert")
+    made = image(cage, vertices, azimuth, side, 2, shader)
     return made[..., :3] + 1 - made[..., 3:]
 
 
 def picture(task: Task, vertices: np.ndarray, azimuth: float, side: int) -> np.ndarray:
     """(H, W, 3): the coloured image; or black where silhouettes agree, red where too wide, green where too narrow."""
     if task.shader == "textured":
-        made = image(task.cage, vertices, azimuth, side, 2, task.shader)
-        return made[..., :3] + 1 - made[..., 3:]
+        return lit(task.cage, vertices, azimuth, side, task.shader)
     mask = silhouette(task.cage, vertices, azimuth, side, 4)[..., None]
     target = silhouette(task.truth, task.truth.vertices, azimuth, side, 4)[..., None]
     both, wide, narrow = np.minimum(mask, target), np.maximum(mask - target, 0), np.maximum(target - mask, 0)
