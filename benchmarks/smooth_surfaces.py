@@ -41,6 +41,8 @@ LEARNING_RATE = 1e-7
 """So small that the shape stays what it is while time is taken."""
 BUDGET = 20.0
 """Seconds of timed calls after which a contender has had enough turns."""
+MOST_FACETS = 6_000_000
+"""Beyond this there is no mesh with a facet a pixel."""
 COLUMNS = {"ms": ("ms", ".1f"), "gradient": ("gradient", ".2g"), "MiB": ("memory", ".0f")}
 REFINED, AS_FOUND, MESH, PIXEL = "refined", "as found", "mesh", "mesh, a facet a pixel"
 STYLES = {
@@ -262,7 +264,9 @@ def measure(name: str, size: tuple[int, int], rounds: int) -> list[dict[str, Any
     reference = patches(REFINED, scene, TOLERANCES[-2] / FINER)
     contenders = [patches(kind, scene, t) for kind in (REFINED, AS_FOUND) for t in TOLERANCES]
     contenders += [mesh(MESH, scene, rate) for rate in scene.rates]
-    contenders.append(mesh(PIXEL, scene, rate_of_a_pixel(scene, size)))
+    rate = rate_of_a_pixel(scene, size)
+    if 2 * rate**2 * int(scene.surface(1.0).whole.patch.max() + 1) <= MOST_FACETS:
+        contenders.append(mesh(PIXEL, scene, rate))
     side = size[0] * PART_OF_PIXEL
     truth = covered(reference.at(size), side)
     length = outline(truth) * PART_OF_PIXEL

@@ -148,6 +148,7 @@ def test_only_the_plugin_asked_for_is_imported():
     assert {"rts_backends.reference", "rts_surfaces.mesh"} <= loaded
     assert {m for m in loaded if m.startswith(("rts_backends.", "rts_surfaces."))} == {
         "rts_backends.reference",
+        "rts_surfaces.entries",
         "rts_surfaces.mesh",
     }
     assert not loaded & set(HEAVY)
