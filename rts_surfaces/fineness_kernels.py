@@ -1,0 +1,247 @@
+"""How finely tiles are to be cut: their shapes, where outlines may be, and rates. Compiled.
+
+Tiles, their tables and their local coordinates are those of `rts_surfaces.tiles.Tiles`. It imports numba.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+compiled = numba.njit(nogil=True)
+kernel = numba.njit(nogil=True, cache=True)
+
+COLLAPSED = 1e-6
+"""Derivatives that are parallel but for this share have no normal."""
+
+
+@compiled
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+# ---------------------------------------------------------------------------------------------------- shapes
+
+
+@compiled
+def _slopes(found, frame, slopes):
+    """Derivatives along s and t (2, 3), of those in parameters of the patch."""
+    for k in range(2):
+        for c in range(3):
+            slopes[k, c] = frame[1 + k, 0] * found[1, c] + frame[1 + k, 1] * found[2, c]
+
+
+@compiled
+def _second(found, a, b, c):
+    """The component c of the second derivative along two directions in parameters of the patch."""
+    return a[0] * b[0] * found[3, c] + (a[0] * b[1] + a[1] * b[0]) * found[4, c] + a[1] * b[1] * found[5, c]
+
+
+@compiled
+def _normal(slopes, out):
+    """Fill the unit normal, and return whether there is one; else it is zero."""
+    for c in range(3):
+        x, y = (c + 1) % 3, (c + 2) % 3
+        out[c] = slopes[0, x] * slopes[1, y] - slopes[0, y] * slopes[1, x]
+    length = math.sqrt(_dot(out, out))
+    there = length > COLLAPSED * math.sqrt(_dot(slopes[0], slopes[0]) * _dot(slopes[1], slopes[1])) and length > 0
+    for c in range(3):
+        out[c] = out[c] / length if there else 0.0
+    return there
+
+
+@kernel
+def shapes(start, stop, found, frames, normals, places, bends):
+    """Fill what is asked of the shape of tiles.
+
+    Args:
+        start: first tile.
+        stop: one after the last.
+        found: (n, G G, 6, 3) float64, points and derivatives in parameters of patches, on a grid of G points a side.
+        frames: (n, 3, 2) float64.
+        normals: (n, G, G, 3), of unit length, or zero.
+        places: (n, G, G, 3), where these are.
+        bends: (n, 3), the largest second derivatives along the normal: in s, in s and t, in t; without a normal, their
+            lengths. Chords are off by those alone: what lies along the surface only moves points within it.
+    """
+    grid, slopes = normals.shape[1], np.empty((2, 3))
+    for n in range(start, stop):
+        frame = frames[n]
+        bends[n] = 0
+        for k in range(grid * grid):
+            normal = normals[n, k // grid, k % grid]
+            _slopes(found[n, k], frame, slopes)
+            there = _normal(slopes, normal)
+            for c in range(3):
+                places[n, k // grid, k % grid, c] = found[n, k, 0, c]
+            for m in range(3):
+                a, b = frame[1 if m < 2 else 2], frame[1 if m < 1 else 2]
+                size, straight = 0.0, 0.0
+                for c in range(3):
+                    x = _second(found[n, k], a, b, c)
+                    size, straight = size + x * x, straight + x * normal[c]
+                bends[n, m] = max(bends[n, m], abs(straight) if there else math.sqrt(size))
+
+
+@kernel
+def curves(start, stop, found, frames, along, out):
+    """Fill out (E,), the largest second derivatives of edges across themselves.
+
+    Args:
+        start: first edge.
+        stop: one after the last.
+        found: (E, G, 6, 3) float64, points and derivatives in parameters of the patch of one of its tiles.
+        frames: (E, 3, 2) float64, of that tile.
+        along: (E, 2) float64, the direction of the edge in the tile's local coordinates.
+        out: (E,) float64.
+    """
+    tangent, bend, way = np.empty(3), np.empty(3), np.empty(2)
+    for e in range(start, stop):
+        for i in range(2):
+            way[i] = along[e, 0] * frames[e, 1, i] + along[e, 1] * frames[e, 2, i]
+        out[e] = 0
+        for k in range(found.shape[1]):
+            for c in range(3):
+                tangent[c] = way[0] * found[e, k, 1, c] + way[1] * found[e, k, 2, c]
+                bend[c] = _second(found[e, k], way, way, c)
+            square, own = _dot(tangent, tangent), _dot(bend, bend)
+            if square > 0:
+                own -= _dot(tangent, bend) ** 2 / square
+            out[e] = max(out[e], math.sqrt(max(own, 0.0)))
+
+
+# ----------------------------------------------------------------------------------------------- how fine
+
+
+@kernel
+def outlines(
+    start, stop, places, normals, bends, eye, toward, parallel, aside, depth, spread, cone, wanted, chord, edge, facing
+):
+    """Fill how far triangles of tiles may be off the surface, in units of space; infinity where out of view.
+
+    Args:
+        start: first tile.
+        stop: one after the last.
+        places: (n, G, G, 3), points at a grid.
+        normals: (n, G, G, 3).
+        bends: (n, 3), the largest second derivatives along the normal.
+        eye: (3,), or the direction towards the viewer if `parallel`.
+        toward: (3,) unit, from the middle of the surface to the eye.
+        parallel: whether rays are.
+        aside: how far the eye may be off sideways; where parallel, how far the direction.
+        depth: how far it may be off along `toward`.
+        spread: (2,), width of a pixel at depth z.
+        cone: (5,): the axis of the view, sine and cosine of its half angle with what the view may be off.
+        wanted: (2,) pixels: where a tile may have an outline, and elsewhere.
+        chord: (n,), of each tile.
+        edge: (n,), of its edges, should they be outlines.
+        facing: (n,) int8: 1 where all of it faces the viewer, −1 where none does, else 0.
+    """
+    grid, move = places.shape[1], aside + depth
+    faces, view, middle = np.empty((grid, grid)), np.empty(3), np.empty(3)
+    for t in range(start, stop):
+        for c in range(3):
+            middle[c] = places[t, :, :, c].mean()
+        radius = 0.0
+        for i in range(grid):
+            for j in range(grid):
+                for c in range(3):
+                    view[c] = places[t, i, j, c] - middle[c]
+                radius = max(radius, _dot(view, view))
+        # Between points of the grid the surface bulges by less than over the whole tile.
+        radius = math.sqrt(radius) + (bends[t, 0] + 2 * bends[t, 1] + bends[t, 2]) / 8
+        nearest = np.inf
+        if not parallel:
+            for c in range(3):
+                view[c] = middle[c] - eye[c]
+            distance = math.sqrt(_dot(view, view))
+            if distance > radius + move:
+                along = _dot(view, cone)
+                across = math.sqrt(max(distance * distance - along * along, 0.0))
+                # Out of the cone by more than its own size, and that of the cell of views.
+                if across * cone[4] - along * cone[3] > radius + move:
+                    chord[t], edge[t], facing[t] = np.inf, np.inf, 0
+                    continue
+        least, most, jump = np.inf, -np.inf, 0.0
+        for i in range(grid):
+            for j in range(grid):
+                far, slack = 1.0, aside
+                for c in range(3):
+                    view[c] = eye[c] if parallel else eye[c] - places[t, i, j, c]
+                if not parallel:
+                    far = math.sqrt(_dot(view, view))
+                    nearest = min(nearest, far - move)
+                    # What moves along the line of sight does not turn it.
+                    ahead = _dot(view, toward)
+                    slack += depth * math.sqrt(max(far * far - ahead * ahead, 0.0)) / far if far > 0 else depth
+                faces[i, j] = _dot(normals[t, i, j], view) / far if far > 0 else 0.0
+                slack = 1.0 if far <= move and not parallel else min(1.0, slack / far)
+                least, most = min(least, faces[i, j] - slack), max(most, faces[i, j] + slack)
+        for i in range(grid):
+            for j in range(grid - 1):
+                jump = max(jump, abs(faces[i, j] - faces[i, j + 1]), abs(faces[j, i] - faces[j + 1, i]))
+        facing[t] = 1 if least - 0.25 * jump > 0 else -1 if most + 0.25 * jump < 0 else 0
+        width = spread[0] if parallel else abs(spread[1] * max(nearest, 0.0))
+        # The eye may be at the tile: then as fine as its size asks for.
+        edge[t] = max(width * wanted[0], 1e-4 * radius)
+        chord[t] = edge[t] if facing[t] == 0 else max(width * wanted[1], 1e-4 * radius)
+
+
+@kernel
+def rates(bends, curves, chord, edge, facing, sides, least, most, inner, edges):
+    """Fill how often tiles and their sides are cut: inner (n, 2) along s and t, edges (E,).
+
+    Args:
+        bends: (n, 3).
+        curves: (E,).
+        chord: (n,), how far triangles of a tile may be off; infinity where out of view.
+        edge: (n,), how far those at its edges may be, should they be outlines.
+        facing: (n,) int8: 1 where all of it faces the viewer, −1 where none does, else 0.
+        sides: (n, k) int32, the edge of each side.
+        least: the least rate of a tile that is cut.
+        most: the largest rate.
+        inner: (n, 2) int32.
+        edges: (E,) int32.
+    """
+    fine, finest, width = np.full(len(edges), np.inf), np.full(len(edges), np.inf), sides.shape[1]
+    beside, front, back = np.zeros(len(edges), np.int32), np.zeros(len(edges), np.bool_), np.zeros(len(edges), np.bool_)
+    for t in range(len(bends)):
+        for s in range(width):
+            e = sides[t, s]
+            fine[e], finest[e] = min(fine[e], chord[t]), min(finest[e], edge[t])
+            beside[e] += 1
+            front[e] |= facing[t] > 0
+            back[e] |= facing[t] < 0
+    for e in range(len(edges)):
+        # Where the surface ends, and at creases between front and back, the edge itself is an outline.
+        if beside[e] == 1 or (front[e] and back[e]):
+            fine[e] = min(fine[e], finest[e])
+        edges[e] = 1
+        if fine[e] < np.inf and curves[e] > 0:
+            edges[e] = int(min(most, max(1.0, math.ceil(math.sqrt(curves[e] / (8 * fine[e]))))))
+    for t in range(len(bends)):
+        allowed = chord[t]
+        ru, rv = 1.0, 1.0
+        if allowed < np.inf:
+            uu, uv, vv = bends[t, 0], bends[t, 1], bends[t, 2]
+            ru, rv = max(1.0, math.sqrt(uu / (4 * allowed))), max(1.0, math.sqrt(vv / (4 * allowed)))
+            # The error of a triangle's chord (Filip, Magedson, Markot 1986).
+            error = (uu / (ru * ru) + 2 * uv / (ru * rv) + vv / (rv * rv)) / 8
+            if error > allowed:
+                grow = math.sqrt(error / allowed)
+                ru, rv = ru * grow, rv * grow
+        if width == 3:
+            ru = rv = max(ru, rv)
+        inner[t, 0], inner[t, 1] = int(min(most, math.ceil(ru))), int(min(most, math.ceil(rv)))
+        for s in range(width):
+            # Cut alike, a side and what lies within make no long triangles.
+            if chord[t] <= fine[sides[t, s]] and allowed < np.inf:
+                edges[sides[t, s]] = max(edges[sides[t, s]], inner[t, s % 2])
+    for t in range(len(bends)):
+        cut = inner[t, 0] > 1 or inner[t, 1] > 1
+        for s in range(width):
+            cut |= edges[sides[t, s]] > 1
+        if cut:
+            inner[t, 0], inner[t, 1] = max(inner[t, 0], least), max(inner[t, 1], least)
