@@ -152,6 +152,19 @@ class Engine(Plugin):
             state = body(state)
         return state
 
+    def map_rows(self, f: Callable[[Array], Array], rows: Array, size: int) -> Array:
+        """The values `f(rows)` of a function that treats each row by itself, so many rows at a time.
+
+        What is computed of more rows than memory has room for at once; it is not for derivatives.
+
+        Args:
+            f: rows (size, ·) → (size, ·).
+            rows: (M, ·).
+            size: the number of rows of one call; the last call may have fewer.
+        """
+        parts = [f(rows[i : i + size]) for i in range(0, rows.shape[0], size)]
+        return parts[0] if len(parts) == 1 else self.namespace.concat(parts)
+
     # ---------------------------------------------------------------------------------------------- derivatives
 
     def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Array]) -> Array:

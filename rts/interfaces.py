@@ -99,6 +99,8 @@ class TriangleSurface(Surface):
         proxy_is_cheap: whether making the triangles costs no more than looking whether their inputs have changed.
         depends_on_view: whether the triangles depend on camera and size; True in a class with its own `proxy_key`.
         refines: whether samples on the triangles go through `refine`; True in a class with its own `refine`.
+        refine_moves: whether `refine` moves samples or drops them. Where it only adds to what they carry, hidden ones
+            are left out before.
         face_count: how many triangles there are, or None if that is not known beforehand; the sampler "auto" goes by
             it.
     """
@@ -108,6 +110,7 @@ class TriangleSurface(Surface):
     proxy_is_cheap: bool = False
     depends_on_view: bool = False
     refines: bool = False
+    refine_moves: bool = True
     face_count: int | None = None
 
     @abc.abstractmethod
@@ -157,6 +160,14 @@ class TriangleSurface(Surface):
         """
         return samples
 
+    def why_no_triangles(self, inputs: Tree) -> str:
+        """What a warning says of the surface where `proxy` has no triangles; `{}` stands for the part.
+
+        Args:
+            inputs: what `proxy_inputs` gave, on the host.
+        """
+        return "{} has no triangles"
+
     def tessellate(self, theta: Mapping[str, Tree], rate: int | float) -> tuple[np.ndarray, np.ndarray]:
         """A mesh whose vertices lie on the surface.
 
@@ -196,7 +207,14 @@ class TriangleSurface(Surface):
 
 
 class RaySurface(Surface):
-    """A surface that intersects rays itself, for the sampler `rays`."""
+    """A surface that intersects rays itself, for the sampler `rays`.
+
+    Attributes:
+        hit_widths: (I, P) of the samples that `intersect` gives; None for `sample_widths`. A surface that has triangles
+            too may tell the two kinds of samples apart by their widths.
+    """
+
+    hit_widths: tuple[int, int] | None = None
 
     @abc.abstractmethod
     def intersect(self, theta: Mapping[str, Tree], origins: Array, directions: Array, layers: int) -> RayHits:

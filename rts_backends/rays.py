@@ -59,7 +59,7 @@ class Rays(Sampler):
         packed = ArraySpec((rows,), np.int32, packed=capacity is None)
         specs = packed, ArraySpec((layers, *size), np.int32), ArraySpec((), np.int32)
         index, row, overflow = engine.call_host(pack, specs, hit)
-        width_i, width_p = surface.sample_widths
+        width_i, width_p = surface.hit_widths or surface.sample_widths
         params = xp.take(xp.reshape(hits.params, (cells, width_p)), index, axis=0)
         if hits.ids is None:
             ids = xp.zeros_like(params[:, :0], dtype=xp.int32)
@@ -73,7 +73,7 @@ def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, 
     """What `intersect` of a surface gave, which must have the right shapes."""
     if not isinstance(hits, RayHits):
         raise InputError(f"intersect of {surface!r} gave a {type(hits).__name__}; expected rts.RayHits")
-    grid, (i, p) = (layers, size[0] * size[1]), surface.sample_widths
+    grid, (i, p) = (layers, size[0] * size[1]), surface.hit_widths or surface.sample_widths
     given = tuple(map(shape_of, (hits.hit, hits.distance, hits.params, *([] if hits.ids is None else [hits.ids]))))
     expected = grid, grid, (*grid, p), *([] if hits.ids is None and i == 0 else [(*grid, i)])
     if given != expected:

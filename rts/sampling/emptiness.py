@@ -31,7 +31,7 @@ def _cause(part: CheckedPart, camera: Camera) -> str:
     inputs, local = known
     proxy = part.surface.proxy(inputs, local, (1, 1))
     if not len(proxy.faces):
-        return "{} has no triangles"
+        return part.surface.why_no_triangles(inputs)
     corners = proxy.vertices[np.unique(proxy.faces)].astype(np.float64)
     at = np.concatenate([corners, np.ones((len(corners), 1))], axis=1) @ (local.projection @ local.view).T
     depth = -(corners @ local.view[2, :3] + local.view[2, 3])

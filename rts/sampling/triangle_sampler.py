@@ -16,7 +16,7 @@ from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, Surface, Tr
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.packing import lift, repack
-from rts.sampling.settling import on_surface
+from rts.sampling.settling import on_surface, refined
 from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
 
@@ -195,7 +195,7 @@ class TriangleSampler(Sampler):
     ) -> Samples:
         """The samples that are to be kept, on the host."""
         # Of tables there is but one set, so that no samples can be added later.
-        more = surface.refines and not tables
+        more = surface.refines and surface.refine_moves and not tables
         grid = max(shape.layers + 1, LEAST_LAYERS) if more else shape.layers, *shape.size
         with self._keeper.lock:
             found = entry or self._entry(surface, inputs, camera, shape.size)
@@ -205,9 +205,12 @@ class TriangleSampler(Sampler):
             else:
                 fragments = _no_fragments(grid)
         covered = fragments.triangle_ids >= 0
-        if not surface.refines:
+        if not (surface.refines and surface.refine_moves):
             kept = covered if needed is None else needed(covered, fragments.depth)
-            return lift(fragments, found.proxy, shape.capacity, kept)
+            if not surface.refines:
+                return lift(fragments, found.proxy, shape.capacity, kept)
+            samples, _ = refined(surface, inputs, lift(fragments, found.proxy, None, kept), camera, tables)
+            return repack(samples, samples.row >= 0, shape.capacity)
         settled = on_surface(surface, inputs, fragments, found.proxy, camera, shape.layers, tables)
         # `needed` is asked only now, since it goes by the final depths.
         left = kept = settled.row >= 0

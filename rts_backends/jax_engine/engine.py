@@ -181,6 +181,17 @@ class JaxEngine(Engine):
             state = jax.lax.stop_gradient(body(state))
         return state
 
+    def map_rows(self, f: Callable[[jax.Array], jax.Array], rows: jax.Array, size: int) -> jax.Array:
+        """See `Engine.map_rows`; all calls are of the shape of one, so that a program holds `f` only once."""
+        count = rows.shape[0]
+        if count <= size:
+            return f(rows)
+        pieces = jnp.pad(rows, ((0, -count % size), *[(0, 0)] * (rows.ndim - 1))).reshape(-1, size, *rows.shape[1:])
+        first = f(pieces[0])
+        traced = isinstance(first, Tracer)
+        found = jax.lax.map(f, pieces) if traced else jnp.stack([first, *[f(piece) for piece in pieces[1:]]])
+        return found.reshape(-1, *found.shape[2:])[:count]
+
     @staticmethod
     def _looped(body: Callable, going: Callable, state: Tree, most: int) -> Tree:
         def step(counted: tuple) -> tuple:

@@ -1,0 +1,166 @@
+"""Functions of space, as surfaces use them: those that are negative inside, and what surfaces of fields share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import Any
+
+from rts.arguments import check_numbers, quoted
+from rts.arrays import kind_of, shape_of, unit
+from rts.engines import engine_of, namespace
+from rts.errors import EngineError, InputError
+from rts.gbuffer import GBuffer
+from rts.interfaces import Surface
+from rts.operations.gradient import gradient
+from rts.trees import Array, Tree, leaves
+from rts_surfaces.entries import RESERVED
+
+Function = Callable[[Mapping[str, Tree], Array], Array]
+"""A function of θ and points (M, 3)."""
+
+SIDES = {"below": 1.0, "above": -1.0}
+"""Which values are inside, and what turns these negative."""
+
+
+class Field:
+    """A scalar function of space that θ parametrizes; its surface is where it has one value.
+
+    Args:
+        f: (θ, points (M, 3)) → (M,), in array code; points and results are in θ's dtype, float32 at least. It may hold
+            for one engine only, such as a network of torch by `torch.func.functional_call`.
+        isovalue: the value on the surface.
+        inside: which values are inside, "below" the isovalue or "above" it.
+        reads: the names of the entries of θ that `f` reads; None for all.
+
+    Attributes:
+        name: what `f` is called.
+
+    Raises:
+        InputError: wrong arguments.
+    """
+
+    def __init__(self, f: Function, isovalue: float = 0.0, inside: str = "below", reads: Iterable[str] | None = None):
+        check_function("f", f)
+        value = check_numbers("isovalue", isovalue, ())
+        if value is None:
+            raise InputError("isovalue is traced; expected a known number, or subtract it in f")
+        if not isinstance(inside, str) or inside not in SIDES:
+            raise InputError(f"inside is {quoted(inside)}; expected 'below' or 'above'")
+        if reads is not None and (
+            isinstance(reads, str) or not isinstance(reads, Iterable) or not all(isinstance(n, str) for n in reads)
+        ):
+            raise InputError(f"reads is {quoted(reads)}; expected names of entries of theta, or None for all")
+        self.f, self.isovalue, self.inside = f, float(value), inside
+        self.name = getattr(f, "__name__", type(f).__name__)
+        self._reads = None if reads is None else tuple(reads)
+
+    def __repr__(self) -> str:
+        return f"Field({self.name}, {self.isovalue:g}, {self.inside!r})"
+
+    def names(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
+        """The names of the entries of θ that `f` reads."""
+        return tuple(theta) if self._reads is None else self._reads
+
+    def level(self, theta: Mapping[str, Tree], points: Array) -> Array:
+        """How far `f` is from the isovalue, negative inside; what has the isovalue itself counts as outside.
+
+        Args:
+            theta: θ.
+            points: (M, 3) float, of θ's engine.
+
+        Returns:
+            (M,), in the dtype of the points.
+
+        Raises:
+            InputError: `f` gave another shape, dtype or engine.
+        """
+        value = self.f(theta, points)
+        check_result("f", value, points)
+        return SIDES[self.inside] * (value - self.isovalue)
+
+    def slope(self, theta: Mapping[str, Tree], points: Array) -> Array:
+        """The gradient (M, 3) of `level` at points (M, 3), towards the outside; see `rts.gradient`."""
+        return gradient(partial(self.level, theta), points)
+
+    def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
+        """The points in the widest floating dtype of what `f` reads, float32 at least."""
+        xp, bits = namespace(points), 0
+        for x in leaves({name: theta[name] for name in self.names(theta)}):
+            if hasattr(x, "dtype") and namespace(x).isdtype(x.dtype, "real floating"):
+                bits = max(bits, namespace(x).finfo(x.dtype).bits)
+        if not bits:
+            return points
+        return xp.astype(points, xp.float64 if bits == 64 else xp.float32, copy=False)
+
+
+class Implicit(Surface):
+    """What surfaces of a field share: which entries of θ they read, and their G-buffer.
+
+    Args:
+        field: the field.
+        attributes: name → g(θ, positions (N, 3)) → (N, C): further entries of the G-buffer, such as "color". They are
+            computed if the shader reads them. They may read any entry of θ.
+
+    Raises:
+        InputError: an attribute has no function, or a name that means something else.
+    """
+
+    def __init__(self, field: Field, attributes: Mapping[str, Function] | None = None):
+        if attributes is not None and not isinstance(attributes, Mapping):
+            raise InputError(f"attributes is {quoted(attributes)}; expected a dict of name → function")
+        for name, g in (attributes or {}).items():
+            if not isinstance(name, str) or name in RESERVED:
+                raise InputError(f"attributes declares {name!r}, which is no further attribute; expected another name")
+            check_function(f"attributes[{name!r}]", g)
+        self.field, self.attributes = field, dict(attributes or {})
+
+    def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
+        """What the field reads; all entries where there are attributes."""
+        return tuple(theta) if self.attributes else self.field.names(theta)
+
+    def check(self, theta: Mapping[str, Tree]) -> None:
+        """Refuse θ that lacks an entry which the field reads. What `f` makes of it is checked when it is called."""
+        for name in self.field.names(theta):
+            if name not in theta:
+                raise InputError(f"theta of {self!r} has no {name!r}; it has {sorted(theta)}")
+
+    def gbuffer(self, theta: Mapping[str, Tree], position: Array) -> GBuffer:
+        """Positions (N, 3) on the surface, with normals of unit length, outwards, and the attributes, when read.
+
+        All are differentiable in θ and in the positions. A normal is zero where the field has no slope.
+        """
+        gbuffer = GBuffer(position=position)
+        gbuffer.defer("normal", lambda: unit(self.field.slope(theta, position)))
+        for name, g in self.attributes.items():
+            gbuffer.defer(name, partial(_attribute, name, g, theta, position))
+        return gbuffer
+
+
+def check_function(name: str, f: Any) -> None:
+    """Refuse what is no function of θ and points; a class is none, its objects may be."""
+    if not callable(f) or isinstance(f, type):
+        raise InputError(f"{name} is {quoted(f)}; expected a function of theta and points (M, 3)")
+
+
+def check_result(name: str, value: Any, points: Array, columns: bool = False) -> None:
+    """Refuse what a function gave for points (M, 3), if it is not (M,), or (M, C), in their engine and dtype."""
+    engine, count = engine_of(points), points.shape[0]
+    expected = f"({count}, C)" if columns else f"({count},)"
+    try:
+        own = hasattr(value, "dtype") and engine_of(value) is engine
+    except EngineError:
+        own = False
+    if not own:
+        raise InputError(f"{name} gave {kind_of(value)} for points of {engine.name}; expected its array {expected}")
+    shape = shape_of(value)
+    if len(shape) != 1 + columns or shape[0] != count:
+        raise InputError(f"{name} gave shape {shape} for {count} points; expected {expected}")
+    if value.dtype != points.dtype:
+        raise InputError(f"{name} gave {value.dtype} for points of {points.dtype}; expected {points.dtype}")
+
+
+def _attribute(name: str, g: Function, theta: Mapping[str, Tree], position: Array) -> Array:
+    value = g(theta, position)
+    check_result(f"attributes[{name!r}]", value, position, columns=True)
+    return value

@@ -1,0 +1,83 @@
+"""Lattices: points at equal distances along three axes, numbered."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rts.arguments import check_numbers, quoted
+from rts.checks import is_count
+from rts.engines import namespace
+from rts.errors import InputError
+from rts.trees import Array
+
+MOST_POINTS = 2**31 - 1
+"""Points are numbered by int32."""
+
+
+class Lattice:
+    """X × Y × Z points from one corner of a box to the opposite one. Point (x, y, z) has the number (x Y + y) Z + z.
+
+    Args:
+        bounds: two corners ((x0, y0, z0), (x1, y1, z1)) of the box, the lower one first.
+        shape: (X, Y, Z), at least 2 each, at most `MOST_POINTS` in all.
+
+    Attributes:
+        shape: (X, Y, Z).
+        low: (3,) float64, the first point.
+        step: (3,) float64, the distance of neighbours along each axis.
+
+    Raises:
+        InputError: there is no such lattice.
+    """
+
+    def __init__(self, bounds: Any, shape: Any):
+        self.low, high = check_bounds(bounds)
+        self.shape = check_shape(shape)
+        self.step = (high - self.low) / (np.array(self.shape) - 1)
+
+    @property
+    def count(self) -> int:
+        """The number of points."""
+        x, y, z = self.shape
+        return x * y * z
+
+    def points(self, numbers: np.ndarray) -> np.ndarray:
+        """The places (M, 3) float64 of points by number (M,)."""
+        return self.low + self.step * np.stack(np.unravel_index(numbers, self.shape), axis=-1)
+
+    def places(self, numbers: Array, dtype: Any) -> Array:
+        """The places (M, 3) of points by number (M,) int32, in array code."""
+        xp = namespace(numbers)
+        _, y, z = self.shape
+        steps = numbers // (y * z), numbers // z % y, numbers % z
+        low, step = self.low.tolist(), self.step.tolist()
+        return xp.stack([low[i] + step[i] * xp.astype(steps[i], dtype) for i in range(3)], axis=-1)
+
+
+def check_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The lower and the upper corner (3,) of a box, in float64; refused where they are none."""
+    known = check_numbers("bounds", bounds, (2, 3))
+    if known is None:
+        raise InputError("bounds are traced; expected known numbers ((x0, y0, z0), (x1, y1, z1))")
+    low, high = np.asarray(known, np.float64)
+    if not (low < high).all():
+        raise InputError(f"bounds are {quoted(bounds)}; expected ((x0, y0, z0), (x1, y1, z1)) with each x0 < x1")
+    return low, high
+
+
+def check_shape(shape: Any) -> tuple[int, int, int]:
+    """(X, Y, Z) as integers, refused where there is no such lattice."""
+    try:
+        given = tuple(shape)
+    except TypeError:
+        given = ()
+    if len(given) != 3 or not all(is_count(n) and n >= 2 for n in given):
+        raise InputError(
+            f"the lattice has shape {quoted(shape)}; expected (X, Y, Z), at least 2 points along each axis"
+        )
+    x, y, z = (int(n) for n in given)
+    if x * y * z > MOST_POINTS:
+        raise InputError(f"a lattice has {x} × {y} × {z} points; expected at most 2**31 − 1, 1290 along each axis")
+    return x, y, z

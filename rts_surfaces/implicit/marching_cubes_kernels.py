@@ -1,0 +1,225 @@
+"""Marching cubes, compiled: cells whose corners differ in sign, the vertices on their edges, their triangles.
+
+Cells are met layer by layer along x. Each owns the three edges that begin at its lowest corner, so that layers can be
+made side by side: the first loop counts, the second writes. So that every edge has an owner, there is one more cell
+along each axis than fit between the points; where the surface is closed there is one before the first point, too.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+
+@numba.njit(nogil=True, inline="always")
+def _signs(values, isovalue, sign, closed, x, out):
+    """Fill `out` with 1 for each point of plane x that is inside, with the cells' border around it."""
+    shape_x, shape_y, shape_z = values.shape
+    outside = x < 0 or x >= shape_x
+    if closed and outside:
+        out[:] = 0
+        return
+    x = min(x, shape_x - 1)
+    shift = 1 if closed else 0
+    for y in range(shape_y):
+        row, given = out[y + shift], values[x, y]
+        for z in range(shape_z):
+            row[z + shift] = sign * (given[z] - isovalue) < 0
+        if closed:
+            row[0], row[shape_z + 1] = 0, 0
+        else:  # Beyond an open end all stays as it is, which crosses no edge.
+            row[shape_z] = row[shape_z - 1]
+    if closed:
+        out[0], out[shape_y + 1] = 0, 0
+    else:
+        out[shape_y] = out[shape_y - 1]
+
+
+@numba.njit(nogil=True, inline="always")
+def _codes(low, high, y, count, out):
+    """Fill `out` with the cases of a row of cells between two planes of signs."""
+    a, b, c, d = low[y], high[y], low[y + 1], high[y + 1]
+    for z in range(count):
+        below = a[z] | b[z] << 1 | c[z] << 2 | d[z] << 3
+        above = a[z + 1] | b[z + 1] << 1 | c[z + 1] << 2 | d[z + 1] << 3
+        out[z] = below | above << 4
+
+
+@numba.njit(nogil=True, inline="always")
+def _is_real(x, y, z, shape, closed):
+    """Whether a cell, counted with the border, has triangles."""
+    return closed or (x < shape[0] - 1 and y < shape[1] - 1 and z < shape[2] - 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
+    """Count mixed cells, vertices and triangles of layers `start` to `stop` into `tally` (layers, 3)."""
+    shape = values.shape
+    border = 2 if closed else 1
+    planes = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8)
+    cells_y, cells_z = shape[1] + border - 1, shape[2] + border - 1
+    codes = np.zeros((cells_z + 7) // 8 * 8, np.uint8)
+    words = codes.view(np.uint64)
+    first = -1 if closed else 0
+    _signs(values, isovalue, sign, closed, start + first, planes[0])
+    full = np.uint64(0xFFFFFFFFFFFFFFFF)
+    for x in range(start, stop):
+        low, high = planes[(x - start) % 2], planes[(x - start + 1) % 2]
+        _signs(values, isovalue, sign, closed, x + first + 1, high)
+        mixed = crossed = triangles = 0
+        for y in range(cells_y):
+            _codes(low, high, y, cells_z, codes)
+            for w in range(len(words)):
+                if words[w] == 0 or words[w] == full:
+                    continue
+                for z in range(8 * w, min(8 * w + 8, cells_z)):
+                    code = codes[z]
+                    if code == 0 or code == 255:
+                        continue
+                    mixed += 1
+                    own = code & 1
+                    crossed += (own != code >> 1 & 1) + (own != code >> 2 & 1) + (own != code >> 4 & 1)
+                    if _is_real(x, y, z, shape, closed):
+                        triangles += triangles_of[code]
+        tally[x, 0], tally[x, 1], tally[x, 2] = mixed, crossed, triangles
+
+
+@numba.njit(cache=True, nogil=True)
+def vertices(
+    start, stop, values, isovalue, sign, closed, origin, step, offsets, cells, codes_of, first_of, ends, places, apart
+):
+    """List the mixed cells of layers, and the vertices on the edges that they own.
+
+    Args:
+        start: the first layer.
+        stop: the layer after the last.
+        values: (X, Y, Z).
+        isovalue: see `of_lattice`.
+        sign: see `of_lattice`.
+        closed: see `of_lattice`.
+        origin: (3,), the place of the first point.
+        step: (3,).
+        offsets: (layers, 3), how many cells, vertices and triangles lie in layers before.
+        cells: (C,) to be filled: y * (number of cells along z) + z within its layer.
+        codes_of: (C,) to be filled: the case of each.
+        first_of: (layers, cells along y, cells along z), filled at mixed cells: eight times the first vertex that it
+            owns, plus a bit for each axis along which its own edge is crossed.
+        ends: (V, 2) to be filled.
+        places: (V, 3) to be filled.
+        apart: (V,) to be filled.
+    """
+    shape = values.shape
+    border = 2 if closed else 1
+    planes = np.zeros((2, shape[1] + border, shape[2] + border), np.uint8)
+    cells_y, cells_z = shape[1] + border - 1, shape[2] + border - 1
+    codes = np.zeros((cells_z + 7) // 8 * 8, np.uint8)
+    words = codes.view(np.uint64)
+    shift = 1 if closed else 0
+    _signs(values, isovalue, sign, closed, start - shift, planes[0])
+    full = np.uint64(0xFFFFFFFFFFFFFFFF)
+    a, b = np.empty(3, np.int64), np.empty(3, np.int64)
+    for x in range(start, stop):
+        low, high = planes[(x - start) % 2], planes[(x - start + 1) % 2]
+        _signs(values, isovalue, sign, closed, x - shift + 1, high)
+        cell, vertex = offsets[x, 0], offsets[x, 1]
+        for y in range(cells_y):
+            _codes(low, high, y, cells_z, codes)
+            for w in range(len(words)):
+                if words[w] == 0 or words[w] == full:
+                    continue
+                for z in range(8 * w, min(8 * w + 8, cells_z)):
+                    code = codes[z]
+                    if code == 0 or code == 255:
+                        continue
+                    cells[cell], codes_of[cell] = y * cells_z + z, code
+                    cell += 1
+                    own = code & 1
+                    crossed = (
+                        (own != code >> 1 & 1)
+                        | np.int64(own != code >> 2 & 1) << 1
+                        | np.int64(own != code >> 4 & 1) << 2
+                    )
+                    first_of[x, y, z] = 8 * vertex + crossed
+                    for axis in range(3):
+                        if not crossed >> axis & 1:
+                            continue
+                        a[0], a[1], a[2] = x - shift, y - shift, z - shift
+                        b[:] = a
+                        b[axis] += 1
+                        for i in range(3):
+                            a[i], b[i] = max(a[i], 0), min(b[i], shape[i] - 1)
+                        ends[vertex, 0] = (a[0] * shape[1] + a[1]) * shape[2] + a[2]
+                        ends[vertex, 1] = (b[0] * shape[1] + b[1]) * shape[2] + b[2]
+                        f_a, f_b = np.float64(values[a[0], a[1], a[2]]), np.float64(values[b[0], b[1], b[2]])
+                        apart[vertex] = abs(f_b - f_a)
+                        along = (isovalue - f_a) / (f_b - f_a) if f_a != f_b else 0.0
+                        for i in range(3):
+                            places[vertex, i] = origin[i] + step[i] * (a[i] + along * (b[i] - a[i]))
+                        vertex += 1
+
+
+@numba.njit(nogil=True, inline="always")
+def _bit_count(x):
+    return (x & 1) + (x >> 1 & 1) + (x >> 2 & 1)
+
+
+@numba.njit(cache=True, nogil=True)
+def faces(
+    start, stop, shape, closed, offsets, cells, codes_of, first_of, triangles_of, edges_of, edges, out, owners, caps
+):
+    """Fill the triangles `out` (T, 3) of layers, with the cells and caps they belong to; see `Triangles`."""
+    cells_z = first_of.shape[2]
+    shift = 1 if closed else 0
+    for x in range(start, stop):
+        t = offsets[x, 2]
+        last = offsets[x + 1, 0] if x + 1 < len(offsets) else len(cells)
+        for c in range(offsets[x, 0], last):
+            y, z = cells[c] // cells_z, cells[c] % cells_z
+            code = codes_of[c]
+            if not _is_real(x, y, z, shape, closed):
+                continue
+            cap, number = 0, 0
+            for axis in range(3):
+                at = (x, y, z)[axis] - shift
+                if at < 0 or at > shape[axis] - 2:
+                    cap |= 1 << axis
+                number = number * shape[axis] + min(max(at, 0), shape[axis] - 2)
+            for i in range(triangles_of[code]):
+                for k in range(3):
+                    edge = edges_of[code, i, k]
+                    corner, axis = edges[edge, 0], edge // 4
+                    packed = first_of[x + (corner & 1), y + (corner >> 1 & 1), z + (corner >> 2 & 1)]
+                    out[t, k] = packed // 8 + _bit_count(packed & 7 & ((1 << axis) - 1))
+                owners[t], caps[t] = number, cap
+                t += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def edges_of_cells(corners, virtual, codes, triangles_of, edges_of, edges, keys, pairs):
+    """Fill the edges that corners of triangles lie on, for mixed cells in any order.
+
+    Args:
+        corners: (C, 8) int32, rows of points.
+        virtual: (C,) uint8, a bit for each corner that is not the point itself, but one beyond it.
+        codes: (C,) uint8, the case of each cell.
+        triangles_of: (256,).
+        edges_of: (256, 5, 3).
+        edges: (12, 2).
+        keys: (3 T,) to be filled: a number that each edge has in all cells that share it.
+        pairs: (3 T, 2) to be filled: the rows of its ends; twice the same row where one of them is virtual.
+    """
+    n = 0
+    for c in range(len(codes)):
+        for i in range(triangles_of[codes[c]]):
+            for k in range(3):
+                edge = edges_of[codes[c], i, k]
+                a, b, axis = edges[edge, 0], edges[edge, 1], edge // 4
+                row_a, row_b = corners[c, a], corners[c, b]
+                if virtual[c] >> a & 1:
+                    keys[n], row_a = 9 * np.int64(row_b) + 3 + axis, row_b
+                elif virtual[c] >> b & 1:
+                    keys[n], row_b = 9 * np.int64(row_a) + 6 + axis, row_a
+                else:
+                    keys[n] = 9 * np.int64(row_a) + axis
+                pairs[n, 0], pairs[n, 1] = row_a, row_b
+                n += 1

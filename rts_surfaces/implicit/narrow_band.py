@@ -1,0 +1,285 @@
+"""The narrow band of an implicit surface: the cells of a lattice that it passes through, at few evaluations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from numbers import Integral
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.arguments import check_positive, quoted
+from rts.checks import is_count
+from rts.errors import InputError
+from rts.threads import parallel
+from rts_surfaces.implicit import narrow_band_kernels as kernels
+from rts_surfaces.implicit.lattice import Lattice
+
+Level = Callable[[np.ndarray], np.ndarray]
+"""The level at places (M, 3) float64: (M,) float32 or float64, negative inside the surface, not outside and on it."""
+
+WORK = 5
+"""Nanoseconds that a place takes."""
+ROUNDING = 4
+"""How many times the last digit of its scale, Lipschitz bound times coordinates, a level may be off."""
+
+
+class Band(NamedTuple):
+    """Cells of a lattice, and their corners.
+
+    Attributes:
+        numbers: (M,) int64, the points of the lattice that are corners of the cells, each once.
+        values: (M,) the levels there, in the dtype of the level.
+        corners: (C, 8) int32, the rows of `numbers` of the corners of each cell. Corner i has the offsets (i & 1,
+            i >> 1 & 1, i >> 2 & 1) along x, y and z.
+        cells: (C, 3) int32, the coordinates of the lowest corner of each cell; each cell once, in no special order.
+        evaluations: how many points the level was evaluated at.
+    """
+
+    numbers: np.ndarray
+    values: np.ndarray
+    corners: np.ndarray
+    cells: np.ndarray
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class NarrowBand:
+    """Finds the cells of a lattice that a surface passes through.
+
+    With a Lipschitz bound these are all cells whose corners differ in sign. Blocks of cells whose level at the centre
+    is further from zero than it can change within them are dropped, the others halved.
+
+    Without one, coarse cells whose corners differ in sign are halved, with those around them; after that, only those
+    of the halves whose corners differ in sign. At every fineness the surface is then followed across the sides of cells
+    that it crosses. So each coarse cell whose corners differ in sign has cells in the band, and none of them ends in a
+    hole: the neighbour is in the band, too, wherever four corners that both have differ in sign. What lies between
+    coarse corners of one sign, and does not hang together with what they see, is found only where it shows at the
+    corners of half as coarse cells, within the margin.
+
+    Args:
+        lipschitz: how fast the level changes at most, per unit of length; None where this is not known.
+        coarse: cells along each side of the blocks to begin with, a power of two; None for 16 with a Lipschitz bound
+            and 8 without one.
+        margin: how many coarse cells around those whose corners differ in sign are halved with them. With a Lipschitz
+            bound it does not count.
+        chunk: how many points the level is evaluated at together, at most.
+
+    Raises:
+        InputError: an argument is of the wrong kind.
+    """
+
+    lipschitz: float | None = None
+    coarse: int | None = None
+    margin: int = 1
+    chunk: int = 2**18
+
+    def __post_init__(self):
+        if self.lipschitz is not None:
+            known = check_positive("lipschitz", self.lipschitz)
+            if known is None:
+                raise InputError("lipschitz is traced; expected a known number")
+            object.__setattr__(self, "lipschitz", float(known))
+        if self.coarse is not None and not (is_count(self.coarse) and int(self.coarse).bit_count() == 1):
+            raise InputError(f"coarse is {quoted(self.coarse)}; expected a power of two, such as 16, or None")
+        if not isinstance(self.margin, Integral) or isinstance(self.margin, bool) or self.margin < 0:
+            raise InputError(f"margin is {quoted(self.margin)}; expected an integer of at least 0")
+        if not is_count(self.chunk):
+            raise InputError(f"chunk is {quoted(self.chunk)}; expected an integer of at least 1")
+
+    def find(self, level: Level, lattice: Lattice, closed: bool) -> Band:
+        """Find the cells whose corners differ in sign.
+
+        Args:
+            level: see `Level`; called for at most `chunk` places at a time.
+            lattice: the lattice.
+            closed: whether the surface is capped at the lattice's boundary. Cells are in the band, too, if one of their
+                corners is inside and on the boundary.
+
+        Returns:
+            The band, which is empty if nothing is found. Where the level turns out to be NaN at a point of the lattice,
+            the search ends, and the band is one cell that has this point as a corner.
+        """
+        evaluate = _Evaluate(level, lattice, int(self.chunk))
+        try:
+            if self.lipschitz is None:
+                grid, cells, rows = _followed(evaluate, int(self.coarse or 8), int(self.margin), bool(closed))
+            else:
+                grid, cells, rows = _bounded(evaluate, int(self.coarse or 16), self.lipschitz, bool(closed))
+        except _Unknown as unknown:
+            evaluate.refuses = False
+            point = np.array(np.unravel_index(unknown.number, lattice.shape))
+            grid, cells = _Grid(evaluate, 1), np.minimum(point, np.array(lattice.shape) - 2)[None].astype(np.int32)
+            rows = grid.corners(cells)
+        numbers, values = kernels.compact(rows, grid.numbers, grid.values)
+        return Band(numbers, values, rows, cells, evaluate.count)
+
+
+class _Unknown(Exception):
+    """The level is NaN at the point of the lattice that has this number."""
+
+    def __init__(self, number: int):
+        super().__init__()
+        self.number = number
+
+
+class _Evaluate:
+    """The level at points of a lattice, in chunks, counted; while it `refuses` NaN, `_Unknown` where there is one."""
+
+    def __init__(self, level: Level, lattice: Lattice, chunk: int):
+        self.level, self.chunk, self.count, self.refuses = level, chunk, 0, True
+        self.dtype = np.dtype(np.float64)  # Until it is known.
+        self.shape = lattice.shape
+        self.low, self.step = tuple(lattice.low.tolist()), tuple(lattice.step.tolist())
+
+    def counts(self, side: int) -> tuple[int, ...]:
+        """How many blocks of such a side there are along each axis."""
+        return tuple(-(-(n - 1) // side) for n in self.shape)
+
+    def all_blocks(self, side: int) -> np.ndarray:
+        """All blocks of such a side, (B, 3) int32."""
+        return np.ascontiguousarray(np.indices(self.counts(side), np.int32).reshape(3, -1).T)
+
+    def at_points(self, numbers: np.ndarray) -> np.ndarray:
+        """The levels (M,) at points by number (M,)."""
+        return self._levels(kernels.places_of, numbers, numbers, self.shape, self.low, self.step)
+
+    def at_centres(self, blocks: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
+        """The numbers (B,) of the centres of blocks (B, 3), −1 where a block is cropped, and the levels there (B,)."""
+        numbers = kernels.centre_numbers(blocks, side, self.shape)
+        return numbers, self._levels(kernels.centres, numbers, blocks, side, self.shape, self.low, self.step)
+
+    def slack(self, values: np.ndarray, lipschitz: float) -> float:
+        """How far levels may be off by rounding."""
+        far = max(max(abs(x), abs(x + s * (n - 1))) for x, s, n in zip(self.low, self.step, self.shape, strict=True))
+        return ROUNDING * float(np.finfo(values.dtype).eps) * lipschitz * far
+
+    def _levels(self, kernel: Callable, numbers: np.ndarray, items: np.ndarray, *args: Any) -> np.ndarray:
+        found = np.empty(0, self.dtype)
+        for first in range(0, len(items), self.chunk):
+            some = items[first : first + self.chunk]
+            places = np.empty((len(some), 3))
+            parallel(kernel, len(some), some, *args, places, work=len(some) * WORK)
+            levels = np.asarray(self.level(places))
+            self.count += len(some)
+            if first == 0:
+                found, self.dtype = np.empty(len(items), levels.dtype), levels.dtype
+            found[first : first + len(some)] = levels
+            wrong = np.isnan(levels) & (numbers[first : first + len(some)] >= 0)
+            if self.refuses and wrong.any():
+                raise _Unknown(int(numbers[first + wrong.argmax()]))
+        return found
+
+
+class _Grid:
+    """Corners of blocks of one side, and the levels at those that are known.
+
+    Attributes:
+        numbers: (M,) int64, their numbers in the lattice.
+        values: (M,) the levels there.
+    """
+
+    def __init__(self, evaluate: _Evaluate, side: int):
+        self.side, self.counts = side, evaluate.counts(side)
+        self._evaluate, self._count, self._used = evaluate, 0, 0
+        self._numbers, self._values = np.empty(64, np.int64), np.empty(0, evaluate.dtype)
+        self.directory, self.bricks = _bricks(self.counts, np.int32)
+
+    @property
+    def numbers(self) -> np.ndarray:
+        return self._numbers[: self._count]
+
+    @property
+    def values(self) -> np.ndarray:
+        return self._values[: self._count]
+
+    def give(self, numbers: np.ndarray, values: np.ndarray) -> None:
+        """Tell the levels at corners by their numbers in the lattice, all of them new; negative numbers are none."""
+        numbers, values = numbers[numbers >= 0], values[numbers >= 0]
+        first, state = self._count, (self.directory, self.bricks, self._used, self._numbers, self._count)
+        self.bricks, self._used, self._numbers, self._count = kernels.given_rows(
+            numbers, self.side, self._evaluate.shape, self.counts, *state
+        )
+        self._keep(first, values)
+
+    def corners(self, blocks: np.ndarray) -> np.ndarray:
+        """The rows (B, 8) of the corners of blocks; where the level is not known there, it is evaluated."""
+        first, state = self._count, (self.directory, self.bricks, self._used, self._numbers, self._count)
+        rows, self.bricks, self._used, self._numbers, self._count = kernels.numbered(
+            blocks, self.side, self._evaluate.shape, self.counts, *state
+        )
+        if self._count > first:
+            self._keep(first, self._evaluate.at_points(self._numbers[first : self._count]))
+        return rows
+
+    def _keep(self, first: int, values: np.ndarray) -> None:
+        if len(self._values) < self._count:
+            longer = np.empty(len(self._numbers), values.dtype)
+            longer[:first] = self._values[:first]
+            self._values = longer
+        self._values[first : self._count] = values
+
+
+def _bricks(counts: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, np.ndarray]:
+    """A directory without bricks, and room for some; see `rts_surfaces.implicit.narrow_band_kernels`."""
+    places = int(np.prod([n // kernels.BRICK + 1 for n in counts]))
+    return np.full(places, -1, np.int32), np.empty((64, kernels.BRICK**3), dtype)
+
+
+def _bounded(evaluate: _Evaluate, side: int, lipschitz: float, closed: bool) -> tuple[_Grid, np.ndarray, np.ndarray]:
+    """Find the cells whose corners differ in sign: the grid of cells, these cells (C, 3) and rows of corners (C, 8)."""
+    blocks, centres, slack = evaluate.all_blocks(side), [], 0.0
+    while side > 1:
+        numbers, levels = evaluate.at_centres(blocks, side)
+        slack = evaluate.slack(levels, lipschitz)
+        near = kernels.near(blocks, levels, side, evaluate.shape, evaluate.step, lipschitz, slack, closed)
+        blocks = blocks[near]
+        centres.append((numbers[near], levels[near]))
+        if side > 2:
+            blocks = kernels.halved(blocks, evaluate.counts(side // 2))
+        side //= 2
+    grid = _Grid(evaluate, 1)
+    if centres:
+        numbers, levels = centres.pop()
+        pairs = _Grid(evaluate, 2)
+        for known in centres:
+            pairs.give(*known)
+        rows, bounds = pairs.corners(blocks), (grid.counts, evaluate.step, lipschitz, slack, closed)
+        blocks = kernels.uncertain(blocks, numbers, levels, rows, pairs.values, *bounds)
+        grid.give(pairs.numbers, pairs.values)
+        grid.give(numbers, levels)
+    rows = grid.corners(blocks)
+    return grid, *kernels.crossed(blocks, rows, grid.values, grid.counts, closed)
+
+
+def _followed(evaluate: _Evaluate, side: int, margin: int, closed: bool) -> tuple[_Grid, np.ndarray, np.ndarray]:
+    """Find cells whose corners differ in sign, and follow the surface from them; returns what `_bounded` does."""
+    grid = _Grid(evaluate, side)
+    blocks = evaluate.all_blocks(side)
+    rows = grid.corners(blocks)
+    blocks, rows = kernels.crossed(blocks, rows, grid.values, grid.counts, closed)
+    if side > 1 and margin > 0:
+        blocks = kernels.widened(blocks, margin, grid.counts)
+        rows = grid.corners(blocks)
+    while side > 1:
+        side //= 2
+        known = kernels.compact(rows, grid.numbers, grid.values)
+        grid = _Grid(evaluate, side)
+        grid.give(*known)
+        blocks = kernels.halved(blocks, grid.counts)
+        blocks, rows = _complete(grid, blocks, closed)
+    return grid, blocks, rows
+
+
+def _complete(grid: _Grid, blocks: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Choose the blocks whose corners differ in sign, and add those that the surface goes on in."""
+    directory, bricks = _bricks(grid.counts, np.uint8)
+    bricks, used = kernels.marked(blocks, grid.counts, directory, bricks, 0)
+    rows = grid.corners(blocks)
+    found = [kernels.crossed(blocks, rows, grid.values, grid.counts, closed)]
+    while len(found[-1][0]):
+        blocks, bricks, used = kernels.beyond(*found[-1], grid.values, grid.counts, closed, directory, bricks, used)
+        rows = grid.corners(blocks)
+        found.append((blocks, rows))
+    return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])

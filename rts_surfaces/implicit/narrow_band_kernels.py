@@ -1,0 +1,415 @@
+"""Blocks and points of narrow bands, compiled.
+
+Blocks of `side` cells an axis lie at multiples of the side; the last ones are cropped at the lattice's end. A block is
+named by its place among blocks, (x, y, z) int32. Their corners, too, form a grid: a corner (x, y, z) is the lattice's
+point (min(x side, X − 1), …). Corner i of a block has the offsets (i & 1, i >> 1 & 1, i >> 2 & 1).
+
+What is known at corners is found through bricks of 4 × 4 × 4 of them: `directory` has the brick at each place, or −1,
+and `bricks` (B, 64) int32 the row of each corner, or −1. It imports numba.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+compiled = numba.njit(nogil=True)
+kernel = numba.njit(nogil=True, cache=True)
+
+SHIFT = 2
+MASK = (1 << SHIFT) - 1
+BRICK = 1 << SHIFT
+"""Corners along each side of a brick, a power of two."""
+
+
+RELATIVE = 1e-9
+"""By how much reaches are longer, for their own rounding."""
+
+
+# ------------------------------------------------------------------------------------------------- blocks
+
+
+@compiled
+def _copy(source, s, target, t):
+    """Copy row s of one array to row t of another, faster than by slices."""
+    for i in range(source.shape[1]):
+        target[t, i] = source[s, i]
+
+
+@kernel
+def halved(blocks, counts):
+    """Halve blocks (B, 3) along each axis: the blocks of half the side, (C, 3), without those beyond the end.
+
+    Args:
+        blocks: (B, 3) int32.
+        counts: how many of the smaller blocks there are along each axis.
+    """
+    total = 0
+    for b in range(len(blocks)):
+        inside = 1
+        for a in range(3):
+            inside *= min(2, counts[a] - 2 * blocks[b, a])
+        total += inside
+    children, c = np.empty((total, 3), np.int32), 0
+    for b in range(len(blocks)):
+        x, y, z = 2 * blocks[b, 0], 2 * blocks[b, 1], 2 * blocks[b, 2]
+        for i in range(x, min(x + 2, counts[0])):
+            for j in range(y, min(y + 2, counts[1])):
+                for k in range(z, min(z + 2, counts[2])):
+                    children[c, 0], children[c, 1], children[c, 2] = i, j, k
+                    c += 1
+    return children
+
+
+@kernel
+def centres(start, stop, blocks, side, shape, low, step, places):
+    """Fill places (B, 3) float64, the centres of blocks."""
+    for b in range(start, stop):
+        for a in range(3):
+            first = blocks[b, a] * side
+            places[b, a] = low[a] + step[a] * (0.5 * (first + min(first + side, shape[a] - 1)))
+
+
+@kernel
+def centre_numbers(blocks, side, shape):
+    """The numbers (B,) int64 in the lattice of the centres of blocks of an even side; −1 where a block is cropped."""
+    numbers = np.empty(len(blocks), np.int64)
+    for b in range(len(blocks)):
+        number, whole = 0, True
+        for a in range(3):
+            first = blocks[b, a] * side
+            whole &= first + side < shape[a]
+            number = number * shape[a] + first + side // 2
+        numbers[b] = number if whole else -1
+    return numbers
+
+
+@kernel
+def near(blocks, values, side, shape, step, lipschitz, slack, closed):
+    """Choose the blocks which the surface may pass through, as far as the levels at their centres tell.
+
+    Args:
+        blocks: (B, 3) int32.
+        values: (B,) the levels; where they are NaN a block stays.
+        side: cells.
+        shape: the points of the lattice along each axis.
+        step: their distances.
+        lipschitz: how fast the level changes at most.
+        slack: how far a level may be off by rounding.
+        closed: whether the surface is capped at the lattice's boundary.
+
+    Returns:
+        (B,) bool.
+    """
+    kept = np.empty(len(blocks), np.bool_)
+    for b in range(len(blocks)):
+        square, border = 0.0, False
+        for a in range(3):
+            first = blocks[b, a] * side
+            last = min(first + side, shape[a] - 1)
+            square += (0.5 * step[a] * (last - first)) ** 2
+            border |= first == 0 or last == shape[a] - 1
+        reach = lipschitz * np.sqrt(square) * (1 + RELATIVE) + slack
+        kept[b] = not (values[b] > reach or (values[b] < -reach and not (closed and border)))
+    return kept
+
+
+@kernel
+def widened(blocks, margin, counts):
+    """Add all blocks that are so many blocks away, or fewer, along each axis: (K, 3), in the order of the grid."""
+    marked = np.zeros(counts, np.bool_)
+    for b in range(len(blocks)):
+        x, y, z = blocks[b]
+        for i in range(max(x - margin, 0), min(x + margin + 1, counts[0])):
+            for j in range(max(y - margin, 0), min(y + margin + 1, counts[1])):
+                marked[i, j, max(z - margin, 0) : min(z + margin + 1, counts[2])] = True
+    kept, count = np.empty((marked.sum(), 3), np.int32), 0
+    for i in range(counts[0]):
+        for j in range(counts[1]):
+            for k in range(counts[2]):
+                if marked[i, j, k]:
+                    kept[count, 0], kept[count, 1], kept[count, 2] = i, j, k
+                    count += 1
+    return kept
+
+
+# ------------------------------------------------------------------------------------------------- corners
+
+
+@compiled
+def _grown(array, count):
+    """A longer copy of which the first rows are those of an array."""
+    longer = np.empty((2 * count + 64, *array.shape[1:]), array.dtype)
+    longer[:count] = array[:count]
+    return longer
+
+
+@compiled
+def _brick(x, y, z, counts):
+    """The place of a corner's brick, and the corner's place in it. There is one corner more than blocks."""
+    place = ((x >> SHIFT) * ((counts[1] >> SHIFT) + 1) + (y >> SHIFT)) * ((counts[2] >> SHIFT) + 1) + (z >> SHIFT)
+    return place, (((x & MASK) << SHIFT | y & MASK) << SHIFT) | z & MASK
+
+
+@kernel
+def numbered(blocks, side, shape, counts, directory, bricks, used, numbers, count):
+    """Give rows to the corners of blocks.
+
+    Args:
+        blocks: (B, 3) int32.
+        side: cells.
+        shape: the points of the lattice along each axis.
+        counts: how many blocks there are along each axis.
+        directory: (D,) int32, written to.
+        bricks: (·, 64) int32, written to.
+        used: how many bricks there are.
+        numbers: (·,) int64, the numbers in the lattice of the corners that have rows, written to.
+        count: how many these are.
+
+    Returns:
+        The rows (B, 8) int32; then `bricks`, `used`, `numbers` and `count`, as they are now.
+    """
+    rows = np.empty((len(blocks), 8), np.int32)
+    for b in range(len(blocks)):
+        if used + 8 > len(bricks):
+            bricks = _grown(bricks, used)
+        if count + 8 > len(numbers):
+            numbers = _grown(numbers, count)
+        for i in range(8):
+            x, y, z = blocks[b, 0] + (i & 1), blocks[b, 1] + (i >> 1 & 1), blocks[b, 2] + (i >> 2 & 1)
+            place, at = _brick(x, y, z, counts)
+            brick = directory[place]
+            if brick < 0:
+                brick = directory[place] = used
+                bricks[brick] = -1
+                used += 1
+            row = bricks[brick, at]
+            if row < 0:
+                row = bricks[brick, at] = count
+                x, y, z = min(x * side, shape[0] - 1), min(y * side, shape[1] - 1), min(z * side, shape[2] - 1)
+                numbers[count] = (x * shape[1] + y) * shape[2] + z
+                count += 1
+            rows[b, i] = row
+    return rows, bricks, used, numbers, count
+
+
+@kernel
+def given_rows(known, side, shape, counts, directory, bricks, used, numbers, count):
+    """Give rows to points of the lattice (M,) by number, all different and without rows; else like `numbered`."""
+    for m in range(len(known)):
+        number = known[m]
+        xy = number // shape[2]
+        x = xy // shape[1]
+        y, z = xy - x * shape[1], number - xy * shape[2]
+        place, at = _brick((x + side - 1) // side, (y + side - 1) // side, (z + side - 1) // side, counts)
+        if used == len(bricks):
+            bricks = _grown(bricks, used)
+        if count == len(numbers):
+            numbers = _grown(numbers, count)
+        brick = directory[place]
+        if brick < 0:
+            brick = directory[place] = used
+            bricks[brick] = -1
+            used += 1
+        bricks[brick, at] = count
+        numbers[count] = number
+        count += 1
+    return bricks, used, numbers, count
+
+
+@kernel
+def places_of(start, stop, numbers, shape, low, step, places):
+    """Fill places (M, 3) float64 of points of the lattice by number."""
+    for m in range(start, stop):
+        number = numbers[m]
+        xy = number // shape[2]
+        x = xy // shape[1]
+        places[m, 0] = low[0] + step[0] * x
+        places[m, 1] = low[1] + step[1] * (xy - x * shape[1])
+        places[m, 2] = low[2] + step[2] * (number - xy * shape[2])
+
+
+# ------------------------------------------------------------------------------------------------- cells
+
+
+UPPER = (0b10101010, 0b11001100, 0b11110000)
+"""The corners on the upper side of a block along each axis, as bits; the others are on the lower side."""
+ALL = 0b11111111
+OPPOSITE = 0b111
+
+
+@compiled
+def _inside(rows, b, values):
+    """The corners of block b that are inside, as bits."""
+    inside = 0
+    for i in range(8):
+        inside |= (values[rows[b, i]] < 0) << i
+    return inside
+
+
+@compiled
+def _border(blocks, b, counts):
+    """The corners of block b that lie on the lattice's boundary, as bits."""
+    border = 0
+    for a in range(3):
+        if blocks[b, a] == 0:
+            border |= ALL ^ UPPER[a]
+        if blocks[b, a] + 1 == counts[a]:
+            border |= UPPER[a]
+    return border
+
+
+@kernel
+def uncertain(blocks, centre_numbers, centre_values, rows, values, counts, step, lipschitz, slack, closed):
+    """Halve blocks of two cells a side; choose the cells whose corners may differ in sign, as far as levels tell.
+
+    Each cell of a block that is not cropped has the block's centre and one of its corners as opposite corners.
+
+    Args:
+        blocks: (B, 3) int32.
+        centre_numbers: (B,) int64, −1 where a block is cropped; all cells of such blocks are chosen.
+        centre_values: (B,) the levels at centres.
+        rows: (B, 8) int32, of `values`.
+        values: the levels at corners of blocks.
+        counts: how many cells there are along each axis.
+        step: the distances of neighbours along each axis.
+        lipschitz: how fast the level changes at most.
+        slack: how far a level may be off by rounding.
+        closed: whether the surface is capped at the lattice's boundary.
+
+    Returns:
+        Cells (K, 3) int32.
+    """
+    reach = np.empty(8)  # How much the level may change to the corner across such axes; not at all to itself.
+    for i in range(8):
+        square = 0.0
+        for a in range(3):
+            square += (step[a] * (i >> a & 1)) ** 2
+        reach[i] = lipschitz * np.sqrt(square) * (1 + RELATIVE) + slack if i > 0 else -1.0
+    kept, count = np.empty((64, 3), np.int32), 0
+    for b in range(len(blocks)):
+        if count + 8 > len(kept):
+            kept = _grown(kept, count)
+        for i in range(8):
+            outside = False
+            for a in range(3):
+                at = 2 * blocks[b, a] + (i >> a & 1)
+                kept[count, a] = at
+                outside |= at >= counts[a]
+            if outside:
+                continue
+            first, second = values[rows[b, i]], centre_values[b]
+            if centre_numbers[b] >= 0 and (first < 0) == (second < 0):
+                certain = True
+                for j in range(8):
+                    certain &= abs(first) > reach[i ^ j] or abs(second) > reach[i ^ j ^ OPPOSITE]
+                if certain and not (closed and first < 0 and _border(kept, count, counts)):
+                    continue
+            count += 1
+    return kept[:count].copy()
+
+
+@kernel
+def crossed(blocks, rows, values, counts, closed):
+    """Choose the blocks whose corners differ in sign; where closed, too, those with a corner inside on the boundary.
+
+    Args:
+        blocks: (B, 3) int32.
+        rows: (B, 8) int32, of `values`.
+        values: the levels.
+        counts: how many blocks there are along each axis.
+        closed: whether the surface is capped at the lattice's boundary.
+
+    Returns:
+        The chosen ones of `blocks` and of `rows`.
+    """
+    kept, kept_rows, count = np.empty_like(blocks), np.empty_like(rows), 0
+    for b in range(len(blocks)):
+        inside = _inside(rows, b, values)
+        if 0 < inside < ALL or (closed and inside & _border(blocks, b, counts)):
+            _copy(blocks, b, kept, count)
+            _copy(rows, b, kept_rows, count)
+            count += 1
+    return kept[:count].copy(), kept_rows[:count].copy()
+
+
+@compiled
+def _mark(x, y, z, counts, directory, bricks, used):
+    """Mark a block where there is room for one brick more: whether it was not marked, and `used` as it is now."""
+    place, at = _brick(x, y, z, counts)
+    brick = directory[place]
+    if brick < 0:
+        brick = directory[place] = used
+        bricks[brick] = 0
+        used += 1
+    new = bricks[brick, at] == 0
+    bricks[brick, at] = 1
+    return new, used
+
+
+@kernel
+def marked(blocks, counts, directory, bricks, used):
+    """Mark blocks (B, 3), by ones in bricks of bytes (·, 64); returns `bricks` and `used` as they are now."""
+    for b in range(len(blocks)):
+        if used == len(bricks):
+            bricks = _grown(bricks, used)
+        _, used = _mark(blocks[b, 0], blocks[b, 1], blocks[b, 2], counts, directory, bricks, used)
+    return bricks, used
+
+
+@kernel
+def beyond(blocks, rows, values, counts, closed, directory, bricks, used):
+    """Find the unmarked blocks across sides of blocks that the surface crosses: those it goes on in. They are marked.
+
+    Args:
+        blocks: (B, 3) int32.
+        rows: (B, 8) int32, of `values`.
+        values: the levels.
+        counts: how many blocks there are along each axis.
+        closed: whether the surface is capped at the lattice's boundary.
+        directory: (D,) int32, of `marked`.
+        bricks: (·, 64) uint8, of `marked`.
+        used: how many bricks there are.
+
+    Returns:
+        Blocks (K, 3) int32; then `bricks` and `used`, as they are now.
+    """
+    found, count = np.empty((64, 3), np.int32), 0
+    for b in range(len(blocks)):
+        if count + 6 > len(found):
+            found = _grown(found, count)
+        if used + 6 > len(bricks):
+            bricks = _grown(bricks, used)
+        inside = _inside(rows, b, values)
+        capped = inside & _border(blocks, b, counts) if closed else 0
+        for way in range(6):
+            a, far = way >> 1, way & 1
+            side = UPPER[a] if far else ALL ^ UPPER[a]
+            at = blocks[b, a] + (1 if far else -1)
+            if 0 <= at < counts[a] and (capped & side or 0 < inside & side < side):
+                _copy(blocks, b, found, count)
+                found[count, a] = at
+                x, y, z = found[count, 0], found[count, 1], found[count, 2]
+                new, used = _mark(x, y, z, counts, directory, bricks, used)
+                count += new
+    return found[:count].copy(), bricks, used
+
+
+@kernel
+def compact(rows, numbers, values):
+    """Drop the points that no cell has; rows (C, 8) are changed to those of the points that stay.
+
+    Returns:
+        Numbers (M,) int64 and values (M,), in order of first appearance in `rows`.
+    """
+    new = np.full(len(numbers), -1, np.int32)
+    kept, levels, count = np.empty_like(numbers), np.empty_like(values), 0
+    for c in range(len(rows)):
+        for i in range(8):
+            row = rows[c, i]
+            if new[row] < 0:
+                new[row] = count
+                kept[count], levels[count] = numbers[row], values[row]
+                count += 1
+            rows[c, i] = new[row]
+    return kept[:count].copy(), levels[:count].copy()

@@ -1,0 +1,122 @@
+"""Surfaces of fields that rays are cast at: signed distances, and any other function of space."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from rts.arguments import check_numbers, check_positive, quoted
+from rts.checks import is_count
+from rts.engines import engine_of, namespace
+from rts.errors import InputError
+from rts.gbuffer import GBuffer
+from rts.interfaces import Part, RaySurface
+from rts.records import RayHits, Samples
+from rts.trees import Array, Tree
+from rts_surfaces.implicit.casting import cast
+from rts_surfaces.implicit.field import Field, Function, Implicit
+from rts_surfaces.implicit.fields import swept_sphere
+
+FLATTEST = 1e-12
+"""The least square of a slope that points are moved by; where the field is flatter, they move less."""
+
+
+class Sdf(Implicit, RaySurface):
+    """The surface of a field within a ball, found by rays: of a signed distance, or of any other function of space.
+
+    A sample is the point where a ray meets the surface, and it moves along the surface's normal as θ changes: with f
+    the field and w = ∇f / |∇f|², at the point x₀ where it was found, it is x₀ − f(θ, x₀) w. Along the ray it would
+    never leave its pixel, and outlines would have no derivative.
+
+    The ball cuts off what is outside of it, and there should be as little of it around the surface as can be.
+
+    Args:
+        f: (θ, points (M, 3)) → (M,), in array code; see `Field`. A ready-made one is in `rts_surfaces.implicit.fields`.
+        radius: of the ball, in the units of the points.
+        center: (3,), of the ball.
+        isovalue: the value of `f` on the surface.
+        inside: which values are inside, "below" the isovalue or "above" it.
+        lipschitz: a number that the slope of `f` nowhere exceeds, 1 for distances. If it is too small, rays miss parts
+            of the surface. None if there is none: rays then take steps of one length, and cost more.
+        reads: the names of the entries of θ that `f` reads; None for all.
+        attributes: name → g(θ, positions (N, 3)) → (N, C), further entries of the G-buffer; see `Implicit`.
+        steps: how many of the shortest steps there are across the ball: what is thinner than one may be missed. None
+            for 256 without `lipschitz`, 1024 with it.
+
+    Raises:
+        InputError: wrong arguments.
+    """
+
+    sample_widths = (0, 6)
+
+    def __init__(
+        self,
+        f: Function,
+        radius: float = 2.0,
+        center: Any = (0.0, 0.0, 0.0),
+        isovalue: float = 0.0,
+        inside: str = "below",
+        lipschitz: float | None = 1.0,
+        reads: Iterable[str] | None = None,
+        attributes: Mapping[str, Function] | None = None,
+        steps: int | None = None,
+    ):
+        super().__init__(Field(f, isovalue, inside, reads), attributes)
+        self.radius = _known("radius", check_positive("radius", radius)).item()
+        self.center = _known("center", check_numbers("center", center, (3,))).astype(np.float64)
+        self.lipschitz = None
+        if lipschitz is not None:
+            self.lipschitz = _known("lipschitz", check_positive("lipschitz", lipschitz)).item()
+        if steps is not None and not is_count(steps):
+            raise InputError(f"steps is {quoted(steps)}; expected how many there are across the ball, or None")
+        self.steps = steps
+
+    def __repr__(self) -> str:
+        return f"Sdf({self.field.name}, radius={self.radius:g})"
+
+    @classmethod
+    def example(cls) -> Part:
+        """A torus."""
+        part = {"radii": np.array([0.9, 0.35], np.float32)}
+        return Part(cls(swept_sphere, 1.3, reads=("radii",)), part, "normals")
+
+    def intersect(self, theta: Mapping[str, Tree], origins: Array, directions: Array, layers: int) -> RayHits:
+        """The nearest hits within the ball, in θ's dtype; see `rts.RaySurface`."""
+        field = self.field
+        return cast(
+            partial(field.level, theta),
+            partial(_samples, field, theta),
+            field.suited(theta, origins),
+            field.suited(theta, directions),
+            layers,
+            center=self.center,
+            radius=self.radius,
+            lipschitz=self.lipschitz,
+            steps=self.steps,
+        )
+
+    def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
+        """Positions, "normal" of unit length, outwards, and the attributes."""
+        engine, params = engine_of(samples.params), self.field.suited(theta, samples.params)
+        if samples.row is not None and engine.padded(params):
+            # Of the origin, where rows that are all zero lie, many a function has no derivative.
+            params = engine.fill_unused(params, samples.row)
+        found, along = params[:, :3], params[:, 3:]
+        return self.gbuffer(theta, found - self.field.level(theta, found)[:, None] * along)
+
+
+def _samples(field: Field, theta: Mapping[str, Tree], points: Array) -> Array:
+    """(M, 6): the points of hits (M, 3), and where they move to for each unit by which the level falls."""
+    engine, slope = engine_of(points), field.slope(theta, points)
+    xp = namespace(points)
+    square = xp.sum(slope * slope, axis=-1, keepdims=True)
+    return engine.stop_gradient(xp.concat([points, slope / xp.clip(square, FLATTEST, None)], axis=-1))
+
+
+def _known(name: str, value: np.ndarray | None) -> np.ndarray:
+    if value is None:
+        raise InputError(f"{name} is traced; expected known numbers, since the ball does not change with theta")
+    return value
