@@ -11,11 +11,15 @@ from collections.abc import Mapping
 from functools import reduce
 
 from rts.arguments import check_positive
-from rts.engines import namespace
+from rts.engines import engine_of, namespace
 from rts.errors import InputError
+from rts.operations.take import take
 from rts.trees import Array, Tree
 from rts_surfaces.entries import check_entry
 from rts_surfaces.implicit.field import Function, check_function
+
+BLOCK = 2048
+"""Points whose distances to all spheres are in memory at once."""
 
 
 def sphere(theta: Mapping[str, Tree], points: Array) -> Array:
@@ -32,6 +36,20 @@ def swept_sphere(theta: Mapping[str, Tree], points: Array) -> Array:
     xp, radii = namespace(points), _entry(theta, "radii", (2,))
     out = _length(xp.stack([points[:, 0], points[:, 2]], axis=-1)) - radii[0]
     return _length(xp.stack([out, points[:, 1]], axis=-1)) - radii[1]
+
+
+def spheres(theta: Mapping[str, Tree], points: Array) -> Array:
+    """The least distance (M,) of points (M, 3) to n spheres, whose centers lie in the plane z = 0.
+
+    θ["centers"] (n, 2) are x and y, θ["radii"] (n,) the radii. The derivative is that of the nearest sphere. Which this
+    is is sought without derivatives, in blocks of `BLOCK` points, or sphere by sphere: memory is of the order of M.
+    """
+    xp, centers = namespace(points), _entry(theta, "centers", ("n", 2))
+    radii = _entry(theta, "radii", (centers.shape[0],))
+    stop = engine_of(points).stop_gradient
+    table = xp.concat([centers, radii[:, None]], axis=1)
+    nearest = take(table, _nearest(stop(points), stop(centers), stop(radii)))
+    return _length(xp.concat([points[:, :2] - nearest[:, :2], points[:, 2:]], axis=1)) - nearest[:, 2]
 
 
 def union(*fields: Function) -> Function:
@@ -79,9 +97,44 @@ def _check_fields(fields: tuple[Function, ...]) -> None:
         check_function(f"field {i}", f)
 
 
-def _entry(theta: Mapping[str, Tree], name: str, shape: tuple[int, ...]) -> Array:
-    """An entry of θ, refused where it is missing or of another shape."""
-    check_entry("the field", theta, name, lambda given: None if given == shape else str(shape or "a number"))
+def _nearest(points: Array, centers: Array, radii: Array) -> Array:
+    """The index (M,) int32 of the sphere that is nearest to each point (M, 3)."""
+    engine = engine_of(points)
+    xp, count = engine.namespace, centers.shape[0]
+    if engine.exact_products(points, centers):
+        # |p − c|² = (−2 c, |c|², 1) · (p, 1, |p|²), in blocks that stay in the cache.
+        one, other = xp.ones_like(points[:, :1]), xp.ones_like(centers[:, :1])
+        rows = xp.concat([points[:, :2], one, xp.sum(points * points, axis=1, keepdims=True)], axis=1)
+        columns = xp.concat([-2 * centers, xp.sum(centers * centers, axis=1, keepdims=True), other], axis=1).T
+        found = []
+        for i in range(0, max(1, rows.shape[0]), BLOCK):
+            square = xp.clip(rows[i : i + BLOCK] @ columns, 0, None)
+            found.append(xp.argmin(xp.sqrt(square) - radii, axis=1))
+        return xp.astype(xp.concat(found), xp.int32)
+
+    def body(state: dict[str, Array]) -> dict[str, Array]:
+        i = state["i"]
+        x, y = (xp.take(centers[:, j], i, axis=0) for j in range(2))
+        square = (points[:, 0] - x) ** 2 + (points[:, 1] - y) ** 2 + points[:, 2] ** 2
+        distance = xp.sqrt(square) - xp.take(radii, i, axis=0)
+        nearer = distance < state["least"]
+        least, index = xp.where(nearer, distance, state["least"]), xp.where(nearer, i, state["index"])
+        return {"i": i + 1, "least": least, "index": index}
+
+    index = xp.zeros_like(points[:, 0], dtype=xp.int32)
+    state = {"i": xp.zeros_like(radii[:1], dtype=xp.int32), "least": xp.full_like(points[:, 0], xp.inf), "index": index}
+    return engine.repeat(body, lambda state: state["i"][0] < count, state, count)["index"]
+
+
+def _entry(theta: Mapping[str, Tree], name: str, shape: tuple[int | str, ...]) -> Array:
+    """An entry of θ, refused where it is missing or of another shape; a letter stands for any length but 0."""
+
+    def expected(given: tuple[int, ...]) -> str | None:
+        pairs = zip(given, shape, strict=False)
+        fits = len(given) == len(shape) and all(g == s or (isinstance(s, str) and g > 0) for g, s in pairs)
+        return None if fits else f"({', '.join(map(str, shape))}{',' * (len(shape) == 1)})"
+
+    check_entry("the field", theta, name, expected)
     return theta[name]
 
 

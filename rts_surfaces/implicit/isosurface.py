@@ -19,7 +19,6 @@ from rts.engines import engine_of, exemplar, namespace, value_of
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part, RaySurface, TriangleSurface
-from rts.operations.combine import combine
 from rts.operations.take import take
 from rts.records import ArraySpec, Proxy, Rays, Samples
 from rts.threads import parallel
@@ -29,6 +28,7 @@ from rts_surfaces.implicit.field import SIDES, Field, Implicit
 from rts_surfaces.implicit.lattice import Lattice, check_bounds
 from rts_surfaces.implicit.lattice_field import LatticeField
 from rts_surfaces.implicit.marching_cubes import Triangles
+from rts_surfaces.implicit.motion import ALONG, PLACE, WEIGHTS, along_normal
 from rts_surfaces.implicit.narrow_band import Band, NarrowBand
 
 NEAR_SINGULAR = 1e-3
@@ -354,25 +354,21 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         if samples.ids.shape[1] == 0:
             return self.at_hits(theta, samples)
         lattice = self.lattice(theta)
-        if self.motion == "edge":
-            position = self._on_edges(theta, samples, lattice)
-        else:
-            level = self._level_at(theta, samples, lattice)
-            params = namespace(level).astype(samples.params, level.dtype)
-            position = params[:, 9:12] - level[:, None] * params[:, 12:15]
-        return self.gbuffer(theta, position)
+        moved = self._on_edges if self.motion == "edge" else self._along_normal
+        return self.gbuffer(theta, moved(theta, samples, lattice))
 
-    def _level_at(self, theta: Mapping[str, Tree], samples: Samples, lattice: Lattice) -> Array:
-        """The level (N,) at samples where these were found, by the six values of each."""
-        weights = samples.params[:, 3:9]
+    def _along_normal(self, theta: Mapping[str, Tree], samples: Samples, lattice: Lattice) -> Array:
+        """Positions (N, 3) of samples that have moved along the gradient, by the six values of each."""
         if isinstance(self.field, LatticeField):
-            xp, values = namespace(theta["values"]), theta["values"]
-            found = combine(xp.reshape(values, (-1, 1)), samples.ids, weights)[:, 0]
-            return self.sign * (found - self.isovalue * xp.astype(xp.sum(weights, axis=1), found.dtype))
+            values = namespace(theta["values"]).reshape(theta["values"], (-1,))
+            return along_normal(values, samples, *self._level())
         if "points" in samples.tables:
-            return combine(self._table_levels(theta, samples, lattice)[:, None], samples.ids, weights)[:, 0]
+            return along_normal(self._table_levels(theta, samples, lattice), samples, *self._level())
         levels = self._six_levels(theta, samples, lattice)
-        return namespace(levels).sum(levels * weights, axis=1)
+        xp = namespace(levels)
+        params = xp.astype(samples.params, levels.dtype, copy=False)
+        level = xp.sum(levels * params[:, WEIGHTS], axis=1)
+        return params[:, PLACE] - level[:, None] * params[:, ALONG]
 
     def _six_levels(self, theta: Mapping[str, Tree], samples: Samples, lattice: Lattice) -> Array:
         """The level (N, 6) at the lattice points of samples."""
