@@ -234,13 +234,13 @@ def _stability_chart(results: dict, path: Path) -> None:
 
 def mixed(output: Path, side: int) -> tuple[str, dict]:
     """A mesh, Bézier patches, a cage, an isosurface and a field that rays are cast at, in one image."""
-    view = rts.Camera.look_at((0.0, 1.4, 6.6), (0, -0.1, 0), fov_y=32)
+    view = rts.Camera.look_at((0.0, 1.6, 6.6), (0, 0.0, 0), fov_y=22)
     parts = mixed_parts()
     torch_parts = [
         p.replace(theta={k: torch.from_numpy(np.asarray(v)).requires_grad_() for k, v in p.theta.items()})
         for p in parts
     ]
-    image = rts.render(torch_parts, view, (side, side * 2), layers=2, background=(1.0, 1.0, 1.0))
+    image = rts.render(torch_parts, view, (side, side * 5 // 2), layers=2, background=(1.0, 1.0, 1.0))
     image[..., :3].square().mean().backward()
     rts.save_image(output / "mixed.png", image.detach().numpy())
     names = ("mesh", "bezier", "subdivision", "isosurface", "sdf")
@@ -256,14 +256,13 @@ def mixed_parts() -> list[rts.Part]:
     bunny = rts.load(DATA / "meshes" / "bunny.obj")[0]
     teapot = rts.load(DATA / "bezier" / "teapot_patches.txt", surface="bezier")[0]
     rook = rts.load(DATA / "cages" / "catmark_rook.obj", surface="subdivision")[0]
-    upright = np.asarray(teapot.theta["points"], np.float64)[:, [0, 2, 1]] * [1, 1, -1]
     blob = smooth_union(12.0, _ball(0.0, 0.55, 0.0, 0.4), swept_sphere)
-    values = on_lattice(lambda p: blob({"radii": (0.6, 0.22)}, p.reshape(-1, 3)).reshape(p.shape[:-1]), 65)
+    values = on_lattice(lambda p: blob({"radii": np.array([0.6, 0.22])}, p.reshape(-1, 3)).reshape(p.shape[:-1]), 65)
     sdf = rts.plugin("surfaces", "sdf")(swept_sphere, radius=1.0)
     made = [
         bunny.replace(theta={"vertices": normalised(bunny.theta["vertices"]).astype(np.float32)}, shader="lambert"),
-        teapot.replace(theta={"points": normalised(upright).astype(np.float32)}, shader="lambert"),
-        rook.replace(theta={"vertices": normalised(rook.theta["vertices"]).astype(np.float32)}, shader="lambert"),
+        teapot.replace(theta={"points": _upright(teapot.theta["points"])}, shader="lambert"),
+        rook.replace(theta={"vertices": _upright(rook.theta["vertices"])}, shader="lambert"),
         rts.Part(isosurface(), {"values": values}, "normals"),
         rts.Part(sdf, {"radii": np.array([0.6, 0.25], np.float32)}, "normals"),
     ]
@@ -274,6 +273,11 @@ def mixed_parts() -> list[rts.Part]:
         transform[:3, 3] = (-2.3 + 1.15 * i, 0.12 * (-1) ** i, 0.35 * (-1) ** i)
         placed.append(part.replace(transform=transform))
     return placed
+
+
+def _upright(points: np.ndarray) -> np.ndarray:
+    """Points of a shape that stands along z, normalised and turned to stand along y."""
+    return normalised(np.asarray(points, np.float64)[:, [0, 2, 1]] * [1, 1, -1]).astype(np.float32)
 
 
 def _ball(x: float, y: float, z: float, radius: float) -> Callable[[Any, Any], Any]:

@@ -13,6 +13,7 @@ from rts.errors import EngineError, InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Surface
 from rts.operations.gradient import gradient
+from rts.records import Samples
 from rts.trees import Array, Tree, leaves
 from rts_surfaces.entries import RESERVED
 
@@ -75,7 +76,12 @@ class Field:
         Raises:
             InputError: `f` gave another shape, dtype or engine.
         """
-        value = self.f(theta, points)
+        try:
+            value = self.f(theta, points)
+        except KeyError as error:
+            if not error.args or error.args[0] in theta:
+                raise
+            raise InputError(f"{self.name} reads theta[{error.args[0]!r}]; theta has {sorted(theta)}") from error
         check_result("f", value, points)
         return SIDES[self.inside] * (value - self.isovalue)
 
@@ -124,6 +130,22 @@ class Implicit(Surface):
         for name in self.field.names(theta):
             if name not in theta:
                 raise InputError(f"theta of {self!r} has no {name!r}; it has {sorted(theta)}")
+
+    def at_hits(self, theta: Mapping[str, Tree], samples: Samples, level: Callable[[Array], Array]) -> GBuffer:
+        """The G-buffer where rays met the field: x₀ − f(x₀) w, with x₀ and w the parameters of samples (N, 6).
+
+        Args:
+            theta: θ.
+            samples: those of `rts_surfaces.implicit.casting.moving`.
+            level: f, points (M, 3) → (M,), differentiable in θ.
+        """
+        params = self.field.suited(theta, samples.params)
+        xp = namespace(params)
+        # At the origin, where rows that only pad would lie, many a function has no derivative: they do as the first.
+        used = xp.any(params != 0, axis=1, keepdims=True)
+        params = xp.where(used, params, xp.where(used[:1], params[:1], xp.ones_like(params[:1])))
+        found, along = params[:, :3], params[:, 3:]
+        return self.gbuffer(theta, found - level(found)[:, None] * along)
 
     def gbuffer(self, theta: Mapping[str, Tree], position: Array) -> GBuffer:
         """Positions (N, 3) on the surface, with normals of unit length, outwards, and the attributes, when read.

@@ -102,15 +102,15 @@ def _nearest(points: Array, centers: Array, radii: Array) -> Array:
     engine = engine_of(points)
     xp, count = engine.namespace, centers.shape[0]
     if engine.exact_products(points, centers):
-        # |p − c|² = (−2 c, |c|², 1) · (p, 1, |p|²), in blocks that stay in the cache.
-        one, other = xp.ones_like(points[:, :1]), xp.ones_like(centers[:, :1])
-        rows = xp.concat([points[:, :2], one, xp.sum(points * points, axis=1, keepdims=True)], axis=1)
-        columns = xp.concat([-2 * centers, xp.sum(centers * centers, axis=1, keepdims=True), other], axis=1).T
-        found = []
-        for i in range(0, max(1, rows.shape[0]), BLOCK):
-            square = xp.clip(rows[i : i + BLOCK] @ columns, 0, None)
-            found.append(xp.argmin(xp.sqrt(square) - radii, axis=1))
-        return xp.astype(xp.concat(found), xp.int32)
+        # |p − c|² = (−2 c, 1, |c|²) · (p, |p|², 1), in blocks that stay in the cache.
+        of_points, of_centers = (xp.sum(x * x, axis=1, keepdims=True) for x in (points, centers))
+        rows = xp.concat([points[:, :2], of_points, xp.ones_like(of_points)], axis=1)
+        columns = xp.concat([-2 * centers, xp.ones_like(of_centers), of_centers], axis=1).T
+
+        def nearest(rows: Array) -> Array:
+            return xp.argmin(xp.sqrt(xp.clip(rows @ columns, 0, None)) - radii, axis=1)
+
+        return xp.astype(engine.map_rows(nearest, rows, BLOCK), xp.int32)
 
     def body(state: dict[str, Array]) -> dict[str, Array]:
         i = state["i"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,10 +21,11 @@ from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part, RaySurface, TriangleSurface
 from rts.operations.take import take
-from rts.records import ArraySpec, Proxy, Rays, Samples
+from rts.records import ArraySpec, Proxy, RayHits, Rays, Samples
 from rts.threads import parallel
 from rts.trees import Array, Tree, leaves
 from rts_surfaces.implicit import marching_cubes
+from rts_surfaces.implicit.casting import box, cast, moving
 from rts_surfaces.implicit.field import SIDES, Field, Implicit
 from rts_surfaces.implicit.lattice import Lattice, check_bounds
 from rts_surfaces.implicit.lattice_field import LatticeField
@@ -36,6 +38,9 @@ NEAR_SINGULAR = 1e-3
 
 CHUNK = 2**15
 """Lattice points at which a function is evaluated at a time."""
+
+BESIDE = 1e-3
+"""How far before the bounds rays begin where the surface is capped, as a share of the bounds: they meet the caps."""
 
 MOTIONS, ENDS, SINGULAR = ("normal", "edge"), ("capped", "open"), ("bound", "drop", "keep")
 
@@ -152,7 +157,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         """A torus, of values on a lattice."""
         axes = [np.linspace(-1.5, 1.5, 31), np.linspace(-0.7, 0.7, 15), np.linspace(-1.5, 1.5, 31)]
         x, y, z = np.meshgrid(*axes, indexing="ij")
-        values = np.hypot(np.hypot(x, z) - 0.9, y) - 0.4
+        values = np.hypot(np.hypot(x - 0.03, z + 0.02) - 0.9, y - 0.01) - 0.4
         surface = cls(((-1.5, -0.7, -1.5), (1.5, 0.7, 1.5)))
         return Part(surface, {"values": values.astype(np.float32)}, "normals")
 
@@ -327,7 +332,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         lattice = self.lattice(theta)
         low, high = lattice.low, lattice.low + (np.array(lattice.shape) - 1) * lattice.step
         margin = BESIDE * (high - low) if self.closed else 0.0
-        level = partial(self._capped if self.closed else self.field.level, theta)
+        level = self._level_in_bounds(theta)
         return cast(
             level,
             partial(moving, level),
@@ -338,6 +343,10 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             lipschitz=self.lipschitz,
             steps=2 * max(lattice.shape) if self.lipschitz is None else None,
         )
+
+    def _level_in_bounds(self, theta: Mapping[str, Tree]) -> Callable[[Array], Array]:
+        """The level as a function of points, with the caps."""
+        return partial(self._capped if self.closed else self.field.level, theta)
 
     def _capped(self, theta: Mapping[str, Tree], points: Array) -> Array:
         """The level, and beyond the bounds no less than the distance to them."""
@@ -352,7 +361,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Positions, normals along the field's gradient, and attributes."""
         if samples.ids.shape[1] == 0:
-            return self.at_hits(theta, samples)
+            return self.at_hits(theta, samples, self._level_in_bounds(theta))
         lattice = self.lattice(theta)
         moved = self._on_edges if self.motion == "edge" else self._along_normal
         return self.gbuffer(theta, moved(theta, samples, lattice))

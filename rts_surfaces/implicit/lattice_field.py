@@ -46,6 +46,12 @@ class LatticeField:
         """The lattice of θ's values."""
         return Lattice(self.bounds, shape_of(theta["values"]))
 
+    def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
+        """The points in the dtype of the values, float32 at least."""
+        xp = namespace(points)
+        wide = namespace(theta["values"]).finfo(theta["values"].dtype).bits == 64
+        return xp.astype(points, xp.float64 if wide else xp.float32, copy=False)
+
     def level(self, theta: Mapping[str, Tree], points: Array) -> Array:
         """Values less the isovalue (M,), negative inside, at points (M, 3) of any dtype; beyond the bounds as on them.
 
@@ -83,7 +89,7 @@ class LatticeField:
 
     @staticmethod
     def _cell(lattice: Lattice, points: Array) -> tuple[list[Array], list[Array]]:
-        """Of the cells that points lie in, the coordinates of the lowest corner (M,) int32; and how far into them."""
+        """The lowest corners of the cells that points lie in, (M,) int32 along each axis; and how far into them."""
         xp, engine = namespace(points), engine_of(points)
         lowest, shares = [], []
         for axis, (low, step) in enumerate(zip(lattice.low.tolist(), lattice.step.tolist(), strict=True)):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.engines import constants, engine_of, namespace
+from rts.engines import namespace
 from rts.errors import InputError
 from rts.operations.combine import combine
 from rts.operations.operation import Arrays, Operation, Some
@@ -27,10 +27,7 @@ def along_normal(values: Array, samples: Any, isovalue: float, sign: float) -> A
         isovalue: the level is `sign * (value - isovalue)`.
         sign: 1 or −1.
     """
-    engine = engine_of(values, samples.params)
-    values = constants(values, engine, samples.params)
-    xp = engine.namespace
-    params = xp.astype(samples.params, values.dtype, copy=False)
+    params = namespace(values).astype(samples.params, values.dtype, copy=False)
     return ALONG_NORMAL(values, params, samples.ids, isovalue=isovalue, sign=sign)
 
 
@@ -63,9 +60,7 @@ def _forward(operands: Arrays, out: np.ndarray, *, isovalue: float, sign: float)
     parallel(motion_kernels.move, len(ids), values, params, ids, real(isovalue), real(sign), out, work=30 * len(ids))
 
 
-def _push(
-    operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, sign: float
-) -> None:
+def _push(operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, sign: float) -> None:
     from rts_surfaces.implicit import motion_kernels
 
     values, params, ids = _checked(operands)
