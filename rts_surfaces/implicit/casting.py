@@ -16,7 +16,7 @@ from rts.trees import Array, map_leaves
 STEPS = 256
 """Steps across the region where no Lipschitz constant is known."""
 
-SHORTEST = 1 / 1024
+SHORTEST = 1 / 512
 """The shortest step where one is known, as a share of the region across. Thinner parts may be missed."""
 
 MOST = 512

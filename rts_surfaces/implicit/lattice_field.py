@@ -8,23 +8,32 @@ from typing import Any
 from rts.arrays import shape_of
 from rts.engines import engine_of, namespace
 from rts.operations.combine import combine
+from rts.records import ArraySpec, Samples
 from rts.trees import Array, Tree
 from rts_surfaces.entries import check_entry
+from rts_surfaces.implicit.field import ScalarField
+from rts_surfaces.implicit.function_on_lattice import Looked
 from rts_surfaces.implicit.lattice import Lattice, check_shape
 
 
-class LatticeField:
-    """θ["values"] (X, Y, Z) at the points of a lattice, as a field; see `rts_surfaces.implicit.field.Field`.
+class LatticeField(ScalarField):
+    """θ["values"] (X, Y, Z) at the points of a lattice, as a field.
 
     Args:
         bounds: the corners of the lattice.
         isovalue: where the level is zero.
         sign: 1 where values below the isovalue are inside, −1 where those above it are.
         shape: (X, Y, Z) that the values must have, or None for any.
+
+    Attributes:
+        level_of_values: isovalue and sign of what `look` gives.
     """
+
+    name = "theta['values']"
 
     def __init__(self, bounds: Any, isovalue: float, sign: float, shape: Any = None):
         self.bounds, self.isovalue, self.sign = bounds, isovalue, sign
+        self.level_of_values = (isovalue, sign)
         self.shape = None if shape is None else check_shape(shape)
 
     def names(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
@@ -45,6 +54,27 @@ class LatticeField:
     def lattice(self, theta: Mapping[str, Tree]) -> Lattice:
         """The lattice of θ's values."""
         return Lattice(self.bounds, shape_of(theta["values"]))
+
+    def look(self, theta: Mapping[str, Tree], closed: bool) -> Looked:
+        """The values."""
+        return Looked({"values": theta["values"]}, 0)
+
+    def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
+        """None: samples name the values themselves."""
+        return {}
+
+    def tabled(self, samples: Samples) -> Samples:
+        """The samples."""
+        return samples
+
+    def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
+        """All values (M,), and which of them (N, 6) belong to each sample."""
+        values = theta["values"]
+        return namespace(values).reshape(values, (-1,)), samples.ids
+
+    def numbers(self, samples: Samples) -> Array:
+        """The lattice points (N, 6) of samples."""
+        return samples.ids
 
     def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
         """The points in the dtype of the values, float32 at least."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -14,27 +13,27 @@ from rts.operations.operation import Arrays, Operation, Some
 from rts.threads import parallel, read_only
 from rts.trees import Array
 
-WEIGHTS, PLACE, ALONG = slice(3, 9), slice(9, 12), slice(12, 15)
+_WEIGHTS, _PLACE, _ALONG = slice(3, 9), slice(9, 12), slice(12, 15)
 """Which parameters of a sample are the weights of the six values, its place, and by how much it moves for a unit."""
 
 
-def along_normal(values: Array, samples: Any, isovalue: float, sign: float) -> Array:
+def along_normal(values: Array, rows: Array, params: Array, isovalue: float, sign: float) -> Array:
     """(N, 3): where samples are, less their vector times the level, which is zero where they were found.
 
     Args:
-        values: (M,) float, by lattice point or by row of a table.
-        samples: ids (N, 6), rows of the values, and params (N, 15).
+        values: (M,) float.
+        rows: (N, 6) int32, the six values of each sample.
+        params: (N, 15), in the dtype of the values.
         isovalue: the level is `sign * (value - isovalue)`.
         sign: 1 or −1.
     """
-    params = namespace(values).astype(samples.params, values.dtype, copy=False)
-    return ALONG_NORMAL(values, params, samples.ids, isovalue=isovalue, sign=sign)
+    return ALONG_NORMAL(values, params, rows, isovalue=isovalue, sign=sign)
 
 
 def _specification(values: Array, params: Array, ids: Array, *, isovalue: float, sign: float) -> Array:
-    xp, weights = namespace(values, params), params[:, WEIGHTS]
+    xp, weights = namespace(values, params), params[:, _WEIGHTS]
     level = combine(values[:, None], ids, weights)[:, 0] - isovalue * xp.sum(weights, axis=1)
-    return params[:, PLACE] - sign * level[:, None] * params[:, ALONG]
+    return params[:, _PLACE] - sign * level[:, None] * params[:, _ALONG]
 
 
 def _shape(values: tuple[int, ...], params: tuple[int, ...], ids: tuple[int, ...], **_: object) -> tuple[int, ...]:

@@ -40,7 +40,7 @@ class Sdf(Implicit, RaySurface):
         reads: the names of the entries of θ that `f` reads; None for all.
         attributes: name → g(θ, positions (N, 3)) → (N, C), further entries of the G-buffer; see `Implicit`.
         steps: how many of the shortest steps there are across the ball: what is thinner than one may be missed. None
-            for 256 without `lipschitz`, 1024 with it.
+            for 256 without `lipschitz`, 512 with it.
 
     Raises:
         InputError: wrong arguments.
