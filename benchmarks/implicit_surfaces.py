@@ -38,6 +38,8 @@ LEARNING_RATE = 1e-7
 EYE = (0.0, 1.9, 2.6)
 MOTIONS = ("normal", "edge")
 SINGULAR = ("bound", "drop", "keep")
+TILT = 1e-5
+"""By how much the ends of edges across a plane of symmetry differ, for a unit of length."""
 
 
 def isosurface(**options: Any) -> Any:
@@ -178,18 +180,23 @@ def gradient_norm(values: np.ndarray, weights: torch.Tensor, motion: str, singul
 
 
 def stability(steps: int, output: Path) -> tuple[str, dict]:
-    """Norms of gradients, of a ball that grows through ties, and of noise in whole numbers."""
+    """Norms of gradients, of a ball that passes through ties, and of noise in and beside whole numbers."""
     weights = torch.from_numpy(np.random.default_rng(0).standard_normal((64, 64, 4)).astype(np.float32))
-    ball = on_lattice(lambda p: np.linalg.norm(p, axis=-1), 33)
-    # Beside lattice points in a row from the middle, the distance is nearly the same.
-    radii = np.linspace(0.55, 0.7, steps)
+
+    def noise(seed: int) -> np.ndarray:
+        return np.random.default_rng(seed).standard_normal((9, 9, 9)).astype(np.float32)
+
+    ball = on_lattice(lambda p: np.linalg.norm(p, axis=-1) + TILT * p[..., 0], 32)
+    # Edges across the plane x = 0 have ends of nearly the same distance; some lie on each of these balls.
+    ties = 0.5 * (ball[15] + ball[16])[18:29, 18:27].reshape(-1)
+    ties = np.sort(ties[(ties > 0.4) & (ties < 0.8)])
+    ties = ties[np.linspace(0, len(ties) - 1, min(steps, len(ties))).astype(int)]
     scenes = {
-        "a ball that grows": [ball - np.float32(r) for r in radii],
-        "squares of distances": [np.float32(1 / 256) * np.rint(256 * (ball * ball - np.float32(r * r))) for r in radii],
-        "noise in whole numbers": [
-            np.rint(2 * np.random.default_rng(i).standard_normal((9, 9, 9))).astype(np.float32) for i in range(steps)
-        ],
-        "noise": [np.random.default_rng(i).standard_normal((9, 9, 9)).astype(np.float32) for i in range(steps)],
+        "a ball that grows": [ball - np.float32(r) for r in np.linspace(0.4, 0.8, steps)],
+        "a ball in ties": [ball - np.float32(r) for r in ties],
+        "noise": [noise(i) for i in range(steps)],
+        "noise in whole numbers": [np.rint(2 * noise(i)) for i in range(steps)],
+        "a hair beside them": [np.rint(2 * noise(i)) + np.float32(1e-5) * noise(steps + i) for i in range(steps)],
     }
     rows, results = [], {}
     for scene, frames in scenes.items():
@@ -222,6 +229,7 @@ def _stability_chart(results: dict, path: Path) -> None:
                 own.semilogy(results[f"{scene}, {motion}"][name], color=color, lw=width, label=name)
             own.set_title(f"{scene}\nmotion along {'edges' if motion == 'edge' else 'the normal'}", fontsize=9)
             own.grid(alpha=0.3)
+        axes[1, column].set_xlabel("image")
     axes[0, 0].set_ylabel("norm of the gradient")
     axes[1, 0].set_ylabel("norm of the gradient")
     axes[0, 0].legend()

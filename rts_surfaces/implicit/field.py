@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -77,16 +77,14 @@ class Field(ScalarField):
         InputError: wrong arguments.
     """
 
-    def __init__(self, f: Function, isovalue: float = 0.0, inside: str = "below", reads: Iterable[str] | None = None):
+    def __init__(self, f: Function, isovalue: float = 0.0, inside: str = "below", reads: Sequence[str] | None = None):
         check_function("f", f)
         value = check_numbers("isovalue", isovalue, ())
         if value is None:
             raise InputError("isovalue is traced; expected a known number, or subtract it in f")
         if not isinstance(inside, str) or inside not in SIDES:
             raise InputError(f"inside is {quoted(inside)}; expected 'below' or 'above'")
-        if reads is not None and (
-            isinstance(reads, str) or not isinstance(reads, Iterable) or not all(isinstance(n, str) for n in reads)
-        ):
+        if reads is not None and not (isinstance(reads, (list, tuple)) and all(isinstance(n, str) for n in reads)):
             raise InputError(f"reads is {quoted(reads)}; expected names of entries of theta, or None for all")
         self.f, self.isovalue, self.inside, self.sign = f, float(value), inside, SIDES[inside]
         self.name = getattr(f, "__name__", type(f).__name__)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -50,7 +50,7 @@ class FunctionOnLattice(Field):
         f: Function,
         isovalue: float,
         inside: str,
-        reads: Iterable[str] | None,
+        reads: Sequence[str] | None,
         lattice: Lattice,
         table: bool | int,
         band: NarrowBand | None,

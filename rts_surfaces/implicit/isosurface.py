@@ -118,7 +118,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             ("at_bounds", at_bounds, ENDS),
             ("near_singular", near_singular, SINGULAR),
         ):
-            if given not in names:
+            if not isinstance(given, str) or given not in names:
                 raise InputError(f"{name} is {quoted(given)}; expected {' or '.join(map(repr, names))}")
         check_bounds(bounds)
         check_numbers("isovalue", isovalue, ())

@@ -70,7 +70,7 @@ def check_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
 def check_shape(shape: Any) -> tuple[int, int, int]:
     """(X, Y, Z) as integers, refused where there is no such lattice."""
     try:
-        given = tuple(shape)
+        given = () if isinstance(shape, (str, bytes)) else tuple(shape)
     except TypeError:
         given = ()
     if len(given) != 3 or not all(is_count(n) and n >= 2 for n in given):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -56,7 +56,7 @@ class Sdf(Implicit, RaySurface):
         isovalue: float = 0.0,
         inside: str = "below",
         lipschitz: float | None = 1.0,
-        reads: Iterable[str] | None = None,
+        reads: Sequence[str] | None = None,
         attributes: Mapping[str, Function] | None = None,
         steps: int | None = None,
     ):
