@@ -198,15 +198,15 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     def proxy(self, inputs: Mapping[str, np.ndarray], camera: Any, size: tuple[int, int]) -> Proxy:
         """The triangles of marching cubes, each with the ends of its edges, its cell, and where it is capped."""
+        from rts_surfaces.implicit import lattice_samples_kernels
+
         found = self._triangles(inputs)
         faces, cells, caps = found.faces, found.cells, found.caps
         if self.near_singular == "drop":
             kept = ~_singular(found)[faces].any(axis=1)
             faces, cells, caps = faces[kept], cells[kept], caps[kept]
         ids = np.empty((len(faces), 8), np.int32)
-        for k in range(3):
-            np.take(found.ends, faces[:, k], axis=0, out=ids[:, 2 * k : 2 * k + 2], mode="clip")
-        ids[:, 6], ids[:, 7] = cells, caps
+        parallel(lattice_samples_kernels.name, len(ids), faces, found.ends, cells, caps, ids, work=10 * len(ids))
         return Proxy(found.vertices, faces, ids)
 
     def refine(self, inputs: Mapping[str, np.ndarray], samples: Samples, rays: Rays) -> Samples:
@@ -218,17 +218,21 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         none = np.empty(0, np.int64), np.empty((0, 8), np.int32)
         numbers, corners = (inputs["numbers"], inputs["corners"]) if "corners" in inputs else none
         count = len(samples.ids)
-        points, carried = np.empty((count, 6), np.int32), np.empty((count, 12), np.float32)
-        slopes, apart = np.empty((count, 3)), np.empty((count, 3))
+        points, carried = np.empty((count, 6), np.int32), np.empty((count, 15), np.float32)
+        squares, apart = np.empty(count), np.empty((count, 3))
         given = values, *self.field.level_of_values, numbers, corners, lattice.shape, lattice.low, lattice.step
-        made = points, carried, slopes, apart
+        made = points, carried, squares, apart
         parallel(lattice_samples_kernels.fill, count, *given, samples.ids, samples.params, *made, work=300 * count)
         if self.motion == "edge":
             crossed = apart[apart > 0]
             least = NEAR_SINGULAR * np.median(crossed) if len(crossed) and self.near_singular == "bound" else 0.0
             params = np.concatenate([carried[:, :3], np.full((count, 1), least, np.float32)], axis=1)
         else:
-            params = np.concatenate([carried, _per_level(slopes, self.near_singular)], axis=1)
+            usual = squares[squares > 0]
+            bounded = len(usual) > 0 and self.near_singular != "keep"
+            least = NEAR_SINGULAR**2 * float(np.median(usual)) if bounded else 0.0
+            parallel(lattice_samples_kernels.divide, count, squares, least, carried, work=5 * count)
+            params = carried
         return self.field.tabled(replace(samples, ids=points, params=params))
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
@@ -312,15 +316,6 @@ def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
     change = (1 - along) * (f_a - engine.stop_gradient(f_a)) + along * (f_b - engine.stop_gradient(f_b))
     # Neither branch may divide by nothing, chosen or not.
     return xp.where(singular, along - change / xp.where(singular, bounded, xp.ones_like(bounded)), exact)
-
-
-def _per_level(slopes: np.ndarray, near_singular: str) -> np.ndarray:
-    """By what vector (N, 3) float32 samples move for each unit of level: the gradient over its square, bounded."""
-    square = (slopes * slopes).sum(axis=1)
-    usual = square[square > 0]
-    least = NEAR_SINGULAR**2 * np.median(usual) if len(usual) and near_singular != "keep" else 0.0
-    divisor = np.maximum(square, least)
-    return np.divide(slopes, divisor[:, None], out=np.zeros_like(slopes), where=divisor[:, None] > 0).astype(np.float32)
 
 
 def _singular(found: Triangles) -> np.ndarray:
