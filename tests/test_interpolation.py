@@ -6,7 +6,7 @@ from helpers import ALL, DIFFERENTIABLE, arrays, derivative, gradient, to_numpy
 
 from rts_surfaces.implicit.interpolation import DIFFERENCES, differences, interpolated
 from rts_surfaces.implicit.lattice import Lattice
-from rts_surfaces.implicit.motion import ALONG_NORMAL, along_normal
+from rts_surfaces.implicit.motion import ALONG_EDGES, ALONG_NORMAL
 
 pytestmark = pytest.mark.sampling
 
@@ -48,9 +48,28 @@ def samples():
 
 
 ROWS, PARAMS = samples()
+
+
+def edges():
+    """Ends of edges of the lattice (N, 6), some of them one point; and params (N, 4) that bound some of them."""
+    count = 30
+    low = RNG.integers(0, (4, 3, 6), (count, 3, 3))
+    high = low + np.eye(3, dtype=int)[RNG.integers(0, 3, (count, 3))] * RNG.choice([0, 1, 1, 1], (count, 3, 1))
+    numbers = np.stack([np.ravel_multi_index(tuple(x.transpose(2, 0, 1)), LATTICE.shape) for x in (low, high)], axis=-1)
+    least = np.where(np.arange(count) % 3 == 0, 0.5, 0.0)[:, None]
+    return numbers.reshape(count, 6).astype(np.int32), np.concatenate([RNG.random((count, 3)), least], axis=1)
+
+
+NUMBERS, BOUNDED = edges()
 CASES = {
     "differences": (DIFFERENCES, [VALUES, POINTS], (), STEPS),
     "along the normal": (ALONG_NORMAL, [RNG.standard_normal(40)], (PARAMS, ROWS), {"isovalue": 0.3, "sign": -1.0}),
+    "along edges": (
+        ALONG_EDGES,
+        [VALUES.reshape(-1)],
+        (BOUNDED, NUMBERS, NUMBERS),
+        {"isovalue": 0.1, "lattice": LATTICE.fixed},
+    ),
 }
 """An operation, operands with and without derivatives, and parameters."""
 
@@ -81,4 +100,4 @@ def test_compiled_values_and_derivatives_are_those_of_the_specification(target, 
 def test_samples_of_another_surface_are_refused():
     values = RNG.standard_normal(10)
     with pytest.raises(ValueError, match="sample this surface anew"):
-        along_normal(values, ROWS, PARAMS, 0.0, 1.0)
+        ALONG_NORMAL(values, PARAMS, ROWS, isovalue=0.0, sign=1.0)

@@ -19,7 +19,6 @@ from rts.engines import CONSTANT_TYPES, engine_of, namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part, RaySurface, TriangleSurface
-from rts.operations.take import take
 from rts.records import ArraySpec, Proxy, RayHits, Rays, Samples
 from rts.threads import parallel
 from rts.trees import Array, Tree, map_leaves
@@ -30,7 +29,7 @@ from rts_surfaces.implicit.function_on_lattice import FunctionOnLattice
 from rts_surfaces.implicit.lattice import Lattice, check_bounds
 from rts_surfaces.implicit.lattice_field import LatticeField
 from rts_surfaces.implicit.marching_cubes import Triangles
-from rts_surfaces.implicit.motion import along_normal
+from rts_surfaces.implicit.motion import ALONG_EDGES, ALONG_NORMAL
 from rts_surfaces.implicit.narrow_band import Band, NarrowBand
 
 NEAR_SINGULAR = 1e-3
@@ -278,44 +277,10 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         isovalue, sign = self.field.level_of_values
         params = namespace(values).astype(samples.params, values.dtype, copy=False)
         if self.motion == "normal":
-            return self.gbuffer(theta, along_normal(values, rows, params, isovalue, sign))
-        xp = namespace(values)
-        levels = sign * (take(values[:, None], xp.reshape(rows, (-1,))) - isovalue)
+            return self.gbuffer(theta, ALONG_NORMAL(values, params, rows, isovalue=isovalue, sign=sign))
         lattice, numbers = self.field.lattice(theta), self.field.numbers(samples)
-        return self.gbuffer(theta, _on_edges(xp.reshape(levels, (-1, 6)), params, lattice, numbers))
-
-
-def _on_edges(levels: Array, params: Array, lattice: Lattice, numbers: Array) -> Array:
-    """Positions (N, 3) in triangles whose corners slide along edges of the lattice.
-
-    Args:
-        levels: (N, 6), at the ends of the edges.
-        params: (N, 4), barycentrics, and by how much the ends of an edge are taken to differ at least.
-        lattice: the lattice.
-        numbers: (N, 6), the ends.
-    """
-    corners = []
-    for k in range(3):
-        a, b = (lattice.places(numbers[:, 2 * k + i], levels.dtype) for i in range(2))
-        along = _crossing(levels[:, 2 * k], levels[:, 2 * k + 1], params[:, 3])
-        corners.append(params[:, k : k + 1] * (a + along[:, None] * (b - a)))
-    return corners[0] + corners[1] + corners[2]
-
-
-def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
-    """How far along an edge the level is zero (N,); its derivative as if the ends differed by `least` or more."""
-    engine = engine_of(f_a)
-    xp, apart = engine.namespace, f_b - f_a
-    same = apart == 0
-    exact = -f_a / xp.where(same, xp.ones_like(apart), apart)
-    exact = xp.where(same, xp.zeros_like(exact), exact)
-    known = engine.stop_gradient(apart)
-    singular = xp.abs(known) < least
-    bounded = xp.where(known < 0, -least, least)
-    along = engine.stop_gradient(exact)
-    change = (1 - along) * (f_a - engine.stop_gradient(f_a)) + along * (f_b - engine.stop_gradient(f_b))
-    # Neither branch may divide by nothing, chosen or not.
-    return xp.where(singular, along - change / xp.where(singular, bounded, xp.ones_like(bounded)), exact)
+        position = ALONG_EDGES(values, params, rows, numbers, isovalue=isovalue, lattice=lattice.fixed)
+        return self.gbuffer(theta, position)
 
 
 def _singular(found: Triangles) -> np.ndarray:

@@ -37,6 +37,18 @@ class Lattice:
         self.shape = check_shape(shape)
         self.step = (high - self.low) / (np.array(self.shape) - 1)
 
+    @classmethod
+    def of(cls, shape: tuple[int, ...], low: tuple[float, ...], step: tuple[float, ...]) -> Lattice:
+        """The lattice whose `fixed` these are."""
+        self = cls.__new__(cls)
+        self.shape, self.low, self.step = shape, np.array(low), np.array(step)
+        return self
+
+    @property
+    def fixed(self) -> tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]:
+        """Shape, first point and step, as numbers of Python."""
+        return self.shape, tuple(self.low.tolist()), tuple(self.step.tolist())
+
     @property
     def count(self) -> int:
         """The number of points."""
