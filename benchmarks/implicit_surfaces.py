@@ -4,6 +4,7 @@
 descent, with torch and K = 2 at 256²; the values change in each. *Naive*: marching cubes by PyMCubes, the vertices
 computed again from the values at the ends of their edges, so that they have derivatives, and drawn as a mesh.
 *Band*: at how many points a function is evaluated, and the time of evaluations and triangles, in NumPy.
+*Outlines*: derivatives of silhouettes against closed forms, and against differences of hard images.
 *Stability*: norms of gradients while a surface passes through ties of lattice values. Contenders take turns:
 
     python -m benchmarks.implicit_surfaces -o out/implicit
@@ -23,7 +24,7 @@ import numpy as np
 import torch
 
 import rts
-from benchmarks.camera import camera
+from benchmarks.camera import camera, supersampled
 from benchmarks.meshes import DATA, normalised
 from benchmarks.report import environment, table
 from benchmarks.speed.memory import growth
@@ -167,6 +168,68 @@ def band(counts: tuple[int, ...]) -> tuple[str, dict]:
     return table(["", "lattice", "evaluations", "of all", "triangles", "s", "MiB"], rows), results
 
 
+# ------------------------------------------------------------------------------------------------- outlines
+
+
+def outlines(counts: tuple[int, ...], side: int, samples: int) -> tuple[str, dict]:
+    """The derivative of a silhouette's area, beside the truth: of a ball by its radius, of a torus by both."""
+    sdf = rts.plugin("surfaces", "sdf")
+    surfaces = {"sdf, by rays": lambda f: sdf(f, radius=1.2, reads=("radii",))}
+    for count in counts:
+        for motion in MOTIONS:
+            surfaces[f"{count}³, {motion}"] = lambda f, c=count, m=motion: isosurface(f=f, shape=(c,) * 3, motion=m)
+    above = rts.Camera.orthographic((0, 3, 0), (0, 0, 0), (0, 0, 1), height=2.2, near=0.5, far=10)
+    per_area = (side / 2.2) ** 2
+    closed_forms = {
+        "ball": _disk_slope(0.7, side),
+        # Seen along its axis its area is 4 π times the product of its radii.
+        "ring above": 4 * np.pi * TUBE * per_area,
+        "tube above": 4 * np.pi * RING * per_area,
+    }
+    scenes: dict[str, tuple] = {
+        "ball": (_round, camera(), [0.7], 0),
+        "ring above": (swept_sphere, above, [RING, TUBE], 0),
+        "tube above": (swept_sphere, above, [RING, TUBE], 1),
+        "ring aslant": (swept_sphere, camera(EYE), [RING, TUBE], 0),
+        "tube aslant": (swept_sphere, camera(EYE), [RING, TUBE], 1),
+    }
+    results: dict[str, dict[str, float]] = {name: {} for name in surfaces}
+    for scene, (f, view, radii, index) in scenes.items():
+        true = closed_forms.get(scene) or _area_slope(f, view, radii, index, side, samples)
+        for name, surface in surfaces.items():
+            for fine in (1, 4):
+                given = torch.tensor(radii, dtype=torch.float32, requires_grad=True)
+                part = rts.Part(surface(f), {"radii": given})
+                area = rts.render(part, view, (side, side), splatter="visible", supersample=fine)[..., 3].sum()
+                results[name][f"{scene}, {fine}"] = float(torch.autograd.grad(area, given)[0][index]) / true
+    rows = [[name, *(f"{100 * (r - 1):+.1f} %" for r in found.values())] for name, found in results.items()]
+    header = [f"off the truth, {side}²", *(f"{s}, s = {n}" for s in scenes for n in (1, 4))]
+    return table(header, rows), results
+
+
+def _round(theta: Any, points: Any) -> Any:
+    """A ball."""
+    xp = rts.namespace(points)
+    return xp.sqrt(xp.sum(points * points, axis=-1) + 1e-12) - theta["radii"][0]
+
+
+def _disk_slope(radius: float, side: int, distance: float = 3.2) -> float:
+    """The derivative by its radius of a ball's area in pixels."""
+    focal = side / 2 / np.tan(np.deg2rad(20))
+    return 2 * np.pi * focal**2 * radius * distance**2 / (distance**2 - radius**2) ** 2
+
+
+def _area_slope(f: Callable, view: rts.Camera, radii: list, index: int, side: int, samples: int) -> float:
+    """The derivative of an area in pixels, by differences of images of samples² hard samples a pixel."""
+    areas, step = [], 0.01
+    for sign in (1, -1):
+        moved = np.array(radii, np.float32)
+        moved[index] += sign * step
+        part = rts.Part(rts.plugin("surfaces", "sdf")(f, radius=1.2), {"radii": moved})
+        areas.append(float(supersampled(part, view, (side, side), samples)[..., 3].sum(dtype=np.float64)))
+    return (areas[0] - areas[1]) / (2 * step)
+
+
 # ----------------------------------------------------------------------------------------------- stability
 
 
@@ -298,7 +361,7 @@ def _ball(x: float, y: float, z: float, radius: float) -> Callable[[Any, Any], A
 
 
 def main() -> None:
-    sections = ("speed", "band", "stability", "mixed")
+    sections = ("speed", "band", "outlines", "stability", "mixed")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/implicit"))
     parser.add_argument("--only", nargs="+", choices=sections, default=sections)
@@ -308,6 +371,7 @@ def main() -> None:
     runs: dict[str, Callable[[], tuple[str, dict]]] = {
         "speed": lambda: speed(2 if args.quick else 7),
         "band": lambda: band((65, 129) if args.quick else (65, 129, 257, 513)),
+        "outlines": lambda: outlines((33,) if args.quick else (33, 65, 128), 256, 2 if args.quick else 6),
         "stability": lambda: stability(12 if args.quick else 120, args.output),
         "mixed": lambda: mixed(args.output, 128 if args.quick else 400),
     }

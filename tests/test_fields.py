@@ -20,7 +20,7 @@ TORUS = {"radii": np.array([0.9, 0.35])}
 
 def to_each(points=POINTS):
     """(M, n) distances to all spheres."""
-    off = points[:, None] - np.insert(CENTERS, 2, 0, axis=1)
+    off = points[:, None] - np.insert(CENTERS, 1, 0, axis=1)
     return np.linalg.norm(off, axis=2) - RADII
 
 
@@ -76,7 +76,7 @@ def test_the_derivative_of_many_spheres_is_that_of_the_nearest(target):
     theta, points = arrays(target, (MANY, POINTS))
     found = gradient(target, lambda theta: fields.spheres(theta, points).sum(), theta)
     nearest = to_each().argmin(axis=1)
-    off = POINTS - np.insert(CENTERS, 2, 0, axis=1)[nearest]
+    off = POINTS - np.insert(CENTERS, 1, 0, axis=1)[nearest]
     toward = -off[:, :2] / np.linalg.norm(off, axis=1)[:, None]
     expected = np.zeros_like(CENTERS)
     np.add.at(expected, nearest, toward)
