@@ -40,7 +40,7 @@ def pull(g, params, rows, sign, results):
 
 @numba.njit(nogil=True, inline="always")
 def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
-    """Of edge k: the axis along which it goes, its length, and how far along it the isovalue is crossed.
+    """The axis along which edge k goes, its length, and how far along it the isovalue is crossed.
 
     Then the number that the derivative divides by; zero for an edge whose ends are one point.
     """
