@@ -117,9 +117,7 @@ def spheres_tasks() -> list[Task]:
     start = {"centers": rng.uniform(-0.8, 0.8, (SPHERES, 2)), "radii": rng.uniform(0.04, 0.12, SPHERES)}
     start = {name: x.astype(np.float32) for name, x in start.items()}
     views = ("front", FRONT), ("rotated", ROTATED)
-    return [
-        Task(name, spheres, start, "lambert", (view,), "adam", SPHERES_RATE, costly=True) for name, view in views
-    ]
+    return [Task(name, spheres, start, "lambert", (view,), "adam", SPHERES_RATE, costly=True) for name, view in views]
 
 
 def grid_tasks() -> list[Task]:
