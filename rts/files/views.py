@@ -30,6 +30,8 @@ MARGIN = 100.0
 """How much nearer, and farther, than what a file tells of its scene the planes of its cameras are."""
 SCALE_OF_NEAREST = 0.75
 """In NeRF's frame of LLFF scenes the nearest bound is 1 / 0.75."""
+OFF_CENTRE = 1e-3
+"""How far, in widths of the image, what a file tells of a lens twice may differ."""
 HEADER, ROW = 5, 17
 """Columns of the matrix (3, 5) of an LLFF pose, and numbers in a row of poses_bounds.npy."""
 
@@ -37,9 +39,10 @@ HEADER, ROW = 5, 17
 class View:
     """A picture, and the camera that took it.
 
-    Attributes:
+    Args:
         camera: the camera, float64 NumPy.
         size: (height, width).
+        image: (H, W, 3 or 4) float32, or a function that gives it whenever it is asked for.
         name: what the picture is called in its file.
         near: the depth at which the scene begins, in the units of the camera; None where that is not known.
         far: the depth at which it ends, or None.
@@ -54,7 +57,6 @@ class View:
         near: float | None = None,
         far: float | None = None,
     ):
-        """A view; `image` (H, W, 3 or 4) float32, or a function that gives it whenever it is asked for."""
         self.camera, self.size, self.name, self.near, self.far = camera, size, name, near, far
         self._image = image
 
@@ -126,12 +128,12 @@ def load_views(
         if plane is not None and not (is_real(plane) and 0 < plane < math.inf):
             raise InputError(f"{name} is {quoted(plane)}; expected a positive number, or None")
     behind = None if background is None else colour_named(background)
-    posed = _blender(path) if path.suffix.lower() == ".json" else _llff(path, downscale, frame)
+    posed = _blender(path, downscale) if path.suffix.lower() == ".json" else _llff(path, downscale, frame)
     reading = functools.partial(_read, linear=bool(linear), behind=behind)
     views = []
     for pose in posed:
-        image = functools.partial(reading, pose.path, pose.size, pose.downscale or downscale)
-        views.append(_view(pose, downscale, pixel_center, planes, functools.cache(image) if cache else image))
+        image = functools.partial(reading, pose.path, pose.size, pose.downscale)
+        views.append(_view(pose, pixel_center, planes, functools.cache(image) if cache else image))
     return views
 
 
@@ -151,18 +153,15 @@ def colour_named(colour: Any) -> np.ndarray:
 
 
 class _Pose(NamedTuple):
-    """What a file says of one picture: camera-to-world (4, 4), its focal length over its width, its bounds.
-
-    `downscale` is what is left to do of it, or None for all.
-    """
+    """What a file says of one picture: how small it is to be made yet, its focal length over its width, its bounds."""
 
     path: Path
     size: tuple[int, int]
+    downscale: int
     camera_to_world: np.ndarray
     focal: float
     near: float | None = None
     far: float | None = None
-    downscale: int | None = None
 
 
 def _checked(path: Path, split: Any, downscale: Any, pixel_center: Any, frame: Any) -> Path:
@@ -193,12 +192,14 @@ def _checked(path: Path, split: Any, downscale: Any, pixel_center: Any, frame: A
 
 def _view(
     pose: _Pose,
-    downscale: int,
     pixel_center: float,
     planes: tuple[float | None, float | None],
     image: Callable[[], np.ndarray],
 ) -> View:
-    size = _smaller(pose, pose.downscale or downscale)
+    (height, width), n = pose.size, pose.downscale
+    if height % n or width % n:
+        raise InputError(f"{pose.path} has {width} × {height} pixels, which are no multiples of downscale = {n}")
+    size = height // n, width // n
     near, far = planes
     near = near or (PLANES[0] if pose.near is None else pose.near / MARGIN)
     far = far or (PLANES[1] if pose.far is None else pose.far * MARGIN)
@@ -207,13 +208,6 @@ def _view(
         shift: Any = pixel_center - 0.5  # A window may lie between pixels.
         camera = camera.window(size, (shift, shift), size)
     return View(camera, size, image, pose.path.name, pose.near, pose.far)
-
-
-def _smaller(pose: _Pose, n: int) -> tuple[int, int]:
-    height, width = pose.size
-    if height % n or width % n:
-        raise InputError(f"{pose.path} has {width} × {height} pixels, which are no multiples of downscale = {n}")
-    return height // n, width // n
 
 
 def _read(path: Path, size: tuple[int, int], n: int, *, linear: bool, behind: np.ndarray | None) -> np.ndarray:
@@ -237,7 +231,7 @@ def _read(path: Path, size: tuple[int, int], n: int, *, linear: bool, behind: np
     return image if behind is None else image[..., :3] + (1 - image[..., 3:]) * behind
 
 
-def _picture(path: Path) -> tuple[int, int]:
+def _picture_size(path: Path) -> tuple[int, int]:
     """(height, width) of a picture, from its header alone."""
     from PIL import Image
 
@@ -252,7 +246,7 @@ def _picture(path: Path) -> tuple[int, int]:
 # ------------------------------------------------------------------------------------------------------------ Blender
 
 
-def _blender(path: Path) -> list[_Pose]:
+def _blender(path: Path, downscale: int) -> list[_Pose]:
     try:
         found = json.loads(contents(path))
     except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError.
@@ -260,13 +254,15 @@ def _blender(path: Path) -> list[_Pose]:
         raise InputError(f"{path} is no JSON ({said}); the file may be cut short: export it again") from error
     if not isinstance(found, Mapping):
         raise InputError(f"{path} holds a {type(found).__name__}; expected an object with camera_angle_x and frames")
-    angle, frames = found.get("camera_angle_x"), found.get("frames")
-    if not (is_real(angle) and 0 < angle < math.pi):
+    angle: Any = found.get("camera_angle_x")
+    frames = found.get("frames")
+    if not is_real(angle) or not 0 < angle < math.pi:
         what = "lacks camera_angle_x" if angle is None else f"has a camera_angle_x of {quoted(angle)}"
         raise InputError(f"{path} {what}; expected the horizontal field of view in radians, between 0 and π")
     if not isinstance(frames, list) or not frames:
-        raise InputError(f"{path} has {'no frames' if not frames else 'frames that are no list'}; expected at least one")
-    _check_lens(path, found, angle)
+        what = "frames that are no list" if frames else "no frames"
+        raise InputError(f"{path} has {what}; expected at least one")
+    focal = 0.5 / math.tan(0.5 * angle)
     poses = []
     for i, frame in enumerate(frames):
         place = f"{path}, frame {i}"
@@ -276,39 +272,35 @@ def _blender(path: Path) -> list[_Pose]:
             raise InputError(f"{place} has a file_path that is {quoted(frame['file_path'])}; expected a name")
         matrix = _rigid(place, frame["transform_matrix"], (4, 4), (3, 4))
         picture = _named(path, place, frame["file_path"])
-        _check_lens(Path(place), {**found, **frame}, angle, width := _picture(picture))
-        poses.append(_Pose(picture, width, matrix, 0.5 / math.tan(0.5 * angle)))
+        size = _picture_size(picture)
+        _check_lens(place, {**found, **frame}, focal, size)
+        poses.append(_Pose(picture, size, downscale, matrix, focal))
     return poses
 
 
-def _check_lens(place: Path, found: Mapping[str, Any], angle: float, size: tuple[int, int] | None = None) -> None:
-    """Refuse what other tools write into such files that is not followed: lenses, and axes that are off centre."""
+def _check_lens(place: str, found: Mapping[str, Any], focal: float, size: tuple[int, int]) -> None:
+    """Refuse what other tools write into such files that is not followed: distortion, and axes off the centre."""
     bent = [k for k in ("k1", "k2", "k3", "k4", "p1", "p2") if found.get(k)]
     if bent:
-        raise InputError(f"{place} has a lens that distorts ({', '.join(bent)}), which is not followed; undistort first")
-    if size is None:
-        return
-    height, width = size
-    wide = found.get("w", width)
-    wide = wide if is_real(wide) and wide > 0 else width
-    focal = 0.5 * wide / math.tan(0.5 * angle)
-    high = height * wide / width
-    for key, expected in (("fl_x", focal), ("fl_y", focal), ("cx", wide / 2), ("cy", high / 2)):
+        raise InputError(f"{place} has a lens that distorts ({', '.join(bent)}), which is not followed; undistort it")
+    width = found["w"] if is_real(found.get("w")) and found["w"] > 0 else size[1]
+    height = width * size[0] / size[1]
+    for key, expected in (("fl_x", focal * width), ("fl_y", focal * width), ("cx", width / 2), ("cy", height / 2)):
         given = found.get(key, expected)
-        if not is_real(given) or abs(given - expected) > 1e-3 * wide:
+        if not is_real(given) or not abs(given - expected) <= OFF_CENTRE * width:
             raise InputError(
-                f"{place} has {key} = {quoted(given)}, and camera_angle_x makes it {expected:.6g}; expected a camera "
+                f"{place} has {key} = {quoted(given)}, where camera_angle_x makes it {expected:.6g}; expected a camera "
                 "of square pixels that looks through the middle of its image"
             )
 
 
 def _named(path: Path, place: str, name: str) -> Path:
     """The picture that a frame names, with or without its extension."""
-    named = inside(path.parent, name, path)
-    for candidate in (named, *(named.with_name(named.name + e) for e in EXTENSIONS)):
+    for extension in ("", *EXTENSIONS):
+        candidate = inside(path.parent, name + extension, path)
         if candidate.is_file():
             return candidate
-    raise InputError(f"{place} refers to the picture {name[:60]!r}, but there is no file {named}, nor {named.name}.png")
+    raise InputError(f"{place} refers to the picture {name[:60]!r}, but there is no such file, nor {name[:60]}.png")
 
 
 def _rigid(place: str, matrix: Any, *shapes: tuple[int, ...]) -> np.ndarray:
@@ -324,7 +316,9 @@ def _rigid(place: str, matrix: Any, *shapes: tuple[int, ...]) -> np.ndarray:
     rotation = whole[:3, :3]
     off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if off > ROTATION_TOLERANCE or np.linalg.det(rotation) < 0 or np.abs(whole[3] - [0, 0, 0, 1]).max() > 1e-5:
-        raise InputError(f"{place}: the matrix is no rotation and position (it scales, shears or mirrors); export again")
+        raise InputError(
+            f"{place}: the matrix is no rotation and position, but scales, shears or mirrors; export it again"
+        )
     return whole
 
 
@@ -344,7 +338,7 @@ def _llff(path: Path, downscale: int, frame: str) -> list[_Pose]:
     rows = rows.astype(np.float64)
     if not np.isfinite(rows).all():
         raise InputError(f"{path} holds NaN or infinity; make the file again")
-    left = None
+    left = downscale
     folder = path.parent / f"images_{downscale}"
     if downscale > 1 and folder.is_dir():
         left = 1
@@ -352,7 +346,7 @@ def _llff(path: Path, downscale: int, frame: str) -> list[_Pose]:
         folder = path.parent / "images"
     if not folder.is_dir():
         raise InputError(f"{path} has no folder {folder.name} beside it; expected its pictures there")
-    pictures = sorted(p for p in folder.iterdir() if p.suffix in EXTENSIONS)
+    pictures = sorted(p for p in folder.iterdir() if p.suffix.lower() in EXTENSIONS)
     if len(pictures) != len(rows):
         raise InputError(f"{path} has {len(rows)} poses, but {folder} {len(pictures)} pictures; expected as many")
     matrices, bounds = rows[:, :-2].reshape(-1, 3, HEADER), rows[:, -2:]
@@ -366,13 +360,13 @@ def _llff(path: Path, downscale: int, frame: str) -> list[_Pose]:
                 f"{place} has height {height:g}, width {width:g}, focal length {focal:g}, bounds {near:g} and {far:g}; "
                 "expected positive numbers, bounds in order"
             )
-        size = _picture(picture)
+        size = _picture_size(picture)
         # Pictures that were made smaller are rounded to whole pixels.
         if abs(size[0] * width / height - size[1]) > 1 + size[1] / size[0]:
             raise InputError(
                 f"{picture} has {size[1]} × {size[0]} pixels, and {place} says {width:g} × {height:g}: another shape"
             )
-        poses.append(_Pose(picture, size, pose, focal / width, float(near), float(far), left))
+        poses.append(_Pose(picture, size, left, pose, focal / width, float(near), float(far)))
     return _nerf_frame(poses) if frame == "nerf" else poses
 
 

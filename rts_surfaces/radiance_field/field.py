@@ -14,6 +14,7 @@ from rts.engines import engine_of
 from rts.errors import InputError
 from rts.files.paths import as_path, output_file, writing
 from rts.trees import Tree, map_leaves, placed_leaves
+from rts_surfaces.radiance_field.lattice import lattice
 from rts_surfaces.radiance_field.network import REPEATED, Architecture, check_network
 
 NETWORKS = ("coarse", "fine")
@@ -60,22 +61,36 @@ class RadianceField:
             path.parent.mkdir(parents=True, exist_ok=True)
             np.savez(path, allow_pickle=False, **named)
 
+    def lattice(
+        self,
+        bounds: Any,
+        shape: tuple[int, int, int],
+        *,
+        network: str = "fine",
+        keep: Any = True,
+        progress: bool | None = None,
+    ) -> np.ndarray:
+        """Densities on a lattice, (X, Y, Z) float32; see `rts_surfaces.radiance_field.lattice`.
+
+        Args:
+            bounds: ((x0, y0, z0), (x1, y1, z1)) in the field's space, both points of the lattice.
+            shape: (X, Y, Z), at least 2 each.
+            network: "fine" or "coarse".
+            keep: True to keep them in the user's cache and to find them there; a folder for that; False for neither.
+            progress: whether to show a progress bar; None to do so in a terminal.
+
+        Raises:
+            InputError: there is no such lattice or network.
+        """
+        return lattice(self, bounds, shape, network=network, keep=keep, progress=progress)
+
     def on_host(self) -> Tree:
         """The weights as NumPy arrays, without derivatives."""
         return map_leaves(engine_of(self.weights).to_numpy, self.weights)
 
 
 def load_radiance_field(path: Any) -> RadianceField:
-    """The radiance field whose weights an .npz holds, float32.
-
-    Its arrays are called as krrish94/nerf-pytorch calls its layers, after the name of the network: coarse.layer1.weight
-    (out, in), coarse.layer1.bias (out,), coarse.layers_xyz.0.weight, …, coarse.fc_alpha.weight, coarse.fc_feat.weight,
-    coarse.layers_dir.0.weight, coarse.fc_rgb.weight, and so on for fine. Nothing is unpickled.
-
-    Raises:
-        InputError: there is no such file, it is no .npz, holds pickles, or something other than real finite numbers; a
-            layer is missing, unknown, or its shape does not fit.
-    """
+    """The field whose weights an .npz holds, as float32; see `rts.load_radiance_field`."""
     path = as_path(path)
     if not path.is_file():
         raise InputError(f"there is no file {path} of weights; check the path (relative paths start at {Path.cwd()})")

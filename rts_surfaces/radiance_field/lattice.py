@@ -7,7 +7,7 @@ import hashlib
 import os
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,9 +18,11 @@ from rts.errors import InputError
 from rts.files.paths import as_path
 from rts.trees import placed_leaves
 from rts_surfaces.radiance_field.chunks import CHUNK, fast_engine, progress_bar
-from rts_surfaces.radiance_field.field import RadianceField
 from rts_surfaces.radiance_field.network import density
 from rts_surfaces.subdivision.library import cache_folder
+
+if TYPE_CHECKING:
+    from rts_surfaces.radiance_field.field import RadianceField
 
 VERSION = b"rts density lattice 1"
 """Changes when lattices that are kept no longer hold."""
@@ -134,7 +136,7 @@ def _checked_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
 def _checked_shape(shape: Any) -> tuple[int, int, int]:
     given = tuple(shape) if isinstance(shape, (tuple, list)) else ()
     if len(given) != 3 or not all(is_count(n) and 2 <= n for n in given):
-        raise InputError(f"the lattice has shape {quoted(shape)}; expected (X, Y, Z), at least 2 points along each axis")
+        raise InputError(f"the lattice has shape {quoted(shape)}; expected (X, Y, Z), at least 2 each")
     x, y, z = map(int, given)
     if x * y * z > MOST_POINTS:
         raise InputError(f"the lattice has {x} × {y} × {z} points; expected at most 2**31 − 1, 1290 along each axis")

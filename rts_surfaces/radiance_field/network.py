@@ -79,7 +79,7 @@ def check_network(weights: Any, name: str = "the network") -> Architecture:
                 f"expected {expected}"
             )
         count += shape[0] * (shape[1] + 1)
-        return shape
+        return shape[0], shape[1]
 
     def levels(place: str, encoded: int) -> int:
         if encoded < 3 or (encoded - 3) % 6:

@@ -14,10 +14,10 @@ from rts.engines import constants, engine_of, exemplar, namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Shader
+from rts.ndc import Ndc
 from rts.trees import Array, Tree
 from rts_surfaces.radiance_field.chunks import CHUNK, in_chunks
 from rts_surfaces.radiance_field.field import RadianceField, load_radiance_field
-from rts_surfaces.radiance_field.ndc import Ndc
 from rts_surfaces.radiance_field.network import check_network, radiance
 from rts_surfaces.radiance_field.volume import VolumeImage, volume_render
 

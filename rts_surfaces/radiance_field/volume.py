@@ -13,10 +13,10 @@ from rts.checks import is_count
 from rts.engines import constants, engine_of
 from rts.errors import InputError
 from rts.files.views import colour_named
+from rts.ndc import Ndc
 from rts.trees import map_leaves
 from rts_surfaces.radiance_field.chunks import CHUNK, fast_engine, in_chunks, progress_bar
 from rts_surfaces.radiance_field.field import RadianceField
-from rts_surfaces.radiance_field.ndc import Ndc
 from rts_surfaces.radiance_field.network import density_and_radiance
 
 RAYS = 512
@@ -44,36 +44,14 @@ def volume_render(
     camera: Camera,
     size: tuple[int, int],
     *,
-    near: float | None = None,
-    far: float | None = None,
-    samples: tuple[int, int] = (64, 64),
-    background: Any = "white",
-    ndc: Ndc | None = None,
-    progress: bool | None = None,
+    near: float | None,
+    far: float | None,
+    samples: tuple[int, int],
+    background: Any,
+    ndc: Ndc | None,
+    progress: bool | None,
 ) -> VolumeImage:
-    """The image of a radiance field by quadrature along rays, as NeRF's test mode: without noise; no derivatives.
-
-    The coarse network is evaluated at N_c equal steps of depth; N_f more samples are placed where it has weight, by
-    the inverse of their distribution; the fine network is evaluated at all of them (Mildenhall et al. 2020, §4 and 5).
-
-    Args:
-        field: the field.
-        camera: a perspective camera; rays pass through the centres of its pixels (for NeRF's own, cameras of
-            `rts.load_views` with `pixel_center`).
-        size: (height, width).
-        near: depth at which rays begin; default 2, as in NeRF's Blender scenes; with `ndc`, always the near plane.
-        far: depth at which they end; default 6; with `ndc`, always infinity.
-        samples: (N_c, N_f).
-        background: what is behind: "white", "black" or a colour (3,); None for transparency.
-        ndc: the map from the world to the field's space, or None where that is the world.
-        progress: whether to show a progress bar; None to do so in a terminal.
-
-    Returns:
-        The image in float32, and the number of evaluations of each network.
-
-    Raises:
-        InputError: an argument is none of these, or the camera is orthographic.
-    """
+    """The image, and the evaluations of both networks; see `rts.volume_render`."""
     height, width = check_pixels(size)
     if not isinstance(field, RadianceField):
         raise InputError(f"field is {quoted(field)}; expected what rts.load_radiance_field gives")

@@ -13,7 +13,7 @@ from rts.engines import namespace
 from rts.trees import Array
 
 NEAREST, FARTHEST = 1e-6, 1e6
-"""Depths over that of the near plane to which points are brought that lie outside: behind the camera, or at infinity."""
+"""Depths, over that of the near plane, to which points behind the camera and at infinity are brought."""
 
 
 @dataclass(frozen=True)
