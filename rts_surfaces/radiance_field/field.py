@@ -127,7 +127,8 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays of an .npz, as float32."""
     found = {}
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # NumPy leaves files open that are damaged, if it opens them.
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             total = sum(item.file_size for item in file.zip.infolist())
             if total > LARGEST:
                 raise ValueError(f"it holds {total / 2**30:.1f} GB")

@@ -100,7 +100,7 @@ def _key(weights: Any, low: np.ndarray, high: np.ndarray, shape: tuple[int, int,
 def _kept(path: Path, shape: tuple[int, int, int]) -> np.ndarray | None:
     """The lattice in a file; None where there is none, or it is damaged (zip files hold checksums)."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             values = file["density"]
     except Exception:  # NumPy and zipfile raise many kinds.
         return None

@@ -60,12 +60,16 @@ def volume_render(
     counts = tuple(samples) if isinstance(samples, (tuple, list)) else ()
     if len(counts) != 2 or not all(map(is_count, counts)) or counts[0] < 3:
         raise InputError(f"samples is {quoted(samples)}; expected (coarse, fine), at least 3 and 1")
+    if ndc is not None and not isinstance(ndc, Ndc):
+        raise InputError(f"ndc is {quoted(ndc)}; expected an rts.Ndc, or None")
     if ndc is not None and not (near is None and far is None):
         raise InputError("near and far are given with ndc, whose rays run from its near plane to infinity; leave them")
     near, far = (0.0, 1.0) if ndc is not None else (2.0 if near is None else near, 6.0 if far is None else far)
     check_planes(near, far, positive=ndc is None)
     behind = None if background is None else colour_named(background)
     camera = map_leaves(engine_of(camera).to_numpy, camera)
+    if camera.for_size((height, width)).projection[3, 2] == 0:
+        raise InputError("the camera is orthographic; volumes are drawn by perspective ones")
     rays = camera.rays((height, width))
     origins, directions = (np.reshape(x, (-1, 3)) for x in (rays.origins, rays.directions))
     viewed = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
