@@ -339,11 +339,12 @@ def test_engines_agree_on_images_and_gradients():
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_gradients_in_chunks_are_those_of_the_whole(target):
-    weights, position, factor = arrays(target, (FIELD.weights["fine"], POINTS, DIRECTIONS @ np.ones((3, 4))))
+    factor = np.random.default_rng(5).standard_normal((len(POINTS), 4))
+    weights, position, factor, camera = arrays(target, (FIELD.weights["fine"], POINTS, factor, CAMERA))
 
     def loss(weights, chunk):
         shader = RadianceShader(chunk=chunk)
-        return (shader({"weights": weights}, rts.GBuffer(position=position), CAMERA) * factor).sum()
+        return (shader({"weights": weights}, rts.GBuffer(position=position), camera) * factor).sum()
 
     whole, parts = (gradient(target, lambda w, c=chunk: loss(w, c), weights) for chunk in (50, 20))
     compared(parts, whole, 1e-4)
