@@ -267,7 +267,7 @@ def test_wrong_lattices_are_refused():
         (((0, 0, 0), (1, 1, 0)), SHAPE, "each x0 < x1"),
         ((0, 1), SHAPE, "bounds"),
         (BOUNDS, (3, 3), "shape (3, 3)"),
-        (BOUNDS, (3, 3, 1), "at least 2"),
+        (BOUNDS, (3, 3, 1), "at least 2 points"),
         (BOUNDS, (3, 3, 2.5), "shape (3, 3, 2.5)"),
         (BOUNDS, (2000, 2000, 2000), "at most 2**31"),
     ):

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rts.arguments import check_numbers, quoted
-from rts.checks import is_count
+from rts.arguments import quoted
 from rts.engines import constants
 from rts.errors import InputError
 from rts.files.paths import as_path
 from rts.trees import placed_leaves
+from rts_surfaces.implicit.lattice import Lattice
 from rts_surfaces.radiance_field.chunks import CHUNK, fast_engine, progress_bar
 from rts_surfaces.radiance_field.network import density
 from rts_surfaces.subdivision.library import cache_folder
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
 VERSION = b"rts density lattice 1"
 """Changes when lattices that are kept no longer hold."""
-MOST_POINTS = 2**31 - 1
 
 
 def lattice(
@@ -58,40 +57,35 @@ def lattice(
     """
     if network not in field.weights:
         raise InputError(f"network is {quoted(network)}; expected 'fine' or 'coarse'")
-    low, high = _checked_bounds(bounds)
-    shape = _checked_shape(shape)
+    points = Lattice(bounds, shape)
     weights = field.on_host()[network]
     folder = None if keep is False else cache_folder() if keep is True else as_path(keep)
-    path = folder / f"density-{_key(weights, low, high, shape)}.npz" if folder is not None else None
-    kept = _kept(path, shape) if path is not None else None
+    path = folder / f"density-{_key(weights, points)}.npz" if folder is not None else None
+    kept = _kept(path, points.shape) if path is not None else None
     if kept is not None:
         return kept
-    values = _computed(weights, low, high, shape, progress)
+    values = _computed(weights, points, progress)
     if path is not None:
         _keep(path, values)
     return values
 
 
-def _computed(
-    weights: Any, low: np.ndarray, high: np.ndarray, shape: tuple[int, int, int], progress: bool | None
-) -> np.ndarray:
+def _computed(weights: Any, points: Lattice, progress: bool | None) -> np.ndarray:
     engine = fast_engine()
     weights = constants(weights, engine, None)
-    values = np.empty(shape[0] * shape[1] * shape[2], np.float32)
-    step = (high - low) / (np.array(shape) - 1)
+    values = np.empty(points.count, np.float32)
     with progress_bar(progress, "density", len(values)) as advance:
         for start in range(0, len(values), CHUNK):
             numbers = np.arange(start, min(start + CHUNK, len(values)))
-            points = low + step * np.stack(np.unravel_index(numbers, shape), axis=-1)
-            found = density(weights, engine.constant(points.astype(np.float32)))
+            found = density(weights, engine.constant(points.points(numbers).astype(np.float32)))
             values[numbers] = engine.to_numpy(found)
             advance(len(numbers))
-    return values.reshape(shape)
+    return values.reshape(points.shape)
 
 
-def _key(weights: Any, low: np.ndarray, high: np.ndarray, shape: tuple[int, int, int]) -> str:
-    """A name that changes with any of these."""
-    found = hashlib.sha256(VERSION + repr(shape).encode() + low.tobytes() + high.tobytes())
+def _key(weights: Any, points: Lattice) -> str:
+    """A name that changes with weights and points."""
+    found = hashlib.sha256(VERSION + repr(points.shape).encode() + points.low.tobytes() + points.step.tobytes())
     for place, array in placed_leaves(weights):
         found.update(repr((place, array.shape, str(array.dtype))).encode() + np.ascontiguousarray(array).tobytes())
     return found.hexdigest()[:32]
@@ -123,21 +117,3 @@ def _keep(path: Path, values: np.ndarray) -> None:
         with contextlib.suppress(OSError):
             Path(str(draft)).unlink(missing_ok=True)
         raise
-
-
-def _checked_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
-    known = check_numbers("bounds", bounds, (2, 3))
-    if known is None or not (known[0] < known[1]).all():
-        raise InputError(f"bounds are {quoted(bounds)}; expected ((x0, y0, z0), (x1, y1, z1)) with each x0 < x1")
-    low, high = np.asarray(known, np.float64)
-    return low, high
-
-
-def _checked_shape(shape: Any) -> tuple[int, int, int]:
-    given = tuple(shape) if isinstance(shape, (tuple, list)) else ()
-    if len(given) != 3 or not all(is_count(n) and 2 <= n for n in given):
-        raise InputError(f"the lattice has shape {quoted(shape)}; expected (X, Y, Z), at least 2 each")
-    x, y, z = map(int, given)
-    if x * y * z > MOST_POINTS:
-        raise InputError(f"the lattice has {x} × {y} × {z} points; expected at most 2**31 − 1, 1290 along each axis")
-    return x, y, z
