@@ -7,7 +7,7 @@ from helpers import ALL, DIFFERENTIABLE, arrays, gradient, icosphere, mesh_part,
 import rts
 from rts import Camera, InputError, Ndc
 from rts.arrays import unit
-from rts.testing import ShaderConformance
+from rts.testing import ShaderConformance, SurfaceConformance
 from rts.trees import map_leaves, placed_leaves
 from rts_surfaces.radiance_field import lattice as lattices
 from rts_surfaces.radiance_field.chunks import in_chunks
@@ -19,6 +19,7 @@ from rts_surfaces.radiance_field.network import (
     encoding,
     radiance,
 )
+from rts_surfaces.radiance_field.projected import Projected
 from rts_surfaces.radiance_field.shader import RadianceShader
 
 pytestmark = pytest.mark.rendering
@@ -529,3 +530,32 @@ def test_weights_of_every_engine_are_drawn(target):
 def test_wrong_arguments_are_refused(changes, message):
     given = {"field": FIELD, "camera": CAMERA, "size": (4, 5), **changes}
     refused(lambda: rts.volume_render(**given), message)
+
+
+# ------------------------------------------------------------------------------------------------ surfaces out of NDC
+
+
+class TestProjected(SurfaceConformance):
+    @pytest.fixture
+    def part(self):
+        return Projected.example()
+
+
+def test_a_ball_in_ndc_is_a_ball_in_the_world():
+    part = Projected.example()
+    camera = Camera.look_at((0.6, 0.4, 2), (0, 0, 0), fov_y=50)
+    samples = rts.sample(part, camera, (48, 48), layers=2).samples[0]
+    found = part.surface.evaluate(part.theta, samples)
+    outward = found["position"] + [0, 0, 2]
+    radius = np.linalg.norm(outward, axis=1)
+    assert len(radius) > 1000 and np.abs(radius - 0.7).max() < 0.02
+    assert ((found["normal"] * outward).sum(axis=1) / radius).min() > 0.99
+    # Triangles face outwards.
+    front = rts.render(part.replace(cull="back"), camera, (48, 48), layers=1)
+    np.testing.assert_allclose(front, rts.render(part, camera, (48, 48), layers=1), atol=1e-6)
+
+
+def test_surfaces_whose_triangles_move_are_not_projected():
+    ndc = Ndc((1, 1))
+    refused(lambda: Projected(rts.plugin("surfaces", "bspline").example().surface, ndc), "no camera changes")
+    refused(lambda: Projected(Projected.example().surface.surface, 3), "ndc is 3")
