@@ -4,6 +4,7 @@
 descent, with torch and K = 2 at 256²; the values change in each. *Naive*: marching cubes by PyMCubes, the vertices
 computed again from the values at the ends of their edges, so that they have derivatives, and drawn as a mesh.
 *Band*: at how many points a function is evaluated, and the time of evaluations and triangles, in NumPy.
+*Outlines*: derivatives of silhouettes against closed forms, and against differences of hard images.
 *Stability*: norms of gradients while a surface passes through ties of lattice values. Contenders take turns:
 
     python -m benchmarks.implicit_surfaces -o out/implicit
@@ -23,7 +24,7 @@ import numpy as np
 import torch
 
 import rts
-from benchmarks.camera import camera
+from benchmarks.camera import camera, supersampled
 from benchmarks.meshes import DATA, normalised
 from benchmarks.report import environment, table
 from benchmarks.speed.memory import growth
@@ -38,6 +39,8 @@ LEARNING_RATE = 1e-7
 EYE = (0.0, 1.9, 2.6)
 MOTIONS = ("normal", "edge")
 SINGULAR = ("bound", "drop", "keep")
+TILT = 1e-5
+"""By how much the ends of edges across a plane of symmetry differ, for a unit of length."""
 
 
 def isosurface(**options: Any) -> Any:
@@ -165,6 +168,68 @@ def band(counts: tuple[int, ...]) -> tuple[str, dict]:
     return table(["", "lattice", "evaluations", "of all", "triangles", "s", "MiB"], rows), results
 
 
+# ------------------------------------------------------------------------------------------------- outlines
+
+
+def outlines(counts: tuple[int, ...], side: int, samples: int) -> tuple[str, dict]:
+    """The derivative of a silhouette's area, beside the truth: of a ball by its radius, of a torus by both."""
+    sdf = rts.plugin("surfaces", "sdf")
+    surfaces = {"sdf, by rays": lambda f: sdf(f, radius=1.2, reads=("radii",))}
+    for count in counts:
+        for motion in MOTIONS:
+            surfaces[f"{count}³, {motion}"] = lambda f, c=count, m=motion: isosurface(f=f, shape=(c,) * 3, motion=m)
+    above = rts.Camera.orthographic((0, 3, 0), (0, 0, 0), (0, 0, 1), height=2.2, near=0.5, far=10)
+    per_area = (side / 2.2) ** 2
+    closed_forms = {
+        "ball": _disk_slope(0.7, side),
+        # Seen along its axis its area is 4 π times the product of its radii.
+        "ring above": 4 * np.pi * TUBE * per_area,
+        "tube above": 4 * np.pi * RING * per_area,
+    }
+    scenes: dict[str, tuple] = {
+        "ball": (_round, camera(), [0.7], 0),
+        "ring above": (swept_sphere, above, [RING, TUBE], 0),
+        "tube above": (swept_sphere, above, [RING, TUBE], 1),
+        "ring aslant": (swept_sphere, camera(EYE), [RING, TUBE], 0),
+        "tube aslant": (swept_sphere, camera(EYE), [RING, TUBE], 1),
+    }
+    results: dict[str, dict[str, float]] = {name: {} for name in surfaces}
+    for scene, (f, view, radii, index) in scenes.items():
+        true = closed_forms.get(scene) or _area_slope(f, view, radii, index, side, samples)
+        for name, surface in surfaces.items():
+            for fine in (1, 4):
+                given = torch.tensor(radii, dtype=torch.float32, requires_grad=True)
+                part = rts.Part(surface(f), {"radii": given})
+                area = rts.render(part, view, (side, side), splatter="visible", supersample=fine)[..., 3].sum()
+                results[name][f"{scene}, {fine}"] = float(torch.autograd.grad(area, given)[0][index]) / true
+    rows = [[name, *(f"{100 * (r - 1):+.1f} %" for r in found.values())] for name, found in results.items()]
+    header = [f"off the truth, {side}²", *(f"{s}, s = {n}" for s in scenes for n in (1, 4))]
+    return table(header, rows), results
+
+
+def _round(theta: Any, points: Any) -> Any:
+    """A ball."""
+    xp = rts.namespace(points)
+    return xp.sqrt(xp.sum(points * points, axis=-1) + 1e-12) - theta["radii"][0]
+
+
+def _disk_slope(radius: float, side: int, distance: float = 3.2) -> float:
+    """The derivative by its radius of a ball's area in pixels."""
+    focal = side / 2 / np.tan(np.deg2rad(20))
+    return 2 * np.pi * focal**2 * radius * distance**2 / (distance**2 - radius**2) ** 2
+
+
+def _area_slope(f: Callable, view: rts.Camera, radii: list, index: int, side: int, samples: int) -> float:
+    """The derivative of an area in pixels, by differences of images of samples² hard samples a pixel."""
+    areas, step = [], 0.01
+    for sign in (1, -1):
+        moved = np.array(radii, np.float32)
+        moved[index] += sign * step
+        part = rts.Part(rts.plugin("surfaces", "sdf")(f, radius=1.2), {"radii": moved})
+        areas.append(float(supersampled(part, view, (side, side), samples)[..., 3].sum(dtype=np.float64)))
+    return (areas[0] - areas[1]) / (2 * step)
+
+
 # ----------------------------------------------------------------------------------------------- stability
 
 
@@ -178,18 +243,23 @@ def gradient_norm(values: np.ndarray, weights: torch.Tensor, motion: str, singul
 
 
 def stability(steps: int, output: Path) -> tuple[str, dict]:
-    """Norms of gradients, of a ball that grows through ties, and of noise in whole numbers."""
+    """Norms of gradients, of a ball that passes through ties, and of noise in and beside whole numbers."""
     weights = torch.from_numpy(np.random.default_rng(0).standard_normal((64, 64, 4)).astype(np.float32))
-    ball = on_lattice(lambda p: np.linalg.norm(p, axis=-1), 33)
-    # Beside lattice points in a row from the middle, the distance is nearly the same.
-    radii = np.linspace(0.55, 0.7, steps)
+
+    def noise(seed: int) -> np.ndarray:
+        return np.random.default_rng(seed).standard_normal((9, 9, 9)).astype(np.float32)
+
+    ball = on_lattice(lambda p: np.linalg.norm(p, axis=-1) + TILT * p[..., 0], 32)
+    # Edges across the plane x = 0 have ends of nearly the same distance; some lie on each of these balls.
+    ties = 0.5 * (ball[15] + ball[16])[18:29, 18:27].reshape(-1)
+    ties = np.sort(ties[(ties > 0.4) & (ties < 0.8)])
+    ties = ties[np.linspace(0, len(ties) - 1, min(steps, len(ties))).astype(int)]
     scenes = {
-        "a ball that grows": [ball - np.float32(r) for r in radii],
-        "squares of distances": [np.float32(1 / 256) * np.rint(256 * (ball * ball - np.float32(r * r))) for r in radii],
-        "noise in whole numbers": [
-            np.rint(2 * np.random.default_rng(i).standard_normal((9, 9, 9))).astype(np.float32) for i in range(steps)
-        ],
-        "noise": [np.random.default_rng(i).standard_normal((9, 9, 9)).astype(np.float32) for i in range(steps)],
+        "a ball that grows": [ball - np.float32(r) for r in np.linspace(0.4, 0.8, steps)],
+        "a ball in ties": [ball - np.float32(r) for r in ties],
+        "noise": [noise(i) for i in range(steps)],
+        "noise in whole numbers": [np.rint(2 * noise(i)) for i in range(steps)],
+        "a hair beside them": [np.rint(2 * noise(i)) + np.float32(1e-5) * noise(steps + i) for i in range(steps)],
     }
     rows, results = [], {}
     for scene, frames in scenes.items():
@@ -222,6 +292,7 @@ def _stability_chart(results: dict, path: Path) -> None:
                 own.semilogy(results[f"{scene}, {motion}"][name], color=color, lw=width, label=name)
             own.set_title(f"{scene}\nmotion along {'edges' if motion == 'edge' else 'the normal'}", fontsize=9)
             own.grid(alpha=0.3)
+        axes[1, column].set_xlabel("image")
     axes[0, 0].set_ylabel("norm of the gradient")
     axes[1, 0].set_ylabel("norm of the gradient")
     axes[0, 0].legend()
@@ -234,13 +305,13 @@ def _stability_chart(results: dict, path: Path) -> None:
 
 def mixed(output: Path, side: int) -> tuple[str, dict]:
     """A mesh, Bézier patches, a cage, an isosurface and a field that rays are cast at, in one image."""
-    view = rts.Camera.look_at((0.0, 1.4, 6.6), (0, -0.1, 0), fov_y=32)
+    view = rts.Camera.look_at((0.0, 1.6, 6.6), (0, 0.0, 0), fov_y=22)
     parts = mixed_parts()
     torch_parts = [
         p.replace(theta={k: torch.from_numpy(np.asarray(v)).requires_grad_() for k, v in p.theta.items()})
         for p in parts
     ]
-    image = rts.render(torch_parts, view, (side, side * 2), layers=2, background=(1.0, 1.0, 1.0))
+    image = rts.render(torch_parts, view, (side, side * 5 // 2), layers=2, background=(1.0, 1.0, 1.0))
     image[..., :3].square().mean().backward()
     rts.save_image(output / "mixed.png", image.detach().numpy())
     names = ("mesh", "bezier", "subdivision", "isosurface", "sdf")
@@ -256,14 +327,13 @@ def mixed_parts() -> list[rts.Part]:
     bunny = rts.load(DATA / "meshes" / "bunny.obj")[0]
     teapot = rts.load(DATA / "bezier" / "teapot_patches.txt", surface="bezier")[0]
     rook = rts.load(DATA / "cages" / "catmark_rook.obj", surface="subdivision")[0]
-    upright = np.asarray(teapot.theta["points"], np.float64)[:, [0, 2, 1]] * [1, 1, -1]
     blob = smooth_union(12.0, _ball(0.0, 0.55, 0.0, 0.4), swept_sphere)
-    values = on_lattice(lambda p: blob({"radii": (0.6, 0.22)}, p.reshape(-1, 3)).reshape(p.shape[:-1]), 65)
+    values = on_lattice(lambda p: blob({"radii": np.array([0.6, 0.22])}, p.reshape(-1, 3)).reshape(p.shape[:-1]), 65)
     sdf = rts.plugin("surfaces", "sdf")(swept_sphere, radius=1.0)
     made = [
         bunny.replace(theta={"vertices": normalised(bunny.theta["vertices"]).astype(np.float32)}, shader="lambert"),
-        teapot.replace(theta={"points": normalised(upright).astype(np.float32)}, shader="lambert"),
-        rook.replace(theta={"vertices": normalised(rook.theta["vertices"]).astype(np.float32)}, shader="lambert"),
+        teapot.replace(theta={"points": _upright(teapot.theta["points"])}, shader="lambert"),
+        rook.replace(theta={"vertices": _upright(rook.theta["vertices"])}, shader="lambert"),
         rts.Part(isosurface(), {"values": values}, "normals"),
         rts.Part(sdf, {"radii": np.array([0.6, 0.25], np.float32)}, "normals"),
     ]
@@ -276,6 +346,11 @@ def mixed_parts() -> list[rts.Part]:
     return placed
 
 
+def _upright(points: np.ndarray) -> np.ndarray:
+    """Points of a shape that stands along z, normalised and turned to stand along y."""
+    return normalised(np.asarray(points, np.float64)[:, [0, 2, 1]] * [1, 1, -1]).astype(np.float32)
+
+
 def _ball(x: float, y: float, z: float, radius: float) -> Callable[[Any, Any], Any]:
     def field(theta: Any, points: Any) -> Any:
         xp = rts.namespace(points)
@@ -286,7 +361,7 @@ def _ball(x: float, y: float, z: float, radius: float) -> Callable[[Any, Any], A
 
 
 def main() -> None:
-    sections = ("speed", "band", "stability", "mixed")
+    sections = ("speed", "band", "outlines", "stability", "mixed")
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=Path("out/implicit"))
     parser.add_argument("--only", nargs="+", choices=sections, default=sections)
@@ -296,6 +371,7 @@ def main() -> None:
     runs: dict[str, Callable[[], tuple[str, dict]]] = {
         "speed": lambda: speed(2 if args.quick else 7),
         "band": lambda: band((65, 129) if args.quick else (65, 129, 257, 513)),
+        "outlines": lambda: outlines((33,) if args.quick else (33, 65, 128), 256, 2 if args.quick else 6),
         "stability": lambda: stability(12 if args.quick else 120, args.output),
         "mixed": lambda: mixed(args.output, 128 if args.quick else 400),
     }

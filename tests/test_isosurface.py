@@ -47,7 +47,7 @@ def test_a_sample_is_six_lattice_points_and_three_barycentrics(motion):
     assert (barycentrics > -1e-6).all()
     np.testing.assert_allclose(barycentrics.sum(axis=1), 1, atol=1e-6)
     flat = part.theta["values"].reshape(-1)
-    places = part.surface.lattice(part.theta).points(samples.ids)
+    places = part.surface.field.lattice(part.theta).points(samples.ids)
     position = 0
     for k in range(3):
         a, b = (flat[samples.ids[:, 2 * k + i]].astype(np.float64) for i in range(2))
@@ -88,7 +88,7 @@ def test_motion_along_edges_keeps_corners_on_their_edges():
     samples = rts.sample(part, CAMERA, SIZE).samples[0]
     moved = on_lattice(lambda p: BALL(p) - 4e-3, 33)[0]
     after = part.surface.evaluate({"values": moved}, samples)["position"]
-    flat, places = moved.reshape(-1), part.surface.lattice(part.theta).points(samples.ids)
+    flat, places = moved.reshape(-1), part.surface.field.lattice(part.theta).points(samples.ids)
     expected = 0
     for k in range(3):
         a, b = (flat[samples.ids[:, 2 * k + i]].astype(np.float64) for i in range(2))

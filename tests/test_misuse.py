@@ -7,6 +7,7 @@ import pytest
 
 import rts
 from rts import Camera
+from rts_surfaces.implicit.narrow_band import NarrowBand
 
 pytestmark = pytest.mark.rendering
 
@@ -15,6 +16,7 @@ CAMERA = Camera.look_at((0.4, 0.5, 4), (0, 0, 0))
 Mesh = rts.plugin("surfaces", "mesh")
 PART = Mesh.example()
 Bezier = rts.plugin("surfaces", "bezier")
+Sdf = rts.plugin("surfaces", "sdf")
 PATCH, VASE, PAWN = (rts.plugin("surfaces", name).example() for name in ("bezier", "bspline", "revolution"))
 SAMPLED = rts.sample(PART, CAMERA, SIZE)
 K = np.array([[14.0, 0, 8], [0, 14, 6], [0, 0, 1]])
@@ -64,6 +66,18 @@ def shaded(name, **entries):
         return rts.render(theta(**given).replace(shader=name), CAMERA, SIZE)
 
     return call
+
+
+def isosurface(bounds=((-1, -1, -1), (1, 1, 1)), **options):
+    return rts.plugin("surfaces", "isosurface")(bounds, **options)
+
+
+def ball(theta, points):
+    return rts.namespace(points).sum(points * points, axis=-1) - 0.5
+
+
+def rendered(surface, entries):
+    return rts.render(rts.Part(surface, entries), CAMERA, SIZE)
 
 
 UV, TEXTURE = np.zeros((12, 2), np.float32), np.ones((2, 2, 3), np.float32)
@@ -165,6 +179,29 @@ CALLS = {
     "combine.weights": lambda v: rts.combine(np.ones((2, 3), np.float32), np.zeros((1, 1), np.int32), v),
     "rigid.pose": rts.rigid,
     "rigid.center": lambda v: rts.rigid(np.zeros(6), v),
+    "Isosurface.bounds": lambda v: isosurface(bounds=v),
+    "Isosurface.isovalue": lambda v: isosurface(isovalue=v),
+    "Isosurface.f": lambda v: rendered(isosurface(f=v, shape=(4, 4, 4)), {}),
+    "Isosurface.shape": lambda v: isosurface(f=ball, shape=v),
+    "Isosurface.motion": lambda v: isosurface(motion=v),
+    "Isosurface.inside": lambda v: isosurface(inside=v),
+    "Isosurface.at_bounds": lambda v: isosurface(at_bounds=v),
+    "Isosurface.near_singular": lambda v: isosurface(near_singular=v),
+    "Isosurface.table": lambda v: isosurface(f=ball, shape=(4, 4, 4), table=v),
+    "Isosurface.band": lambda v: isosurface(f=ball, shape=(4, 4, 4), band=v),
+    "Isosurface.lipschitz": lambda v: isosurface(f=ball, shape=(4, 4, 4), lipschitz=v),
+    "Isosurface.reads": lambda v: isosurface(f=ball, shape=(4, 4, 4), reads=v),
+    "Isosurface.attributes": lambda v: isosurface(attributes=v),
+    "Isosurface.values": lambda v: rendered(isosurface(), {"values": v}),
+    "Sdf.f": lambda v: rendered(Sdf(v), {}),
+    "Sdf.radius": lambda v: Sdf(ball, radius=v),
+    "Sdf.center": lambda v: Sdf(ball, center=v),
+    "Sdf.lipschitz": lambda v: Sdf(ball, lipschitz=v),
+    "Sdf.steps": lambda v: Sdf(ball, steps=v),
+    "NarrowBand.lipschitz": lambda v: NarrowBand(lipschitz=v),
+    "NarrowBand.coarse": lambda v: NarrowBand(coarse=v),
+    "NarrowBand.margin": lambda v: NarrowBand(margin=v),
+    "NarrowBand.chunk": lambda v: NarrowBand(chunk=v),
     "Bezier.indices": Bezier,
     "Bezier.tolerance": lambda v: Bezier(PATCH.surface.table, tolerance=v),
     "Bezier.points": lambda v: rts.render(PATCH.replace(theta={"points": v}), CAMERA, SIZE),
@@ -232,17 +269,22 @@ OPTIONAL = """
     prepare.size
     Part.transform Mesh.indices look_at.aspect look_at.near look_at.far within.transform splatter.calibration
     ImageResiduals.weights fit.steps fit.learning_rate fit.callback gradient_image.scale
+    Isosurface.band Isosurface.lipschitz Isosurface.reads Isosurface.attributes Sdf.lipschitz Sdf.steps
+    NarrowBand.lipschitz NarrowBand.coarse
 """
 NUMBERS = """
     shader.specular shader.shininess shader.ambient look_at.fov_y look_at.aspect look_at.near look_at.far
     orthographic.height from_opencv.near from_opencv.pixel_center from_pytorch3d.focal_length from_blender.focal
     splatter.sigma splatter.calibration exact_calibration.sigma save_animation.fps fit.learning_rate fit.tolerance
-    gradient_image.scale Bezier.tolerance tessellate.rate
+    gradient_image.scale Bezier.tolerance tessellate.rate Isosurface.isovalue Isosurface.lipschitz Sdf.radius
+    Sdf.lipschitz NarrowBand.lipschitz
 """
 ACCEPTED = {
     "None": OPTIONAL.split(),
     "a fraction": NUMBERS.split(),
-    "minus one": ["from_opencv.pixel_center"],
+    "minus one": ["from_opencv.pixel_center", "Isosurface.isovalue"],
+    "an empty list": ["Isosurface.reads"],
+    "a list of words": ["Isosurface.reads"],
     "infinity": ["fit.tolerance"],
     "a function": ["fit.callback"],
     # No points have no pixels; sums and products of NaN are NaN.

@@ -14,10 +14,10 @@ from rts.records import RayHits
 from rts.trees import Array, map_leaves
 
 STEPS = 256
-"""Steps across the ball where no Lipschitz constant is known."""
+"""Steps across the region where no Lipschitz constant is known."""
 
-SHORTEST = 1 / 1024
-"""The shortest step where one is known, as a share of the ball's diameter. Thinner parts may be missed."""
+SHORTEST = 1 / 512
+"""The shortest step where one is known, as a share of the region across. Thinner parts may be missed."""
 
 MOST = 512
 """Such steps that a ray takes at most; one that keeps along a surface for longer ends there."""
@@ -28,6 +28,69 @@ SECANT, NEWTON = 5, 2
 CROWDED = 0.75
 """The share of rays that still go on at which the others are taken out."""
 
+FLATTEST = 1e-12
+"""The least square of a slope that points are moved by; where the field is flatter, they move less."""
+
+
+class Region(NamedTuple):
+    """Where surfaces are looked for: a `ball` or a `box`.
+
+    Attributes:
+        span: origins and directions (R, 3) → (R,) where rays enter, or 0 where they begin within, and (R,) where they
+            leave, in units of their directions; both are 0 for rays that miss it.
+        across: how long it is.
+    """
+
+    span: Callable[[Array, Array], tuple[Array, Array]]
+    across: float
+
+
+def ball(center: np.ndarray, radius: float) -> Region:
+    """A ball; `center` is (3,)."""
+
+    def span(origins: Array, directions: Array) -> tuple[Array, Array]:
+        engine = engine_of(origins)
+        xp, off = engine.namespace, origins - engine.constant(center, origins)
+        square = xp.sum(directions * directions, axis=-1)
+        nearest = -xp.sum(off * directions, axis=-1) / square
+        off = off + nearest[:, None] * directions
+        left = radius * radius - xp.sum(off * off, axis=-1)
+        half = xp.sqrt(xp.where(left > 0, left, 0.0) / square)
+        return _ahead(nearest - half, nearest + half)
+
+    return Region(span, 2 * radius)
+
+
+def box(low: np.ndarray, high: np.ndarray) -> Region:
+    """A box along the axes, from its lower corner (3,) to the opposite one."""
+
+    def span(origins: Array, directions: Array) -> tuple[Array, Array]:
+        engine = engine_of(origins)
+        xp, along = engine.namespace, directions == 0
+        ends = [
+            (engine.constant(corner, origins) - origins) / xp.where(along, 1.0, directions) for corner in (low, high)
+        ]
+        # Rays along a plane are between it and the opposite one for ever, or never.
+        between = (ends[0] <= 0) & (ends[1] >= 0)
+        far = xp.full_like(directions, xp.inf)
+        never = xp.where(between, -far, far)
+        first = xp.where(along, never, xp.minimum(*ends))
+        last = xp.where(along, -never, xp.maximum(*ends))
+        return _ahead(xp.max(first, axis=-1), xp.min(last, axis=-1))
+
+    return Region(span, float(np.max(high - low)))
+
+
+def moving(level: Callable[[Array], Array], points: Array) -> Array:
+    """(M, 6) for points (M, 3) of a surface: the points, and how they move for each unit that the level falls there.
+
+    The latter is the slope over its square, w = ∇f / |∇f|²: the point x₀ − f(x₀) w is on the surface, to first order.
+    """
+    engine, slope = engine_of(points), gradient(level, points)
+    xp = engine.namespace
+    square = xp.sum(slope * slope, axis=-1, keepdims=True)
+    return engine.stop_gradient(xp.concat([points, slope / xp.clip(square, FLATTEST, None)], axis=-1))
+
 
 def cast(
     level: Callable[[Array], Array],
@@ -36,15 +99,15 @@ def cast(
     directions: Array,
     layers: int,
     *,
-    center: np.ndarray,
-    radius: float,
+    within: Region,
     lipschitz: float | None = None,
     steps: int | None = None,
 ) -> RayHits:
-    """The nearest points of each ray at which a function changes its sign, within a ball; without derivative.
+    """The nearest points of each ray at which a function changes its sign, within a region; without derivative.
 
-    With a Lipschitz constant L steps are |level| / L long, but not shorter than a share of the ball, so that they lead
-    over the surface. Without one all steps are of one length. Either way what is thinner than a step may be missed.
+    With a Lipschitz constant L steps are |level| / L long, but not shorter than a share of the region, so that they
+    lead over the surface. Without one all steps are of one length. Either way what is thinner than a step may be
+    missed.
 
     Args:
         level: points (M, 3) → (M,), negative inside, zero counts as outside.
@@ -52,10 +115,9 @@ def cast(
         origins: (R, 3).
         directions: (R, 3), of any length but zero.
         layers: K.
-        center: (3,), the ball's.
-        radius: the ball's.
+        within: the region.
         lipschitz: L, which the slope of `level` nowhere exceeds; or None.
-        steps: the number of the shortest steps across the ball; None for `STEPS`, or 1 / `SHORTEST` with L.
+        steps: the number of the shortest steps across the region; None for `STEPS`, or 1 / `SHORTEST` with L.
 
     Returns:
         Hits in the arrays' engine and dtype. Where there is none, distance and parameters are 0.
@@ -63,14 +125,14 @@ def cast(
     engine = engine_of(origins)
     xp = engine.namespace
     length = xp.sqrt(xp.sum(directions * directions, axis=-1))
-    enter, leave = _within(origins - engine.constant(center, origins), directions, length, radius)
+    enter, leave = within.span(origins, directions)
     if steps is None:
         steps = STEPS if lipschitz is None else round(1 / SHORTEST)
     rays = _Rays(
         origins + enter[:, None] * directions,
         directions,
         leave - enter,
-        2 * radius / steps / length,
+        within.across / steps / length,
         xp.zeros_like(length) if lipschitz is None else 1 / (lipschitz * length),
     )
     most = steps + 1 if lipschitz is None else MOST
@@ -81,12 +143,12 @@ def cast(
 
 
 class _Rays(NamedTuple):
-    """Rays from where they enter the ball.
+    """Rays from where they enter the region.
 
     Attributes:
         starts: (R, 3).
         directions: (R, 3).
-        last: (R,), where they leave the ball, in units of their directions; 0 for those that do not meet it.
+        last: (R,), where they leave the region, in units of their directions; 0 for those that do not meet it.
         shortest: (R,), the shortest step.
         rate: (R,), the step for each unit of the level.
     """
@@ -122,7 +184,8 @@ def _cast_some(
     xp, count = engine_of(enter).namespace, enter.shape[0]
     index = xp.arange(count, dtype=xp.int64, device=enter.device)
     going, found, t, value = rays, xp.zeros_like(index), xp.zeros_like(enter), free(rays.starts)
-    cells, brackets = [index[:0]], [_Bracket(*[t[:0]] * 4)]
+    # The first is of no hit, so that no function is called without points.
+    cells, brackets = [index[:1]], [_Bracket(*[t[:1]] * 4)]
     for _ in range(most):
         on = (t < going.last) & (found < layers)
         left = int(xp.sum(xp.astype(on, xp.int64)))
@@ -139,15 +202,15 @@ def _cast_some(
         found = found + xp.astype(crossed, xp.int64)
         t, value = further, after
     cell, bracket = xp.concat(cells), _Bracket(*(xp.concat(x) for x in zip(*brackets, strict=True)))
-    met = _rows(rays, cell % max(1, count))
+    met = _rows(rays, cell % count)
     t = _roots(level, free, met, bracket)
 
     def spread(values: Array) -> Array:
         table = xp.zeros((layers * count, *values.shape[1:]), dtype=values.dtype, device=values.device)
-        table[cell] = values
+        table[cell[1:]] = values[1:]
         return xp.reshape(table, (layers, count, *values.shape[1:]))
 
-    distance = t + xp.take(enter, cell % max(1, count), axis=0)
+    distance = t + xp.take(enter, cell % count, axis=0)
     return RayHits(spread(xp.ones_like(cell, dtype=xp.bool)), spread(distance), spread(describe(met.at(t))))
 
 
@@ -224,13 +287,9 @@ def _without_derivative(level: Callable[[Array], Array], points: Array) -> Array
     return engine_of(points).stop_gradient(level(points))
 
 
-def _within(origins: Array, directions: Array, length: Array, radius: float) -> tuple[Array, Array]:
-    """Where rays enter a ball about the origin, or begin in it, and leave it; both are 0 for those that miss it."""
-    xp = engine_of(origins).namespace
-    nearest = -xp.sum(origins * directions, axis=-1) / (length * length)
-    off = origins + nearest[:, None] * directions
-    square = radius * radius - xp.sum(off * off, axis=-1)
-    half = xp.sqrt(xp.where(square > 0, square, 0.0)) / length
-    met = (square > 0) & (nearest + half > 0)
-    enter = xp.clip(nearest - half, 0, None)
-    return xp.where(met, enter, 0.0), xp.where(met, nearest + half, 0.0)
+def _ahead(enter: Array, leave: Array) -> tuple[Array, Array]:
+    """The part of a span that is not behind the origin of a ray; 0 and 0 where there is none."""
+    xp = engine_of(enter).namespace
+    enter = xp.clip(enter, 0, None)
+    met = leave > enter
+    return xp.where(met, enter, 0.0), xp.where(met, leave, 0.0)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import abc
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -13,6 +14,7 @@ from rts.errors import EngineError, InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Surface
 from rts.operations.gradient import gradient
+from rts.records import Samples
 from rts.trees import Array, Tree, leaves
 from rts_surfaces.entries import RESERVED
 
@@ -23,7 +25,45 @@ SIDES = {"below": 1.0, "above": -1.0}
 """Which values are inside, and what turns these negative."""
 
 
-class Field:
+class ScalarField(abc.ABC):
+    """A number at every point of space, as surfaces use it: negative inside.
+
+    Attributes:
+        name: what errors call it.
+    """
+
+    name: str
+
+    @abc.abstractmethod
+    def names(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
+        """The names of the entries of θ that are read."""
+
+    @abc.abstractmethod
+    def check(self, theta: Mapping[str, Tree]) -> None:
+        """Refuse θ without them."""
+
+    @abc.abstractmethod
+    def level(self, theta: Mapping[str, Tree], points: Array) -> Array:
+        """How far the field is from the isovalue, negative inside; what has the isovalue itself counts as outside.
+
+        Args:
+            theta: θ.
+            points: (M, 3) float, of θ's engine.
+
+        Returns:
+            (M,), in the dtype of the points.
+        """
+
+    @abc.abstractmethod
+    def slope(self, theta: Mapping[str, Tree], points: Array) -> Array:
+        """The gradient (M, 3) of `level` at points (M, 3), towards the outside."""
+
+    @abc.abstractmethod
+    def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
+        """The points in the dtype that θ asks for, float32 at least."""
+
+
+class Field(ScalarField):
     """A scalar function of space that θ parametrizes; its surface is where it has one value.
 
     Args:
@@ -33,25 +73,20 @@ class Field:
         inside: which values are inside, "below" the isovalue or "above" it.
         reads: the names of the entries of θ that `f` reads; None for all.
 
-    Attributes:
-        name: what `f` is called.
-
     Raises:
         InputError: wrong arguments.
     """
 
-    def __init__(self, f: Function, isovalue: float = 0.0, inside: str = "below", reads: Iterable[str] | None = None):
+    def __init__(self, f: Function, isovalue: float = 0.0, inside: str = "below", reads: Sequence[str] | None = None):
         check_function("f", f)
         value = check_numbers("isovalue", isovalue, ())
         if value is None:
             raise InputError("isovalue is traced; expected a known number, or subtract it in f")
         if not isinstance(inside, str) or inside not in SIDES:
             raise InputError(f"inside is {quoted(inside)}; expected 'below' or 'above'")
-        if reads is not None and (
-            isinstance(reads, str) or not isinstance(reads, Iterable) or not all(isinstance(n, str) for n in reads)
-        ):
+        if reads is not None and not (isinstance(reads, (list, tuple)) and all(isinstance(n, str) for n in reads)):
             raise InputError(f"reads is {quoted(reads)}; expected names of entries of theta, or None for all")
-        self.f, self.isovalue, self.inside = f, float(value), inside
+        self.f, self.isovalue, self.inside, self.sign = f, float(value), inside, SIDES[inside]
         self.name = getattr(f, "__name__", type(f).__name__)
         self._reads = None if reads is None else tuple(reads)
 
@@ -62,22 +97,26 @@ class Field:
         """The names of the entries of θ that `f` reads."""
         return tuple(theta) if self._reads is None else self._reads
 
+    def check(self, theta: Mapping[str, Tree]) -> None:
+        """Refuse θ that lacks an entry which `f` reads. What `f` makes of it is checked when it is called."""
+        for name in self.names(theta):
+            if name not in theta:
+                raise InputError(f"theta has no {name!r}, which {self.name} reads; it has {sorted(theta)}")
+
     def level(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """How far `f` is from the isovalue, negative inside; what has the isovalue itself counts as outside.
-
-        Args:
-            theta: θ.
-            points: (M, 3) float, of θ's engine.
-
-        Returns:
-            (M,), in the dtype of the points.
+        """See `ScalarField`.
 
         Raises:
             InputError: `f` gave another shape, dtype or engine.
         """
-        value = self.f(theta, points)
+        try:
+            value = self.f(theta, points)
+        except KeyError as error:
+            if not error.args or error.args[0] in theta:
+                raise
+            raise InputError(f"{self.name} reads theta[{error.args[0]!r}]; theta has {sorted(theta)}") from error
         check_result("f", value, points)
-        return SIDES[self.inside] * (value - self.isovalue)
+        return self.sign * (value - self.isovalue)
 
     def slope(self, theta: Mapping[str, Tree], points: Array) -> Array:
         """The gradient (M, 3) of `level` at points (M, 3), towards the outside; see `rts.gradient`."""
@@ -106,7 +145,7 @@ class Implicit(Surface):
         InputError: an attribute has no function, or a name that means something else.
     """
 
-    def __init__(self, field: Field, attributes: Mapping[str, Function] | None = None):
+    def __init__(self, field: ScalarField, attributes: Mapping[str, Function] | None = None):
         if attributes is not None and not isinstance(attributes, Mapping):
             raise InputError(f"attributes is {quoted(attributes)}; expected a dict of name → function")
         for name, g in (attributes or {}).items():
@@ -120,10 +159,24 @@ class Implicit(Surface):
         return tuple(theta) if self.attributes else self.field.names(theta)
 
     def check(self, theta: Mapping[str, Tree]) -> None:
-        """Refuse θ that lacks an entry which the field reads. What `f` makes of it is checked when it is called."""
-        for name in self.field.names(theta):
-            if name not in theta:
-                raise InputError(f"theta of {self!r} has no {name!r}; it has {sorted(theta)}")
+        """Refuse θ without what the field reads."""
+        self.field.check(theta)
+
+    def at_hits(self, theta: Mapping[str, Tree], samples: Samples, level: Callable[[Array], Array]) -> GBuffer:
+        """The G-buffer where rays met the field: x₀ − f(x₀) w, with x₀ and w the parameters of samples (N, 6).
+
+        Args:
+            theta: θ.
+            samples: those of `rts_surfaces.implicit.casting.moving`.
+            level: f, points (M, 3) → (M,), differentiable in θ.
+        """
+        params = self.field.suited(theta, samples.params)
+        xp = namespace(params)
+        # At the origin, where rows that only pad would lie, many a function has no derivative: they do as the first.
+        used = xp.any(params != 0, axis=1, keepdims=True)
+        params = xp.where(used, params, xp.where(used[:1], params[:1], xp.ones_like(params[:1])))
+        found, along = params[:, :3], params[:, 3:]
+        return self.gbuffer(theta, found - level(found)[:, None] * along)
 
     def gbuffer(self, theta: Mapping[str, Tree], position: Array) -> GBuffer:
         """Positions (N, 3) on the surface, with normals of unit length, outwards, and the attributes, when read.

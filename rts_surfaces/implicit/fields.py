@@ -39,9 +39,9 @@ def swept_sphere(theta: Mapping[str, Tree], points: Array) -> Array:
 
 
 def spheres(theta: Mapping[str, Tree], points: Array) -> Array:
-    """The least distance (M,) of points (M, 3) to n spheres, whose centers lie in the plane z = 0.
+    """The least distance (M,) of points (M, 3) to n spheres, whose centers lie in the plane y = 0.
 
-    θ["centers"] (n, 2) are x and y, θ["radii"] (n,) the radii. The derivative is that of the nearest sphere. Which this
+    θ["centers"] (n, 2) are x and z, θ["radii"] (n,) the radii. The derivative is that of the nearest sphere. Which this
     is is sought without derivatives, in blocks of `BLOCK` points, or sphere by sphere: memory is of the order of M.
     """
     xp, centers = namespace(points), _entry(theta, "centers", ("n", 2))
@@ -49,7 +49,8 @@ def spheres(theta: Mapping[str, Tree], points: Array) -> Array:
     stop = engine_of(points).stop_gradient
     table = xp.concat([centers, radii[:, None]], axis=1)
     nearest = take(table, _nearest(stop(points), stop(centers), stop(radii)))
-    return _length(xp.concat([points[:, :2] - nearest[:, :2], points[:, 2:]], axis=1)) - nearest[:, 2]
+    x, y, z = (points[:, i] for i in range(3))
+    return _length(xp.stack([x - nearest[:, 0], y, z - nearest[:, 1]], axis=1)) - nearest[:, 2]
 
 
 def union(*fields: Function) -> Function:
@@ -102,20 +103,20 @@ def _nearest(points: Array, centers: Array, radii: Array) -> Array:
     engine = engine_of(points)
     xp, count = engine.namespace, centers.shape[0]
     if engine.exact_products(points, centers):
-        # |p − c|² = (−2 c, |c|², 1) · (p, 1, |p|²), in blocks that stay in the cache.
-        one, other = xp.ones_like(points[:, :1]), xp.ones_like(centers[:, :1])
-        rows = xp.concat([points[:, :2], one, xp.sum(points * points, axis=1, keepdims=True)], axis=1)
-        columns = xp.concat([-2 * centers, xp.sum(centers * centers, axis=1, keepdims=True), other], axis=1).T
-        found = []
-        for i in range(0, max(1, rows.shape[0]), BLOCK):
-            square = xp.clip(rows[i : i + BLOCK] @ columns, 0, None)
-            found.append(xp.argmin(xp.sqrt(square) - radii, axis=1))
-        return xp.astype(xp.concat(found), xp.int32)
+        # |p − c|² = (−2 c, 1, |c|²) · (p, |p|², 1), in blocks that stay in the cache.
+        of_points, of_centers = (xp.sum(x * x, axis=1, keepdims=True) for x in (points, centers))
+        rows = xp.concat([points[:, :1], points[:, 2:], of_points, xp.ones_like(of_points)], axis=1)
+        columns = xp.concat([-2 * centers, xp.ones_like(of_centers), of_centers], axis=1).T
+
+        def nearest(rows: Array) -> Array:
+            return xp.argmin(xp.sqrt(xp.clip(rows @ columns, 0, None)) - radii, axis=1)
+
+        return xp.astype(engine.map_rows(nearest, rows, BLOCK), xp.int32)
 
     def body(state: dict[str, Array]) -> dict[str, Array]:
         i = state["i"]
-        x, y = (xp.take(centers[:, j], i, axis=0) for j in range(2))
-        square = (points[:, 0] - x) ** 2 + (points[:, 1] - y) ** 2 + points[:, 2] ** 2
+        x, z = (xp.take(centers[:, j], i, axis=0) for j in range(2))
+        square = (points[:, 0] - x) ** 2 + points[:, 1] ** 2 + (points[:, 2] - z) ** 2
         distance = xp.sqrt(square) - xp.take(radii, i, axis=0)
         nearer = distance < state["least"]
         least, index = xp.where(nearer, distance, state["least"]), xp.where(nearer, i, state["index"])

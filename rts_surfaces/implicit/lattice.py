@@ -37,6 +37,18 @@ class Lattice:
         self.shape = check_shape(shape)
         self.step = (high - self.low) / (np.array(self.shape) - 1)
 
+    @classmethod
+    def of(cls, shape: tuple[int, ...], low: tuple[float, ...], step: tuple[float, ...]) -> Lattice:
+        """The lattice whose `fixed` these are."""
+        self = cls.__new__(cls)
+        self.shape, self.low, self.step = shape, np.array(low), np.array(step)
+        return self
+
+    @property
+    def fixed(self) -> tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]:
+        """Shape, first point and step, as numbers of Python."""
+        return self.shape, tuple(self.low.tolist()), tuple(self.step.tolist())
+
     @property
     def count(self) -> int:
         """The number of points."""
@@ -70,7 +82,7 @@ def check_bounds(bounds: Any) -> tuple[np.ndarray, np.ndarray]:
 def check_shape(shape: Any) -> tuple[int, int, int]:
     """(X, Y, Z) as integers, refused where there is no such lattice."""
     try:
-        given = tuple(shape)
+        given = () if isinstance(shape, (str, bytes)) else tuple(shape)
     except TypeError:
         given = ()
     if len(given) != 3 or not all(is_count(n) and n >= 2 for n in given):

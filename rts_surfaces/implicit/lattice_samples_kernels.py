@@ -5,6 +5,9 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+LARGEST = 1e38
+"""What is larger is no number of single precision: fields that are flat to the last digit move nothing."""
+
 
 @numba.njit(nogil=True, inline="always")
 def _place(number, shape, low, step, out):
@@ -15,7 +18,7 @@ def _place(number, shape, low, step, out):
 
 @numba.njit(cache=True, nogil=True)
 def fill(
-    start, stop, values, isovalue, sign, numbers, corners, shape, low, step, ids, weights, points, params, slopes, apart
+    start, stop, values, isovalue, sign, numbers, corners, shape, low, step, ids, near, points, params, squares, apart
 ):
     """Fill what samples `start` to `stop` carry.
 
@@ -31,18 +34,19 @@ def fill(
         low: (3,), the first point.
         step: (3,).
         ids: (N, 8) int32: the ends of three edges, the cell, and the axes along which it is capped.
-        weights: (N, 2), barycentrics.
+        near: (N, 2), barycentrics.
         points: (N, 6) int32, to be filled with the numbers of lattice points.
-        params: (N, 12), to be filled: barycentrics (3), weights of the six values (6), the sample's place (3).
-        slopes: (N, 3), to be filled with the level's gradient within the cell, along the side where it is capped.
+        params: (N, 15), to be filled: barycentrics (3), weights of the six values (6), the sample's place (3), and the
+            level's gradient within the cell (3), along the side where it is capped.
+        squares: (N,), to be filled with the square of the gradient's length.
         apart: (N, 3), to be filled: by how much the values at the ends of edges differ; 0 where they are one point.
     """
     banded = len(numbers) > 0
     a, b, lowest = np.empty(3), np.empty(3), np.empty(3)
-    at, near, slope = np.empty(3), np.empty((3, 2)), np.empty(3)
+    at, beside, slope = np.empty(3), np.empty((3, 2)), np.empty(3)
     corner = np.empty(8)
     for n in range(start, stop):
-        params[n, 0], params[n, 1], params[n, 2] = weights[n, 0], weights[n, 1], 1 - weights[n, 0] - weights[n, 1]
+        params[n, 0], params[n, 1], params[n, 2] = near[n, 0], near[n, 1], 1 - near[n, 0] - near[n, 1]
         at[:] = 0
         for k in range(3):
             row_a, row_b, share = ids[n, 2 * k], ids[n, 2 * k + 1], np.float64(params[n, k])
@@ -67,13 +71,36 @@ def fill(
                 corner[i] = values[base + ((i & 1) * shape[1] + (i >> 1 & 1)) * shape[2] + (i >> 2 & 1)]
         for i in range(3):
             params[n, 9 + i] = at[i]
-            near[i, 1] = min(max((at[i] - lowest[i]) / step[i], 0.0), 1.0)
-            near[i, 0] = 1 - near[i, 1]
+            beside[i, 1] = min(max((at[i] - lowest[i]) / step[i], 0.0), 1.0)
+            beside[i, 0] = 1 - beside[i, 1]
         slope[:] = 0
         for i in range(8):
             x, y, z = i & 1, i >> 1 & 1, i >> 2 & 1
-            slope[0] += (2 * x - 1) * near[1, y] * near[2, z] * corner[i]
-            slope[1] += (2 * y - 1) * near[0, x] * near[2, z] * corner[i]
-            slope[2] += (2 * z - 1) * near[0, x] * near[1, y] * corner[i]
+            slope[0] += (2 * x - 1) * beside[1, y] * beside[2, z] * corner[i]
+            slope[1] += (2 * y - 1) * beside[0, x] * beside[2, z] * corner[i]
+            slope[2] += (2 * z - 1) * beside[0, x] * beside[1, y] * corner[i]
+        squares[n] = 0
         for i in range(3):
-            slopes[n, i] = 0 if ids[n, 7] >> i & 1 else sign * slope[i] / step[i]
+            along = 0.0 if ids[n, 7] >> i & 1 else sign * slope[i] / step[i]
+            params[n, 12 + i] = along
+            squares[n] += along * along
+
+
+@numba.njit(cache=True, nogil=True)
+def divide(start, stop, squares, least, params):
+    """Turn gradients into how samples move for each unit of level: divide by their square, or by `least` if larger."""
+    for n in range(start, stop):
+        divisor = max(squares[n], least)
+        for i in range(12, 15):
+            moved = params[n, i] / divisor if divisor > 0 else 0.0
+            params[n, i] = moved if abs(moved) < LARGEST else 0.0
+
+
+@numba.njit(cache=True, nogil=True)
+def name(start, stop, faces, ends, cells, caps, ids):
+    """Fill what triangles hand on to samples, (T, 8): the ends of three edges, the cell, and where it is capped."""
+    for t in range(start, stop):
+        for k in range(3):
+            for i in range(2):
+                ids[t, 2 * k + i] = ends[faces[t, k], i]
+        ids[t, 6], ids[t, 7] = cells[t], caps[t]

@@ -151,7 +151,7 @@ def _with_border(band: Band, lattice: Lattice, closed: bool) -> tuple[np.ndarray
         if not side.any() or not len(there):
             continue
         # Along an axis of the border, both corners are the lattice's last ones.
-        beside = np.where(side == 0, CORNERS, side > 0) @ (1, 2, 4)
+        beside = np.where(side == 0, CORNERS, side > 0).astype(np.int64) @ np.array([1, 2, 4])
         outer = ((side != 0) & (CORNERS == (side > 0))).any(axis=1) @ (1 << np.arange(8))
         cap = (side != 0) @ (1, 2, 4)
         of_all = np.full(len(there), outer, np.uint8), np.full(len(there), cap, np.int8)

@@ -1,56 +1,52 @@
-"""How samples of an isosurface move along the field's gradient: an operation."""
+"""How samples of an isosurface move with the field: along its gradient, or along the edges of the lattice; operations.
+
+Both take values (M,), params (N, P) in their dtype, and rows (N, 6) int32: the six values of each sample.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from rts.engines import constants, engine_of, namespace
+from rts.engines import engine_of, namespace
 from rts.errors import InputError
 from rts.operations.combine import combine
 from rts.operations.operation import Arrays, Operation, Some
+from rts.operations.take import take
 from rts.threads import parallel, read_only
 from rts.trees import Array
+from rts_surfaces.implicit.lattice import Lattice
 
-WEIGHTS, PLACE, ALONG = slice(3, 9), slice(9, 12), slice(12, 15)
+Edges = tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]
+"""Shape, first point and step of a lattice."""
+
+_WEIGHTS, _PLACE, _ALONG = slice(3, 9), slice(9, 12), slice(12, 15)
 """Which parameters of a sample are the weights of the six values, its place, and by how much it moves for a unit."""
 
 
-def along_normal(values: Array, samples: Any, isovalue: float, sign: float) -> Array:
-    """(N, 3): where samples are, less their vector times the level, which is zero where they were found.
-
-    Args:
-        values: (M,) float, by lattice point or by row of a table.
-        samples: ids (N, 6), rows of the values, and params (N, 15).
-        isovalue: the level is `sign * (value - isovalue)`.
-        sign: 1 or −1.
-    """
-    engine = engine_of(values, samples.params)
-    values = constants(values, engine, samples.params)
-    xp = engine.namespace
-    params = xp.astype(samples.params, values.dtype, copy=False)
-    return ALONG_NORMAL(values, params, samples.ids, isovalue=isovalue, sign=sign)
+def _by_level(values: Array, params: Array, rows: Array, *, isovalue: float, sign: float) -> Array:
+    xp, weights = namespace(values, params), params[:, _WEIGHTS]
+    level = combine(values[:, None], rows, weights)[:, 0] - isovalue * xp.sum(weights, axis=1)
+    return params[:, _PLACE] - sign * level[:, None] * params[:, _ALONG]
 
 
-def _specification(values: Array, params: Array, ids: Array, *, isovalue: float, sign: float) -> Array:
-    xp, weights = namespace(values, params), params[:, WEIGHTS]
-    level = combine(values[:, None], ids, weights)[:, 0] - isovalue * xp.sum(weights, axis=1)
-    return params[:, PLACE] - sign * level[:, None] * params[:, ALONG]
-
-
-def _shape(values: tuple[int, ...], params: tuple[int, ...], ids: tuple[int, ...], **_: object) -> tuple[int, ...]:
+def _shape(values: tuple[int, ...], params: tuple[int, ...], *_: object, **__: object) -> tuple[int, ...]:
     return params[0], 3
 
 
-def _checked(operands: Arrays) -> Arrays:
-    values, params, ids = operands
-    if ids.shape != (len(params), 6) or params.shape[1] != 15:
-        raise InputError(f"ids and params have shapes {ids.shape} and {params.shape}; expected (N, 6) and (N, 15)")
-    if ids.size and not 0 <= ids.min() <= ids.max() < len(values):
+def _checked(operands: Arrays, width: int) -> Arrays:
+    values, params, *numbers = operands
+    for rows in numbers:
+        if rows.shape != (len(params), 6) or params.shape[1] != width:
+            raise InputError(
+                f"ids and params have shapes {rows.shape} and {params.shape}; expected (N, 6) and (N, {width}): sample "
+                f"this surface anew"
+            )
+    rows = numbers[0]
+    if rows.size and not 0 <= rows.min() <= rows.max() < len(values):
         raise InputError(
-            f"samples refer to values from {ids.min()} to {ids.max()} of {len(values)}; sample this surface anew"
+            f"samples refer to values from {rows.min()} to {rows.max()} of {len(values)}; sample this surface anew"
         )
     return operands
 
@@ -58,32 +54,30 @@ def _checked(operands: Arrays) -> Arrays:
 def _forward(operands: Arrays, out: np.ndarray, *, isovalue: float, sign: float) -> None:
     from rts_surfaces.implicit import motion_kernels
 
-    values, params, ids = _checked(operands)
+    values, params, rows = _checked(operands, 15)
     real = values.dtype.type
-    parallel(motion_kernels.move, len(ids), values, params, ids, real(isovalue), real(sign), out, work=30 * len(ids))
+    parallel(motion_kernels.move, len(rows), values, params, rows, real(isovalue), real(sign), out, work=30 * len(rows))
 
 
-def _push(
-    operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, sign: float
-) -> None:
+def _push(operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, sign: float) -> None:
     from rts_surfaces.implicit import motion_kernels
 
-    values, params, ids = _checked(operands)
-    given = read_only(tangents[0]), params, ids, values.dtype.type(sign), out
-    parallel(motion_kernels.push, len(ids), *given, work=30 * len(ids))
+    values, params, rows = _checked(operands, 15)
+    given = read_only(tangents[0]), params, rows, values.dtype.type(sign), out
+    parallel(motion_kernels.push, len(rows), *given, work=30 * len(rows))
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some, *, isovalue: float, sign: float) -> None:
     from rts_surfaces.implicit import motion_kernels
 
-    values, params, ids = _checked(operands)
+    values, params, rows = _checked(operands, 15)
     if results[0] is not None:
-        motion_kernels.pull(read_only(g), params, ids, values.dtype.type(sign), results[0])
+        motion_kernels.pull(read_only(g), params, rows, values.dtype.type(sign), results[0])
 
 
 ALONG_NORMAL = Operation(
     "rts_surfaces.along_normal",
-    _specification,
+    _by_level,
     ranks=(1, 2, 2),
     shape=_shape,
     forward=_forward,
@@ -92,4 +86,80 @@ ALONG_NORMAL = Operation(
     packed=(1, 2),
     packed_result=True,
 )
-"""The operation of `along_normal`, on values, params and ids."""
+"""(N, 3): where samples are, less their vector times the level, `sign * (value - isovalue)` by the weights of the six
+values; it is zero where they were found. A sample's params (15) are barycentrics, these weights, place and vector."""
+
+
+# ------------------------------------------------------------------------------------------------ along edges
+
+
+def _by_crossings(
+    values: Array, params: Array, rows: Array, numbers: Array, *, isovalue: float, lattice: Edges
+) -> Array:
+    xp = namespace(values)
+    six = xp.reshape(take(values[:, None], xp.reshape(rows, (-1,))), (-1, 6)) - isovalue
+    placed, corners = Lattice.of(*lattice), []
+    for k in range(3):
+        a, b = (placed.places(numbers[:, 2 * k + i], values.dtype) for i in range(2))
+        along = _crossing(six[:, 2 * k], six[:, 2 * k + 1], params[:, 3])
+        corners.append(params[:, k : k + 1] * (a + along[:, None] * (b - a)))
+    return corners[0] + corners[1] + corners[2]
+
+
+def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
+    """How far along an edge the level is zero (N,); its derivative as if the ends differed by `least` or more."""
+    engine = engine_of(f_a)
+    xp, apart = engine.namespace, f_b - f_a
+    same = apart == 0
+    exact = -f_a / xp.where(same, xp.ones_like(apart), apart)
+    exact = xp.where(same, xp.zeros_like(exact), exact)
+    known = engine.stop_gradient(apart)
+    singular = xp.abs(known) < least
+    bounded = xp.where(known < 0, -least, least)
+    along = engine.stop_gradient(exact)
+    change = (1 - along) * (f_a - engine.stop_gradient(f_a)) + along * (f_b - engine.stop_gradient(f_b))
+    # Neither branch may divide by nothing, chosen or not.
+    return xp.where(singular, along - change / xp.where(singular, bounded, xp.ones_like(bounded)), exact)
+
+
+def _forward_edges(operands: Arrays, out: np.ndarray, *, isovalue: float, lattice: Edges) -> None:
+    from rts_surfaces.implicit import motion_kernels
+
+    values, params, rows, numbers = _checked(operands, 4)
+    given = values, params, rows, numbers, values.dtype.type(isovalue), *lattice, out
+    parallel(motion_kernels.cross, len(rows), *given, work=60 * len(rows))
+
+
+def _push_edges(
+    operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, lattice: Edges
+) -> None:
+    from rts_surfaces.implicit import motion_kernels
+
+    values, params, rows, numbers = _checked(operands, 4)
+    given = values, read_only(tangents[0]), params, rows, numbers, values.dtype.type(isovalue), *lattice, out
+    parallel(motion_kernels.push_crossings, len(rows), *given, work=60 * len(rows))
+
+
+def _pull_edges(operands: Arrays, g: np.ndarray, results: Some, *, isovalue: float, lattice: Edges) -> None:
+    from rts_surfaces.implicit import motion_kernels
+
+    values, params, rows, numbers = _checked(operands, 4)
+    if results[0] is not None:
+        given = values, read_only(g), params, rows, numbers, values.dtype.type(isovalue), *lattice, results[0]
+        motion_kernels.pull_crossings(*given)
+
+
+ALONG_EDGES = Operation(
+    "rts_surfaces.along_edges",
+    _by_crossings,
+    ranks=(1, 2, 2, 2),
+    shape=_shape,
+    forward=_forward_edges,
+    push=_push_edges,
+    pull=_pull_edges,
+    packed=(1, 2, 3),
+    packed_result=True,
+)
+"""(N, 3): the points of triangles whose corners lie where three edges of a lattice cross the isovalue. Its last operand
+are the numbers (N, 6) of the lattice points at their ends. A sample's params (4) are barycentrics, and by how much the
+ends of an edge are taken to differ at least, in derivatives."""

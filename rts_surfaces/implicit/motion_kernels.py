@@ -1,37 +1,99 @@
-"""Samples moved along the field's gradient, and the derivatives, compiled. See `rts_surfaces.implicit.motion`."""
+"""Samples moved with the field, and the derivatives, compiled. See `rts_surfaces.implicit.motion`."""
 
 from __future__ import annotations
 
 import numba
+import numpy as np
 
 
 @numba.njit(cache=True, nogil=True)
-def move(start, stop, values, params, ids, isovalue, sign, out):
+def move(start, stop, values, params, rows, isovalue, sign, out):
     """Fill the places (N, 3) of samples `start` to `stop`."""
     for n in range(start, stop):
         level = values.dtype.type(0)
         for i in range(6):
-            level += params[n, 3 + i] * (values[ids[n, i]] - isovalue)
+            level += params[n, 3 + i] * (values[rows[n, i]] - isovalue)
         for i in range(3):
             out[n, i] = params[n, 9 + i] - sign * level * params[n, 12 + i]
 
 
 @numba.njit(cache=True, nogil=True)
-def push(start, stop, tangents, params, ids, sign, out):
+def push(start, stop, tangents, params, rows, sign, out):
     """Fill the derivatives (N, 3) along tangents (M,) of the values."""
     for n in range(start, stop):
         level = tangents.dtype.type(0)
         for i in range(6):
-            level += params[n, 3 + i] * tangents[ids[n, i]]
+            level += params[n, 3 + i] * tangents[rows[n, i]]
         for i in range(3):
             out[n, i] = -sign * level * params[n, 12 + i]
 
 
 @numba.njit(cache=True, nogil=True)
-def pull(g, params, ids, sign, results):
+def pull(g, params, rows, sign, results):
     """Add the gradients (M,) of the values, of those (N, 3) of the places."""
-    for n in range(len(ids)):
+    for n in range(len(rows)):
         along = g[n, 0] * params[n, 12] + g[n, 1] * params[n, 13] + g[n, 2] * params[n, 14]
         if along != 0:
             for i in range(6):
-                results[ids[n, i]] -= sign * along * params[n, 3 + i]
+                results[rows[n, i]] -= sign * along * params[n, 3 + i]
+
+
+@numba.njit(nogil=True, inline="always")
+def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
+    """Of edge k: the axis along which it goes, its length, and how far along it the isovalue is crossed.
+
+    Then the number that the derivative divides by; zero for an edge whose ends are one point.
+    """
+    a, b = np.int64(numbers[n, 2 * k]), np.int64(numbers[n, 2 * k + 1])
+    if a == b:
+        return 0, 0.0, 0.0, 0.0
+    f_a, f_b = values[rows[n, 2 * k]] - isovalue, values[rows[n, 2 * k + 1]] - isovalue
+    apart = f_b - f_a
+    ahead = b - a
+    axis = 2 if abs(ahead) == 1 else 1 if abs(ahead) == shape[2] else 0
+    length = step[axis] if ahead > 0 else -step[axis]
+    along = -f_a / apart if apart != 0 else 0.0
+    least = params[n, 3]
+    if abs(apart) < least:
+        apart = -least if apart < 0 else least
+    return axis, length, along, apart
+
+
+@numba.njit(cache=True, nogil=True)
+def cross(start, stop, values, params, rows, numbers, isovalue, shape, low, step, out):
+    """Fill the places (N, 3) of samples `start` to `stop` whose corners slide along edges."""
+    for n in range(start, stop):
+        x = y = z = 0.0
+        for k in range(3):
+            axis, length, along, _ = _edge(n, k, values, params, rows, numbers, isovalue, shape, step)
+            number, share = np.int64(numbers[n, 2 * k]), params[n, k]
+            x += share * (low[0] + step[0] * (number // (shape[1] * shape[2])) + (along * length if axis == 0 else 0))
+            y += share * (low[1] + step[1] * (number // shape[2] % shape[1]) + (along * length if axis == 1 else 0))
+            z += share * (low[2] + step[2] * (number % shape[2]) + (along * length if axis == 2 else 0))
+        out[n, 0], out[n, 1], out[n, 2] = x, y, z
+
+
+@numba.njit(cache=True, nogil=True)
+def push_crossings(start, stop, values, tangents, params, rows, numbers, isovalue, shape, low, step, out):
+    """Fill the derivatives (N, 3) along tangents (M,) of the values."""
+    for n in range(start, stop):
+        out[n] = 0
+        for k in range(3):
+            axis, length, along, apart = _edge(n, k, values, params, rows, numbers, isovalue, shape, step)
+            if apart != 0:
+                change = (1 - along) * tangents[rows[n, 2 * k]] + along * tangents[rows[n, 2 * k + 1]]
+                out[n, axis] -= params[n, k] * length * change / apart
+
+
+@numba.njit(cache=True, nogil=True)
+def pull_crossings(values, g, params, rows, numbers, isovalue, shape, low, step, results):
+    """Add the gradients (M,) of the values, of those (N, 3) of the places."""
+    for n in range(len(rows)):
+        if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:
+            continue
+        for k in range(3):
+            axis, length, along, apart = _edge(n, k, values, params, rows, numbers, isovalue, shape, step)
+            if apart != 0:
+                change = g[n, axis] * params[n, k] * length / apart
+                results[rows[n, 2 * k]] -= (1 - along) * change
+                results[rows[n, 2 * k + 1]] -= along * change

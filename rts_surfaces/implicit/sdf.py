@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -10,18 +10,14 @@ import numpy as np
 
 from rts.arguments import check_numbers, check_positive, quoted
 from rts.checks import is_count
-from rts.engines import engine_of, namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part, RaySurface
 from rts.records import RayHits, Samples
 from rts.trees import Array, Tree
-from rts_surfaces.implicit.casting import cast
+from rts_surfaces.implicit.casting import ball, cast, moving
 from rts_surfaces.implicit.field import Field, Function, Implicit
 from rts_surfaces.implicit.fields import swept_sphere
-
-FLATTEST = 1e-12
-"""The least square of a slope that points are moved by; where the field is flatter, they move less."""
 
 
 class Sdf(Implicit, RaySurface):
@@ -44,7 +40,7 @@ class Sdf(Implicit, RaySurface):
         reads: the names of the entries of θ that `f` reads; None for all.
         attributes: name → g(θ, positions (N, 3)) → (N, C), further entries of the G-buffer; see `Implicit`.
         steps: how many of the shortest steps there are across the ball: what is thinner than one may be missed. None
-            for 256 without `lipschitz`, 1024 with it.
+            for 256 without `lipschitz`, 512 with it.
 
     Raises:
         InputError: wrong arguments.
@@ -60,7 +56,7 @@ class Sdf(Implicit, RaySurface):
         isovalue: float = 0.0,
         inside: str = "below",
         lipschitz: float | None = 1.0,
-        reads: Iterable[str] | None = None,
+        reads: Sequence[str] | None = None,
         attributes: Mapping[str, Function] | None = None,
         steps: int | None = None,
     ):
@@ -80,40 +76,26 @@ class Sdf(Implicit, RaySurface):
     @classmethod
     def example(cls) -> Part:
         """A torus."""
-        part = {"radii": np.array([0.9, 0.35], np.float32)}
-        return Part(cls(swept_sphere, 1.3, reads=("radii",)), part, "normals")
+        theta = {"radii": np.array([0.9, 0.35], np.float32)}
+        return Part(cls(swept_sphere, 1.3, reads=("radii",)), theta, "normals")
 
     def intersect(self, theta: Mapping[str, Tree], origins: Array, directions: Array, layers: int) -> RayHits:
         """The nearest hits within the ball, in θ's dtype; see `rts.RaySurface`."""
-        field = self.field
+        level = partial(self.field.level, theta)
         return cast(
-            partial(field.level, theta),
-            partial(_samples, field, theta),
-            field.suited(theta, origins),
-            field.suited(theta, directions),
+            level,
+            partial(moving, level),
+            self.field.suited(theta, origins),
+            self.field.suited(theta, directions),
             layers,
-            center=self.center,
-            radius=self.radius,
+            within=ball(self.center, self.radius),
             lipschitz=self.lipschitz,
             steps=self.steps,
         )
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Positions, "normal" of unit length, outwards, and the attributes."""
-        engine, params = engine_of(samples.params), self.field.suited(theta, samples.params)
-        if samples.row is not None and engine.padded(params):
-            # Of the origin, where rows that are all zero lie, many a function has no derivative.
-            params = engine.fill_unused(params, samples.row)
-        found, along = params[:, :3], params[:, 3:]
-        return self.gbuffer(theta, found - self.field.level(theta, found)[:, None] * along)
-
-
-def _samples(field: Field, theta: Mapping[str, Tree], points: Array) -> Array:
-    """(M, 6): the points of hits (M, 3), and where they move to for each unit by which the level falls."""
-    engine, slope = engine_of(points), field.slope(theta, points)
-    xp = namespace(points)
-    square = xp.sum(slope * slope, axis=-1, keepdims=True)
-    return engine.stop_gradient(xp.concat([points, slope / xp.clip(square, FLATTEST, None)], axis=-1))
+        return self.at_hits(theta, samples, partial(self.field.level, theta))
 
 
 def _known(name: str, value: np.ndarray | None) -> np.ndarray:

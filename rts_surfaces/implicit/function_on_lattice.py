@@ -1,0 +1,141 @@
+"""Functions of space, looked at on a lattice: everywhere, or in a narrow band."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.arguments import quoted
+from rts.arrays import shape_of
+from rts.checks import is_count
+from rts.engines import engine_of, exemplar, namespace, value_of
+from rts.errors import InputError
+from rts.records import ArraySpec, Samples
+from rts.trees import Array, Tree, leaves
+from rts_surfaces.implicit.field import Field, Function
+from rts_surfaces.implicit.lattice import Lattice
+from rts_surfaces.implicit.narrow_band import NarrowBand
+
+CHUNK = 2**15
+"""Lattice points at which a function is evaluated at a time."""
+
+
+class Looked(NamedTuple):
+    """What is known of a field at lattice points.
+
+    Attributes:
+        inputs: what `TriangleSurface.proxy_inputs` gives: "values" (X, Y, Z); or "values" (M,), "numbers" (M,),
+            "corners" (C, 8) and "cells" (C, 3) of a `Band`.
+        evaluations: how many points a function was evaluated at.
+    """
+
+    inputs: dict[str, Array]
+    evaluations: int
+
+
+class FunctionOnLattice(Field):
+    """A field that is looked at on a lattice; see `Field`, and `Isosurface` for the arguments.
+
+    Attributes:
+        level_of_values: isovalue and sign of what `look` gives: the level itself.
+    """
+
+    level_of_values = (0.0, 1.0)
+
+    def __init__(
+        self,
+        f: Function,
+        isovalue: float,
+        inside: str,
+        reads: Sequence[str] | None,
+        lattice: Lattice,
+        table: bool | int,
+        band: NarrowBand | None,
+    ):
+        super().__init__(f, isovalue, inside, reads)
+        if not isinstance(table, bool) and not is_count(table):
+            raise InputError(f"table is {quoted(table)}; expected True, False or a number of lattice points")
+        if band is not None and not isinstance(band, NarrowBand):
+            raise InputError(f"band is {quoted(band)}; expected a NarrowBand, or None")
+        self._lattice, self.table, self.band = lattice, table, band
+
+    def lattice(self, theta: Mapping[str, Tree]) -> Lattice:
+        """The lattice."""
+        return self._lattice
+
+    def at(self, theta: Mapping[str, Tree], numbers: Array) -> Array:
+        """The level (M,) at lattice points by number (M,) int32."""
+        places = self._lattice.places(numbers, namespace(numbers).float32)
+        return self.level(theta, self.suited(theta, places))
+
+    def look(self, theta: Mapping[str, Tree], closed: bool) -> Looked:
+        """The level at all lattice points, or at those of the band; without derivative."""
+        read = {name: theta[name] for name in self.names(theta)}
+        engine, like, count = engine_of(read), exemplar(read), self._lattice.count
+        if self.band is None:
+            numbers = engine.constant(np.arange(count, dtype=np.int32), like)
+            levels = engine.map_rows(lambda some: self.at(theta, some), numbers, CHUNK)
+            return Looked({"values": engine.namespace.reshape(levels, self._lattice.shape)}, count)
+        known = [(value_of(x), shape_of(x)) for x in leaves(read)]
+        if any(value is None or value.shape != shape for value, shape in known):
+            raise InputError(
+                "a narrow band decides on values of f, and theta is traced; sample outside of jit and vmap (by "
+                "rts.sample, and rts.render_samples inside), or leave out the band"
+            )
+        few_shapes = like is not None and engine.padded(like)
+
+        def level(places: np.ndarray) -> np.ndarray:
+            count = len(places)
+            if few_shapes:  # Lest each be compiled.
+                places = np.resize(places, (1 << max(0, count - 1).bit_length(), 3))
+            points = self.suited(theta, engine.constant(places.astype(np.float32), like))
+            return engine.to_numpy(engine.stop_gradient(self.level(theta, points)))[:count]
+
+        found = self.band.find(level, self._lattice, closed)
+        return Looked({k: v for k, v in found._asdict().items() if k != "evaluations"}, found.evaluations)
+
+    # ------------------------------------------------------------------------------------------------ samples
+
+    def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
+        """The lattice points that samples share, by number, if there is to be such a table."""
+        if not self.table:
+            return {}
+        room = 6 * rows if capacity is None else 2 * capacity if self.table is True else int(self.table)
+        return {"points": ArraySpec((min(room, self._lattice.count),), np.int32, packed=capacity is None)}
+
+    def tabled(self, samples: Samples) -> Samples:
+        """Samples whose ids are rows of a table of lattice points, if there is to be one."""
+        if not self.table:
+            return samples
+        from rts_surfaces.implicit.distinct_kernels import distinct
+
+        points, rows = distinct(samples.ids.reshape(-1).astype(np.int64))
+        room = len(samples.tables["points"])
+        ids = rows.reshape(-1, 6).astype(np.int32, copy=False)
+        row, overflow = samples.row, samples.overflow
+        if len(points) > room:
+            # Points are in the order of samples, which is that of layers: the deepest find no room.
+            gone = (row >= 0) & (ids.max(axis=1) >= room)[row]
+            row, overflow = np.where(gone, -1, row), np.asarray(overflow + gone.sum(), np.int32)
+            ids = np.minimum(ids, room - 1)
+        return replace(samples, ids=ids, row=row, overflow=overflow, tables={"points": points[:room].astype(np.int32)})
+
+    def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
+        """Levels (M,), differentiable; and which rows of them (N, 6) int32 the six values of each sample are."""
+        if self.table:
+            return self.at(theta, samples.tables["points"]), samples.ids
+        count = samples.ids.shape[0]
+        levels = self.at(theta, namespace(samples.ids).reshape(samples.ids, (-1,)))
+        rows = np.arange(6 * count, dtype=np.int32).reshape(count, 6)
+        return levels, engine_of(levels).constant(rows, levels)
+
+    def numbers(self, samples: Samples) -> Array:
+        """The lattice points (N, 6) of samples."""
+        if not self.table:
+            return samples.ids
+        xp = namespace(samples.ids)
+        flat = xp.take(samples.tables["points"], xp.reshape(samples.ids, (-1,)), axis=0)
+        return xp.reshape(flat, (-1, 6))

@@ -1,0 +1,130 @@
+"""Values on a lattice interpolated linearly along each axis, and their central differences likewise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rts.engines import engine_of, namespace
+from rts.operations.combine import combine
+from rts.operations.operation import Arrays, Operation, Some
+from rts.threads import parallel, read_only
+from rts.trees import Array
+from rts_surfaces.implicit.lattice import Lattice
+
+Numbers = tuple[float, ...]
+
+
+def interpolated(values: Array, points: Array, lattice: Lattice) -> Array:
+    """(M,): values (X, Y, Z) of a lattice at points (M, 3), differentiable in both; beyond its bounds as on them."""
+    lowest, shares = _cells(values.shape, points, lattice.low.tolist(), lattice.step.tolist())
+    return _combined(values, *_corners(values.shape, lowest, shares))
+
+
+def differences(values: Array, points: Array, lattice: Lattice) -> Array:
+    """(M, 3): central differences of values (X, Y, Z) along the axes at points (M, 3); see `interpolated`.
+
+    At the bounds they are one-sided. Unlike the slope of what is interpolated, they have no jumps.
+    """
+    points = namespace(values).astype(points, values.dtype, copy=False)
+    return DIFFERENCES(values, points, low=tuple(lattice.low.tolist()), step=tuple(lattice.step.tolist()))
+
+
+def _cells(
+    shape: Sequence[int], points: Array, low: Sequence[float], step: Sequence[float]
+) -> tuple[list[Array], list[Array]]:
+    """The lowest corners of the cells that points lie in, (M,) int32 along each axis; and how far into them, 0 to 1."""
+    xp, engine = namespace(points), engine_of(points)
+    lowest, shares = [], []
+    for axis in range(3):
+        last = shape[axis] - 1
+        at = xp.clip((points[:, axis] - low[axis]) / step[axis], 0.0, float(last))
+        cell = xp.clip(xp.floor(engine.stop_gradient(at)), 0.0, float(last - 1))
+        lowest.append(xp.astype(cell, xp.int32))
+        shares.append(at - cell)
+    return lowest, shares
+
+
+def _corners(shape: Sequence[int], lowest: Sequence[Array], shares: Sequence[Array]) -> tuple[Array, Array]:
+    """Numbers and weights (M, 8) of the corners of cells, for what is interpolated linearly along each axis."""
+    xp = namespace(lowest[0])
+    first = (lowest[0] * shape[1] + lowest[1]) * shape[2] + lowest[2]
+    ids, weights = [], []
+    for i in range(8):
+        bits = i & 1, i >> 1 & 1, i >> 2 & 1
+        ids.append(first + (bits[0] * shape[1] + bits[1]) * shape[2] + bits[2])
+        factors = [s if bit else 1 - s for s, bit in zip(shares, bits, strict=True)]
+        weights.append(factors[0] * factors[1] * factors[2])
+    return xp.stack(ids, axis=-1), xp.stack(weights, axis=-1)
+
+
+def _combined(values: Array, ids: Array, weights: Array) -> Array:
+    return combine(namespace(values).reshape(values, (-1, 1)), ids, weights)[:, 0]
+
+
+def _specification(values: Array, points: Array, *, low: Numbers, step: Numbers) -> Array:
+    lowest, shares = _cells(values.shape, points, low, step)
+    xp = namespace(points)
+    corners, shared = _corners(values.shape, lowest, shares)
+    columns, strides = [], (values.shape[1] * values.shape[2], values.shape[2], 1)
+    for axis in range(3):
+        ids, weights = [], []
+        for i in range(8):
+            at = lowest[axis] + (i >> axis & 1)
+            up, down = xp.astype(at < values.shape[axis] - 1, at.dtype), xp.astype(at > 0, at.dtype)
+            per_step = shared[:, i] / (xp.astype(up + down, points.dtype) * step[axis])
+            ids += [corners[:, i] + strides[axis] * up, corners[:, i] - strides[axis] * down]
+            weights += [per_step, -per_step]
+        columns.append(_combined(values, xp.stack(ids, axis=-1), xp.stack(weights, axis=-1)))
+    return xp.stack(columns, axis=-1)
+
+
+def _shape(values: tuple[int, ...], points: tuple[int, ...], **_: object) -> tuple[int, ...]:
+    return points[0], 3
+
+
+def _forward(operands: Arrays, out: np.ndarray, *, low: Numbers, step: Numbers) -> None:
+    from rts_surfaces.implicit import interpolation_kernels
+
+    values, points = operands
+    parallel(interpolation_kernels.value, len(points), values, points, low, step, out, work=150 * len(points))
+
+
+def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, low: Numbers, step: Numbers) -> None:
+    from rts_surfaces.implicit import interpolation_kernels
+
+    (values, points), (t_values, t_points) = operands, tangents
+    out[...] = 0
+    if t_values is not None:
+        _forward((read_only(t_values), points), out, low=low, step=step)
+    if t_points is not None:
+        given = values, points, read_only(t_points), low, step, out
+        parallel(interpolation_kernels.push_points, len(points), *given, work=300 * len(points))
+
+
+def _pull(operands: Arrays, g: np.ndarray, results: Some, *, low: Numbers, step: Numbers) -> None:
+    from rts_surfaces.implicit import interpolation_kernels
+
+    (values, points), (g_values, g_points), g = operands, results, read_only(g)
+    if g_values is not None:
+        interpolation_kernels.pull_values(points, g, low, step, g_values)
+    if g_points is not None:
+        given = values, points, g, low, step, g_points
+        parallel(interpolation_kernels.pull_points, len(points), *given, work=300 * len(points))
+
+
+_PACKED: dict[str, Any] = {"packed": (1,), "packed_result": True}
+DIFFERENCES = Operation(
+    "rts_surfaces.differences",
+    _specification,
+    ranks=(3, 2),
+    shape=_shape,
+    forward=_forward,
+    push=_push,
+    pull=_pull,
+    differentiable=2,
+    **_PACKED,
+)
+"""The operation of `differences`, on values and points; low and step are those of the lattice."""

@@ -1,0 +1,132 @@
+"""Central differences on a lattice, interpolated, and their derivatives, compiled. See `interpolation`."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+
+@numba.njit(nogil=True, inline="always")
+def _place(point, shape, low, step, lowest, near, slopes):
+    """Fill the lowest corner of a point's cell, its shares (3, 2) of both ends along each axis, and their slopes (3,).
+
+    Returns whether the point is a number.
+    """
+    for axis in range(3):
+        at = (point[axis] - low[axis]) / step[axis]
+        if not np.isfinite(at):
+            return False
+        last = shape[axis] - 1
+        within = 0 <= at <= last
+        at = min(max(at, 0.0), float(last))
+        lowest[axis] = min(int(at), last - 1)
+        near[axis, 1] = at - lowest[axis]
+        near[axis, 0] = 1 - near[axis, 1]
+        slopes[axis] = 1 / step[axis] if within else 0.0
+    return True
+
+
+@numba.njit(nogil=True, inline="always")
+def _difference(values, at, axis, step):
+    """The central difference at the lattice point `at` (3,) along an axis, one-sided at the bounds."""
+    x, y, z = at
+    up, down = at[axis] < values.shape[axis] - 1, at[axis] > 0
+    i, j, k = axis == 0, axis == 1, axis == 2
+    above = values[x + (i and up), y + (j and up), z + (k and up)]
+    below = values[x - (i and down), y - (j and down), z - (k and down)]
+    return (above - below) / ((up + down) * step[axis])
+
+
+@numba.njit(cache=True, nogil=True)
+def value(start, stop, values, points, low, step, out):
+    """Fill the differences (N, 3) at points `start` to `stop`."""
+    lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
+    for n in range(start, stop):
+        out[n] = 0
+        if not _place(points[n], values.shape, low, step, lowest, near, slopes):
+            out[n] = np.nan
+            continue
+        for i in range(8):
+            share = 1.0
+            for axis in range(3):
+                bit = i >> axis & 1
+                at[axis] = lowest[axis] + bit
+                share *= near[axis, bit]
+            for axis in range(3):
+                out[n, axis] += share * _difference(values, at, axis, step)
+
+
+@numba.njit(nogil=True, inline="always")
+def _share_slopes(i, near, slopes, out):
+    """Fill the derivatives (3,) of the share of corner i in the coordinates of the point."""
+    for along in range(3):
+        slope = slopes[along] if i >> along & 1 else -slopes[along]
+        for axis in range(3):
+            if axis != along:
+                slope *= near[axis, i >> axis & 1]
+        out[along] = slope
+
+
+@numba.njit(cache=True, nogil=True)
+def push_points(start, stop, values, points, tangents, low, step, out):
+    """Add the derivatives along tangents (N, 3) of the points."""
+    lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
+    own = np.empty(3)
+    for n in range(start, stop):
+        if not _place(points[n], values.shape, low, step, lowest, near, slopes):
+            out[n] = np.nan
+            continue
+        for i in range(8):
+            _share_slopes(i, near, slopes, own)
+            change = own[0] * tangents[n, 0] + own[1] * tangents[n, 1] + own[2] * tangents[n, 2]
+            for axis in range(3):
+                at[axis] = lowest[axis] + (i >> axis & 1)
+            for axis in range(3):
+                out[n, axis] += change * _difference(values, at, axis, step)
+
+
+@numba.njit(cache=True, nogil=True)
+def pull_points(start, stop, values, points, g, low, step, results):
+    """Fill the gradients (N, 3) of the points, of those of the differences."""
+    lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
+    own = np.empty(3)
+    for n in range(start, stop):
+        results[n] = 0
+        if not _place(points[n], values.shape, low, step, lowest, near, slopes):
+            continue
+        for i in range(8):
+            for axis in range(3):
+                at[axis] = lowest[axis] + (i >> axis & 1)
+            along = 0.0
+            for axis in range(3):
+                along += g[n, axis] * _difference(values, at, axis, step)
+            _share_slopes(i, near, slopes, own)
+            for axis in range(3):
+                results[n, axis] += along * own[axis]
+
+
+@numba.njit(cache=True, nogil=True)
+def pull_values(points, g, low, step, results):
+    """Add the gradients (X, Y, Z) of the values, of those of the differences."""
+    shape = results.shape
+    lowest, near, slopes = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3)
+    at, up, down = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
+    for n in range(len(points)):
+        if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:
+            continue
+        if not _place(points[n], shape, low, step, lowest, near, slopes):
+            continue
+        for i in range(8):
+            share = 1.0
+            for axis in range(3):
+                bit = i >> axis & 1
+                at[axis] = lowest[axis] + bit
+                share *= near[axis, bit]
+            for axis in range(3):
+                up[:] = at
+                down[:] = at
+                up[axis] = min(at[axis] + 1, shape[axis] - 1)
+                down[axis] = max(at[axis] - 1, 0)
+                change = share * g[n, axis] / ((up[axis] - down[axis]) * step[axis])
+                results[up[0], up[1], up[2]] += change
+                results[down[0], down[1], down[2]] -= change

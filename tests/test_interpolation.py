@@ -1,0 +1,103 @@
+"""Values on a lattice as functions of space, and what moves samples along the gradient: compiled and specified."""
+
+import numpy as np
+import pytest
+from helpers import ALL, DIFFERENTIABLE, arrays, derivative, gradient, to_numpy
+
+from rts_surfaces.implicit.interpolation import DIFFERENCES, differences, interpolated
+from rts_surfaces.implicit.lattice import Lattice
+from rts_surfaces.implicit.motion import ALONG_EDGES, ALONG_NORMAL
+
+pytestmark = pytest.mark.sampling
+
+LATTICE = Lattice(((-1.0, 0.5, -2.0), (1.0, 1.5, 1.0)), (5, 4, 7))
+RNG = np.random.default_rng(0)
+VALUES = RNG.standard_normal(LATTICE.shape)
+POINTS = RNG.uniform((-1.3, 0.3, -2.4), (1.3, 1.7, 1.4), (60, 3))
+"""Some lie beyond the bounds."""
+STEPS = {"low": tuple(LATTICE.low.tolist()), "step": tuple(LATTICE.step.tolist())}
+
+
+def on_lattice(f):
+    return f(LATTICE.points(np.arange(LATTICE.count))).reshape(LATTICE.shape)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_what_is_linear_along_each_axis_is_interpolated_exactly(target):
+    def f(p):
+        return 2 - p[:, 0] + 3 * p[:, 1] * p[:, 2] + 0.5 * p[:, 0] * p[:, 1] * p[:, 2]
+
+    values, points = arrays(target, (on_lattice(f), POINTS), np.float64 if target != "jax" else np.float32)
+    expected = f(np.clip(POINTS, (-1, 0.5, -2), (1, 1.5, 1)))
+    np.testing.assert_allclose(to_numpy(interpolated(values, points, LATTICE)), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_central_differences_are_exact_for_squares_within_the_bounds(target):
+    values = on_lattice(lambda p: p[:, 0] ** 2 - 3 * p[:, 1] * p[:, 2] + p[:, 2])
+    # One-sided differences at the bounds are not exact.
+    points = RNG.uniform((-0.5, 0.84, -1.5), (0.5, 1.16, 0.5), (40, 3))
+    expected = np.stack([2 * points[:, 0], -3 * points[:, 2], 1 - 3 * points[:, 1]], axis=1)
+    found = differences(*arrays(target, (values, points)), LATTICE)
+    np.testing.assert_allclose(to_numpy(found), expected, atol=2e-5)
+
+
+def samples():
+    """Rows of 40 values (N, 6), and params (N, 15)."""
+    return RNG.integers(0, 40, (30, 6)).astype(np.int32), RNG.standard_normal((30, 15))
+
+
+ROWS, PARAMS = samples()
+
+
+def edges():
+    """Ends of edges of the lattice (N, 6), some of them one point; and params (N, 4) that bound some of them."""
+    count = 30
+    low = RNG.integers(0, (4, 3, 6), (count, 3, 3))
+    high = low + np.eye(3, dtype=int)[RNG.integers(0, 3, (count, 3))] * RNG.choice([0, 1, 1, 1], (count, 3, 1))
+    numbers = np.stack([np.ravel_multi_index(tuple(x.transpose(2, 0, 1)), LATTICE.shape) for x in (low, high)], axis=-1)
+    least = np.where(np.arange(count) % 3 == 0, 0.5, 0.0)[:, None]
+    return numbers.reshape(count, 6).astype(np.int32), np.concatenate([RNG.random((count, 3)), least], axis=1)
+
+
+NUMBERS, BOUNDED = edges()
+CASES = {
+    "differences": (DIFFERENCES, [VALUES, POINTS], (), STEPS),
+    "along the normal": (ALONG_NORMAL, [RNG.standard_normal(40)], (PARAMS, ROWS), {"isovalue": 0.3, "sign": -1.0}),
+    "along edges": (
+        ALONG_EDGES,
+        [VALUES.reshape(-1)],
+        (BOUNDED, NUMBERS, NUMBERS),
+        {"isovalue": 0.1, "lattice": LATTICE.fixed},
+    ),
+}
+"""An operation, operands with and without derivatives, and parameters."""
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_compiled_values_and_derivatives_are_those_of_the_specification(target, case):
+    operation, operands, fixed, options = CASES[case]
+    operands, fixed = arrays(target, operands), arrays(target, fixed)
+    weights = arrays(target, RNG.standard_normal((60 if case == "differences" else 30, 3)))
+
+    def compiled(x):
+        return operation(*x, *fixed, **options)
+
+    def specified(x):
+        return operation.specification(*x, *fixed, **options)
+
+    np.testing.assert_allclose(to_numpy(compiled(operands)), to_numpy(specified(operands)), rtol=2e-5, atol=2e-5)
+    along = arrays(target, [RNG.standard_normal(x.shape) for x in operands])
+    pushed = [derivative(target, f, operands, along)[1] for f in (compiled, specified)]
+    np.testing.assert_allclose(*pushed, rtol=2e-4, atol=2e-4)
+    pulled = [gradient(target, lambda x, f=f: (f(x) * weights).sum(), operands) for f in (compiled, specified)]
+    for found, expected in zip(*pulled, strict=True):
+        assert np.abs(expected).max() > 0.1
+        np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
+
+
+def test_samples_of_another_surface_are_refused():
+    values = RNG.standard_normal(10)
+    with pytest.raises(ValueError, match="sample this surface anew"):
+        ALONG_NORMAL(values, PARAMS, ROWS, isovalue=0.0, sign=1.0)
