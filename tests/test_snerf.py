@@ -163,10 +163,15 @@ def test_scores_are_those_of_their_definitions():
 def test_tables_and_pictures_are_written(scene, grid, tmp_path, monkeypatch):
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(snerf.Scene, "grid", lambda self, keep: grid)
-    parser = dict(resume=True, steps=2, learning_rate=1e-3, rate=1e5, every=1, views=1)
+    parser = dict(resume=True, steps=2, learning_rate=1e-3, rate=1e5, every=1, views=1, start=None)
     options = snerf.argparse.Namespace(**parser)
     assert snerf.run(scene, tmp_path, ("fixed", "finetuned", "joint"), options)
     assert snerf.run(scene, tmp_path, ("fixed", "joint"), options)  # Nothing is left to do.
+    other = snerf.argparse.Namespace(**parser | {"start": tmp_path})
+    assert snerf.run(scene, tmp_path / "second", ("joint",), other)
+    first, second = (np.load(folder / "joint.npz") for folder in (tmp_path, tmp_path / "second"))
+    assert np.abs(first["values"] - second["values"]).max() > 0
+    assert '"steps": 4' in (tmp_path / "second" / "joint.json").read_text()
     text = snerf.tables(tmp_path)
     assert "surface and network, joint" in text and "fewer" in text
     snerf.draw(tmp_path / "a.png", scene, tmp_path, "100", [0])

@@ -7,6 +7,7 @@ the grid with the weights held, on the square differences from a window of one p
 
     python -m benchmarks.paper.snerf -o out/snerf                 # lego, all stages, then figure and tables
     python -m benchmarks.paper.snerf -o out/snerf --resume        # go on where it was interrupted
+    python -m benchmarks.paper.snerf -o out/snerf100 --start out/snerf --finest 100 --steps 1000 --sides 100
     python -m benchmarks.paper.snerf -o out/fern --scene fern     # the surface lies in NDC
     python -m benchmarks.paper.snerf --quick                      # in some minutes
 
@@ -15,7 +16,8 @@ that was not interrupted.
 
 The grid holds log(1 + density), whose slope is more even than that of the density. Its gradient is smoothed over a cell
 of the lattice: one view says little of a single value, and more of what its neighbours have in common. Windows are cut
-from the finest photographs, in which a pixel is smaller than a cell; images are scored at other sizes, too.
+from the finest photographs, in which a pixel is smaller than a cell; images are scored at other sizes, too, and a
+second run (the third command) makes a field refined by these suit coarse pixels.
 """
 
 from __future__ import annotations
@@ -165,7 +167,7 @@ def _real(image: np.ndarray) -> np.ndarray:
 
 
 def _camera(pose: np.ndarray, size: tuple[int, int], focal: float, factor: int) -> rts.Camera:
-    """The camera of means of factor² pixels: these fields were trained on rays through the pixels' upper left corners."""
+    """The camera of means of factor² pixels: the fields were trained on rays through pixels' upper left corners."""
     shift: Any = (factor - 1) / (2 * factor) - 0.5  # A window may lie between pixels.
     return rts.Camera.from_blender(pose, size, focal=focal / factor).window(size, (shift, shift), size)
 
@@ -202,9 +204,7 @@ def rendered(scene: Scene, values: Any, weights: Any, shot: Shot, shader: Any = 
     return _image(scene.part(values, weights, shader), scene, shot.camera, shot.size, engine)
 
 
-def _image(
-    part: Any, scene: Scene, camera: rts.Camera, size: Any, engine: str = "torch", supersample: int = 1
-) -> Any:
+def _image(part: Any, scene: Scene, camera: rts.Camera, size: Any, engine: str = "torch", supersample: int = 1) -> Any:
     options = {"splatter": "multi", "layers": LAYERS, "supersample": supersample}
     return rts.render(part, camera, size, background=scene.behind(), engine=engine, **options)[..., :3]
 
@@ -241,17 +241,17 @@ class Refinement:
         scene: the scene.
         settings: how to refine it.
         values: the grid to start from, (X, Y, Z).
+        weights: likewise the network; None for the fine one of the field.
     """
 
-    def __init__(self, scene: Scene, settings: Settings, values: np.ndarray):
+    def __init__(self, scene: Scene, settings: Settings, values: np.ndarray, weights: Any = None):
         import torch
 
         self.scene, self.settings, self.step, self.seconds = scene, settings, 0, 0.0
         self.losses: list[float] = []
         self.values = torch.from_numpy(np.array(values, np.float32))
-        self.weights = map_leaves(
-            lambda x: torch.from_numpy(np.array(x)).requires_grad_(True), scene.field.weights["fine"]
-        )
+        weights = scene.field.weights["fine"] if weights is None else weights
+        self.weights = map_leaves(lambda x: torch.from_numpy(np.array(x)).requires_grad_(True), weights)
         self.adam = torch.optim.Adam(leaves(self.weights), lr=settings.learning_rate)
         self.random = np.random.default_rng(settings.seed)
 
@@ -439,9 +439,7 @@ def drawn(
         images.append(np.asarray(_image(part, scene, shot.camera, shot.size, supersample=supersample)))
         seconds.append(time.perf_counter() - begun)
         splatter = rts.plugin("splatters", "multi")()
-        found = rts.sample(
-            part, shot.camera, shot.size, splatter=splatter, layers=LAYERS, supersample=supersample
-        )
+        found = rts.sample(part, shot.camera, shot.size, splatter=splatter, layers=LAYERS, supersample=supersample)
         evaluations.append(int(found.samples[0].ids.shape[0]))
         apron, fine = found.apron, supersample
         row = found.row[0, apron:-apron, apron:-apron] >= 0
@@ -461,7 +459,10 @@ def run(scene: Scene, folder: Path, stages: Sequence[str], options: argparse.Nam
         values, weights = scene.grid(folder), scene.field.weights["fine"]
         if name in ("finetuned", "joint"):
             settings = Settings(name == "joint", options.steps, options.learning_rate, options.rate)
-            refinement, path = Refinement(scene, settings, values), folder / f"{name}.npz"
+            before = {}
+            if options.start is not None:
+                values, weights, before = ended(scene, options.start, name)
+            refinement, path = Refinement(scene, settings, values, weights), folder / f"{name}.npz"
             if options.resume and path.is_file():
                 refinement.restore(path)
                 print(f"{name}: goes on at step {refinement.step}", flush=True)
@@ -470,6 +471,7 @@ def run(scene: Scene, folder: Path, stages: Sequence[str], options: argparse.Nam
                 return False
             values, weights = refinement.found()
             about = {"steps": refinement.step, "training": refinement.seconds}
+            about = {key: value + before.get(key, 0) for key, value in about.items()}
         sides = {}
         for side, shots in scene.tests.items():
             shots = shots[: options.views]
@@ -484,6 +486,15 @@ def run(scene: Scene, folder: Path, stages: Sequence[str], options: argparse.Nam
         for side, numbers in sides.items():
             print(f"{name} at {side}: {np.mean(numbers['psnr']):.2f} dB, {np.mean(numbers['ssim']):.3f}", flush=True)
     return True
+
+
+def ended(scene: Scene, folder: Path, name: str) -> tuple[np.ndarray, Any, dict[str, float]]:
+    """Grid and weights that a run into another folder ended with, and what it took."""
+    about = json.loads((folder / f"{name}.json").read_text())
+    with np.load(folder / f"{name}.npz", allow_pickle=False) as file:
+        values, count = file["values"], iter(range(len(file.files)))
+        weights = map_leaves(lambda _: file[f"weights.{next(count)}"], scene.field.weights["fine"])
+    return values, weights, {key: about[key] for key in ("steps", "training")}
 
 
 def told(name: str, refinement: Refinement) -> None:
@@ -597,6 +608,8 @@ def main() -> None:
     parser.add_argument("--factor", type=int, default=3, help="of fern: 378 × 504 pixels over this")
     parser.add_argument("--fineness", type=float, default=1.0, help="of the lattice")
     parser.add_argument("--stages", nargs="*", choices=STAGES, default=list(STAGES))
+    parser.add_argument("--finest", type=int, choices=(100, 200, 400), default=400, help="side of lego's photographs")
+    parser.add_argument("--start", type=Path, default=None, help="folder of a run to start from")
     parser.add_argument("--steps", type=int, default=5000)
     parser.add_argument("--learning-rate", type=float, default=Settings._field_defaults["learning_rate"])
     parser.add_argument("--rate", type=float, default=Settings._field_defaults["rate"], help="of the grid")
@@ -608,7 +621,7 @@ def main() -> None:
     args = parser.parse_args()
     if args.quick:
         args.steps, args.views, args.fineness, args.every, args.sides = 100, 2, 0.5, 50, [100]
-    scene = lego(args.sides, args.fineness) if args.scene == "lego" else fern(args.factor, args.fineness)
+    scene = lego(args.sides, args.fineness, args.finest) if args.scene == "lego" else fern(args.factor, args.fineness)
     if not run(scene, args.output, args.stages, args):
         raise SystemExit(130)
     if args.times or args.quick:

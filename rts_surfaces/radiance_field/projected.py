@@ -43,7 +43,8 @@ class Projected(TriangleSurface):
     refine_moves = False
 
     def __init__(self, surface: Any, ndc: Ndc):
-        if not isinstance(surface, TriangleSurface) or surface.depends_on_view or surface.refine_moves:
+        fits = isinstance(surface, TriangleSurface) and surface.refines
+        if not fits or surface.depends_on_view or surface.refine_moves:
             raise InputError(
                 f"surface is {quoted(surface)}; expected one of triangles that no camera changes, such as an isosurface"
             )
@@ -91,6 +92,7 @@ class Projected(TriangleSurface):
         # NDC are a mirror image of the world: z grows with depth.
         faces = np.ascontiguousarray(found.faces[:, ::-1])
         depths = (-world[:, 2]).astype(np.float32)[found.faces]
+        assert found.ids is not None, "surfaces that refine samples say what these carry"
         kept = (depths < DEEPEST * self.ndc.near).all(axis=1)
         ids = np.concatenate([found.ids, depths.view(np.int32)], axis=1)
         return Proxy(world.astype(np.float32), faces[kept], np.ascontiguousarray(ids[kept]))
