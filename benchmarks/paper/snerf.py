@@ -44,7 +44,7 @@ DATA = Path(os.environ.get("RTS_DATA") or "../shared/data")
 THRESHOLD = 50.0
 """Density of the isosurface."""
 HIGHEST = 8.0
-"""Of the grid: log(1 + density) of 3,000, twice the greatest of these fields. The lowest is 0, no density."""
+"""The most that the grid may hold: log(1 + density) of 3,000, twice the greatest of these fields. The lowest is 0, no density."""
 STAGES = ("baseline", "fixed", "finetuned", "joint")
 TITLES = {
     "baseline": "NeRF (volume)",
@@ -56,7 +56,7 @@ LEGO = ((-0.705, -1.18, -0.53), (0.705, 1.18, 1.07)), (77, 128, 87)
 FERN = ((-1.5, -1.35, -0.6), (1.5, 1.35, 0.98)), (161, 145, 128)
 LAYERS = 2
 SHOWN = (0, 5, 12)
-"""Of lego: test views 0, 40 and 96."""
+"""Test views 0, 40 and 96 of lego, by number."""
 FINE = 128
 """Evaluations of the fine network for a ray of volume rendering."""
 
@@ -535,9 +535,10 @@ def tables(folder: Path) -> str:
     sides = list(dict.fromkeys(side for stage in found.values() for side in stage["sides"]))
     lines = []
     for side in sides:
-        views = max(len(stage["sides"][side]["views"]) for stage in found.values() if side in stage["sides"])
+        having = [stage["sides"][side]["views"] for stage in found.values() if side in stage["sides"]]
+        count = min(map(len, having))  # All have the first ones in common.
         lines += [
-            f"At {side} ({views} views held out):",
+            f"At {side} ({count} views held out):",
             "",
             "| | PSNR | SSIM | steps | training | fine evaluations a covered pixel |",
             "|---|---|---|---|---|---|",
@@ -545,7 +546,7 @@ def tables(folder: Path) -> str:
         for name, stage in found.items():
             if side not in stage["sides"]:
                 continue
-            numbers = stage["sides"][side]
+            numbers = {k: v[:count] if isinstance(v, list) else v for k, v in stage["sides"][side].items()}
             training = f"{stage['training'] / 60:.0f} min" if "training" in stage else "–"
             if name == "baseline":
                 coarse, fine = (np.mean(numbers[n]) / numbers["pixels"] for n in ("coarse", "fine"))
