@@ -44,7 +44,7 @@ DATA = Path(os.environ.get("RTS_DATA") or "../shared/data")
 THRESHOLD = 50.0
 """Density of the isosurface."""
 HIGHEST = 8.0
-"""The most that the grid may hold: log(1 + density) of 3,000, twice the greatest of these fields. The lowest is 0, no density."""
+"""The grid lies between 0, no density, and this: log(1 + density) of 3,000, near the greatest of these fields."""
 STAGES = ("baseline", "fixed", "finetuned", "joint")
 TITLES = {
     "baseline": "NeRF (volume)",
