@@ -83,6 +83,20 @@ def test_a_run_that_is_interrupted_goes_on_to_the_same_result(scene, grid, tmp_p
         other.restore(path)
 
 
+def test_windows_are_parts_of_photographs(scene, grid):
+    run = refinement(scene, grid, window=(30, 44))
+    camera, image = run._chosen()
+    shot = scene.train[np.random.default_rng(0).integers(len(scene.train))]
+    tops, lefts = range(100 - 29), range(100 - 43)
+    places = [(i, j) for i in tops for j in lefts if np.array_equal(shot.truth()[i : i + 30, j : j + 44], image)]
+    assert len(places) == 1
+    part = scene.part(grid, scene.field.weights["fine"])
+    whole = np.asarray(rts.render(part, shot.camera, (100, 100), splatter="multi", engine="torch"))
+    found = np.asarray(rts.render(part, camera, (30, 44), splatter="multi", engine="torch"))
+    (top, left), *_ = places
+    np.testing.assert_allclose(found, whole[top : top + 30, left : left + 44], atol=2e-3)
+
+
 def test_a_checkpoint_that_fails_leaves_the_one_before(scene, grid, tmp_path, monkeypatch):
     run, path = refinement(scene, grid), tmp_path / "run.npz"
     run.save(path)
