@@ -597,7 +597,7 @@ def draw(path: Path, scene: Scene, folder: Path, side: str, chosen: Sequence[int
         axes.axis("off")
     for column, (title, pictures, notes) in zip(grid.T, columns, strict=True):
         for k, (axes, picture, note) in enumerate(zip(column, pictures, notes, strict=False)):
-            axes.imshow(np.clip(picture, 0, 1), interpolation="nearest")
+            axes.imshow(np.clip(picture, 0, 1), interpolation="antialiased")
             axes.set_title(f"{title}\n{note}" if k == 0 else note, fontsize=9)
     figure.savefig(path, dpi=130)
 
