@@ -428,6 +428,13 @@ def namespace(*arrays: Array) -> Any:
     return (engine_of(*arrays) if engine is None else engine).namespace
 
 
+def stopped(tree: Tree) -> Tree:
+    """A copy of a tree whose arrays are without derivatives: what is made of it keeps no graph."""
+    if type(tree) is np.ndarray:
+        return tree
+    return map_leaves(lambda x: x if isinstance(x, CONSTANT_TYPES) else engine_of(x).stop_gradient(x), tree)
+
+
 def constants(tree: Tree, engine: Engine, like: Array | None) -> Tree:
     """A copy of a tree in which every NumPy array and number is a constant of the engine; see `Engine.constant`."""
     if tree is None or type(tree) in OWNERS:

@@ -18,7 +18,7 @@ import numpy as np
 from rts.adapting import Plugin, adapted
 from rts.arguments import quoted
 from rts.arrays import from_numbers, shape_of, without_border
-from rts.engines import constants, engine_of, exemplar, namespace
+from rts.engines import constants, engine_of, exemplar, namespace, stopped
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.records import ArraySpec, Proxy, RayHits, Rays, Samples, Splats
@@ -161,12 +161,12 @@ class TriangleSurface(Surface):
         return samples
 
     def why_no_triangles(self, inputs: Tree) -> str:
-        """What a warning says of the surface where `proxy` has no triangles; `{}` stands for the part.
+        """What a warning says of the part where `proxy` has no triangles, beginning with a verb.
 
         Args:
             inputs: what `proxy_inputs` gave, on the host.
         """
-        return "{} has no triangles"
+        return "has no triangles"
 
     def tessellate(self, theta: Mapping[str, Tree], rate: int | float) -> tuple[np.ndarray, np.ndarray]:
         """A mesh whose vertices lie on the surface.
@@ -187,8 +187,8 @@ class TriangleSurface(Surface):
             raise InputError(
                 f"{self!r} has no tessellate, and its triangles depend on the view; it cannot be made a mesh"
             )
-        engine = engine_of(theta)
-        inputs = map_leaves(engine.to_numpy, self.proxy_inputs(theta))
+        inputs = self.proxy_inputs(stopped(from_numbers(theta, "theta")))
+        inputs = map_leaves(engine_of(inputs).to_numpy, inputs)
         proxy = self.proxy(inputs, None, (1, 1))  # pyright: ignore[reportArgumentType]  # It does not look at it.
         return np.asarray(proxy.vertices, np.float32), np.asarray(proxy.faces, np.int32)
 

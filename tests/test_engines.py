@@ -547,3 +547,24 @@ def test_rows_are_exact_or_padded_to_a_bucket(target):
         assert rows == min(p for p in powers if p >= covered)
     else:
         assert rows == covered
+
+
+def test_map_rows_is_the_function_of_all_rows():
+    rows = np.arange(23, dtype=np.float32)
+    for target in ALL:
+        given = arrays(target, rows)
+        found = rts.engine_of(given).map_rows(lambda x: 2 * x + 1, given, 5)
+        np.testing.assert_array_equal(to_numpy(found), 2 * rows + 1)
+
+
+def test_map_rows_is_one_loop_in_a_compiled_program():
+    jax = pytest.importorskip("jax")
+    engine, calls = rts.engine_of(jax.numpy.zeros(1)), []
+
+    def f(x):
+        calls.append(x.shape[0])
+        return 2 * x + 1
+
+    rows = np.arange(23, dtype=np.float32)
+    np.testing.assert_array_equal(jax.jit(lambda x: engine.map_rows(f, x, 5))(rows), 2 * rows + 1)
+    assert set(calls) == {5} and len(calls) < 5

@@ -43,8 +43,8 @@ def test_central_differences_are_exact_for_squares_within_the_bounds(target):
 
 
 def samples():
-    """Rows of 40 values (N, 6), and params (N, 15)."""
-    return RNG.integers(0, 40, (30, 6)).astype(np.int32), RNG.standard_normal((30, 15))
+    """Rows of 40 values (N, 6), and params (N, 16)."""
+    return RNG.integers(0, 40, (30, 6)).astype(np.int32), RNG.standard_normal((30, 16))
 
 
 ROWS, PARAMS = samples()

@@ -23,10 +23,11 @@ KEPT = 2
 
 
 class Entry(NamedTuple):
-    """A proxy, and what a sampler built over it."""
+    """A proxy, what a sampler built over it, and what the proxy was made of, where samples are refined later."""
 
     proxy: Proxy
     prepared: Any
+    inputs: Tree = None
 
 
 class Keeper:

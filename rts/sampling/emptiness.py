@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.camera import Camera
-from rts.engines import value_of
+from rts.engines import stopped, value_of
 from rts.interfaces import CheckedPart, TriangleSurface
 from rts.trees import Tree, map_leaves
 
@@ -25,13 +25,13 @@ def why_empty(parts: Sequence[CheckedPart], camera: Camera) -> str:
 def _cause(part: CheckedPart, camera: Camera) -> str:
     if not isinstance(part.surface, TriangleSurface):
         return "no ray meets {}, or its shader gives an alpha of 0"
-    known = _known((part.surface.proxy_inputs(part.theta), camera.within(part.transform)))
+    known = _known((part.surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))
     if known is None:
         return "{} is not in sight, or its shader gives an alpha of 0"
     inputs, local = known
     proxy = part.surface.proxy(inputs, local, (1, 1))
     if not len(proxy.faces):
-        return part.surface.why_no_triangles(inputs)
+        return "{} " + part.surface.why_no_triangles(inputs).replace("{", "{{").replace("}", "}}")
     corners = proxy.vertices[np.unique(proxy.faces)].astype(np.float64)
     at = np.concatenate([corners, np.ones((len(corners), 1))], axis=1) @ (local.projection @ local.view).T
     depth = -(corners @ local.view[2, :3] + local.view[2, 3])

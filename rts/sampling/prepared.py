@@ -10,7 +10,6 @@ from rts.camera import Camera
 from rts.checks import check_sampler, check_scene, suited_sampler
 from rts.errors import InputError
 from rts.interfaces import Part
-from rts.records import Proxy
 from rts.sampling.cache import Entry
 
 
@@ -30,12 +29,13 @@ class PreparedParts:
 
     def __getstate__(self) -> dict[str, Any]:
         """Everything but what samplers have built, of which the triangles are enough."""
-        return {**self.__dict__, "entries": [e.proxy if isinstance(e, Entry) else e for e in self.entries]}
+        kept = [e._replace(prepared=None) if isinstance(e, Entry) else e for e in self.entries]
+        return {**self.__dict__, "entries": kept}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Build it again."""
         pairs = zip(state["samplers"], state["entries"], strict=True)
-        entries = tuple(_built(sampler, kept) if isinstance(kept, Proxy) else kept for sampler, kept in pairs)
+        entries = tuple(_built(sampler, kept) if isinstance(kept, Entry) else kept for sampler, kept in pairs)
         self.__dict__.update(state, entries=entries)
 
     def replace(self, index: int = 0, **changes: Any) -> PreparedParts:
@@ -53,8 +53,8 @@ class PreparedParts:
         return PreparedParts(parts, self.samplers, self.entries)
 
 
-def _built(sampler: Any, proxy: Proxy) -> Entry:
-    return Entry(proxy, sampler.prepare(proxy) if len(proxy.faces) else None)
+def _built(sampler: Any, kept: Entry) -> Entry:
+    return kept._replace(prepared=sampler.prepare(kept.proxy) if len(kept.proxy.faces) else None)
 
 
 def prepare(

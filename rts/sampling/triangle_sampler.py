@@ -10,9 +10,9 @@ import numpy as np
 
 from rts.adapting import adapted, unwrapped
 from rts.camera import Camera
-from rts.engines import CONSTANT_TYPES, engine_of, is_constant, namespace, suiting
+from rts.engines import engine_of, is_constant, namespace, stopped, suiting
 from rts.errors import InputError
-from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, Surface, TriangleSurface, as_surface
+from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSurface, as_surface
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.packing import lift, repack
@@ -81,12 +81,13 @@ class TriangleSampler(Sampler):
         surface = _of_triangles(part.surface)
         if surface.depends_on_view and (camera is None or size is None):
             raise InputError(f"the triangles of {surface!r} depend on the view; give camera and size")
-        inputs = surface.proxy_inputs(_stopped(part.theta))
+        inputs = surface.proxy_inputs(stopped(part.theta))
         inputs = map_leaves(engine_of(inputs).to_numpy, inputs)
         if camera is not None:
             camera = camera if size is None else camera.for_size(size)
             camera = camera.within(part.transform).map(lambda m: engine_of(m).to_numpy(m))
-        return self._built(surface, inputs, camera, size)
+        built = self._built(surface, inputs, camera, size)
+        return built._replace(inputs=map_leaves(np.copy, inputs)) if surface.refines else built
 
     def _built(self, surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Entry:
         """A copy of the surface's proxy for host inputs, checked, and what this sampler prepares of it."""
@@ -143,7 +144,7 @@ class TriangleSampler(Sampler):
         surface, theta, camera = _of_triangles(part.surface), part.theta, camera.for_size(size)
         engine, like = suiting(theta, camera)
         shape = _Shape(layers, size, capacity)
-        inputs = surface.proxy_inputs(_stopped(theta)) if entry is None or surface.refines else None
+        inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
         reads = {name: theta[name] for name in surface.reads(theta)}
         host_theta = reads if engine.differentiates and is_constant(reads) else None
         tables = shape.tables(surface) if surface.refines else {}
@@ -155,7 +156,7 @@ class TriangleSampler(Sampler):
 
         def host(view: np.ndarray, projection: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
             it = iter(rest[len(transform) :])
-            host_inputs = map_leaves(lambda _: next(it), inputs)
+            host_inputs = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
             host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
             host_camera = check_camera(host_camera, *rest[: len(transform)])
             found = self._found(surface, part.cull, host_inputs, host_camera, shape, tables, needed, entry)
@@ -272,18 +273,6 @@ def _of_triangles(given: Any) -> TriangleSurface:
     return surface
 
 
-def _stopped(theta: Mapping[str, Tree]) -> dict[str, Tree]:
-    """θ without derivatives: what is made of it for sampling keeps no graph."""
-    stopped = {}
-    for name, value in theta.items():
-        stopped[name] = value if type(value) is np.ndarray else map_leaves(_stop, value)
-    return stopped
-
-
-def _stop(x: Any) -> Any:
-    return x if isinstance(x, CONSTANT_TYPES) else engine_of(x).stop_gradient(x)
-
-
 def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
     """A table with zeros added up to the number of rows that its spec fixes."""
     if spec.packed or len(table) == spec.shape[0]:
@@ -292,7 +281,7 @@ def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
 
 
 def _attribute_specs(
-    surface: Surface, asked: Sequence[str] | None, host_theta: Mapping | None, shape: _Shape, like: Array | None
+    surface: TriangleSurface, asked: Sequence[str] | None, host_theta: Mapping | None, shape: _Shape, like: Array | None
 ) -> dict[str, ArraySpec]:
     """The attributes to evaluate on the host for a surface that is constant: those its shader reads."""
     if host_theta is None:
@@ -302,7 +291,8 @@ def _attribute_specs(
         return {"position": shape.row_spec(real, 3)}
     i, p = surface.sample_widths
     none = np.full((1, 1, 1), -1, np.int32)
-    one = Samples(np.zeros((1, i), np.int32), np.zeros((1, p), np.float32), none, none, np.int32(0))
+    tables = {name: np.zeros((1, *spec.shape[1:]), spec.dtype) for name, spec in shape.tables(surface).items()}
+    one = Samples(np.zeros((1, i), np.int32), np.zeros((1, p), np.float32), none, none, np.int32(0), tables)
     gbuffer = surface.evaluate(host_theta, one)
     names = list(gbuffer) if asked is None else ["position", *(n for n in asked if n in gbuffer)]
     return {n: shape.row_spec(real, *gbuffer[n].shape[1:]) for n in dict.fromkeys(names)}

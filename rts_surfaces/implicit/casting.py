@@ -8,19 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.engines import engine_of
+from rts.engines import engine_of, namespace
 from rts.operations.gradient import gradient
 from rts.records import RayHits
 from rts.trees import Array, map_leaves
 
-STEPS = 256
-"""Steps across the region where no Lipschitz constant is known."""
-
-SHORTEST = 1 / 512
-"""The shortest step where one is known, as a share of the region across. Thinner parts may be missed."""
-
-MOST = 512
-"""Such steps that a ray takes at most; one that keeps along a surface for longer ends there."""
+STEPS, WITH_BOUND = 256, 512
+"""How many of the shortest steps there are across the region, without and with a Lipschitz constant."""
 
 SECANT, NEWTON = 5, 2
 """How often the methods of Illinois and of Newton are applied in a bracket."""
@@ -28,8 +22,8 @@ SECANT, NEWTON = 5, 2
 CROWDED = 0.75
 """The share of rays that still go on at which the others are taken out."""
 
-FLATTEST = 1e-12
-"""The least square of a slope that points are moved by; where the field is flatter, they move less."""
+FLATTEST = 1e-6
+"""The least square of a slope that points are moved by, as a share of the largest; flatter places move less."""
 
 
 class Region(NamedTuple):
@@ -38,7 +32,7 @@ class Region(NamedTuple):
     Attributes:
         span: origins and directions (R, 3) → (R,) where rays enter, or 0 where they begin within, and (R,) where they
             leave, in units of their directions; both are 0 for rays that miss it.
-        across: how long it is.
+        across: the length of the longest ray within it.
     """
 
     span: Callable[[Array, Array], tuple[Array, Array]]
@@ -78,7 +72,7 @@ def box(low: np.ndarray, high: np.ndarray) -> Region:
         last = xp.where(along, -never, xp.maximum(*ends))
         return _ahead(xp.max(first, axis=-1), xp.min(last, axis=-1))
 
-    return Region(span, float(np.max(high - low)))
+    return Region(span, float(np.linalg.norm(high - low)))
 
 
 def moving(level: Callable[[Array], Array], points: Array) -> Array:
@@ -86,10 +80,18 @@ def moving(level: Callable[[Array], Array], points: Array) -> Array:
 
     The latter is the slope over its square, w = ∇f / |∇f|²: the point x₀ − f(x₀) w is on the surface, to first order.
     """
-    engine, slope = engine_of(points), gradient(level, points)
-    xp = engine.namespace
-    square = xp.sum(slope * slope, axis=-1, keepdims=True)
-    return engine.stop_gradient(xp.concat([points, slope / xp.clip(square, FLATTEST, None)], axis=-1))
+    engine = engine_of(points)
+    return engine.stop_gradient(engine.namespace.concat([points, per_level(gradient(level, points))], axis=-1))
+
+
+def per_level(slope: Array) -> Array:
+    """(M, 3): slopes (M, 3) over their squares."""
+    xp = namespace(slope)
+    # Squares of small slopes are no numbers of single precision.
+    largest = xp.max(xp.abs(slope)) if slope.shape[0] else xp.ones_like(xp.sum(slope))
+    largest = xp.where(largest > 0, largest, xp.ones_like(largest))
+    scaled = slope / largest
+    return scaled / xp.clip(xp.sum(scaled * scaled, axis=-1, keepdims=True), FLATTEST, None) / largest
 
 
 def cast(
@@ -117,7 +119,7 @@ def cast(
         layers: K.
         within: the region.
         lipschitz: L, which the slope of `level` nowhere exceeds; or None.
-        steps: the number of the shortest steps across the region; None for `STEPS`, or 1 / `SHORTEST` with L.
+        steps: the number of the shortest steps across the region; None for `STEPS`, or with L `WITH_BOUND`.
 
     Returns:
         Hits in the arrays' engine and dtype. Where there is none, distance and parameters are 0.
@@ -127,7 +129,7 @@ def cast(
     length = xp.sqrt(xp.sum(directions * directions, axis=-1))
     enter, leave = within.span(origins, directions)
     if steps is None:
-        steps = STEPS if lipschitz is None else round(1 / SHORTEST)
+        steps = STEPS if lipschitz is None else WITH_BOUND
     rays = _Rays(
         origins + enter[:, None] * directions,
         directions,
@@ -135,7 +137,7 @@ def cast(
         within.across / steps / length,
         xp.zeros_like(length) if lipschitz is None else 1 / (lipschitz * length),
     )
-    most = steps + 1 if lipschitz is None else MOST
+    most = steps + 1  # No step is shorter.
     free = partial(_without_derivative, level)
     if engine.padded(origins):
         return _cast_all(level, free, describe, rays, enter, layers, most)

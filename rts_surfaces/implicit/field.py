@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from rts.arguments import check_numbers, quoted
 from rts.arrays import kind_of, shape_of, unit
 from rts.engines import engine_of, namespace
@@ -17,6 +19,9 @@ from rts.operations.gradient import gradient
 from rts.records import Samples
 from rts.trees import Array, Tree, leaves
 from rts_surfaces.entries import RESERVED
+
+LARGEST = 1e38
+"""What is larger is no number of single precision."""
 
 Function = Callable[[Mapping[str, Tree], Array], Array]
 """A function of θ and points (M, 3)."""
@@ -79,14 +84,12 @@ class Field(ScalarField):
 
     def __init__(self, f: Function, isovalue: float = 0.0, inside: str = "below", reads: Sequence[str] | None = None):
         check_function("f", f)
-        value = check_numbers("isovalue", isovalue, ())
-        if value is None:
-            raise InputError("isovalue is traced; expected a known number, or subtract it in f")
+        value = check_isovalue(isovalue)
         if not isinstance(inside, str) or inside not in SIDES:
             raise InputError(f"inside is {quoted(inside)}; expected 'below' or 'above'")
         if reads is not None and not (isinstance(reads, (list, tuple)) and all(isinstance(n, str) for n in reads)):
             raise InputError(f"reads is {quoted(reads)}; expected names of entries of theta, or None for all")
-        self.f, self.isovalue, self.inside, self.sign = f, float(value), inside, SIDES[inside]
+        self.f, self.isovalue, self.inside, self.sign = f, value, inside, SIDES[inside]
         self.name = getattr(f, "__name__", type(f).__name__)
         self._reads = None if reads is None else tuple(reads)
 
@@ -112,9 +115,16 @@ class Field(ScalarField):
         try:
             value = self.f(theta, points)
         except KeyError as error:
-            if not error.args or error.args[0] in theta:
+            raise InputError(f"{self.name} finds no {error}; theta has {sorted(theta)}") from error
+        except (AttributeError, TypeError) as error:
+            if engine_of(points).differentiates:
                 raise
-            raise InputError(f"{self.name} reads theta[{error.args[0]!r}]; theta has {sorted(theta)}") from error
+            raise InputError(
+                f"{self.name} cannot work with arrays of NumPy ({error}); it gets these where theta has no others: put "
+                f"the weights that it reads into theta"
+            ) from error
+        if not engine_of(points).differentiates and getattr(value, "dtype", None) == np.float32:
+            value = np.asarray(value, points.dtype)  # Differences for slopes are taken in float64.
         check_result("f", value, points)
         return self.sign * (value - self.isovalue)
 
@@ -163,7 +173,7 @@ class Implicit(Surface):
         self.field.check(theta)
 
     def at_hits(self, theta: Mapping[str, Tree], samples: Samples, level: Callable[[Array], Array]) -> GBuffer:
-        """The G-buffer where rays met the field: x₀ − f(x₀) w, with x₀ and w the parameters of samples (N, 6).
+        """The G-buffer where rays met the field: x₀ − f(x₀) w, with x₀ and w the first parameters of samples.
 
         Args:
             theta: θ.
@@ -175,8 +185,12 @@ class Implicit(Surface):
         # At the origin, where rows that only pad would lie, many a function has no derivative: they do as the first.
         used = xp.any(params != 0, axis=1, keepdims=True)
         params = xp.where(used, params, xp.where(used[:1], params[:1], xp.ones_like(params[:1])))
-        found, along = params[:, :3], params[:, 3:]
+        found, along = params[:, :3], params[:, 3:6]
         return self.gbuffer(theta, found - level(found)[:, None] * along)
+
+    def normal(self, theta: Mapping[str, Tree], position: Array) -> Array:
+        """Normals (N, 3) of unit length, outwards, at positions on the surface; zero where the field has no slope."""
+        return unit(self.field.slope(theta, position))
 
     def gbuffer(self, theta: Mapping[str, Tree], position: Array) -> GBuffer:
         """Positions (N, 3) on the surface, with normals of unit length, outwards, and the attributes, when read.
@@ -184,10 +198,25 @@ class Implicit(Surface):
         All are differentiable in θ and in the positions. A normal is zero where the field has no slope.
         """
         gbuffer = GBuffer(position=position)
-        gbuffer.defer("normal", lambda: unit(self.field.slope(theta, position)))
+        gbuffer.defer("normal", lambda: self.normal(theta, position))
         for name, g in self.attributes.items():
             gbuffer.defer(name, partial(_attribute, name, g, theta, position))
         return gbuffer
+
+
+def check_isovalue(isovalue: Any) -> float:
+    """The isovalue; refused where it is no number of single precision, or traced."""
+    value = known_number("isovalue", check_numbers("isovalue", isovalue, ()))
+    if abs(value) > LARGEST:
+        raise InputError(f"isovalue is {value:g}; expected a number of single precision")
+    return value
+
+
+def known_number(name: str, value: np.ndarray | None) -> float:
+    """A number that `rts.arguments` checked; refused where it is traced."""
+    if value is None:
+        raise InputError(f"{name} is traced; expected a known number: surfaces do not change with theta")
+    return float(value)
 
 
 def check_function(name: str, f: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from rts.checks import is_count
 from rts.engines import engine_of, exemplar, namespace, value_of
 from rts.errors import InputError
 from rts.records import ArraySpec, Samples
-from rts.trees import Array, Tree, leaves
+from rts.trees import Array, Tree, collected
 from rts_surfaces.implicit.field import Field, Function
 from rts_surfaces.implicit.lattice import Lattice
 from rts_surfaces.implicit.narrow_band import NarrowBand
@@ -76,10 +77,11 @@ class FunctionOnLattice(Field):
         read = {name: theta[name] for name in self.names(theta)}
         engine, like, count = engine_of(read), exemplar(read), self._lattice.count
         if self.band is None:
-            numbers = engine.constant(np.arange(count, dtype=np.int32), like)
-            levels = engine.map_rows(lambda some: self.at(theta, some), numbers, CHUNK)
-            return Looked({"values": engine.namespace.reshape(levels, self._lattice.shape)}, count)
-        known = [(value_of(x), shape_of(x)) for x in leaves(read)]
+            across, *rest = self._lattice.shape
+            planes = engine.constant(np.arange(across, dtype=np.int32), like)
+            levels = engine.map_rows(partial(self._in_planes, theta), planes, max(1, CHUNK // (rest[0] * rest[1])))
+            return Looked({"values": levels}, count)
+        known = [(value_of(x), shape_of(x)) for x in collected(read)]
         if any(value is None or value.shape != shape for value, shape in known):
             raise InputError(
                 "a narrow band decides on values of f, and theta is traced; sample outside of jit and vmap (by "
@@ -92,10 +94,20 @@ class FunctionOnLattice(Field):
             if few_shapes:  # Lest each be compiled.
                 places = np.resize(places, (1 << max(0, count - 1).bit_length(), 3))
             points = self.suited(theta, engine.constant(places.astype(np.float32), like))
-            return engine.to_numpy(engine.stop_gradient(self.level(theta, points)))[:count]
+            return np.asarray(value_of(engine.stop_gradient(self.level(theta, points))))[:count]
 
         found = self.band.find(level, self._lattice, closed)
         return Looked({k: v for k, v in found._asdict().items() if k != "evaluations"}, found.evaluations)
+
+    def _in_planes(self, theta: Mapping[str, Tree], planes: Array) -> Array:
+        """The level (P, Y, Z) in planes of the lattice across its first axis, (P,) int32."""
+        xp, engine, shape = namespace(planes), engine_of(planes), self._lattice.shape
+        low, step = self._lattice.low, self._lattice.step
+        axes = [float(low[0]) + float(step[0]) * xp.astype(planes, xp.float32)]
+        axes += [engine.constant((low[i] + step[i] * np.arange(shape[i])).astype(np.float32), axes[0]) for i in (1, 2)]
+        places = xp.stack(xp.meshgrid(*axes, indexing="ij"), axis=-1)
+        levels = self.level(theta, self.suited(theta, xp.reshape(places, (-1, 3))))
+        return xp.reshape(levels, (-1, *shape[1:]))
 
     # ------------------------------------------------------------------------------------------------ samples
 
@@ -126,6 +138,8 @@ class FunctionOnLattice(Field):
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
         """Levels (M,), differentiable; and which rows of them (N, 6) int32 the six values of each sample are."""
         if self.table:
+            if "points" not in samples.tables:
+                raise InputError("the samples have no table of lattice points, and the surface has one; sample it anew")
             return self.at(theta, samples.tables["points"]), samples.ids
         count = samples.ids.shape[0]
         levels = self.at(theta, namespace(samples.ids).reshape(samples.ids, (-1,)))

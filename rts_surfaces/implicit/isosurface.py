@@ -13,18 +13,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arguments import check_numbers, check_positive, quoted
-from rts.arrays import is_finite
-from rts.engines import CONSTANT_TYPES, engine_of, namespace
+from rts.arguments import check_positive, quoted
+from rts.arrays import from_numbers, is_finite, unit
+from rts.engines import engine_of, namespace, stopped, value_of
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part, RaySurface, TriangleSurface
+from rts.operations.gradient import gradient
 from rts.records import ArraySpec, Proxy, RayHits, Rays, Samples
+from rts.sampling.cache import fingerprint
 from rts.threads import parallel
 from rts.trees import Array, Tree, map_leaves
 from rts_surfaces.implicit import marching_cubes
-from rts_surfaces.implicit.casting import box, cast, moving
-from rts_surfaces.implicit.field import SIDES, Implicit
+from rts_surfaces.implicit.casting import box, cast, per_level
+from rts_surfaces.implicit.field import SIDES, Implicit, check_isovalue, known_number
 from rts_surfaces.implicit.function_on_lattice import FunctionOnLattice
 from rts_surfaces.implicit.lattice import Lattice, check_bounds
 from rts_surfaces.implicit.lattice_field import LatticeField
@@ -37,6 +39,15 @@ NEAR_SINGULAR = 1e-3
 
 BESIDE = 1e-3
 """How far before the bounds rays begin where the surface is capped, as a share of the bounds: they meet the caps."""
+
+STEPS_PER_CELL = 2
+"""Steps of rays across the narrowest side of a cell, where there is no Lipschitz bound."""
+
+ON_SIDE = 1e-6
+"""How near to the bounds' side points of a cap are, as a share of the bounds."""
+
+KEPT = 4
+"""Fields whose usual differences are remembered."""
 
 MOTIONS, ENDS, SINGULAR = ("normal", "edge"), ("capped", "open"), ("bound", "drop", "keep")
 
@@ -91,7 +102,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
     """
 
     refine_moves = False
-    hit_widths = (0, 6)
+    hit_widths = (0, 7)
     field: LatticeField | FunctionOnLattice
 
     def __init__(
@@ -119,21 +130,24 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         ):
             if not isinstance(given, str) or given not in names:
                 raise InputError(f"{name} is {quoted(given)}; expected {' or '.join(map(repr, names))}")
-        check_bounds(bounds)
-        check_numbers("isovalue", isovalue, ())
-        if lipschitz is not None:
-            check_positive("lipschitz", lipschitz)
-        self.bounds, self.isovalue, self.motion = bounds, float(isovalue), motion
-        self.closed, self.near_singular, self.lipschitz = at_bounds == "capped", near_singular, lipschitz
-        self.sample_widths = (6, 15 if motion == "normal" else 4)
+        self.bounds, self.isovalue, self.motion = check_bounds(bounds), check_isovalue(isovalue), motion
+        self.closed, self.near_singular = at_bounds == "capped", near_singular
+        self.lipschitz = (
+            None if lipschitz is None else known_number("lipschitz", check_positive("lipschitz", lipschitz))
+        )
+        self._usual: dict[tuple, float] = {}
+        self.sample_widths = (6, 16 if motion == "normal" else 4)
         if f is not None:
             if shape is None:
                 raise InputError("shape is None; expected (X, Y, Z), how finely to look at f")
-            field = FunctionOnLattice(f, isovalue, inside, reads, Lattice(bounds, shape), table, band)
+            field = FunctionOnLattice(f, isovalue, inside, reads, Lattice(self.bounds, shape), table, band)
         else:
-            if table is not False or band is not None:
-                raise InputError("a table or band needs a function f; values that are given need no evaluation")
-            field = LatticeField(bounds, self.isovalue, SIDES[inside], shape)
+            for name, given, none in (("table", table, False), ("band", band, None), ("reads", reads, None)):
+                if given is not none:
+                    raise InputError(
+                        f"{name} is {quoted(given)} without a function f; expected {none}: θ has the values"
+                    )
+            field = LatticeField(self.bounds, self.isovalue, SIDES[inside], shape)
         super().__init__(field, attributes)
 
     def __repr__(self) -> str:
@@ -155,7 +169,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         return self.field.look(theta, self.closed).inputs
 
     def extract(self, theta: Mapping[str, Tree]) -> Extracted:
-        """The triangles that samplers see, and what they cost.
+        """The triangles of marching cubes, dropped ones included, and what they cost.
 
         Args:
             theta: θ, with values that are known.
@@ -163,8 +177,9 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         Raises:
             InputError: the field is NaN or infinite somewhere.
         """
+        theta = stopped(from_numbers(theta, "theta"))
         self.check(theta)
-        looked = self.field.look(map_leaves(_stopped, theta), self.closed)
+        looked = self.field.look(theta, self.closed)
         found = self._triangles(map_leaves(lambda x: engine_of(x).to_numpy(x), looked.inputs))
         return Extracted(found.vertices, found.faces, int(_singular(found).sum()), looked.evaluations)
 
@@ -186,26 +201,27 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         raise InputError(f"{self.field.name} is {value} at lattice point [{at}]; expected finite numbers")
 
     def why_no_triangles(self, inputs: Mapping[str, np.ndarray]) -> str:
-        """Where the field lies beside the isovalue."""
-        values = inputs["values"]
-        if not values.size:
-            return f"the field of {{}} crosses the isovalue {self.isovalue:g} nowhere that its band was looked for"
-        isovalue, sign = self.field.level_of_values
-        levels = [sign * (float(end) - isovalue) for end in (values.min(), values.max())]
-        least, most = sorted(self.field.sign * level + self.isovalue for level in levels)
-        return f"the field of {{}} is {least:.4g} to {most:.4g}, and crosses the isovalue {self.isovalue:g} nowhere"
+        """Where the field lies beside the isovalue; one text for all values, so that a loop warns once."""
+        values, (isovalue, sign) = inputs["values"], self.field.level_of_values
+        if "corners" in inputs:
+            return f"has no surface: its band found no place where the field crosses the isovalue {self.isovalue:g}"
+        side = "inside" if (sign * (values.reshape(-1)[0] - isovalue)) < 0 else "outside"
+        return f"has no surface: the field is {side} of the isovalue {self.isovalue:g} all over its bounds"
 
     def proxy(self, inputs: Mapping[str, np.ndarray], camera: Any, size: tuple[int, int]) -> Proxy:
         """The triangles of marching cubes, each with the ends of its edges, its cell, and where it is capped."""
         from rts_surfaces.implicit import lattice_samples_kernels
 
         found = self._triangles(inputs)
+        if len(self._usual) >= KEPT:
+            self._usual.clear()
+        self._usual[fingerprint(inputs["values"])] = _usual(found)
         faces, cells, caps = found.faces, found.cells, found.caps
         if self.near_singular == "drop":
             kept = ~_singular(found)[faces].any(axis=1)
             faces, cells, caps = faces[kept], cells[kept], caps[kept]
         ids = np.empty((len(faces), 8), np.int32)
-        parallel(lattice_samples_kernels.name, len(ids), faces, found.ends, cells, caps, ids, work=10 * len(ids))
+        parallel(lattice_samples_kernels.hand_on, len(ids), faces, found.ends, cells, caps, ids, work=10 * len(ids))
         return Proxy(found.vertices, faces, ids)
 
     def refine(self, inputs: Mapping[str, np.ndarray], samples: Samples, rays: Rays) -> Samples:
@@ -214,25 +230,24 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
         lattice = self.field.lattice(inputs)
         values = np.ascontiguousarray(inputs["values"]).reshape(-1)
-        none = np.empty(0, np.int64), np.empty((0, 8), np.int32)
-        numbers, corners = (inputs["numbers"], inputs["corners"]) if "corners" in inputs else none
-        count = len(samples.ids)
-        points, carried = np.empty((count, 6), np.int32), np.empty((count, 15), np.float32)
-        squares, apart = np.empty(count), np.empty((count, 3))
-        given = values, *self.field.level_of_values, numbers, corners, lattice.shape, lattice.low, lattice.step
-        made = points, carried, squares, apart
-        parallel(lattice_samples_kernels.fill, count, *given, samples.ids, samples.params, *made, work=300 * count)
+        band = (inputs["numbers"], inputs["corners"]) if "corners" in inputs else None
+        points = np.zeros((len(samples.ids), 6), np.int32)
+        params = np.zeros((len(samples.ids), self.sample_widths[1]), np.float32)
+        least = 0.0 if self.near_singular == "keep" else NEAR_SINGULAR * self._usual_difference(inputs)
         if self.motion == "edge":
-            crossed = apart[apart > 0]
-            least = NEAR_SINGULAR * np.median(crossed) if len(crossed) and self.near_singular == "bound" else 0.0
-            params = np.concatenate([carried[:, :3], np.full((count, 1), least, np.float32)], axis=1)
-        else:
-            usual = squares[squares > 0]
-            bounded = len(usual) > 0 and self.near_singular != "keep"
-            least = NEAR_SINGULAR**2 * float(np.median(usual)) if bounded else 0.0
-            parallel(lattice_samples_kernels.divide, count, squares, least, carried, work=5 * count)
-            params = carried
+            params[:, 3] = least if self.near_singular == "bound" else 0.0
+        isovalue, sign = self.field.level_of_values
+        given = values, float(values.dtype.type(isovalue)), sign, band, lattice.shape, lattice.low, lattice.step
+        # Where no cell is covered there is a row nevertheless, of nothing.
+        count = int(samples.row.max()) + 1
+        made = points, params, least / lattice.step.max()
+        parallel(lattice_samples_kernels.fill, count, *given, samples.ids, samples.params, *made, work=300 * count)
         return self.field.tabled(replace(samples, ids=points, params=params))
+
+    def _usual_difference(self, inputs: Mapping[str, np.ndarray]) -> float:
+        """The median, over all edges that are crossed, of the difference of their ends; kept since the triangles."""
+        found = self._usual.get(fingerprint(inputs["values"]))
+        return _usual(self._triangles(inputs)) if found is None else found
 
     def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
         """The lattice points that samples share."""
@@ -242,37 +257,62 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     def intersect(self, theta: Mapping[str, Tree], origins: Array, directions: Array, layers: int) -> RayHits:
         """Where rays meet the field itself within the bounds, and the caps; see `rts.RaySurface`."""
-        lattice = self.field.lattice(theta)
-        low, high = check_bounds(self.bounds)
+        lattice, (low, high) = self.field.lattice(theta), self.bounds
         margin = BESIDE * (high - low) if self.closed else 0.0
-        level = self._level_in_bounds(theta)
+        known = value_of(theta["values"]) if isinstance(self.field, LatticeField) else None
+        if known is not None and known.shape == lattice.shape:
+            self._check_finite({"values": known}, lattice)
+        steps = np.linalg.norm(high - low) * STEPS_PER_CELL / lattice.step.min()
         return cast(
-            level,
-            partial(moving, level),
+            partial(self._capped if self.closed else self.field.level, theta),
+            partial(self._moving, theta),
             self.field.suited(theta, origins),
             self.field.suited(theta, directions),
             layers,
             within=box(low - margin, high + margin),
             lipschitz=self.lipschitz,
-            steps=2 * max(lattice.shape) if self.lipschitz is None else None,
+            steps=int(np.ceil(steps)) if self.lipschitz is None else None,
         )
 
-    def _level_in_bounds(self, theta: Mapping[str, Tree]) -> Callable[[Array], Array]:
-        """The level as a function of points, with the caps."""
-        return partial(self._capped if self.closed else self.field.level, theta)
-
     def _capped(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """The level, and beyond the bounds no less than the distance to them."""
+        """The level, and beyond the bounds no less than what grows with the distance to them as fast as it may."""
         xp, level = namespace(points), self.field.level(theta, points)
-        for axis, (low, high) in enumerate(zip(*check_bounds(self.bounds), strict=True)):
-            at = points[:, axis]
-            level = xp.maximum(level, xp.maximum(float(low) - at, at - float(high)))
+        for axis, (low, high) in enumerate(np.stack(self.bounds, axis=1).tolist()):
+            beyond = xp.maximum(low - points[:, axis], points[:, axis] - high)
+            level = xp.maximum(level, (self.lipschitz or 1.0) * beyond)
         return level
+
+    def _caps(self, points: Array) -> Array:
+        """(M, 3): 1 or −1 for the axis across which a point lies in the bounds' side, where they are capped; else 0."""
+        xp, (low, high) = namespace(points), self.bounds
+        columns = []
+        for axis in range(3):
+            near = float(ON_SIDE * (high - low)[axis])
+            at = points[:, axis]
+            above, below = at > float(high[axis]) - near, at < float(low[axis]) + near
+            column = xp.astype(above, points.dtype) - xp.astype(below, points.dtype)
+            columns.append(column if self.closed else xp.zeros_like(column))
+        return xp.stack(columns, axis=-1)
+
+    def _moving(self, theta: Mapping[str, Tree], points: Array) -> Array:
+        """(M, 7): points, how they move for each unit of level, and their level; in a cap only within its side."""
+        engine = engine_of(points)
+        xp, level = engine.namespace, partial(self.field.level, theta)
+        within = 1 - xp.abs(self._caps(points))
+        along, free = per_level(within * gradient(level, points)), xp.min(within, axis=-1, keepdims=True)
+        return engine.stop_gradient(xp.concat([points, along, (1 - free) * level(points)[:, None]], axis=-1))
+
+    def normal(self, theta: Mapping[str, Tree], position: Array) -> Array:
+        """The field's, and in caps that of the bounds' side."""
+        xp, caps = namespace(position), self._caps(engine_of(position).stop_gradient(position))
+        capped = xp.max(xp.abs(caps), axis=-1, keepdims=True) > 0
+        return xp.where(capped, unit(caps), super().normal(theta, position))
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Positions, normals along the field's gradient, and attributes."""
         if samples.ids.shape[1] == 0:
-            return self.at_hits(theta, samples, self._level_in_bounds(theta))
+            was = self.field.suited(theta, samples.params[:, 6])
+            return self.at_hits(theta, samples, lambda points: self.field.level(theta, points) - was)
         values, rows = self.field.six(theta, samples)
         isovalue, sign = self.field.level_of_values
         params = namespace(values).astype(samples.params, values.dtype, copy=False)
@@ -285,11 +325,10 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
 def _singular(found: Triangles) -> np.ndarray:
     """Which vertices lie on near-singular edges (V,) bool."""
+    return (found.differences > 0) & (found.differences < NEAR_SINGULAR * _usual(found))
+
+
+def _usual(found: Triangles) -> float:
+    """The median difference of the ends of edges that are crossed."""
     crossed = found.differences[found.differences > 0]
-    if not len(crossed):
-        return np.zeros(len(found.differences), bool)
-    return (found.differences > 0) & (found.differences < NEAR_SINGULAR * np.median(crossed))
-
-
-def _stopped(x: Any) -> Any:
-    return x if isinstance(x, CONSTANT_TYPES) else engine_of(x).stop_gradient(x)
+    return float(np.median(crossed)) if len(crossed) else 0.0

@@ -69,7 +69,7 @@ class LatticeField(ScalarField):
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
         """All values (M,), and which of them (N, 6) belong to each sample."""
-        values = theta["values"]
+        values = self.suited(theta, theta["values"])
         return namespace(values).reshape(values, (-1,)), samples.ids
 
     def numbers(self, samples: Samples) -> Array:

@@ -16,10 +16,34 @@ def _place(number, shape, low, step, out):
     out[2] = low[2] + step[2] * (number % shape[2])
 
 
+@numba.njit(nogil=True, inline="always")
+def _slope(values, band, cell, base, at, shape, low, step, caps, out):
+    """Fill the gradient (3,) of values interpolated within a cell; zero across sides that are capped."""
+    x, y, z = base // (shape[1] * shape[2]), base // shape[2] % shape[1], base % shape[2]
+    near_x = min(max((at[0] - low[0]) / step[0] - x, 0.0), 1.0)
+    near_y = min(max((at[1] - low[1]) / step[1] - y, 0.0), 1.0)
+    near_z = min(max((at[2] - low[2]) / step[2] - z, 0.0), 1.0)
+    out[:] = 0
+    for i in range(8):
+        a, b, c = i & 1, i >> 1 & 1, i >> 2 & 1
+        if band is None:
+            value = np.float64(values[base + (a * shape[1] + b) * shape[2] + c])
+        else:
+            value = np.float64(values[band[1][cell, i]])
+        along_x, along_y, along_z = (
+            (near_x if a else 1 - near_x),
+            (near_y if b else 1 - near_y),
+            (near_z if c else 1 - near_z),
+        )
+        out[0] += (2 * a - 1) * along_y * along_z * value
+        out[1] += (2 * b - 1) * along_x * along_z * value
+        out[2] += (2 * c - 1) * along_x * along_y * value
+    for i in range(3):
+        out[i] = 0.0 if caps >> i & 1 else out[i] / step[i]
+
+
 @numba.njit(cache=True, nogil=True)
-def fill(
-    start, stop, values, isovalue, sign, numbers, corners, shape, low, step, ids, near, points, params, squares, apart
-):
+def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near, points, params, least):
     """Fill what samples `start` to `stop` carry.
 
     Args:
@@ -28,76 +52,56 @@ def fill(
         values: (M,), of all lattice points by number, or of those of a band by row.
         isovalue: see `marching_cubes.of_lattice`.
         sign: see `marching_cubes.of_lattice`.
-        numbers: (M,) of the points of a band; empty where all points are known.
-        corners: (C, 8), rows of the corners of the cells of a band; empty likewise.
+        band: numbers (M,) of the band's points, and rows (C, 8) of the corners of its cells; None without one.
         shape: (X, Y, Z).
         low: (3,), the first point.
         step: (3,).
         ids: (N, 8) int32: the ends of three edges, the cell, and the axes along which it is capped.
         near: (N, 2), barycentrics.
         points: (N, 6) int32, to be filled with the numbers of lattice points.
-        params: (N, 15), to be filled: barycentrics (3), weights of the six values (6), the sample's place (3), and the
-            level's gradient within the cell (3), along the side where it is capped.
-        squares: (N,), to be filled with the square of the gradient's length.
-        apart: (N, 3), to be filled: by how much the values at the ends of edges differ; 0 where they are one point.
+        params: (N, 4), of which the barycentrics (3) are filled; or (N, 16), filled with the barycentrics, the weights
+            of the six values (6), the place (3), how it moves for each unit of level (3), and the sum of the values
+            less the isovalue by these weights.
+        least: by how much the level is taken to change at least over a unit of length.
     """
-    banded = len(numbers) > 0
-    a, b, lowest = np.empty(3), np.empty(3), np.empty(3)
-    at, beside, slope = np.empty(3), np.empty((3, 2)), np.empty(3)
-    corner = np.empty(8)
+    a, b, at, slope = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     for n in range(start, stop):
         params[n, 0], params[n, 1], params[n, 2] = near[n, 0], near[n, 1], 1 - near[n, 0] - near[n, 1]
         at[:] = 0
+        level = 0.0
         for k in range(3):
             row_a, row_b, share = ids[n, 2 * k], ids[n, 2 * k + 1], np.float64(params[n, k])
-            number_a, number_b = (np.int64(numbers[row_a]), np.int64(numbers[row_b])) if banded else (row_a, row_b)
+            if band is None:
+                number_a, number_b = np.int64(row_a), np.int64(row_b)
+            else:
+                number_a, number_b = np.int64(band[0][row_a]), np.int64(band[0][row_b])
             points[n, 2 * k], points[n, 2 * k + 1] = number_a, number_b
+            if params.shape[1] == 4:
+                continue
             _place(number_a, shape, low, step, a)
             _place(number_b, shape, low, step, b)
             f_a, f_b = np.float64(values[row_a]), np.float64(values[row_b])
             along = (isovalue - f_a) / (f_b - f_a) if f_a != f_b else 0.0
             for i in range(3):
                 at[i] += share * (a[i] + along * (b[i] - a[i]))
-            real = row_a != row_b
-            params[n, 3 + 2 * k], params[n, 4 + 2 * k] = real * share * (1 - along), real * share * along
-            apart[n, k] = abs(f_b - f_a)
-        cell = ids[n, 6]
-        base = np.int64(numbers[corners[cell, 0]]) if banded else np.int64(cell)
-        _place(base, shape, low, step, lowest)
-        for i in range(8):
-            if banded:
-                corner[i] = values[corners[cell, i]]
-            else:
-                corner[i] = values[base + ((i & 1) * shape[1] + (i >> 1 & 1)) * shape[2] + (i >> 2 & 1)]
+            params[n, 3 + 2 * k], params[n, 4 + 2 * k] = share * (1 - along), share * along
+            level += share * ((1 - along) * (f_a - isovalue) + along * (f_b - isovalue))
+        if params.shape[1] == 4:
+            continue
+        cell = np.int64(ids[n, 6])
+        base = cell if band is None else np.int64(band[0][band[1][cell, 0]])
+        _slope(values, band, cell, base, at, shape, low, step, ids[n, 7], slope)
+        divisor = max(slope[0] * slope[0] + slope[1] * slope[1] + slope[2] * slope[2], least * least)
         for i in range(3):
             params[n, 9 + i] = at[i]
-            beside[i, 1] = min(max((at[i] - lowest[i]) / step[i], 0.0), 1.0)
-            beside[i, 0] = 1 - beside[i, 1]
-        slope[:] = 0
-        for i in range(8):
-            x, y, z = i & 1, i >> 1 & 1, i >> 2 & 1
-            slope[0] += (2 * x - 1) * beside[1, y] * beside[2, z] * corner[i]
-            slope[1] += (2 * y - 1) * beside[0, x] * beside[2, z] * corner[i]
-            slope[2] += (2 * z - 1) * beside[0, x] * beside[1, y] * corner[i]
-        squares[n] = 0
-        for i in range(3):
-            along = 0.0 if ids[n, 7] >> i & 1 else sign * slope[i] / step[i]
-            params[n, 12 + i] = along
-            squares[n] += along * along
+            moved = sign * slope[i] / divisor if divisor > 0 else 0.0
+            params[n, 12 + i] = moved if abs(moved) < LARGEST else 0.0
+        # Zero on the isosurface; within a cap samples move with what the field is there.
+        params[n, 15] = level
 
 
 @numba.njit(cache=True, nogil=True)
-def divide(start, stop, squares, least, params):
-    """Turn gradients into how samples move for each unit of level: divide by their square, or by `least` if larger."""
-    for n in range(start, stop):
-        divisor = max(squares[n], least)
-        for i in range(12, 15):
-            moved = params[n, i] / divisor if divisor > 0 else 0.0
-            params[n, i] = moved if abs(moved) < LARGEST else 0.0
-
-
-@numba.njit(cache=True, nogil=True)
-def name(start, stop, faces, ends, cells, caps, ids):
+def hand_on(start, stop, faces, ends, cells, caps, ids):
     """Fill what triangles hand on to samples, (T, 8): the ends of three edges, the cell, and where it is capped."""
     for t in range(start, stop):
         for k in range(3):

@@ -27,7 +27,7 @@ _WEIGHTS, _PLACE, _ALONG = slice(3, 9), slice(9, 12), slice(12, 15)
 
 def _by_level(values: Array, params: Array, rows: Array, *, isovalue: float, sign: float) -> Array:
     xp, weights = namespace(values, params), params[:, _WEIGHTS]
-    level = combine(values[:, None], rows, weights)[:, 0] - isovalue * xp.sum(weights, axis=1)
+    level = combine(values[:, None], rows, weights)[:, 0] - isovalue * xp.sum(weights, axis=1) - params[:, 15]
     return params[:, _PLACE] - sign * level[:, None] * params[:, _ALONG]
 
 
@@ -54,7 +54,7 @@ def _checked(operands: Arrays, width: int) -> Arrays:
 def _forward(operands: Arrays, out: np.ndarray, *, isovalue: float, sign: float) -> None:
     from rts_surfaces.implicit import motion_kernels
 
-    values, params, rows = _checked(operands, 15)
+    values, params, rows = _checked(operands, 16)
     real = values.dtype.type
     parallel(motion_kernels.move, len(rows), values, params, rows, real(isovalue), real(sign), out, work=30 * len(rows))
 
@@ -62,7 +62,7 @@ def _forward(operands: Arrays, out: np.ndarray, *, isovalue: float, sign: float)
 def _push(operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, sign: float) -> None:
     from rts_surfaces.implicit import motion_kernels
 
-    values, params, rows = _checked(operands, 15)
+    values, params, rows = _checked(operands, 16)
     given = read_only(tangents[0]), params, rows, values.dtype.type(sign), out
     parallel(motion_kernels.push, len(rows), *given, work=30 * len(rows))
 
@@ -70,7 +70,7 @@ def _push(operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray, *, 
 def _pull(operands: Arrays, g: np.ndarray, results: Some, *, isovalue: float, sign: float) -> None:
     from rts_surfaces.implicit import motion_kernels
 
-    values, params, rows = _checked(operands, 15)
+    values, params, rows = _checked(operands, 16)
     if results[0] is not None:
         motion_kernels.pull(read_only(g), params, rows, values.dtype.type(sign), results[0])
 
@@ -86,8 +86,8 @@ ALONG_NORMAL = Operation(
     packed=(1, 2),
     packed_result=True,
 )
-"""(N, 3): where samples are, less their vector times the level, `sign * (value - isovalue)` by the weights of the six
-values; it is zero where they were found. A sample's params (15) are barycentrics, these weights, place and vector."""
+"""(N, 3): where samples are, less their vector times the change of the level `sign * (value - isovalue)`, by weights
+of six values. A sample's params (16) are barycentrics, these weights, place, vector, and what they summed up to."""
 
 
 # ------------------------------------------------------------------------------------------------ along edges

@@ -10,7 +10,7 @@ import numpy as np
 def move(start, stop, values, params, rows, isovalue, sign, out):
     """Fill the places (N, 3) of samples `start` to `stop`."""
     for n in range(start, stop):
-        level = values.dtype.type(0)
+        level = -params[n, 15]
         for i in range(6):
             level += params[n, 3 + i] * (values[rows[n, i]] - isovalue)
         for i in range(3):

@@ -16,7 +16,7 @@ from rts.interfaces import Part, RaySurface
 from rts.records import RayHits, Samples
 from rts.trees import Array, Tree
 from rts_surfaces.implicit.casting import ball, cast, moving
-from rts_surfaces.implicit.field import Field, Function, Implicit
+from rts_surfaces.implicit.field import Field, Function, Implicit, known_number
 from rts_surfaces.implicit.fields import swept_sphere
 
 
@@ -61,11 +61,14 @@ class Sdf(Implicit, RaySurface):
         steps: int | None = None,
     ):
         super().__init__(Field(f, isovalue, inside, reads), attributes)
-        self.radius = _known("radius", check_positive("radius", radius)).item()
-        self.center = _known("center", check_numbers("center", center, (3,))).astype(np.float64)
+        self.radius = known_number("radius", check_positive("radius", radius))
+        known = check_numbers("center", center, (3,))
+        if known is None:
+            raise InputError("center is traced; expected known numbers: surfaces do not change with theta")
+        self.center = known.astype(np.float64)
         self.lipschitz = None
         if lipschitz is not None:
-            self.lipschitz = _known("lipschitz", check_positive("lipschitz", lipschitz)).item()
+            self.lipschitz = known_number("lipschitz", check_positive("lipschitz", lipschitz))
         if steps is not None and not is_count(steps):
             raise InputError(f"steps is {quoted(steps)}; expected how many there are across the ball, or None")
         self.steps = steps
@@ -96,9 +99,3 @@ class Sdf(Implicit, RaySurface):
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Positions, "normal" of unit length, outwards, and the attributes."""
         return self.at_hits(theta, samples, partial(self.field.level, theta))
-
-
-def _known(name: str, value: np.ndarray | None) -> np.ndarray:
-    if value is None:
-        raise InputError(f"{name} is traced; expected known numbers, since the ball does not change with theta")
-    return value
