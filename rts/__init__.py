@@ -21,14 +21,17 @@ from rts.errors import (
 )
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
+from rts.files.views import View, load_views
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.gbuffer import GBuffer
 from rts.interfaces import Evaluator, Part, RaySurface, Residuals, Sampler, Shader, Splatter, Surface, TriangleSurface
+from rts.ndc import Ndc
 from rts.operations.combine import combine
 from rts.operations.gradient import gradient
 from rts.operations.operation import Operation
 from rts.operations.rigid import rigid
+from rts.radiance_fields import load_radiance_field, volume_render
 from rts.records import ArraySpec, Fragments, Proxy, RayHits, Rays, Sampled, Samples, Splats
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples, sample
@@ -54,6 +57,7 @@ __all__ = [
     "ImageResiduals",
     "InputError",
     "LayersWarning",
+    "Ndc",
     "Operation",
     "Part",
     "PluginError",
@@ -73,6 +77,7 @@ __all__ = [
     "Surface",
     "TriangleSampler",
     "TriangleSurface",
+    "View",
     "check_gradient",
     "combine",
     "engine_of",
@@ -83,6 +88,8 @@ __all__ = [
     "gradient_image",
     "load",
     "load_image",
+    "load_radiance_field",
+    "load_views",
     "namespace",
     "plugin",
     "plugins",
@@ -94,4 +101,5 @@ __all__ = [
     "save_animation",
     "save_image",
     "unwrapped",
+    "volume_render",
 ]

@@ -1,0 +1,1 @@
+"""Radiance fields: networks of position and direction, drawn as volumes or as surface light fields."""

@@ -1,0 +1,64 @@
+"""Functions of many rows, called on some at a time so that memory stays bounded; and how far they have come."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+
+from rts.engines import Engine, engine_named, engine_of
+from rts.errors import InputError, PluginError
+from rts.trees import Array
+
+CHUNK = 8192
+"""Rows at a time: activations of a network of 128 units are then some 20 MB."""
+
+
+def in_chunks(f: Callable[..., Array], rows: int, *arrays: Array) -> Array:
+    """The result of `f(*arrays)`, computed from `rows` rows at a time, and once more for its gradient.
+
+    Args:
+        f: arrays (M, ·) → (M, ·), each row from its own row alone.
+        rows: the largest number of rows at a time.
+        *arrays: (N, ·) each, of one engine.
+
+    Returns:
+        (N, ·). Between value and gradient only results are kept, where the engine can (`Engine.checkpoint`).
+    """
+    count = arrays[0].shape[0]
+    if count <= rows:
+        return f(*arrays)
+    engine, found = engine_of(arrays), []
+    for start in range(0, count, rows):
+        some = [x[start : start + rows, ...] for x in arrays]
+        found.append(engine.checkpoint(lambda: None, lambda _, some=some: f(*some)))
+    return engine.namespace.concat(found)
+
+
+def fast_engine() -> Engine:
+    """The engine for networks whose arrays are NumPy's: torch, which uses all cores, where it is installed."""
+    try:
+        return engine_named("torch")
+    except (PluginError, InputError):  # Missing, or not registered.
+        return engine_named("numpy")
+
+
+@contextlib.contextmanager
+def progress_bar(wanted: bool | None, what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A progress bar on standard error, and the function that moves it on by a number.
+
+    Args:
+        wanted: whether to show it; None to do so in a terminal.
+        what: what is being done.
+        total: the number that makes it full.
+    """
+    if wanted is False or (wanted is None and not sys.stderr.isatty()):
+        yield lambda count: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task(what, total=total)
+        yield lambda count: bar.update(task, advance=count)

@@ -1,0 +1,147 @@
+"""Radiance fields in files: weights of two networks, read and written, never unpickled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rts.arguments import quoted
+from rts.arrays import from_numbers
+from rts.engines import engine_of
+from rts.errors import InputError
+from rts.files.paths import as_path, output_file, writing
+from rts.trees import Tree, map_leaves, placed_leaves
+from rts_surfaces.radiance_field.lattice import lattice
+from rts_surfaces.radiance_field.network import REPEATED, Architecture, check_network
+
+NETWORKS = ("coarse", "fine")
+LARGEST = 2**30
+"""Bytes of weights; what claims to be more is no network of this kind."""
+
+
+@dataclass(frozen=True, eq=False)
+class RadianceField:
+    """A coarse network, by which samples along rays are placed, and a fine one, which is the field.
+
+    Attributes:
+        weights: {"coarse": network, "fine": network}, nested dicts and lists of arrays of any engine (float32 NumPy as
+            loaded): see `rts_surfaces.radiance_field.network.check_network`. As θ["weights"] of a part, one network.
+
+    Raises:
+        InputError: a network is missing, or its weights do not fit together.
+    """
+
+    weights: Any
+
+    def __post_init__(self):
+        if not isinstance(self.weights, dict) or set(self.weights) != set(NETWORKS):
+            raise InputError(f"weights are {quoted(self.weights)}; expected a dict of 'coarse' and 'fine'")
+        for name in NETWORKS:
+            check_network(self.weights[name], f"the network {name!r}")
+
+    def __repr__(self) -> str:
+        return f"RadianceField({', '.join(f'{name}: {self.architecture(name)}' for name in NETWORKS)})"
+
+    def architecture(self, network: str = "fine") -> Architecture:
+        """What the network "coarse" or "fine" is like."""
+        return check_network(self.weights[network])
+
+    def save(self, path: Any) -> None:
+        """Write the weights as an .npz that `rts.load_radiance_field` reads, in their dtypes.
+
+        Raises:
+            InputError: another extension, or a path that cannot be or may not be written to.
+        """
+        path = output_file(path, "radiance field", (".npz",))
+        named = {".".join(map(str, place)): x for place, x in placed_leaves(self.on_host())}
+        with writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savez(path, allow_pickle=False, **named)
+
+    def lattice(
+        self,
+        bounds: Any,
+        shape: tuple[int, int, int],
+        *,
+        network: str = "fine",
+        keep: Any = True,
+        progress: bool | None = None,
+    ) -> np.ndarray:
+        """Densities on a lattice, (X, Y, Z) float32; see `rts_surfaces.radiance_field.lattice`.
+
+        Args:
+            bounds: ((x0, y0, z0), (x1, y1, z1)) in the field's space, both points of the lattice.
+            shape: (X, Y, Z), at least 2 each.
+            network: "fine" or "coarse".
+            keep: True to keep them in the user's cache and to find them there; a folder for that; False for neither.
+            progress: whether to show a progress bar; None to do so in a terminal.
+
+        Raises:
+            InputError: there is no such lattice or network.
+        """
+        return lattice(self, bounds, shape, network=network, keep=keep, progress=progress)
+
+    def on_host(self) -> Tree:
+        """The weights as NumPy arrays, without derivatives."""
+        return map_leaves(engine_of(self.weights).to_numpy, self.weights)
+
+
+def load_radiance_field(path: Any) -> RadianceField:
+    """The field whose weights an .npz holds, as float32; see `rts.load_radiance_field`."""
+    path = as_path(path)
+    if not path.is_file():
+        raise InputError(f"there is no file {path} of weights; check the path (relative paths start at {Path.cwd()})")
+    found: dict[str, Any] = {}
+    for key, array in _arrays(path).items():
+        network, _, rest = key.partition(".")
+        *place, kind = rest.split(".")
+        layer, number = (place + [None, None])[:2]
+        known = network in NETWORKS and kind in ("weight", "bias") and bool(layer)
+        if not known or len(place) != 1 + (layer in REPEATED) or not str(number or 0).isdecimal():
+            raise InputError(
+                f"{path} has an array {key[:60]!r}, of no layer that is known; expected such as 'fine.layer1.weight'"
+            )
+        layers = found.setdefault(network, {})
+        if number is None:
+            layers.setdefault(layer, {})[kind] = array
+        else:
+            layers.setdefault(layer, {}).setdefault(int(number), {})[kind] = array
+    for network in NETWORKS:
+        if network not in found:
+            raise InputError(f"{path} lacks the layer '{network}.layer1'; expected the networks coarse and fine")
+        for name in REPEATED:
+            numbered = found[network].get(name, {})
+            gap = next((i for i in range(len(numbered)) if i not in numbered), None)
+            if gap is not None:
+                raise InputError(f"{path} lacks the layer '{network}.{name}.{gap}', though it has later ones")
+            if numbered:
+                found[network][name] = [numbered[i] for i in range(len(numbered))]
+        check_network(found[network], f"{path}: the network {network!r}")
+    return RadianceField(found)
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an .npz, as float32."""
+    found = {}
+    try:
+        # NumPy leaves files open that are damaged, if it opens them.
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            total = sum(item.file_size for item in file.zip.infolist())
+            if total > LARGEST:
+                raise ValueError(f"it holds {total / 2**30:.1f} GB")
+            for key in file.files:
+                found[key] = np.asarray(file[key])
+    except Exception as error:  # NumPy and zipfile raise many kinds.
+        what = " ".join(str(error).split())[:80]
+        raise InputError(f"{path} is no .npz of weights ({what}); expected numpy.savez's, without pickles") from error
+    for key, array in found.items():
+        if array.dtype.kind != "f":
+            raise InputError(f"{path} has {key[:60]!r} of dtype {array.dtype}; expected floating numbers")
+        with np.errstate(over="ignore"):
+            found[key] = from_numbers(array, key).astype(np.float32)
+        if not np.isfinite(found[key]).all():
+            raise InputError(f"{path} has NaN, infinity or too large numbers in {key[:60]!r}; repair the file")
+    return found

@@ -1,0 +1,139 @@
+"""Surfaces in NDC, brought to the world: where a forward-facing radiance field is to be drawn by a camera.
+
+Between NDC and the world planes and straight lines stay what they are, so that triangles do, too; but the middle of a
+side does not stay in its middle. What is λ_k in the world, of a corner at depth d_k, is λ_k d_k over the sum in NDC.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from rts.arguments import quoted
+from rts.arrays import unit
+from rts.engines import namespace
+from rts.errors import InputError
+from rts.gbuffer import GBuffer
+from rts.interfaces import Part, TriangleSurface
+from rts.ndc import Ndc
+from rts.records import ArraySpec, Proxy, Rays, Samples
+from rts.trees import Array, Tree
+
+DEEPEST = 1e4
+"""Depth, over that of the near plane, beyond which triangles are left out: rounding moves them too far in the world."""
+
+
+class Projected(TriangleSurface):
+    """A surface of NDC in the world: its triangles, its points and its normals, differentiable in θ.
+
+    Its G-buffer has position and normal, if that surface has them, and further entries as they are.
+
+    Args:
+        surface: a surface in NDC whose triangles do not depend on the camera, and whose samples have two parameters
+            before its `refine`, the barycentrics; `refine` may not move them. Such as an isosurface.
+        ndc: the map between the world and NDC.
+
+    Raises:
+        InputError: another surface.
+    """
+
+    refine_moves = False
+
+    def __init__(self, surface: Any, ndc: Ndc):
+        fits = isinstance(surface, TriangleSurface) and surface.refines
+        if not fits or surface.depends_on_view or surface.refine_moves:
+            raise InputError(
+                f"surface is {quoted(surface)}; expected one of triangles that no camera changes, such as an isosurface"
+            )
+        if not isinstance(ndc, Ndc):
+            raise InputError(f"ndc is {quoted(ndc)}; expected an rts.Ndc")
+        self.surface, self.ndc = surface, ndc
+        self.sample_widths, self.centered = surface.sample_widths, surface.centered
+        self.proxy_is_cheap = surface.proxy_is_cheap
+
+    def __repr__(self) -> str:
+        return f"Projected({self.surface!r})"
+
+    @classmethod
+    def example(cls) -> Part:
+        """A ball two units before the camera at the origin, as an isosurface in NDC."""
+        from rts_surfaces.implicit.isosurface import Isosurface
+
+        ndc = Ndc((1.5, 1.5), near=1.0)
+        axes = [np.linspace(-1, 1, 25), np.linspace(-1, 1, 25), np.linspace(-0.8, 0.6, 25)]
+        points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        values = np.linalg.norm(ndc.to_world(points) + [0, 0, 2], axis=1) - 0.7
+        surface = Isosurface(((-1, -1, -0.8), (1, 1, 0.6)))
+        theta = {"values": values.reshape(25, 25, 25).astype(np.float32)}
+        move = np.eye(4)
+        move[2, 3] = 2
+        return Part(cls(surface, ndc), theta, "normals", transform=move)
+
+    def check(self, theta: Mapping[str, Tree]) -> None:
+        """As the surface itself does."""
+        self.surface.check(theta)
+
+    def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
+        """What the surface itself reads."""
+        return self.surface.reads(theta)
+
+    def proxy_inputs(self, theta: Mapping[str, Tree]) -> Tree:
+        """What the surface itself needs."""
+        return self.surface.proxy_inputs(theta)
+
+    def proxy(self, inputs: Tree, camera: Any, size: tuple[int, int]) -> Proxy:
+        """The surface's triangles, seen from the world; they carry the depths of their corners, as bits of floats."""
+        found = self.surface.proxy(inputs, camera, size)
+        vertices = np.asarray(found.vertices, np.float64)
+        world = self.ndc.to_world(vertices)
+        # NDC are a mirror image of the world: z grows with depth.
+        faces = np.ascontiguousarray(found.faces[:, ::-1])
+        depths = (-world[:, 2]).astype(np.float32)[found.faces]
+        assert found.ids is not None, "surfaces that refine samples say what these carry"
+        kept = (depths < DEEPEST * self.ndc.near).all(axis=1)
+        ids = np.concatenate([found.ids, depths.view(np.int32)], axis=1)
+        return Proxy(world.astype(np.float32), faces[kept], np.ascontiguousarray(ids[kept]))
+
+    def refine(self, inputs: Tree, samples: Samples, rays: Rays) -> Samples:
+        """Barycentrics as they are in NDC; then what the surface itself does with samples there."""
+        depths = np.ascontiguousarray(samples.ids[:, -3:]).view(np.float32).astype(np.float64)
+        second, third = samples.params[:, 1].astype(np.float64), samples.params[:, 0].astype(np.float64)
+        shares = np.stack([1 - second - third, second, third], axis=1) * np.maximum(depths, 1e-30)
+        shares /= shares.sum(axis=1, keepdims=True)
+        within = replace(
+            samples,
+            ids=np.ascontiguousarray(samples.ids[:, :-3]),
+            params=shares[:, :2].astype(samples.params.dtype),
+        )
+        return self.surface.refine(inputs, within, rays)
+
+    def table_specs(self, rows: int, capacity: int | None) -> Mapping[str, ArraySpec]:
+        """Those of the surface itself."""
+        return self.surface.table_specs(rows, capacity)
+
+    def why_no_triangles(self, inputs: Tree) -> str:
+        """What the surface itself says."""
+        return self.surface.why_no_triangles(inputs)
+
+    def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
+        """The surface's points in the world, with their normals and further entries."""
+        within = self.surface.evaluate(theta, samples)
+        position = self.ndc.to_world(within["position"])
+        gbuffer = GBuffer(position=position)
+        for name in within:
+            if name == "normal":
+                gbuffer.defer(name, lambda: self._normals(position, within["normal"]))
+            elif name != "position":
+                gbuffer.defer(name, lambda name=name: within[name])
+        return gbuffer
+
+    def _normals(self, position: Array, normals: Array) -> Array:
+        """Unit normals (N, 3) in the world, of those in NDC: times the transposed Jacobian of world to NDC."""
+        xp, (x_scale, y_scale) = namespace(position), self.ndc.scale
+        x, y, depth = position[:, 0], position[:, 1], -position[:, 2]
+        a, b = x_scale * normals[:, 0], y_scale * normals[:, 1]
+        along = (a * x + b * y - 2 * self.ndc.near * normals[:, 2]) / depth
+        return unit(xp.stack([a, b, along], axis=1))

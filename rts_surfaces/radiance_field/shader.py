@@ -1,0 +1,74 @@
+"""The colours of a radiance field on a surface: a surface light field, one evaluation a sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rts.arguments import quoted
+from rts.arrays import unit
+from rts.camera import Camera
+from rts.checks import is_count
+from rts.engines import constants, engine_of, exemplar, namespace
+from rts.errors import InputError
+from rts.gbuffer import GBuffer
+from rts.interfaces import Shader
+from rts.ndc import Ndc
+from rts.trees import Array, Tree
+from rts_surfaces.radiance_field.chunks import CHUNK, in_chunks
+from rts_surfaces.radiance_field.field import RadianceField, load_radiance_field
+from rts_surfaces.radiance_field.network import check_network, radiance
+from rts_surfaces.radiance_field.volume import VolumeImage, volume_render
+
+
+@dataclass(frozen=True)
+class RadianceShader(Shader):
+    """What a network θ["weights"] sees at a sample along the ray that meets it (Miller et al. 1998, NeRF's colours).
+
+    Colours are as the network gives them, in the encoding of the images that it was trained on: sRGB, as a rule. For
+    linear ones, decode the image.
+
+    Attributes:
+        ndc: the map from the world to the network's space, or None where that is the world.
+        chunk: samples at a time. In torch and jax only their colours are kept for the gradient, which computes the rest
+            anew, so that memory stays bounded.
+    """
+
+    ndc: Ndc | None = None
+    chunk: int = CHUNK
+    opaque = True
+    reads = ()
+
+    def __post_init__(self):
+        if self.ndc is not None and not isinstance(self.ndc, Ndc):
+            raise InputError(f"ndc is {quoted(self.ndc)}; expected an Ndc, or None")
+        if not is_count(self.chunk):
+            raise InputError(f"chunk is {quoted(self.chunk)}; expected an integer of at least 1")
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+        """See `rts.Shader`."""
+        if "weights" not in theta:
+            raise InputError(
+                "the radiance shader needs theta['weights'], a network such as load_radiance_field(path)"
+                f".weights['fine']; theta has {sorted(theta)}"
+            )
+        weights = theta["weights"]
+        check_network(weights, "theta['weights']")
+        position = gbuffer["position"]
+        given = weights, position, -unit(camera.toward(position))
+        weights, position, direction = constants(given, engine_of(given), exemplar(given))
+        points = position if self.ndc is None else self.ndc.from_world(position)
+        color = in_chunks(lambda p, d: radiance(weights, p, d), self.chunk, points, direction)
+        xp = namespace(color)
+        return xp.concat([color, xp.ones_like(color[:, :1])], axis=1)
+
+    @staticmethod
+    def load(path: Any) -> RadianceField:
+        """See `rts.load_radiance_field`."""
+        return load_radiance_field(path)
+
+    @staticmethod
+    def volume_render(field: RadianceField, camera: Camera, size: tuple[int, int], **options: Any) -> VolumeImage:
+        """See `rts.volume_render`."""
+        return volume_render(field, camera, size, **options)

@@ -1,0 +1,142 @@
+"""Radiance fields drawn by volume rendering: what surface light fields are compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.arguments import check_pixels, check_planes, quoted
+from rts.camera import Camera
+from rts.checks import is_count
+from rts.engines import constants, engine_of
+from rts.errors import InputError
+from rts.files.views import colour_named
+from rts.ndc import Ndc
+from rts.trees import map_leaves
+from rts_surfaces.radiance_field.chunks import CHUNK, fast_engine, in_chunks, progress_bar
+from rts_surfaces.radiance_field.field import RadianceField
+from rts_surfaces.radiance_field.network import density_and_radiance
+
+RAYS = 512
+"""Rays at a time."""
+LAST = 1e10
+"""Length of the last interval of a ray, which has no end."""
+
+
+class VolumeImage(NamedTuple):
+    """A picture of a volume, and what it took.
+
+    Attributes:
+        image: (H, W, 3) RGB on the background, or (H, W, 4) premultiplied RGBA, in the encoding of the network.
+        coarse: evaluations of the coarse network.
+        fine: evaluations of the fine network.
+    """
+
+    image: np.ndarray
+    coarse: int
+    fine: int
+
+
+def volume_render(
+    field: RadianceField,
+    camera: Camera,
+    size: tuple[int, int],
+    *,
+    near: float | None,
+    far: float | None,
+    samples: tuple[int, int],
+    background: Any,
+    ndc: Ndc | None,
+    progress: bool | None,
+) -> VolumeImage:
+    """The image, and the evaluations of both networks; see `rts.volume_render`."""
+    height, width = check_pixels(size)
+    if not isinstance(field, RadianceField):
+        raise InputError(f"field is {quoted(field)}; expected what rts.load_radiance_field gives")
+    if not isinstance(camera, Camera):
+        raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera")
+    counts = tuple(samples) if isinstance(samples, (tuple, list)) else ()
+    if len(counts) != 2 or not all(map(is_count, counts)) or counts[0] < 3:
+        raise InputError(f"samples is {quoted(samples)}; expected (coarse, fine), at least 3 and 1")
+    if ndc is not None and not isinstance(ndc, Ndc):
+        raise InputError(f"ndc is {quoted(ndc)}; expected an rts.Ndc, or None")
+    if ndc is not None and not (near is None and far is None):
+        raise InputError("near and far are given with ndc, whose rays run from its near plane to infinity; leave them")
+    near, far = (0.0, 1.0) if ndc is not None else (2.0 if near is None else near, 6.0 if far is None else far)
+    check_planes(near, far, positive=ndc is None)
+    behind = None if background is None else colour_named(background)
+    camera = map_leaves(engine_of(camera).to_numpy, camera)
+    if camera.for_size((height, width)).projection[3, 2] == 0:
+        raise InputError("the camera is orthographic; volumes are drawn by perspective ones")
+    rays = camera.rays((height, width))
+    origins, directions = (np.reshape(x, (-1, 3)) for x in (rays.origins, rays.directions))
+    viewed = (directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+    if ndc is not None:
+        origins, directions = ndc.rays(origins, directions)
+    origins, directions = origins.astype(np.float32), directions.astype(np.float32)
+
+    coarse, fine = (_evaluator(field, name) for name in ("coarse", "fine"))
+    image = np.empty((height * width, 4), np.float32)
+    done = {"coarse": 0, "fine": 0}
+    with progress_bar(progress, "volume rendering", height * width) as advance:
+        for start in range(0, height * width, RAYS):
+            some = slice(start, min(start + RAYS, height * width))
+            o, d, v = origins[some], directions[some], viewed[some]
+            t = np.broadcast_to(np.linspace(near, far, counts[0], dtype=np.float32), (len(o), counts[0]))
+            weights = _composited(coarse(o, d, v, t), t, d)[1]
+            t = np.sort(np.concatenate([t, _placed(t, weights, counts[1])], axis=1), axis=1)
+            image[some] = _composited(fine(o, d, v, t), t, d)[0]
+            done["coarse"] += len(o) * counts[0]
+            done["fine"] += t.size
+            advance(len(o))
+    image = image.reshape(height, width, 4)
+    if behind is not None:
+        image = image[..., :3] + (1 - image[..., 3:]) * behind
+    return VolumeImage(image, done["coarse"], done["fine"])
+
+
+def _evaluator(field: RadianceField, name: str) -> Callable[..., np.ndarray]:
+    """A function of origins, directions, unit directions (R, 3) and depths (R, S): colours and density (R, S, 4)."""
+    engine = fast_engine()
+    weights = constants(field.on_host()[name], engine, None)
+    xp = engine.namespace
+
+    def rows(points: Any, directions: Any) -> Any:
+        sigma, rgb = density_and_radiance(weights, points, directions)
+        return xp.concat([rgb, sigma[:, None]], axis=1)
+
+    def call(o: np.ndarray, d: np.ndarray, v: np.ndarray, t: np.ndarray) -> np.ndarray:
+        points = (o[:, None] + t[..., None] * d[:, None]).reshape(-1, 3)
+        directions = np.repeat(v, t.shape[1], axis=0)
+        found = in_chunks(rows, CHUNK, engine.constant(points), engine.constant(directions))
+        return engine.to_numpy(found).reshape(*t.shape, 4)
+
+    return call
+
+
+def _composited(found: np.ndarray, t: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Premultiplied RGBA (R, 4), and the weight of each sample (R, S)."""
+    lengths = np.concatenate([np.diff(t, axis=1), np.full_like(t[:, :1], LAST)], axis=1)
+    lengths = lengths * np.linalg.norm(directions, axis=1, keepdims=True)
+    passed = np.exp(-found[..., 3] * lengths)
+    before = np.cumprod(np.concatenate([np.ones_like(t[:, :1]), passed[:, :-1] + np.float32(1e-10)], axis=1), axis=1)
+    weights = (1 - passed) * before
+    rgb = np.sum(weights[..., None] * found[..., :3], axis=1)
+    return np.concatenate([rgb, np.sum(weights, axis=1, keepdims=True)], axis=1), weights
+
+
+def _placed(t: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:
+    """Depths (R, count) at equal steps of the distribution that the weights (R, S) of samples at t (R, S) make."""
+    edges = (t[:, 1:] + t[:, :-1]) / 2
+    share = weights[:, 1:-1] + np.float32(1e-5)
+    total = np.cumsum(share / share.sum(axis=1, keepdims=True), axis=1)
+    total = np.concatenate([np.zeros_like(total[:, :1]), total], axis=1)
+    wanted = np.linspace(0, 1, count, dtype=np.float32)
+    above = np.sum(total[:, :, None] <= wanted, axis=1)
+    low, high = np.maximum(above - 1, 0), np.minimum(above, total.shape[1] - 1)
+    start, end = np.take_along_axis(total, low, 1), np.take_along_axis(total, high, 1)
+    width = np.where(end - start < 1e-5, np.float32(1), end - start)
+    a, b = np.take_along_axis(edges, low, 1), np.take_along_axis(edges, high, 1)
+    return a + (wanted - start) / width * (b - a)
