@@ -476,7 +476,10 @@ class Camera:
         change = np.diag([width / columns, height / rows, 1.0, 1.0])
         change[:2, 3] = (width - 2 * left) / columns - 1, 1 - (height - 2 * top) / rows
         change = engine_of(self.projection).constant(change, self.projection)
-        return self.replace(projection=matmul(change, self.projection))
+        aspect = self.aspect
+        if isinstance(aspect, float):
+            aspect *= (columns * height) / (rows * width)
+        return self.replace(projection=matmul(change, self.projection), aspect=aspect)
 
     def project(self, points: Array, size: tuple[int, int]) -> Array:
         """Pixel x, pixel y and linear depth of world points.

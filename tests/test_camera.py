@@ -716,3 +716,14 @@ def test_complex_matrices_are_refused():
         rts.render(square(), camera.replace(view=camera.view.astype(complex)), SIZE)
     with pytest.raises(InputError, match="eye has dtype complex128"):
         Camera.look_at(np.array([0, 0, 4j]), (0, 0, 0))
+
+
+def test_a_window_is_for_images_of_its_own_ratio():
+    part = rts.plugin("surfaces", "mesh").example()
+    camera = Camera.look_at((0, 0, 4), (0, 0, 0), aspect=1.5)
+    whole = rts.render(part, camera, SIZE)
+    window = camera.window(SIZE, (10, 20), (20, 12))
+    assert window.aspect == pytest.approx(12 / 20)
+    # Warnings are errors: none is given of another ratio.
+    np.testing.assert_allclose(rts.render(part, window, (20, 12))[2:-2, 2:-2], whole[12:28, 22:30], atol=1e-5)
+    assert Camera.look_at((0, 0, 4), (0, 0, 0)).window(SIZE, (0, 0), (20, 20)).aspect == pytest.approx(1)

@@ -292,7 +292,7 @@ class Refinement:
             int(np.clip(x[at] - n // 2, 0, m - n)) for x, n, m in zip((rows, columns), window, size, strict=True)
         )
         image = _real(shot.image[top : top + window[0], left : left + window[1]])
-        camera = shot.camera.window(size, (top, left), window).replace(aspect=window[1] / window[0])
+        camera = shot.camera.window(size, (top, left), window)
         return camera, torch.from_numpy(np.ascontiguousarray(image))
 
     def _loss(self, values: Any, weights: Any, camera: rts.Camera, photograph: Any) -> Any:

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import os
 import struct
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path, PureWindowsPath
@@ -105,3 +107,19 @@ def inside(folder: Path, name: str, referrer: Path) -> Path:
         return as_path(target)
     except InputError:
         raise InputError(f"{referrer} refers to {name[:60]!r}, which no file can be called; repair the file") from None
+
+
+def cache_folder() -> Path:
+    """Where what is costly to make is kept from one process to the next, such as compiled libraries."""
+    try:
+        if sys.platform == "darwin":
+            return Path.home() / "Library" / "Caches" / "rts"
+        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rts"
+    except RuntimeError:  # There is no home.
+        return Path(own_folder().name)
+
+
+@functools.cache
+def own_folder() -> tempfile.TemporaryDirectory:
+    """A folder of this process alone, which is removed at its end."""
+    return tempfile.TemporaryDirectory(prefix="rts-")

@@ -14,12 +14,11 @@ import numpy as np
 from rts.arguments import quoted
 from rts.engines import constants
 from rts.errors import InputError
-from rts.files.paths import as_path
+from rts.files.paths import as_path, cache_folder
 from rts.trees import placed_leaves
 from rts_surfaces.implicit.lattice import Lattice
 from rts_surfaces.radiance_field.chunks import CHUNK, fast_engine, progress_bar
 from rts_surfaces.radiance_field.network import density
-from rts_surfaces.subdivision.library import cache_folder
 
 if TYPE_CHECKING:
     from rts_surfaces.radiance_field.field import RadianceField

@@ -13,13 +13,13 @@ import os
 import shlex
 import shutil
 import subprocess
-import sys
 import tempfile
 import threading
 from pathlib import Path
 from typing import NamedTuple
 
 from rts.errors import PluginError
+from rts.files.paths import cache_folder, own_folder
 
 SOURCES = ("opensubdiv.cpp", "cage.h", "newton.h")
 PREFIXES = ("/usr", "/usr/local", "/opt/homebrew", "/usr/local/opt/opensubdiv")
@@ -114,7 +114,7 @@ def _opened(tools: Tools) -> ctypes.CDLL:
             path.unlink(missing_ok=True)
             path = _compiled(tools, cache_folder())
         except OSError:  # It cannot be removed.
-            path = _compiled(tools, Path(_own_folder().name))
+            path = _compiled(tools, Path(own_folder().name))
         try:
             library = ctypes.CDLL(str(path))
         except OSError as error:
@@ -138,7 +138,7 @@ def _compiled(tools: Tools, folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         handle, draft = tempfile.mkstemp(suffix=".so", dir=folder)
     except OSError:  # A cache that cannot be written to: made anew in each process.
-        folder = Path(_own_folder().name)
+        folder = Path(own_folder().name)
         handle, draft = tempfile.mkstemp(suffix=".so", dir=folder)
     os.close(handle)
     try:
@@ -149,22 +149,6 @@ def _compiled(tools: Tools, folder: Path) -> Path:
         Path(draft).unlink(missing_ok=True)
         raise
     return folder / name
-
-
-def cache_folder() -> Path:
-    """Where compiled libraries are kept."""
-    try:
-        if sys.platform == "darwin":
-            return Path.home() / "Library" / "Caches" / "rts"
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "rts"
-    except RuntimeError:  # There is no home.
-        return Path(_own_folder().name)
-
-
-@functools.cache
-def _own_folder() -> tempfile.TemporaryDirectory:
-    """A folder of this process alone, which is removed at its end."""
-    return tempfile.TemporaryDirectory(prefix="rts-")
 
 
 def _key(tools: Tools) -> str:
