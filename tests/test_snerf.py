@@ -7,7 +7,7 @@ import pytest
 from helpers import arrays, relative_error, to_numpy
 
 import rts
-from benchmarks.paper import snerf
+from benchmarks.paper import snerf, snerf_scenes
 from rts.trees import leaves
 
 pytestmark = pytest.mark.rendering
@@ -21,8 +21,8 @@ def scene(data):
     if not (data / "nerf/lego_test_400.npz").is_file():
         pytest.skip(f"no radiance field in {data}")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(snerf, "DATA", data)
-        return snerf.lego((100,), fineness=0.5, finest=100)
+        patch.setattr(snerf_scenes, "DATA", data)
+        return snerf_scenes.lego((100,), fineness=0.5, finest=100)
 
 
 @pytest.fixture(scope="module")
