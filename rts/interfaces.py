@@ -11,7 +11,7 @@ import abc
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
@@ -29,6 +29,22 @@ if TYPE_CHECKING:
 
 
 # ------------------------------------------------------------------------------------------------------------ surfaces
+
+
+class Rate(NamedTuple):
+    """Another form of a surface, coarser or finer.
+
+    Attributes:
+        setting: what differs, as the keyword argument that a user would give: "tolerance=0.4".
+        work: how much work it is, relative to the surface as it is; roughly, to order them.
+        surface: the surface.
+        theta: θ → θ for it, differentiable; None where θ stays.
+    """
+
+    setting: str
+    work: float
+    surface: Surface
+    theta: Callable[[Mapping[str, Tree]], Mapping[str, Tree]] | None = None
 
 
 class Evaluator(Plugin):
@@ -69,6 +85,16 @@ class Surface(Evaluator):
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
         """The names of the entries of θ that the surface reads; others are its shader's. The default is all of them."""
         return tuple(theta)
+
+    def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
+        """Coarser and finer forms of the surface, for whoever looks for the cheapest that will do; none by default.
+
+        `rts.diagnostics.compare` and `rts.tune` try them. The surface as it is need not be among them.
+
+        Args:
+            theta: θ; NumPy arrays are constants, others may be of any engine.
+        """
+        return ()
 
     @classmethod
     def example(cls) -> Part | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import combinations
 from typing import Any
@@ -14,7 +14,7 @@ from rts.arrays import unit
 from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.interfaces import Part, TriangleSurface
+from rts.interfaces import Part, Rate, TriangleSurface
 from rts.operations.combine import interpolate
 from rts.operations.take import take
 from rts.records import Proxy, Samples
@@ -106,6 +106,25 @@ class Mesh(TriangleSurface):
             known = (name for name in self._columns if name in theta or name not in VERTEX_ATTRIBUTES)
             self._reads[names] = ("vertices", *known)
         return self._reads[names]
+
+    def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
+        """Meshes of fewer faces, while no derivative is taken of the vertices; see `rts_surfaces.decimation`."""
+        from rts_surfaces.decimation import fewer_faces
+
+        plain = len(self._tables) == 1 and "normals" not in theta and "uv" not in theta
+        if not plain or not is_constant(theta["vertices"]):
+            return ()
+        found = []
+        for faces, vertices, nearest in fewer_faces(np.asarray(theta["vertices"]), self.faces):
+            change = partial(self._thinned, vertices, nearest)
+            found.append(Rate(f"faces={len(faces)}", len(faces) / len(self.faces), Mesh(faces), change))
+        return found
+
+    def _thinned(self, vertices: np.ndarray, nearest: np.ndarray, theta: Mapping[str, Tree]) -> dict[str, Tree]:
+        """θ with other vertices, which have the attributes of those that they stand for."""
+        kept = {name: theta[name] for name in self._attributes(theta)}
+        attributes = {name: take(x, engine_of(x).constant(nearest, x)) for name, x in kept.items()}
+        return {**theta, **attributes, "vertices": vertices}
 
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Array:
         """The vertices."""

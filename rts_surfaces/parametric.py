@@ -6,7 +6,8 @@ A sample is the number of its patch and (u, v) in it.
 from __future__ import annotations
 
 import abc
-from collections.abc import Hashable, Mapping
+import copy
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from rts.camera import Camera
 from rts.checks import is_count
 from rts.engines import engine_of
 from rts.errors import InputError
-from rts.interfaces import TriangleSurface
+from rts.interfaces import Rate, TriangleSurface
 from rts.records import Proxy, Rays, Samples
 from rts.topology import fixed
 from rts.trees import Array, Tree
@@ -25,6 +26,9 @@ from rts_surfaces.views import view_key, view_of
 
 TOLERANCE = 0.1
 """Pixels that a triangle may be off the surface where there may be an outline."""
+
+TOLERANCES = (0.8, 0.3, 0.1, 0.05)
+"""Those of `rates`."""
 
 RESIDUAL, STEPS, LARGEST_STEP, BEYOND = 1e-4, 6, 0.25, 0.02
 """Newton's method: pixels a sample may be off its ray, the number of steps, the largest one, and how far a sample may
@@ -84,6 +88,16 @@ class Parametric(TriangleSurface):
             for array in value if isinstance(value, tuple) else (value,):
                 if isinstance(array, np.ndarray):
                     fixed(array)
+
+    def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
+        """Other tolerances."""
+        found = []
+        for tolerance in TOLERANCES:
+            if tolerance != self.tolerance:
+                other = copy.copy(self)
+                other.tolerance = tolerance
+                found.append(Rate(f"tolerance={tolerance:g}", self.tolerance / tolerance, other))
+        return found
 
     def uniform(self, rate: int) -> tuple[np.ndarray, np.ndarray]:
         """Rates of the edges of `whole` and within it, for so many cuts along each side of a patch."""

@@ -15,23 +15,19 @@ from rts.arguments import quoted
 from rts.arrays import from_numbers, kind_of
 from rts.camera import Camera
 from rts.checks import check_size, is_count, is_real
+from rts.diagnostics.steps import pixel_step
 from rts.engines import Engine, engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.files.srgb import decode_srgb
 from rts.fitting.dependence import differentiable
 from rts.fitting.names import named_leaves
 from rts.fitting.run import untraceable
-from rts.interfaces import Part, Splatter
-from rts.records import Splats
+from rts.interfaces import Part
 from rts.rendering import render
 from rts.trees import Array, Tree, leaves, map_leaves
 
 Scene = Callable[[Tree], tuple[Part | Sequence[Part], Camera]]
 
-STEP_PIXELS = 1.0
-"""How far the finite differences move what moves fastest in the image."""
-STEP_COLOR = 0.05
-"""How far the finite differences change the colour that changes fastest, where nothing moves."""
 NEGLIGIBLE = 0.01
 """What does not matter, as a share of the largest effect of a step."""
 LOSS_SMOOTHNESS = 4.0
@@ -210,7 +206,7 @@ def check_gradient(
         flat = engine.to_numpy(slope).reshape(-1)
         for index in _chosen(flat, entries):
             direction = _unit(engine, parameters, number, index)
-            step = _step(engine, image, parameters, direction)
+            step = pixel_step(engine, image, parameters, direction)
             hard = partial(_difference, engine, loss, partial(image, splatter="none"), parameters, direction)
             coarse, fine, wide = hard(step, samples), hard(step, samples + 1), hard(2 * step, samples)
             difference = (coarse + fine) / 2
@@ -302,31 +298,6 @@ def _unit(engine: Engine, parameters: Tree, number: int, index: int) -> Tree:
 
 
 # ------------------------------------------------------------------------------------------- finite differences
-
-
-class _Probe(Splatter):
-    """A splatter that shows where samples are on the image, and their colour."""
-
-    def __init__(self, color: bool):
-        self.color = color
-
-    def image(self, splats: Splats) -> Array:
-        positions, rgba, row = splats.positions, splats.rgba, splats.row
-        xp = namespace(positions, rgba, row)
-        values = rgba if self.color else xp.concat([positions[:, :2]] * 2, axis=1)
-        index = xp.reshape(xp.where(row[0] >= 0, row[0], 0), (-1,))
-        shown = xp.reshape(xp.take(values, index, axis=0), (*row.shape[1:], 4))
-        return xp.where((row[0] >= 0)[..., None], shown, 0.0)
-
-
-def _step(engine: Engine, image: Callable, parameters: Tree, direction: Tree) -> float:
-    """A step along one number that moves the image by a pixel or, where nothing moves, changes its colour."""
-    for color, wanted in ((False, STEP_PIXELS), (True, STEP_COLOR)):
-        probe = partial(image, splatter=_Probe(color), supersample=1, background=None)
-        speed = np.abs(engine.to_numpy(engine.jvp(probe, parameters, direction)[1])).max(initial=0.0)
-        if speed > 1e-6:
-            return float(wanted / speed)
-    return 1e-2
 
 
 def _difference(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import copy
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -37,6 +38,20 @@ class Looked(NamedTuple):
     evaluations: int
 
 
+class Resampled(NamedTuple):
+    """A field on another lattice.
+
+    Attributes:
+        shape: (X, Y, Z) of the lattice.
+        field: the field.
+        theta: θ → θ for it, or None where θ stays.
+    """
+
+    shape: tuple[int, ...]
+    field: Any
+    theta: Callable[[Mapping[str, Tree]], Mapping[str, Tree]] | None
+
+
 class FunctionOnLattice(Field):
     """A field that is looked at on a lattice; see `Field`, and `Isosurface` for the arguments.
 
@@ -66,6 +81,14 @@ class FunctionOnLattice(Field):
     def lattice(self, theta: Mapping[str, Tree]) -> Lattice:
         """The lattice."""
         return self._lattice
+
+    def resampled(self, theta: Mapping[str, Tree]) -> Iterator[Resampled]:
+        """The function on coarser lattices, and on one that is finer."""
+        for factor in (1 / 4, 1 / 2, 2):
+            shape = tuple(max(2, round(factor * (n - 1)) + 1) for n in self._lattice.shape)
+            other = copy.copy(self)
+            other._lattice = self._lattice.of_shape(shape)
+            yield Resampled(shape, other, None)
 
     def at(self, theta: Mapping[str, Tree], numbers: Array) -> Array:
         """The level (M,) at lattice points by number (M,) int32."""

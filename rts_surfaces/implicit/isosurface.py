@@ -6,6 +6,7 @@ are differentiated: nothing knows of the triangles, so that the topology may cha
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -18,7 +19,7 @@ from rts.arrays import from_numbers, is_finite, unit
 from rts.engines import engine_of, namespace, stopped, value_of
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.interfaces import Part, RaySurface, TriangleSurface
+from rts.interfaces import Part, Rate, RaySurface, TriangleSurface
 from rts.operations.gradient import gradient
 from rts.records import ArraySpec, Proxy, RayHits, Rays, Samples
 from rts.sampling.cache import fingerprint
@@ -161,6 +162,15 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         values = np.hypot(np.hypot(x - 0.03, z + 0.02) - 0.9, y - 0.01) - 0.4
         surface = cls(((-1.5, -0.7, -1.5), (1.5, 0.7, 1.5)))
         return Part(surface, {"values": values.astype(np.float32)}, "normals")
+
+    def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
+        """Coarser lattices, and of functions a finer one."""
+        count, found = self.field.lattice(theta).count, []
+        for shape, field, change in self.field.resampled(theta):
+            other = copy.copy(self)
+            other.field, other._usual = field, {}
+            found.append(Rate(f"shape={shape}", float(np.prod(shape)) / count, other, change))
+        return found
 
     # ----------------------------------------------------------------------------------- triangles and samples
 

@@ -44,6 +44,11 @@ class Lattice:
         self.shape, self.low, self.step = shape, np.array(low), np.array(step)
         return self
 
+    def of_shape(self, shape: tuple[int, ...]) -> Lattice:
+        """A lattice of another shape between its first and its last point."""
+        extent = self.step * (np.array(self.shape) - 1)
+        return Lattice((self.low, self.low + extent), shape)
+
     @property
     def fixed(self) -> tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]:
         """Shape, first point and step, as numbers of Python."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 from rts.arrays import shape_of
@@ -11,7 +12,7 @@ from rts.records import ArraySpec, Samples
 from rts.trees import Array, Tree
 from rts_surfaces.entries import check_entry
 from rts_surfaces.implicit.field import ScalarField
-from rts_surfaces.implicit.function_on_lattice import Looked
+from rts_surfaces.implicit.function_on_lattice import Looked, Resampled
 from rts_surfaces.implicit.interpolation import differences, interpolated
 from rts_surfaces.implicit.lattice import Lattice, check_shape
 
@@ -55,6 +56,14 @@ class LatticeField(ScalarField):
         """The lattice of θ's values."""
         return Lattice(self.bounds, shape_of(theta["values"]))
 
+    def resampled(self, theta: Mapping[str, Tree]) -> Iterator[Resampled]:
+        """Every fourth value along each axis, and every second, where they begin and end with the lattice."""
+        for stride in (4, 2):
+            shape = tuple((n - 1) // stride + 1 for n in shape_of(theta["values"]))
+            if min(shape) >= 2 and all((n - 1) % stride == 0 for n in shape_of(theta["values"])):
+                field = LatticeField(self.bounds, self.isovalue, self.sign)
+                yield Resampled(shape, field, partial(_every, stride))
+
     def look(self, theta: Mapping[str, Tree], closed: bool) -> Looked:
         """The values."""
         return Looked({"values": theta["values"]}, 0)
@@ -93,3 +102,8 @@ class LatticeField(ScalarField):
     def slope(self, theta: Mapping[str, Tree], points: Array) -> Array:
         """The gradient (M, 3) of the level: central differences at lattice points, interpolated as the values are."""
         return self.sign * differences(theta["values"], points, self.lattice(theta))
+
+
+def _every(stride: int, theta: Mapping[str, Tree]) -> dict[str, Tree]:
+    """θ with some of its values."""
+    return {**theta, "values": theta["values"][::stride, ::stride, ::stride]}

@@ -1,0 +1,50 @@
+"""How far parameters are moved by finite differences: until something has moved by a pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from rts.engines import Engine, namespace
+from rts.interfaces import Splatter
+from rts.records import Splats
+from rts.trees import Array, Tree
+
+STEP_PIXELS = 1.0
+"""How far a step moves what moves fastest in the image."""
+STEP_COLOR = 0.05
+"""How far a step changes the colour that changes fastest, where nothing moves."""
+
+
+class _Probe(Splatter):
+    """A splatter that shows where samples are on the image, or their colour."""
+
+    def __init__(self, color: bool):
+        self.color = color
+
+    def image(self, splats: Splats) -> Array:
+        positions, rgba, row = splats.positions, splats.rgba, splats.row
+        xp = namespace(positions, rgba, row)
+        values = rgba if self.color else xp.concat([positions[:, :2]] * 2, axis=1)
+        index = xp.reshape(xp.where(row[0] >= 0, row[0], 0), (-1,))
+        shown = xp.reshape(xp.take(values, index, axis=0), (*row.shape[1:], 4))
+        return xp.where((row[0] >= 0)[..., None], shown, 0.0)
+
+
+def pixel_step(engine: Engine, image: Callable[..., Array], parameters: Tree, direction: Tree) -> float:
+    """A step along a direction that moves the image by a pixel or, where nothing moves, changes its colour.
+
+    Args:
+        engine: of the parameters.
+        image: parameters and options of `rts.render` → (H, W, 4).
+        parameters: where derivatives are looked at.
+        direction: of their structure.
+    """
+    for color, wanted in ((False, STEP_PIXELS), (True, STEP_COLOR)):
+        probe = partial(image, splatter=_Probe(color), supersample=1, background=None)
+        speed = np.abs(engine.to_numpy(engine.jvp(probe, parameters, direction)[1])).max(initial=0.0)
+        if speed > 1e-6:
+            return float(wanted / speed)
+    return 1e-2
