@@ -7,13 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
 import rts
-from benchmarks.accuracy import other_renderers, scenes
+from benchmarks.accuracy import scenes
+from rts.diagnostics.comparison.peers import Peer, peers
+from rts.diagnostics.comparison.scene import Scene
 
 CASES = ("A", "B", "C")
 """The scenes that peers render too, and that times are taken of."""
@@ -84,24 +87,30 @@ def splatters(scene: scenes.Scene) -> list[Method]:
     return found
 
 
-def deodr(scene: scenes.Scene) -> Method:
-    renderer = other_renderers.Deodr(scene)
-    return Method("DEODR", lambda seed: renderer.derivative(), renderer.gradient)
+def others(scene: scenes.Scene, spp: list[int]) -> tuple[list[Method], list[str]]:
+    """DEODR and Mitsuba with each number of samples a pixel, and why they are left out where they are.
+
+    See `rts.diagnostics.comparison.peers`.
+    """
+    t = {"t": np.zeros(())}
+    given = Scene(scene.name, lambda t: (scene.at(t["t"]), scene.camera), t, {MOTION: {"t": np.ones(())}}, scene.size)
+    found, left_out = peers(given, spp)
+    return [_method(peer) for peer in found], left_out
 
 
-def mitsuba(scene: scenes.Scene, spp: list[int]) -> list[Method]:
-    """Mitsuba with each number of samples a pixel."""
-    renderer = other_renderers.Mitsuba(scene)
-    return [
-        Method(
-            f"Mitsuba, {n} spp",
-            lambda seed, n=n: renderer.derivative(n, seed),
-            lambda weights, n=n: renderer.gradient(weights, n, seed=0),
-            # Its noise has heavy tails, and many samples take long.
-            seeds=4 if n <= 64 else 2,
-        )
-        for n in spp
-    ]
+MOTION = "motion"
+"""The only mode of a scene here."""
+
+
+def _method(peer: Peer) -> Method:
+    spp = peer.settings.get("spp")
+    return Method(
+        peer.name if spp is None else f"{peer.name}, {spp} spp",
+        partial(peer.derivative, MOTION),
+        lambda weights: peer.gradient(MOTION, weights)(),
+        # Mitsuba's noise has heavy tails, and many samples take long.
+        seeds=1 if spp is None else 4 if spp <= 64 else 2,
+    )
 
 
 def turned_over(scene: scenes.Scene) -> scenes.Scene | None:

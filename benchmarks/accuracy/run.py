@@ -48,17 +48,6 @@ def references(scene: scenes.Scene, folder: Path) -> References:
     return References(truth(scene, folder), closed.truth() if closed else truth(scene, folder, 0.25))
 
 
-def peers_of(scene: scenes.Scene, spp: list[int], skipped: set[str]) -> list[Method]:
-    """DEODR and Mitsuba where they are installed; why not goes to `skipped`."""
-    found: list[Method] = []
-    for name, make in (("DEODR", lambda: [methods.deodr(scene)]), ("Mitsuba", lambda: methods.mitsuba(scene, spp))):
-        try:
-            found += make()
-        except ImportError as error:
-            skipped.add(f"{name} is left out: {error}")
-    return found
-
-
 def score(scene: str, method: Method, against: References) -> tuple[dict, np.ndarray]:
     """A row of the results, the mean of its seeds' scores, and the derivative image of the first seed."""
     images = [method.derivative(seed) for seed in range(method.seeds)]
@@ -141,7 +130,10 @@ class Plan(NamedTuple):
 def plans(args: argparse.Namespace, skipped: set[str]) -> list[Plan]:
     found = []
     for scene, against in variants(args.scenes, args.truth):
-        others = peers_of(scene, args.spp, skipped) if scene.name in CASES and not args.no_peers else []
+        others: list[Method] = []
+        if scene.name in CASES and not args.no_peers:
+            others, left_out = methods.others(scene, args.spp)
+            skipped.update(left_out)
         found.append(Plan(scene, against, methods.splatters(scene), others))
     return found
 
@@ -180,7 +172,7 @@ def main() -> None:
         progress.update(task, total=sum(p.steps for p in plan))
         say, done = partial(progress.update, task), partial(progress.advance, task)
         results, images = measure(plan, lambda text: say(description=text), done)
-    print(*sorted(skipped), sep="\n")
+    print(*(f"left out: {reason}" for reason in sorted(skipped)), sep="\n")
     against = {p.scene.name: p.against for p in plan}
     (args.output / "accuracy.json").write_text(json.dumps(results, indent=1))
     (args.output / "accuracy.md").write_text(tables.document(results))

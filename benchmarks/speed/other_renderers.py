@@ -15,9 +15,9 @@ from collections.abc import Callable
 import numpy as np
 
 from benchmarks.camera import DISTANCE, FOV
-from benchmarks.mitsuba_scenes import emitter, integrator, mitsuba, sensor
 from benchmarks.speed.pose_iteration import Task
 from benchmarks.timing import RATE, START
+from rts.diagnostics.comparison.mitsuba_peer import emitter, integrator, mitsuba, sensor
 
 SIGMA = 1.0
 """Width of DEODR's anti-aliased edges, pixels."""
@@ -202,7 +202,8 @@ class Mitsuba(_Fit):
         mi = mitsuba()
         with tempfile.TemporaryDirectory() as folder:
             mesh = emitter(task.vertices, task.faces, f"{folder}/mesh.ply")
-            self.scene = mi.load_dict({"type": "scene", "sensor": sensor(task.size, "luminance"), "mesh": mesh})
+            camera = sensor(task.size, FOV, (0.5, 10.0), DISTANCE, "luminance")
+            self.scene = mi.load_dict({"type": "scene", "sensor": camera, "mesh": mesh})
         self.integrator = integrator()
         self.parameters = mi.traverse(self.scene)
         self.vertices = mi.Point3f(task.vertices.T.astype(np.float32))

@@ -1,0 +1,48 @@
+"""Other differentiable renderers on a scene: DEODR and Mitsuba. They come with the extra `bench`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rts.diagnostics.comparison.deodr_peer import Deodr
+from rts.diagnostics.comparison.mitsuba_peer import Mitsuba, MitsubaScene
+from rts.diagnostics.comparison.scene import Scene
+from rts.diagnostics.comparison.seen import Peer, Seen, Unsuited, seen
+
+SPP = (1, 4, 16, 64)
+"""Samples a pixel of Mitsuba."""
+
+
+def peers(scene: Scene, spp: Sequence[int] = SPP) -> tuple[list[Peer], list[str]]:
+    """The renderers that can render a scene, and why others cannot.
+
+    Args:
+        scene: of unlit or white parts without textures, and a perspective camera.
+        spp: samples a pixel; Mitsuba is there once for each.
+
+    Returns:
+        The renderers, and a line for each that is left out.
+    """
+    try:
+        given = seen(scene)
+    except Unsuited as reason:
+        return [], [f"DEODR and Mitsuba: {reason}"]
+    found: list[Peer] = []
+    left_out = []
+    for name, make in (("DEODR", _deodr), ("Mitsuba", _mitsuba)):
+        try:
+            found += make(given, spp)
+        except ModuleNotFoundError as error:
+            left_out.append(f"{name}: no module {error.name!r}; pip install 'rasterize-then-splat[bench]'")
+        except (ImportError, Unsuited) as error:
+            left_out.append(f"{name}: {error}")
+    return found, left_out
+
+
+def _deodr(given: Seen, spp: Sequence[int]) -> list[Peer]:
+    return [Deodr(given)]
+
+
+def _mitsuba(given: Seen, spp: Sequence[int]) -> list[Peer]:
+    scene = MitsubaScene(given)
+    return [Mitsuba(scene, n) for n in spp]
