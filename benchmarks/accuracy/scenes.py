@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 
 import rts
-from benchmarks.accuracy.shapes import QUAD, box, grid, icosphere, motion, on_screen, pixel, rectangle, unlit
 from benchmarks.camera import DISTANCE, camera
-from benchmarks.meshes import DATA, mesh, normalised, rotation_xy
+from benchmarks.meshes import DATA, mesh, rotation_xy
+from rts.diagnostics.comparison import shapes
+from rts.diagnostics.comparison.shapes import CARD_DEPTH, QUAD, box, grid, icosphere, on_screen, pixel, rectangle, unlit
 from rts.engines import constants, engine_of, exemplar
 
 SIZE = 256
-CARD_DEPTH = 4.3
-"""Camera depth of what lies behind the object in the middle."""
 
 
 @dataclass(frozen=True)
@@ -60,22 +59,16 @@ class Scene:
         return parts
 
 
+def motion(depth: float, size: int, sign: float = 1.0) -> np.ndarray:
+    """Derivative (4, 4) of a motion along +x by one pixel at a depth."""
+    matrix = np.zeros((4, 4))
+    matrix[0, 3] = sign * pixel(depth, size)
+    return matrix
+
+
 @cache
 def _bunny_and_square() -> tuple[rts.Part, rts.Part]:
-    """The green bunny and the red square behind it, both unlit."""
-    surface = rts.plugin("rts.surfaces", "mesh")
-    vertices, faces = mesh("bunny")
-    bunny = surface(faces)
-    green = 0.25 + 0.7 * np.maximum(0, bunny.vertex_normals(vertices) @ [0.4, 0.5, 0.77])
-    colors = np.stack([np.zeros_like(green), green, np.zeros_like(green)], axis=-1)
-    c, s = np.cos(0.03), np.sin(0.03)
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * 0.62 @ np.array([[c, s], [-s, c]])
-    square = np.concatenate([corners + [0.35, 0.15], np.full((4, 1), -1.1)], axis=1)
-    red = np.tile([0.8, 0.1, 0.1], (4, 1))
-    return (
-        rts.Part(bunny, {"vertices": vertices, "colors": colors}, "unlit"),
-        rts.Part(surface(QUAD), {"vertices": square, "colors": red}, "unlit"),
-    )
+    return shapes.bunny_and_square(*mesh("bunny"))
 
 
 def bunny_over_black(size: int, cull: str = "back") -> Scene:
@@ -140,17 +133,10 @@ def box_over_card(size: int, moves: str = "box") -> Scene:
 
 
 def turned_box(size: int) -> Scene:
-    vertices, faces = box([-0.45, -0.35, -0.4], [0.45, 0.35, 0.4])
-    hues = np.array(
-        [[0.9, 0.3, 0.1], [0.2, 0.7, 0.3], [0.8, 0.8, 0.2], [0.5, 0.2, 0.7], [0.1, 0.4, 0.9], [0.3, 0.8, 0.8]]
-    )
-    back, order = grid(16, 16)
-    card = np.column_stack([1.1 * back, np.full(len(back), DISTANCE - CARD_DEPTH)])
-    waves = 0.5 + 0.3 * np.column_stack([np.sin(5 * back[:, 0]), np.sin(4 * back[:, 1]), np.cos(3 * back.sum(1))])
     return Scene(
         "turned box",
         (size, size),
-        (unlit(vertices @ rotation_xy(0.5, 0.6).T, faces, np.repeat(hues, 4, axis=0)), unlit(card, order, waves)),
+        shapes.turned_box(),
         (motion(DISTANCE, size), None),
         (2, 4),
         "a closed, unculled box with a colour a face moves before a card with a pattern",
@@ -158,23 +144,12 @@ def turned_box(size: int) -> Scene:
 
 
 def cards(size: int, count: int, alternating: bool = False) -> Scene:
-    """Open cards one behind the other, tilted and turned at random (fixed seed), the first the nearest."""
-    random = np.random.default_rng(count)
-    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    parts, directions = [], []
-    for i in range(count):
-        depth = 2.6 + 2.0 * i / (count - 1)
-        turn, tilt_x, tilt_y = random.uniform(-np.pi, np.pi), *random.uniform(-0.12, 0.12, 2)
-        c, s = np.cos(turn), np.sin(turn)
-        rotation = rotation_xy(tilt_x, tilt_y) @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-        extent = np.append(random.uniform(0.15, 0.35, 2) + 0.3 * i / count, 1) * depth / DISTANCE
-        place = np.append(random.uniform(-0.35, 0.35, 2) * depth / DISTANCE, DISTANCE - depth)
-        color = 0.55 + 0.4 * np.cos(2.4 * i + np.array([0, 2.1, 4.2]))
-        parts.append(unlit(corners * extent @ rotation.T + place, QUAD, color))
-        if alternating:
-            directions.append(motion(depth, size, (-1) ** i))
-        else:
-            directions.append(motion(depth, size) if i == count // 2 else None)
+    """Open cards: one in the middle moves, or neighbours in depth in opposite directions."""
+    parts, depths = shapes.cards(count)
+    if alternating:
+        directions = [motion(depth, size, (-1) ** i) for i, depth in enumerate(depths)]
+    else:
+        directions = [motion(depth, size) if i == count // 2 else None for i, depth in enumerate(depths)]
     return Scene(
         f"{count} cards" + (", alternating" if alternating else ""),
         (size, size),
@@ -210,23 +185,10 @@ def sheet(size: int) -> Scene:
 
 
 def wires(size: int, width: float) -> Scene:
-    """Seven thin quads from nearly upright to nearly level."""
-    vertices, faces = [], []
-    for i, slant in enumerate(np.radians([4, -9, 17, -31, 44, 68, -83])):
-        along, across = np.array([np.sin(slant), np.cos(slant)]), np.array([np.cos(slant), -np.sin(slant)])
-        center = size * np.array([0.5 + 0.085 * (i - 3), 0.5 + 0.05 * (i % 3 - 1)]) + 0.3
-        ends = [
-            center + a * 0.22 * size * along + b * width / 2 * across for a, b in ((-1, -1), (-1, 1), (1, 1), (1, -1))
-        ]
-        vertices.append(on_screen(np.array(ends), DISTANCE + 0.02 * i, size))
-        faces += [[4 * i + j for j in f] for f in QUAD]
-    colors = np.repeat(
-        np.array([[1, 1, 1], [1, 0.6, 0.2], [0.3, 0.8, 1], [0.9, 0.9, 0.2]])[np.arange(7) % 4], 4, axis=0
-    )
     return Scene(
         f"wires {width:g} px",
         (size, size),
-        (unlit(np.concatenate(vertices), faces, colors),),
+        (shapes.wires(size, [width] * 7),),
         (motion(DISTANCE, size),),
         (1, 2),
         f"seven slanted wires, {width:g} pixels wide, move over black",
@@ -234,14 +196,10 @@ def wires(size: int, width: float) -> Scene:
 
 
 def spheres(size: int) -> Scene:
-    vertices, faces = icosphere(5)
-    shade = 0.35 + 0.6 * np.maximum(0, vertices @ [0.4, 0.5, 0.77])[:, None]
-    still = unlit(0.6 * vertices + [-0.28, 0.05, -0.05], faces, shade * [1.0, 0.5, 0.15])
-    moving = unlit(0.5 * vertices + [0.32, -0.05, 0.1], faces, shade * [0.2, 0.6, 1.0])
     return Scene(
         "spheres",
         (size, size),
-        (still, moving),
+        shapes.crossing_spheres(),
         (None, motion(DISTANCE - 0.1, size)),
         (2, 4),
         "two spheres that pass through one another, unculled; the nearer moves",
@@ -250,13 +208,7 @@ def spheres(size: int) -> Scene:
 
 @cache
 def _spot() -> rts.Part:
-    (part,) = rts.load(DATA / "meshes" / "spot" / "spot_triangulated.obj")
-    if "texture" not in part.theta:
-        image = rts.load_image(DATA / "meshes" / "spot" / "spot_texture.png")
-        part = part.replace(theta={**part.theta, "texture": image[..., :3]})
-    vertices = normalised(part.theta["vertices"].astype(float)) @ rotation_xy(0.2, 0.4 + np.pi).T
-    theta = {**part.theta, "vertices": vertices}
-    return part.replace(theta={k: theta[k] for k in ("vertices", "uv", "texture")}, shader="unlit", cull="back")
+    return shapes.textured_spot(DATA / "meshes" / "spot")
 
 
 def spot(size: int, turns: bool = False) -> Scene:

@@ -62,7 +62,8 @@ def fingerprint(scene: scenes.Scene) -> str:
     """Hash of every array of the scene and its camera."""
     digest = hashlib.sha256(repr([(p.shader, p.cull, repr(p.surface)) for p in scene.rest]).encode())
     tables = [t for p in scene.rest for t in (p.surface.faces, *(p.theta[k] for k in sorted(p.theta)))]
-    for array in (*tables, *(np.zeros(0) if d is None else d for d in scene.directions), *scene.camera):
+    directions = [np.zeros(0) if d is None else d for d in scene.directions]
+    for array in (*tables, *directions, *scene.camera.for_size(scene.size)):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()[:16]
 
