@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.arguments import quoted
 from rts.camera import Camera
-from rts.engines import Engine, constants, engine_of, exemplar
+from rts.engines import Engine, constants, engine_of, exemplar, is_constant
 from rts.errors import InputError
-from rts.interfaces import Part
+from rts.interfaces import Part, TriangleSurface, as_surface
+from rts.registry import instance
+from rts.shading import Unlit
 from rts.trees import Array, Tree, collected, leaves, map_leaves
 
 SceneFunction = Callable[[Tree], tuple[Part | Sequence[Part], Camera]]
@@ -44,13 +49,17 @@ class Scene:
     exact: SceneFunction | None = None
     separate: bool = False
 
+    def with_modes(self, modes: Sequence[str]) -> Scene:
+        """The scene with some of its modes."""
+        return replace(self, directions={mode: self.directions[mode] for mode in modes})
+
     def moved(self, mode: str, by: Any = 0.0, engine: Engine | None = None) -> Tree:
         """The parameters, moved along the direction of a mode.
 
         Args:
             mode: a key of `directions`.
             by: how far; a number, or a scalar of the engine.
-            engine: the engine of the parameters that move, and where the scene is not `separate` of all; None for NumPy.
+            engine: that of the parameters that move, and of all where the scene is not `separate`; None for NumPy.
         """
         direction = iter(leaves(self.directions[mode]))
 
@@ -82,8 +91,9 @@ def moving(
 
     - translation: to the right of the image;
     - rotation: about the upright axis of the camera, through the middle of what moves;
-    - shape: what the surface reads swells, unevenly, about its middle; what are no points changes by one number;
-    - color: what the surface does not read changes, each channel in another way;
+    - shape: the points that the surface is made of swell, unevenly, about their middle; what it reads and is no points,
+      such as radii or values on a lattice, changes by one number;
+    - color: the base colour of the parts, which `rts.shading` describes, changes, each channel in another way;
     - camera: it moves ahead.
 
     Args:
@@ -94,53 +104,97 @@ def moving(
         moves: the indices of the parts that translations, rotations and shapes move; None for all.
         modes: some of the ways. Those that change nothing are left out.
         note: what is hard about the scene.
-        exact: the same parts as exact surfaces, with the same transforms; `shape` is left out then unless their θ has
-            the entries that change.
+        exact: the same parts as exact surfaces, with the same transforms. Modes that change entries of θ which these
+            lack, or have in another shape, are left out.
+
+    Raises:
+        InputError: another number of exact parts, or modes and indices that there are not.
     """
     parts = [parts] if isinstance(parts, Part) else list(parts)
-    moved = range(len(parts)) if moves is None else moves
+    true = parts if exact is None else [exact] if isinstance(exact, Part) else list(exact)
+    moved = tuple(range(len(parts)) if moves is None else moves)
+    _check(parts, true, moved, modes)
     axes = np.linalg.inv(np.asarray(camera.view, np.float64))
-    center = _middle([parts[i] for i in moved])
-    generators = {"translation": _translation(axes[:3, 0]), "rotation": _rotation(axes[:3, 1], center)}
-    changes = {
-        "shape": [_swelling(p) if i in moved else {} for i, p in enumerate(parts)],
-        "color": [_coloring(p) for p in parts],
-    }
-
-    def function(which: Sequence[Part]) -> SceneFunction:
-        def at(parameters: Mapping[str, Any]) -> tuple[list[Part], Camera]:
-            live = {k: t for k, t in parameters.items() if not (isinstance(t, (float, np.ndarray)) and t == 0)}
-            seen = camera
-            if "camera" in live:
-                ahead = np.zeros((4, 4))
-                ahead[2, 3] = 1.0  # In the camera's space what is seen comes nearer.
-                seen = camera.replace(view=_plus(np.asarray(camera.view, np.float64), live["camera"], ahead))
-            found = []
-            for index, part in enumerate(which):
-                theta, transform = dict(part.theta), part.transform
-                for mode, of_parts in changes.items():
-                    if mode in live:
-                        for entry, direction in of_parts[index].items():
-                            theta[entry] = _plus(theta[entry], live[mode], direction)
-                if index in moved:
-                    for mode, generator in generators.items():
-                        if mode in live:
-                            start = np.eye(4) if part.transform is None else np.asarray(part.transform)
-                            transform = _plus(start if transform is None else transform, live[mode], generator @ start)
-                found.append(part.replace(theta=theta, transform=transform))
-            return found, seen
-
-        return at
-
-    kept = [m for m in modes if m not in changes or any(changes[m])]
+    ways = _Ways(
+        camera,
+        moved,
+        {
+            "translation": _translation(axes[:3, 0]),
+            "rotation": _rotation(axes[:3, 1], _middle([parts[i] for i in moved])),
+        },
+        {
+            "shape": [_swelling(p) if i in moved else {} for i, p in enumerate(parts)],
+            "color": [_coloring(p) for p in parts],
+        },
+    )
+    kept = [m for m in modes if ways.changes_something(m, parts, true)]
     parameters = {mode: np.zeros((), np.float32) for mode in kept}
     directions = {mode: {m: np.ones(()) if m == mode else np.zeros(()) for m in kept} for mode in kept}
-    true = None if exact is None else function([exact] if isinstance(exact, Part) else list(exact))
-    return Scene(name, function(parts), parameters, directions, size, note, true, separate=True)
+    scene = Scene(name, partial(ways.at, parts), parameters, directions, size, note, separate=True)
+    return scene if exact is None else replace(scene, exact=partial(ways.at, true))
+
+
+def _check(parts: Sequence[Part], exact: Sequence[Part], moved: Sequence[int], modes: Sequence[str]) -> None:
+    if len(exact) != len(parts):
+        raise InputError(f"exact has {len(exact)} parts; expected as many as `parts`, {len(parts)}")
+    if not moved or not set(moved) <= set(range(len(parts))):
+        raise InputError(f"moves is {quoted(moved)}; expected indices of the {len(parts)} parts, from 0 on")
+    if not set(modes) <= set(MODES):
+        raise InputError(f"modes is {quoted(modes)}; expected some of {', '.join(MODES)}")
+
+
+class _Ways(NamedTuple):
+    """How parts and a camera change with the parameter of each mode.
+
+    Attributes:
+        camera: at rest.
+        moved: the indices of the parts that generators move.
+        generators: mode → (4, 4), the derivative of the transform that moves them.
+        changes: mode → for each part the directions of entries of θ; those that θ lacks begin at ones.
+    """
+
+    camera: Camera
+    moved: Sequence[int]
+    generators: Mapping[str, np.ndarray]
+    changes: Mapping[str, Sequence[Mapping[str, np.ndarray]]]
+
+    def at(self, parts: Sequence[Part], parameters: Mapping[str, Any]) -> tuple[list[Part], Camera]:
+        """Parts and the camera, for the parameters of some modes."""
+        live = {k: t for k, t in parameters.items() if not (is_constant(t) and np.all(np.asarray(t) == 0))}
+        camera = self.camera
+        if "camera" in live:
+            ahead = np.zeros((4, 4))
+            ahead[2, 3] = 1.0  # In the camera's space what is seen comes nearer.
+            camera = camera.replace(view=_plus(np.asarray(camera.view, np.float64), live["camera"], ahead))
+        return [self._part(index, part, live) for index, part in enumerate(parts)], camera
+
+    def _part(self, index: int, part: Part, live: Mapping[str, Any]) -> Part:
+        theta, transform = dict(part.theta), part.transform
+        for mode in (m for m in self.changes if m in live):
+            for entry, direction in self.changes[mode][index].items():
+                start = theta[entry] if entry in theta else np.ones(direction.shape)
+                theta[entry] = _plus(start, live[mode], direction)
+        for mode in (m for m in self.generators if m in live and index in self.moved):
+            start = np.eye(4) if part.transform is None else np.asarray(part.transform)
+            transform = _plus(start if transform is None else transform, live[mode], self.generators[mode] @ start)
+        return part.replace(theta=theta, transform=transform)
+
+    def changes_something(self, mode: str, parts: Sequence[Part], exact: Sequence[Part]) -> bool:
+        """Whether a mode has an effect, and the same one on parts and on exact ones."""
+        if mode == "camera":  # What is far is as large as what is near where there is no perspective.
+            return bool(np.any(np.asarray(self.camera.projection)[3, :3]))
+        if mode not in self.changes:
+            return True
+        entries = [(i, entry) for i, changed in enumerate(self.changes[mode]) for entry in changed]
+        shapes = [
+            [np.shape(which[i].theta[entry]) if entry in which[i].theta else None for i, entry in entries]
+            for which in (parts, exact)
+        ]
+        return bool(entries) and shapes[0] == shapes[1]
 
 
 def _plus(start: Any, by: Any, direction: np.ndarray) -> Any:
-    """start + by · direction, in the engine of either."""
+    """Start + by · direction, in the engine of either."""
     engine, like = engine_of(start, by), exemplar(start, by)
     start, by, direction = constants((start, by, direction), engine, like)
     return start + by * direction
@@ -161,69 +215,89 @@ def _rotation(about: np.ndarray, center: np.ndarray) -> np.ndarray:
     return generator
 
 
-def _points(part: Part) -> np.ndarray | None:
-    """What a surface is made of, (M, 3), world space: the first entry that it reads and that holds points."""
-    for name in part.surface.reads(part.theta):
-        array = part.theta[name]
-        if isinstance(array, np.ndarray) and array.ndim >= 2 and array.shape[-1] == 3:
-            points = np.asarray(array, np.float64).reshape(-1, 3)
-            if part.transform is None:
-                return points
-            matrix = np.asarray(part.transform, np.float64)
-            return points @ matrix[:3, :3].T + matrix[:3, 3]
-    return None
+# ------------------------------------------------------------------------------------------------ where parts are
+
+CUTS = 4
+"""How often patches are cut along each side, to see where they are."""
 
 
 def _middle(parts: Sequence[Part]) -> np.ndarray:
-    """The middle of the box around parts, (3,); where they stand, for those that hold no points."""
+    """The middle (3,) of the box around parts, world space."""
     found = []
     for part in parts:
         points = _points(part)
-        if points is None:
-            points = np.zeros((1, 3)) if part.transform is None else np.asarray(part.transform)[None, :3, 3]
+        if part.transform is not None:
+            matrix = np.asarray(part.transform, np.float64)
+            points = points @ matrix[:3, :3].T + matrix[:3, 3]
         found.append(points)
     everything = np.concatenate(found)
     return (everything.min(axis=0) + everything.max(axis=0)) / 2
 
 
+def _points(part: Part) -> np.ndarray:
+    """Points (M, 3) of a surface, local space; where it has no triangles, the middle that it says it has, or 0."""
+    surface = as_surface(part.surface)
+    if isinstance(surface, TriangleSurface):
+        with contextlib.suppress(InputError):  # Of a surface whose triangles depend on the view.
+            vertices, faces = surface.tessellate(part.theta, CUTS)
+            if len(faces):
+                return np.asarray(vertices, np.float64)[np.unique(faces)]
+    return np.reshape(np.asarray(getattr(surface, "center", np.zeros(3)), np.float64), (1, 3))
+
+
+# ------------------------------------------------------------------------------------- how shapes and colours change
+
 UNEVEN = np.array([2.0, 3.0, 2.5])
 """How often a swelling goes up and down across an object, in radians from its middle to its end, along each axis."""
 
+NO_SHAPE = ("normals", "colors", "uv", "color", "texture", "light", "specular", "shininess", "depth_range")
+"""Attributes of surfaces, and what shaders read."""
+
+TINT = np.array([1.0, -0.5, 0.25, 0.0])
+"""By how much of themselves red, green, blue and alpha change."""
+
 
 def _swelling(part: Part) -> dict[str, np.ndarray]:
-    """The directions in which what the surface reads is moved, by entry."""
+    """The directions in which what the surface is made of changes, by entry."""
+    reads = as_surface(part.surface).reads(part.theta)
+    # Beside its vertices a mesh may have attributes of any name.
+    names = ("vertices",) if "vertices" in reads else [name for name in reads if name not in NO_SHAPE]
     found = {}
-    for name in part.surface.reads(part.theta):
-        array = part.theta[name]
-        if not (isinstance(array, np.ndarray) and np.issubdtype(array.dtype, np.floating)) or name in ATTRIBUTES:
+    for name in names:
+        if not isinstance(part.theta.get(name), (np.ndarray, np.floating)):
             continue
-        if array.ndim >= 2 and array.shape[-1] in (2, 3):
-            middle = (array.min(axis=tuple(range(array.ndim - 1))) + array.max(axis=tuple(range(array.ndim - 1)))) / 2
-            away = array - middle
-            radius = float(np.linalg.norm(away, axis=-1).max()) or 1.0
-            wave = np.sin(away / radius @ UNEVEN[: array.shape[-1]])
-            found[name] = away * (1 + 0.5 * wave)[..., None]
-        else:
-            found[name] = np.ones(array.shape)
+        array = np.asarray(part.theta[name])
+        if not np.issubdtype(array.dtype, np.floating):
+            continue
+        direction = _away(array) if array.ndim >= 2 and array.shape[-1] in (2, 3) else np.ones(array.shape)
+        if direction.any():
+            found[name] = direction
     return found
 
 
-ATTRIBUTES = ("normals", "colors", "uv")
-"""What meshes interpolate beside their positions: of these only colours are changed, and by `color`."""
-NO_COLORS = ("normals", "uv", "shininess", "exponent", "depth_range")
-"""What shaders read that is no colour."""
+def _away(points: np.ndarray) -> np.ndarray:
+    """How points (..., 2 or 3) go away from their middle, some faster than others."""
+    rows = np.asarray(points, np.float64).reshape(-1, points.shape[-1])
+    away = rows - (rows.min(axis=0) + rows.max(axis=0)) / 2
+    radius = float(np.linalg.norm(away, axis=1).max(initial=0.0)) or 1.0
+    wave = np.sin(away / radius @ UNEVEN[: rows.shape[1]])
+    return (away * (1 + 0.5 * wave)[:, None]).reshape(points.shape)
 
 
 def _coloring(part: Part) -> dict[str, np.ndarray]:
-    """The directions in which the colours of a part change, by entry."""
-    reads = set(part.surface.reads(part.theta)) - {"colors"}
-    found = {}
-    for name, value in part.theta.items():
-        if name in reads or name in NO_COLORS or not isinstance(value, np.ndarray) or value.shape[-1:] != (3,):
-            continue
-        if np.issubdtype(value.dtype, np.floating) and "direction" not in name:
-            found[name] = value * np.array([1.0, -0.5, 0.25])
-    return found
+    """The direction in which the base colour of a part changes, by the entry that it comes from."""
+    theta, reads = part.theta, as_surface(part.surface).reads(part.theta)
+    shader = instance("rts.shaders", part.shader)
+    wanted = getattr(shader, "reads", None)
+    if wanted is not None and not {"color", "uv"} & set(wanted):
+        return {}
+    sources = {"texture": "uv" in theta, "colors": "colors" in reads, "color": True}
+    for name, used in sources.items():
+        value = theta.get(name)
+        if used and isinstance(value, np.ndarray) and value.shape[-1:] in ((1,), (3,), (4,)):
+            direction = value * TINT[: value.shape[-1]]
+            return {name: direction} if direction.any() else {}
+    return {"color": TINT[:3]} if isinstance(shader, Unlit) else {}
 
 
 def check_directions(scene: Scene) -> None:
@@ -236,6 +310,8 @@ def check_directions(scene: Scene) -> None:
     for mode, direction in scene.directions.items():
         given = [tuple(np.shape(d)) for d in collected(direction)]
         if given != wanted:
-            raise InputError(f"the direction {mode!r} has arrays of shapes {given}; expected those of parameters, {wanted}")
+            raise InputError(
+                f"the direction {mode!r} has arrays of shapes {given}; expected those of parameters, {wanted}"
+            )
         if not any(np.any(np.asarray(d)) for d in collected(direction)):
             raise InputError(f"the direction {mode!r} is zero; expected a way in which parameters change")
