@@ -71,6 +71,16 @@ def test_an_edge_that_moves(peer_of):
     assert np.abs(found[:, :28]).max() < 1e-6 and np.abs(found[:, 36:]).max() < 1e-6
 
 
+def test_cards_that_touch(peer_of):
+    left, right = card(-4, -4, 0.013, 4), card(0.013, -4, 4, 4)
+    vertices = np.concatenate([p.theta["vertices"] for p in (left, right)])
+    faces = np.concatenate([left.surface.faces, right.surface.faces + 4])
+    colors = np.repeat([COLOR, COLOR[::-1] / 2], 4, axis=0)
+    found = peer_of(moving("cards", unlit(vertices, faces, colors), CAMERA, SIZE)).derivative("translation")
+    change = (COLOR - COLOR[::-1] / 2) * SIZE[0] * PIXELS
+    np.testing.assert_allclose(found[:, 10:54].sum(axis=(0, 1)), change, rtol=0.01, atol=0.03 * np.abs(change).max())
+
+
 CAMERAS = {
     "centred": CAMERA,
     "sheared": rts.Camera.from_opencv([[60, 6, 25], [0, 50, 30], [0, 0, 1]], np.diag([1, -1, -1]), (0, 0, DEPTH), SIZE),

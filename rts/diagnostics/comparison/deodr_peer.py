@@ -1,7 +1,7 @@
 """Derivatives by DEODR (de La Gorce, Paragios and Fleet 2011): anti-aliased edges drawn over a rasterized image.
 
-It differentiates in reverse mode only; a derivative image is here the central difference of its own float64 image over
-a step so small that no pixel changes the triangle it sees, which its reverse mode agrees with to five digits. It sees
+It differentiates in reverse mode only; a derivative image is here the difference of its own float64 images over a step
+so small that hardly a pixel changes the triangle it sees, which its reverse mode agrees with to five digits. It sees
 the fronts of triangles only.
 """
 
@@ -68,9 +68,11 @@ class Deodr(Peer):
         """See `Peer`."""
         move, change = self._velocity(mode)
         step = STEP / (self.seen.fastest(mode) or 1.0)
-        half = step / 2
-        ahead = self._render(self.vertices + half * move, self.colors + half * change)
-        return (ahead - self._render(self.vertices - half * move, self.colors - half * change)) / step
+        rest = self._render(self.vertices, self.colors)
+        ahead = self._render(self.vertices + step * move, self.colors + step * change) - rest
+        behind = rest - self._render(self.vertices - step * move, self.colors - step * change)
+        # Where depths tie, rounding decides what is seen: a jump, on one of both sides.
+        return np.where(np.abs(ahead) < np.abs(behind), ahead, behind) / step
 
     def gradient(self, mode: str, weights: np.ndarray | None = None) -> Callable[[], float]:
         """See `Peer`. DEODR computes the gradients of vertices and of colours in any mode."""
