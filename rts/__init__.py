@@ -7,6 +7,7 @@ differentiate only that.
 from rts.adapting import unwrapped
 from rts.camera import Camera
 from rts.diagnostics.gradients import check_gradient, gradient_image
+from rts.diagnostics.tune import Tuned, tune
 from rts.engines import Engine, engine_of, namespace
 from rts.errors import (
     AspectWarning,
@@ -18,6 +19,7 @@ from rts.errors import (
     PluginError,
     RtsError,
     RtsWarning,
+    ToleranceWarning,
 )
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
@@ -25,7 +27,18 @@ from rts.files.views import View, load_views
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.gbuffer import GBuffer
-from rts.interfaces import Evaluator, Part, RaySurface, Residuals, Sampler, Shader, Splatter, Surface, TriangleSurface
+from rts.interfaces import (
+    Evaluator,
+    Part,
+    Rate,
+    RaySurface,
+    Residuals,
+    Sampler,
+    Shader,
+    Splatter,
+    Surface,
+    TriangleSurface,
+)
 from rts.ndc import Ndc
 from rts.operations.combine import combine
 from rts.operations.gradient import gradient
@@ -64,6 +77,7 @@ __all__ = [
     "Proxy",
     "RayHits",
     "RaySurface",
+    "Rate",
     "Rays",
     "Residuals",
     "RtsError",
@@ -75,8 +89,10 @@ __all__ = [
     "Splats",
     "Splatter",
     "Surface",
+    "ToleranceWarning",
     "TriangleSampler",
     "TriangleSurface",
+    "Tuned",
     "View",
     "check_gradient",
     "combine",
@@ -100,6 +116,7 @@ __all__ = [
     "sample",
     "save_animation",
     "save_image",
+    "tune",
     "unwrapped",
     "volume_render",
 ]

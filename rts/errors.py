@@ -42,6 +42,10 @@ class EmptyImageWarning(RtsWarning):
     """An image in which nothing is seen."""
 
 
+class ToleranceWarning(RtsWarning):
+    """No setting is as accurate as was asked for."""
+
+
 class FileWarning(RtsWarning):
     """A file was read, but not all that it says could be followed."""
 

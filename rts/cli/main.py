@@ -1,4 +1,4 @@
-"""The command line: `rts plugins`, `rts render`, `rts fit-pose`, `rts export`, `rts demo`."""
+"""The command line: `rts plugins`, `render`, `fit-pose`, `export`, `compare`, `tune`, `demo`."""
 
 from __future__ import annotations
 
@@ -339,6 +339,94 @@ def export(
     parts = rts.load(model, surface=surface)
     vertices, faces = write_mesh(output, parts, tolerance * bounds_of(parts).radius)
     _say(escape(f"{vertices} vertices and {faces} triangles; wrote {output}"))
+
+
+Scene = Annotated[
+    str,
+    typer.Argument(
+        help="A model, a Python file (FILE.py or FILE.py:FUNCTION), or a built-in scene: see `rts compare list`.",
+        show_default=False,
+    ),
+]
+Modes = Annotated[
+    list[str] | None,
+    typer.Option("--mode", help="translation, rotation, shape, color or camera; may be repeated. All by default."),
+]
+SceneSize = Annotated[str | None, typer.Option("--size", help="Pixels: 256, or HEIGHTxWIDTH; the scene's own.")]
+
+
+@app.command(epilog="Example: rts compare bunny.obj --quick -o out/bunny && open out/bunny/bunny.html")
+def compare(
+    scene: Scene,
+    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("comparison"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="One mode, one engine, one sampler, at most 40 settings.")
+    ] = False,
+    modes: Modes = None,
+    size: SceneSize = None,
+    surface: Surface = "mesh",
+    samplers: Annotated[list[str] | None, typer.Option("--sampler", help="May be repeated. All by default.")] = None,
+    splatters: Annotated[list[str] | None, typer.Option("--splatter", help="May be repeated. All by default.")] = None,
+    engines: Annotated[list[str] | None, typer.Option("--engine", help="May be repeated. All by default.")] = None,
+    peers: Annotated[bool, typer.Option(help="DEODR and Mitsuba, where they are installed.")] = True,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Forget what earlier runs have measured.")] = False,
+) -> None:
+    """Chart the error of derivatives against the time of a render and gradient, over all settings and plugins.
+
+    Writes SCENE.json, SCENE.png and SCENE.html, which is interactive. A run that is interrupted goes on where it was.
+    """
+    from rts.cli.comparison import scene_list, summary
+    from rts.diagnostics import compare as measured
+
+    if scene == "list":
+        Console().print(scene_list())
+        return
+    wanted: dict[str, Any] = dict(modes=modes, samplers=samplers, splatters=splatters, engines=engines)
+    options = {name: value or None for name, value in wanted.items()}
+    shape = None if size is None else _size(size)
+    with _going_on():
+        found = measured(
+            scene, size=shape, peers=peers, quick=quick, surface=surface, output=output, fresh=fresh, **options
+        )
+    Console().print(summary(found))
+    for line in found.left_out:
+        _say(escape(f"left out: {line}"))
+    _say_written(found.files(output))
+    if len(found.files(output)) < 3:
+        _say("no charts, which need matplotlib and plotly: pip install 'rasterize-then-splat\\[plots]'")
+
+
+@app.command(epilog="Example: rts tune bunny.obj --tolerance 0.05 --mode translation --mode rotation")
+def tune(
+    scene: Scene,
+    tolerance: Annotated[float, typer.Option(help="The largest error of derivatives, a share of them.")] = 0.05,
+    budget: Annotated[float, typer.Option(help="Seconds of measuring; the truth does not count.")] = 60.0,
+    modes: Modes = None,
+    size: SceneSize = None,
+    surface: Surface = "mesh",
+    engine: Annotated[str, typer.Option(help="torch or jax; auto is whichever is installed.")] = "auto",
+) -> None:
+    """Find the cheapest settings whose derivatives are accurate enough on a scene, and say why."""
+    import rts
+
+    shape, chosen = None if size is None else _size(size), None if engine == "auto" else engine
+    options: dict[str, Any] = dict(tolerance=tolerance, budget_s=budget, modes=modes or None)
+    with _going_on():
+        found = rts.tune(scene, size=shape, engine=chosen, surface=surface, **options)
+    _say(escape(f"rts.render(parts, camera, size, {', '.join(f'{k}={v!r}' for k, v in found.settings.items())})"))
+    _say(f"error {100 * found.error:.2g} %, {1e3 * found.seconds:.3g} ms for a render and gradient")
+    for reason in found.reasons:
+        _say(escape(f"  {reason}"))
+
+
+@contextlib.contextmanager
+def _going_on() -> Iterator[None]:
+    """Say how to go on after Ctrl-C."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo("rts: interrupted; what was measured is kept: the same command goes on from there", err=True)
+        raise typer.Exit(130) from None
 
 
 @app.command(epilog="Example: rts demo -o out && open out/summary.md")

@@ -1,0 +1,114 @@
+"""Speed against accuracy on all built-in scenes: what `rts compare` measures, as files to keep.
+
+Writes to benchmarks/results a PNG and a JSON a scene, chart.html for all of them, and summary.md: what to take for
+10 %, 3 % and 1 % of error. What is measured is kept in a folder of its own, and a run that is interrupted goes on:
+
+    python -m benchmarks.chart                                 # most of two hours on two cores
+    python -m benchmarks.chart --scenes "thin wires" -o /tmp/wires
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.report import table
+from rts.diagnostics import compare
+from rts.diagnostics.comparison.builtin import BUILTIN
+from rts.diagnostics.comparison.chart import draw
+from rts.diagnostics.comparison.compare import file_name
+from rts.diagnostics.comparison.front import best_within, timed
+from rts.diagnostics.comparison.page import write_page
+from rts.diagnostics.comparison.scene import MODES
+from rts.diagnostics.comparison.style import label
+
+LEVELS = (0.1, 0.03, 0.01)
+RESULTS = Path(__file__).parent / "results"
+
+
+def options() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, default=RESULTS)
+    parser.add_argument("--scenes", nargs="+", choices=BUILTIN, default=list(BUILTIN))
+    parser.add_argument("--kept", type=Path, default=Path("out/chart"), help="where measurements and truths are kept")
+    parser.add_argument("--draw", action="store_true", help="only draw what the JSON files of the output hold")
+    return parser.parse_args()
+
+
+def main() -> None:
+    args = options()
+    args.output.mkdir(parents=True, exist_ok=True)
+    found = []
+    for scene in args.scenes:
+        path = args.output / f"{file_name(scene)}.json"
+        if not args.draw:
+            print(scene, flush=True)
+            data = compare(scene, output=args.kept, truths=args.kept).data
+            path.write_text(json.dumps(rounded(data), separators=(",", ":")) + "\n")
+        found.append(json.loads(path.read_text()))
+        draw(found[-1], path.with_suffix(".png"))
+    write_page(found, args.output / "chart.html")
+    (args.output / "summary.md").write_text(summary(found))
+    print(f"wrote {args.output}")
+
+
+def rounded(value: Any) -> Any:
+    """Numbers to four digits, which is more than what was measured means."""
+    if isinstance(value, float):
+        return float(f"{value:.4g}")
+    if isinstance(value, Mapping):
+        return {key: rounded(v) for key, v in value.items()}
+    return [rounded(v) for v in value] if isinstance(value, (list, tuple)) else value
+
+
+def own(comparison: Mapping, mode: str) -> list[Mapping]:
+    """The library's own rows of a mode."""
+    return [row for row in comparison["rows"] if row["mode"] == mode and "peer" not in row]
+
+
+def summary(comparisons: Sequence[Mapping]) -> str:
+    """What to take: over all scenes, and for each of them."""
+    modes = [mode for mode in MODES if any(mode in c["modes"] for c in comparisons)]
+    header = ["mode", *(f"{level:.0%}" for level in LEVELS)]
+    overall = table(header, [[mode, *(advice(comparisons, mode, level) for level in LEVELS)] for mode in modes])
+    parts = [f"What is within an error in most scenes, of {len(comparisons)}; median time, 256².\n\n{overall}"]
+    for comparison in comparisons:
+        lines = []
+        for mode in comparison["modes"]:
+            cells = []
+            for level in LEVELS:
+                rows = [row for row in comparison["rows"] if row["mode"] == mode]
+                best, peer = best_within(own(comparison, mode), level), best_within(rows, level)
+                text = "none" if best is None else f"{label(best)}: {best['ms']['median']:.3g} ms"
+                if peer is not None and "peer" in peer:
+                    text += f" (**{label(peer)}: {peer['ms']['median']:.3g} ms**)"
+                cells.append(text)
+            lines.append([mode, *cells])
+        parts.append(f"### {comparison['scene']['name']}\n\n{table(header, lines)}")
+    return "\n".join(parts)
+
+
+def advice(comparisons: Sequence[Mapping], mode: str, level: float) -> str:
+    """The setting, with nothing changed of the surfaces, that is within an error in most scenes; the faster of two."""
+    times: dict[tuple, list[float]] = defaultdict(list)
+    scenes = [c for c in comparisons if mode in c["modes"]]
+    for comparison in scenes:
+        for row in own(comparison, mode):
+            s = row["settings"]
+            if timed(row) and row["error"] <= level and not s["rate"] and s["engine"] == "torch":
+                times[s["splatter"], s["layers"], s["supersample"]].append(row["ms"]["median"])
+    if not times:
+        return "none"
+    best = max(times, key=lambda key: (len(times[key]), -statistics.median(times[key])))
+    splatter, layers, supersample = best
+    asked = f"`{splatter}`, K = {layers}, {supersample} × {supersample}"
+    return f"{asked}: {len(times[best])} of {len(scenes)}, {statistics.median(times[best]):.3g} ms"
+
+
+if __name__ == "__main__":
+    main()

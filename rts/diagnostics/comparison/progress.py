@@ -1,0 +1,42 @@
+"""Progress of long measurements, on standard error."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+
+Phase = Callable[[str, int], Callable[[], None]]
+"""(what is done, how many steps it has) → a function to call after each step."""
+
+
+@contextlib.contextmanager
+def phases(wanted: bool | None) -> Iterator[Phase]:
+    """A bar for each phase, with the time that is left.
+
+    Args:
+        wanted: None for where standard error is a terminal.
+    """
+    if wanted is False or (wanted is None and not sys.stderr.isatty()):
+        yield lambda what, steps: lambda: None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    left, taken = TimeRemainingColumn(), TimeElapsedColumn()
+    texts = [TextColumn(text) for text in ("{task.description}", "left,", "taken")]
+    columns = (texts[0], BarColumn(), MofNCompleteColumn(), left, texts[1], taken, texts[2])
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+
+        def phase(what: str, steps: int) -> Callable[[], None]:
+            task = bar.add_task(what, total=steps)
+            return lambda: bar.advance(task)
+
+        yield phase

@@ -1,0 +1,135 @@
+"""Settings that are compared: what there is to choose from, and which are worth a look."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from rts import registry
+from rts.engines import Engine, engine_named
+from rts.errors import PluginError
+
+FIRST = "torch"
+"""The engine that errors are measured with where it is installed, since all agree on them and it compiles nothing."""
+
+
+ALIKE = 1.05
+"""A setting that costs more has to have an error smaller than by this factor."""
+
+
+CLEARLY = 0.9
+"""A setting betters another one clearly where its error and its time are at most this share of the other's."""
+
+
+class Setting(NamedTuple):
+    """One way to render a scene.
+
+    Attributes:
+        splatter: its name.
+        layers: K, or "auto".
+        supersample: samples along each side of a pixel.
+        rate: what differs of the surfaces, such as "tolerance=0.4"; "" for nothing.
+        sampler: its name; "" where only the error is meant.
+        engine: its name; "" likewise.
+    """
+
+    splatter: str
+    layers: int | str
+    supersample: int
+    rate: str = ""
+    sampler: str = ""
+    engine: str = ""
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Keyword arguments of `rts.render`."""
+        found = {"splatter": self.splatter, "layers": self.layers, "supersample": self.supersample}
+        return {"sampler": self.sampler, **found} if self.sampler else found
+
+
+def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], list[str]]:
+    """The plugins of a group that load, "auto" and further names of one class left out; and why others are not there.
+
+    Args:
+        group: such as "rts.splatters".
+        chosen: names; None for all.
+    """
+    found: dict[str, Any] = {}
+    left_out = []
+    for name in registry.plugins(group) if chosen is None else chosen:
+        if name == "auto" and chosen is None:
+            continue
+        try:
+            loaded = registry.plugin(group, name)
+        except PluginError as error:
+            if chosen is not None:
+                raise
+            left_out.append(str(error))
+            continue
+        if not any(loaded is other for other in found.values()):
+            found[name] = loaded
+    return list(found), left_out
+
+
+def engines(chosen: Sequence[str] | None = None) -> tuple[list[Engine], list[str]]:
+    """The engines that have derivatives, the one that errors are measured with first; and why others are not there."""
+    names, left_out = usable("rts.engines", chosen)
+    found = [engine_named(name) for name in names]
+    found = [engine for engine in found if engine.differentiates]
+    if not found:
+        raise PluginError(
+            "no engine with derivatives is installed, and derivatives are compared: pip install "
+            "'rasterize-then-splat[torch]', or [jax]"
+        )
+    return sorted(found, key=lambda e: e.name != FIRST if chosen is None else names.index(e.name)), left_out
+
+
+def worth_timing(errors: Mapping[Setting, float], work: Callable[[Setting], tuple[float, ...]]) -> list[Setting]:
+    """The settings that no cheaper one betters, nor an equal one before it: the front of errors, with work for time.
+
+    Args:
+        errors: setting → error.
+        work: setting → what it costs in several respects.
+    """
+    found: list[Setting] = []
+    for setting in sorted(errors, key=lambda s: (work(s), errors[s])):
+        mine = work(setting)
+        if not any(
+            errors[other] <= ALIKE * errors[setting] and all(a <= b for a, b in zip(work(other), mine, strict=True))
+            for other in found
+        ):
+            found.append(setting)
+    return found
+
+
+def near_front(errors: Mapping[Setting, float], times: Mapping[Setting, float]) -> list[Setting]:
+    """The settings that no other one clearly betters, both in error and in time."""
+    return [
+        s for s in times if not any(errors[o] <= CLEARLY * errors[s] and times[o] <= CLEARLY * times[s] for o in times)
+    ]
+
+
+class TooSlow(Exception):
+    """Something took longer than it was given."""
+
+
+@contextlib.contextmanager
+def limited(seconds: float) -> Iterator[None]:
+    """Raise `TooSlow` in a block of Python code that takes longer; without effect outside of the main thread."""
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "setitimer"):
+        yield
+        return
+
+    def stop(*_: Any) -> None:
+        raise TooSlow(f"more than {seconds:g} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)

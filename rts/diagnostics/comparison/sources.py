@@ -1,0 +1,190 @@
+"""Where scenes come from: built-in names, model files, Python files and functions."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rts.arguments import quoted
+from rts.arrays import kind_of
+from rts.camera import Camera
+from rts.checks import check_scene, check_size
+from rts.diagnostics.comparison import builtin
+from rts.diagnostics.comparison.scene import Scene, check_directions, moving
+from rts.engines import is_constant
+from rts.errors import InputError
+from rts.files.paths import as_path
+from rts.fitting.names import named_leaves, one_line
+from rts.interfaces import Part
+from rts.trees import Tree, leaves, map_leaves
+
+SIZE = (256, 256)
+FEW = 6
+"""Arrays of at most so many numbers have a mode for each."""
+VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+
+
+def scene_of(
+    scene: Any,
+    parameters: Tree = None,
+    directions: Mapping[str, Tree] | None = None,
+    size: tuple[int, int] | None = None,
+    *,
+    surface: str = "mesh",
+) -> Scene:
+    """The scene that a user means.
+
+    Args:
+        scene: a `Scene`; the name of a built-in one; the path of a model; the path of a Python file, perhaps with
+            ":name" of a function in it, "scene" by default; or a function: () or parameters → (parts, camera).
+        parameters: of the function: an array, or nested dicts and lists of them. A Python file may have them under
+            the name "parameters". None for a function without arguments, whose parts move in five ways.
+        directions: mode → direction of the parameters; None for one mode for each number of small arrays, and one at
+            random for each larger array.
+        size: (height, width); None for the scene's own, 256² where it has none.
+        surface: the kind of surface that reads a model.
+
+    Raises:
+        InputError: there is no such scene, or it does not give parts and a camera.
+    """
+    if size is not None:
+        size = check_size(size, 1, None, 1)
+    if isinstance(scene, Scene):
+        found = scene
+    elif callable(scene):
+        found = _of_function(scene, getattr(scene, "__name__", type(scene).__name__), parameters, directions)
+    elif isinstance(scene, (str, Path)):
+        found = _named(str(scene), parameters, directions, surface, size or SIZE)
+    else:
+        raise InputError(f"scene is {quoted(scene)}; expected a name, the path of a model, or a function")
+    if size is not None:
+        found = replace(found, size=size)
+    if not found.directions:
+        raise InputError(f"nothing moves in {found.name!r}; expected a scene with parameters")
+    check_directions(found)
+    return found
+
+
+def some_modes(scene: Scene, modes: Sequence[str] | None) -> Scene:
+    """The scene with some of its modes; None for all.
+
+    Raises:
+        InputError: it has no such modes.
+    """
+    if modes is None:
+        return scene
+    if isinstance(modes, str) or not modes or any(mode not in scene.directions for mode in modes):
+        raise InputError(
+            f"modes is {quoted(modes)}; expected some of those of the scene, {', '.join(scene.directions)}"
+        )
+    return scene.with_modes(modes)
+
+
+def _named(
+    name: str, parameters: Tree, directions: Mapping[str, Tree] | None, surface: str, size: tuple[int, int]
+) -> Scene:
+    file, _, function = name.partition(":") if re.search(r"\.py(:\w*)?$", name) else (name, "", "")
+    path = as_path(file)
+    if path.suffix == ".py":
+        module = _module(path)
+        found = getattr(module, function or "scene", None)
+        if not (callable(found) or isinstance(found, Scene)):
+            raise InputError(f"{path} has no function {function or 'scene'!r}; name one: {path}:NAME")
+        if isinstance(found, Scene):
+            return found
+        given = getattr(module, "parameters", None) if parameters is None else parameters
+        return _of_function(found, path.stem, given, directions)
+    if parameters is not None:
+        raise InputError("parameters were given; only functions of parameters have them")
+    if path.suffix and path.exists():
+        return of_model(path, surface, size)
+    if path.suffix and not builtin.known(name):
+        raise InputError(
+            f"{path} does not exist; expected a model, a Python file, or one of {', '.join(builtin.names())}"
+        )
+    return builtin.builtin(name)
+
+
+def of_model(path: Path, surface: str, size: tuple[int, int]) -> Scene:
+    """The scene of a model, seen as `rts render` sees it, whose parts all move."""
+    from rts.cli.views import bounds_of, orbit
+    from rts.files.models import load
+
+    parts = load(path, surface=surface)
+    camera = orbit(bounds_of(parts), size, 30, 20)
+    return moving(path.stem, parts, camera, size, note=f"the model {path.name}")
+
+
+def _module(path: Path) -> Any:
+    """A Python file, run."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise InputError(f"{path} does not exist; expected a Python file")
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise InputError(f"{path} fails: {type(error).__name__}: {one_line(str(error))}") from error
+    return module
+
+
+def _of_function(f: Callable, name: str, parameters: Tree, directions: Mapping[str, Tree] | None) -> Scene:
+    if parameters is None:
+        needed = [
+            p for p in inspect.signature(f).parameters.values() if p.default is p.empty and p.kind not in VARIADIC
+        ]
+        if needed:
+            raise InputError(
+                f"{name} takes parameters; pass parameters=, or let its Python file have them by that name"
+            )
+        found = f()
+        if isinstance(found, Scene):
+            return found
+        parts, camera = checked(found, name)
+        if not is_constant([p.theta for p in parts]):
+            raise InputError(f"{name} gave arrays of an engine; expected NumPy where there are no parameters")
+        return moving(name, parts, camera, SIZE)
+    if not any(np.size(x) for x in leaves(parameters)):
+        raise InputError("parameters holds no numbers; expected arrays, in nested dicts and lists")
+    parameters = map_leaves(lambda x: np.asarray(x, np.float32) if is_constant(x) else x, parameters)
+    return Scene(name, f, parameters, _modes(parameters) if directions is None else directions, SIZE)
+
+
+def checked(found: Any, name: str) -> tuple[list[Part], Camera]:
+    """The parts and the camera that a function gave.
+
+    Raises:
+        InputError: it gave something else.
+    """
+    if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Camera)):
+        raise InputError(f"{name} gave {kind_of(found)}; expected (parts, camera)")
+    parts, camera = found
+    check_scene(parts, camera)
+    return ([parts] if isinstance(parts, Part) else list(parts)), camera
+
+
+def _modes(parameters: Tree) -> dict[str, Tree]:
+    """A mode for each number of small arrays, and one at random for each larger array."""
+    names = [name for name, _ in named_leaves(parameters)]
+    shapes = [tuple(np.shape(x)) for _, x in named_leaves(parameters)]
+    found = {}
+    for index, (name, shape) in enumerate(zip(names, shapes, strict=True)):
+        count = int(np.prod(shape))
+        choices = np.eye(count) if count <= FEW else np.random.default_rng(0).normal(size=(1, count))
+        for number, values in enumerate(choices):
+            label = f"{name}[{number}]" if 1 < count <= FEW else name
+            found[label] = _only(parameters, index, values.reshape(shape))
+    return found
+
+
+def _only(parameters: Tree, index: int, values: np.ndarray) -> Tree:
+    """A direction that is zero but in one leaf."""
+    number = iter(range(sum(1 for _ in leaves(parameters))))
+    return map_leaves(lambda x: values if next(number) == index else np.zeros(np.shape(x)), parameters)

@@ -1,0 +1,185 @@
+"""The true derivative of an image, by differences of area-sampled renders that know nothing of splatting.
+
+The differences are central, over a quarter of a pixel, on two lattices of points in the pixel that have nothing in
+common: what they disagree on is their error. They are kept on disk by a key of the scene.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.diagnostics.comparison.scene import Scene
+from rts.diagnostics.comparison.scores import low_pass, relative_l2
+from rts.engines import Engine, engine_of
+from rts.files.paths import cache_folder, writing
+from rts.interfaces import Part
+from rts.rendering import render, sample
+from rts.sampling.cache import fingerprint
+from rts.trees import leaves
+
+SAMPLES = 16
+"""Points a pixel, along x and along y."""
+STEP = 0.25
+"""Length of the difference, pixels."""
+
+
+class Truth(NamedTuple):
+    """How an image changes along one mode.
+
+    Attributes:
+        derivative: (H, W, 3) a pixel of motion, the mean of the two lattices'.
+        error: what the lattices disagree on, relative L2 through the low-pass of `scores`.
+    """
+
+    derivative: np.ndarray
+    error: float
+
+
+def lattice(samples: int) -> np.ndarray:
+    """`samples`² points (S, 2) of a pixel, from its centre, in pixels: a rank-1 lattice of the golden ratio.
+
+    No two points share a row or a column, so upright edges are resolved to 1/S of a pixel.
+    """
+    count = samples**2
+    return np.column_stack([(np.arange(count) + 0.5) / count, (np.arange(count) * (5**0.5 - 1) / 2 + 0.25) % 1]) - 0.5
+
+
+def area_image(
+    parts: list[Part],
+    camera: Camera,
+    size: tuple[int, int],
+    points: np.ndarray,
+    done: Callable[[], None] = lambda: None,
+    **options: object,
+) -> np.ndarray:
+    """Mean of the hard image (H, W, 4) float64 over points (S, 2) of each pixel; nothing is splatted.
+
+    Args:
+        parts: without derivatives.
+        camera: the camera.
+        size: (height, width).
+        points: of the pixel's centre, x right and y down, pixels.
+        done: called after each point.
+        **options: of `rts.render`.
+    """
+    total = np.zeros((*size, 4))
+    for dx, dy in points:
+        shift = np.eye(4)
+        # Moving the image by −dx pixels puts the point at +dx under the pixel's centre.
+        shift[0, 3], shift[1, 3] = -2 * dx / size[1], 2 * dy / size[0]
+        moved = camera.for_size(size)
+        projection = np.asarray(engine_of(moved.projection).to_numpy(moved.projection), np.float64)
+        image = render(parts, moved.replace(projection=shift @ projection), size, splatter="none", layers=1, **options)
+        total += engine_of(image).to_numpy(image)
+        done()
+    return total / len(points)
+
+
+def scene_key(scene: Scene, mode: str, step: float, samples: int, engine: Engine | None) -> str:
+    """A hash of all that the truth depends on: arrays of θ, camera, and what is seen at the ends of the difference."""
+    digest = hashlib.sha256(repr((scene.size, step, samples)).encode())
+    for by in (-step / 2, step / 2):
+        parts, camera = shown(scene, mode, by, engine)
+        for part in parts:
+            digest.update(repr((part.cull, type(part.surface).__name__)).encode())
+        everything = [*(p.theta for p in parts), *(p.transform for p in parts), camera.view, camera.projection]
+        arrays = [engine_of(x).to_numpy(x) for x in leaves(everything)]
+        seen = sample(parts, camera, scene.size, layers=1)
+        image = render(parts, camera, scene.size, splatter="none", layers=1)
+        arrays += [engine_of(x).to_numpy(x) for x in (seen.depth, image)]
+        digest.update(repr(fingerprint([np.asarray(a) for a in arrays])).encode())
+    return digest.hexdigest()[:20]
+
+
+def shown(scene: Scene, mode: str, by: float, engine: Engine | None) -> tuple[list[Part], Camera]:
+    """The exact parts of a scene and its camera, moved along a mode.
+
+    Args:
+        scene: the scene.
+        mode: of it.
+        by: how far along the mode's direction.
+        engine: None for NumPy, where the scene takes it.
+    """
+    parts, camera = (scene.exact or scene.at)(scene.moved(mode, by, engine))
+    return ([parts] if isinstance(parts, Part) else list(parts)), camera
+
+
+def truth(
+    scene: Scene,
+    mode: str,
+    pixel: float,
+    *,
+    samples: int = SAMPLES,
+    engine: Engine | None = None,
+    folder: Path | None = None,
+    done: Callable[[], None] = lambda: None,
+) -> Truth:
+    """The derivative of a scene's area-sampled image along a mode; made once, then read from disk.
+
+    Args:
+        scene: the scene.
+        mode: of it.
+        pixel: how far along the mode's direction one pixel of motion is.
+        samples: the square root of the number of points a pixel.
+        engine: as in `shown`.
+        folder: where truths are kept; None for the folder of caches.
+        done: called `samples`² times four, or as if, where it is known.
+    """
+    step = STEP * pixel
+    folder = (cache_folder() if folder is None else folder) / "truths"
+    key = scene_key(scene, mode, step, samples, engine)
+    path = folder / f"{key}.npz"
+    if path.exists():
+        for _ in range(4 * samples**2):
+            done()
+        with np.load(path) as kept:
+            return _of(kept["derivatives"])
+    points = lattice(samples)
+    images = [
+        [
+            _kept_image(partial(shown, scene, mode, by, engine), scene.size, grid, folder / f"{key}-{i}{j}.npy", done)
+            for j, by in enumerate((-step / 2, step / 2))
+        ]
+        for i, grid in enumerate((points, points[:, ::-1]))
+    ]
+    derivatives = np.stack([(after - before) / STEP for before, after in images])
+    with writing(path):
+        np.savez_compressed(path, derivatives=derivatives.astype(np.float32))
+        for image in folder.glob(f"{key}-*.npy"):
+            image.unlink()
+    return _of(derivatives)
+
+
+def _kept_image(
+    seen: Callable[[], tuple[list[Part], Camera]],
+    size: tuple[int, int],
+    points: np.ndarray,
+    path: Path,
+    done: Callable[[], None],
+) -> np.ndarray:
+    """One of the four images of a difference, which a run that is interrupted has not made in vain."""
+    if path.exists():
+        for _ in points:
+            done()
+        return np.load(path)
+    image = area_image(*seen(), size, points, done)[..., :3]
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_suffix(".part")
+        with unfinished.open("wb") as file:
+            np.save(file, image)
+        unfinished.replace(path)
+    return image
+
+
+def _of(derivatives: np.ndarray) -> Truth:
+    first, second = derivatives.astype(np.float64)
+    mean = (first + second) / 2
+    return Truth(mean, relative_l2(low_pass(first), low_pass(second), low_pass(mean)))

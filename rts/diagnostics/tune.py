@@ -1,0 +1,301 @@
+"""`rts.tune`: the cheapest settings that are accurate enough, on one scene, for its parameters, on this machine."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rts.arguments import check_positive, quoted
+from rts.checks import is_real
+from rts.diagnostics.comparison.journal import Journal
+from rts.diagnostics.comparison.measure import TOGETHER, Measurements
+from rts.diagnostics.comparison.progress import Phase, phases
+from rts.diagnostics.comparison.scene import SceneFunction
+from rts.diagnostics.comparison.settings import Setting, engines, usable
+from rts.diagnostics.comparison.sources import checked, scene_of, some_modes
+from rts.engines import engine_of
+from rts.errors import InputError, ToleranceWarning, warn
+from rts.files.paths import output_folder
+from rts.interfaces import Part
+from rts.trees import Tree
+
+LAYERS = (1, 2, 4, 8)
+SUPERSAMPLE = (1, 2, 3, 4)
+HOPELESS = 2.0
+"""How many times the error of the best splatter another one may have, to be looked at further."""
+TURNS = 3
+"""Turns of the settings that are told of beside the chosen one; the last that are left have twice as many."""
+
+
+class Tuned(NamedTuple):
+    """Settings, and what is to be rendered with them.
+
+    Attributes:
+        parts: the scene's parts at the parameters, their surfaces at the rates that were chosen.
+        settings: keyword arguments of `rts.render`: sampler, splatter, layers and supersample.
+        reasons: a line for each choice: what the cheaper one lacks, and what the next costs.
+        scene: parameters → (parts, camera), with the same rates: what a fit renders.
+        error: the largest error of the derivatives along the modes, relative L2 through a Gaussian of 2 pixels.
+        seconds: median time of a render and gradient.
+    """
+
+    parts: list[Part]
+    settings: dict[str, Any]
+    reasons: list[str]
+    scene: SceneFunction
+    error: float
+    seconds: float
+
+
+def tune(
+    scene: Any,
+    parameters: Tree = None,
+    *,
+    tolerance: float = 0.05,
+    budget_s: float = 60.0,
+    directions: Mapping[str, Tree] | None = None,
+    size: tuple[int, int] | None = None,
+    modes: Sequence[str] | None = None,
+    engine: str | None = None,
+    samplers: Sequence[str] | None = None,
+    splatters: Sequence[str] | None = None,
+    surface: str = "mesh",
+    truths: Path | str | None = None,
+    progress: bool | None = None,
+) -> Tuned:
+    """Find the cheapest settings whose derivatives are accurate enough.
+
+    They are for `rts.render(tuned.parts, camera, size, **tuned.settings)`.
+
+    Sampler, splatter, layers, samples a pixel, and the rates that surfaces offer: tolerances, lattices, meshes of fewer
+    faces where no derivative is taken of their vertices. Errors are measured as in `rts.diagnostics.compare`, of cheap
+    settings first; dearer ones are not looked at. Those that are accurate enough are timed in turns, and the slower
+    half is left out each time.
+
+    Args:
+        scene: as in `rts.diagnostics.compare`.
+        parameters: of the scene's function: where derivatives are taken.
+        tolerance: the largest error of the derivatives along any mode, such as 0.05.
+        budget_s: seconds of measuring, after which the best so far is taken; the truth, which is made once and kept,
+            does not count.
+        directions: as in `compare`.
+        size: (height, width); None for the scene's own. Errors and times are those of this size.
+        modes: as in `compare`.
+        engine: its name; None for that of the parameters, or for the first that is installed.
+        samplers: names; None for all that suit the scene.
+        splatters: names; None for all.
+        surface: the kind of surface that reads a model.
+        truths: the folder of truths; None for the folder of caches.
+        progress: whether to show progress; None for where standard error is a terminal.
+
+    Raises:
+        InputError: there is no such scene, or an argument is wrong; before anything is measured.
+
+    Warns:
+        ToleranceWarning: nothing is accurate enough; the most accurate is given.
+    """
+    if not (is_real(tolerance) and 0 < tolerance < math.inf):
+        raise InputError(f"tolerance is {quoted(tolerance)}; expected a share of the derivative, such as 0.05")
+    check_positive("budget_s", budget_s)
+    found = some_modes(scene_of(scene, parameters, directions, size, surface=surface), modes)
+    kept = None if truths is None else output_folder(truths)
+    own = engine_of(found.parameters)
+    chosen = [engine] if engine is not None else [own.name] if own.differentiates else None
+    used = engines(chosen)[0][:1]
+    checked(found.at(found.moved(next(iter(found.directions)), 0.0, used[0])), found.name)
+    measured = Measurements(found, Journal(), used, truths=kept, together=True)
+    suited = measured.samplers(usable("rts.samplers", samplers)[0])
+    if not suited:
+        raise InputError(f"no sampler suits {found.name!r}: {'; '.join(measured.left_out)}")
+    with phases(progress) as phase:
+        done = phase("truth", 4 * measured.samples**2 * len(found.directions))
+        for mode in found.directions:
+            measured.truth(mode, done)
+        search = _Search(measured, tolerance, time.perf_counter() + budget_s, phase)
+        return search.run(usable("rts.splatters", splatters)[0], suited)
+
+
+class _Search:
+    """A search for the cheapest settings within a tolerance.
+
+    Args:
+        measured: the scene, and what is known of it.
+        tolerance: of the error.
+        deadline: when to stop measuring, on the clock of `time.perf_counter`.
+        phase: shows progress.
+    """
+
+    def __init__(self, measured: Measurements, tolerance: float, deadline: float, phase: Phase):
+        self.measured, self.tolerance, self.deadline, self.phase = measured, tolerance, deadline, phase
+        self.modes = list(measured.scene.directions)
+        self.errors: dict[Setting, float] = {}
+        self.engine = measured.engine.name
+        self.late = False
+
+    def run(self, splatters: Sequence[str], samplers: Sequence[str]) -> Tuned:
+        """The best that is found in time."""
+        cells = self._cells(splatters)
+        within = self._within(cells)
+        if not within:
+            if not self.errors:
+                raise InputError(f"nothing could be measured: {'; '.join(self.measured.left_out)}")
+            within = [min(self.errors, key=lambda s: self.errors[s])]
+        chosen = self._fastest([s._replace(sampler=n, engine=self.engine) for s in within for n in samplers])
+        reasons = self._reasons(chosen, cells, samplers)
+        error, seconds = self._error(chosen, whole=True), self._timed([chosen])[chosen]
+        if error > self.tolerance:
+            reasons.insert(
+                0, f"nothing is within {_percent(self.tolerance)}: the least error that was found is {_percent(error)}"
+            )
+            warn(f"{reasons[0]}; give a larger tolerance, or more samples", ToleranceWarning)
+        if self.late:
+            reasons.append("the budget was spent before all settings were looked at")
+        at = self.measured.forms(TOGETHER)[chosen.rate].at
+        parts, _ = at(self.measured.start(TOGETHER))
+        return Tuned([parts] if isinstance(parts, Part) else list(parts), chosen.options, reasons, at, error, seconds)
+
+    # -------------------------------------------------------------------------------------------------- accuracy
+
+    def _cells(self, splatters: Sequence[str]) -> list[Setting]:
+        """All settings but for samplers, the cheapest first."""
+        found = self.measured.settings(TOGETHER, splatters, LAYERS, SUPERSAMPLE, rates=True)
+        return sorted(found, key=lambda s: math.prod(self._work(s)))
+
+    def _work(self, setting: Setting) -> tuple[float, ...]:
+        layers, supersample, rate = self.measured.work(TOGETHER, setting)
+        return layers, supersample**2, rate
+
+    def _promising(self, cells: Sequence[Setting]) -> list[Setting]:
+        """The settings of splatters that are accurate enough, or nearly as accurate as the best, with two layers."""
+        base = {s.splatter: s for s in cells if s.supersample == 1 and not s.rate and s.layers in LAYERS[:2]}
+        for setting in base.values():
+            self._error(setting)
+        least = min((self._error(s) for s in base.values()), default=math.inf)
+        allowed = max(self.tolerance, HOPELESS * least)
+        return [s for s in cells if s.splatter not in base or self._error(base[s.splatter]) <= allowed]
+
+    def _within(self, cells: Sequence[Setting]) -> list[Setting]:
+        """The settings within the tolerance that no cheaper one of their splatter makes needless."""
+        promising = self._promising(cells)
+        done = self.phase("errors", len(promising))
+        found: list[Setting] = []
+        for setting in promising:
+            done()
+            if self._needless(setting, found):
+                continue
+            if self._over():
+                break
+            if self._error(setting) <= self.tolerance:
+                found.append(setting)
+        return found
+
+    def _needless(self, setting: Setting, found: Sequence[Setting]) -> bool:
+        """Whether a setting costs no less, in any respect, than one of its splatter that is accurate enough."""
+        mine = self._work(setting)
+        return any(
+            s.splatter == setting.splatter and all(a <= b for a, b in zip(self._work(s), mine, strict=True))
+            for s in found
+        )
+
+    def _error(self, setting: Setting, whole: bool = False) -> float:
+        """The largest error along a mode.
+
+        Args:
+            setting: a setting.
+            whole: whether all modes are looked at, even where one is known to be beyond the tolerance.
+        """
+        same, worst = setting._replace(sampler="", engine=""), 0.0
+        if same in self.errors and not whole:
+            return self.errors[same]
+        for mode in self.modes:
+            found = self.measured.scores(mode, same)
+            error = math.inf if found is None else found["error"]
+            if error > worst:
+                worst = error
+                # What was worst once is looked at first.
+                self.modes = [mode, *(m for m in self.modes if m != mode)]
+            if worst > self.tolerance and not whole:
+                break
+        self.errors[same] = worst
+        return worst
+
+    # ------------------------------------------------------------------------------------------------------ time
+
+    def _over(self) -> bool:
+        self.late = self.late or time.perf_counter() > self.deadline
+        return self.late
+
+    def _timed(self, settings: Sequence[Setting], turns: int = TURNS) -> dict[Setting, float]:
+        """Seconds of settings, those that fail left out."""
+        calls: dict[tuple, Callable] = {tuple(s): lambda s=s: self.measured.call(TOGETHER, s) for s in settings}
+        found = self.measured.time(TOGETHER, calls, rounds=turns)
+        return {s: found[tuple(s)]["median"] / 1e3 for s in settings if tuple(s) in found}
+
+    def _fastest(self, settings: Sequence[Setting]) -> Setting:
+        """The fastest, by successive halving: all have a turn, the faster half another, and so on."""
+        turns, left = 1, list(settings)
+        while True:
+            times = self._timed(left, turns)
+            if not times:
+                raise InputError(f"nothing could be timed: {'; '.join(self.measured.left_out)}")
+            left = sorted(times, key=lambda s: times[s])[: max(1, (len(times) + 1) // 2)]
+            if len(times) <= 1 or turns >= 2 * TURNS or self._over():
+                return left[0]
+            turns += 1
+
+    # --------------------------------------------------------------------------------------------------- reasons
+
+    def _reasons(self, chosen: Setting, cells: Sequence[Setting], samplers: Sequence[str]) -> list[str]:
+        """For each choice what the cheaper one lacks, and what the next one costs."""
+        options: dict[str, list] = {
+            "layers": list(dict.fromkeys(s.layers for s in cells)),
+            "supersample": list(SUPERSAMPLE),
+            "rate": [f for f in self.measured.forms(TOGETHER)],
+            "splatter": list(dict.fromkeys(s.splatter for s in cells)),
+            "sampler": list(samplers),
+        }
+        others = {name: self._others(chosen, name, values) for name, values in options.items()}
+        told = [s for found in others.values() for s in found if s is not None and not self._over()]
+        times = self._timed([chosen, *dict.fromkeys(told)]) if told else {}
+        return [self._reason(chosen, name, *found, times) for name, found in others.items() if any(found)]
+
+    def _others(self, chosen: Setting, name: str, values: Sequence) -> tuple[Setting | None, Setting | None]:
+        """The next cheaper and the next dearer setting in one respect; for names, one that is another."""
+        found = [chosen._replace(**{name: value}) for value in values if value != getattr(chosen, name)]
+        if name in ("splatter", "sampler"):
+            known = [s for s in found if s._replace(sampler="", engine="") in self.errors]
+            return None, min(known, key=self._error, default=None)
+        mine = math.prod(self._work(chosen))
+        work = {s: math.prod(self._work(s)) for s in found}
+        below, above = (
+            [s for s in found if (work[s] < mine) == cheaper and work[s] != mine] for cheaper in (True, False)
+        )
+        return max(below, key=lambda s: work[s], default=None), min(above, key=lambda s: work[s], default=None)
+
+    def _reason(
+        self, chosen: Setting, name: str, below: Setting | None, above: Setting | None, times: Mapping[Setting, float]
+    ) -> str:
+        """One line on one choice."""
+        parts = []
+        if below is not None:
+            parts.append(f"{_value(below, name)} is off by {_percent(self._error(below))}")
+        if above is not None and chosen in times and above in times:
+            ratio = times[above] / times[chosen]
+            error = f", off by {_percent(self._error(above))}" if name != "sampler" else ""
+            parts.append(f"{_value(above, name)} takes {ratio:.2g} times as long{error}")
+        return f"{_value(chosen, name)}: {'; '.join(parts)}" if parts else f"{_value(chosen, name)}"
+
+
+def _value(setting: Setting, name: str) -> str:
+    """A choice as a user would write it."""
+    value = getattr(setting, name)
+    if name == "rate":
+        return value or "the surfaces as they are given"
+    return f"{name}={value!r}"
+
+
+def _percent(error: float) -> str:
+    return f"{100 * error:.2g} %"
