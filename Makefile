@@ -10,8 +10,10 @@ INSTALL := PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet -c constra
 SOURCES := pyproject.toml constraints.txt
 EXAMPLE := tests/plugin_example
 
+# What opens the pages of comparisons, where no other browser that the tests know is there.
+BROWSER := $(if $(shell command -v chromium || command -v chromium-browser || command -v google-chrome),,chromium)
 # What tests need of the system, by Debian's names; installed where this is root or may use sudo.
-SYSTEM_PACKAGES := python3-venv libegl1 libgl1-mesa-dri libosd-dev g++
+SYSTEM_PACKAGES := python3-venv libegl1 libgl1-mesa-dri libosd-dev g++ $(BROWSER)
 SUDO := $(shell if [ "$$(id -u)" = 0 ]; then echo env; elif sudo -n true 2>/dev/null; then echo sudo; fi)
 
 .PHONY: check demo test lint types wheel oldest clean system
@@ -47,8 +49,11 @@ system:
 	if ! command -v dpkg >/dev/null; then \
 		echo "not a Debian system: install the equivalents of $(SYSTEM_PACKAGES) if tests are skipped"; \
 	elif [ -n "$$missing" ] && [ -n "$(SUDO)" ]; then \
-		{ $(SUDO) apt-get update -qq && $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq $$missing >/dev/null; } \
-			|| echo "could not install $$missing: tests that need them are skipped"; \
+		$(SUDO) apt-get update -qq; \
+		for p in $$missing; do \
+			$(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $$p >/dev/null \
+				|| echo "could not install $$p: tests that need it are skipped"; \
+		done; \
 	elif [ -n "$$missing" ]; then \
 		echo "not root and no sudo: tests that need these Debian packages are skipped: $$missing"; \
 	fi
