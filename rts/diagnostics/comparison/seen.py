@@ -157,6 +157,8 @@ def seen(scene: Scene) -> Seen:
     velocities = {mode: _velocities(partial(at, mode), rest, focal, near) for mode in scene.directions}
     if all(isinstance(v, str) for v in velocities.values()):
         raise Unsuited(velocities[first])
+    for index, part in enumerate(rest):
+        _check_joined(index, part)
     wound = tuple(_turned(a) if b.cull == "none" else a for a, b in zip(rest, parts, strict=True))
     return Seen(scene.size, focal, (near, far), wound, velocities)
 
@@ -255,6 +257,16 @@ def _rgb(index: int, part: CheckedPart, colors: np.ndarray) -> np.ndarray:
     if colors.shape[1] == 4 and not part.shader.opaque:
         raise Unsuited(f"part {index} is translucent")
     return colors[:, :3] if colors.shape[1] >= 3 else np.repeat(colors[:, :1], 3, axis=1)
+
+
+def _check_joined(index: int, part: Colored) -> None:
+    """Refuse triangles that meet at an edge without sharing its vertices: it would count as two outlines."""
+    _, place = np.unique(part.vertices, axis=0, return_inverse=True)
+    edges = np.sort(np.concatenate([part.faces[:, [0, 1]], part.faces[:, [1, 2]], part.faces[:, [2, 0]]]), axis=1)
+    alone, counts = np.unique(edges, axis=0, return_counts=True)
+    ends = np.sort(place.reshape(-1)[alone[counts == 1]], axis=1)
+    if len(np.unique(ends, axis=0)) < len(ends):
+        raise Unsuited(f"triangles of part {index} meet at edges whose vertices they do not share")
 
 
 def _turned(part: Colored) -> Colored:
