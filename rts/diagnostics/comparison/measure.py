@@ -30,7 +30,7 @@ from rts.trees import Array, Tree, collected, leaves, map_leaves
 
 ROUNDS, CONSECUTIVE = 5, 2
 """Turns that each setting has, and calls timed in a turn."""
-SLOW = 4.0
+SLOW = 2.5
 """Seconds of timed calls after which a setting has had its turns, two at least."""
 PATIENCE = 30.0
 """Seconds after which a plugin that has not answered is left out."""

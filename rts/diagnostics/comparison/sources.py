@@ -81,9 +81,7 @@ def some_modes(scene: Scene, modes: Sequence[str] | None) -> Scene:
     if modes is None:
         return scene
     if isinstance(modes, str) or not modes or any(mode not in scene.directions for mode in modes):
-        raise InputError(
-            f"modes is {quoted(modes)}; expected some of those of the scene, {', '.join(scene.directions)}"
-        )
+        raise InputError(f"modes is {quoted(modes)}; expected some of {', '.join(scene.directions)}")
     return scene.with_modes(modes)
 
 
@@ -100,12 +98,12 @@ def _named(
         if isinstance(found, Scene):
             return found
         given = getattr(module, "parameters", None) if parameters is None else parameters
-        return _of_function(found, path.stem, given, directions)
+        return _of_function(found, function or path.stem, given, directions)
     if parameters is not None:
         raise InputError("parameters were given; only functions of parameters have them")
     if path.suffix and path.exists():
         return of_model(path, surface, size)
-    if path.suffix and not builtin.known(name):
+    if path.suffix:
         raise InputError(
             f"{path} does not exist; expected a model, a Python file, or one of {', '.join(builtin.names())}"
         )

@@ -149,9 +149,9 @@ def truth(
         ]
         for i, grid in enumerate((points, points[:, ::-1]))
     ]
-    derivatives = np.stack([(after - before) / STEP for before, after in images])
+    derivatives = np.stack([(after - before) / STEP for before, after in images]).astype(np.float32)
     with writing(path):
-        np.savez_compressed(path, derivatives=derivatives.astype(np.float32))
+        np.savez_compressed(path, derivatives=derivatives)
         for image in folder.glob(f"{key}-*.npy"):
             image.unlink()
     return _of(derivatives)

@@ -1,0 +1,524 @@
+"""`rts.diagnostics.compare` and `rts.tune`: truth, errors, times, what is kept of them, and the command line."""
+
+import json
+import random
+
+import numpy as np
+import pytest
+from helpers import quad
+from hypothesis import given
+from hypothesis import strategies as st
+
+import rts
+from rts import registry
+from rts.diagnostics import compare
+from rts.diagnostics.comparison import measure, truth
+from rts.diagnostics.comparison.journal import Journal
+from rts.diagnostics.comparison.scene import moving
+from rts.diagnostics.comparison.scores import loss_weights, scores
+from rts.diagnostics.comparison.settings import ALIKE, Setting, limited, near_front, worth_timing
+from rts.diagnostics.tune import tune
+from rts.engines import engine_named
+from rts.errors import InputError, PluginError, ToleranceWarning
+from rts.registry import plugin
+
+pytestmark = [
+    pytest.mark.rendering,
+    pytest.mark.skipif(not registry.plugins("rts.engines"), reason="no engine"),
+]
+pytest.importorskip("torch")
+
+SIDE = 48
+CAMERA = rts.Camera.look_at((0, 0, 3), (0, 0, 0), fov_y=40)
+
+
+def card(left=-0.6, right=0.43, z=0.0, color=(0.9, 0.5, 0.2)):
+    vertices, faces = quad(left, right, -0.5, 0.55, z)
+    turn = np.array([[np.cos(0.2), -np.sin(0.2), 0], [np.sin(0.2), np.cos(0.2), 0], [0, 0, 1]])
+    theta = {"vertices": (vertices @ turn.T).astype(np.float32), "colors": np.tile(np.float32(color), (4, 1))}
+    return rts.Part(plugin("surfaces", "mesh")(faces), theta, "unlit")
+
+
+def two_cards():
+    return [card(), card(-0.2, 0.8, -0.4, (0.2, 0.4, 0.9))], CAMERA
+
+
+def scene(*modes):
+    found = moving("two cards", *two_cards(), (SIDE, SIDE), moves=[0])
+    return found.with_modes(modes) if modes else found
+
+
+SMALL = dict(engines=["torch"], samplers=["raster"], supersample=[1, 2], layers=[1, 2], peers=False, progress=False)
+
+
+# -------------------------------------------------------------------------------------------------- truth, scores
+
+
+class TestScores:
+    def test_exact(self):
+        true = np.random.default_rng(0).normal(size=(20, 24, 3))
+        found = scores(true, true)
+        assert found["error"] == 0 and found["loss_error"] == 0
+        assert found["gain"] == pytest.approx(1)
+
+    def test_twice(self):
+        true = np.random.default_rng(1).normal(size=(20, 24, 3))
+        assert scores(2 * true, true) == pytest.approx({"error": 1, "gain": 2, "loss_error": 1})
+
+    def test_weights(self):
+        weights = loss_weights(32, 40)
+        assert weights.shape[1:] == (32, 40, 3)
+        np.testing.assert_allclose(weights.std(axis=(1, 2, 3)), 1)
+
+
+class TestTruth:
+    def test_lattice(self):
+        points = truth.lattice(8)
+        assert points.shape == (64, 2) and np.abs(points).max() <= 0.5
+        assert len(np.unique(points[:, 0])) == len(np.unique(points[:, 1])) == 64
+        np.testing.assert_allclose(points.mean(axis=0), 0, atol=0.01)
+
+    def test_closed_form(self, tmp_path):
+        """What a convex card covers does not change as it moves, and its edges pass by as long as they are upright."""
+        moved = moving("card", card(), CAMERA, (SIDE, SIDE), modes=["translation"])
+        found = truth.truth(moved, "translation", 2 * 3 * np.tan(np.radians(20)) / SIDE, samples=8, folder=tmp_path)
+        image = found.derivative
+        assert np.abs(image.sum(axis=(0, 1))).max() < 1e-2 * np.abs(image).sum()
+        # The first moment grows by the area, for each pixel of motion.
+        area = rts.render(card(), CAMERA, (SIDE, SIDE), splatter="none", layers=1, supersample=8)[..., :3].sum((0, 1))
+        moment = (image * (np.arange(SIDE) + 0.5)[None, :, None]).sum(axis=(0, 1))
+        np.testing.assert_allclose(moment, area, rtol=0.01)
+        assert 0 < found.error < 0.1
+
+    def test_kept(self, tmp_path, monkeypatch):
+        first = truth.truth(scene(), "translation", 0.03, samples=2, folder=tmp_path)
+        assert [p.suffix for p in (tmp_path / "truths").iterdir()] == [".npz"]
+        monkeypatch.setattr(truth, "area_image", None)
+        again = truth.truth(scene(), "translation", 0.03, samples=2, folder=tmp_path)
+        np.testing.assert_allclose(again.derivative, first.derivative, atol=1e-6)
+
+    @pytest.mark.parametrize("change", ["color", "camera", "pixel", "cull", "samples"])
+    def test_another_scene_has_another_key(self, change):
+        def key(scene, step=0.1, samples=4):
+            return truth.scene_key(scene, "translation", step, samples, None)
+
+        parts, camera = two_cards()
+        others = {
+            "color": lambda: key(moving("two cards", [card(color=(0.9, 0.5, 0.21)), parts[1]], camera, (SIDE, SIDE))),
+            "camera": lambda: key(
+                moving("two cards", parts, rts.Camera.look_at((0, 0, 3), (0, 1e-3, 0), fov_y=40), (SIDE, SIDE))
+            ),
+            "pixel": lambda: key(scene(), 0.11),
+            "cull": lambda: key(moving("two cards", [parts[0].replace(cull="back"), parts[1]], camera, (SIDE, SIDE))),
+            "samples": lambda: key(scene(), samples=5),
+        }
+        base = key(moving("two cards", parts, camera, (SIDE, SIDE)))
+        assert base == key(moving("two cards", *two_cards(), (SIDE, SIDE))) != others[change]()
+
+
+# ------------------------------------------------------------------------------------------------------- choosing
+
+
+class TestWorthTiming:
+    settings = st.lists(
+        st.tuples(st.integers(1, 3), st.integers(1, 3), st.floats(0.01, 1)), min_size=1, max_size=12, unique=True
+    )
+
+    @given(settings)
+    def test_front(self, drawn):
+        errors = {Setting("visible", k, s, str(i)): e for i, (k, s, e) in enumerate(drawn)}
+
+        def work(setting):
+            return setting.layers, setting.supersample
+
+        kept = worth_timing(errors, work)
+        assert kept
+        for setting in errors:
+            cheaper = [
+                k for k in kept if k is not setting and all(a <= b for a, b in zip(work(k), work(setting), strict=True))
+            ]
+            bettered = any(errors[k] <= ALIKE * errors[setting] for k in cheaper)
+            assert (setting in kept) or bettered
+        # Nothing that is kept is bettered by something else that is kept and was there before.
+        for n, setting in enumerate(kept):
+            for other in kept[:n]:
+                dearer = all(a <= b for a, b in zip(work(other), work(setting), strict=True))
+                assert not (dearer and errors[other] <= ALIKE * errors[setting])
+
+    def test_near_front(self):
+        a, b, c = (Setting("visible", 1, n) for n in (1, 2, 3))
+        assert near_front({a: 0.1, b: 0.05, c: 0.2}, {a: 1.0, b: 2.0, c: 3.0}) == [a, b]
+        assert near_front({a: 0.1, b: 0.095}, {a: 1.0, b: 1.05}) == [a, b]
+
+
+class TestLimited:
+    def test_slow(self):
+        with pytest.raises(Exception, match=r"more than 0\.05 s"), limited(0.05):
+            while True:
+                pass
+
+    def test_quick(self):
+        with limited(0.05):
+            pass
+        for _ in range(100):
+            sum(range(10000))
+
+
+# -------------------------------------------------------------------------------------------------------- journal
+
+
+class TestJournal:
+    def test_kept(self, tmp_path):
+        path = tmp_path / "deep" / "journal"
+        Journal(path).put({"error": 0.1}, "error", "translation", 1)
+        assert Journal(path).get("error", "translation", 1) == {"error": 0.1}
+        assert Journal(path).get("error", "translation", 2) is None
+
+    @given(st.integers(0, 200))
+    def test_cut_off_anywhere(self, at):
+        import tempfile
+        from pathlib import Path
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "journal"
+            journal = Journal(path)
+            for n in range(8):
+                journal.put(n, "key", n)
+            text = path.read_bytes()
+            path.write_bytes(text[:at])
+            whole = text[:at].count(b"\n")
+            again = Journal(path)
+            assert [again.get("key", n) for n in range(8)] == [n if n < whole else None for n in range(8)]
+            again.put("new", "key", "new")
+            assert Journal(path).get("key", "new") == "new"
+
+    def test_damaged(self, tmp_path):
+        path = tmp_path / "journal"
+        path.write_text("not a measurement\n")
+        with pytest.raises(InputError, match="line 1 of .* is no measurement; remove the file"):
+            Journal(path)
+
+
+# -------------------------------------------------------------------------------------------------------- compare
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory):
+    """A folder for truths, which are made once."""
+    return tmp_path_factory.mktemp("truths")
+
+
+@pytest.fixture(scope="module")
+def found(kept, tmp_path_factory):
+    output = tmp_path_factory.mktemp("output")
+    return compare(scene("translation", "shape"), output=output, truths=kept, **SMALL), output
+
+
+class TestCompare:
+    def test_rows(self, found):
+        comparison, _ = found
+        names = {r["settings"]["splatter"] for r in comparison.rows}
+        assert names == {"none", "single", "multi", "visible"}
+        assert set(comparison.modes) == {"translation", "shape"}
+        for mode in comparison.modes:
+            errors = {tuple(r["settings"].values())[:3]: r["error"] for r in comparison.rows if r["mode"] == mode}
+            assert errors["none", 1, 1] == pytest.approx(1, abs=1e-3)  # It has no derivative here.
+            assert errors["visible", 2, 2] < errors["visible", 2, 1] < errors["single", 1, 1] < 1
+            assert 0 < comparison.modes[mode]["truth_error"] < 0.05
+
+    def test_front(self, found):
+        comparison, _ = found
+        for mode in comparison.modes:
+            timed = [r for r in comparison.rows if r["mode"] == mode and r["ms"]]
+            for row in timed:
+                better = [
+                    o
+                    for o in timed
+                    if o["error"] <= row["error"] and o["ms"]["median"] <= row["ms"]["median"] and o is not row
+                ]
+                assert row["front"] == (not better)
+            best = comparison.best(mode, 0.3)
+            assert best["error"] <= 0.3
+            assert comparison.best(mode, 1e-6) is None
+
+    def test_error_is_that_of_the_derivative(self, found, kept):
+        torch = pytest.importorskip("torch")
+        comparison, _ = found
+        cards = scene("translation")
+        measured = measure.Measurements(cards, Journal(), [engine_named("torch")], truths=kept)
+        pixel = measured.pixel("translation")
+        # The nearer card moves by a pixel at its own depth; each of its samples, at its own.
+        assert pixel == pytest.approx(2 * 3 * np.tan(np.radians(20)) / SIDE, rel=1e-3)
+
+        def image(t):
+            return rts.render(*cards.at(cards.moved("translation", t, measured.engine)), (SIDE, SIDE), layers=2)[
+                ..., :3
+            ]
+
+        derivative = torch.func.jvp(image, (torch.zeros(()),), (torch.tensor(pixel),))[1].numpy()
+        wanted = {"splatter": "visible", "layers": 2, "supersample": 1}
+        rows = [r for r in comparison.rows if r["mode"] == "translation" and wanted.items() <= r["settings"].items()]
+        true = measured.truth("translation").derivative
+        assert [r["error"] for r in rows] == [pytest.approx(scores(derivative, true)["error"], rel=1e-4)]
+
+    def test_files(self, found):
+        comparison, output = found
+        assert [p.name for p in comparison.files(output)] == ["two_cards.json", "two_cards.png", "two_cards.html"]
+        assert json.loads((output / "two_cards.json").read_text()) == json.loads(json.dumps(comparison.data))
+
+    def test_another_run_measures_nothing(self, found, kept, monkeypatch):
+        comparison, output = found
+        for name in ("_measured", "_turn"):
+            monkeypatch.setattr(measure.Measurements, name, None)
+        again = compare(scene("translation", "shape"), output=output, truths=kept, **SMALL)
+        assert again.data == comparison.data
+
+    def test_interrupted(self, found, kept, tmp_path, monkeypatch):
+        """Ten times at random: nothing is measured twice, and nothing is lost."""
+        chance, finished, begun = random.Random(1), [], []
+
+        def interrupted(name):
+            whole = getattr(measure.Measurements, name)
+
+            def part(self, *args):
+                key = json.dumps([str(a) for a in args[:2] if not isinstance(a, dict)])
+                begun.append(key)
+                if len(begun) - len(finished) <= 10 and chance.random() < 0.3:
+                    raise KeyboardInterrupt
+                value = whole(self, *args)
+                finished.append((name, key))
+                return value
+
+            monkeypatch.setattr(measure.Measurements, name, part)
+
+        interrupted("_measured")
+        interrupted("_turn")
+        interruptions = 0
+        while True:
+            try:
+                again = compare(scene("translation"), output=tmp_path, truths=kept, **SMALL)
+                break
+            except KeyboardInterrupt:
+                interruptions += 1
+        assert interruptions == 10
+        errors = [key for name, key in finished if name == "_measured"]
+        assert len(errors) == len(set(errors))
+        turns = [key for name, key in finished if name == "_turn"]
+        assert max(turns.count(key) for key in turns) == measure.ROUNDS
+        want = [(r["settings"], r["error"]) for r in found[0].rows if r["mode"] == "translation"]
+        timed = {json.dumps(r["settings"]) for r in again.rows if r["ms"]}
+        assert {json.dumps(s) for s, _ in want if s["sampler"]} == timed
+
+    def test_function(self, kept):
+        def pose(parameters):
+            transform = rts.rigid(parameters["pose"])
+            return [p.replace(transform=transform) for p in two_cards()[0]], CAMERA
+
+        options = {**SMALL, "supersample": [1], "layers": 1, "splatters": ["visible"]}
+        start = {"pose": np.zeros(6)}
+        comparison = compare(pose, start, size=(SIDE, SIDE), modes=["pose[3]"], truths=kept, **options)
+        (row,) = comparison.rows
+        assert row["error"] < 0.5 and row["ms"]["median"] > 0
+
+    def test_auto_layers(self, kept):
+        options = {**SMALL, "supersample": [1], "layers": ["auto", 4, 1], "splatters": ["visible"]}
+        comparison = compare(scene("translation"), truths=kept, **options)
+        errors = {r["settings"]["layers"]: r["error"] for r in comparison.rows}
+        assert errors["auto"] == errors[4] < errors[1]
+
+
+class TestStrangers:
+    def test_sampler(self, kept):
+        pytest.importorskip("rts_plugin_example")
+        options = {**SMALL, "samplers": None, "supersample": [1], "splatters": ["visible"]}
+        comparison = compare(scene("translation"), truths=kept, **options)
+        assert "toy" in {r["settings"]["sampler"] for r in comparison.rows if r["ms"]}
+
+    def test_splatter(self, kept, monkeypatch):
+        """A splatter that another distribution registers."""
+        from importlib.metadata import EntryPoint
+
+        entries = dict(registry._entries("rts.splatters"))
+        entries["gauss5"] = [EntryPoint("gauss5", "second_plugin.gauss5:Gauss5", "rts.splatters")]
+        monkeypatch.setitem(registry._found, "rts.splatters", entries)
+        comparison = compare(scene("translation"), truths=kept, **{**SMALL, "supersample": [1]})
+        timed = {r["settings"]["splatter"] for r in comparison.rows if r["ms"]}
+        assert {"gauss5", "visible"} <= timed
+
+    def test_splatter_that_fails(self, kept, monkeypatch):
+        class Broken(rts.Splatter):
+            def image(self, splats):
+                raise RuntimeError("it broke\nin two lines")
+
+        monkeypatch.setitem(registry._defaults, ("rts.splatters", "multi"), Broken())
+        comparison = compare(scene("translation"), truths=kept, **{**SMALL, "supersample": [1]})
+        assert "multi" not in {r["settings"]["splatter"] for r in comparison.rows}
+        assert any("it broke in two lines" in line for line in comparison.left_out)
+
+    def test_sampler_that_takes_long(self, kept, monkeypatch):
+        class Slow(plugin("samplers", "reference")):
+            def rasterize(self, *args):
+                while True:
+                    pass
+
+        monkeypatch.setattr(measure, "PATIENCE", 0.1)
+        monkeypatch.setitem(registry._defaults, ("rts.samplers", "reference"), Slow())
+        options = {**SMALL, "samplers": ["raster", "reference"], "supersample": [1], "splatters": ["visible"]}
+        comparison = compare(scene("translation"), truths=kept, **options)
+        assert {r["settings"]["sampler"] for r in comparison.rows if r["ms"]} == {"raster"}
+        assert any("'reference': more than 0.1 s" in line for line in comparison.left_out)
+
+
+# ----------------------------------------------------------------------------------------------------------- tune
+
+
+@pytest.fixture
+def modelled(monkeypatch):
+    """Times that are a formula of the setting, so that the fastest is known."""
+    costs = {"none": 0.8, "single": 0.9, "multi": 1.1, "visible": 1.2}
+    samplers = {"raster": 1.0, "embree": 2.0, "opengl": 3.0, "reference": 5.0, "toy": 50.0}
+
+    def cost(setting):
+        return costs[setting.splatter] * setting.layers**0.3 * setting.supersample**2 * samplers[setting.sampler]
+
+    def time(self, group, calls, done=lambda: None, rounds=0):
+        made = {key: calls[key]() for key in calls}
+        assert all(callable(f) for f in made.values())
+        return {key: {"median": cost(Setting(*key)), "low": 0, "high": 0, "calls": rounds} for key in calls}
+
+    monkeypatch.setattr(measure.Measurements, "time", time)
+    return cost
+
+
+class TestTune:
+    @pytest.mark.parametrize("tolerance", [1.5, 0.6, 0.25, 0.1])
+    def test_cheapest(self, modelled, kept, tolerance):
+        modes = ["translation", "shape"]
+        options = dict(splatters=["none", "single", "multi", "visible"], samplers=["raster", "reference"], truths=kept)
+        tuned = tune(scene(*modes), tolerance=tolerance, progress=False, **options)
+        whole = compare(
+            scene(*modes),
+            **{**SMALL, "layers": [1, 2, 4], "supersample": [1, 2, 3, 4], "splatters": options["splatters"]},
+            truths=kept,
+        )
+        worst = {}
+        for row in whole.rows:
+            key = tuple(row["settings"].values())[:4]
+            worst[key] = max(worst.get(key, 0), row["error"])
+        within = [Setting(*key, "raster", "torch") for key, error in worst.items() if error <= tolerance]
+        best = min(modelled(s) for s in within)
+        chosen = Setting(**{**tuned.settings, "engine": "torch"})
+        assert modelled(chosen) == pytest.approx(best)
+        assert tuned.error == pytest.approx(max(worst[tuple(chosen)[:4]], 0), rel=1e-6)
+        assert tuned.seconds == pytest.approx(best / 1e3)
+        assert rts.render(tuned.parts, CAMERA, (SIDE, SIDE), **tuned.settings).shape == (SIDE, SIDE, 4)
+
+    def test_nothing_is_within(self, modelled, kept):
+        with pytest.warns(ToleranceWarning, match="nothing is within 0.0001 %: the least error that was found"):
+            tuned = tune(scene("translation"), tolerance=1e-6, samplers=["raster"], truths=kept, progress=False)
+        assert tuned.settings["splatter"] == "visible" and tuned.settings["supersample"] == 4
+        assert tuned.error > 1e-6
+
+    def test_reasons(self, modelled, kept):
+        tuned = tune(scene("translation"), tolerance=0.2, samplers=["raster", "reference"], truths=kept, progress=False)
+        told = " | ".join(tuned.reasons)
+        assert "sampler='raster': sampler='reference' takes 5 times as long" in told
+        assert "supersample=" in told and "off by" in told
+
+    def test_rates(self, modelled, kept):
+        """A lattice that is finer than need be is thinned, and the scene that is given back has derivatives."""
+        import torch
+
+        axis = np.linspace(-1, 1, 17)
+        x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
+        values = (np.sqrt(x**2 + y**2 + z**2) - 0.7).astype(np.float32)
+        surface = plugin("surfaces", "isosurface")(((-1, -1, -1), (1, 1, 1)))
+
+        def ball(parameters):
+            theta = {"values": rts.namespace(parameters).asarray(values) + parameters}
+            return rts.Part(surface, theta, "silhouette"), CAMERA
+
+        start = torch.zeros(())
+        tuned = tune(ball, start, tolerance=0.5, size=(32, 32), samplers=["raster"], truths=kept, progress=False)
+        assert tuned.parts[0].theta["values"].shape == (5, 5, 5)
+        moved = torch.zeros((), requires_grad=True)
+        parts, camera = tuned.scene(moved)
+        rts.render(parts, camera, (32, 32), **tuned.settings).sum().backward()
+        assert moved.grad < -10
+
+    def test_budget(self, kept):
+        """What is known when it is spent is what is taken."""
+        options = dict(samplers=["raster"], truths=kept, progress=False)
+        tuned = tune(scene("translation"), tolerance=0.5, budget_s=1e-6, **options)
+        assert tuned.reasons[-1] == "the budget was spent before all settings were looked at"
+        assert tuned.error <= 0.5
+
+
+# --------------------------------------------------------------------------------------------------------- misuse
+
+
+def nothing(parameters):
+    pass
+
+
+class TestMisuse:
+    @pytest.mark.parametrize(
+        ("given", "message"),
+        [
+            (dict(scene="bunni over black"), "did you mean"),
+            (dict(scene="missing.obj"), "missing.obj does not exist; expected a model, a Python file, or one of"),
+            (dict(scene="missing.py"), "missing.py does not exist"),
+            (dict(scene=3), "scene is 3; expected a name"),
+            (dict(scene=nothing), "nothing takes parameters"),
+            (dict(scene=nothing, parameters=np.zeros(2)), "nothing gave None.*expected .parts, camera."),
+            (dict(scene=lambda: None), "gave None.*expected .parts, camera."),
+            (dict(scene=nothing, parameters={}), "parameters holds no numbers"),
+            (
+                dict(scene=nothing, parameters=np.zeros(2), directions={"a": np.zeros(3)}),
+                "expected those of parameters",
+            ),
+            (dict(scene=nothing, parameters=np.zeros(2), directions={"a": np.zeros(2)}), "is zero"),
+            (dict(scene="thin wires", parameters=np.zeros(2)), "only functions of parameters"),
+            (dict(scene="thin wires", modes=["sideways"]), "expected some of translation"),
+            (dict(scene="thin wires", modes="shape"), "expected some of translation"),
+            (dict(scene="thin wires", size=(0, 4)), "size"),
+            (dict(scene="thin wires", layers=[0]), "layers is .0.; expected integers of at least 1 or 'auto'"),
+            (dict(scene="thin wires", supersample=["auto"]), "supersample is"),
+            (dict(scene="thin wires", samplers=["rays"]), "none of the samplers rays suits"),
+        ],
+    )
+    def test_compare(self, given, message):
+        with pytest.raises(InputError, match=message) as caught:
+            compare(given.pop("scene"), given.pop("parameters", None), progress=False, **given)
+        assert "\n" not in str(caught.value)
+
+    @pytest.mark.parametrize("name", ["splatters", "samplers", "engines"])
+    def test_unknown_plugin(self, name):
+        with pytest.raises((InputError, PluginError), match="no .* named 'blender'"):
+            compare("thin wires", **{name: ["blender"]}, progress=False)
+
+    def test_folder(self, tmp_path):
+        (tmp_path / "file").write_text("")
+        with pytest.raises(InputError, match="is a file; expected a folder to write into"):
+            compare("thin wires", output=tmp_path / "file" / "deeper", progress=False)
+
+    @pytest.mark.parametrize("tolerance", [0, -1, float("nan"), "much"])
+    def test_tolerance(self, tolerance):
+        with pytest.raises(InputError, match="tolerance is"):
+            tune("thin wires", tolerance=tolerance)
+
+    def test_no_engine(self, monkeypatch):
+        monkeypatch.setattr(registry, "plugins", lambda group: ["numpy"] if group == "rts.engines" else [])
+        with pytest.raises(PluginError, match="no engine with derivatives is installed"):
+            compare("thin wires", progress=False)
+
+    def test_python_file(self, tmp_path):
+        path = tmp_path / "mine.py"
+        path.write_text("def other():\n    return None\n")
+        with pytest.raises(InputError, match="has no function 'scene'; name one"):
+            compare(path, progress=False)
+        with pytest.raises(InputError, match="other gave None"):
+            compare(f"{path}:other", progress=False)
+        path.write_text("1 / 0\n")
+        with pytest.raises(InputError, match="fails: ZeroDivisionError: division by zero"):
+            compare(path, progress=False)
