@@ -1,5 +1,6 @@
 """The compiled splatters against the specification, which test_splatting.py holds against the method's definition."""
 
+import dataclasses
 import itertools
 import subprocess
 import sys
@@ -72,14 +73,13 @@ class Compiled(Cells):
 
 
 def compiled(splatter, scene, border=0):
-    settings = Settings(splatter.kind, splatter.sigma, splatter.epsilon, splatter.gamma, border)
-    return Compiled(settings, *scene)
+    return Compiled(splatter._settings(border), *scene)
 
 
 def specification(splatter):
     """The class of `rts.splatting` with the same settings."""
     plain = getattr(splatting, type(splatter).__name__)
-    return plain(splatter.sigma, splatter.epsilon, splatter.calibration)
+    return plain(**{field.name: getattr(splatter, field.name) for field in dataclasses.fields(splatter)})
 
 
 def noise(*shape, dtype=np.float64, seed=7):

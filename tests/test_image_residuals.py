@@ -16,7 +16,7 @@ from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
 from rts_backends.fused import normal_equations as fused_normal
 from rts_backends.fused import splatters as fused
-from rts_backends.fused.cells import Cells, Settings
+from rts_backends.fused.cells import Cells
 
 pytestmark = pytest.mark.fitting
 
@@ -333,7 +333,7 @@ def splats_of(kind, layers=2, size=(40, 150), dtype=np.float64, seed=0):
     rgba = rng.random((len(k), 4))
     tangents = rng.normal(size=(3, len(k), 3)), rng.normal(size=(3, len(k), 4))
     kernel = {"single": fused.Single, "multi": fused.Multi, "visible": fused.Visible}[kind]()
-    settings = Settings(kind, kernel.sigma, kernel.epsilon, kernel.gamma, 2)
+    settings = kernel._settings(2)
     splats = Cells(settings, positions.astype(dtype), rgba.astype(dtype), row)
     return splats, *(t.astype(dtype) for t in tangents)
 
