@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.errors import InputError
-from rts.splatting.kernel import LEAST_EPSILON
 from rts.splatting import rims
+from rts.splatting.kernel import LEAST_EPSILON
 from rts.splatting.layers import OFFSETS, check_rows
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only

@@ -212,7 +212,22 @@ def _closes(positions, row, part, y, x, py, px, converging):
 
 @kernel
 def fill(
-    start, stop, positions, rgba, row, scale, peak, gamma, mixed, ranges, sums, firsts, marks, offsets, columns, gives,
+    start,
+    stop,
+    positions,
+    rgba,
+    row,
+    scale,
+    peak,
+    gamma,
+    mixed,
+    ranges,
+    sums,
+    firsts,
+    marks,
+    offsets,
+    columns,
+    gives,
     changes,
 ):
     """List the marked targets of rows [start, stop): the last three arrays of `Outlines`.
