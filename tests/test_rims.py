@@ -9,8 +9,8 @@ from loops import STEPS, Pairing
 
 import rts
 from rts.splatting import Visible, rims
-from rts_backends.fused import splatters as fused
 from rts.splatting.layers import NEIGHBOURS, Layers
+from rts_backends.fused import splatters as fused
 
 pytestmark = pytest.mark.splatting
 
@@ -204,7 +204,7 @@ def pulled(splatter, splats, along, target="torch-cpu"):
     return gradient(target, loss, given)
 
 
-@pytest.mark.parametrize("target, layers", [*[(target, layers) for target in TORCH for layers in (1, 2, 3)], ("jax", 2)])
+@pytest.mark.parametrize("target, layers", [case[:2] for case in CASES])
 def test_compiled_derivatives_are_those_of_the_specification(target, layers, double):
     for seed in range(6 if target in TORCH else 1):
         splats, rng = rough(layers, seed, 9, 11), np.random.default_rng(seed)
