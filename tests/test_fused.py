@@ -423,8 +423,11 @@ def test_finite_differences_agree(kind):
     positions, rgba, row = map(torch.tensor, cells(2, (4, 5)))
     where = positions[:, :2].clone().requires_grad_()
 
+    # The derivative of coverage with rims is not that of the image's own weights.
+    splatter = fused.Visible(rims=False) if kind == "visible" else KINDS[kind]()
+
     def image(where, rgba):
-        return KINDS[kind]().splat(torch.cat([where, positions[:, 2:]], dim=1), rgba, row)
+        return splatter.splat(torch.cat([where, positions[:, 2:]], dim=1), rgba, row)
 
     given = where, rgba.requires_grad_()
     assert torch.autograd.gradcheck(image, given, check_forward_ad=True, check_undefined_grad=False)

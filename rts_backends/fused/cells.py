@@ -222,7 +222,8 @@ class Cells:
             parallel(mixed.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=self._mixed_work // 5)
             parallel(mixed.pull, height, *self.mixed_arguments, adjoints, *found, work=self._mixed_work)
         if self.rims and g_positions is not None:
-            outlines.pull(self.positions, self.row, *self._numbers, self.outlines, self.border, g, g_positions)
+            given: tuple = self.positions, self.row, *self._numbers, self.outlines, self.border, g, g_positions
+            outlines.pull(*given)
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
         """Fill tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4), or None."""
