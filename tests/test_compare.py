@@ -22,10 +22,7 @@ from rts.engines import engine_named
 from rts.errors import InputError, PluginError, ToleranceWarning
 from rts.registry import plugin
 
-pytestmark = [
-    pytest.mark.rendering,
-    pytest.mark.skipif(not registry.plugins("rts.engines"), reason="no engine"),
-]
+pytestmark = pytest.mark.rendering
 pytest.importorskip("torch")
 
 SIDE = 48

@@ -199,7 +199,7 @@ def compare(
         suited[:1] if quick else suited,
         used,
         _counts("layers", layers, LAYERS[:2] if quick else LAYERS, ("auto",)),
-        _counts("supersample", supersample, SUPERSAMPLE[:2] if quick else SUPERSAMPLE),
+        _counts("supersample", supersample, SUPERSAMPLE),
         rates=not quick,
         most=QUICK_CELLS if quick else None,
         peers=others,

@@ -1,7 +1,7 @@
 """The true derivative of an image, by differences of area-sampled renders that know nothing of splatting.
 
 The differences are central, over a quarter of a pixel, on two lattices of points in the pixel that have nothing in
-common: what they disagree on is their error. They are kept on disk by a key of the scene.
+common: what they disagree on tells their error. They are kept on disk by a key of the scene.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ class Truth(NamedTuple):
 
     Attributes:
         derivative: (H, W, 3) a pixel of motion, the mean of the two lattices'.
-        error: what the lattices disagree on, relative L2 through the low-pass of `scores`.
+        error: half of what the lattices disagree on, relative L2 through the low-pass of `scores`: how far the mean of
+            two that err alike, and independently, is off.
     """
 
     derivative: np.ndarray
@@ -57,7 +58,6 @@ def area_image(
     size: tuple[int, int],
     points: np.ndarray,
     done: Callable[[], None] = lambda: None,
-    **options: object,
 ) -> np.ndarray:
     """Mean of the hard image (H, W, 4) float64 over points (S, 2) of each pixel; nothing is splatted.
 
@@ -67,7 +67,6 @@ def area_image(
         size: (height, width).
         points: of the pixel's centre, x right and y down, pixels.
         done: called after each point.
-        **options: of `rts.render`.
     """
     total = np.zeros((*size, 4))
     for dx, dy in points:
@@ -76,7 +75,7 @@ def area_image(
         shift[0, 3], shift[1, 3] = -2 * dx / size[1], 2 * dy / size[0]
         moved = camera.for_size(size)
         projection = np.asarray(engine_of(moved.projection).to_numpy(moved.projection), np.float64)
-        image = render(parts, moved.replace(projection=shift @ projection), size, splatter="none", layers=1, **options)
+        image = render(parts, moved.replace(projection=shift @ projection), size, splatter="none", layers=1)
         total += engine_of(image).to_numpy(image)
         done()
     return total / len(points)
@@ -182,4 +181,4 @@ def _kept_image(
 def _of(derivatives: np.ndarray) -> Truth:
     first, second = derivatives.astype(np.float64)
     mean = (first + second) / 2
-    return Truth(mean, relative_l2(low_pass(first), low_pass(second), low_pass(mean)))
+    return Truth(mean, relative_l2(low_pass(first), low_pass(second), low_pass(mean)) / 2)
