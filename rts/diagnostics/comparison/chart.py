@@ -38,7 +38,7 @@ COLUMNS = 3
 PANEL_WIDTH, PANEL_HEIGHT, LEGEND_WIDTH, LINE_HEIGHT = 5.4, 4.3, 2.2, 0.142
 """In inches; the last is that of a line of the list under a panel."""
 CHARACTER_WIDTH = 0.075
-"""Of the line below all panels, inches."""
+"""Inches of a character of the line below all panels."""
 LONGEST = 70
 """Characters of a line under a panel."""
 

@@ -320,7 +320,7 @@ def _peer_key(peer: Peer) -> tuple:
 
 def _peer_scores(measured: Measurements, mode: str, peer: Peer, done: Any) -> dict[str, float] | None:
     key = ("peer", measured.samples, mode, *_peer_key(peer))
-    kept = measured.journal.get(*key)
+    kept: Any = measured.journal.get(*key)
     if kept is None:
         try:
             derivative = peer.derivative(mode) * measured.pixel(mode)
