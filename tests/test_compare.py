@@ -323,6 +323,23 @@ class TestCompare:
         errors = {r["settings"]["layers"]: r["error"] for r in comparison.rows}
         assert errors["auto"] == errors[4] < errors[1]
 
+    def test_a_mode_that_changes_nothing(self, kept):
+        def still(parameters):
+            parts, camera = two_cards()
+            x = parameters["x"]
+            pose = rts.namespace(x).stack([0 * x, 0 * x, 0 * x, x, 0 * x, 0 * x])
+            return [parts[0].replace(transform=rts.rigid(pose)), parts[1]], camera
+
+        start = {"x": np.zeros(()), "y": np.zeros(())}
+        options = {**SMALL, "supersample": [1], "layers": 1, "splatters": ["visible"], "size": (SIDE, SIDE)}
+        comparison = compare(still, start, truths=kept, **options)
+        assert list(comparison.modes) == ["x"]
+        assert comparison.left_out[0].startswith(
+            "nothing in the image of 'still' changes with 'y'; expected parameters"
+        )
+        with pytest.raises(InputError, match="changes with 'y'"):
+            compare(still, start, modes=["y"], truths=kept, **options)
+
 
 class TestStrangers:
     def test_sampler(self, kept):

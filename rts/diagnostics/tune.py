@@ -36,6 +36,7 @@ class Tuned(NamedTuple):
     Attributes:
         parts: the scene's parts at the parameters, their surfaces at the rates that were chosen.
         settings: keyword arguments of `rts.render`: sampler, splatter, layers and supersample.
+        rate: what is other about the surfaces, such as "tolerance=0.4"; "" for nothing.
         reasons: a line for each choice: what the cheaper one lacks, and what the next costs.
         scene: parameters → (parts, camera), with the same rates: what a fit renders.
         error: the largest error of the derivatives along the modes, relative L2 through a Gaussian of 2 pixels.
@@ -44,6 +45,7 @@ class Tuned(NamedTuple):
 
     parts: list[Part]
     settings: dict[str, Any]
+    rate: str
     reasons: list[str]
     scene: SceneFunction
     error: float
@@ -107,12 +109,14 @@ def tune(
     used = engines(chosen)[0][:1]
     checked(found.at(found.moved(next(iter(found.directions)), 0.0, used[0])), found.name)
     measured = Measurements(found, Journal(), used, truths=kept, together=True)
+    measured.leave_out_what_rests()
     suited = measured.samplers(usable("rts.samplers", samplers)[0])
     if not suited:
         raise InputError(f"no sampler suits {found.name!r}: {'; '.join(measured.left_out)}")
     with phases(progress) as phase:
-        done = phase("truth", 4 * measured.samples**2 * len(found.directions))
-        for mode in found.directions:
+        modes = list(measured.scene.directions)
+        done = phase("truth", 4 * measured.samples**2 * len(modes))
+        for mode in modes:
             measured.truth(mode, done)
         search = _Search(measured, tolerance, time.perf_counter() + budget_s, phase)
         return search.run(usable("rts.splatters", splatters)[0], suited)
@@ -155,7 +159,8 @@ class _Search:
             reasons.append("the budget was spent before all settings were looked at")
         at = self.measured.forms(TOGETHER)[chosen.rate].at
         parts, _ = at(self.measured.start(TOGETHER))
-        return Tuned([parts] if isinstance(parts, Part) else list(parts), chosen.options, reasons, at, error, seconds)
+        parts = [parts] if isinstance(parts, Part) else list(parts)
+        return Tuned(parts, chosen.options, chosen.rate, reasons, at, error, seconds)
 
     # -------------------------------------------------------------------------------------------------- accuracy
 

@@ -189,6 +189,7 @@ def compare(
     journal = _journal(folder, found, used[0], fresh)
     measured = Measurements(found, journal, used, truths=kept)
     measured.left_out += [*left_out, *without, *missing]
+    measured.leave_out_what_rests()
     suited = measured.samplers(possible)
     if not suited:
         raise InputError(f"none of the samplers {', '.join(possible)} suits {found.name!r}; {measured.left_out[-1]}")

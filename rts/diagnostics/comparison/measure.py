@@ -106,7 +106,11 @@ class Measurements:
         return [mode for mode in self.scene.directions if self.group(mode) == group]
 
     def pixel(self, mode: str) -> float:
-        """How far along a mode what moves fastest moves by a pixel."""
+        """How far along a mode what moves fastest moves by a pixel.
+
+        Raises:
+            InputError: nothing changes with it.
+        """
         if mode not in self._pixels:
             engine, scene = self.engine, self.scene
 
@@ -116,9 +120,32 @@ class Measurements:
                 return render(*found, scene.size, **options)
 
             start = self._number(0.0)
-            step = pixel_step(engine, image, start, namespace(start).ones_like(start))
+            step = _quietly(lambda: pixel_step(engine, image, start, namespace(start).ones_like(start)))
+            if step is None:
+                raise InputError(
+                    f"nothing in the image of {scene.name!r} changes with {mode!r}; expected parameters that the scene "
+                    f"depends on, and parts that are in view"
+                )
             self._pixels[mode] = step
         return self._pixels[mode]
+
+    def leave_out_what_rests(self) -> None:
+        """Go on with those modes that change something.
+
+        Raises:
+            InputError: there are none.
+        """
+        changing, why = [], []
+        for mode in self.scene.directions:
+            try:
+                self.pixel(mode)
+                changing.append(mode)
+            except InputError as error:
+                why.append(error)
+                self._leave_out(str(error))
+        if not changing:
+            raise why[0]
+        self.scene = self.scene.with_modes(changing)
 
     def _number(self, value: float) -> Array:
         like = next((x for x in leaves(self.scene.parameters) if self.engine.owns(x)), None)
