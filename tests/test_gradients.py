@@ -5,7 +5,7 @@ import pytest
 from helpers import DIFFERENTIABLE, arrays, quad
 
 import rts
-from rts.diagnostics import steps
+from rts.diagnostics import gradients, steps
 
 pytestmark = pytest.mark.rendering
 
