@@ -17,10 +17,12 @@ from pathlib import Path
 import rts
 from benchmarks.report import table
 from rts.diagnostics.comparison.builtin import builtin
+from rts.diagnostics.comparison.compare import file_name
 from rts.diagnostics.comparison.environment import environment
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.measure import TOGETHER, Measurements
 from rts.diagnostics.comparison.settings import Setting, engines, usable
+from rts.diagnostics.comparison.turns import Calls
 from rts.diagnostics.tune import LAYERS, SUPERSAMPLE
 
 MODES = ("translation", "rotation")
@@ -46,11 +48,12 @@ def options() -> argparse.Namespace:
 def within(measured: Measurements, tolerance: float) -> list[Setting]:
     """All settings that are accurate enough, with each sampler."""
     splatters, samplers = usable("rts.splatters")[0], measured.samplers(usable("rts.samplers")[0])
-    found = []
-    for setting in measured.settings(TOGETHER, splatters, LAYERS, SUPERSAMPLE, rates=True):
+    kinds, found = measured.kinds(samplers), []
+    for setting in measured.settings(TOGETHER, splatters, LAYERS, SUPERSAMPLE, dict.fromkeys(kinds.values())):
         scores = [measured.scores(mode, setting) for mode in measured.scene.directions]
         if all(s is not None and s["error"] <= tolerance for s in scores):
-            found += [setting._replace(sampler=name, engine=measured.engine.name) for name in samplers]
+            alike = [name for name, kind in kinds.items() if kind == setting.sampler]
+            found += [setting._replace(sampler=name, engine=measured.engine.name) for name in alike]
     return found
 
 
@@ -61,16 +64,14 @@ def case(name: str, modes: tuple[str, ...], tolerance: float, folder: Path) -> d
         start = time.perf_counter()
         tuned = rts.tune(scene, modes=modes, tolerance=tolerance, truths=folder, progress=False)
         times.append(time.perf_counter() - start)
-    kept = folder / f"{name.replace(' ', '_')}.jsonl"
-    measured = Measurements(scene.with_modes(modes), Journal(kept), engines()[0][:1], truths=folder, together=True)
+    journal = Journal(folder / f"{file_name(name)}.jsonl")
+    measured = Measurements(scene.with_modes(modes), journal, engines()[0][:1], truths=folder, together=True)
     admissible = within(measured, tolerance)
-    calls = {tuple(s): lambda s=s: measured.call(TOGETHER, s) for s in admissible}
-    found = {s: t["median"] for s, t in measured.time(TOGETHER, calls, rounds=2).items()}
-    best = Setting(*min(found, key=lambda s: found[s]))
+    found = medians(measured, admissible, 2)
+    best = min(found, key=lambda s: found[s])
     chosen = Setting(**tuned.settings, rate=tuned.rate, engine=measured.engine.name)
     last = Measurements(measured.scene, Journal(), [measured.engine], truths=folder, together=True)
-    again = {tuple(s): lambda s=s: last.call(TOGETHER, s) for s in {chosen, best}}
-    medians = {s: t["median"] for s, t in last.time(TOGETHER, again, rounds=TURNS).items()}
+    again = medians(last, list({chosen: None, best: None}), TURNS)
     return {
         "scene": name,
         "tolerance": tolerance,
@@ -78,10 +79,16 @@ def case(name: str, modes: tuple[str, ...], tolerance: float, folder: Path) -> d
         "tuned": _told(chosen),
         "cheapest": _told(best),
         "error": tuned.error,
-        "ms": [medians[tuple(chosen)], medians[tuple(best)]],
+        "ms": [again[chosen], again[best]],
         "seconds": times,
         "reasons": tuned.reasons,
     }
+
+
+def medians(measured: Measurements, settings: list[Setting], turns: int) -> dict[Setting, float]:
+    """Milliseconds of settings, in turns."""
+    calls: Calls = {s: lambda s=s: measured.call(TOGETHER, s) for s in settings}
+    return {Setting(*s): ms["median"] for s, ms in measured.turns(TOGETHER, calls).run(turns).items()}
 
 
 def _told(setting: Setting) -> str:

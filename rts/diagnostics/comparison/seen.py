@@ -18,9 +18,11 @@ from rts import registry
 from rts.camera import Camera
 from rts.checks import check_scene
 from rts.diagnostics.comparison.scene import Scene
+from rts.engines import Engine, engine_of
 from rts.errors import InputError
 from rts.interfaces import CheckedPart, Part
 from rts.shading import Silhouette, Unlit
+from rts.trees import map_leaves
 
 EDGE = 4.0
 """Pixels that edges of triangles are to be shorter than, where a surface is cut into triangles."""
@@ -133,7 +135,7 @@ class Peer(abc.ABC):
         """
 
 
-def seen(scene: Scene) -> Seen:
+def seen(scene: Scene, engine: Engine | None = None) -> Seen:
     """A scene at rest, and its velocities in every mode.
 
     Velocities are central differences over a pixel: exact up to rounding where vertices move along straight lines.
@@ -142,7 +144,7 @@ def seen(scene: Scene) -> Seen:
         Unsuited: other renderers cannot render it.
     """
     first = next(iter(scene.directions))
-    parts, camera = check_scene(*scene.at(scene.moved(first)))
+    parts, camera = _on_host(scene, first, 0.0, engine)
     projection = np.asarray(camera.for_size(scene.size).projection, np.float64)
     if projection[3, 2] == 0:
         raise Unsuited("the camera is orthographic")
@@ -150,7 +152,7 @@ def seen(scene: Scene) -> Seen:
     near, far = (float(d) for d in camera.depth_range())
     to_camera = _to_camera(camera, focal, scene.size)
     cuts = [1 if _is_mesh(part) else _cuts(index, part, to_camera, focal) for index, part in enumerate(parts)]
-    at = partial(_snapshot, scene, focal, cuts)
+    at = partial(_snapshot, scene, engine, focal, cuts)
     rest = at(first, 0.0)
     if not np.isfinite(far):
         far = 2 * max(float(-p.vertices[:, 2].min()) for p in rest)
@@ -166,9 +168,16 @@ def seen(scene: Scene) -> Seen:
 # --------------------------------------------------------------------------------------------------------------- parts
 
 
-def _snapshot(scene: Scene, focal: float, cuts: list[int], mode: str, t: float) -> list[Colored]:
+def _on_host(scene: Scene, mode: str, t: float, engine: Engine | None) -> tuple[list[CheckedPart], Camera]:
+    """The parts and the camera at t, their arrays in NumPy."""
+    parts, camera = scene.at(scene.moved(mode, t, engine))
+    host = map_leaves(lambda x: engine_of(x).to_numpy(engine_of(x).stop_gradient(x)), (parts, camera))
+    return check_scene(*host)
+
+
+def _snapshot(scene: Scene, engine: Engine | None, focal: float, cuts: list[int], mode: str, t: float) -> list[Colored]:
     """The parts at t, wound as they are."""
-    parts, camera = check_scene(*scene.at(scene.moved(mode, t)))
+    parts, camera = _on_host(scene, mode, t, engine)
     to_camera = _to_camera(camera, focal, scene.size)
     found = []
     for index, (part, rate) in enumerate(zip(parts, cuts, strict=True)):

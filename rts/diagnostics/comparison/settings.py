@@ -9,14 +9,15 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rts import registry
+from rts.arguments import quoted
 from rts.engines import Engine, engine_named
-from rts.errors import PluginError
+from rts.errors import InputError, PluginError
 
 FIRST = "torch"
 """The engine that errors are measured with where it is installed, since all agree on them and it compiles nothing."""
 
 
-ALIKE = 1.05
+ALIKE = 1.01
 """A setting that costs more has to have an error smaller than by this factor."""
 
 
@@ -59,6 +60,8 @@ def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], 
     """
     found: dict[str, Any] = {}
     left_out = []
+    if chosen is not None and (not isinstance(chosen, (list, tuple)) or not chosen):
+        raise InputError(f"{group.removeprefix('rts.')} is {quoted(chosen)}; expected a list of names, or None for all")
     for name in registry.plugins(group) if chosen is None else chosen:
         if name == "auto" and chosen is None:
             continue
