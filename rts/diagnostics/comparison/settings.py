@@ -22,7 +22,7 @@ ALIKE = 1.01
 
 
 CLEARLY = 0.9
-"""A setting betters another one clearly where its error and its time are at most this share of the other's."""
+"""A setting betters another one clearly where its error or its time is at most this share of the other's."""
 
 
 class Setting(NamedTuple):
@@ -109,10 +109,13 @@ def worth_timing(errors: Mapping[Setting, float], work: Callable[[Setting], tupl
 
 
 def near_front(errors: Mapping[Setting, float], times: Mapping[Setting, float]) -> list[Setting]:
-    """The settings that no other one clearly betters, both in error and in time."""
-    return [
-        s for s in times if not any(errors[o] <= CLEARLY * errors[s] and times[o] <= CLEARLY * times[s] for o in times)
-    ]
+    """The settings that no other one betters in both error and time, and clearly in one of them."""
+
+    def bettered(a: Setting, b: Setting) -> bool:
+        error, time = errors[b] / max(errors[a], 1e-30), times[b] / times[a]
+        return max(error, time) <= 1 and min(error, time) <= CLEARLY
+
+    return [a for a in times if not any(bettered(a, b) for b in times)]
 
 
 class TooSlow(Exception):
