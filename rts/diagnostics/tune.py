@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rts.arguments import check_positive, quoted
-from rts.checks import is_real
+from rts.checks import is_count, is_real
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.measure import TOGETHER, Measurements
 from rts.diagnostics.comparison.progress import Phase, phases
 from rts.diagnostics.comparison.scene import SceneFunction, parts_of
 from rts.diagnostics.comparison.settings import Setting, usable
 from rts.diagnostics.comparison.sources import engines_for, scene_of, some_modes
+from rts.diagnostics.comparison.truth import SAMPLES
 from rts.diagnostics.comparison.turns import Calls
 from rts.engines import stopped
 from rts.errors import InputError, ToleranceWarning, warn
@@ -69,6 +70,7 @@ def tune(
     splatters: Sequence[str] | None = None,
     surface: str = "mesh",
     truths: Path | str | None = None,
+    truth_samples: int = SAMPLES,
     progress: bool | None = None,
 ) -> Tuned:
     """Find the cheapest settings whose derivatives are accurate enough.
@@ -94,6 +96,7 @@ def tune(
         splatters: names; None for all.
         surface: the kind of surface that reads a model.
         truths: the folder of truths; None for the folder of caches.
+        truth_samples: of the truth, along each side of a pixel; fewer are faster, and leave a larger error of its own.
         progress: whether to show progress; None for where standard error is a terminal.
 
     Raises:
@@ -105,12 +108,14 @@ def tune(
     if not (is_real(tolerance) and 0 < tolerance < math.inf):
         raise InputError(f"tolerance is {quoted(tolerance)}; expected a share of the derivative, such as 0.05")
     check_positive("budget_s", budget_s)
+    if not is_count(truth_samples):
+        raise InputError(f"truth_samples is {quoted(truth_samples)}; expected an integer of at least 1")
     found = some_modes(scene_of(scene, parameters, directions, size, surface=surface), modes)
     kept = None if truths is None else output_folder(truths)
     named = usable("rts.splatters", splatters)[0]
     possible = usable("rts.samplers", samplers)[0]
     used, _ = engines_for(found, None if engine is None else [engine])
-    measured = Measurements(found, Journal(), used[:1], truths=kept, together=True)
+    measured = Measurements(found, Journal(), used[:1], truths=kept, samples=truth_samples, together=True)
     measured.leave_out_what_rests()
     with phases(progress) as phase:
         measured.truths(phase("truth", 4 * measured.samples**2 * len(measured.scene.directions)))

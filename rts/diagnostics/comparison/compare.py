@@ -14,15 +14,16 @@ from typing import Any, NamedTuple
 from rts.arguments import quoted
 from rts.checks import is_count
 from rts.diagnostics.comparison.environment import environment
-from rts.diagnostics.comparison.front import Row, best_within, marked
+from rts.diagnostics.comparison.front import Row, best_within, front, marked
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.measure import Measurements
 from rts.diagnostics.comparison.progress import Phase, phases
 from rts.diagnostics.comparison.scene import Scene
 from rts.diagnostics.comparison.scores import scores
 from rts.diagnostics.comparison.seen import Peer
-from rts.diagnostics.comparison.settings import Setting, near_front, usable, worth_timing
+from rts.diagnostics.comparison.settings import Setting, usable, worth_timing
 from rts.diagnostics.comparison.sources import engines_for, scene_of, some_modes
+from rts.diagnostics.comparison.truth import SAMPLES
 from rts.diagnostics.comparison.turns import ROUNDS, Calls, Turns
 from rts.engines import Engine
 from rts.errors import InputError, PluginError
@@ -34,7 +35,7 @@ LAYERS = (1, 2, 4, "auto")
 SUPERSAMPLE = (1, 2, 4)
 QUICK_CELLS = 40
 """The most settings that are looked at with `quick`."""
-PEER_ROUNDS = 3
+PEER_ROUNDS = 2
 """Turns of other renderers."""
 PACKAGES = ("rasterize-then-splat", "numpy", "numba", "torch", "jax", "embreex", "moderngl", "deodr", "mitsuba")
 
@@ -144,6 +145,7 @@ def compare(
     surface: str = "mesh",
     output: Path | str | None = None,
     truths: Path | str | None = None,
+    truth_samples: int = SAMPLES,
     fresh: bool = False,
     progress: bool | None = None,
 ) -> Comparison:
@@ -173,6 +175,7 @@ def compare(
         surface: the kind of surface that reads a model.
         output: a folder for the results, and for what a run that is interrupted goes on from; None to write nothing.
         truths: the folder of truths; None for the folder of caches.
+        truth_samples: of the truth, along each side of a pixel; fewer are faster, and leave a larger error of its own.
         fresh: whether to forget what earlier runs have measured.
         progress: whether to show progress; None for where standard error is a terminal.
 
@@ -186,11 +189,12 @@ def compare(
     found = some_modes(found, list(found.directions)[:1] if quick and modes is None else modes)
     layers = _counts("layers", layers, LAYERS[:2] if quick else LAYERS, ("auto",))
     supersample = _counts("supersample", supersample, SUPERSAMPLE)
+    (samples,) = _counts("truth_samples", truth_samples, ())
     names, without = usable("rts.splatters", splatters)
     possible, missing = usable("rts.samplers", samplers)
     used, failing = engines_for(found, engines)
-    used = used[:1] if quick else used
-    measured = Measurements(found, _journal(folder, found, fresh), used, truths=kept)
+    used, journal = used[:1] if quick else used, _journal(folder, found, fresh)
+    measured = Measurements(found, journal, used, truths=kept, samples=samples)
     measured.left_out += [*failing, *without, *missing, *_unthinned()]
     measured.leave_out_what_rests()
     suited = measured.samplers(possible)
@@ -295,8 +299,8 @@ def _timed(
     """Times of settings.
 
     Of each splatter, and each sampler with errors of its own, the front of errors is timed, with one sampler and the
-    first engine; what is then near the front of errors and times, with all samplers that share these errors, and with
-    all other engines.
+    first engine; what is then on the front of errors and times, with all samplers that share these errors, and with all
+    other engines.
     """
     engine = plan.engines[0].name
     usual = {kind: next(name for name, k in plan.samplers.items() if k == kind) for kind in plan.samplers.values()}
@@ -309,17 +313,19 @@ def _timed(
                 first[setting] = setting._replace(sampler=usual[kind], engine=engine)
     times = _taken(measured, group, list(first.values()), phase, f"times, {group}")
     known = {s: times[timed]["median"] for s, timed in first.items() if timed in times}
-    near: dict[Setting, None] = {}
-    for of_mode in plain.values():
-        near.update(dict.fromkeys(near_front(of_mode, {s: t for s, t in known.items() if s in of_mode})))
+    best: dict[Setting, None] = {}
+    for mode, of_mode in plain.items():
+        tried = [s for s in of_mode if s in known]
+        on = front([{"mode": mode, "error": of_mode[s], "ms": {"median": known[s]}} for s in tried])
+        best.update(dict.fromkeys(s for s, wanted in zip(tried, on, strict=True) if wanted))
     more = [
         s._replace(sampler=name, engine=engine)
-        for s in near
+        for s in best
         for name, kind in plan.samplers.items()
         if kind == s.sampler and name != usual[kind]
     ]
     # Compiled programs have to know how many layers there are.
-    more += [first[s]._replace(engine=e.name) for s in near for e in plan.engines[1:] if s.layers != "auto"]
+    more += [first[s]._replace(engine=e.name) for s in best for e in plan.engines[1:] if s.layers != "auto"]
     return times | _taken(measured, group, more, phase, "times, other samplers and engines")
 
 

@@ -21,10 +21,6 @@ ALIKE = 1.01
 """A setting that costs more has to have an error smaller than by this factor."""
 
 
-CLEARLY = 0.9
-"""A setting betters another one clearly where its error or its time is at most this share of the other's."""
-
-
 class Setting(NamedTuple):
     """One way to render a scene.
 
@@ -106,16 +102,6 @@ def worth_timing(errors: Mapping[Setting, float], work: Callable[[Setting], tupl
         ):
             found.append(setting)
     return found
-
-
-def near_front(errors: Mapping[Setting, float], times: Mapping[Setting, float]) -> list[Setting]:
-    """The settings that no other one betters in both error and time, and clearly in one of them."""
-
-    def bettered(a: Setting, b: Setting) -> bool:
-        error, time = errors[b] / max(errors[a], 1e-30), times[b] / times[a]
-        return max(error, time) <= 1 and min(error, time) <= CLEARLY
-
-    return [a for a in times if not any(bettered(a, b) for b in times)]
 
 
 class TooSlow(Exception):

@@ -13,9 +13,9 @@ from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.settings import limited
 from rts.fitting.names import one_line
 
-ROUNDS, CONSECUTIVE = 5, 2
+ROUNDS, CONSECUTIVE = 4, 2
 """Turns that each function has, and calls timed in a turn."""
-SLOW = 2.5
+SLOW = 1.5
 """Seconds of timed calls after which a function has had its turns, two at least."""
 LONGEST = 120.0
 """Seconds after which a function that is to be timed is left out."""
