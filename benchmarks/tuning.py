@@ -1,7 +1,7 @@
 """Whether `rts.tune` finds the cheapest settings: beside an exhaustive search over all that it may choose from.
 
-On six scenes of different surfaces, for the pose of what moves. *Exhaustive*: the error of every setting, and the time
-of every one that is within the tolerance, with every sampler. Both then take turns once more, and the ratio is that of
+On six scenes of different surfaces, 128², for the pose of what moves. *Exhaustive*: the error of every setting, and the
+time of every one that is within the tolerance, with every sampler. Both then take turns once more: the ratio is that of
 their medians:
 
     python -m benchmarks.tuning -o out/tuning
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import rts
@@ -35,7 +36,7 @@ CASES = {
     "torus by lattice": (MODES, 0.1),
 }
 """Scene → its modes, and the tolerance."""
-TURNS = 5
+SIZE, TURNS = (128, 128), 5
 
 
 def options() -> argparse.Namespace:
@@ -62,10 +63,11 @@ def case(name: str, modes: tuple[str, ...], tolerance: float, folder: Path) -> d
     times = []
     for _ in range(2):  # Without the truth at hand, where no earlier run has left it, and with it.
         start = time.perf_counter()
-        tuned = rts.tune(scene, modes=modes, tolerance=tolerance, truths=folder, progress=False)
+        tuned = rts.tune(scene, modes=modes, tolerance=tolerance, size=SIZE, truths=folder, progress=False)
         times.append(time.perf_counter() - start)
     journal = Journal(folder / f"{file_name(name)}.jsonl")
-    measured = Measurements(scene.with_modes(modes), journal, engines()[0][:1], truths=folder, together=True)
+    scene = replace(scene.with_modes(modes), size=SIZE)
+    measured = Measurements(scene, journal, engines()[0][:1], truths=folder, together=True)
     admissible = within(measured, tolerance)
     found = medians(measured, admissible, 2)
     best = min(found, key=lambda s: found[s])

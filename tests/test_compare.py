@@ -16,7 +16,7 @@ from rts.diagnostics.comparison import measure, truth, turns
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.scene import moving
 from rts.diagnostics.comparison.scores import loss_weights, scores
-from rts.diagnostics.comparison.settings import ALIKE, Setting, limited, worth_timing
+from rts.diagnostics.comparison.settings import Setting, _no_worse, limited, worth_timing
 from rts.diagnostics.tune import tune
 from rts.engines import engine_named
 from rts.errors import InputError, PluginError, ToleranceWarning
@@ -141,13 +141,18 @@ class TestWorthTiming:
             cheaper = [
                 k for k in kept if k is not setting and all(a <= b for a, b in zip(work(k), work(setting), strict=True))
             ]
-            bettered = any(errors[k] <= ALIKE * errors[setting] for k in cheaper)
+            bettered = any(_no_worse(errors[k], errors[setting]) for k in cheaper)
             assert (setting in kept) or bettered
         # Nothing that is kept is bettered by something else that is kept and was there before.
         for n, setting in enumerate(kept):
             for other in kept[:n]:
                 dearer = all(a <= b for a, b in zip(work(other), work(setting), strict=True))
-                assert not (dearer and errors[other] <= ALIKE * errors[setting])
+                assert not (dearer and _no_worse(errors[other], errors[setting]))
+
+    def test_levels(self):
+        """What is just within 3 % is not left out for what is just beyond it."""
+        cheap, dear, dearer = (Setting("visible", k, 1) for k in (1, 2, 4))
+        assert worth_timing({cheap: 0.0305, dear: 0.0295, dearer: 0.029}, lambda s: (s.layers,)) == [cheap, dear]
 
 
 class TestLimited:

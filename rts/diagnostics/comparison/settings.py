@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from rts import registry
 from rts.arguments import quoted
+from rts.diagnostics.comparison.front import LEVELS
 from rts.engines import Engine, engine_named
 from rts.errors import InputError, PluginError
 
@@ -17,8 +18,8 @@ FIRST = "torch"
 """The engine that errors are measured with where it is installed, since all agree on them and it compiles nothing."""
 
 
-ALIKE = 1.01
-"""A setting that costs more has to have an error smaller than by this factor."""
+ALIKE = 1.1
+"""A setting that costs more has to have an error smaller than by this factor, or smaller than one of `LEVELS`."""
 
 
 class Setting(NamedTuple):
@@ -97,11 +98,16 @@ def worth_timing(errors: Mapping[Setting, float], work: Callable[[Setting], tupl
     for setting in sorted(errors, key=lambda s: (work(s), errors[s])):
         mine = work(setting)
         if not any(
-            errors[other] <= ALIKE * errors[setting] and all(a <= b for a, b in zip(work(other), mine, strict=True))
+            _no_worse(errors[other], errors[setting]) and all(a <= b for a, b in zip(work(other), mine, strict=True))
             for other in found
         ):
             found.append(setting)
     return found
+
+
+def _no_worse(error: float, other: float) -> bool:
+    """Whether an error is not much larger than another one, and within all `LEVELS` that the other is within."""
+    return error <= ALIKE * other and not any(other <= level < error for level in LEVELS)
 
 
 class TooSlow(Exception):

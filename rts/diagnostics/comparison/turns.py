@@ -13,7 +13,7 @@ from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.settings import limited
 from rts.fitting.names import one_line
 
-ROUNDS, CONSECUTIVE = 4, 2
+ROUNDS, CONSECUTIVE = 3, 2
 """Turns that each function has, and calls timed in a turn."""
 SLOW = 1.5
 """Seconds of timed calls after which a function has had its turns, two at least."""
