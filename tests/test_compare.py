@@ -405,8 +405,8 @@ class TestStrangers:
 
     def test_sampler(self, kept):
         pytest.importorskip("rts_plugin_example")
-        options = {**SMALL, "samplers": None, "supersample": [1], "splatters": ["visible"]}
-        comparison = compare(scene("translation"), truths=kept, **options)
+        options = {**SMALL, "samplers": ["raster", "toy"], "supersample": [1], "splatters": ["visible"]}
+        comparison = compare(scene("translation"), truths=kept, **options, quick=True)
         assert "toy" in {r["settings"]["sampler"] for r in comparison.rows if r["ms"]}
 
     def test_splatter(self, kept, monkeypatch):
@@ -547,6 +547,25 @@ def nothing(parameters):
     pass
 
 
+MY_SCENE = """
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import rts
+
+
+@dataclasses.dataclass
+class Look:
+    eye: tuple = (1, 1, 3)
+
+
+def scene():
+    return rts.plugin("surfaces", "mesh").example(), rts.Camera.look_at(Look().eye, (0, 0, 0))
+"""
+
+
 class TestMisuse:
     @pytest.mark.parametrize(
         ("given", "message"),
@@ -610,6 +629,9 @@ class TestMisuse:
             compare(path, progress=False)
         with pytest.raises(InputError, match="other gave None"):
             compare(f"{path}:other", progress=False)
+        path.write_text(MY_SCENE)
+        options = {**SMALL, "supersample": [1], "layers": 1, "splatters": ["visible"], "size": (SIDE, SIDE)}
+        assert list(compare(path, modes=["camera"], truths=tmp_path, **options).modes) == ["camera"]
         path.write_text("1 / 0\n")
         with pytest.raises(InputError, match="fails: ZeroDivisionError: division by zero"):
             compare(path, progress=False)

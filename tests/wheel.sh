@@ -26,7 +26,8 @@ venv/bin/rts demo -o out
 test -s out/summary.md && test -s out/after.png
 venv/bin/rts plugins
 venv/bin/python -c "import trimesh; trimesh.creation.icosphere(3).export('model.obj')"
-venv/bin/rts compare model.obj --quick --size 64 -o out/compare
+venv/bin/rts compare model.obj --quick -o out/compare
 test -s out/compare/model.json && test -s out/compare/model.png && test -s out/compare/model.html
+venv/bin/rts tune model.obj --tolerance 0.1 --mode translation
 cd plugin
 ../venv/bin/python -m pytest -q -p no:cacheprovider tests

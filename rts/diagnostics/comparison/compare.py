@@ -171,7 +171,7 @@ def compare(
         layers: numbers of layers, or "auto"; None for 1, 2, 4 and "auto".
         supersample: samples along each side of a pixel; None for 1, 2 and 4.
         peers: whether other renderers take part.
-        quick: one mode, one engine, one sampler, at most 40 settings, no peers.
+        quick: one mode, engine and sampler unless others are named, at most 40 settings, no peers.
         surface: the kind of surface that reads a model.
         output: a folder for the results, and for what a run that is interrupted goes on from; None to write nothing.
         truths: the folder of truths; None for the folder of caches.
@@ -193,7 +193,8 @@ def compare(
     names, without = usable("rts.splatters", splatters)
     possible, missing = usable("rts.samplers", samplers)
     used, failing = engines_for(found, engines)
-    used, journal = used[:1] if quick else used, _journal(folder, found, fresh)
+    journal = _journal(folder, found, fresh)
+    used = used[:1] if quick and engines is None else used
     measured = Measurements(found, journal, used, truths=kept, samples=samples)
     measured.left_out += [*failing, *without, *missing, *_unthinned()]
     measured.leave_out_what_rests()
@@ -203,7 +204,7 @@ def compare(
     others, unsuited = _peers(measured, peers and not quick)
     measured.left_out += unsuited
     most = QUICK_CELLS if quick else None
-    kinds = measured.kinds(suited[:1] if quick else suited)
+    kinds = measured.kinds(suited[:1] if quick and samplers is None else suited)
     plan = Plan(names, kinds, used, layers, supersample, rates=not quick, most=most, peers=others)
     with phases(progress) as phase:
         comparison = _compared(measured, plan, phase)
