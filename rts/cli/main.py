@@ -382,7 +382,7 @@ def compare(
         Console().print(scene_list())
         return
     wanted: dict[str, Any] = dict(modes=modes, samplers=samplers, splatters=splatters, engines=engines)
-    options = {name: value or None for name, value in wanted.items()}
+    options: dict[str, Any] = {name: value or None for name, value in wanted.items()}
     shape = None if size is None else _size(size)
     with _interrupted("what was measured is kept: the same command goes on from there"):
         found = measured(
