@@ -22,12 +22,11 @@ from rts.diagnostics import compare
 from rts.diagnostics.comparison.builtin import BUILTIN
 from rts.diagnostics.comparison.chart import draw
 from rts.diagnostics.comparison.compare import file_name
-from rts.diagnostics.comparison.front import best_within, timed
+from rts.diagnostics.comparison.front import LEVELS, best_within, timed
 from rts.diagnostics.comparison.page import write_page
 from rts.diagnostics.comparison.scene import MODES
 from rts.diagnostics.comparison.style import label
 
-LEVELS = (0.1, 0.03, 0.01)
 RESULTS = Path(__file__).parent / "results"
 
 
@@ -95,19 +94,25 @@ def summary(comparisons: Sequence[Mapping]) -> str:
 
 def advice(comparisons: Sequence[Mapping], mode: str, level: float) -> str:
     """The setting, with nothing changed of the surfaces, that is within an error in most scenes; the faster of two."""
-    times: dict[tuple, list[float]] = defaultdict(list)
     scenes = [c for c in comparisons if mode in c["modes"]]
-    for comparison in scenes:
+    within: dict[tuple, set[int]] = defaultdict(set)
+    times: dict[tuple, dict[int, float]] = defaultdict(dict)
+    for number, comparison in enumerate(scenes):
         for row in own(comparison, mode):
             s = row["settings"]
-            if timed(row) and row["error"] <= level and not s["rate"] and s["engine"] == "torch":
-                times[s["splatter"], s["layers"], s["supersample"]].append(row["ms"]["median"])
-    if not times:
+            key = s["splatter"], s["layers"], s["supersample"]
+            if row["error"] > level or s["rate"]:
+                continue
+            within[key].add(number)
+            if timed(row):
+                times[key][number] = min(row["ms"]["median"], times[key].get(number, float("inf")))
+    known = [key for key in within if times[key]]
+    if not known:
         return "none"
-    best = max(times, key=lambda key: (len(times[key]), -statistics.median(times[key])))
+    best = max(known, key=lambda key: (len(within[key]), -statistics.median(times[key].values())))
     splatter, layers, supersample = best
     asked = f"`{splatter}`, K = {layers}, {supersample} × {supersample}"
-    return f"{asked}: {len(times[best])} of {len(scenes)}, {statistics.median(times[best]):.3g} ms"
+    return f"{asked}: {len(within[best])} of {len(scenes)}, {statistics.median(times[best].values()):.3g} ms"
 
 
 if __name__ == "__main__":

@@ -26,10 +26,10 @@ import torch
 import rts
 from benchmarks.camera import camera, supersampled
 from benchmarks.meshes import DATA, normalised
-from benchmarks.report import environment, table
+from benchmarks.report import table
 from benchmarks.speed.memory import growth
 from benchmarks.timing import in_turn
-from rts.threads import thread_count
+from rts.diagnostics.comparison.environment import environment
 from rts_surfaces.implicit.fields import smooth_union, swept_sphere
 from rts_surfaces.implicit.narrow_band import NarrowBand
 
@@ -380,7 +380,7 @@ def main() -> None:
         text, results[name] = runs[name]()
         print(text, flush=True)
         texts.append(text)
-    about = environment(thread_count(), ("numpy", "numba", "torch", "PyMCubes"))
+    about = environment(("numpy", "numba", "torch", "PyMCubes"))
     (args.output / "implicit.json").write_text(json.dumps(about | results, indent=2) + "\n")
     (args.output / "implicit.md").write_text("\n".join(texts))
 

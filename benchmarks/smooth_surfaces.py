@@ -27,10 +27,10 @@ from scipy.sparse import csr_matrix
 import rts
 from benchmarks.camera import camera, supersampled
 from benchmarks.meshes import DATA, normalised, rotation_xy
-from benchmarks.report import environment, table
+from benchmarks.report import table
 from benchmarks.speed.memory import growth
 from benchmarks.timing import in_turn
-from rts.threads import thread_count
+from rts.diagnostics.comparison.environment import environment
 
 SHADERS = ("silhouette", "lambert")
 TOLERANCES = (0.8, 0.4, 0.2, 0.1, 0.05)
@@ -337,7 +337,7 @@ def main() -> None:
     sizes, rounds = args.sizes or ([256] if args.quick else [256, 512]), args.rounds or (2 if args.quick else 5)
     args.output.mkdir(parents=True, exist_ok=True)
     results = {f"{name}, {side}²": measure(name, (side, side), rounds) for name in args.only for side in sizes}
-    about = environment(thread_count(), ("numpy", "numba", "torch"))
+    about = environment(("numpy", "numba", "torch"))
     (args.output / "smooth.json").write_text(json.dumps(about | {"results": results}, indent=2) + "\n")
     text = "\n".join(written(rows, title) for title, rows in results.items())
     (args.output / "smooth.md").write_text(text)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -41,7 +41,7 @@ def fewer_faces(vertices: np.ndarray, faces: np.ndarray) -> Iterator[Decimated]:
         return
     points, triangles = np.ascontiguousarray(vertices, np.float64), np.array(faces, np.int32)
     for share in SHARES:
-        simplified = fast_simplification.simplify(points, triangles, 1 - share, return_collapses=True)
+        simplified: Any = fast_simplification.simplify(points, triangles, 1 - share, return_collapses=True)
         merged, left, became = fast_simplification.replay_simplification(points, triangles, simplified[2])
         distance = np.linalg.norm(points - merged[became], axis=1)
         # The nearest comes last, and so is what remains.

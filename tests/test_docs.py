@@ -21,7 +21,14 @@ pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = ["README.md", *(f"docs/{p.name}" for p in sorted((ROOT / "docs").glob("*.md"))), "CONTRIBUTING.md"]
-ELSEWHERE = {"rts demo": "make wheel", "rts plugins --matrix": "test_compatibility.py"}
+ELSEWHERE = {
+    "rts demo": "make wheel",
+    "rts plugins --matrix": "test_compatibility.py",
+    "rts compare model.obj --quick -o out/compare": "make wheel",
+    "rts tune model.obj --tolerance 0.1 --mode translation": "make wheel",
+    'rts compare "stack of cards" --quick --sampler raster --sampler toy': "test_compare.py",
+    "rts compare my_scene.py": "test_compare.py",
+}
 """Commands that take long, and who runs them."""
 
 

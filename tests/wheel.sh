@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Whether the wheel works by itself: installed into an empty environment, away from the sources, the demo runs, and the
-# tests of the example plugin pass.
+# Whether the wheel works by itself: installed into an empty environment, away from the sources, the demo runs, settings
+# are compared on a model, and the tests of the example plugin pass.
 #
 #     tests/wheel.sh <folder of the wheel> <folder of the example plugin> <constraints>
 set -euo pipefail
@@ -25,5 +25,9 @@ PYTHON
 venv/bin/rts demo -o out
 test -s out/summary.md && test -s out/after.png
 venv/bin/rts plugins
+venv/bin/python -c "import trimesh; trimesh.creation.icosphere(3).export('model.obj')"
+venv/bin/rts compare model.obj --quick -o out/compare
+test -s out/compare/model.json && test -s out/compare/model.png && test -s out/compare/model.html
+venv/bin/rts tune model.obj --tolerance 0.1 --mode translation
 cd plugin
 ../venv/bin/python -m pytest -q -p no:cacheprovider tests

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -26,9 +25,10 @@ from rich.progress import Progress
 from benchmarks.accuracy import figures, methods, scenes, tables
 from benchmarks.accuracy.closed_forms import closed_form
 from benchmarks.accuracy.methods import CASES, Method
-from benchmarks.accuracy.scores import loss_weights, scores
+from benchmarks.accuracy.scores import scores
 from benchmarks.accuracy.truth import Truth, truth
-from benchmarks.report import environment
+from rts.diagnostics.comparison.environment import environment
+from rts.diagnostics.comparison.scores import loss_weights
 
 SPP = (1, 4, 16, 64, 256)
 QUICK = ("A", "half-plane")
@@ -141,7 +141,7 @@ def plans(args: argparse.Namespace, skipped: set[str]) -> list[Plan]:
 
 def measure(plan: list[Plan], say: Callable[[str], None], done: Callable[[], None]) -> tuple[dict, dict]:
     """The results, and the derivative images by scene and method."""
-    results: dict = {**environment(os.cpu_count() or 1, PACKAGES), "scenes": {}, "rows": [], "times": []}
+    results: dict = {**environment(PACKAGES), "scenes": {}, "rows": [], "times": []}
     images: dict[tuple[str, str], np.ndarray] = {}
     for scene, against, ours, others in plan:
         noise = {name: reference.noise for name, reference in against._asdict().items()}

@@ -2,30 +2,10 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
-from scipy.ndimage import binary_dilation, gaussian_filter
+from scipy.ndimage import binary_dilation
 
-LOW_PASS, RADIUS = 2.0, 6
-"""Standard deviation and cut-off of the Gaussian that errors are looked at through, pixels."""
-LOSSES, LOSS_SCALE = 16, 8.0
-"""How many random losses, and the standard deviation of the Gaussian that smooths their weights, pixels."""
-
-
-def low_pass(x: np.ndarray) -> np.ndarray:
-    """(H, W, 3) after the Gaussian."""
-    return gaussian_filter(np.asarray(x, np.float64), (LOW_PASS, LOW_PASS, 0), radius=(RADIUS, RADIUS, 0))
-
-
-@cache
-def loss_weights(height: int, width: int) -> np.ndarray:
-    """Weights (L, H, W, 3) of the random losses L = Σ w · image: smooth, of fixed seed and unit variance."""
-    noise = np.random.default_rng(0).normal(size=(LOSSES, height, width, 3))
-    smooth = gaussian_filter(noise, (0, LOSS_SCALE, LOSS_SCALE, 0))
-    weights = smooth / smooth.std(axis=(1, 2, 3), keepdims=True)
-    weights.setflags(write=False)
-    return weights
+from rts.diagnostics.comparison.scores import loss_weights, low_pass, relative_l2
 
 
 def scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
@@ -55,8 +35,3 @@ def _compared(x: np.ndarray, true: np.ndarray, prefix: str) -> dict[str, float]:
         f"{prefix}cosine": product / max(float(np.linalg.norm(x) * np.linalg.norm(true)), 1e-30),
         f"{prefix}gain": product / square,
     }
-
-
-def relative_l2(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> float:
-    """Norm of the difference over that of `scale`."""
-    return float(np.linalg.norm(x - y) / np.linalg.norm(scale))

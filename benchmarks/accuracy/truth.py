@@ -14,20 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy import scenes
-from benchmarks.accuracy.scores import low_pass, relative_l2
 from benchmarks.camera import regular_grid, supersampled
+from rts.diagnostics.comparison.scores import low_pass, relative_l2
+from rts.diagnostics.comparison.truth import lattice
 
 SAMPLES = 16
 """Points a pixel, along x and along y."""
-
-
-def lattice(samples: int) -> np.ndarray:
-    """`samples`² points (S, 2) of a pixel, from its centre, in pixels: a rank-1 lattice of the golden ratio.
-
-    No two points share a row or a column, so upright edges are resolved to 1/S of a pixel.
-    """
-    count = samples**2
-    return np.column_stack([(np.arange(count) + 0.5) / count, (np.arange(count) * (5**0.5 - 1) / 2 + 0.25) % 1]) - 0.5
 
 
 GRIDS: dict[str, Callable[[int], np.ndarray]] = {"regular": regular_grid, "lattice": lattice}

@@ -21,12 +21,11 @@ from pathlib import Path
 from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 
 from benchmarks.meshes import MESHES, kept_mesh
-from benchmarks.report import environment
 from benchmarks.speed import levenberg_marquardt, memory, second_layer, splatters, stages, tables
 from benchmarks.speed.charts import CHARTS
 from benchmarks.speed.pose_iteration import ENGINES, MODES, Task
 from benchmarks.timing import ROUNDS, WARM_UP, in_turn
-from rts.threads import thread_count
+from rts.diagnostics.comparison.environment import environment
 
 QUICK_MESHES, QUICK_SIZES, QUICK_ROUNDS = ("teapot", "bunny"), (256,), 3
 SPLATTED, PRUNED, STAGED = ("bunny",), ("bunny", "nefertiti"), ("teapot", "bunny", "nefertiti")
@@ -152,7 +151,7 @@ def write(results: dict, folder: Path) -> None:
 def main() -> None:
     args = options()
     args.output.mkdir(parents=True, exist_ok=True)
-    results = environment(thread_count(), PACKAGES)
+    results = environment(PACKAGES)
     results["command"] = shlex.join(["python", "-m", "benchmarks.speed.run", *sys.argv[1:]])
     before = load_average()
     with Progress(*Progress.get_default_columns(), MofNCompleteColumn(), TimeElapsedColumn()) as progress:

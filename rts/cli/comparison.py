@@ -6,10 +6,8 @@ from rich.table import Table
 
 from rts.diagnostics.comparison import builtin
 from rts.diagnostics.comparison.compare import Comparison
+from rts.diagnostics.comparison.front import LEVELS
 from rts.diagnostics.comparison.style import label
-
-WITHIN = (0.1, 0.03, 0.01)
-"""Errors that the summary names a setting for."""
 
 
 def scene_list() -> Table:
@@ -23,10 +21,10 @@ def scene_list() -> Table:
 def summary(comparison: Comparison) -> Table:
     """For each mode the fastest setting within some errors."""
     title = f"{comparison.scene['name']}: fastest settings by the error of derivatives"
-    table = Table("mode", *(f"{error:.0%}" for error in WITHIN), title=title)
+    table = Table("mode", *(f"{error:.0%}" for error in LEVELS), title=title)
     for mode in comparison.modes:
         cells = []
-        for error in WITHIN:
+        for error in LEVELS:
             row = comparison.best(mode, error)
             cells.append("none" if row is None else f"{label(row)}\n{row['ms']['median']:.3g} ms")
         table.add_row(mode, *cells)

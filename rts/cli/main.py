@@ -382,9 +382,9 @@ def compare(
         Console().print(scene_list())
         return
     wanted: dict[str, Any] = dict(modes=modes, samplers=samplers, splatters=splatters, engines=engines)
-    options = {name: value or None for name, value in wanted.items()}
+    options: dict[str, Any] = {name: value or None for name, value in wanted.items()}
     shape = None if size is None else _size(size)
-    with _going_on():
+    with _interrupted("what was measured is kept: the same command goes on from there"):
         found = measured(
             scene, size=shape, peers=peers, quick=quick, surface=surface, output=output, fresh=fresh, **options
         )
@@ -411,21 +411,23 @@ def tune(
 
     shape, chosen = None if size is None else _size(size), None if engine == "auto" else engine
     options: dict[str, Any] = dict(tolerance=tolerance, budget_s=budget, modes=modes or None)
-    with _going_on():
+    with _interrupted("the truth is kept, other measurements are not"):
         found = rts.tune(scene, size=shape, engine=chosen, surface=surface, **options)
     _say(escape(f"rts.render(parts, camera, size, {', '.join(f'{k}={v!r}' for k, v in found.settings.items())})"))
     _say(f"error {100 * found.error:.2g} %, {1e3 * found.seconds:.3g} ms for a render and gradient")
+    if found.rate:
+        _say(escape(f"with surfaces of {found.rate}: rts.tune(...).parts and .scene have them"))
     for reason in found.reasons:
         _say(escape(f"  {reason}"))
 
 
 @contextlib.contextmanager
-def _going_on() -> Iterator[None]:
-    """Say how to go on after Ctrl-C."""
+def _interrupted(what: str) -> Iterator[None]:
+    """Say what is left after Ctrl-C."""
     try:
         yield
     except KeyboardInterrupt:
-        typer.echo("rts: interrupted; what was measured is kept: the same command goes on from there", err=True)
+        typer.echo(f"rts: interrupted; {what}", err=True)
         raise typer.Exit(130) from None
 
 

@@ -28,6 +28,8 @@ from rts.trees import Array, Tree, leaves, map_leaves
 
 Scene = Callable[[Tree], tuple[Part | Sequence[Part], Camera]]
 
+STEP_UNSEEN = 1e-2
+"""How far the finite differences change a number that nothing seems to depend on."""
 NEGLIGIBLE = 0.01
 """What does not matter, as a share of the largest effect of a step."""
 LOSS_SMOOTHNESS = 4.0
@@ -206,7 +208,7 @@ def check_gradient(
         flat = engine.to_numpy(slope).reshape(-1)
         for index in _chosen(flat, entries):
             direction = _unit(engine, parameters, number, index)
-            step = pixel_step(engine, image, parameters, direction)
+            step = pixel_step(engine, image, parameters, direction) or STEP_UNSEEN
             hard = partial(_difference, engine, loss, partial(image, splatter="none"), parameters, direction)
             coarse, fine, wide = hard(step, samples), hard(step, samples + 1), hard(2 * step, samples)
             difference = (coarse + fine) / 2

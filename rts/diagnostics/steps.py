@@ -33,8 +33,10 @@ class _Probe(Splatter):
         return xp.where((row[0] >= 0)[..., None], shown, 0.0)
 
 
-def pixel_step(engine: Engine, image: Callable[..., Array], parameters: Tree, direction: Tree) -> float:
+def pixel_step(engine: Engine, image: Callable[..., Array], parameters: Tree, direction: Tree) -> float | None:
     """A step along a direction that moves the image by a pixel or, where nothing moves, changes its colour.
+
+    None where neither changes.
 
     Args:
         engine: of the parameters.
@@ -47,4 +49,4 @@ def pixel_step(engine: Engine, image: Callable[..., Array], parameters: Tree, di
         speed = np.abs(engine.to_numpy(engine.jvp(probe, parameters, direction)[1])).max(initial=0.0)
         if speed > 1e-6:
             return float(wanted / speed)
-    return 1e-2
+    return None

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rts.arguments import check_positive, quoted
-from rts.checks import is_real
+from rts.checks import is_count, is_real
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.measure import TOGETHER, Measurements
 from rts.diagnostics.comparison.progress import Phase, phases
-from rts.diagnostics.comparison.scene import SceneFunction
-from rts.diagnostics.comparison.settings import Setting, engines, usable
-from rts.diagnostics.comparison.sources import checked, scene_of, some_modes
-from rts.engines import engine_of
+from rts.diagnostics.comparison.scene import SceneFunction, parts_of
+from rts.diagnostics.comparison.settings import Setting, usable
+from rts.diagnostics.comparison.sources import engines_for, scene_of, some_modes
+from rts.diagnostics.comparison.truth import SAMPLES
+from rts.diagnostics.comparison.turns import Calls
+from rts.engines import stopped
 from rts.errors import InputError, ToleranceWarning, warn
 from rts.files.paths import output_folder
 from rts.interfaces import Part
@@ -26,6 +28,8 @@ LAYERS = (1, 2, 4, 8)
 SUPERSAMPLE = (1, 2, 3, 4)
 HOPELESS = 2.0
 """How many times the error of the best splatter another one may have, to be looked at further."""
+ALIKE = 0.9
+"""A setting is faster than another one if it takes less than this share of its time."""
 TURNS = 3
 """Turns of the settings that are told of beside the chosen one; the last that are left have twice as many."""
 
@@ -34,8 +38,9 @@ class Tuned(NamedTuple):
     """Settings, and what is to be rendered with them.
 
     Attributes:
-        parts: the scene's parts at the parameters, their surfaces at the rates that were chosen.
+        parts: the scene's parts at the parameters, without derivatives, their surfaces at the rates that were chosen.
         settings: keyword arguments of `rts.render`: sampler, splatter, layers and supersample.
+        rate: what is other about the surfaces, such as "tolerance=0.4"; "" for nothing.
         reasons: a line for each choice: what the cheaper one lacks, and what the next costs.
         scene: parameters → (parts, camera), with the same rates: what a fit renders.
         error: the largest error of the derivatives along the modes, relative L2 through a Gaussian of 2 pixels.
@@ -44,6 +49,7 @@ class Tuned(NamedTuple):
 
     parts: list[Part]
     settings: dict[str, Any]
+    rate: str
     reasons: list[str]
     scene: SceneFunction
     error: float
@@ -64,6 +70,7 @@ def tune(
     splatters: Sequence[str] | None = None,
     surface: str = "mesh",
     truths: Path | str | None = None,
+    truth_samples: int = SAMPLES,
     progress: bool | None = None,
 ) -> Tuned:
     """Find the cheapest settings whose derivatives are accurate enough.
@@ -89,6 +96,7 @@ def tune(
         splatters: names; None for all.
         surface: the kind of surface that reads a model.
         truths: the folder of truths; None for the folder of caches.
+        truth_samples: of the truth, along each side of a pixel; fewer are faster, and leave a larger error of its own.
         progress: whether to show progress; None for where standard error is a terminal.
 
     Raises:
@@ -100,22 +108,22 @@ def tune(
     if not (is_real(tolerance) and 0 < tolerance < math.inf):
         raise InputError(f"tolerance is {quoted(tolerance)}; expected a share of the derivative, such as 0.05")
     check_positive("budget_s", budget_s)
+    if not is_count(truth_samples):
+        raise InputError(f"truth_samples is {quoted(truth_samples)}; expected an integer of at least 1")
     found = some_modes(scene_of(scene, parameters, directions, size, surface=surface), modes)
     kept = None if truths is None else output_folder(truths)
-    own = engine_of(found.parameters)
-    chosen = [engine] if engine is not None else [own.name] if own.differentiates else None
-    used = engines(chosen)[0][:1]
-    checked(found.at(found.moved(next(iter(found.directions)), 0.0, used[0])), found.name)
-    measured = Measurements(found, Journal(), used, truths=kept, together=True)
-    suited = measured.samplers(usable("rts.samplers", samplers)[0])
-    if not suited:
-        raise InputError(f"no sampler suits {found.name!r}: {'; '.join(measured.left_out)}")
+    named = usable("rts.splatters", splatters)[0]
+    possible = usable("rts.samplers", samplers)[0]
+    used, _ = engines_for(found, None if engine is None else [engine])
+    measured = Measurements(found, Journal(), used[:1], truths=kept, samples=truth_samples, together=True)
+    measured.leave_out_what_rests()
     with phases(progress) as phase:
-        done = phase("truth", 4 * measured.samples**2 * len(found.directions))
-        for mode in found.directions:
-            measured.truth(mode, done)
-        search = _Search(measured, tolerance, time.perf_counter() + budget_s, phase)
-        return search.run(usable("rts.splatters", splatters)[0], suited)
+        measured.truths(phase("truth", 4 * measured.samples**2 * len(measured.scene.directions)))
+        deadline = time.perf_counter() + budget_s
+        suited = measured.samplers(possible)
+        if not suited:
+            raise InputError(f"no sampler suits {found.name!r}: {'; '.join(measured.left_out)}")
+        return _Search(measured, tolerance, deadline, phase).run(named, measured.kinds(suited))
 
 
 class _Search:
@@ -131,51 +139,75 @@ class _Search:
     def __init__(self, measured: Measurements, tolerance: float, deadline: float, phase: Phase):
         self.measured, self.tolerance, self.deadline, self.phase = measured, tolerance, deadline, phase
         self.modes = list(measured.scene.directions)
-        self.errors: dict[Setting, float] = {}
+        self.bounds: dict[Setting, float] = {}
         self.engine = measured.engine.name
         self.late = False
 
-    def run(self, splatters: Sequence[str], samplers: Sequence[str]) -> Tuned:
-        """The best that is found in time."""
+    def run(self, splatters: Sequence[str], samplers: Mapping[str, str]) -> Tuned:
+        """The best that is found in time.
+
+        Args:
+            splatters: names.
+            samplers: names, each with the one whose errors it shares; "" for the usual one.
+        """
+        self.samplers = samplers
         cells = self._cells(splatters)
         within = self._within(cells)
-        if not within:
-            if not self.errors:
-                raise InputError(f"nothing could be measured: {'; '.join(self.measured.left_out)}")
-            within = [min(self.errors, key=lambda s: self.errors[s])]
-        chosen = self._fastest([s._replace(sampler=n, engine=self.engine) for s in within for n in samplers])
-        reasons = self._reasons(chosen, cells, samplers)
-        error, seconds = self._error(chosen, whole=True), self._timed([chosen])[chosen]
+        chosen = self._fastest(self._sampled(within or [self._best(cells)]))
+        reasons, faster = self._reasons(chosen, cells)
+        if faster is not None:  # More work need not take longer.
+            chosen = faster
+            reasons, _ = self._reasons(chosen, cells)
+        error, seconds = self._error(chosen), self._timed([chosen])[chosen]
         if error > self.tolerance:
-            reasons.insert(
-                0, f"nothing is within {_percent(self.tolerance)}: the least error that was found is {_percent(error)}"
-            )
-            warn(f"{reasons[0]}; give a larger tolerance, or more samples", ToleranceWarning)
+            reasons.insert(0, self._told_of_failure(error))
         if self.late:
             reasons.append("the budget was spent before all settings were looked at")
         at = self.measured.forms(TOGETHER)[chosen.rate].at
-        parts, _ = at(self.measured.start(TOGETHER))
-        return Tuned([parts] if isinstance(parts, Part) else list(parts), chosen.options, reasons, at, error, seconds)
+        own = None if self.measured.scene.separate else self.measured.engine
+        parts = stopped(parts_of(at(self.measured.scene.moved(self.modes[0], 0.0, own))))
+        return Tuned(parts, chosen.options, chosen.rate, reasons, at, error, seconds)
+
+    def _told_of_failure(self, error: float) -> str:
+        """What to say where nothing is within the tolerance; a warning, too."""
+        wanted = _percent(self.tolerance)
+        told = f"nothing within {wanted} was found in time" if self.late else f"nothing is within {wanted}"
+        told = f"{told}: the least error that was found is {_percent(error)}"
+        advice = "give a larger budget_s" if self.late else "give a larger tolerance, or look at more pixels"
+        warn(f"{told}; {advice}", ToleranceWarning)
+        return told
 
     # -------------------------------------------------------------------------------------------------- accuracy
 
     def _cells(self, splatters: Sequence[str]) -> list[Setting]:
-        """All settings but for samplers, the cheapest first."""
-        found = self.measured.settings(TOGETHER, splatters, LAYERS, SUPERSAMPLE, rates=True)
+        """All settings that may differ in their error, the cheapest first."""
+        kinds = dict.fromkeys(self.samplers.values())
+        found = self.measured.settings(TOGETHER, splatters, LAYERS, SUPERSAMPLE, kinds)
         return sorted(found, key=lambda s: math.prod(self._work(s)))
 
+    def _sampled(self, settings: Sequence[Setting]) -> list[Setting]:
+        """Settings with each sampler that shares their errors."""
+        return [
+            s._replace(sampler=name, engine=self.engine)
+            for s in settings
+            for name, kind in self.samplers.items()
+            if kind == s.sampler
+        ]
+
+    def _cell(self, setting: Setting) -> Setting:
+        """What the error of a setting is kept under."""
+        return setting._replace(sampler=self.samplers.get(setting.sampler, setting.sampler), engine="")
+
     def _work(self, setting: Setting) -> tuple[float, ...]:
-        layers, supersample, rate = self.measured.work(TOGETHER, setting)
+        layers, supersample, rate = self.measured.work(TOGETHER, self._cell(setting))
         return layers, supersample**2, rate
 
     def _promising(self, cells: Sequence[Setting]) -> list[Setting]:
         """The settings of splatters that are accurate enough, or nearly as accurate as the best, with two layers."""
         base = {s.splatter: s for s in cells if s.supersample == 1 and not s.rate and s.layers in LAYERS[:2]}
-        for setting in base.values():
-            self._error(setting)
-        least = min((self._error(s) for s in base.values()), default=math.inf)
-        allowed = max(self.tolerance, HOPELESS * least)
-        return [s for s in cells if s.splatter not in base or self._error(base[s.splatter]) <= allowed]
+        known = {splatter: self._error(s) for splatter, s in base.items() if not self._over()}
+        allowed = max(self.tolerance, HOPELESS * min(known.values(), default=math.inf))
+        return [s for s in cells if known.get(s.splatter, 0.0) <= allowed]
 
     def _within(self, cells: Sequence[Setting]) -> list[Setting]:
         """The settings within the tolerance that no cheaper one of their splatter makes needless."""
@@ -188,39 +220,55 @@ class _Search:
                 continue
             if self._over():
                 break
-            if self._error(setting) <= self.tolerance:
+            if self._bound(setting) <= self.tolerance:
                 found.append(setting)
         return found
 
     def _needless(self, setting: Setting, found: Sequence[Setting]) -> bool:
-        """Whether a setting costs no less, in any respect, than one of its splatter that is accurate enough."""
+        """Whether a setting costs no less, in any respect, than one of its kind that is accurate enough."""
         mine = self._work(setting)
         return any(
-            s.splatter == setting.splatter and all(a <= b for a, b in zip(self._work(s), mine, strict=True))
+            (s.splatter, s.sampler) == (setting.splatter, setting.sampler)
+            and all(a <= b for a, b in zip(self._work(s), mine, strict=True))
             for s in found
         )
 
-    def _error(self, setting: Setting, whole: bool = False) -> float:
-        """The largest error along a mode.
-
-        Args:
-            setting: a setting.
-            whole: whether all modes are looked at, even where one is known to be beyond the tolerance.
-        """
-        same, worst = setting._replace(sampler="", engine=""), 0.0
-        if same in self.errors and not whole:
-            return self.errors[same]
-        for mode in self.modes:
-            found = self.measured.scores(mode, same)
-            error = math.inf if found is None else found["error"]
-            if error > worst:
-                worst = error
-                # What was worst once is looked at first.
-                self.modes = [mode, *(m for m in self.modes if m != mode)]
-            if worst > self.tolerance and not whole:
+    def _best(self, cells: Sequence[Setting]) -> Setting:
+        """The setting of the least error among those that were looked at; the first of all where none was."""
+        least, best = math.inf, cells[0] if cells else None
+        for setting in sorted(self.bounds, key=lambda s: self.bounds[s]):
+            if self.bounds[setting] >= least:
                 break
-        self.errors[same] = worst
+            error = self._error(setting)
+            if error < least:
+                least, best = error, setting
+        if best is None:
+            raise InputError(f"nothing could be measured: {'; '.join(self.measured.left_out)}")
+        return best
+
+    def _bound(self, setting: Setting) -> float:
+        """The largest error along a mode, or that along the first mode where it is beyond the tolerance."""
+        worst = 0.0
+        for mode in self.modes:
+            error = self._along(mode, setting)
+            if error > self.tolerance:
+                # What was too much once is looked at first.
+                self.modes = [mode, *(m for m in self.modes if m != mode)]
+                worst = error
+                break
+            worst = max(worst, error)
+        self.bounds[self._cell(setting)] = worst
         return worst
+
+    def _error(self, setting: Setting) -> float:
+        """The largest error along a mode."""
+        worst = max(self._along(mode, setting) for mode in self.modes)
+        self.bounds[self._cell(setting)] = worst
+        return worst
+
+    def _along(self, mode: str, setting: Setting) -> float:
+        found = self.measured.scores(mode, self._cell(setting))
+        return math.inf if found is None else found["error"]
 
     # ------------------------------------------------------------------------------------------------------ time
 
@@ -229,10 +277,10 @@ class _Search:
         return self.late
 
     def _timed(self, settings: Sequence[Setting], turns: int = TURNS) -> dict[Setting, float]:
-        """Seconds of settings, those that fail left out."""
-        calls: dict[tuple, Callable] = {tuple(s): lambda s=s: self.measured.call(TOGETHER, s) for s in settings}
-        found = self.measured.time(TOGETHER, calls, rounds=turns)
-        return {s: found[tuple(s)]["median"] / 1e3 for s in settings if tuple(s) in found}
+        """Seconds of settings, those that fail or come too late left out."""
+        calls: Calls = {s: lambda s=s: self.measured.call(TOGETHER, s) for s in settings}
+        found = self.measured.turns(TOGETHER, calls).run(turns, late=self._over)
+        return {Setting(*s): ms["median"] / 1e3 for s, ms in found.items()}
 
     def _fastest(self, settings: Sequence[Setting]) -> Setting:
         """The fastest, by successive halving: all have a turn, the faster half another, and so on."""
@@ -248,31 +296,31 @@ class _Search:
 
     # --------------------------------------------------------------------------------------------------- reasons
 
-    def _reasons(self, chosen: Setting, cells: Sequence[Setting], samplers: Sequence[str]) -> list[str]:
-        """For each choice what the cheaper one lacks, and what the next one costs."""
+    def _reasons(self, chosen: Setting, cells: Sequence[Setting]) -> tuple[list[str], Setting | None]:
+        """For each choice what the cheaper one lacks, and what the next one costs; and what is better after all."""
         options: dict[str, list] = {
             "layers": list(dict.fromkeys(s.layers for s in cells)),
             "supersample": list(SUPERSAMPLE),
-            "rate": [f for f in self.measured.forms(TOGETHER)],
+            "rate": list(self.measured.forms(TOGETHER)),
             "splatter": list(dict.fromkeys(s.splatter for s in cells)),
-            "sampler": list(samplers),
+            "sampler": list(self.samplers),
         }
         others = {name: self._others(chosen, name, values) for name, values in options.items()}
-        told = [s for found in others.values() for s in found if s is not None and not self._over()]
-        times = self._timed([chosen, *dict.fromkeys(told)]) if told else {}
-        return [self._reason(chosen, name, *found, times) for name, found in others.items() if any(found)]
+        told = dict.fromkeys(s for found in others.values() for s in found if s is not None)
+        times = self._timed([chosen, *told]) if not self._over() else {}
+        faster = [s for s in times if times[s] < ALIKE * times[chosen] and self._error(s) <= self.tolerance]
+        lines = [self._reason(chosen, name, *found, times) for name, found in others.items() if any(found)]
+        return lines, min(faster, key=lambda s: times[s], default=None)
 
     def _others(self, chosen: Setting, name: str, values: Sequence) -> tuple[Setting | None, Setting | None]:
         """The next cheaper and the next dearer setting in one respect; for names, one that is another."""
         found = [chosen._replace(**{name: value}) for value in values if value != getattr(chosen, name)]
         if name in ("splatter", "sampler"):
-            known = [s for s in found if s._replace(sampler="", engine="") in self.errors]
-            return None, min(known, key=self._error, default=None)
+            known = [s for s in found if self._cell(s) in self.bounds]
+            return None, min(known, key=lambda s: self.bounds[self._cell(s)], default=None)
         mine = math.prod(self._work(chosen))
         work = {s: math.prod(self._work(s)) for s in found}
-        below, above = (
-            [s for s in found if (work[s] < mine) == cheaper and work[s] != mine] for cheaper in (True, False)
-        )
+        below, above = [s for s in found if work[s] < mine], [s for s in found if work[s] > mine]
         return max(below, key=lambda s: work[s], default=None), min(above, key=lambda s: work[s], default=None)
 
     def _reason(
@@ -280,7 +328,7 @@ class _Search:
     ) -> str:
         """One line on one choice."""
         parts = []
-        if below is not None:
+        if below is not None and not self._over():
             parts.append(f"{_value(below, name)} is off by {_percent(self._error(below))}")
         if above is not None and chosen in times and above in times:
             ratio = times[above] / times[chosen]
@@ -298,4 +346,4 @@ def _value(setting: Setting, name: str) -> str:
 
 
 def _percent(error: float) -> str:
-    return f"{100 * error:.2g} %"
+    return f"{100 * error:.3g} %"

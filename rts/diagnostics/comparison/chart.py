@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,6 +37,8 @@ INK, PALE = "#1f2937", "#6b7280"
 COLUMNS = 3
 PANEL_WIDTH, PANEL_HEIGHT, LEGEND_WIDTH, LINE_HEIGHT = 5.4, 4.3, 2.2, 0.142
 """In inches; the last is that of a line of the list under a panel."""
+CHARACTER_WIDTH = 0.075
+"""Inches of a character of the line below all panels."""
 LONGEST = 70
 """Characters of a line under a panel."""
 
@@ -90,7 +93,8 @@ def _texts(figure: Figure, comparison: Mapping[str, Any]) -> None:
     title = f"{scene['name']}, {' × '.join(map(str, scene['size']))}"
     note = f"\n{scene['note']}" if scene.get("note") else ""
     figure.suptitle(title + note, fontsize=13, color=INK, parse_math=False)
-    figure.supxlabel(environment_line(comparison["environment"]), fontsize=8, color=PALE, parse_math=False)
+    where = textwrap.fill(environment_line(comparison["environment"]), int(figure.get_figwidth() / CHARACTER_WIDTH))
+    figure.supxlabel(where, fontsize=8, color=PALE, parse_math=False)
 
 
 def _front(rows: Sequence[Row]) -> list[Row]:

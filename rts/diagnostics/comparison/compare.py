@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from rts.arguments import quoted
 from rts.checks import is_count
 from rts.diagnostics.comparison.environment import environment
-from rts.diagnostics.comparison.front import Row, best_within, marked
+from rts.diagnostics.comparison.front import Row, best_within, front, marked
 from rts.diagnostics.comparison.journal import Journal
-from rts.diagnostics.comparison.measure import ROUNDS, Measurements
+from rts.diagnostics.comparison.measure import Measurements
 from rts.diagnostics.comparison.progress import Phase, phases
 from rts.diagnostics.comparison.scene import Scene
 from rts.diagnostics.comparison.scores import scores
 from rts.diagnostics.comparison.seen import Peer
-from rts.diagnostics.comparison.settings import Setting, engines, near_front, usable, worth_timing
-from rts.diagnostics.comparison.sources import checked, scene_of, some_modes
-from rts.diagnostics.comparison.truth import scene_key
+from rts.diagnostics.comparison.settings import Setting, usable, worth_timing
+from rts.diagnostics.comparison.sources import engines_for, scene_of, some_modes
+from rts.diagnostics.comparison.truth import SAMPLES
+from rts.diagnostics.comparison.turns import ROUNDS, Calls, Turns
 from rts.engines import Engine
 from rts.errors import InputError, PluginError
 from rts.files.paths import output_folder, writing
@@ -33,8 +35,8 @@ LAYERS = (1, 2, 4, "auto")
 SUPERSAMPLE = (1, 2, 4)
 QUICK_CELLS = 40
 """The most settings that are looked at with `quick`."""
-SPP = (1, 4, 16)
-"""Samples a pixel of Mitsuba."""
+PEER_ROUNDS = 2
+"""Turns of other renderers."""
 PACKAGES = ("rasterize-then-splat", "numpy", "numba", "torch", "jax", "embreex", "moderngl", "deodr", "mitsuba")
 
 
@@ -106,7 +108,8 @@ class Plan(NamedTuple):
 
     Attributes:
         splatters: names.
-        samplers: names of those that suit the scene, the usual one first.
+        samplers: names of those that suit the scene, the usual one first; each with the one whose errors it shares:
+            "" for the usual one.
         engines: the one that errors are measured with first.
         layers: K or "auto".
         supersample: samples along each side of a pixel.
@@ -116,7 +119,7 @@ class Plan(NamedTuple):
     """
 
     splatters: Sequence[str]
-    samplers: Sequence[str]
+    samplers: Mapping[str, str]
     engines: Sequence[Engine]
     layers: Sequence[int | str]
     supersample: Sequence[int]
@@ -142,6 +145,7 @@ def compare(
     surface: str = "mesh",
     output: Path | str | None = None,
     truths: Path | str | None = None,
+    truth_samples: int = SAMPLES,
     fresh: bool = False,
     progress: bool | None = None,
 ) -> Comparison:
@@ -167,10 +171,11 @@ def compare(
         layers: numbers of layers, or "auto"; None for 1, 2, 4 and "auto".
         supersample: samples along each side of a pixel; None for 1, 2 and 4.
         peers: whether other renderers take part.
-        quick: one mode, one engine, one sampler, at most 40 settings, no peers.
+        quick: one mode, engine and sampler unless others are named, at most 40 settings, no peers.
         surface: the kind of surface that reads a model.
         output: a folder for the results, and for what a run that is interrupted goes on from; None to write nothing.
         truths: the folder of truths; None for the folder of caches.
+        truth_samples: of the truth, along each side of a pixel; fewer are faster, and leave a larger error of its own.
         fresh: whether to forget what earlier runs have measured.
         progress: whether to show progress; None for where standard error is a terminal.
 
@@ -182,28 +187,25 @@ def compare(
     folder = None if output is None else output_folder(output)
     kept = None if truths is None else output_folder(truths)
     found = some_modes(found, list(found.directions)[:1] if quick and modes is None else modes)
-    used, left_out = _engines(engines, quick)
-    checked(found.at(found.moved(next(iter(found.directions)), 0.0, used[0])), found.name)
+    layers = _counts("layers", layers, LAYERS[:2] if quick else LAYERS, ("auto",))
+    supersample = _counts("supersample", supersample, SUPERSAMPLE)
+    (samples,) = _counts("truth_samples", truth_samples, ())
     names, without = usable("rts.splatters", splatters)
     possible, missing = usable("rts.samplers", samplers)
-    journal = _journal(folder, found, used[0], fresh)
-    measured = Measurements(found, journal, used, truths=kept)
-    measured.left_out += [*left_out, *without, *missing]
+    used, failing = engines_for(found, engines)
+    journal = _journal(folder, found, fresh)
+    used = used[:1] if quick and engines is None else used
+    measured = Measurements(found, journal, used, truths=kept, samples=samples)
+    measured.left_out += [*failing, *without, *missing, *_unthinned()]
+    measured.leave_out_what_rests()
     suited = measured.samplers(possible)
     if not suited:
         raise InputError(f"none of the samplers {', '.join(possible)} suits {found.name!r}; {measured.left_out[-1]}")
-    others, unsuited = _peers(found, peers and not quick)
+    others, unsuited = _peers(measured, peers and not quick)
     measured.left_out += unsuited
-    plan = Plan(
-        names,
-        suited[:1] if quick else suited,
-        used,
-        _counts("layers", layers, LAYERS[:2] if quick else LAYERS, ("auto",)),
-        _counts("supersample", supersample, SUPERSAMPLE[:2] if quick else SUPERSAMPLE),
-        rates=not quick,
-        most=QUICK_CELLS if quick else None,
-        peers=others,
-    )
+    most = QUICK_CELLS if quick else None
+    kinds = measured.kinds(suited[:1] if quick and samplers is None else suited)
+    plan = Plan(names, kinds, used, layers, supersample, rates=not quick, most=most, peers=others)
     with phases(progress) as phase:
         comparison = _compared(measured, plan, phase)
     if folder is not None:
@@ -211,70 +213,81 @@ def compare(
     return comparison
 
 
-def _engines(chosen: Sequence[str] | None, quick: bool) -> tuple[list[Engine], list[str]]:
-    found, left_out = engines(chosen)
-    return (found[:1], []) if quick else (found, left_out)
-
-
 def _counts(name: str, given: Any, usual: Sequence, others: tuple[str, ...] = ()) -> list:
     found = list(usual) if given is None else list(given) if isinstance(given, (list, tuple)) else [given]
     if not found or not all(is_count(n) or n in others for n in found):
         expected = " or ".join(["integers of at least 1", *map(repr, others)])
         raise InputError(f"{name} is {quoted(given)}; expected {expected}")
-    return found
+    return [n if n in others else int(n) for n in found]
 
 
-def _peers(scene: Scene, wanted: bool) -> tuple[list[Peer], list[str]]:
-    from rts.diagnostics.comparison.peers import peers
+def _unthinned() -> list[str]:
+    if find_spec("fast_simplification") is None:
+        return ["meshes of fewer faces: pip install 'rasterize-then-splat[decimation]'"]
+    return []
 
-    return peers(scene, SPP) if wanted else ([], [])
 
-
-def _journal(folder: Path | None, scene: Scene, engine: Engine, fresh: bool) -> Journal:
-    """What earlier runs have measured of this very scene."""
+def _journal(folder: Path | None, scene: Scene, fresh: bool) -> Journal:
+    """What earlier runs have measured of scenes of this name."""
     if folder is None:
         return Journal()
-    mode, start = next(iter(scene.directions)), None if scene.separate else engine
-    path = folder / f".{file_name(scene.name)}-{scene_key(scene, mode, 0.0, 0, start)}.jsonl"
+    path = folder / f".{file_name(scene.name)}.jsonl"
     if fresh:
         path.unlink(missing_ok=True)
     return Journal(path)
 
 
+def _peers(measured: Measurements, wanted: bool) -> tuple[list[Peer], list[str]]:
+    if not wanted:
+        return [], []
+    from rts.diagnostics.comparison.peers import peers
+
+    return peers(measured.scene, engine=None if measured.scene.separate else measured.engine)
+
+
 def _compared(measured: Measurements, plan: Plan, phase: Phase) -> Comparison:
+    done = phase("truth", 4 * measured.samples**2 * len(measured.scene.directions))
+    measured.truths(done)
     scene, rows = measured.scene, []
     modes = list(scene.directions)
-    done = phase("truth", 4 * measured.samples**2 * len(modes))
-    truth_errors = {mode: {"truth_error": measured.truth(mode, done).error} for mode in modes}
-    groups = {mode: measured.group(mode) for mode in modes}
-    cells = {g: _cells(measured, plan, g) for g in dict.fromkeys(groups.values())}
-    done = phase("errors", sum(len(cells[g]) for g in groups.values()) + len(plan.peers) * len(modes))
+    cells = {g: _cells(measured, plan, g) for g in dict.fromkeys(map(measured.group, modes))}
+    done = phase("errors", sum(len(cells[measured.group(m)]) + len(plan.peers) for m in modes))
     errors: dict[str, dict[Setting, dict[str, float]]] = {}
     for mode in modes:
-        errors[mode] = {}
-        for setting in cells[groups[mode]]:
-            found = measured.scores(mode, setting)
-            if found is not None:
-                errors[mode][setting] = found
-            done()
-    of_peers = {mode: [_peer_scores(measured, mode, peer, done) for peer in plan.peers] for mode in modes}
+        found = {s: _counted(measured.scores, mode, s, done=done) for s in cells[measured.group(mode)]}
+        errors[mode] = {setting: score for setting, score in found.items() if score is not None}
+    of_peers = {(m, p): _counted(_peer_scores, measured, m, p, done=done) for m in modes for p in plan.peers}
     for group in cells:
         of_group = {mode: errors[mode] for mode in measured.modes(group)}
-        timed, times = _timed(measured, plan, group, of_group, phase)
+        times = _timed(measured, plan, group, of_group, phase)
         for mode, found in of_group.items():
-            rows += _rows(mode, found, timed, times)
-            for peer, score in zip(plan.peers, of_peers[mode], strict=True):
+            rows += _rows(mode, found, plan.samplers, times)
+            peer_times = _peer_times(measured, mode, plan.peers, phase)
+            for peer in plan.peers:
+                score, ms = of_peers[mode, peer], peer_times.get(_peer_key(peer))
                 if score is not None:
-                    ms = times.get(_peer_key(peer))
                     rows.append({"mode": mode, "peer": peer.name, "settings": dict(peer.settings), **score, "ms": ms})
-    name = {"name": scene.name, "note": scene.note, "size": list(scene.size)}
     rows.sort(key=lambda row: modes.index(row["mode"]))
-    found = marked({"scene": name, "environment": environment(PACKAGES), "modes": truth_errors, "rows": rows})
-    return Comparison(**found, left_out=measured.left_out)
+    found = marked({"rows": rows})
+    return Comparison(
+        {"name": scene.name, "note": scene.note, "size": list(scene.size)},
+        {**environment(PACKAGES), "date": measured.journal.since},
+        {mode: {"truth_error": measured.truth(mode).error} for mode in modes},
+        found["rows"],
+        measured.left_out,
+    )
+
+
+def _counted(f: Callable, *args: Any, done: Callable[[], None]) -> Any:
+    """The result of a call, which counts as a step."""
+    found = f(*args)
+    done()
+    return found
 
 
 def _cells(measured: Measurements, plan: Plan, group: str) -> list[Setting]:
-    found = measured.settings(group, plan.splatters, plan.layers, plan.supersample, plan.rates)
+    kinds = dict.fromkeys(plan.samplers.values())
+    found = measured.settings(group, plan.splatters, plan.layers, plan.supersample, kinds, plan.rates)
     if plan.most is not None and len(found) > plan.most:
         measured.left_out.append(f"{len(found) - plan.most} settings beyond the {plan.most} that are quick to measure")
         found = found[: plan.most]
@@ -283,66 +296,89 @@ def _cells(measured: Measurements, plan: Plan, group: str) -> list[Setting]:
 
 def _timed(
     measured: Measurements, plan: Plan, group: str, errors: Mapping[str, Mapping[Setting, dict]], phase: Phase
-) -> tuple[list[Setting], dict[tuple, dict[str, float]]]:
-    """What was timed, and the times of that and of the peers.
+) -> dict[Setting, dict[str, float]]:
+    """Times of settings.
 
-    Of each splatter that is the front of errors, with the usual sampler and engine; and what is then near the front of
-    errors and times, with all other samplers, and with all other engines.
+    Of each splatter, and each sampler with errors of its own, the front of errors is timed, with one sampler and the
+    first engine; what is then on the front of errors and times, with all samplers that share these errors, and with all
+    other engines.
     """
-    sampler, engine = plan.samplers[0], plan.engines[0].name
+    engine = plan.engines[0].name
+    usual = {kind: next(name for name, k in plan.samplers.items() if k == kind) for kind in plan.samplers.values()}
     plain = {mode: {s: found["error"] for s, found in of_mode.items()} for mode, of_mode in errors.items()}
-    usual: dict[Setting, None] = {}
+    first: dict[Setting, Setting] = {}
     for of_mode in plain.values():
-        for splatter in plan.splatters:
-            own = {s: error for s, error in of_mode.items() if s.splatter == splatter}
-            usual.update(dict.fromkeys(worth_timing(own, lambda s: measured.work(group, s))))
-
-    def taken(settings: Iterable[Setting], what: str, others: Mapping[tuple, Callable] = MappingProxyType({})) -> dict:
-        calls = {tuple(s): lambda s=s: measured.call(group, s) for s in settings} | dict(others)
-        return measured.time(group, calls, phase(f"times, {what}", ROUNDS * len(calls)))
-
-    first = [s._replace(sampler=sampler, engine=engine) for s in usual]
-    mode = measured.modes(group)[0]
-    times = taken(first, group, {_peer_key(p): lambda p=p: p.gradient(mode) for p in plan.peers})
-    known = {s._replace(sampler="", engine=""): times[tuple(s)]["median"] for s in first if tuple(s) in times}
-    near: dict[Setting, None] = {}
-    for of_mode in plain.values():
-        near.update(dict.fromkeys(near_front(of_mode, {s: t for s, t in known.items() if s in of_mode})))
-    more = [s._replace(sampler=name, engine=engine) for s in near for name in plan.samplers[1:]]
+        for splatter, kind in product(plan.splatters, usual):
+            own = {s: error for s, error in of_mode.items() if (s.splatter, s.sampler) == (splatter, kind)}
+            for setting in worth_timing(own, lambda s: measured.work(group, s)):
+                first[setting] = setting._replace(sampler=usual[kind], engine=engine)
+    times = _taken(measured, group, list(first.values()), phase, f"times, {group}")
+    known = {s: times[timed]["median"] for s, timed in first.items() if timed in times}
+    best: dict[Setting, None] = {}
+    for mode, of_mode in plain.items():
+        tried = [s for s in of_mode if s in known]
+        on = front([{"mode": mode, "error": of_mode[s], "ms": {"median": known[s]}} for s in tried])
+        best.update(dict.fromkeys(s for s, wanted in zip(tried, on, strict=True) if wanted))
+    more = [
+        s._replace(sampler=name, engine=engine)
+        for s in best
+        for name, kind in plan.samplers.items()
+        if kind == s.sampler and name != usual[kind]
+    ]
     # Compiled programs have to know how many layers there are.
-    other = [s._replace(sampler=sampler, engine=e.name) for s in near for e in plan.engines[1:] if s.layers != "auto"]
-    return first + more + other, times | taken([*more, *other], "other samplers and engines")
+    more += [first[s]._replace(engine=e.name) for s in best for e in plan.engines[1:] if s.layers != "auto"]
+    return times | _taken(measured, group, more, phase, "times, other samplers and engines")
+
+
+def _taken(
+    measured: Measurements, group: str, settings: Sequence[Setting], phase: Phase, what: str
+) -> dict[Setting, dict[str, float]]:
+    turns = measured.turns(group, {s: lambda s=s: measured.call(group, s) for s in settings})
+    found = turns.run(done=phase(what, ROUNDS * len(settings)))
+    measured.left_out += [f"{', '.join(str(v) for v in s if v != '')}: {why}" for s, why in turns.failed.items()]
+    return {Setting(*s): ms for s, ms in found.items()}
 
 
 def _peer_key(peer: Peer) -> tuple:
     return peer.name, *(f"{name}={value}" for name, value in peer.settings.items())
 
 
-def _peer_scores(measured: Measurements, mode: str, peer: Peer, done: Any) -> dict[str, float] | None:
-    key = ("peer", measured.samples, mode, *_peer_key(peer))
-    kept = measured.journal.get(*key)
+def _peer_scores(measured: Measurements, mode: str, peer: Peer) -> dict[str, float] | None:
+    key = "peer", mode, *_peer_key(peer), *measured.state(mode)
+    kept: Any = measured.journal.get(*key)
     if kept is None:
         try:
             derivative = peer.derivative(mode) * measured.pixel(mode)
-            kept = scores(derivative, measured.truth(mode).derivative)
+            kept = measured.journal.put(scores(derivative, measured.truth(mode).derivative), *key)
         except Exception as error:
-            kept = {"why": one_line(f"{type(error).__name__}: {error}")}
-        measured.journal.put(kept, *key)
-    done()
-    if "why" in kept:
-        measured.left_out.append(f"{' '.join(_peer_key(peer))}, {mode}: {kept['why']}")
-        return None
+            why = one_line(f"{type(error).__name__}: {error}")
+            measured.left_out.append(f"{' '.join(_peer_key(peer))}, {mode}: {why}")
     return kept
 
 
-def _rows(mode: str, errors: Mapping[Setting, dict], settings: Sequence[Setting], times: Mapping) -> list[dict]:
+def _peer_times(
+    measured: Measurements, mode: str, peers: Sequence[Peer], phase: Phase
+) -> dict[tuple, dict[str, float]]:
+    """Times of peers in a mode: they have to be told anew where a mode changes other vertices or colours."""
+    if not peers:
+        return {}
+    calls: Calls = {_peer_key(p): lambda p=p: p.gradient(mode) for p in peers}
+    turns = Turns(measured.journal, calls, lambda name: ("peer", mode, *name, *measured.state(mode)))
+    return turns.run(PEER_ROUNDS, phase(f"times of peers, {mode}", PEER_ROUNDS * len(peers)))
+
+
+def _rows(
+    mode: str,
+    errors: Mapping[Setting, dict],
+    samplers: Mapping[str, str],
+    times: Mapping[Setting, dict[str, float]],
+) -> list[dict]:
     """A row for each setting that was timed, and one without time for each that was not."""
     timed: dict[Setting, list[Setting]] = {}
-    for setting in settings:
-        if tuple(setting) in times:
-            timed.setdefault(setting._replace(sampler="", engine=""), []).append(setting)
+    for setting in times:
+        timed.setdefault(setting._replace(sampler=samplers[setting.sampler], engine=""), []).append(setting)
     return [
-        {"mode": mode, "settings": s._asdict(), **found, "ms": times.get(tuple(s)) if s.sampler else None}
+        {"mode": mode, "settings": s._asdict(), **found, "ms": times.get(s) if s.engine else None}
         for setting, found in errors.items()
         for s in timed.get(setting, [setting])
     ]

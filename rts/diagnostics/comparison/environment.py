@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import datetime
-import os
 import platform
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+from rts.threads import thread_count
+
 
 def environment(packages: Iterable[str]) -> dict[str, Any]:
     """Date, machine and versions; None for a package that is not installed."""
-    machine = f"{os.cpu_count()} cores, {platform.machine()}, {platform.system()}, Python {platform.python_version()}"
+    machine = f"{thread_count()} cores, {platform.machine()}, {platform.system()}, Python {platform.python_version()}"
     return {
         "date": datetime.date.today().isoformat(),
         "machine": machine,

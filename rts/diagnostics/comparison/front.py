@@ -13,6 +13,9 @@ from typing import Any
 
 Row = Mapping[str, Any]
 
+LEVELS = (0.1, 0.03, 0.01)
+"""Errors that summaries name the fastest row for."""
+
 
 def timed(row: Row) -> bool:
     """Whether both the time and the error of a row are known."""

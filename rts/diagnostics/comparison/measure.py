@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import random
-import time
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from rts.camera import Camera
 from rts.checks import check_scene, suited_sampler
+from rts.diagnostics.comparison.forms import Form, forms_of
+from rts.diagnostics.comparison.identity import library_key, plugin_key, state_key
 from rts.diagnostics.comparison.journal import Journal
-from rts.diagnostics.comparison.scene import Scene, SceneFunction
-from rts.diagnostics.comparison.scores import loss_weights, scores
+from rts.diagnostics.comparison.scene import Scene, parts_of
+from rts.diagnostics.comparison.scores import loss_weights, low_pass, relative_l2, scores
 from rts.diagnostics.comparison.settings import Setting, TooSlow, limited
-from rts.diagnostics.comparison.truth import SAMPLES, Truth, truth
+from rts.diagnostics.comparison.truth import SAMPLES, STEP, Truth, truth, truth_key
+from rts.diagnostics.comparison.turns import LONGEST, Calls, Turns
 from rts.diagnostics.steps import pixel_step
 from rts.engines import Engine, is_constant, namespace
 from rts.errors import InputError, RtsWarning
@@ -28,33 +29,17 @@ from rts.rendering import render, sample
 from rts.sampling.auto import explain
 from rts.trees import Array, Tree, collected, leaves, map_leaves
 
-ROUNDS, CONSECUTIVE = 5, 2
-"""Turns that each setting has, and calls timed in a turn."""
-SLOW = 2.5
-"""Seconds of timed calls after which a setting has had its turns, two at least."""
-PATIENCE = 30.0
-"""Seconds after which a plugin that has not answered is left out."""
+PATIENCE = 8.0
+"""Seconds after which a sampler that has not answered is left out."""
 PROBE, SLOWEST = 8, 3.0
 """Side of the first image that samplers are tried on, pixels; the most seconds that one of the scene's size takes."""
+ALIKE = 0.002
+"""Samplers whose derivatives differ by less, relative L2, share their errors."""
 
 TOGETHER = "all"
 """The group of all modes, where they are differentiated at once."""
 
 Done = Callable[[], None]
-
-
-class Form(NamedTuple):
-    """A scene at one rate of its surfaces.
-
-    Attributes:
-        at: parameters → (parts, camera).
-        work: how much it is, relative to the scene as it is given.
-        settings: of each part that differs, its index and its `Rate`.
-    """
-
-    at: SceneFunction
-    work: float
-    rates: Mapping[int, Any]
 
 
 class Measurements:
@@ -82,18 +67,20 @@ class Measurements:
         samples: int = SAMPLES,
         together: bool = False,
     ):
-        self.scene, self.journal, self.engines, self.truths, self.samples = scene, journal, engines, truths, samples
+        self.scene, self.journal, self.engines, self.folder, self.samples = scene, journal, engines, truths, samples
         self.engine = engines[0]
         self.left_out: list[str] = []
         self._truths: dict[str, Truth] = {}
         self._forms: dict[str, dict[str, Form]] = {}
         self._pixels: dict[str, float] = {}
+        self._states: dict[str, tuple[str, ...]] = {}
+        self._failed: dict[tuple, str] = {}
         self._groups = {m: TOGETHER if together else self._group(m) for m in scene.directions}
 
     # ------------------------------------------------------------------------------------------------- the scene
 
     def _group(self, mode: str) -> str:
-        parts = _parts(self.scene.at(self.scene.moved(mode, 0.0, self.engine)))
+        parts = parts_of(self.scene.at(self.scene.moved(mode, 0.0, self.engine)))
         read = [part.theta[name] for part in parts for name in as_surface(part.surface).reads(part.theta)]
         return "surfaces rest" if is_constant(read) else "surfaces change"
 
@@ -106,7 +93,11 @@ class Measurements:
         return [mode for mode in self.scene.directions if self.group(mode) == group]
 
     def pixel(self, mode: str) -> float:
-        """How far along a mode what moves fastest moves by a pixel."""
+        """How far along a mode what moves fastest moves by a pixel.
+
+        Raises:
+            InputError: nothing changes with it.
+        """
         if mode not in self._pixels:
             engine, scene = self.engine, self.scene
 
@@ -116,9 +107,55 @@ class Measurements:
                 return render(*found, scene.size, **options)
 
             start = self._number(0.0)
-            step = pixel_step(engine, image, start, namespace(start).ones_like(start))
+            step = _quietly(lambda: pixel_step(engine, image, start, namespace(start).ones_like(start)))
+            if step is None:
+                raise self._rests(mode)
             self._pixels[mode] = step
         return self._pixels[mode]
+
+    def leave_out_what_rests(self) -> None:
+        """Go on with those modes that change something.
+
+        Raises:
+            InputError: there are none.
+        """
+        self._keep(self.pixel)
+
+    def truths(self, done: Done) -> None:
+        """Make the truths, and go on with those modes in which the image changes.
+
+        Args:
+            done: see `truth`.
+
+        Raises:
+            InputError: there are none.
+        """
+
+        def changes(mode: str) -> None:
+            if not np.linalg.norm(self.truth(mode, done).derivative) > 0:
+                raise self._rests(mode)
+
+        self._keep(changes)
+
+    def _keep(self, check: Callable[[str], Any]) -> None:
+        """Go on with the modes that a check does not refuse."""
+        kept, why = [], []
+        for mode in self.scene.directions:
+            try:
+                check(mode)
+                kept.append(mode)
+            except InputError as error:
+                why.append(error)
+                self._leave_out(str(error))
+        if not kept:
+            raise why[0]
+        self.scene = self.scene.with_modes(kept)
+
+    def _rests(self, mode: str) -> InputError:
+        return InputError(
+            f"nothing in the image of {self.scene.name!r} changes with {mode!r}; expected parameters that the scene "
+            f"depends on, and parts that are in view"
+        )
 
     def _number(self, value: float) -> Array:
         like = next((x for x in leaves(self.scene.parameters) if self.engine.owns(x)), None)
@@ -127,38 +164,75 @@ class Measurements:
     def truth(self, mode: str, done: Done = lambda: None) -> Truth:
         """How the image truly changes along a mode; see `truth`."""
         if mode not in self._truths:
-            engine = None if self.scene.separate else self.engine
-            options: dict[str, Any] = dict(samples=self.samples, engine=engine, folder=self.truths, done=done)
+            options: dict[str, Any] = dict(samples=self.samples, engine=self._still, folder=self.folder, done=done)
             self._truths[mode] = truth(self.scene, mode, self.pixel(mode), **options)
         return self._truths[mode]
+
+    @property
+    def _still(self) -> Engine | None:
+        """The engine of scenes without derivatives: None for NumPy, where the scene takes it."""
+        return None if self.scene.separate else self.engine
+
+    def state(self, mode: str) -> tuple[str, ...]:
+        """What measurements of a mode depend on: the scene where it begins and ends, its truth, and the library."""
+        if mode not in self._states:
+            step = STEP * self.pixel(mode)
+            moved = [self.scene.at(self.scene.moved(mode, by, self._still)) for by in (-step / 2, step / 2)]
+            own = [state_key(parts_of(found), found[1], self.scene.size) for found in moved]
+            true = truth_key(self.scene, mode, step, self.samples, self._still)
+            self._states[mode] = (*own, true, library_key())
+        return self._states[mode]
 
     def forms(self, group: str) -> dict[str, Form]:
         """The scene at the rates that its surfaces offer; "" as it is given."""
         if group not in self._forms:
-            given = self.scene.at(self.start(group))
-            offered: dict[str, dict[int, Any]] = {}
-            for index, part in enumerate(_parts(given)):
-                for rate in as_surface(part.surface).rates(part.theta):
-                    offered.setdefault(rate.setting, {})[index] = rate
-            found = {name: Form(_changed(self.scene.at, rates), _work(rates), rates) for name, rates in offered.items()}
-            self._forms[group] = {"": Form(self.scene.at, 1.0, {}), **found}
+            self._forms[group] = forms_of(self.scene.at, parts_of(self.scene.at(self.start(group))))
         return self._forms[group]
+
+    # -------------------------------------------------------------------------------------------------- samplers
 
     def samplers(self, names: Iterable[str]) -> list[str]:
         """Those that can sample all parts, the one that "auto" takes first; "auto" itself where it takes several."""
-        mode = next(iter(self.scene.directions))
-        parts, camera = self.scene.at(self.start(self.group(mode)))
-        auto = {choice.sampler for choice in explain(_as_list(parts), camera)}
-        found = ["auto"] if len(auto) > 1 else []
+        found = self.scene.at(self.start(self.group(next(iter(self.scene.directions)))))
+        parts = parts_of(found)
+        auto = {choice.sampler for choice in explain(parts, found[1])}
+        suited = ["auto"] if len(auto) > 1 else []
         for name in names:
-            kept = self.journal.get("sampler", name)
+            key = "sampler", name, plugin_key("rts.samplers", name), *self.state(next(iter(self.scene.directions)))
+            kept = self.journal.get(*key)
             if kept is None:
-                kept = self.journal.put(self._tried(name, _as_list(parts), camera), "sampler", name)
-            if kept["why"]:
-                self._leave_out(f"sampler {name!r}: {kept['why']}")
+                kept = self._tried(name, parts, found[1])
+                if kept["suits"]:
+                    self.journal.put(kept, *key)
             if kept["suits"]:
-                found.append(name)
-        return sorted(found, key=lambda name: (name not in auto, name != "auto"))
+                suited.append(name)
+            else:
+                self._leave_out(f"sampler {name!r}: {kept['why']}")
+        return sorted(suited, key=lambda name: (name not in auto, name != "auto"))
+
+    def kinds(self, samplers: Sequence[str]) -> dict[str, str]:
+        """Each sampler, with the one that its errors are shared with: "" for the usual one, itself where it differs."""
+        group = self.group(next(iter(self.scene.directions)))
+        found = {}
+        for name in samplers:
+            key = "kind", name, plugin_key("rts.samplers", name), samplers[0], *self.state(self.modes(group)[0])
+            kept = self.journal.get(*key)
+            if kept is None:
+                kept = self.journal.put(name == samplers[0] or self._agrees(name, samplers[0], group), *key)
+            found[name] = "" if kept else name
+        return found
+
+    def _agrees(self, name: str, usual: str, group: str) -> bool:
+        """Whether a sampler gives the derivatives that the usual one gives."""
+        for mode in self.modes(group):
+            setting = Setting("auto", 2, 1)
+            try:
+                a, b = (low_pass(self._derivative(mode, setting._replace(sampler=n))) for n in (usual, name))
+            except Exception:
+                return False
+            if not relative_l2(a, b, a) <= ALIKE:
+                return False
+        return True
 
     def _tried(self, name: str, parts: list[Part], camera: Camera) -> dict[str, Any]:
         """Whether a sampler suits the scene, and why not."""
@@ -187,70 +261,102 @@ class Measurements:
     # ---------------------------------------------------------------------------------------------------- errors
 
     def settings(
-        self, group: str, splatters: Iterable[str], layers: Iterable[int | str], samples: Iterable[int], rates: bool
+        self,
+        group: str,
+        splatters: Iterable[str],
+        layers: Iterable[int | str],
+        samples: Iterable[int],
+        kinds: Iterable[str] = ("",),
+        rates: bool = True,
     ) -> list[Setting]:
-        """All that differ in their error; of numbers of layers beyond those that count the least one that suffices."""
-        found = []
-        for rate in self.forms(group) if rates else [""]:
-            for supersample in samples:
-                for splatter in splatters:
-                    for count in layers:
-                        setting = Setting(splatter, count, supersample, rate)
-                        if self.counting(group, setting) is not None:
-                            found.append(setting)
-        return found
+        """All that may differ in their error, those that can be had.
+
+        Args:
+            group: of modes.
+            splatters: names.
+            layers: numbers, or "auto".
+            samples: along each side of a pixel.
+            kinds: samplers that have errors of their own, and "" for all others.
+            rates: whether the rates that surfaces offer are among them.
+        """
+        all_of = (
+            Setting(splatter, count, supersample, rate, kind)
+            for kind in kinds
+            for rate in (self.forms(group) if rates else [""])
+            for supersample in samples
+            for splatter in splatters
+            for count in layers
+        )
+        return [setting for setting in all_of if self.counting(group, setting) is not None]
 
     def counting(self, group: str, setting: Setting) -> int | None:
-        """How many layers count in a setting, None where it cannot be had."""
-        most = self._layers(group, setting._replace(layers="auto"))
+        """How many layers count in a setting: beyond those that "auto" takes there are none. None where that fails."""
+        most = self._layers(group, setting._replace(layers="auto", engine=""))
         if most is None:
             return None if setting.layers == "auto" else int(setting.layers)
         return most if setting.layers == "auto" else min(int(setting.layers), most)
 
     def _layers(self, group: str, setting: Setting) -> int | None:
         """How many layers "auto" takes, None where it takes none."""
-        kept = self.journal.get("layers", group, *setting)
+        key = "layers", group, *setting, *self._identity(self.modes(group)[0], setting)
+        if key in self._failed:
+            return None
+        kept = self.journal.get(*key)
         if kept is None:
             parts, camera = self.forms(group)[setting.rate].at(self.start(group))
-            options: dict[str, Any] = dict(splatter=setting.splatter, layers="auto", supersample=setting.supersample)
             try:
-                found = _quietly(lambda: sample(parts, camera, self.scene.size, **options))
-                kept = {"count": int(found.row.shape[0])}
+                with limited(LONGEST):
+                    found = _quietly(lambda: sample(parts, camera, self.scene.size, **setting.options))
+                kept = self.journal.put(int(found.row.shape[0]), *key)
             except Exception as error:
-                kept = {"count": None, "why": one_line(f"{type(error).__name__}: {error}")}
-            self.journal.put(kept, "layers", group, *setting)
-        if kept["count"] is None:
-            self._leave_out(f'splatter {setting.splatter!r}, layers="auto": {kept["why"]}')
-        return kept["count"]
+                self._failed[key] = one_line(f"{type(error).__name__}: {error}")
+                self._leave_out(f'splatter {setting.splatter!r}, layers="auto": {self._failed[key]}')
+        return kept
 
     def scores(self, mode: str, setting: Setting) -> dict[str, float] | None:
-        """How far the derivative along a mode is off; see `rts.diagnostics.comparison.scores`. None where it fails."""
+        """How far the derivative along a mode is off; see `rts.diagnostics.comparison.scores`. None where it fails.
+
+        Args:
+            mode: of the scene.
+            setting: its `sampler` is one that has errors of its own, or "".
+        """
         count = self.counting(self.group(mode), setting)
         if count is None:
             return None
-        same = setting._replace(layers=count, sampler="", engine="")
-        kept = self.journal.get("error", self.samples, mode, *same)
-        if kept is None:
-            kept = self.journal.put(self._measured(mode, same), "error", self.samples, mode, *same)
-        if "why" in kept:
-            self._leave_out(f"splatter {same.splatter!r}, {mode}: {kept['why']}")
+        same = setting._replace(layers=count, engine="")
+        key = "error", mode, *same, *self._identity(mode, same)
+        if key in self._failed:
             return None
+        kept = self.journal.get(*key)
+        if kept is None:
+            try:
+                kept = self.journal.put(self._measured(mode, same), *key)
+            except Exception as error:
+                self._failed[key] = one_line(f"{type(error).__name__}: {error}")
+                self._leave_out(f"splatter {same.splatter!r}, {mode}: {self._failed[key]}")
         return kept
 
-    def _measured(self, mode: str, setting: Setting) -> dict[str, Any]:
+    def _identity(self, mode: str, setting: Setting) -> tuple[str, ...]:
+        """What a measurement of a setting depends on beside the setting."""
+        plugins = ("rts.splatters", setting.splatter), ("rts.samplers", setting.sampler)
+        return *(plugin_key(*p) for p in plugins), *self.state(mode)
+
+    def _measured(self, mode: str, setting: Setting) -> dict[str, float]:
+        derivative = self._derivative(mode, setting)
+        if not np.isfinite(derivative).all():
+            raise InputError("its derivative is not finite")
+        return scores(derivative, self.truth(mode).derivative)
+
+    def _derivative(self, mode: str, setting: Setting) -> np.ndarray:
+        """The derivative image (H, W, 3) along a mode, a pixel of motion."""
         at, pixel = self.forms(self.group(mode))[setting.rate].at, self.pixel(mode)
 
         def image(t: Array) -> Array:
             return render(*at(self.scene.moved(mode, t, self.engine)), self.scene.size, **setting.options)[..., :3]
 
-        try:
-            derivative = _quietly(lambda: self.engine.jvp(image, self._number(0.0), self._number(pixel))[1])
-        except Exception as error:
-            return {"why": one_line(f"{type(error).__name__}: {error}")}
-        found = self.engine.to_numpy(derivative).astype(np.float64)
-        if not np.isfinite(found).all():
-            return {"why": "its derivative is not finite"}
-        return scores(found, self.truth(mode).derivative)
+        with limited(LONGEST):
+            found = _quietly(lambda: self.engine.jvp(image, self._number(0.0), self._number(pixel))[1])
+        return self.engine.to_numpy(found).astype(np.float64)
 
     # ----------------------------------------------------------------------------------------------------- times
 
@@ -268,14 +374,14 @@ class Measurements:
         engine = next(e for e in self.engines if e.name == setting.engine)
         at, size = self.forms(group)[setting.rate].at, self.scene.size
         live, rebuilt = self._live(group, engine)
-        weights = engine.constant(np.asarray(loss_weights(*size)[0], np.float32), live[0])
+        weights = engine.constant(np.asarray(loss_weights(*size, 1)[0], np.float32), live[0])
 
         def loss(values: list[Array]) -> Array:
             image = render(*at(rebuilt(values)), size, **setting.options)
             return namespace(image).sum(image[..., :3] * weights)
 
         gradient = engine.jit(engine.value_and_grad(loss))
-        return lambda: engine.block(gradient(live))
+        return lambda: _quietly(lambda: engine.block(gradient(live)))
 
     def start(self, group: str) -> Tree:
         """The parameters, those that a group's modes change in arrays of the first engine."""
@@ -298,93 +404,21 @@ class Measurements:
 
         return live, rebuilt
 
-    def time(
-        self,
-        group: str,
-        calls: Mapping[tuple, Callable[[], Callable[[], Any]]],
-        done: Done = lambda: None,
-        rounds: int = ROUNDS,
-    ) -> dict[tuple, dict[str, float]]:
-        """Milliseconds of each of some functions, which take turns in shuffled order after a call to warm up.
+    def turns(self, group: str, calls: Calls) -> Turns:
+        """Functions that are to be timed, such as those of `call`, and where their times are kept.
 
         Args:
-            group: of modes.
-            calls: what to keep a time under → a function that makes the function to be timed.
-            done: called for each turn.
-            rounds: turns of each.
-
-        Returns:
-            Under each key that could be timed the median, quartiles and number of calls.
+            group: of modes, whose parameters they differentiate.
+            calls: what to keep times under, a `Setting` or what a peer is called, → see `Turns`.
         """
-        times: dict[tuple, list[float]] = {}
-        made: dict[tuple, Callable[[], Any]] = {}
-        failed = {key: self.journal.get("fails", group, *key) for key in calls}
-        order, shuffle = list(calls), random.Random(0).shuffle
-        for n in range(rounds):
-            shuffle(order)
-            for key in order:
-                done()
-                kept = self.journal.get("time", group, *key, n)
-                if failed[key] is None and kept is None and _goes_on(times.get(key, [])):
-                    try:
-                        kept = self._turn(key, calls, made)
-                        self.journal.put(kept, "time", group, *key, n)
-                    except Exception as error:
-                        failed[key] = one_line(f"{type(error).__name__}: {error}")
-                        self.journal.put(failed[key], "fails", group, *key)
-                times.setdefault(key, []).extend(kept or [])
-        for key, why in failed.items():
-            if why is not None:
-                self._leave_out(f"{_told(key)}: {why}")
-        return {key: _milliseconds(found) for key, found in times.items() if found}
+        modes = self.modes(group)
+        states = [state for mode in modes for state in self.state(mode)]
 
-    def _turn(self, key: tuple, calls: Mapping[tuple, Callable], made: dict[tuple, Callable[[], Any]]) -> list[float]:
-        """Seconds of a few consecutive calls, after one that is not timed."""
-        if key not in made:
-            with limited(4 * PATIENCE):  # Some compile.
-                made[key] = calls[key]()
-                _quietly(made[key])
-        with limited(4 * PATIENCE):
-            start = time.perf_counter()
-            _quietly(made[key])
-            found = [time.perf_counter() - start]
-            if found[0] < SLOW / 2:
-                for _ in range(CONSECUTIVE):
-                    start = time.perf_counter()
-                    made[key]()
-                    found.append(time.perf_counter() - start)
-                del found[0]
-        return found
+        def key(name: tuple) -> tuple:
+            own = self._identity(modes[0], name) if isinstance(name, Setting) else ()
+            return group, *name, *own, *states
 
-
-def _parts(found: tuple[Any, Camera]) -> list[Part]:
-    return _as_list(found[0])
-
-
-def _as_list(parts: Any) -> list[Part]:
-    return [parts] if isinstance(parts, Part) else list(parts)
-
-
-def _changed(at: SceneFunction, rates: Mapping[int, Any]) -> SceneFunction:
-    """A scene some of whose parts have other surfaces."""
-
-    def changed(parameters: Tree) -> tuple[list[Part], Camera]:
-        parts, camera = at(parameters)
-        parts = _as_list(parts)
-        for index, rate in rates.items():
-            theta = parts[index].theta if rate.theta is None else rate.theta(parts[index].theta)
-            parts[index] = parts[index].replace(surface=rate.surface, theta=theta)
-        return parts, camera
-
-    return changed
-
-
-def _work(rates: Mapping[int, Any]) -> float:
-    return float(np.mean([rate.work for rate in rates.values()]))
-
-
-def _goes_on(times: list[float]) -> bool:
-    return len(times) < 2 or sum(times) < SLOW
+        return Turns(self.journal, calls, key)
 
 
 def _quietly(f: Callable[[], Any]) -> Any:
@@ -392,12 +426,3 @@ def _quietly(f: Callable[[], Any]) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RtsWarning)
         return f()
-
-
-def _told(key: tuple) -> str:
-    return ", ".join(str(k) for k in key if k != "")
-
-
-def _milliseconds(times: list[float]) -> dict[str, float]:
-    low, median, high = 1e3 * np.percentile(times, [25, 50, 75])
-    return {"median": float(median), "low": float(low), "high": float(high), "calls": len(times)}

@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from rts.diagnostics.comparison.front import Row, best_within
+from rts.diagnostics.comparison.front import LEVELS, Row, best_within
 from rts.diagnostics.comparison.style import (
     OTHER_COLORS,
     PEER_COLORS,
@@ -26,9 +26,6 @@ from rts.diagnostics.comparison.style import (
 )
 from rts.errors import InputError, PluginError
 from rts.files.paths import writing
-
-ERRORS = (0.1, 0.03, 0.01)
-"""Errors for which the page names the fastest settings."""
 
 
 def write_page(comparisons: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -132,7 +129,7 @@ def _mode(truth_error: float, rows: Sequence[Row], settings: Mapping[str, int]) 
         **{name: [_short(row["ms"][name]) for row in rows] for name in ("median", "low", "high")},
         "calls": [row["ms"]["calls"] for row in rows],
         "front": [i for i, row in enumerate(rows) if row.get("front")],
-        "within": [[error, fastest(ours, error), fastest(peers, error)] for error in ERRORS],
+        "within": [[error, fastest(ours, error), fastest(peers, error)] for error in LEVELS],
         "least": index[id(min(ours, key=lambda row: row["error"]))] if ours else None,
     }
 

@@ -8,25 +8,29 @@ from rts.diagnostics.comparison.deodr_peer import Deodr
 from rts.diagnostics.comparison.mitsuba_peer import Mitsuba, MitsubaScene
 from rts.diagnostics.comparison.scene import Scene
 from rts.diagnostics.comparison.seen import Peer, Seen, Unsuited, seen
+from rts.engines import Engine
+from rts.fitting.names import one_line
 
-SPP = (1, 4, 16, 64)
+SPP = (1, 4, 16)
 """Samples a pixel of Mitsuba."""
 
 
-def peers(scene: Scene, spp: Sequence[int] = SPP) -> tuple[list[Peer], list[str]]:
+def peers(scene: Scene, spp: Sequence[int] = SPP, engine: Engine | None = None) -> tuple[list[Peer], list[str]]:
     """The renderers that can render a scene, and why others cannot.
 
     Args:
         scene: of unlit or white parts without textures, and a perspective camera.
         spp: samples a pixel; Mitsuba is there once for each.
+        engine: of the scene's parameters; None for NumPy.
 
     Returns:
         The renderers, and a line for each that is left out.
     """
     try:
-        given = seen(scene)
-    except Unsuited as reason:
-        return [], [f"DEODR and Mitsuba: {reason}"]
+        given = seen(scene, engine)
+    except Exception as error:
+        reason = str(error) if isinstance(error, Unsuited) else f"{type(error).__name__}: {error}"
+        return [], [f"DEODR and Mitsuba: {one_line(reason)}"]
     found: list[Peer] = []
     left_out = []
     for name, make in (("DEODR", _deodr), ("Mitsuba", _mitsuba)):
@@ -34,8 +38,8 @@ def peers(scene: Scene, spp: Sequence[int] = SPP) -> tuple[list[Peer], list[str]
             found += make(given, spp)
         except ModuleNotFoundError as error:
             left_out.append(f"{name}: no module {error.name!r}; pip install 'rasterize-then-splat[bench]'")
-        except (ImportError, Unsuited) as error:
-            left_out.append(f"{name}: {error}")
+        except Exception as error:
+            left_out.append(f"{name}: {one_line(str(error))}")
     return found, left_out
 
 

@@ -76,6 +76,11 @@ class Scene:
         return map_leaves(leaf, self.parameters)
 
 
+def parts_of(found: tuple[Part | Sequence[Part], Camera]) -> list[Part]:
+    """The parts of what a scene's function gave, in a list."""
+    return [found[0]] if isinstance(found[0], Part) else list(found[0])
+
+
 def moving(
     name: str,
     parts: Part | Sequence[Part],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 
@@ -24,13 +24,13 @@ def relative_l2(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> float:
     return float(np.linalg.norm(x - y) / max(float(np.linalg.norm(scale)), 1e-30))
 
 
-@cache
-def loss_weights(height: int, width: int) -> np.ndarray:
-    """Weights (L, H, W, 3) of the random losses L = Σ w · image: smooth, of fixed seed and unit variance."""
+@lru_cache(2)
+def loss_weights(height: int, width: int, count: int = LOSSES) -> np.ndarray:
+    """Weights (count, H, W, 3) float32 of random losses L = Σ w · image: smooth, of fixed seed and unit variance."""
     from scipy.ndimage import gaussian_filter
 
-    noise = np.random.default_rng(0).normal(size=(LOSSES, height, width, 3))
-    smooth = gaussian_filter(noise, (0, LOSS_SCALE, LOSS_SCALE, 0))
+    noise = np.random.default_rng(0).normal(size=(count, height, width, 3))
+    smooth = gaussian_filter(noise, (0, LOSS_SCALE, LOSS_SCALE, 0), output=np.float32)
     weights = smooth / smooth.std(axis=(1, 2, 3), keepdims=True)
     weights.setflags(write=False)
     return weights

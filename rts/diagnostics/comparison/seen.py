@@ -18,9 +18,11 @@ from rts import registry
 from rts.camera import Camera
 from rts.checks import check_scene
 from rts.diagnostics.comparison.scene import Scene
+from rts.engines import Engine, engine_of
 from rts.errors import InputError
 from rts.interfaces import CheckedPart, Part
 from rts.shading import Silhouette, Unlit
+from rts.trees import map_leaves
 
 EDGE = 4.0
 """Pixels that edges of triangles are to be shorter than, where a surface is cut into triangles."""
@@ -133,7 +135,7 @@ class Peer(abc.ABC):
         """
 
 
-def seen(scene: Scene) -> Seen:
+def seen(scene: Scene, engine: Engine | None = None) -> Seen:
     """A scene at rest, and its velocities in every mode.
 
     Velocities are central differences over a pixel: exact up to rounding where vertices move along straight lines.
@@ -142,7 +144,7 @@ def seen(scene: Scene) -> Seen:
         Unsuited: other renderers cannot render it.
     """
     first = next(iter(scene.directions))
-    parts, camera = check_scene(*scene.at(scene.moved(first)))
+    parts, camera = _on_host(scene, first, 0.0, engine)
     projection = np.asarray(camera.for_size(scene.size).projection, np.float64)
     if projection[3, 2] == 0:
         raise Unsuited("the camera is orthographic")
@@ -150,7 +152,8 @@ def seen(scene: Scene) -> Seen:
     near, far = (float(d) for d in camera.depth_range())
     to_camera = _to_camera(camera, focal, scene.size)
     cuts = [1 if _is_mesh(part) else _cuts(index, part, to_camera, focal) for index, part in enumerate(parts)]
-    at = partial(_snapshot, scene, focal, cuts)
+    apart = partial(_snapshot, scene, engine, focal, cuts)
+    at = partial(_joined, apart, [_joints(part) for part in apart(first, 0.0)])
     rest = at(first, 0.0)
     if not np.isfinite(far):
         far = 2 * max(float(-p.vertices[:, 2].min()) for p in rest)
@@ -166,9 +169,16 @@ def seen(scene: Scene) -> Seen:
 # --------------------------------------------------------------------------------------------------------------- parts
 
 
-def _snapshot(scene: Scene, focal: float, cuts: list[int], mode: str, t: float) -> list[Colored]:
+def _on_host(scene: Scene, mode: str, t: float, engine: Engine | None) -> tuple[list[CheckedPart], Camera]:
+    """The parts and the camera at t, their arrays in NumPy."""
+    parts, camera = scene.at(scene.moved(mode, t, engine))
+    host = map_leaves(lambda x: engine_of(x).to_numpy(engine_of(x).stop_gradient(x)), (parts, camera))
+    return check_scene(*host)
+
+
+def _snapshot(scene: Scene, engine: Engine | None, focal: float, cuts: list[int], mode: str, t: float) -> list[Colored]:
     """The parts at t, wound as they are."""
-    parts, camera = check_scene(*scene.at(scene.moved(mode, t)))
+    parts, camera = _on_host(scene, mode, t, engine)
     to_camera = _to_camera(camera, focal, scene.size)
     found = []
     for index, (part, rate) in enumerate(zip(parts, cuts, strict=True)):
@@ -259,13 +269,38 @@ def _rgb(index: int, part: CheckedPart, colors: np.ndarray) -> np.ndarray:
     return colors[:, :3] if colors.shape[1] >= 3 else np.repeat(colors[:, :1], 3, axis=1)
 
 
+def _joints(part: Colored) -> tuple[np.ndarray, np.ndarray]:
+    """Which vertices (V',) to keep where several are in one place and of one colour, and (V,) what each becomes."""
+    _, first, became = np.unique(
+        np.hstack([part.vertices, part.colors]), axis=0, return_index=True, return_inverse=True
+    )
+    return first, became.reshape(-1)
+
+
+def _joined(
+    at: Callable[[str, float], list[Colored]], joints: list[tuple[np.ndarray, np.ndarray]], mode: str, t: float
+) -> list[Colored]:
+    """The parts at t, with one vertex a place and colour: else an edge between patches would count as two outlines."""
+    return [
+        Colored(became[part.faces], part.vertices[first], part.colors[first])
+        if len(part.vertices) == len(became)
+        else part
+        for part, (first, became) in zip(at(mode, t), joints, strict=True)
+    ]
+
+
 def _check_joined(index: int, part: Colored) -> None:
-    """Refuse triangles that meet at an edge without sharing its vertices: it would count as two outlines."""
+    """Refuse a part that faces both ways, and whose triangles meet without sharing vertices.
+
+    There an edge of a front and a back face would count as two outlines.
+    """
+    a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
+    volumes = np.einsum("ij,ij->i", a, np.cross(b, c))
     _, place = np.unique(part.vertices, axis=0, return_inverse=True)
     edges = np.sort(np.concatenate([part.faces[:, [0, 1]], part.faces[:, [1, 2]], part.faces[:, [2, 0]]]), axis=1)
     alone, counts = np.unique(edges, axis=0, return_counts=True)
     ends = np.sort(place.reshape(-1)[alone[counts == 1]], axis=1)
-    if len(np.unique(ends, axis=0)) < len(ends):
+    if len(np.unique(ends, axis=0)) < len(ends) and volumes.min() < 0 < volumes.max():
         raise Unsuited(f"triangles of part {index} meet at edges whose vertices they do not share")
 
 

@@ -9,19 +9,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rts import registry
+from rts.arguments import quoted
+from rts.diagnostics.comparison.front import LEVELS
 from rts.engines import Engine, engine_named
-from rts.errors import PluginError
+from rts.errors import InputError, PluginError
 
 FIRST = "torch"
 """The engine that errors are measured with where it is installed, since all agree on them and it compiles nothing."""
 
 
-ALIKE = 1.05
-"""A setting that costs more has to have an error smaller than by this factor."""
-
-
-CLEARLY = 0.9
-"""A setting betters another one clearly where its error and its time are at most this share of the other's."""
+ALIKE = 1.1
+"""A setting that costs more has to have an error smaller than by this factor, or smaller than one of `LEVELS`."""
 
 
 class Setting(NamedTuple):
@@ -59,6 +57,8 @@ def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], 
     """
     found: dict[str, Any] = {}
     left_out = []
+    if chosen is not None and (not isinstance(chosen, (list, tuple)) or not chosen):
+        raise InputError(f"{group.removeprefix('rts.')} is {quoted(chosen)}; expected a list of names, or None for all")
     for name in registry.plugins(group) if chosen is None else chosen:
         if name == "auto" and chosen is None:
             continue
@@ -98,18 +98,16 @@ def worth_timing(errors: Mapping[Setting, float], work: Callable[[Setting], tupl
     for setting in sorted(errors, key=lambda s: (work(s), errors[s])):
         mine = work(setting)
         if not any(
-            errors[other] <= ALIKE * errors[setting] and all(a <= b for a, b in zip(work(other), mine, strict=True))
+            _no_worse(errors[other], errors[setting]) and all(a <= b for a, b in zip(work(other), mine, strict=True))
             for other in found
         ):
             found.append(setting)
     return found
 
 
-def near_front(errors: Mapping[Setting, float], times: Mapping[Setting, float]) -> list[Setting]:
-    """The settings that no other one clearly betters, both in error and in time."""
-    return [
-        s for s in times if not any(errors[o] <= CLEARLY * errors[s] and times[o] <= CLEARLY * times[s] for o in times)
-    ]
+def _no_worse(error: float, other: float) -> bool:
+    """Whether an error is not much larger than another one, and within all `LEVELS` that the other is within."""
+    return error <= ALIKE * other and not any(other <= level < error for level in LEVELS)
 
 
 class TooSlow(Exception):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import inspect
 import re
-from collections.abc import Callable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +19,10 @@ from rts.arrays import kind_of
 from rts.camera import Camera
 from rts.checks import check_scene, check_size
 from rts.diagnostics.comparison import builtin
-from rts.diagnostics.comparison.scene import Scene, check_directions, moving
-from rts.engines import is_constant
-from rts.errors import InputError
+from rts.diagnostics.comparison.scene import Scene, check_directions, moving, parts_of
+from rts.diagnostics.comparison.settings import engines
+from rts.engines import Engine, engine_of, is_constant, namespace
+from rts.errors import InputError, RtsError
 from rts.files.paths import as_path
 from rts.fitting.names import named_leaves, one_line
 from rts.interfaces import Part
@@ -28,7 +31,7 @@ from rts.trees import Tree, leaves, map_leaves
 SIZE = (256, 256)
 FEW = 6
 """Arrays of at most so many numbers have a mode for each."""
-VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 
 def scene_of(
@@ -88,8 +91,8 @@ def some_modes(scene: Scene, modes: Sequence[str] | None) -> Scene:
 def _named(
     name: str, parameters: Tree, directions: Mapping[str, Tree] | None, surface: str, size: tuple[int, int]
 ) -> Scene:
-    file, _, function = name.partition(":") if re.search(r"\.py(:\w*)?$", name) else (name, "", "")
-    path = as_path(file)
+    match = re.fullmatch(r"(.*\.py)(?::(\w*))?", name, re.DOTALL)
+    path, function = as_path(match[1] if match else name), match[2] if match else None
     if path.suffix == ".py":
         module = _module(path)
         found = getattr(module, function or "scene", None)
@@ -99,8 +102,8 @@ def _named(
             return found
         given = getattr(module, "parameters", None) if parameters is None else parameters
         return _of_function(found, function or path.stem, given, directions)
-    if parameters is not None:
-        raise InputError("parameters were given; only functions of parameters have them")
+    if parameters is not None or directions is not None:
+        raise InputError("parameters or directions were given; only functions of parameters have them")
     if path.suffix and path.exists():
         return of_model(path, surface, size)
     if path.suffix:
@@ -121,16 +124,31 @@ def of_model(path: Path, surface: str, size: tuple[int, int]) -> Scene:
 
 
 def _module(path: Path) -> Any:
-    """A Python file, run."""
+    """A Python file, run; it finds modules in its own folder."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
     if not path.is_file() or spec is None or spec.loader is None:
         raise InputError(f"{path} does not exist; expected a Python file")
     module = importlib.util.module_from_spec(spec)
+    # Dataclasses look their module up.
+    sys.modules.setdefault(path.stem, module)
+    sys.path.insert(0, str(path.parent.resolve()))
     try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise InputError(f"{path} fails: {type(error).__name__}: {one_line(str(error))}") from error
+        with _told(str(path)):
+            spec.loader.exec_module(module)
+    finally:
+        sys.path.pop(0)
     return module
+
+
+@contextlib.contextmanager
+def _told(what: str) -> Iterator[None]:
+    """What goes wrong in a user's code, told in one line."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        if isinstance(error, RtsError):
+            raise
+        raise InputError(f"{what} fails: {type(error).__name__}: {one_line(str(error))}") from error
 
 
 def _of_function(f: Callable, name: str, parameters: Tree, directions: Mapping[str, Tree] | None) -> Scene:
@@ -142,17 +160,53 @@ def _of_function(f: Callable, name: str, parameters: Tree, directions: Mapping[s
             raise InputError(
                 f"{name} takes parameters; pass parameters=, or let its Python file have them by that name"
             )
-        found = f()
+        with _told(name):
+            found = f()
         if isinstance(found, Scene):
             return found
         parts, camera = checked(found, name)
         if not is_constant([p.theta for p in parts]):
             raise InputError(f"{name} gave arrays of an engine; expected NumPy where there are no parameters")
         return moving(name, parts, camera, SIZE)
+    parameters = map_leaves(_float_array, parameters)
     if not any(np.size(x) for x in leaves(parameters)):
         raise InputError("parameters holds no numbers; expected arrays, in nested dicts and lists")
-    parameters = map_leaves(lambda x: np.asarray(x, np.float32) if is_constant(x) else x, parameters)
     return Scene(name, f, parameters, _modes(parameters) if directions is None else directions, SIZE)
+
+
+def _float_array(x: Any) -> Any:
+    """A leaf of parameters: NumPy's and Python's numbers become float32, as the engines take them."""
+    if is_constant(x):
+        return np.asarray(x, np.float32)
+    dtype = getattr(x, "dtype", None)
+    if dtype is None or not namespace(x).isdtype(dtype, "real floating"):
+        raise InputError(f"parameters holds {quoted(x)}; expected arrays of real numbers, in nested dicts and lists")
+    return engine_of(x).stop_gradient(x)
+
+
+def engines_for(scene: Scene, chosen: Sequence[str] | None = None) -> tuple[list[Engine], list[str]]:
+    """The engines that can compute a scene, the one that errors are measured with first; and why others cannot.
+
+    Args:
+        scene: the scene; where its parameters are arrays of an engine, no other one can.
+        chosen: names; None for all that are installed.
+
+    Raises:
+        InputError: the scene gives something else than parts and a camera, in all engines.
+    """
+    own = engine_of(scene.parameters)
+    found, left_out = engines([own.name] if own.differentiates and chosen is None else chosen)
+    can, first = [], next(iter(scene.directions))
+    for engine in found:
+        try:
+            with _told(scene.name):
+                checked(scene.at(scene.moved(first, 0.0, engine)), scene.name)
+            can.append(engine)
+        except RtsError as error:
+            left_out.append(f"engine {engine.name!r}: {error}")
+            if engine is found[-1] and not can:
+                raise
+    return can, left_out
 
 
 def checked(found: Any, name: str) -> tuple[list[Part], Camera]:
@@ -165,7 +219,7 @@ def checked(found: Any, name: str) -> tuple[list[Part], Camera]:
         raise InputError(f"{name} gave {kind_of(found)}; expected (parts, camera)")
     parts, camera = found
     check_scene(parts, camera)
-    return ([parts] if isinstance(parts, Part) else list(parts)), camera
+    return parts_of(found), camera
 
 
 def _modes(parameters: Tree) -> dict[str, Tree]:

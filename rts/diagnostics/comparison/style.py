@@ -116,5 +116,5 @@ def arguments(row: Row) -> str:
 
 def environment_line(environment: Mapping[str, Any]) -> str:
     """Where and when a comparison was made, in one line."""
-    versions = ", ".join(f"{name} {version}" for name, version in environment.get("versions", {}).items())
+    versions = ", ".join(f"{name} {version}" for name, version in environment.get("versions", {}).items() if version)
     return "; ".join(filter(None, [environment.get("date"), environment.get("machine"), versions]))

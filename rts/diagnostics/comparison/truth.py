@@ -1,12 +1,14 @@
 """The true derivative of an image, by differences of area-sampled renders that know nothing of splatting.
 
 The differences are central, over a quarter of a pixel, on two lattices of points in the pixel that have nothing in
-common: what they disagree on is their error. They are kept on disk by a key of the scene.
+common: what they disagree on tells their error. They are kept on disk by a key of the scene.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
+import tempfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -15,14 +17,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.camera import Camera
-from rts.diagnostics.comparison.scene import Scene
+from rts.diagnostics.comparison.identity import layers_of, state_key
+from rts.diagnostics.comparison.scene import Scene, parts_of
 from rts.diagnostics.comparison.scores import low_pass, relative_l2
 from rts.engines import Engine, engine_of
-from rts.files.paths import cache_folder, writing
+from rts.errors import InputError
+from rts.files.paths import cache_folder, output_folder, own_folder, writing
 from rts.interfaces import Part
-from rts.rendering import render, sample
-from rts.sampling.cache import fingerprint
-from rts.trees import leaves
+from rts.rendering import render
 
 SAMPLES = 16
 """Points a pixel, along x and along y."""
@@ -35,7 +37,8 @@ class Truth(NamedTuple):
 
     Attributes:
         derivative: (H, W, 3) a pixel of motion, the mean of the two lattices'.
-        error: what the lattices disagree on, relative L2 through the low-pass of `scores`.
+        error: half of what the lattices disagree on, relative L2 through the low-pass of `scores`: how far the mean of
+            two that err alike, and independently, is off.
     """
 
     derivative: np.ndarray
@@ -57,7 +60,6 @@ def area_image(
     size: tuple[int, int],
     points: np.ndarray,
     done: Callable[[], None] = lambda: None,
-    **options: object,
 ) -> np.ndarray:
     """Mean of the hard image (H, W, 4) float64 over points (S, 2) of each pixel; nothing is splatted.
 
@@ -67,35 +69,24 @@ def area_image(
         size: (height, width).
         points: of the pixel's centre, x right and y down, pixels.
         done: called after each point.
-        **options: of `rts.render`.
     """
-    total = np.zeros((*size, 4))
+    total, layers = np.zeros((*size, 4)), layers_of(parts, camera)
     for dx, dy in points:
         shift = np.eye(4)
         # Moving the image by −dx pixels puts the point at +dx under the pixel's centre.
         shift[0, 3], shift[1, 3] = -2 * dx / size[1], 2 * dy / size[0]
         moved = camera.for_size(size)
         projection = np.asarray(engine_of(moved.projection).to_numpy(moved.projection), np.float64)
-        image = render(parts, moved.replace(projection=shift @ projection), size, splatter="none", layers=1, **options)
+        image = render(parts, moved.replace(projection=shift @ projection), size, splatter="none", layers=layers)
         total += engine_of(image).to_numpy(image)
         done()
     return total / len(points)
 
 
-def scene_key(scene: Scene, mode: str, step: float, samples: int, engine: Engine | None) -> str:
-    """A hash of all that the truth depends on: arrays of θ, camera, and what is seen at the ends of the difference."""
-    digest = hashlib.sha256(repr((scene.size, step, samples)).encode())
-    for by in (-step / 2, step / 2):
-        parts, camera = shown(scene, mode, by, engine)
-        for part in parts:
-            digest.update(repr((part.cull, type(part.surface).__name__)).encode())
-        everything = [*(p.theta for p in parts), *(p.transform for p in parts), camera.view, camera.projection]
-        arrays = [engine_of(x).to_numpy(x) for x in leaves(everything)]
-        seen = sample(parts, camera, scene.size, layers=1)
-        image = render(parts, camera, scene.size, splatter="none", layers=1)
-        arrays += [engine_of(x).to_numpy(x) for x in (seen.depth, image)]
-        digest.update(repr(fingerprint([np.asarray(a) for a in arrays])).encode())
-    return digest.hexdigest()[:20]
+def truth_key(scene: Scene, mode: str, step: float, samples: int, engine: Engine | None) -> str:
+    """A hash of all that the truth depends on: the exact scene at the ends of the difference."""
+    states = [state_key(*shown(scene, mode, by, engine), scene.size) for by in (-step / 2, step / 2)]
+    return hashlib.sha256(repr((samples, states)).encode()).hexdigest()[:20]
 
 
 def shown(scene: Scene, mode: str, by: float, engine: Engine | None) -> tuple[list[Part], Camera]:
@@ -107,8 +98,8 @@ def shown(scene: Scene, mode: str, by: float, engine: Engine | None) -> tuple[li
         by: how far along the mode's direction.
         engine: None for NumPy, where the scene takes it.
     """
-    parts, camera = (scene.exact or scene.at)(scene.moved(mode, by, engine))
-    return ([parts] if isinstance(parts, Part) else list(parts)), camera
+    found = (scene.exact or scene.at)(scene.moved(mode, by, engine))
+    return parts_of(found), found[1]
 
 
 def truth(
@@ -133,14 +124,14 @@ def truth(
         done: called `samples`² times four, or as if, where it is known.
     """
     step = STEP * pixel
-    folder = (cache_folder() if folder is None else folder) / "truths"
-    key = scene_key(scene, mode, step, samples, engine)
-    path = folder / f"{key}.npz"
-    if path.exists():
+    folder = (kept_folder() if folder is None else folder) / "truths"
+    key = truth_key(scene, mode, step, samples, engine)
+    path = folder / f"{key}.npy"
+    kept = _read(path)
+    if kept is not None:
         for _ in range(4 * samples**2):
             done()
-        with np.load(path) as kept:
-            return _of(kept["derivatives"])
+        return _of(kept)
     points = lattice(samples)
     images = [
         [
@@ -150,10 +141,9 @@ def truth(
         for i, grid in enumerate((points, points[:, ::-1]))
     ]
     derivatives = np.stack([(after - before) / STEP for before, after in images]).astype(np.float32)
-    with writing(path):
-        np.savez_compressed(path, derivatives=derivatives)
-        for image in folder.glob(f"{key}-*.npy"):
-            image.unlink()
+    _write(path, derivatives)
+    for image in folder.glob(f"{key}-*.npy"):
+        image.unlink(missing_ok=True)
     return _of(derivatives)
 
 
@@ -165,21 +155,42 @@ def _kept_image(
     done: Callable[[], None],
 ) -> np.ndarray:
     """One of the four images of a difference, which a run that is interrupted has not made in vain."""
-    if path.exists():
+    kept = _read(path)
+    if kept is not None:
         for _ in points:
             done()
-        return np.load(path)
+        return kept
     image = area_image(*seen(), size, points, done)[..., :3]
+    _write(path, image)
+    return image
+
+
+def kept_folder() -> Path:
+    """The folder of caches, or one of this process alone where nothing can be kept."""
+    try:
+        return output_folder(cache_folder())
+    except InputError:
+        return Path(own_folder().name)
+
+
+def _read(path: Path) -> np.ndarray | None:
+    """An array that was written; None where there is none, or a damaged one, which is made anew."""
+    try:
+        return np.load(path)
+    except (OSError, ValueError, EOFError):
+        return None
+
+
+def _write(path: Path, array: np.ndarray) -> None:
+    """Write an array: all of it, or nothing, whatever interrupts, and whoever else does the same."""
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_suffix(".part")
-        with unfinished.open("wb") as file:
-            np.save(file, image)
-        unfinished.replace(path)
-    return image
+        with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".part", delete=False) as file:
+            np.save(file, array)
+        os.replace(file.name, path)
 
 
 def _of(derivatives: np.ndarray) -> Truth:
     first, second = derivatives.astype(np.float64)
     mean = (first + second) / 2
-    return Truth(mean, relative_l2(low_pass(first), low_pass(second), low_pass(mean)))
+    return Truth(mean, relative_l2(low_pass(first), low_pass(second), low_pass(mean)) / 2)
