@@ -103,10 +103,10 @@ def _orthogonalise(columns, axes, p, q):
         first += columns[p, r] * columns[p, r]
         second += columns[q, r] * columns[q, r]
         both += columns[p, r] * columns[q, r]
-    if not abs(both) > 1e-15 * math.sqrt(first * second):
+    if not both * both > 1e-30 * first * second:
         return False
-    half = (second - first) / (2 * both)
-    slope = math.copysign(1.0, half) / (abs(half) + math.sqrt(1 + half * half))
+    more, twice = second - first, 2 * both
+    slope = twice / (more + math.copysign(math.sqrt(more * more + twice * twice), more))
     cosine = 1 / math.sqrt(1 + slope * slope)
     sine = cosine * slope
     for r in range(3):
