@@ -143,6 +143,7 @@ def chamfer(a: tuple, b: tuple) -> float:
 def fitted(rims: bool, cull: str, weight: float, targets: list[np.ndarray], views: list[rts.Camera]) -> np.ndarray:
     """Vertices (V, 3) after Adam."""
     import torch
+
     from rts.regularizers import Laplacian
 
     start, faces = sphere()

@@ -530,8 +530,8 @@ def test_the_gain_of_a_disk_depends_on_sigma_as_measured():
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 @pytest.mark.parametrize("splatter, low, high", [("multi", 0.82, 0.89), ("visible", 0.99, 1.01)])
 def test_the_area_of_a_sphere_grows_with_its_circumference(splatter, low, high, target):
-    # Orthographic, one world unit a pixel: sum(alpha) is π r², its derivative 2 π r. Of it `multi` feels what it feels of
-    # any edge, less a percent: the samples of the rim lie up to a pixel inside and grow less.
+    # Orthographic, one world unit a pixel: sum(alpha) is π r², its derivative 2 π r. Of it `multi` feels what it feels
+    # of any edge, less a percent: the samples of the rim lie up to a pixel inside and grow less.
     vertices, faces = icosphere(4)
     mesh = rts.plugin("surfaces", "mesh")(faces)
     camera = rts.Camera.orthographic((0, 0, 100), (0, 0, 0), height=128)

@@ -116,7 +116,7 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: AnyNeeded | None)
         taken: samples the scene with a number of layers, less what a `Needed` drops.
         needed: says which samples the splatter needs.
     """
-    count = 2
+    count = 3  # A closed surface before nothing needs two: the second at its outlines.
     while True:
         # At the limit one more is taken, to know what is missing there.
         inspection = Inspection(needed)
