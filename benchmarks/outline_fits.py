@@ -1,10 +1,9 @@
 """Fits with and without `rims` of `visible`: whether outlines that move as outlines do find more, or break something.
 
-*Poses* are those of `pose_recovery`, with a vase besides that looks the same however it is turned about its axis, which
-is therefore left out of its angle. *Vertices*: a sphere becomes the bunny, every vertex free, by Adam, from eight shaded
-pictures with their silhouettes and a Laplacian energy; judged by the distance between the two surfaces (chamfer: the
-mean over points of each of the distance to the other, in thousandths of the bunny's size) and by pictures from
-elsewhere.
+*Poses* are those of `pose_recovery`, and those of a vase, which looks the same however it is turned about its axis: its
+angle is that of the axis. *Vertices*: a sphere becomes the bunny, every vertex free, by Adam, from eight shaded pictures
+with their silhouettes, and a Laplacian energy; judged by the distance between the two surfaces (chamfer: the mean over
+points of each of the distance to the other, in thousandths of the bunny's size) and by pictures from elsewhere.
 
     python -m benchmarks.outline_fits -o out/outline_fits
     python -m benchmarks.outline_fits --only poses --meshes bunny --seeds 3
@@ -60,19 +59,12 @@ def vase() -> tuple[np.ndarray, np.ndarray]:
     profile = spline(np.linspace(0, ends, count - 1))
     radius, height = np.concatenate([profile, [[0.0, profile[-1, 1]]]]).T
     angle = 2 * np.pi * np.arange(around) / around
-    vertices = np.stack(
-        [
-            radius[:, None] * np.cos(angle),
-            np.broadcast_to(height[:, None], (count, around)),
-            radius[:, None] * np.sin(angle),
-        ],
-        axis=-1,
-    ).reshape(-1, 3)
+    x, z = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)
+    vertices = np.stack([x, np.broadcast_to(height[:, None], x.shape), z], axis=-1).reshape(-1, 3)
     i, j = np.meshgrid(np.arange(count - 1), np.arange(around), indexing="ij")
     a, b = i * around + j, i * around + (j + 1) % around
-    faces = np.concatenate(
-        [np.stack(f, axis=-1).reshape(-1, 3) for f in ((a, a + around, b), (b, a + around, b + around))]
-    )
+    triangles = (a, a + around, b), (b, a + around, b + around)
+    faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in triangles])
     return vertices @ rotation_xy(*TILT).T, faces.astype(np.int32)
 
 
