@@ -1,9 +1,10 @@
 """Fits with and without `rims` of `visible`: whether outlines that move as outlines do find more, or break something.
 
 *Poses* are those of `pose_recovery`, and those of a vase, which looks the same however it is turned about its axis: its
-angle is that of the axis. *Vertices*: a sphere becomes the bunny, every vertex free, by Adam, from eight shaded pictures
-with their silhouettes, and a Laplacian energy; judged by the distance between the two surfaces (chamfer: the mean over
-points of each of the distance to the other, in thousandths of the bunny's size) and by pictures from elsewhere.
+angle is that of the axis. *Vertices*: a sphere becomes the bunny, every vertex free, by Adam, from eight shaded
+pictures with their silhouettes, and a Laplacian energy; judged by the distance between the two surfaces (chamfer: the
+mean over points of each of the distance to the other, in thousandths of the bunny's size) and by pictures from
+elsewhere.
 
     python -m benchmarks.outline_fits -o out/outline_fits
     python -m benchmarks.outline_fits --only poses --meshes bunny --seeds 3
@@ -73,11 +74,6 @@ def between_axes(pose: np.ndarray) -> float:
     axis = rotation_xy(*TILT)[:, 1]
     moved = np.asarray(rts.rigid(np.asarray(pose, np.float64)))[:3, :3] @ axis
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(axis, moved)), axis @ moved)))
-
-
-def off_axis(pose: np.ndarray) -> float:
-    """How far the vase's middle is from where it was, in its size."""
-    return float(np.linalg.norm(pose[3:]) / DIAMETER)
 
 
 def poses(args: argparse.Namespace) -> Iterator[tuple[str, list[dict]]]:
