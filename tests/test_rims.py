@@ -4,10 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from helpers import ALL, TORCH, arrays, derivative, gradient, mesh_part, quad, to_numpy
+from helpers import TORCH, arrays, derivative, gradient, icosphere, mesh_part, quad, to_numpy
 from loops import STEPS, Pairing
 
 import rts
+from rts import rendering
 from rts.splatting import Visible, rims
 from rts.splatting.layers import NEIGHBOURS, Layers
 from rts_backends.fused import splatters as fused
@@ -162,18 +163,20 @@ def test_derivatives_change_as_the_loops_say(target, layers, name, double):
         splats = rough(layers, seed)
         tangent = np.random.default_rng(seed).normal(size=splats.positions.shape)
         expected, names = corrections_by_loops(Visible(), splats, tangent)
-        _, found = pushed(Visible(), splats, tangent, target)
-        _, without = pushed(Visible(rims=False), splats, tangent, target)
+        image, found = pushed(Visible(), splats, tangent, target)
+        same, without = pushed(Visible(rims=False), splats, tangent, target)
+        np.testing.assert_array_equal(image, same)
         np.testing.assert_allclose(found - without, expected, rtol=0, atol=1e-9)
         seen += names
     assert seen.count(name) > 1 and seen.count("none") > 1
 
 
-@pytest.mark.parametrize("target", ALL)
-def test_the_image_is_the_same_bit_for_bit(target):
+@pytest.mark.parametrize("target", TORCH)
+@pytest.mark.parametrize("splatter", [Visible, fused.Visible])
+def test_the_image_is_the_same_bit_for_bit(splatter, target):
     splats = rough(2, 7)
     given = arrays(target, (splats.positions, splats.rgba, splats.row, splats.part))
-    images = [to_numpy(s.image(rts.Splats(*given))) for s in (Visible(), Visible(rims=False))]
+    images = [to_numpy(s.image(rts.Splats(*given))) for s in (splatter(), splatter(rims=False))]
     np.testing.assert_array_equal(*images)
 
 
@@ -204,9 +207,10 @@ def pulled(splatter, splats, along, target="torch-cpu"):
     return gradient(target, loss, given)
 
 
-@pytest.mark.parametrize("target, layers", [case[:2] for case in CASES])
-def test_compiled_derivatives_are_those_of_the_specification(target, layers, double):
-    for seed in range(6 if target in TORCH else 1):
+@pytest.mark.parametrize("target", TORCH)
+@pytest.mark.parametrize("layers", [1, 2, 3])
+def test_compiled_derivatives_are_those_of_the_specification(target, layers):
+    for seed in range(6):
         splats, rng = rough(layers, seed, 9, 11), np.random.default_rng(seed)
         tangent, along = rng.normal(size=splats.positions.shape), rng.normal(size=(9, 11, 4))
         for found, expected in zip(
@@ -216,6 +220,16 @@ def test_compiled_derivatives_are_those_of_the_specification(target, layers, dou
         gradients = [pulled(s, splats, along, target) for s in (fused.Visible(), Visible())]
         for name, found in gradients[0].items():
             np.testing.assert_allclose(found, gradients[1][name], rtol=0, atol=1e-10)
+
+
+def test_compiled_derivatives_are_the_same_with_jax(double):
+    splats, rng = rough(2, 0, 9, 11), np.random.default_rng(0)
+    tangent, along = rng.normal(size=splats.positions.shape), rng.normal(size=(9, 11, 4))
+    found, expected = (pushed(fused.Visible(), splats, tangent, t)[1] for t in ("jax", "torch-cpu"))
+    np.testing.assert_array_equal(found, expected)
+    found, expected = (pulled(fused.Visible(), splats, along, t) for t in ("jax", "torch-cpu"))
+    for name in found:
+        np.testing.assert_allclose(found[name], expected[name], rtol=0, atol=1e-14)
 
 
 def test_a_sample_in_several_cells_moves_all_of_their_outlines():
@@ -391,6 +405,44 @@ def test_a_sphere_that_grows_gains_its_outline_times_its_growth():
         expected = 0.01 * growth * 2 * np.pi * radius * (a + b * around[0] + c * around[1] ** 2).mean()
         scale = 0.01 * growth * 2 * np.pi * radius
         assert abs((found * (a + b * x + c * y**2)).sum() - expected) < 0.015 * scale
+
+
+@pytest.mark.parametrize("turns, layers, most", [(2.0, 1, 0.05), (-2.0, 1, 0.05), (2.0, 2, 0.02)])
+def test_a_sphere_that_rolls_changes_as_one_that_moves(turns, layers, most):
+    # The outline is a circle, which moves by f d / (d² − r²) a unit.
+    size = 192
+    focal, square, pixel = size / (2 * math.tan(math.radians(20))), DISTANCE**2 - RADIUS**2, step(size)
+    radius, speed = focal * RADIUS / math.sqrt(square), pixel * focal * DISTANCE / square
+    angle = np.linspace(0, 2 * np.pi, 1000, endpoint=False)
+    x, y = np.moveaxis(centres(1, size, size)[0] - size / 2, -1, 0) / radius
+
+    def errors(rims):
+        found = moved(size, lambda p: moving(pixel)(p) + turning(turns * pixel)(p), layers, splatter=Visible(rims=rims))
+        for weigh in (lambda x, y: x, lambda x, y: x * y**2, lambda x, y: x**3):
+            expected = speed * radius * 2 * np.pi * (weigh(np.cos(angle), np.sin(angle)) * np.cos(angle)).mean()
+            yield abs((found[..., 3] * weigh(x, y)).sum() / expected - 1)
+
+    assert max(errors(True)) < most and min(errors(False)) > 0.15
+
+
+AXIS = np.array([0.5, 1.0, 0.0, 0.1, 0.0, 0.2])
+"""A pose's motion."""
+
+
+def test_bands_make_no_difference_to_outlines(monkeypatch):
+    # The same samples decide in each band, those of its apron included.
+    sphere, (axis, angle, one) = mesh_part(icosphere(3, 1.3)), arrays("torch-cpu", (AXIS, np.zeros(()), np.ones(())))
+    camera = rts.Camera.look_at((0, 0.5, 4), (0, 0, 0), fov_y=40)
+
+    def image(t):
+        return rts.render(sphere.replace(transform=rts.rigid(t * axis)), camera, (20, 24), supersample=2)
+
+    found = []
+    for band in (rendering.BAND, 500):
+        monkeypatch.setattr(rendering, "BAND", band)
+        found.append(derivative("torch-cpu", image, angle, one)[1])
+    assert len(rendering._bands(20, 24, 2, 2)) > 5 and np.abs(found[0]).max() > 1
+    np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-3)
 
 
 def test_texture_inside_of_an_outline_moves_as_before():

@@ -170,28 +170,28 @@ class Cells:
     def outlines(self) -> Outlines:
         """How outlines move, and what that changes; nothing without rims."""
         _, height, width = self.row.shape
-        choices, kind = self.choices, self.positions.dtype
-        counts, beta = np.zeros(height, np.int64), np.zeros((height, width), kind)
-        partner, marks = np.empty((height, width), np.int32), np.empty((height, width), np.uint8)
-        mixed = choices.offsets, choices.columns, choices.ranges
+        choices, kind, counts = self.choices, self.positions.dtype, np.zeros(height, np.int64)
+        ends, marks = np.empty((height, width), np.uint16), np.empty((height, width), np.uint8)
         if self.rims:
-            ends, work = np.empty((height, width), np.uint16), 2 * self.row[0].size
-            given = self.positions, self.row, self._reach, choices.mixed, *mixed, ends, marks, counts
-            parallel(outlines.find, height, *given, work=work)
-            rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
-            given = self.positions, self.row, self.part, ends, kind.type(choices.extent), rules, beta, partner
-            parallel(outlines.decide, height, *given, work=work)
+            listed = choices.mixed, choices.offsets, choices.columns, choices.ranges
+            given = self.positions, self.row, self._reach, choices.states, *listed, ends, marks, counts
+            parallel(outlines.find, height, *given, work=self.row[0].size)
         offsets = np.concatenate([[0], np.cumsum(counts)])
-        lists = (
+        found = Outlines(
+            np.empty((height, width), kind),
+            np.empty((height, width), np.int32),
+            offsets,
             np.empty(offsets[-1], np.int32),
             np.empty((offsets[-1], 9), np.uint8),
+            np.empty((offsets[-1], 9, 2), kind),
             np.empty((offsets[-1], 2, 4), kind),
         )
-        if len(lists[0]):
-            given = *self._numbers, choices.mixed, choices.ranges, choices.sums, choices.offsets, marks, offsets
-            arrays = self.positions, self.rgba, self.row
-            parallel(outlines.fill, height, *arrays, *given, *lists, work=200 * len(lists[0]))
-        return Outlines(beta, partner, offsets, *lists)
+        if len(found.columns):
+            rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
+            arrays = self.positions, self.rgba, self.row, *self._numbers, self.part, kind.type(choices.extent), rules
+            listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
+            parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=200 * len(found.columns))
+        return found
 
     def image(self, out: np.ndarray) -> None:
         """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""
@@ -222,8 +222,7 @@ class Cells:
             parallel(mixed.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=self._mixed_work // 5)
             parallel(mixed.pull, height, *self.mixed_arguments, adjoints, *found, work=self._mixed_work)
         if self.rims and g_positions is not None:
-            given: tuple = self.positions, self.row, *self._numbers, self.outlines, self.border, g, g_positions
-            outlines.pull(*given)
+            outlines.pull(self.row, self.outlines, self.border, g, g_positions)
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
         """Fill tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4), or None."""
@@ -238,8 +237,8 @@ class Cells:
             given = *self.mixed_arguments, self.choices.sums, tangents, self.border
             parallel(mixed.push, out.shape[1], *given, out, work=self._mixed_work * len(out))
         if self.rims and t_positions is not None:
-            given = self.positions, self.row, *self._numbers, self.outlines, tangents[0], self.border
-            parallel(outlines.push, out.shape[1], *given, out, work=200 * len(self.outlines.columns) * len(out))
+            given = self.row, self.outlines, tangents[0], self.border
+            parallel(outlines.push, out.shape[1], *given, out, work=80 * len(self.outlines.columns) * len(out))
 
     def _vjp_of_repeated(self, g: np.ndarray, *results: np.ndarray | None) -> None:
         """`vjp` with a copy of the sample for each cell, whose gradients are then added in the order of the cells."""

@@ -178,7 +178,7 @@ def _accumulate(start, stop, planes, plain, row, choices, outlines, tangents, fi
                         tangent_row(to, value, layers, count, planes)
                     composite(value, layers, count)
                     _mix(change, value, plain, row, choices, tangents, border, y, left, count, changes)
-                    _move_outlines(change, plain, row, outlines, t_positions, border, y, left, count)
+                    _move_outlines(change, row, outlines, t_positions, border, y, left, count)
                 else:
                     fill(value, rgba, row[0, y + border, border:], choices.states[y + border, border:], left, count)
                 if fine > 1:
@@ -229,15 +229,14 @@ def _mix(change, value, plain, row, choices, tangents, border, y, left, count, c
 
 
 @compiled
-def _move_outlines(change, plain, row, outlines, t_positions, border, y, left, count):
+def _move_outlines(change, row, outlines, t_positions, border, y, left, count):
     """Add what moving outlines change in a row of a tile."""
-    positions, _, _, scale, peak, gamma = plain
     for d in range(outlines.offsets[y + border], outlines.offsets[y + border + 1]):
         j = outlines.columns[d] - border - left
         if not 0 <= j < count:
             continue
         for n in range(len(change)):
-            front, surface = gain(d, t_positions[n], positions, row, scale, peak, gamma, outlines, y + border)
+            front, surface = gain(d, t_positions[n], row, outlines, y + border)
             for c in range(4):
                 change[n, c * PITCH + j] += front * outlines.changes[d, 0, c] + surface * outlines.changes[d, 1, c]
 

@@ -12,11 +12,13 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from rts_backends.fused.mixed import splat, sums_of
+from rts_backends.fused.mixed import splat
+from rts_backends.fused.survey import FLAT
 
 NOTHING, FRONT, JOINED, SURFACE = 0, 1, 2, 3
 """What a source gives to a target: nothing, or coverage of the buffer in front as its outline moves; of that at the
 surface as the target's outline moves; of that at the surface, over nothing, as its own does."""
+
 
 compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
@@ -36,11 +38,12 @@ class Outlines(NamedTuple):
     """How outlines move, and the targets that they cover in part.
 
     Attributes:
-        beta: (H, W), β of each cell; 0 where its front's own motion is the outline's.
+        beta: (H, W), β of the targets below that are covered; 0 where the front's own motion is the outline's.
         partner: (H, W) int32, the partner's sample where β is not 0.
         offsets: (H + 1,) int64, where the targets of each row begin in the lists below.
         columns: (M,) int32, their columns.
         gives: (M, 9) uint8, what each source gives; source 3 (v + 1) + (u + 1) lies at −(u, v).
+        slopes: (M, 9, 2), of the weights of sources that give something, with their position.
         changes: (M, 2, 4), of the target's colour with coverage in front, and at the surface.
     """
 
@@ -49,11 +52,12 @@ class Outlines(NamedTuple):
     offsets: np.ndarray
     columns: np.ndarray
     gives: np.ndarray
+    slopes: np.ndarray
     changes: np.ndarray
 
 
 @kernel
-def find(start, stop, positions, row, reach, mixed, offsets, columns, ranges, ends, marks, counts):
+def find(start, stop, positions, row, reach, states, mixed, offsets, columns, ranges, ends, marks, counts):
     """Find where fronts end in rows [start, stop), and mark targets that may be covered in part.
 
     Args:
@@ -62,6 +66,7 @@ def find(start, stop, positions, row, reach, mixed, offsets, columns, ranges, en
         positions: (N, 3).
         row: (K, H, W).
         reach: pixels that a sample may lie off its cell's centre, so that weights are sure to add up to one.
+        states: (H, W) of `survey.py`.
         mixed: (H, W), see `rts_backends.fused.cells.Choices`, as `offsets`, `columns` and `ranges`.
         offsets: (H + 1,).
         columns: (M,).
@@ -76,7 +81,7 @@ def find(start, stop, positions, row, reach, mixed, offsets, columns, ranges, en
     for y in range(start, stop):
         for v in range(3):
             if y == start or v == 2:
-                _look(cells[(y + v) % 3], positions, row[0], y + v - 1, reach)
+                _look(cells[(y + v) % 3], positions, row[0], states, y + v - 1, reach)
         above, level, below = cells[y % 3], cells[(y + 1) % 3], cells[(y + 2) % 3]
         for x in range(width):
             around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
@@ -96,7 +101,7 @@ EMPTY, COVERED, LOOSE = np.uint8(1), np.uint8(2), np.uint8(4)
 
 
 @compiled
-def _look(cells, positions, row, y, reach):
+def _look(cells, positions, row, states, y, reach):
     """Bits of a row of cells, and of one cell at each side."""
     height, width = row.shape
     half = positions.dtype.type(0.5)
@@ -105,6 +110,9 @@ def _look(cells, positions, row, y, reach):
         return
     middle = positions.dtype.type(y) + half
     for x in range(width):
+        if states[y, x] == FLAT:
+            cells[x + 1] = COVERED
+            continue
         i = row[y, x]
         if i < 0:
             cells[x + 1] = EMPTY | LOOSE
@@ -135,17 +143,6 @@ def _ends_before_others(choice, row, y, x):
             if not (choice[n, 1, 0] == 0 and choice[n, 1, 1] == 1):
                 bits |= 1 << (8 - n)
     return np.uint16(bits)
-
-
-@kernel
-def decide(start, stop, positions, row, part, ends, extent, rules, beta, partner):
-    """Fill β and the partners of cells of rows [start, stop), as `rts.splatting.rims.rules` does."""
-    _, height, width = row.shape
-    for y in range(start, stop):
-        for x in range(width):
-            beta[y, x] = positions.dtype.type(0)
-            if ends[y, x]:
-                beta[y, x], partner[y, x] = _rule(positions, row, part, ends, y, x, extent, rules)
 
 
 @compiled
@@ -220,17 +217,18 @@ def fill(
     scale,
     peak,
     gamma,
+    part,
+    extent,
+    rules,
     mixed,
     ranges,
     sums,
     firsts,
+    ends,
     marks,
-    offsets,
-    columns,
-    gives,
-    changes,
+    found,
 ):
-    """List the marked targets of rows [start, stop): the last three arrays of `Outlines`.
+    """Decide how outlines move in rows [start, stop), as `rts.splatting.rims.rules` does, and list the marked targets.
 
     Args:
         start: first row.
@@ -241,32 +239,58 @@ def fill(
         scale: the exponent's factor.
         peak: of the weights, along one axis.
         gamma: the calibration.
+        part: (K, H, W), the part of each sample, or no layers.
+        extent: of the depths.
+        rules: numbers of the rules.
         mixed: (H, W), see `rts_backends.fused.cells.Choices`, as `ranges` and `sums`.
         ranges: (M, 9, 3, 2).
         sums: (M, 3, 5).
         firsts: (H + 1,), where the mixed targets of each row begin.
+        ends: (H, W) of `find`.
         marks: (H, W) of `find`.
-        offsets: (H + 1,), where the marked targets of each row begin.
-        columns: to be filled.
-        gives: to be filled.
-        changes: to be filled.
+        found: `Outlines`, to be filled but for its offsets.
     """
-    own, plain = np.empty((3, 5), positions.dtype), np.zeros((9, 3, 2), ranges.dtype)
+    own, plain = np.zeros((3, 5), positions.dtype), np.zeros((9, 3, 2), ranges.dtype)
+    slope = positions.dtype.type(2) * scale * gamma
     plain[:, 1, 1] = 1
     for y in range(start, stop):
-        d, m = offsets[y], firsts[y]
+        d, m = found.offsets[y], firsts[y]
         for x in range(marks.shape[1]):
             if not marks[y, x]:
                 continue
-            choice, total = plain, own
+            if row[0, y, x] >= 0:
+                found.beta[y, x] = positions.dtype.type(0)
+                if ends[y, x]:
+                    found.beta[y, x], found.partner[y, x] = _rule(positions, row, part, ends, y, x, extent, rules)
+            found.columns[d] = x
+            _weigh(own[1], found.slopes[d], positions, rgba, row, y, x, scale, peak, gamma, slope)
             if mixed[y, x]:
-                choice, total = ranges[m], sums[m]
+                _list(found.gives[d], found.changes[d], ranges[m], sums[m], row, y, x)
                 m += 1
             else:
-                sums_of(own, positions, rgba, row, y, x, plain, scale, peak, gamma)
-            columns[d] = x
-            _list(gives[d], changes[d], choice, total, row, y, x)
+                _list(found.gives[d], found.changes[d], plain, own, row, y, x)
             d += 1
+
+
+@compiled
+def _weigh(total, slopes, positions, rgba, row, y, x, scale, peak, gamma, slope):
+    """Sums (5,) of the fronts around a target, colours over the weight; and the slopes (9, 2) of their weights."""
+    _, height, width = row.shape
+    total[:] = total.dtype.type(0)
+    for n in range(9):
+        v, u = n // 3 - 1, n % 3 - 1
+        py, px = y - v, x - u
+        if not (0 <= py < height and 0 <= px < width) or row[0, py, px] < 0:
+            continue
+        i = row[0, py, px]
+        w, dx, dy = splat(positions, i, py, px, u, v, scale, peak, gamma)
+        slopes[n, 0], slopes[n, 1] = slope * w * dx, slope * w * dy
+        for c in range(4):
+            total[c] += w * rgba[i, c]
+        total[4] += w
+    if total[4] > 1:
+        for c in range(4):
+            total[c] /= total[4]
 
 
 @compiled
@@ -299,11 +323,10 @@ def _outline(t_positions, row, beta, partner, y, x, axis):
 
 
 @compiled
-def gain(d, t_positions, positions, row, scale, peak, gamma, outlines, y):
+def gain(d, t_positions, row, outlines, y):
     """What moving outlines add to the coverage of a target's buffers in front and at the surface, along a tangent."""
-    zero = positions.dtype.type(0)
+    front, surface = outlines.slopes.dtype.type(0), outlines.slopes.dtype.type(0)
     x, beta, partner = outlines.columns[d], outlines.beta, outlines.partner
-    slope, front, surface = positions.dtype.type(2) * scale * gamma, zero, zero
     for n in range(9):
         given = outlines.gives[d, n]
         if given == NOTHING:
@@ -312,18 +335,17 @@ def gain(d, t_positions, positions, row, scale, peak, gamma, outlines, y):
         i, qy, qx = row[0, y - v, x - u], y - v, x - u
         if given == JOINED:
             qy, qx = y, x
-        w, dx, dy = splat(positions, i, y - v, x - u, u, v, scale, peak, gamma)
-        along = dx * (_outline(t_positions, row, beta, partner, qy, qx, 0) - t_positions[i, 0])
-        along += dy * (_outline(t_positions, row, beta, partner, qy, qx, 1) - t_positions[i, 1])
+        along = outlines.slopes[d, n, 0] * (_outline(t_positions, row, beta, partner, qy, qx, 0) - t_positions[i, 0])
+        along += outlines.slopes[d, n, 1] * (_outline(t_positions, row, beta, partner, qy, qx, 1) - t_positions[i, 1])
         if given == FRONT:
-            front += slope * w * along
+            front += along
         else:
-            surface += slope * w * along
+            surface += along
     return front, surface
 
 
 @kernel
-def push(start, stop, positions, row, scale, peak, gamma, outlines, t_positions, border, out):
+def push(start, stop, row, outlines, t_positions, border, out):
     """Add to rows [start, stop) of the tangents (T, H, W, 4)."""
     for y in range(start + border, stop + border):
         for d in range(outlines.offsets[y], outlines.offsets[y + 1]):
@@ -331,40 +353,45 @@ def push(start, stop, positions, row, scale, peak, gamma, outlines, t_positions,
             if not 0 <= x < out.shape[2]:
                 continue
             for t in range(len(out)):
-                front, surface = gain(d, t_positions[t], positions, row, scale, peak, gamma, outlines, y)
+                front, surface = gain(d, t_positions[t], row, outlines, y)
                 for c in range(4):
                     change = front * outlines.changes[d, 0, c] + surface * outlines.changes[d, 1, c]
                     out[t, y - border, x, c] += change
 
 
 @kernel
-def pull(positions, row, scale, peak, gamma, outlines, border, g, g_positions):
+def pull(row, outlines, border, g, g_positions):
     """Add to the gradients of positions (N, 3) what outlines give, from that of the image."""
-    slope = positions.dtype.type(2) * scale * gamma
     height, width, _ = g.shape
+    zero = g_positions.dtype.type(0)
     for y in range(border, height + border):
         for d in range(outlines.offsets[y], outlines.offsets[y + 1]):
             x = outlines.columns[d]
             if not 0 <= x - border < width:
                 continue
-            front, surface = positions.dtype.type(0), positions.dtype.type(0)
+            front, surface = zero, zero
             for c in range(4):
                 front += g[y - border, x - border, c] * outlines.changes[d, 0, c]
                 surface += g[y - border, x - border, c] * outlines.changes[d, 1, c]
+            if front == zero and surface == zero:
+                continue
+            joined_x, joined_y = zero, zero
             for n in range(9):
                 given = outlines.gives[d, n]
                 if given == NOTHING:
                     continue
-                v, u = n // 3 - 1, n % 3 - 1
-                i = row[0, y - v, x - u]
-                w, dx, dy = splat(positions, i, y - v, x - u, u, v, scale, peak, gamma)
-                h = slope * w * (front if given == FRONT else surface)
-                g_positions[i, 0] -= h * dx
-                g_positions[i, 1] -= h * dy
+                py, px = y + 1 - n // 3, x + 1 - n % 3
+                h = front if given == FRONT else surface
+                h_x, h_y = h * outlines.slopes[d, n, 0], h * outlines.slopes[d, n, 1]
+                i = row[0, py, px]
+                g_positions[i, 0] -= h_x
+                g_positions[i, 1] -= h_y
                 if given == JOINED:
-                    _add(g_positions, row, outlines, y, x, h * dx, h * dy)
+                    joined_x, joined_y = joined_x + h_x, joined_y + h_y
                 else:
-                    _add(g_positions, row, outlines, y - v, x - u, h * dx, h * dy)
+                    _add(g_positions, row, outlines, py, px, h_x, h_y)
+            if joined_x != zero or joined_y != zero:
+                _add(g_positions, row, outlines, y, x, joined_x, joined_y)
 
 
 @compiled
