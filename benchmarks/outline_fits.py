@@ -32,8 +32,8 @@ from rts.diagnostics.comparison.builtin import VASE_HEIGHTS, VASE_RADII
 RIMS = (False, True)
 TILT = (0.45, 0.3)
 """Turns of the vase about x and y, radians."""
-SIZE, STEPS, RATE = (128, 128), 400, 0.01
-WEIGHTS = (0.01, 0.1, 1.0)
+SIZE, STEPS, RATE = (128, 128), 250, 0.01
+WEIGHTS = (0.003, 0.03)
 """Of the Laplacian energy, a mean over vertices in squares of the sphere's edges, beside the mean square of pixels."""
 COLOR = (0.85, 0.75, 0.6)
 
