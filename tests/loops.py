@@ -41,7 +41,7 @@ class Pairing:
     def shift(self, source, target):
         """The number s of a source at a target."""
         s, off = self._nearest(self.depths(*source), self.depths(*target))
-        joined = self._continues(target, source, off / 2) or self._continues(source, target, off / 2)
+        joined = self._continues(target, source, 0.8 * off) or self._continues(source, target, 0.8 * off)
         return 0 if self.visible and joined else s
 
     def ends(self, cell, n):

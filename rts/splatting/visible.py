@@ -13,7 +13,7 @@ from rts.splatting.kernel import Kernel
 from rts.splatting.layers import NEIGHBOURS, Depths, Layers, all_of, nearest, normalised, over
 from rts.trees import Array
 
-CONTINUED = 0.5
+CONTINUED = 0.8
 """Share of the error of plain pairing below which `Visible` takes the line of a front layer for its continuation."""
 
 
@@ -22,7 +22,7 @@ class Visible(Kernel):
     """`Multi` with a calibrated derivative, where opaque layers of one source hide each other.
 
     Pairing is that of `Multi`, but front layers also pair (s = 0) where one lies on the line through the other and its
-    next cell, or off it by less than half of the smallest of A and B: depth that changes fast, as on the sides of a box
+    next cell, or off it by less than 0.8 of the smallest of A and B: depth that changes fast, as on the sides of a box
     near its outline, is nearer to a back face than to itself.
 
     Each buffer gets at most one layer of a source. An empty target takes the source's front layer, at the surface. A
