@@ -50,7 +50,7 @@ def vase() -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) and faces (T, 3) of a vase that is closed above, tilted."""
     from scipy.interpolate import BSpline
 
-    count, around, degree = 64, 96, 3
+    count, degree = 64, 3
     ends = len(VASE_RADII) - degree
     spline = BSpline(
         np.clip(np.arange(len(VASE_RADII) + degree + 1) - degree, 0, ends),
@@ -59,14 +59,20 @@ def vase() -> tuple[np.ndarray, np.ndarray]:
     )
     profile = spline(np.linspace(0, ends, count - 1))
     radius, height = np.concatenate([profile, [[0.0, profile[-1, 1]]]]).T
-    angle = 2 * np.pi * np.arange(around) / around
+    vertices, faces = around_axis(radius, height, 96)
+    return vertices @ rotation_xy(*TILT).T, faces
+
+
+def around_axis(radius: np.ndarray, height: np.ndarray, around: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) and faces (T, 3) that a profile, from below, sweeps around the y axis."""
+    angle, count = 2 * np.pi * np.arange(around) / around, len(radius)
     x, z = radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)
     vertices = np.stack([x, np.broadcast_to(height[:, None], x.shape), z], axis=-1).reshape(-1, 3)
     i, j = np.meshgrid(np.arange(count - 1), np.arange(around), indexing="ij")
     a, b = i * around + j, i * around + (j + 1) % around
     triangles = (a, a + around, b), (b, a + around, b + around)
     faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in triangles])
-    return vertices @ rotation_xy(*TILT).T, faces.astype(np.int32)
+    return vertices, faces.astype(np.int32)
 
 
 def between_axes(pose: np.ndarray) -> float:
