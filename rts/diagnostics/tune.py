@@ -30,8 +30,12 @@ HOPELESS = 2.0
 """How many times the error of the best splatter another one may have, to be looked at further."""
 ALIKE = 0.9
 """A setting is faster than another one if it takes less than this share of its time."""
-TURNS = 3
-"""Turns of the settings that are told of beside the chosen one; the last that are left have twice as many."""
+TURNS = 6
+"""Turns of the fastest settings; those that are told of beside the chosen one have a sixth."""
+ENOUGH = 3
+"""Turns of the chosen one, at least."""
+FAR = 1.5
+"""A setting is passed over if by what fewer samples did its error will be so many times the tolerance."""
 
 
 class Tuned(NamedTuple):
@@ -151,14 +155,14 @@ class _Search:
             samplers: names, each with the one whose errors it shares; "" for the usual one.
         """
         self.samplers = samplers
-        cells = self._cells(splatters)
+        cells = self._cells(self._promising(splatters))
         within = self._within(cells)
         chosen = self._fastest(self._sampled(within or [self._best(cells)]))
-        reasons, faster = self._reasons(chosen, cells)
+        reasons, faster = self._reasons(chosen, cells, splatters)
         if faster is not None:  # More work need not take longer.
             chosen = faster
-            reasons, _ = self._reasons(chosen, cells)
-        error, seconds = self._error(chosen), self._timed([chosen])[chosen]
+            reasons, _ = self._reasons(chosen, cells, splatters)
+        error, seconds = self._error(chosen), self._timed([chosen], ENOUGH)[chosen]
         if error > self.tolerance:
             reasons.insert(0, self._told_of_failure(error))
         if self.late:
@@ -179,11 +183,26 @@ class _Search:
 
     # -------------------------------------------------------------------------------------------------- accuracy
 
-    def _cells(self, splatters: Sequence[str]) -> list[Setting]:
+    def _cells(
+        self,
+        splatters: Sequence[str],
+        layers: Sequence[int] = LAYERS,
+        supersample: Sequence[int] = SUPERSAMPLE,
+        rates: bool = True,
+    ) -> list[Setting]:
         """All settings that may differ in their error, the cheapest first."""
         kinds = dict.fromkeys(self.samplers.values())
-        found = self.measured.settings(TOGETHER, splatters, LAYERS, SUPERSAMPLE, kinds)
+        found = self.measured.settings(TOGETHER, splatters, layers, supersample, kinds, rates)
         return sorted(found, key=lambda s: math.prod(self._work(s)))
+
+    def _promising(self, splatters: Sequence[str]) -> list[str]:
+        """The splatters that are accurate enough, or nearly as accurate as the best, with two layers and one sample."""
+        known: dict[str, float] = {}
+        for setting in self._cells(splatters, LAYERS[:2], SUPERSAMPLE[:1], rates=False):
+            if not self._over():
+                known[setting.splatter] = min(self._error(setting), known.get(setting.splatter, math.inf))
+        allowed = max(self.tolerance, HOPELESS * min(known.values(), default=math.inf))
+        return [name for name in splatters if known.get(name, 0.0) <= allowed]
 
     def _sampled(self, settings: Sequence[Setting]) -> list[Setting]:
         """Settings with each sampler that shares their errors."""
@@ -202,21 +221,13 @@ class _Search:
         layers, supersample, rate = self.measured.work(TOGETHER, self._cell(setting))
         return layers, supersample**2, rate
 
-    def _promising(self, cells: Sequence[Setting]) -> list[Setting]:
-        """The settings of splatters that are accurate enough, or nearly as accurate as the best, with two layers."""
-        base = {s.splatter: s for s in cells if s.supersample == 1 and not s.rate and s.layers in LAYERS[:2]}
-        known = {splatter: self._error(s) for splatter, s in base.items() if not self._over()}
-        allowed = max(self.tolerance, HOPELESS * min(known.values(), default=math.inf))
-        return [s for s in cells if known.get(s.splatter, 0.0) <= allowed]
-
     def _within(self, cells: Sequence[Setting]) -> list[Setting]:
         """The settings within the tolerance that no cheaper one of their splatter makes needless."""
-        promising = self._promising(cells)
-        done = self.phase("errors", len(promising))
+        done = self.phase("errors", len(cells))
         found: list[Setting] = []
-        for setting in promising:
+        for setting in cells:
             done()
-            if self._needless(setting, found):
+            if self._needless(setting, found) or self._far(setting):
                 continue
             if self._over():
                 break
@@ -232,6 +243,18 @@ class _Search:
             and all(a <= b for a, b in zip(self._work(s), mine, strict=True))
             for s in found
         )
+
+    def _far(self, setting: Setting) -> bool:
+        """Whether the errors with fewer samples, as a power of their number, tell of one that is much too large."""
+        fewer = [setting._replace(supersample=n) for n in SUPERSAMPLE if n < setting.supersample]
+        known = [(s.supersample, self.bounds[self._cell(s)]) for s in fewer if self._cell(s) in self.bounds]
+        if len(known) < 2:
+            return False
+        (coarse, larger), (fine, smaller) = known[-2:]
+        if not 0 < smaller < math.inf or not 0 < larger < math.inf:
+            return False
+        power = math.log(smaller / larger) / math.log(fine / coarse)
+        return smaller * (setting.supersample / fine) ** power > FAR * self.tolerance
 
     def _best(self, cells: Sequence[Setting]) -> Setting:
         """The setting of the least error among those that were looked at; the first of all where none was."""
@@ -276,7 +299,7 @@ class _Search:
         self.late = self.late or time.perf_counter() > self.deadline
         return self.late
 
-    def _timed(self, settings: Sequence[Setting], turns: int = TURNS) -> dict[Setting, float]:
+    def _timed(self, settings: Sequence[Setting], turns: int = 1) -> dict[Setting, float]:
         """Seconds of settings, those that fail or come too late left out."""
         calls: Calls = {s: lambda s=s: self.measured.call(TOGETHER, s) for s in settings}
         found = self.measured.turns(TOGETHER, calls).run(turns, late=self._over)
@@ -290,19 +313,21 @@ class _Search:
             if not times:
                 raise InputError(f"nothing could be timed: {'; '.join(self.measured.left_out)}")
             left = sorted(times, key=lambda s: times[s])[: max(1, (len(times) + 1) // 2)]
-            if len(times) <= 1 or turns >= 2 * TURNS or self._over():
+            if len(times) <= 1 or turns >= TURNS or self._over():
                 return left[0]
             turns += 1
 
     # --------------------------------------------------------------------------------------------------- reasons
 
-    def _reasons(self, chosen: Setting, cells: Sequence[Setting]) -> tuple[list[str], Setting | None]:
+    def _reasons(
+        self, chosen: Setting, cells: Sequence[Setting], splatters: Sequence[str]
+    ) -> tuple[list[str], Setting | None]:
         """For each choice what the cheaper one lacks, and what the next one costs; and what is better after all."""
         options: dict[str, list] = {
             "layers": list(dict.fromkeys(s.layers for s in cells)),
             "supersample": list(SUPERSAMPLE),
             "rate": list(self.measured.forms(TOGETHER)),
-            "splatter": list(dict.fromkeys(s.splatter for s in cells)),
+            "splatter": list(splatters),
             "sampler": list(self.samplers),
         }
         others = {name: self._others(chosen, name, values) for name, values in options.items()}
