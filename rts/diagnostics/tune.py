@@ -225,15 +225,27 @@ class _Search:
         """The settings within the tolerance that no cheaper one of their splatter makes needless."""
         done = self.phase("errors", len(cells))
         found: list[Setting] = []
+        passed: list[Setting] = []
         for setting in cells:
             done()
-            if self._needless(setting, found) or self._far(setting):
+            if self._needless(setting, found):
                 continue
-            if self._over():
+            if self._far(setting):
+                passed.append(setting)
+            elif not self._looked_at(setting, found):
                 break
-            if self._bound(setting) <= self.tolerance:
-                found.append(setting)
+        for setting in passed if not found else ():
+            if not self._looked_at(setting, found):
+                break
         return found
+
+    def _looked_at(self, setting: Setting, found: list[Setting]) -> bool:
+        """Whether there was time to look at a setting, which joins those found if it is accurate enough."""
+        if self._over():
+            return False
+        if self._bound(setting) <= self.tolerance:
+            found.append(setting)
+        return True
 
     def _needless(self, setting: Setting, found: Sequence[Setting]) -> bool:
         """Whether a setting costs no less, in any respect, than one of its kind that is accurate enough."""
