@@ -22,16 +22,16 @@ from rts.diagnostics.comparison.compare import file_name
 from rts.diagnostics.comparison.environment import environment
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.measure import TOGETHER, Measurements
+from rts.diagnostics.comparison.search import LAYERS, SUPERSAMPLE
 from rts.diagnostics.comparison.settings import Setting, engines, usable
 from rts.diagnostics.comparison.turns import Calls
-from rts.diagnostics.tune import LAYERS, SUPERSAMPLE
 
 CASES = {
     "bunny over black": (("translation", "rotation"), 0.25),
     "stack of cards": (("translation", "rotation"), 0.07),
     "vase that turns": (("translation", "shape"), 0.08),
     "bezier teapot": (("translation", "camera"), 0.05),
-    "subdivided rook": (("translation", "rotation"), 0.2),
+    "subdivided rook": (("translation", "shape"), 0.12),
     "torus by lattice": (("translation", "camera"), 0.06),
 }
 """Scene → what a fit would change, and the tolerance: such that neither one sample nor sixteen are sure to do."""
@@ -66,12 +66,14 @@ def case(name: str, modes: tuple[str, ...], tolerance: float, folder: Path) -> d
         times.append(time.perf_counter() - start)
     journal = Journal(folder / f"{file_name(name)}.jsonl")
     scene = replace(scene.with_modes(modes), size=SIZE)
-    measured = Measurements(scene, journal, engines()[0][:1], truths=folder, together=True)
+    measured = Measurements(scene, journal, engines()[0][:1], truths=folder, together=True, count_at=SUPERSAMPLE[-1])
     admissible = within(measured, tolerance)
     found = medians(measured, admissible, 2)
     best = min(found, key=lambda s: found[s])
     chosen = Setting(**tuned.settings, rate=tuned.rate, engine=measured.engine.name)
-    last = Measurements(measured.scene, Journal(), [measured.engine], truths=folder, together=True)
+    last = Measurements(
+        measured.scene, Journal(), [measured.engine], truths=folder, together=True, count_at=SUPERSAMPLE[-1]
+    )
     again = medians(last, list({chosen: None, best: None}), TURNS)
     return {
         "scene": name,
