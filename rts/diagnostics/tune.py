@@ -12,26 +12,20 @@ from rts.arguments import check_positive, quoted
 from rts.checks import is_count, is_real
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.measure import TOGETHER, Measurements
-from rts.diagnostics.comparison.progress import Phase, phases
+from rts.diagnostics.comparison.progress import phases
 from rts.diagnostics.comparison.scene import SceneFunction, parts_of
-from rts.diagnostics.comparison.settings import Setting, usable
+from rts.diagnostics.comparison.search import SUPERSAMPLE, Search
+from rts.diagnostics.comparison.settings import usable
 from rts.diagnostics.comparison.sources import engines_for, scene_of, some_modes
 from rts.diagnostics.comparison.truth import SAMPLES
-from rts.diagnostics.comparison.turns import Calls
 from rts.engines import stopped
-from rts.errors import InputError, ToleranceWarning, warn
+from rts.errors import InputError
 from rts.files.paths import output_folder
 from rts.interfaces import Part
 from rts.trees import Tree
 
-LAYERS = (1, 2, 4, 8)
-SUPERSAMPLE = (1, 2, 3, 4)
-HOPELESS = 2.0
-"""How many times the error of the best splatter another one may have, to be looked at further."""
-ALIKE = 0.9
-"""A setting is faster than another one if it takes less than this share of its time."""
-TURNS = 3
-"""Turns of the settings that are told of beside the chosen one; the last that are left have twice as many."""
+SAMPLED = 1.0
+"""Seconds that a sampler may take, for 512² pixels or fewer."""
 
 
 class Tuned(NamedTuple):
@@ -115,7 +109,16 @@ def tune(
     named = usable("rts.splatters", splatters)[0]
     possible = usable("rts.samplers", samplers)[0]
     used, _ = engines_for(found, None if engine is None else [engine])
-    measured = Measurements(found, Journal(), used[:1], truths=kept, samples=truth_samples, together=True)
+    measured = Measurements(
+        found,
+        Journal(),
+        used[:1],
+        truths=kept,
+        samples=truth_samples,
+        together=True,
+        count_at=SUPERSAMPLE[-1],
+        slowest=SAMPLED * max(1.0, math.prod(found.size) / 512**2),
+    )
     measured.leave_out_what_rests()
     with phases(progress) as phase:
         measured.truths(phase("truth", 4 * measured.samples**2 * len(measured.scene.directions)))
@@ -123,227 +126,10 @@ def tune(
         suited = measured.samplers(possible)
         if not suited:
             raise InputError(f"no sampler suits {found.name!r}: {'; '.join(measured.left_out)}")
-        return _Search(measured, tolerance, deadline, phase).run(named, measured.kinds(suited))
-
-
-class _Search:
-    """A search for the cheapest settings within a tolerance.
-
-    Args:
-        measured: the scene, and what is known of it.
-        tolerance: of the error.
-        deadline: when to stop measuring, on the clock of `time.perf_counter`.
-        phase: shows progress.
-    """
-
-    def __init__(self, measured: Measurements, tolerance: float, deadline: float, phase: Phase):
-        self.measured, self.tolerance, self.deadline, self.phase = measured, tolerance, deadline, phase
-        self.modes = list(measured.scene.directions)
-        self.bounds: dict[Setting, float] = {}
-        self.engine = measured.engine.name
-        self.late = False
-
-    def run(self, splatters: Sequence[str], samplers: Mapping[str, str]) -> Tuned:
-        """The best that is found in time.
-
-        Args:
-            splatters: names.
-            samplers: names, each with the one whose errors it shares; "" for the usual one.
-        """
-        self.samplers = samplers
-        cells = self._cells(splatters)
-        within = self._within(cells)
-        chosen = self._fastest(self._sampled(within or [self._best(cells)]))
-        reasons, faster = self._reasons(chosen, cells)
-        if faster is not None:  # More work need not take longer.
-            chosen = faster
-            reasons, _ = self._reasons(chosen, cells)
-        error, seconds = self._error(chosen), self._timed([chosen])[chosen]
-        if error > self.tolerance:
-            reasons.insert(0, self._told_of_failure(error))
-        if self.late:
-            reasons.append("the budget was spent before all settings were looked at")
-        at = self.measured.forms(TOGETHER)[chosen.rate].at
-        own = None if self.measured.scene.separate else self.measured.engine
-        parts = stopped(parts_of(at(self.measured.scene.moved(self.modes[0], 0.0, own))))
-        return Tuned(parts, chosen.options, chosen.rate, reasons, at, error, seconds)
-
-    def _told_of_failure(self, error: float) -> str:
-        """What to say where nothing is within the tolerance; a warning, too."""
-        wanted = _percent(self.tolerance)
-        told = f"nothing within {wanted} was found in time" if self.late else f"nothing is within {wanted}"
-        told = f"{told}: the least error that was found is {_percent(error)}"
-        advice = "give a larger budget_s" if self.late else "give a larger tolerance, or look at more pixels"
-        warn(f"{told}; {advice}", ToleranceWarning)
-        return told
-
-    # -------------------------------------------------------------------------------------------------- accuracy
-
-    def _cells(self, splatters: Sequence[str]) -> list[Setting]:
-        """All settings that may differ in their error, the cheapest first."""
-        kinds = dict.fromkeys(self.samplers.values())
-        found = self.measured.settings(TOGETHER, splatters, LAYERS, SUPERSAMPLE, kinds)
-        return sorted(found, key=lambda s: math.prod(self._work(s)))
-
-    def _sampled(self, settings: Sequence[Setting]) -> list[Setting]:
-        """Settings with each sampler that shares their errors."""
-        return [
-            s._replace(sampler=name, engine=self.engine)
-            for s in settings
-            for name, kind in self.samplers.items()
-            if kind == s.sampler
-        ]
-
-    def _cell(self, setting: Setting) -> Setting:
-        """What the error of a setting is kept under."""
-        return setting._replace(sampler=self.samplers.get(setting.sampler, setting.sampler), engine="")
-
-    def _work(self, setting: Setting) -> tuple[float, ...]:
-        layers, supersample, rate = self.measured.work(TOGETHER, self._cell(setting))
-        return layers, supersample**2, rate
-
-    def _promising(self, cells: Sequence[Setting]) -> list[Setting]:
-        """The settings of splatters that are accurate enough, or nearly as accurate as the best, with two layers."""
-        base = {s.splatter: s for s in cells if s.supersample == 1 and not s.rate and s.layers in LAYERS[:2]}
-        known = {splatter: self._error(s) for splatter, s in base.items() if not self._over()}
-        allowed = max(self.tolerance, HOPELESS * min(known.values(), default=math.inf))
-        return [s for s in cells if known.get(s.splatter, 0.0) <= allowed]
-
-    def _within(self, cells: Sequence[Setting]) -> list[Setting]:
-        """The settings within the tolerance that no cheaper one of their splatter makes needless."""
-        promising = self._promising(cells)
-        done = self.phase("errors", len(promising))
-        found: list[Setting] = []
-        for setting in promising:
-            done()
-            if self._needless(setting, found):
-                continue
-            if self._over():
-                break
-            if self._bound(setting) <= self.tolerance:
-                found.append(setting)
-        return found
-
-    def _needless(self, setting: Setting, found: Sequence[Setting]) -> bool:
-        """Whether a setting costs no less, in any respect, than one of its kind that is accurate enough."""
-        mine = self._work(setting)
-        return any(
-            (s.splatter, s.sampler) == (setting.splatter, setting.sampler)
-            and all(a <= b for a, b in zip(self._work(s), mine, strict=True))
-            for s in found
+        chosen, reasons, error, seconds = Search(measured, tolerance, deadline, phase).run(
+            named, measured.kinds(suited)
         )
-
-    def _best(self, cells: Sequence[Setting]) -> Setting:
-        """The setting of the least error among those that were looked at; the first of all where none was."""
-        least, best = math.inf, cells[0] if cells else None
-        for setting in sorted(self.bounds, key=lambda s: self.bounds[s]):
-            if self.bounds[setting] >= least:
-                break
-            error = self._error(setting)
-            if error < least:
-                least, best = error, setting
-        if best is None:
-            raise InputError(f"nothing could be measured: {'; '.join(self.measured.left_out)}")
-        return best
-
-    def _bound(self, setting: Setting) -> float:
-        """The largest error along a mode, or that along the first mode where it is beyond the tolerance."""
-        worst = 0.0
-        for mode in self.modes:
-            error = self._along(mode, setting)
-            if error > self.tolerance:
-                # What was too much once is looked at first.
-                self.modes = [mode, *(m for m in self.modes if m != mode)]
-                worst = error
-                break
-            worst = max(worst, error)
-        self.bounds[self._cell(setting)] = worst
-        return worst
-
-    def _error(self, setting: Setting) -> float:
-        """The largest error along a mode."""
-        worst = max(self._along(mode, setting) for mode in self.modes)
-        self.bounds[self._cell(setting)] = worst
-        return worst
-
-    def _along(self, mode: str, setting: Setting) -> float:
-        found = self.measured.scores(mode, self._cell(setting))
-        return math.inf if found is None else found["error"]
-
-    # ------------------------------------------------------------------------------------------------------ time
-
-    def _over(self) -> bool:
-        self.late = self.late or time.perf_counter() > self.deadline
-        return self.late
-
-    def _timed(self, settings: Sequence[Setting], turns: int = TURNS) -> dict[Setting, float]:
-        """Seconds of settings, those that fail or come too late left out."""
-        calls: Calls = {s: lambda s=s: self.measured.call(TOGETHER, s) for s in settings}
-        found = self.measured.turns(TOGETHER, calls).run(turns, late=self._over)
-        return {Setting(*s): ms["median"] / 1e3 for s, ms in found.items()}
-
-    def _fastest(self, settings: Sequence[Setting]) -> Setting:
-        """The fastest, by successive halving: all have a turn, the faster half another, and so on."""
-        turns, left = 1, list(settings)
-        while True:
-            times = self._timed(left, turns)
-            if not times:
-                raise InputError(f"nothing could be timed: {'; '.join(self.measured.left_out)}")
-            left = sorted(times, key=lambda s: times[s])[: max(1, (len(times) + 1) // 2)]
-            if len(times) <= 1 or turns >= 2 * TURNS or self._over():
-                return left[0]
-            turns += 1
-
-    # --------------------------------------------------------------------------------------------------- reasons
-
-    def _reasons(self, chosen: Setting, cells: Sequence[Setting]) -> tuple[list[str], Setting | None]:
-        """For each choice what the cheaper one lacks, and what the next one costs; and what is better after all."""
-        options: dict[str, list] = {
-            "layers": list(dict.fromkeys(s.layers for s in cells)),
-            "supersample": list(SUPERSAMPLE),
-            "rate": list(self.measured.forms(TOGETHER)),
-            "splatter": list(dict.fromkeys(s.splatter for s in cells)),
-            "sampler": list(self.samplers),
-        }
-        others = {name: self._others(chosen, name, values) for name, values in options.items()}
-        told = dict.fromkeys(s for found in others.values() for s in found if s is not None)
-        times = self._timed([chosen, *told]) if not self._over() else {}
-        faster = [s for s in times if times[s] < ALIKE * times[chosen] and self._error(s) <= self.tolerance]
-        lines = [self._reason(chosen, name, *found, times) for name, found in others.items() if any(found)]
-        return lines, min(faster, key=lambda s: times[s], default=None)
-
-    def _others(self, chosen: Setting, name: str, values: Sequence) -> tuple[Setting | None, Setting | None]:
-        """The next cheaper and the next dearer setting in one respect; for names, one that is another."""
-        found = [chosen._replace(**{name: value}) for value in values if value != getattr(chosen, name)]
-        if name in ("splatter", "sampler"):
-            known = [s for s in found if self._cell(s) in self.bounds]
-            return None, min(known, key=lambda s: self.bounds[self._cell(s)], default=None)
-        mine = math.prod(self._work(chosen))
-        work = {s: math.prod(self._work(s)) for s in found}
-        below, above = [s for s in found if work[s] < mine], [s for s in found if work[s] > mine]
-        return max(below, key=lambda s: work[s], default=None), min(above, key=lambda s: work[s], default=None)
-
-    def _reason(
-        self, chosen: Setting, name: str, below: Setting | None, above: Setting | None, times: Mapping[Setting, float]
-    ) -> str:
-        """One line on one choice."""
-        parts = []
-        if below is not None and not self._over():
-            parts.append(f"{_value(below, name)} is off by {_percent(self._error(below))}")
-        if above is not None and chosen in times and above in times:
-            ratio = times[above] / times[chosen]
-            error = f", off by {_percent(self._error(above))}" if name != "sampler" else ""
-            parts.append(f"{_value(above, name)} takes {ratio:.2g} times as long{error}")
-        return f"{_value(chosen, name)}: {'; '.join(parts)}" if parts else f"{_value(chosen, name)}"
-
-
-def _value(setting: Setting, name: str) -> str:
-    """A choice as a user would write it."""
-    value = getattr(setting, name)
-    if name == "rate":
-        return value or "the surfaces as they are given"
-    return f"{name}={value!r}"
-
-
-def _percent(error: float) -> str:
-    return f"{100 * error:.3g} %"
+    at = measured.forms(TOGETHER)[chosen.rate].at
+    own = None if measured.scene.separate else measured.engine
+    parts = stopped(parts_of(at(measured.scene.moved(next(iter(measured.scene.directions)), 0.0, own))))
+    return Tuned(parts, chosen.options, chosen.rate, reasons, at, error, seconds)

@@ -52,6 +52,9 @@ class Measurements:
         truths: the folder of truths; None for that of caches.
         samples: of the truth, the square root of their number a pixel.
         together: whether the parameters of all modes are differentiated at once.
+        count_at: samples along each side of a pixel with which layers are counted, once for all settings of a splatter;
+            None to count them with those of each setting.
+        slowest: the most seconds that a sampler may take for an image of the scene's size.
 
     Attributes:
         left_out: what could not be measured, a line each.
@@ -66,9 +69,11 @@ class Measurements:
         truths: Path | None = None,
         samples: int = SAMPLES,
         together: bool = False,
+        count_at: int | None = None,
+        slowest: float = SLOWEST,
     ):
         self.scene, self.journal, self.engines, self.folder, self.samples = scene, journal, engines, truths, samples
-        self.engine = engines[0]
+        self.engine, self.count_at, self.slowest = engines[0], count_at, slowest
         self.left_out: list[str] = []
         self._truths: dict[str, Truth] = {}
         self._forms: dict[str, dict[str, Form]] = {}
@@ -242,7 +247,7 @@ class Measurements:
             chosen = instance("rts.samplers", name)
             for part in checked:
                 suited_sampler(chosen, part, seen)
-            for size, patience in (((PROBE, PROBE), PATIENCE), (self.scene.size, SLOWEST)):
+            for size, patience in (((PROBE, PROBE), PATIENCE), (self.scene.size, self.slowest)):
                 side = size[0]
                 with limited(patience):
                     _quietly(lambda size=size: sample(parts, camera, size, sampler=name, layers=1))
@@ -291,7 +296,10 @@ class Measurements:
 
     def counting(self, group: str, setting: Setting) -> int | None:
         """How many layers count in a setting: beyond those that "auto" takes there are none. None where that fails."""
-        most = self._layers(group, setting._replace(layers="auto", engine=""))
+        counted = setting._replace(layers="auto", engine="")
+        if self.count_at is not None:
+            counted = counted._replace(supersample=self.count_at, rate="")
+        most = self._layers(group, counted)
         if most is None:
             return None if setting.layers == "auto" else int(setting.layers)
         return most if setting.layers == "auto" else min(int(setting.layers), most)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import time
 from collections.abc import Callable, Mapping
@@ -19,6 +20,9 @@ SLOW = 1.5
 """Seconds of timed calls after which a function has had its turns, two at least."""
 LONGEST = 120.0
 """Seconds after which a function that is to be timed is left out."""
+
+WARM = 0.5
+"""Seconds that a first call may always take: it loads what the next ones find."""
 
 Calls = Mapping[tuple, Callable[[], Callable[[], Any]]]
 """What to keep a time under → a function that makes the function to be timed."""
@@ -41,9 +45,14 @@ class Turns:
         self.failed: dict[tuple, str] = {}
         self._times: dict[tuple, list[float]] = {name: [] for name in calls}
         self._made: dict[tuple, Callable[[], Any]] = {}
+        self._hopeless = math.inf
 
     def run(
-        self, rounds: int = ROUNDS, done: Callable[[], None] = lambda: None, late: Callable[[], bool] = lambda: False
+        self,
+        rounds: int = ROUNDS,
+        done: Callable[[], None] = lambda: None,
+        late: Callable[[], bool] = lambda: False,
+        hopeless: float = math.inf,
     ) -> dict[tuple, dict[str, float]]:
         """Let them take turns in shuffled order, each after a call to warm up.
 
@@ -51,10 +60,12 @@ class Turns:
             rounds: turns of each; those of earlier runs count.
             done: called for each turn.
             late: whether to end, once something is known.
+            hopeless: what takes so many times as long as the fastest is called once.
 
         Returns:
             Milliseconds under each name that could be timed: "median", quartiles "low" and "high", number of "calls".
         """
+        self._hopeless = hopeless
         order, shuffle = list(self.calls), random.Random(0).shuffle
         for number in range(rounds):
             shuffle(order)
@@ -82,11 +93,18 @@ class Turns:
         with limited(LONGEST):
             if name not in self._made:
                 self._made[name] = self.calls[name]()
-                self._made[name]()
+                first = _seconds(self._made[name])
+                if first > self._most():
+                    return [first]
             found = [_seconds(self._made[name])]
             if found[0] < SLOW / 2:
                 found = [_seconds(self._made[name]) for _ in range(CONSECUTIVE)]
         return found
+
+    def _most(self) -> float:
+        """Seconds of a first call after which there is no other."""
+        known = [float(np.median(times)) for times in self._times.values() if times]
+        return max(WARM, self._hopeless * min(known)) if known else math.inf
 
 
 def _seconds(f: Callable[[], Any]) -> float:
