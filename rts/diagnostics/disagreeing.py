@@ -1,0 +1,330 @@
+"""Why the derivative of an image disagrees with the truth: experiments that make it agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.diagnostics import variants
+from rts.diagnostics.baseline import nearest
+from rts.diagnostics.comparison.scores import low_pass
+from rts.diagnostics.reasons import Finding
+from rts.diagnostics.slopes import DEEP, Number, Setting, Touched
+from rts.diagnostics.vanishing import why_constant
+from rts.rendering import sample
+
+HALVED = 0.5
+"""An experiment names a reason if it leaves less than this share of the error."""
+LARGE_SHARE = 0.3
+"""Pixels of a kind name a reason if they hold so much of the disagreement."""
+STRONG = 0.1
+"""A pixel disagrees if it is off by this share of the pixel that is most."""
+FINE = 8
+"""Cells along each side of a pixel, to see what is thinner than a sample."""
+ALIKE = 0.5
+"""The baseline is off, too, if by this share of what the scene is off by."""
+AGAIN = 4
+"""Samples a pixel, along each axis, that experiments take instead of one."""
+
+
+class _Error(NamedTuple):
+    """By how much a derivative image is off the truth.
+
+    Attributes:
+        image: (H, W, 4), through the low-pass of `scores`.
+        norm: of it.
+    """
+
+    image: np.ndarray
+    norm: float
+
+    @classmethod
+    def of(cls, pushed: np.ndarray, true: np.ndarray) -> _Error:
+        """The error of a derivative image."""
+        image = low_pass(pushed - true)
+        return cls(image, float(np.linalg.norm(image)))
+
+    @property
+    def energy(self) -> np.ndarray:
+        """(H, W)."""
+        return (self.image**2).sum(axis=-1)
+
+
+class _Case:
+    """A number whose derivatives disagree, and how far it has been explained.
+
+    Attributes:
+        setting: what is looked at.
+        number: the number.
+        options: of `rts.render`, those of the experiments that helped.
+        pushed: the derivative with these.
+        error: of this.
+        noise: of the truth, as `error.norm`.
+        whole: the error at first.
+        findings: what was found.
+    """
+
+    def __init__(self, setting: Setting, number: Number):
+        self.setting, self.number = setting, number
+        self.options: dict[str, Any] = {"capacity": None}
+        self.pushed = number.pushed
+        self.whole = self.error = _Error.of(number.pushed, number.true)
+        self.noise = float(np.linalg.norm(low_pass(number.noise)))
+        self.findings: list[Finding] = []
+
+    @property
+    def open(self) -> bool:
+        """Whether something is left to explain."""
+        return self.error.norm > max(1.5 * self.noise, 0.2 * self.whole.norm)
+
+    def strong(self, error: _Error) -> np.ndarray:
+        """(H, W) bool, the pixels that disagree most."""
+        size = np.abs(self.number.pushed - self.number.true).max(axis=-1)
+        energy = error.energy
+        return (size > STRONG * size.max()) & (energy > STRONG**2 * energy.max())
+
+    def try_out(self, **options: Any) -> _Error | None:
+        """The error before, if options make it much smaller, which are kept then; else None."""
+        changed = {**self.options, **options}
+        pushed = self.setting.push(self.number.direction, **changed) * self.number.slope.step
+        error, before = _Error.of(pushed, self.number.true), self.error
+        if error.norm > max(HALVED * before.norm, 1.5 * self.noise):
+            return None
+        self.options, self.pushed, self.error = changed, pushed, error
+        return before
+
+    def gained(self, before: _Error) -> float:
+        """Which share of the whole went with the last experiment."""
+        return (before.norm**2 - self.error.norm**2) / self.whole.norm**2
+
+
+def _constants(case: _Case, touched: Touched) -> None:
+    found = why_constant(case.setting, touched)
+    if not found or case.number.pushed.any() and not touched.constant and not touched.cut:
+        return
+    everything = len(touched.all) == len(touched.constant) + len(touched.cut)
+    mask, share = case.strong(case.whole), 1.0 if everything and not case.number.pushed.any() else None
+    case.findings += [f._replace(mask=mask, share=share) for f in found]
+
+
+def _outlines(case: _Case, touched: Touched) -> None:
+    """A splatter that gives outlines no derivative, or hides what a better one shows."""
+    splatter = case.setting.options.get("splatter", "auto")
+    if splatter in ("auto", "visible"):
+        return
+    before = case.try_out(splatter="visible")
+    if before is not None:
+        told = f"splatter={splatter!r}" if isinstance(splatter, str) else f"the splatter {type(splatter).__name__}"
+        because = f"{told} has not the derivative of outlines that 'visible' has"
+        case.findings.append(
+            Finding(
+                "outlines", because, "Leave out splatter=, or say 'visible'.", case.strong(before), case.gained(before)
+            )
+        )
+
+
+def _layers(case: _Case, touched: Touched) -> None:
+    layers = case.setting.options.get("layers", 2)
+    if isinstance(layers, str) or layers >= DEEP:
+        return
+    before = case.try_out(layers=DEEP)
+    if before is None:
+        return
+    mask, share, enough = case.strong(before), case.gained(before), DEEP
+    for count in range(layers + 1, DEEP):
+        pushed = case.setting.push(case.number.direction, **{**case.options, "layers": count}) * case.number.slope.step
+        if _Error.of(pushed, case.number.true).norm <= max(1.1 * case.error.norm, HALVED * before.norm):
+            enough = count
+            break
+    because = f"it shows deeper than the {layers} layer{'s' if layers > 1 else ''} that are kept"
+    advice = f"Raise layers to {enough}, or say layers='auto'." if case.setting.opaque else f"Raise layers to {enough}."
+    case.findings.append(Finding("layers", because, advice, mask, share))
+
+
+def _bounded(case: _Case, touched: Touched) -> None:
+    """Surfaces that bound derivatives where they are near-singular."""
+    if all(part.surface.unbounded() is None for part in case.setting.parts):
+        return
+    pushed = case.setting.push(case.number.direction, variants.unbounded, **case.options) * case.number.slope.step
+    change = np.nan_to_num(np.abs(pushed - case.pushed), nan=np.inf, posinf=np.inf).max(axis=-1)
+    mask = change > STRONG * max(np.abs(case.number.true).max(), np.abs(case.pushed).max())
+    _by_pixels(
+        case,
+        mask,
+        "bounded",
+        "field values at the ends of lattice edges are so nearly alike there that crossings move without bound; the "
+        "surface bounds their derivative",
+        "Smooth the field, or take motion='normal' or near_singular='drop'.",
+    )
+
+
+def _crossing(case: _Case, touched: Touched) -> None:
+    """Lines where parts pass through one another."""
+    setting = case.setting
+    if len(setting.parts) < 2:
+        return
+    parts, camera = setting.shown(setting.parameters)
+    sampled = sample(parts, camera, setting.size, layers=2, sampler=setting.options.get("sampler", "auto"))
+    apron = sampled.apron
+    part = setting.engine.to_numpy(sampled.part) if setting.engine.owns(sampled.row) else np.asarray(sampled.part)
+    front, second = part[0], part[1] if len(part) > 1 else np.full_like(part[0], -1)
+    mask = np.zeros(front.shape, bool)
+    for axis in (0, 1):
+        a, b = (tuple(slice(s, n) if i == axis else slice(None) for i in (0, 1)) for s, n in ((0, -1), (1, None)))
+        swaps = (front[a] != front[b]) & (front[a] == second[b]) & (second[a] == front[b]) & (second[a] >= 0)
+        mask[a] |= swaps
+        mask[b] |= swaps
+    _by_pixels(
+        case,
+        mask[apron:-apron, apron:-apron],
+        "crossing",
+        "parts pass through one another there, and their line of crossing moves otherwise than either",
+        "Part them, or model the line as an edge of both.",
+    )
+
+
+def _samples(case: _Case, touched: Touched) -> None:
+    """Too few samples: for what is thin, for colours, or for other reasons."""
+    taken = case.setting.options.get("supersample", 1)
+    before = case.try_out(supersample=AGAIN * taken if taken == 1 else 2 * taken)
+    if before is None:
+        return
+    gain, share = np.maximum(before.energy - case.error.energy, 0), case.gained(before)
+    thin, outlines = _thin_and_outlines(case.setting, taken)
+    strong, left = case.strong(before), 1.0
+    for kind, mask, because, advice in (
+        ("thin", thin, f"there the scene is thinner than a sample ({_each(taken)})", "Take more samples: "),
+        ("colors", ~outlines, f"there colours change within a sample ({_each(taken)}), inside of surfaces",
+         "Blur the texture to the size of a pixel, or take more samples: "),
+    ):  # fmt: skip
+        held = float(gain[mask].sum() / max(gain.sum(), 1e-30))
+        if held >= LARGE_SHARE:
+            advice += f"with supersample={case.options['supersample']} it is {_times(case, before)} better."
+            case.findings.append(Finding(kind, because, advice, strong & mask, share * held))
+            left -= held
+    if left > 1 - LARGE_SHARE:
+        because = f"{_each(taken)} is too few for its outlines"
+        advice = f"With supersample={case.options['supersample']} it is {_times(case, before)} better."
+        case.findings.append(Finding("samples", because, advice, strong & ~thin & outlines, share * left))
+
+
+def _times(case: _Case, before: _Error) -> str:
+    return f"{before.norm / max(case.error.norm, 1e-30):.2g} times"
+
+
+def _each(count: int) -> str:
+    return "one sample a pixel" if count == 1 else f"{count} × {count} samples a pixel"
+
+
+def _thin_and_outlines(setting: Setting, taken: int) -> tuple[np.ndarray, np.ndarray]:
+    """The pixels (H, W) bool around what is thinner than a sample, and those around outlines."""
+    from scipy.ndimage import binary_dilation, binary_opening
+
+    parts, camera = setting.shown(setting.parameters)
+    fine = FINE * taken
+    found = sample(
+        parts, camera, setting.size, layers=1, supersample=fine, sampler=setting.options.get("sampler", "auto")
+    )
+    apron = found.apron
+    to_numpy = setting.engine.to_numpy if setting.engine.owns(found.row) else np.asarray
+    part, depth = (to_numpy(x)[0, apron:-apron, apron:-apron] for x in (found.part, found.depth))
+    spans = np.ptp(depth[part >= 0]) if (part >= 0).any() else 0.0
+    along = np.hypot(*np.indices((FINE, FINE)) - (FINE - 1) / 2) <= FINE / 2 - 0.5  # A disk as wide as a sample.
+    thin = np.zeros(part.shape, bool)
+    for index in np.unique(part):
+        mask = np.pad(part == index, FINE, mode="edge")
+        thin |= (mask & ~binary_opening(mask, along))[FINE:-FINE, FINE:-FINE]
+    jumps = np.zeros(part.shape, bool)
+    for axis in (0, 1):
+        step = np.abs(np.diff(depth, axis=axis)) > 0.05 * spans
+        change = (np.diff(part, axis=axis) != 0) | step
+        jumps |= np.pad(change, [(0, 1) if i == axis else (0, 0) for i in (0, 1)])
+    height, width = setting.size
+
+    def pixels(mask: np.ndarray, least: float) -> np.ndarray:
+        return mask.reshape(height, fine, width, fine).mean(axis=(1, 3)) > least
+
+    # A corner that a disk does not reach into is less than a twentieth of a sample.
+    return binary_dilation(pixels(thin, 0.1), iterations=3), binary_dilation(pixels(jumps, 0), iterations=2)
+
+
+def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str) -> None:
+    """Name a reason if pixels around the mask hold much of what is left."""
+    from scipy.ndimage import binary_dilation
+
+    if not mask.any():
+        return
+    near = binary_dilation(mask, iterations=2)
+    energy = case.error.energy
+    held = float(energy[near].sum() / max(energy.sum(), 1e-30))
+    if held < LARGE_SHARE:
+        return
+    share = held * case.error.norm**2 / case.whole.norm**2
+    case.findings.append(Finding(kind, because, advice, near & case.strong(case.error), share))
+    # What they hold is explained.
+    image = case.error.image * ~near[..., None]
+    case.error = _Error(image, float(np.linalg.norm(image)))
+
+
+def _bias(case: _Case, touched: Touched) -> None:
+    """What the nearest built-in configuration shows, too; or nothing that is known."""
+    off = _off(case.pushed, case.number.true)
+    mask, share = case.strong(case.error), case.error.norm**2 / case.whole.norm**2
+    found = nearest(case.setting, case.number, touched.parts, case.options)
+    if found is not None:
+        theirs = _off(found.pushed, found.true)
+        ratio = f"{found.slope / found.difference:.2f}" if found.difference else "–"
+        told = f"{found.name} of this size, in this place, moved alike"
+        if theirs >= ALIKE * off:
+            because = (
+                f"a known bias of the library: its derivative image is off by {off:.0%} of its size, that of {told} by "
+                f"{theirs:.0%} (ratio {ratio})"
+            )
+            advice = "Outlines move as the samples inside of them do: expect it where round things turn."
+            case.findings.append(Finding("bias", because, advice, mask, share))
+            return
+        because = f"no experiment makes it agree; {told} is off by {theirs:.0%}, this by {off:.0%}"
+    else:
+        because = "no experiment makes it agree"
+    case.findings.append(Finding("unknown", because, "", mask, share))
+
+
+def _off(pushed: np.ndarray, true: np.ndarray) -> float:
+    a, b = low_pass(pushed), low_pass(true)
+    return float(np.linalg.norm(a - b) / max(np.linalg.norm(a), np.linalg.norm(b), 1e-30))
+
+
+EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
+    _constants,
+    _outlines,
+    _layers,
+    _crossing,
+    _bounded,
+    _samples,
+    _bias,
+)
+"""From the cheap and certain to the dear; each adds what it finds to the case."""
+
+
+def why_off(setting: Setting, number: Number, touched: Touched, going: Callable[[], bool]) -> list[Finding]:
+    """Why the derivatives of a number disagree.
+
+    Args:
+        setting: what is looked at.
+        number: the number.
+        touched: what of the scene it changes.
+        going: whether there is time for another experiment.
+    """
+    case = _Case(setting, number)
+    for experiment in EXPERIMENTS:
+        if not going():
+            break
+        if experiment is _constants or (case.open and not _all_constant(case)):
+            experiment(case, touched)
+    return case.findings
+
+
+def _all_constant(case: _Case) -> bool:
+    return any(f.kind == "constant" and f.share == 1 for f in case.findings)
