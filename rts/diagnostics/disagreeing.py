@@ -17,12 +17,19 @@ from rts.rendering import sample
 
 HALVED = 0.5
 """An experiment names a reason if it leaves less than this share of the error."""
+NOISY, BETTER = 1.5, 0.8
+"""So far above its noise the truth is believed; one that leaves no more than this, and less than that share of the
+error, names a reason, too."""
+LEFT = 0.2
+"""What remains of the error when the rest is explained, and is no longer looked into."""
 LARGE_SHARE = 0.3
 """Pixels of a kind name a reason if they hold so much of the disagreement."""
 STRONG = 0.1
 """A pixel disagrees if it is off by this share of the pixel that is most."""
 FINE = 8
 """Cells along each side of a pixel, to see what is thinner than a sample."""
+JUMP, FLAT = 0.05, 1e-3
+"""Depth jumps where it changes, from cell to cell, by such a share of all depths' span, and such a share of depth."""
 ALIKE = 0.5
 """The baseline is off, too, if by this share of what the scene is off by."""
 AGAIN = 4
@@ -35,16 +42,18 @@ class _Error(NamedTuple):
     Attributes:
         image: (H, W, 4), through the low-pass of `scores`.
         norm: of it.
+        sharp: (H, W), its energy without the low-pass.
     """
 
     image: np.ndarray
     norm: float
+    sharp: np.ndarray
 
     @classmethod
     def of(cls, pushed: np.ndarray, true: np.ndarray) -> _Error:
         """The error of a derivative image."""
         image = low_pass(pushed - true)
-        return cls(image, float(np.linalg.norm(image)))
+        return cls(image, float(np.linalg.norm(image)), ((pushed - true) ** 2).sum(axis=-1))
 
     @property
     def energy(self) -> np.ndarray:
@@ -77,7 +86,7 @@ class _Case:
     @property
     def open(self) -> bool:
         """Whether something is left to explain."""
-        return self.error.norm > max(1.5 * self.noise, 0.2 * self.whole.norm)
+        return self.error.norm > max(NOISY * self.noise, LEFT * self.whole.norm)
 
     def strong(self, error: _Error) -> np.ndarray:
         """(H, W) bool, the pixels that disagree most."""
@@ -90,7 +99,8 @@ class _Case:
         changed = {**self.options, **options}
         pushed = self.setting.push(self.number.direction, **changed) * self.number.slope.step
         error, before = _Error.of(pushed, self.number.true), self.error
-        if error.norm > max(HALVED * before.norm, 1.5 * self.noise):
+        least = NOISY * self.noise
+        if error.norm > HALVED * before.norm and not (error.norm < least and error.norm < BETTER * before.norm):
             return None
         self.options, self.pushed, self.error = changed, pushed, error
         return before
@@ -102,8 +112,6 @@ class _Case:
 
 def _constants(case: _Case, touched: Touched) -> None:
     found = why_constant(case.setting, touched)
-    if not found or case.number.pushed.any() and not touched.constant and not touched.cut:
-        return
     everything = len(touched.all) == len(touched.constant) + len(touched.cut)
     mask, share = case.strong(case.whole), 1.0 if everything and not case.number.pushed.any() else None
     case.findings += [f._replace(mask=mask, share=share) for f in found]
@@ -118,11 +126,8 @@ def _outlines(case: _Case, touched: Touched) -> None:
     if before is not None:
         told = f"splatter={splatter!r}" if isinstance(splatter, str) else f"the splatter {type(splatter).__name__}"
         because = f"{told} has not the derivative of outlines that 'visible' has"
-        case.findings.append(
-            Finding(
-                "outlines", because, "Leave out splatter=, or say 'visible'.", case.strong(before), case.gained(before)
-            )
-        )
+        advice = "Leave out splatter=, or say 'visible'."
+        case.findings.append(Finding("outlines", because, advice, case.strong(before), case.gained(before)))
 
 
 def _layers(case: _Case, touched: Touched) -> None:
@@ -191,7 +196,7 @@ def _samples(case: _Case, touched: Touched) -> None:
     before = case.try_out(supersample=AGAIN * taken if taken == 1 else 2 * taken)
     if before is None:
         return
-    gain, share = np.maximum(before.energy - case.error.energy, 0), case.gained(before)
+    gain, share = np.maximum(before.sharp - case.error.sharp, 0), case.gained(before)
     thin, outlines = _thin_and_outlines(case.setting, taken)
     strong, left = case.strong(before), 1.0
     for kind, mask, because, advice in (
@@ -230,7 +235,7 @@ def _thin_and_outlines(setting: Setting, taken: int) -> tuple[np.ndarray, np.nda
     apron = found.apron
     to_numpy = setting.engine.to_numpy if setting.engine.owns(found.row) else np.asarray
     part, depth = (to_numpy(x)[0, apron:-apron, apron:-apron] for x in (found.part, found.depth))
-    spans = np.ptp(depth[part >= 0]) if (part >= 0).any() else 0.0
+    jump = max(JUMP * np.ptp(depth[part >= 0]), FLAT * depth.max()) if (part >= 0).any() else 0.0
     along = np.hypot(*np.indices((FINE, FINE)) - (FINE - 1) / 2) <= FINE / 2 - 0.5  # A disk as wide as a sample.
     thin = np.zeros(part.shape, bool)
     for index in np.unique(part):
@@ -238,7 +243,7 @@ def _thin_and_outlines(setting: Setting, taken: int) -> tuple[np.ndarray, np.nda
         thin |= (mask & ~binary_opening(mask, along))[FINE:-FINE, FINE:-FINE]
     jumps = np.zeros(part.shape, bool)
     for axis in (0, 1):
-        step = np.abs(np.diff(depth, axis=axis)) > 0.05 * spans
+        step = np.abs(np.diff(depth, axis=axis)) > jump
         change = (np.diff(part, axis=axis) != 0) | step
         jumps |= np.pad(change, [(0, 1) if i == axis else (0, 0) for i in (0, 1)])
     height, width = setting.size
@@ -265,7 +270,7 @@ def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: s
     case.findings.append(Finding(kind, because, advice, near & case.strong(case.error), share))
     # What they hold is explained.
     image = case.error.image * ~near[..., None]
-    case.error = _Error(image, float(np.linalg.norm(image)))
+    case.error = _Error(image, float(np.linalg.norm(image)), case.error.sharp * ~near)
 
 
 def _bias(case: _Case, touched: Touched) -> None:
@@ -323,6 +328,9 @@ def why_off(setting: Setting, number: Number, touched: Touched, going: Callable[
             break
         if experiment is _constants or (case.open and not _all_constant(case)):
             experiment(case, touched)
+    if going() and not case.findings:
+        because = "the derivative images agree as well as the truth is known, and only the loss does not"
+        return [Finding("unknown", because, "Take more samples a pixel for the truth, samples=16 say.")]
     return case.findings
 
 

@@ -204,10 +204,11 @@ def check_gradient(
         numbers, count = _looked_at(setting, entries, samples, clock, phase)
         check = GradientCheck([n.slope for n in numbers], tolerance)
         found, left = explained(setting, numbers, check.agrees, own, clock.going, phase)
+        picture = marked(setting.seen, found)
     notes = [f"{len(numbers)} of {count} numbers were looked at"] if len(numbers) < count else []
     notes += [f"reasons were not looked for in {left} of them"] if left else []
     note = f"After {clock.spent:.0f} s the budget was spent: {', and '.join(notes)}." if notes else ""
-    return check._replace(reasons=found, picture=marked(setting.seen, found), note=note)
+    return check._replace(reasons=found, picture=picture, note=note)
 
 
 class _Clock:

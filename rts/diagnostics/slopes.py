@@ -28,8 +28,10 @@ Change = Callable[[list[Part], Camera], tuple[list[Part], Camera]]
 
 STEP_UNSEEN = 1e-2
 """How far the finite differences change a number that nothing seems to depend on."""
-STEPS_OF_CONSTANTS = (0.01, 0.04, 0.16, 0.64)
-"""How far they change one that no derivative leads away from: the first that is seen."""
+DEPENDS = 1.0
+"""How far parameters are changed to see whether the scene depends on them at all."""
+SHORT = 1e-3
+"""How far they are changed to see how fast arrays of the scene change."""
 DEEP = 8
 """Layers of the finite differences where shaders are not opaque."""
 
@@ -60,7 +62,7 @@ class Number(NamedTuple):
         direction: of the parameters' structure, 1 at the number.
         pushed: (H, W, 4), the derivative of the image through the splatter, for a step of the slope's length.
         true: (H, W, 4), the finite difference over that step.
-        noise: (H, W, 4), half of what two sampling grids disagree on.
+        noise: (H, W, 4), half of what two sampling grids disagree on, signed.
     """
 
     slope: Slope
@@ -148,7 +150,7 @@ class Setting:
         if self.engine.owns(image):
             return
         ones = map_leaves(self.engine.namespace.ones_like, self.parameters)
-        if not self.touched(ones, 2 * STEPS_OF_CONSTANTS[-1]).all:
+        if not self.touched(ones, DEPENDS).all:
             raise InputError(f"the image is {kind_of(image)}: nothing in the scene depends on the parameters")
 
     def moved(self, direction: Tree, by: float) -> Tree:
@@ -168,16 +170,29 @@ class Setting:
         """The derivative (H, W, 4) of the image along a direction, by forward mode."""
         return self._pushed(direction, partial(self.drawn, change=change, **options))
 
-    def step(self, direction: Tree) -> float | None:
-        """What `pixel_step` gives."""
-        one, unit, at = self._line(direction)
-        return pixel_step(self.engine, lambda t, **options: self.drawn(at(t), **options), one * 0, unit)
+    def step(
+        self, direction: Tree, change: Change | None = None, *, connect: bool = False, **given: Any
+    ) -> float | None:
+        """What `pixel_step` gives of a changed scene.
+
+        Args:
+            direction: of the parameters.
+            change: of the scene.
+            connect: whether arrays that no derivative leads to move, too.
+            **given: options of `rts.render`.
+        """
+        one, unit, at = self._line(direction, connect)
+
+        def image(t: Array, **options: Any) -> Array:
+            return self.drawn(at(t), change, **{**given, **options})
+
+        return pixel_step(self.engine, image, one * 0, unit)
 
     def _pushed(self, direction: Tree, draw: Callable[[tuple], Array]) -> np.ndarray:
         one, unit, at = self._line(direction)
         return self.engine.to_numpy(self.engine.jvp(lambda t: draw(at(t)), one * 0, unit)[1])
 
-    def _line(self, direction: Tree) -> tuple[Array, Array, Callable[[Array], tuple]]:
+    def _line(self, direction: Tree, connect: bool = False) -> tuple[Array, Array, Callable[[Array], tuple]]:
         """One and a unit, and t → the scene of the parameters moved by t along a direction.
 
         The scene function is differentiated if it can be. One that looks at values, as NumPy does, cannot be by some
@@ -192,7 +207,7 @@ class Setting:
                 map_leaves(lambda p: p + xp.astype(t, p.dtype, copy=False) * next(steps), self.parameters)
             )
 
-        return one, one, at if self._forward else self._by_differences(direction)
+        return one, one, at if self._forward and not connect else self._by_differences(direction, connect)
 
     @cached_property
     def _forward(self) -> bool:
@@ -208,21 +223,26 @@ class Setting:
             return False
         return True
 
-    def _by_differences(self, direction: Tree) -> Callable[[Array], tuple]:
-        h, rest = 1e-3, self.shown(self.parameters)
+    def _by_differences(self, direction: Tree, connect: bool) -> Callable[[Array], tuple]:
+        rest, like = self.shown(self.parameters), next(leaves(self.parameters))
         places, here = self._arrays(rest)
-        ends = [self._arrays(self.shown(self.moved(direction, by)))[1] for by in (h, -h)]
+        ends = [self._arrays(self.shown(self.moved(direction, by)))[1] for by in (SHORT, -SHORT)]
         tangents = []
         for place, x, a, b in zip(places, here, *ends, strict=True):
-            moves = self.engine.owns(x) and bool(self._gradients.get(place))
-            tangents.append((a - b) / (2 * h) if moves else None)
+            floating = is_floating(x)
+            moves = floating and (connect or (self.engine.owns(x) and place in self._gradients))
+            tangent = (a - b) / (2 * SHORT) if moves else None
+            tangents.append(tangent if self.engine.owns(x) or tangent is None else self.engine.constant(tangent, like))
 
         def at(t: Array) -> tuple:
             it, xp = iter(tangents), self.engine.namespace
 
             def leaf(x: Array) -> Array:
                 tangent = next(it)
-                return x if tangent is None else x + xp.astype(t, x.dtype, copy=False) * tangent
+                if tangent is None:
+                    return x
+                x = x if self.engine.owns(x) else self.engine.constant(np.asarray(x), like)
+                return x + xp.astype(t, x.dtype, copy=False) * tangent
 
             return tuple(map_leaves(leaf, [listed_parts(rest[0]), rest[1]]))
 
@@ -244,7 +264,7 @@ class Setting:
         engine, found = self.engine, {}
         places, arrays = self._arrays(self.shown(self.parameters))
         for k, (place, x) in enumerate(zip(places, arrays, strict=True)):
-            if not engine.owns(x) or not namespace(x).isdtype(x.dtype, "real floating"):
+            if not engine.owns(x) or not is_floating(x):
                 continue
             weights = np.random.default_rng(k).normal(size=tuple(x.shape))
 
@@ -318,7 +338,7 @@ def measured(setting: Setting, name: str, direction: Tree, slope: float | None, 
         slope: the derivative of the loss by reverse mode; None for that by forward mode.
         samples: the square root of the number of samples a pixel.
     """
-    step = setting.step(direction) or _step_of_constants(setting, direction) or STEP_UNSEEN
+    step = setting.step(direction) or _step_of_hidden(setting, direction) or STEP_UNSEEN
     to_numpy = setting.engine.to_numpy
 
     def hard(length: float, count: int) -> tuple[float, np.ndarray]:
@@ -332,19 +352,24 @@ def measured(setting: Setting, name: str, direction: Tree, slope: float | None, 
     if slope is None:
         slope = float((setting.weights * pushed).sum() / step)
     found = Slope(name, slope, (coarse + fine) / 2, error, step)
-    return Number(found, direction, pushed, (image + other) / 2, np.abs(image - other) / 2)
+    return Number(found, direction, pushed, (image + other) / 2, (image - other) / 2)
 
 
-def _step_of_constants(setting: Setting, direction: Tree) -> float | None:
-    """The first step that is seen, of a number that changes arrays which no derivative leads to."""
-    touched = setting.touched(direction, STEPS_OF_CONSTANTS[-1])
-    if not (touched.constant or touched.cut):
-        return None
-    for step in STEPS_OF_CONSTANTS:
-        before, after = (setting.engine.to_numpy(setting.hard(direction, by, 1)) for by in (-step / 2, step / 2))
-        if np.abs(after - before).max() > 0:
-            return step
-    return None
+def _step_of_hidden(setting: Setting, direction: Tree) -> float | None:
+    """A step that moves by a pixel what is behind something, or what no derivative leads to."""
+    touched = setting.touched(direction, STEP_UNSEEN)
+    connect = bool(touched.constant or touched.cut)
+    kept = touched.parts
+
+    def alone(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
+        return [p for i, p in enumerate(parts) if kept is None or i in kept], camera
+
+    return setting.step(direction, alone, connect=connect, capacity=None) if touched.all else None
+
+
+def is_floating(x: Array) -> bool:
+    """Whether an array, or a number, is of floating numbers."""
+    return np.asarray(x).dtype.kind == "f" if is_constant(x) else namespace(x).isdtype(x.dtype, "real floating")
 
 
 def chosen(gradient: np.ndarray, count: int) -> list[int]:

@@ -20,8 +20,8 @@ QUIET = 1e-4
 DISTANCES = (4.0, 16.0, 64.0, -4.0, -16.0)
 """How far a camera is moved back, in distances of its near plane."""
 FLAT, FAR = 1e-3, 0.05
-"""A loss is flat where a step of two pixels changes it by no more than the one, as a share of what a far one does; which
-has to be more than the other, as a share of the loss."""
+"""A loss is flat where moves of up to two pixels change it by no more than the one, as a share of what a far move does;
+which has to be more than the other, as a share of the loss."""
 OPEN = 1e-3
 """The singular value of a combination that is not determined, as a share of those of its numbers."""
 OPEN_TRUE = 0.1
@@ -100,7 +100,9 @@ class _Trial:
     def changed(self, change: Any, **options: Any) -> np.ndarray:
         """(H, W) bool, the pixels that the number changes."""
         given = {"splatter": "auto", "background": None, "capacity": None, "supersample": 1, **options}
-        pushed = self.setting.push(self.number.direction, change, **given) * self.number.slope.step
+        direction = self.number.direction
+        step = self.setting.step(direction, change, **given) or self.number.slope.step
+        pushed = self.setting.push(direction, change, **given) * step
         return np.abs(pushed).max(axis=-1) > QUIET
 
     def seen_outside(self, *changes: Any) -> bool:

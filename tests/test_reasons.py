@@ -1,0 +1,243 @@
+"""Scenes that are broken on purpose: `check_gradient` names the reason, and does not name it once they are mended."""
+
+import numpy as np
+import pytest
+from helpers import arrays, icosphere, quad
+
+import rts
+from rts.engines import engine_of
+
+pytestmark = pytest.mark.rendering
+
+MESH = rts.plugin("rts.surfaces", "mesh")
+SIZE = (32, 32)
+CAMERA = rts.Camera.orthographic((0, 0, 20), (0, 0, 0), height=32)  # A world unit is a pixel.
+EYE = rts.Camera.look_at((0, 0, 4), (0, 0, 0), fov_y=40, near=0.5, far=20)
+RED, BLUE, GREEN = np.array([0.9, 0.3, 0.2]), np.array([0.2, 0.4, 0.9]), np.array([0.3, 0.8, 0.3])
+
+
+def constant(x, value):
+    return engine_of(x).constant(value, x)
+
+
+def flat(vertices, faces, color, **fields):
+    colors = np.tile(color.astype(np.float32), (len(vertices), 1))
+    return rts.Part(MESH(faces), {"vertices": vertices, "colors": colors}, "unlit", **fields)
+
+
+SLANT = np.array([[0.96, -0.28, 0], [0.28, 0.96, 0], [0, 0, 1]], np.float32)
+"""Edges along rows of pixels are what few samples show worst."""
+
+
+def card(left, right, bottom, top, z, color, **fields):
+    vertices, faces = quad(left, right, bottom, top, z)
+    return flat(vertices @ SLANT.T, faces, color, **fields)
+
+
+def moved(part, shift):
+    """A part whose vertices are shifted; some components of the shift may be left out."""
+    xp, vertices = rts.namespace(shift), part.theta["vertices"]
+    full = xp.concat([shift, constant(shift, np.zeros(3 - shift.shape[0]))]) if shift.shape[0] < 3 else shift
+    return part.replace(theta={**part.theta, "vertices": constant(shift, vertices) + full})
+
+
+NEAR = card(-7.3, 6.4, -6.1, 8.2, 0, RED)
+ZERO = np.array([0.1, 0.2])
+
+
+def outside(mended):
+    start = np.array([0.1 if mended else 40.0, 0.2])
+    return lambda p: (moved(NEAR, p), CAMERA), start, {}
+
+
+def behind(mended):
+    vertices, faces = quad(-0.6, 0.7, -0.5, 0.6, 0.0 if mended else 6.0)
+    return lambda p: (moved(flat(vertices, faces, RED), p), EYE), ZERO, {}
+
+
+def hidden(mended):
+    front = card(-12.2, 11.3, -11.4, 12.1, 5, BLUE)
+    small = card(-4.3, 5.2, -3.4, 4.1, 8 if mended else 0, RED)
+    return lambda p: ([front, moved(small, p)], CAMERA), ZERO, {}
+
+
+def hidden_by_itself(mended):
+    """A vertex on the side of a ball that is turned away."""
+    vertices, faces = icosphere(2, radius=9.0)
+    index = int(np.argmax(vertices[:, 2] * (1 if mended else -1)))
+
+    def scene(p):
+        one = np.zeros((len(vertices), 1), np.float32)
+        one[index] = 1
+        theta = {"vertices": constant(p, vertices) + constant(p, one) * p}
+        return rts.Part(MESH(faces), theta, "normals"), CAMERA
+
+    return scene, np.zeros(3), {"entries": 3}
+
+
+def culled(mended):
+    part = flat(NEAR.theta["vertices"], quad()[1] if mended else quad()[1][:, ::-1], RED, cull="back")
+    return lambda p: (moved(part, p), CAMERA), ZERO, {}
+
+
+def glass(theta, gbuffer, camera):
+    """Half transparent."""
+    return 0.5 * rts.plugin("rts.shaders", "unlit")()(theta, gbuffer, camera)
+
+
+def layers(mended):
+    """The third of three panes of glass."""
+    panes = [
+        card(-9.2 + i, 8.3 - i, -8.4, 8.1, 5 - 2 * i, c).replace(shader=glass) for i, c in enumerate([BLUE, GREEN])
+    ]
+    last = card(-5.3, 4.2, -4.4, 4.1, 0, RED).replace(shader=glass)
+    return lambda p: ([*panes, moved(last, p)], CAMERA), ZERO, {"layers": 4 if mended else 2}
+
+
+def outlines(mended):
+    return lambda p: (moved(NEAR, p), CAMERA), ZERO, {"splatter": "auto" if mended else "none"}
+
+
+def reach(mended):
+    """A square loss of a target that the object does not touch, or touches."""
+    target = rts.render(card(4.3 if mended else 9.3, 13.2, -4.1, 4.2, 0, RED), CAMERA, SIZE)
+    part = card(-11.3, 6.4 if mended else -5.4, -3.2, 3.4, 0, RED)
+    loss = lambda image: ((image - constant(image, target)) ** 2).mean()  # noqa: E731
+    return lambda p: (moved(part, p), CAMERA), np.array([0.1]), {"loss": loss}
+
+
+def bounded(mended):
+    """Values on a lattice, some of whose crossed edges have hardly any slope."""
+    axes = np.meshgrid(*[np.linspace(-1, 1, 13)] * 3, indexing="ij")
+    values = (np.linalg.norm(np.stack(axes), axis=0) - 0.73).astype(np.float32)
+    if not mended:
+        inside = (values[:, :, 6:-1] < 0) & (values[:, :, 7:] > 0)  # Edges that point to the viewer.
+        x, y, z = np.argwhere(inside)[::2].T
+        values[x, y, z + 6], values[x, y, z + 7] = -1e-5, 1e-5
+    surface = rts.plugin("rts.surfaces", "isosurface")(((-1, -1, -1), (1, 1, 1)), motion="edge")
+
+    def scene(p):
+        return rts.Part(surface, {"values": constant(p, values) + p}, "normals"), EYE
+
+    return scene, np.zeros(()), {}
+
+
+def thin(mended):
+    """Wires of a third of a pixel, or of three pixels."""
+    width, wires = (3.0, 2) if mended else (0.3, 6)
+    found = [quad(-width / 2, width / 2, -11, 11) for _ in range(wires)]
+    vertices = np.concatenate([(v + [4.37 * i - 10, 0, 0]) @ SLANT.T for i, (v, _) in enumerate(found)])
+    faces = np.concatenate([f + 4 * i for i, (_, f) in enumerate(found)])
+    part = flat(vertices.astype(np.float32), faces.astype(np.int32), RED)
+    return lambda p: (moved(part, p), CAMERA), np.array([0.1]), {}
+
+
+def colors(mended):
+    """A texture of stripes, finer than pixels or coarser, on a card that fills the view."""
+    texture = np.zeros((96, 96, 3))
+    stripes = 6.1 if mended else 27.0
+    texture[:] = 0.5 + 0.4 * np.sin(np.arange(96) / 96 * stripes * 2 * np.pi)[None, :, None]
+    vertices, faces = quad(-30, 30, -30, 30)
+    theta = {"vertices": vertices, "uv": np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32), "texture": texture}
+    part = rts.Part(MESH(faces), theta, "textured")
+    return lambda p: (moved(part, p), CAMERA), np.array([0.1]), {}
+
+
+def numpy_transform(mended):
+    """A pose that goes through NumPy beside a colour that does not."""
+
+    def scene(p):
+        transform = rts.rigid(p["pose"])
+        if not mended:
+            transform = transform.detach().numpy()
+        vertices, faces = quad(-7.3, 6.4, -6.1, 8.2)
+        return rts.Part(MESH(faces), {"vertices": vertices, "color": p["color"]}, "unlit", transform), CAMERA
+
+    return scene, {"pose": np.array([0.0, 0, 0, 0.1, 0.2, 0]), "color": RED}, {}
+
+
+def all_numpy(mended):
+    """Vertices that go through NumPy, where nothing else has a derivative."""
+
+    def scene(p):
+        part = moved(NEAR, p)
+        vertices = part.theta["vertices"]
+        return part if mended else part.replace(theta={**part.theta, "vertices": vertices.detach().numpy()}), CAMERA
+
+    return scene, ZERO, {}
+
+
+def cut(mended):
+    """Vertices that are cut off from the parameters."""
+    return lambda p: (moved(NEAR, p if mended else engine_of(p).stop_gradient(p)), CAMERA), ZERO, {}
+
+
+def unused(mended):
+    start = {"shift": ZERO, "scale": np.array(1.5)}
+    return lambda p: (moved(NEAR, p["shift"] * p["scale"] if mended else p["shift"]), CAMERA), start, {}
+
+
+def gauge(mended):
+    """A colour and a gain that multiplies it."""
+
+    def scene(p):
+        color = p["color"] if mended else p["color"] * p["gain"]
+        return NEAR.replace(theta={"vertices": NEAR.theta["vertices"], "color": color}), CAMERA
+
+    color = {"color": np.array([0.5, 0.3, 0.2])}
+    return scene, color if mended else {**color, "gain": np.array(1.1)}, {}
+
+
+def depth(mended):
+    """How far away something is, without perspective and with it."""
+    part = card(-0.9, 0.8, -0.7, 0.9, 0.0, RED)
+    camera = EYE if mended else rts.Camera.orthographic((0, 0, 4), (0, 0, 0), height=3)
+    xp = rts.namespace
+    return lambda p: (moved(part, xp(p).stack([0 * p, 0 * p, p])), camera), np.array(0.0), {}
+
+
+def turning(mended):
+    """A smooth, round thing that turns about itself, or moves."""
+    vertices, faces = icosphere(3, radius=10.0)
+    vertices = vertices * np.array([1.0, 0.8, 0.7], np.float32)
+
+    def scene(p):
+        zero = 0 * p
+        pose = rts.namespace(p).stack(
+            [zero, zero, zero, p, zero, zero] if mended else [zero, p, zero, zero, zero, zero]
+        )
+        return flat(vertices, faces, RED, transform=rts.rigid(pose)), CAMERA
+
+    return scene, np.array(0.1), {"loss": lambda image: image[:, :16, 3].sum()}
+
+
+def crossing(mended):
+    """Two cards that pass through one another; one moves in depth."""
+    vertices, faces = quad(-13.2, 13.3, -9.4, 9.1)
+    tilted = vertices.copy()
+    tilted[:, 2] = 0.7 * tilted[:, 0] - (40 if mended else 0)
+    level = flat(vertices, faces, BLUE)
+    camera = rts.Camera.look_at((0, 0, 60), (0, 0, 0), fov_y=30, near=1, far=200)
+
+    def scene(p):
+        part = flat(tilted, faces, RED)
+        return [level, moved(part, rts.namespace(p).stack([0 * p, 0 * p, p]))], camera
+
+    return scene, np.array(0.3), {}
+
+
+SCENES = {
+    outside: "outside", behind: "outside", hidden: "hidden", hidden_by_itself: "hidden", culled: "culled",
+    layers: "layers", outlines: "outlines", reach: "reach", bounded: "bounded", thin: "thin", colors: "colors",
+    numpy_transform: "constant", all_numpy: "constant", cut: "constant", unused: "unused", gauge: "undetermined",
+    depth: "undetermined", turning: "bias", crossing: "crossing",
+}  # fmt: skip
+JAX = (cut, hidden, layers)
+
+
+def check(make, mended, target="torch-cpu", **options):
+    scene, start, given = make(mended)
+    return rts.check_gradient(scene, arrays(target, start), SIZE, **{**given, **options})
+
+
+CASES = [*((make, "torch-cpu") for make in SCENES), *((make, "jax") for make in JAX)]
