@@ -91,7 +91,14 @@ def layers(mended):
         card(-9.2 + i, 8.3 - i, -8.4, 8.1, 5 - 2 * i, c).replace(shader=glass) for i, c in enumerate([BLUE, GREEN])
     ]
     last = card(-5.3, 4.2, -4.4, 4.1, 0, RED).replace(shader=glass)
-    return lambda p: ([*panes, moved(last, p)], CAMERA), ZERO, {"layers": 4 if mended else 2}
+    return lambda p: ([*panes, moved(last, p)], CAMERA), ZERO, {"layers": 4 if mended else 2, "splatter": "multi"}
+
+
+def transparent(mended):
+    """A pane behind a pane, for which the default splatter is not made."""
+    panes = [card(-9.2, 8.3, -8.4, 8.1, 5, BLUE), card(-5.3, 4.2, -4.4, 4.1, 0, RED)]
+    panes = [p.replace(shader=glass) for p in panes]
+    return lambda p: ([panes[0], moved(panes[1], p)], CAMERA), ZERO, {"splatter": "multi"} if mended else {}
 
 
 def outlines(mended):
@@ -107,19 +114,18 @@ def reach(mended):
 
 
 def bounded(mended):
-    """Values on a lattice, some of whose crossed edges have hardly any slope."""
+    """Values on a lattice, some of whose crossed edges have hardly any slope: those across its right outline."""
     axes = np.meshgrid(*[np.linspace(-1, 1, 13)] * 3, indexing="ij")
     values = (np.linalg.norm(np.stack(axes), axis=0) - 0.73).astype(np.float32)
     if not mended:
-        inside = (values[:, :, 6:-1] < 0) & (values[:, :, 7:] > 0)  # Edges that point to the viewer.
-        x, y, z = np.argwhere(inside)[::2].T
-        values[x, y, z + 6], values[x, y, z + 7] = -1e-5, 1e-5
+        x, y, z = np.argwhere((values[6:-1] < 0) & (values[7:] > 0)).T
+        values[x + 6, y, z], values[x + 7, y, z] = -1e-5, 1e-5
     surface = rts.plugin("rts.surfaces", "isosurface")(((-1, -1, -1), (1, 1, 1)), motion="edge")
 
     def scene(p):
-        return rts.Part(surface, {"values": constant(p, values) + p}, "normals"), EYE
+        return rts.Part(surface, {"values": constant(p, values) + p}), EYE
 
-    return scene, np.zeros(()), {}
+    return scene, np.zeros(()), {"loss": lambda image: image[..., 3].sum()}
 
 
 def thin(mended):
@@ -133,10 +139,9 @@ def thin(mended):
 
 
 def colors(mended):
-    """A texture of stripes, finer than pixels or coarser, on a card that fills the view."""
-    texture = np.zeros((96, 96, 3))
-    stripes = 6.1 if mended else 27.0
-    texture[:] = 0.5 + 0.4 * np.sin(np.arange(96) / 96 * stripes * 2 * np.pi)[None, :, None]
+    """A texture of noise, finer than pixels or coarser, on a card that fills the view."""
+    count = 12 if mended else 150
+    texture = np.random.default_rng(1).uniform(size=(count, count, 3))
     vertices, faces = quad(-30, 30, -30, 30)
     theta = {"vertices": vertices, "uv": np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32), "texture": texture}
     part = rts.Part(MESH(faces), theta, "textured")
@@ -227,7 +232,7 @@ def crossing(mended):
 
 
 SCENES = {
-    outside: "outside", behind: "outside", hidden: "hidden", hidden_by_itself: "hidden", culled: "culled",
+    outside: "outside", behind: "outside", hidden: "hidden", hidden_by_itself: "hidden", culled: "culled", transparent: "transparent",
     layers: "layers", outlines: "outlines", reach: "reach", bounded: "bounded", thin: "thin", colors: "colors",
     numpy_transform: "constant", all_numpy: "constant", cut: "constant", unused: "unused", gauge: "undetermined",
     depth: "undetermined", turning: "bias", crossing: "crossing",

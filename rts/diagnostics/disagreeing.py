@@ -20,7 +20,7 @@ HALVED = 0.5
 NOISY, BETTER = 1.5, 0.8
 """So far above its noise the truth is believed; one that leaves no more than this, and less than that share of the
 error, names a reason, too."""
-LEFT = 0.2
+LEFT = 0.5
 """What remains of the error when the rest is explained, and is no longer looked into."""
 LARGE_SHARE = 0.3
 """Pixels of a kind name a reason if they hold so much of the disagreement."""
@@ -32,6 +32,8 @@ JUMP, FLAT = 0.05, 1e-3
 """Depth jumps where it changes, from cell to cell, by such a share of all depths' span, and such a share of depth."""
 ALIKE = 0.5
 """The baseline is off, too, if by this share of what the scene is off by."""
+SHORTER = 0.25
+"""The step of differences of fine colours, as a share of that of others."""
 AGAIN = 4
 """Samples a pixel, along each axis, that experiments take instead of one."""
 
@@ -130,6 +132,18 @@ def _outlines(case: _Case, touched: Touched) -> None:
         case.findings.append(Finding("outlines", because, advice, case.strong(before), case.gained(before)))
 
 
+def _transparent(case: _Case, touched: Touched) -> None:
+    """Shaders that are not opaque, beneath a splatter that lets nothing shine through."""
+    if case.setting.opaque or case.setting.options.get("splatter", "auto") == "multi":
+        return
+    before, advice = case.try_out(splatter="multi"), "Say splatter='multi'."
+    if before is None:
+        before, advice = case.try_out(splatter="multi", layers=DEEP), f"Say splatter='multi', layers={DEEP}."
+    if before is not None:
+        because = "shaders are not opaque, but the splatter shows the front of what it covers"
+        case.findings.append(Finding("transparent", because, advice, case.strong(before), case.gained(before)))
+
+
 def _layers(case: _Case, touched: Touched) -> None:
     layers = case.setting.options.get("layers", 2)
     if isinstance(layers, str) or layers >= DEEP:
@@ -190,33 +204,48 @@ def _crossing(case: _Case, touched: Touched) -> None:
     )
 
 
+def _colors(case: _Case, touched: Touched) -> None:
+    """Colours finer than pixels: what is off lies inside of surfaces, and more samples mend it."""
+    setting, number = case.setting, case.number
+    taken = setting.options.get("supersample", 1)
+    inside = ~_thin_and_outlines(setting, taken)[1]
+    if case.error.sharp[inside].sum() < LARGE_SHARE * case.error.sharp.sum():
+        return
+    step = number.slope.step * SHORTER  # Over a pixel, fine colours change to and fro.
+    after, before = (setting.engine.to_numpy(setting.hard(number.direction, by, FINE)) for by in (step / 2, -step / 2))
+    true, finer = (after.astype(np.float64) - before) / SHORTER, {**case.options, "supersample": _more(taken)}
+    pushed = setting.push(number.direction, **finer) * number.slope.step
+    was, left = (float(((x - true)[inside] ** 2).sum()) ** 0.5 for x in (case.pushed, pushed))
+    if left > HALVED * was:
+        return
+    because = f"colours change within a sample there ({_each(taken)}), inside of surfaces"
+    times = was / max(left, 1e-30)
+    advice = f"Blur them to the size of a pixel, or take more samples: with supersample={_more(taken)} "
+    _by_pixels(case, inside, "colors", because, f"{advice}it is {times:.2g} times better.", widen=0)
+
+
 def _samples(case: _Case, touched: Touched) -> None:
-    """Too few samples: for what is thin, for colours, or for other reasons."""
+    """Too few samples, for what is thin or for outlines."""
     taken = case.setting.options.get("supersample", 1)
-    before = case.try_out(supersample=AGAIN * taken if taken == 1 else 2 * taken)
+    before = case.try_out(supersample=_more(taken))
     if before is None:
         return
     gain, share = np.maximum(before.sharp - case.error.sharp, 0), case.gained(before)
-    thin, outlines = _thin_and_outlines(case.setting, taken)
-    strong, left = case.strong(before), 1.0
-    for kind, mask, because, advice in (
-        ("thin", thin, f"there the scene is thinner than a sample ({_each(taken)})", "Take more samples: "),
-        ("colors", ~outlines, f"there colours change within a sample ({_each(taken)}), inside of surfaces",
-         "Blur the texture to the size of a pixel, or take more samples: "),
-    ):  # fmt: skip
-        held = float(gain[mask].sum() / max(gain.sum(), 1e-30))
-        if held >= LARGE_SHARE:
-            advice += f"with supersample={case.options['supersample']} it is {_times(case, before)} better."
-            case.findings.append(Finding(kind, because, advice, strong & mask, share * held))
-            left -= held
-    if left > 1 - LARGE_SHARE:
-        because = f"{_each(taken)} is too few for its outlines"
-        advice = f"With supersample={case.options['supersample']} it is {_times(case, before)} better."
-        case.findings.append(Finding("samples", because, advice, strong & ~thin & outlines, share * left))
+    thin, strong = _thin_and_outlines(case.setting, taken)[0], case.strong(before)
+    better = f"with supersample={_more(taken)} it is {before.norm / max(case.error.norm, 1e-30):.2g} times better."
+    held = float(gain[thin].sum() / max(gain.sum(), 1e-30))
+    if held >= LARGE_SHARE:
+        because = f"the scene is thinner than a sample there ({_each(taken)})"
+        case.findings.append(Finding("thin", because, f"Take more samples: {better}", strong & thin, share * held))
+    if 1 - held >= LARGE_SHARE:
+        because = f"{_each(taken)} is too little for these outlines"
+        advice = better[0].upper() + better[1:]
+        case.findings.append(Finding("samples", because, advice, strong & ~thin, share * (1 - held)))
 
 
-def _times(case: _Case, before: _Error) -> str:
-    return f"{before.norm / max(case.error.norm, 1e-30):.2g} times"
+def _more(taken: int) -> int:
+    """Samples along each axis of a pixel, for an experiment with more of them."""
+    return AGAIN if taken == 1 else 2 * taken
 
 
 def _each(count: int) -> str:
@@ -255,13 +284,13 @@ def _thin_and_outlines(setting: Setting, taken: int) -> tuple[np.ndarray, np.nda
     return binary_dilation(pixels(thin, 0.1), iterations=3), binary_dilation(pixels(jumps, 0), iterations=2)
 
 
-def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str) -> None:
+def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str, widen: int = 2) -> None:
     """Name a reason if pixels around the mask hold much of what is left."""
     from scipy.ndimage import binary_dilation
 
     if not mask.any():
         return
-    near = binary_dilation(mask, iterations=2)
+    near = binary_dilation(mask, iterations=widen) if widen else mask
     energy = case.error.energy
     held = float(energy[near].sum() / max(energy.sum(), 1e-30))
     if held < LARGE_SHARE:
@@ -287,7 +316,10 @@ def _bias(case: _Case, touched: Touched) -> None:
                 f"a known bias of the library: its derivative image is off by {off:.0%} of its size, that of {told} by "
                 f"{theirs:.0%} (ratio {ratio})"
             )
-            advice = "Outlines move as the samples inside of them do: expect it where round things turn."
+            advice = (
+                "More samples a pixel lessen it where things shift; where round things turn, outlines move as the "
+                "samples inside of them do, and nothing helps but other views."
+            )
             case.findings.append(Finding("bias", because, advice, mask, share))
             return
         because = f"no experiment makes it agree; {told} is off by {theirs:.0%}, this by {off:.0%}"
@@ -304,9 +336,11 @@ def _off(pushed: np.ndarray, true: np.ndarray) -> float:
 EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
     _constants,
     _outlines,
+    _transparent,
     _layers,
     _crossing,
     _bounded,
+    _colors,
     _samples,
     _bias,
 )

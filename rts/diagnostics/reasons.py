@@ -17,12 +17,13 @@ KINDS = {
     "hidden": ("blue", (60, 110, 255)),
     "culled": ("sky blue", (90, 200, 255)),
     "outlines": ("red", (255, 40, 40)),
+    "transparent": ("cyan", (0, 255, 255)),
     "layers": ("magenta", (255, 60, 220)),
     "thin": ("yellow", (250, 230, 40)),
     "colors": ("green", (40, 200, 70)),
     "samples": ("olive", (150, 150, 30)),
     "bounded": ("violet", (150, 60, 255)),
-    "crossing": ("turquoise", (20, 220, 190)),
+    "crossing": ("teal", (0, 140, 130)),
     "bias": ("pink", (255, 150, 170)),
     "reach": ("brown", (170, 95, 30)),
     "undetermined": ("none", None),
@@ -36,6 +37,7 @@ KINDS = {
 - hidden: what it moves is behind something.
 - culled: what it moves is seen from behind, and cull="back".
 - outlines: the splatter gives outlines no derivative.
+- transparent: shaders are not opaque, and the splatter takes them to be.
 - layers: deeper than K layers.
 - thin: thinner than a sample.
 - colors: colours finer than pixels.

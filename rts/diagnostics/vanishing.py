@@ -59,7 +59,7 @@ def why_nothing(setting: Setting, number: Number, touched: Touched) -> list[Find
         because = f"what it changes of {what} is hidden behind {others}; alone it is seen"
         advice = "Move what hides it, take a view that shows it, or leave it out until it is seen."
         return [Finding("hidden", because, advice, mask)]
-    mask = trial.changed(variants.transparent, layers=DEEP)
+    mask = trial.changed(variants.transparent, layers=DEEP, splatter="multi")
     if mask.any():
         because = f"what it changes of {what} is hidden behind other parts of it; looked through, it is seen"
         return [Finding("hidden", because, "Take a view that shows it.", mask)]
