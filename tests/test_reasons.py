@@ -86,12 +86,21 @@ def glass(theta, gbuffer, camera):
 
 
 def layers(mended):
-    """The third of three panes of glass."""
-    panes = [
-        card(-9.2 + i, 8.3 - i, -8.4, 8.1, 5 - 2 * i, c).replace(shader=glass) for i, c in enumerate([BLUE, GREEN])
-    ]
-    last = card(-5.3, 4.2, -4.4, 4.1, 0, RED).replace(shader=glass)
-    return lambda p: ([*panes, moved(last, p)], CAMERA), ZERO, {"layers": 4 if mended else 2, "splatter": "multi"}
+    """A pane behind a pane."""
+    panes = [card(-9.2, 8.3, -8.4, 8.1, 5, BLUE), card(-5.3, 4.2, -4.4, 4.1, 0, RED)]
+    panes = [p.replace(shader=glass) for p in panes]
+    options = {"splatter": "multi", "layers": 2 if mended else 1}
+    return lambda p: ([panes[0], moved(panes[1], p)], CAMERA), ZERO, options
+
+
+def opaque_layers(mended):
+    """A closed box over a card, which is behind the back of the box."""
+    vertices, faces = box(1.0)
+    solid = flat(
+        (vertices @ np.array([[0.8, 0, -0.6], [0, 1, 0], [0.6, 0, 0.8]], np.float32) * 6) @ SLANT.T, faces, RED
+    )
+    behind = card(-15.2, 14.3, -13.4, 14.1, -30, BLUE)
+    return lambda p: ([moved(solid, p), behind], CAMERA), ZERO, {"layers": 3 if mended else 1}
 
 
 def transparent(mended):
@@ -232,11 +241,28 @@ def crossing(mended):
 
 
 SCENES = {
-    outside: "outside", behind: "outside", hidden: "hidden", hidden_by_itself: "hidden", culled: "culled", transparent: "transparent",
-    layers: "layers", outlines: "outlines", reach: "reach", bounded: "bounded", thin: "thin", colors: "colors",
-    numpy_transform: "constant", all_numpy: "constant", cut: "constant", unused: "unused", gauge: "undetermined",
-    depth: "undetermined", turning: "bias", crossing: "crossing",
-}  # fmt: skip
+    outside: "outside",
+    behind: "outside",
+    hidden: "hidden",
+    hidden_by_itself: "hidden",
+    culled: "culled",
+    outlines: "outlines",
+    transparent: "transparent",
+    layers: "layers",
+    opaque_layers: "layers",
+    reach: "reach",
+    bounded: "bounded",
+    thin: "thin",
+    colors: "colors",
+    numpy_transform: "constant",
+    all_numpy: "constant",
+    cut: "constant",
+    unused: "unused",
+    gauge: "undetermined",
+    depth: "undetermined",
+    turning: "bias",
+    crossing: "crossing",
+}
 JAX = (cut, hidden, layers)
 
 

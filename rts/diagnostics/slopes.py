@@ -171,7 +171,7 @@ class Setting:
         return self._pushed(direction, partial(self.drawn, change=change, **options))
 
     def step(
-        self, direction: Tree, change: Change | None = None, *, connect: bool = False, **given: Any
+        self, direction: Tree, change: Change | None = None, *, connect: bool = False, deep: bool = False, **given: Any
     ) -> float | None:
         """What `pixel_step` gives of a changed scene.
 
@@ -179,6 +179,7 @@ class Setting:
             direction: of the parameters.
             change: of the scene.
             connect: whether arrays that no derivative leads to move, too.
+            deep: whether to look at hidden layers, too.
             **given: options of `rts.render`.
         """
         one, unit, at = self._line(direction, connect)
@@ -186,7 +187,7 @@ class Setting:
         def image(t: Array, **options: Any) -> Array:
             return self.drawn(at(t), change, **{**given, **options})
 
-        return pixel_step(self.engine, image, one * 0, unit)
+        return pixel_step(self.engine, image, one * 0, unit, deep=deep)
 
     def _pushed(self, direction: Tree, draw: Callable[[tuple], Array]) -> np.ndarray:
         one, unit, at = self._line(direction)
@@ -364,7 +365,9 @@ def _step_of_hidden(setting: Setting, direction: Tree) -> float | None:
     def alone(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
         return [p for i, p in enumerate(parts) if kept is None or i in kept], camera
 
-    return setting.step(direction, alone, connect=connect, capacity=None) if touched.all else None
+    return (
+        setting.step(direction, alone, connect=connect, deep=True, layers=DEEP, capacity=None) if touched.all else None
+    )
 
 
 def is_floating(x: Array) -> bool:

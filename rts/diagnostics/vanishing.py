@@ -101,7 +101,7 @@ class _Trial:
         """(H, W) bool, the pixels that the number changes."""
         given = {"splatter": "auto", "background": None, "capacity": None, "supersample": 1, **options}
         direction = self.number.direction
-        step = self.setting.step(direction, change, **given) or self.number.slope.step
+        step = self.setting.step(direction, change, deep=True, **given) or self.number.slope.step
         pushed = self.setting.push(direction, change, **given) * step
         return np.abs(pushed).max(axis=-1) > QUIET
 
