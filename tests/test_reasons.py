@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers import arrays, icosphere, quad
+from helpers import arrays, box, icosphere, quad
 
 import rts
 from rts.engines import engine_of
@@ -263,7 +263,8 @@ SCENES = {
     turning: "bias",
     crossing: "crossing",
 }
-JAX = (cut, hidden, layers)
+JAX = (cut, hidden, thin)
+CASES = [*((make, "torch-cpu") for make in SCENES), *((make, "jax") for make in JAX)]
 
 
 def check(make, mended, target="torch-cpu", **options):
@@ -271,4 +272,105 @@ def check(make, mended, target="torch-cpu", **options):
     return rts.check_gradient(scene, arrays(target, start), SIZE, **{**given, **options})
 
 
-CASES = [*((make, "torch-cpu") for make in SCENES), *((make, "jax") for make in JAX)]
+@pytest.mark.parametrize("make, target", CASES)
+def test_what_is_broken_is_named(make, target):
+    found = check(make, mended=False, target=target)
+    named = [r for r in found.reasons if r.kind == SCENES[make]]
+    assert named and found.reasons[0].kind == SCENES[make]
+    assert all(r.kind in KINDS for r in found.reasons) and not found.note
+    for reason in named:
+        assert reason.text in str(found)
+        if reason.color != "none" and reason.pixels.any():
+            assert f"{reason.color} = {reason.kind}" in str(found)
+
+
+@pytest.mark.parametrize("make, target", CASES)
+def test_what_is_mended_is_not_named(make, target):
+    assert SCENES[make] not in {r.kind for r in check(make, mended=True, target=target).reasons}
+
+
+def test_a_gradient_that_agrees_needs_no_reason():
+    found = check(culled, mended=True)
+    assert found.ok and found.reasons == [] and "picture" not in str(found)
+
+
+def test_the_text_names_what_is_changed_where_and_what_to_do():
+    (found,) = check(all_numpy, mended=False).reasons
+    assert found.parameters == ["parameters[0]", "parameters[1]"]
+    assert "part 0's theta.vertices changes with it, but is NumPy" in found.text
+    assert f"{found.pixels.sum()} pixels, 100% of the disagreement" in found.text
+    assert "torch arrays throughout" in found.text
+    (found,) = check(outside, mended=False).reasons
+    assert "part 0 lies outside of the view, beyond its right edge" in found.text and not found.pixels.any()
+    (found,) = check(gauge, mended=False).reasons
+    assert "with" in found.text and "gain" not in found.parameters and "color[0]" in found.text
+
+
+def test_the_advice_on_layers_is_enough():
+    found = check(layers, mended=False)
+    assert "Raise layers to 2" in found.reasons[0].text
+    assert not check(layers, mended=False, layers=2).reasons
+
+
+def test_pixels_are_where_the_derivatives_disagree():
+    found = check(outlines, mended=False)
+    (reason,) = found.reasons
+    inside = np.zeros(SIZE, bool)
+    inside[12:18, 13:18] = True
+    assert reason.pixels.any() and not (reason.pixels & inside).any()
+    on = found.picture[reason.pixels]
+    assert found.picture.shape == (*SIZE, 3) and (on[:, 0] > 5 * on[:, 1]).all()  # Red, as the legend says.
+    assert np.ptp(found.picture[inside], axis=-1).max() < 1e-6  # Grey.
+
+
+def test_a_picture_can_be_saved(tmp_path):
+    from PIL import Image
+
+    rts.save_image(tmp_path / "why.png", check(hidden, mended=False).picture)
+    pixels = np.asarray(Image.open(tmp_path / "why.png"))
+    assert tuple(KINDS["hidden"][1]) in set(map(tuple, pixels.reshape(-1, 3)))
+
+
+def test_shares_tell_what_explains_most():
+    """A splatter without outlines, and wires that are thinner than a sample."""
+    found = check(thin, mended=False, splatter="none")
+    kinds = [r.kind for r in found.reasons]
+    assert "outlines" in kinds or "thin" in kinds
+    assert found.reasons[0].text.count("%") >= 1
+
+
+def test_a_budget_that_is_spent_is_told():
+    begun = time.perf_counter()
+    found = check(numpy_transform, mended=False, budget_s=1e-3)
+    assert time.perf_counter() - begun < 10
+    assert len(found.slopes) == 1 and "1 of 9 numbers were looked at" in found.note and found.note in str(found)
+    assert "reasons were not looked for in 1" in found.note and not found.reasons
+
+
+def test_progress_is_shown_where_it_is_wanted(capsys):
+    check(culled, mended=False, progress=True)
+    told = capsys.readouterr().err
+    assert "derivatives" in told and "reasons" in told
+    check(culled, mended=False)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"budget_s": 0}, "budget_s is 0; expected a positive number of seconds"),
+        ({"budget_s": "60"}, "budget_s is '60'; expected a positive number"),
+        ({"budget_s": float("nan")}, "budget_s is nan; expected a positive number"),
+        ({"budget_s": True}, "budget_s is True; expected a positive number"),
+        ({"progress": "yes"}, "progress is 'yes'; expected True, False, or None"),
+    ],
+)
+def test_bad_budgets_are_refused(change, said):
+    with pytest.raises(rts.InputError, match=said) as error:
+        check(culled, mended=True, **change)
+    assert "\n" not in str(error.value)
+
+
+def test_colours_of_kinds_are_distinct():
+    used = [color for _, color in KINDS.values() if color is not None]
+    assert len(set(used)) == len(used) and len(KINDS) == len({name for name, _ in KINDS.values()} - {"none"}) + 3

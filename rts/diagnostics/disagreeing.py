@@ -157,7 +157,7 @@ def _layers(case: _Case, touched: Touched) -> None:
         if _Error.of(pushed, case.number.true).norm <= max(1.1 * case.error.norm, HALVED * before.norm):
             enough = count
             break
-    because = f"it shows deeper than the {layers} layer{'s' if layers > 1 else ''} that are kept"
+    because = f"what it changes, or uncovers, lies deeper than the K = {layers} layers that are kept"
     advice = f"Raise layers to {enough}, or say layers='auto'." if case.setting.opaque else f"Raise layers to {enough}."
     case.findings.append(Finding("layers", because, advice, mask, share))
 
