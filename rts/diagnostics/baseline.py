@@ -13,7 +13,7 @@ from rts.camera import Camera
 from rts.diagnostics import variants
 from rts.diagnostics.comparison.shapes import box, icosphere, unlit
 from rts.diagnostics.slopes import Number, Setting, measured
-from rts.engines import namespace
+from rts.engines import engine_of, namespace
 from rts.interfaces import Part
 from rts.trees import Tree, leaves, map_leaves
 
@@ -85,7 +85,7 @@ def nearest(
 
 def _shapes(position: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.ndarray]]:
     """A sphere and a box about points (N, 3) that are seen from a camera: vertices and faces, world space."""
-    view = np.asarray(_host(camera.view), np.float64)
+    view = np.asarray(engine_of(camera.view).to_numpy(camera.view), np.float64)
     local = position @ view[:3, :3].T + view[:3, 3]
     low, high = np.percentile(local, 1, axis=0), np.percentile(local, 99, axis=0)
     half, middle = (high - low) / 2, (high + low) / 2
@@ -117,9 +117,3 @@ def _scene(
             theta={**part.theta, "vertices": engine.constant(vertices, by) + by * engine.constant(velocity, by)}
         )
     return part, camera
-
-
-def _host(x: Any) -> np.ndarray:
-    from rts.engines import engine_of
-
-    return engine_of(x).to_numpy(x)

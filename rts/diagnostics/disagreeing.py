@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from rts.diagnostics.comparison.scores import low_pass
 from rts.diagnostics.reasons import Finding
 from rts.diagnostics.slopes import DEEP, Number, Setting, Touched
 from rts.diagnostics.vanishing import why_constant
+from rts.engines import engine_of
 from rts.rendering import sample
 
 HALVED = 0.5
@@ -26,14 +28,16 @@ LARGE_SHARE = 0.3
 """Pixels of a kind name a reason if they hold so much of the disagreement."""
 STRONG = 0.1
 """A pixel disagrees if it is off by this share of the pixel that is most."""
-FINE = 8
-"""Cells along each side of a pixel, to see what is thinner than a sample."""
+FINE, CELLS = 8, 2**22
+"""Cells along each side of a sample, to see what is thinner; fewer where there would be more than so many in all."""
 JUMP, FLAT = 0.05, 1e-3
 """Depth jumps where it changes, from cell to cell, by such a share of all depths' span, and such a share of depth."""
+CORNER = 0.1
+"""The share of a pixel that the disk may leave of corners, without anything being thin there."""
 ALIKE = 0.5
 """The baseline is off, too, if by this share of what the scene is off by."""
-SHORTER = 0.25
-"""The step of differences of fine colours, as a share of that of others."""
+SHORTER, DENSE = 0.25, 8
+"""The step of differences of fine colours, as a share of that of others; the square root of their samples a pixel."""
 AGAIN = 4
 """Samples a pixel, along each axis, that experiments take instead of one."""
 
@@ -187,7 +191,7 @@ def _crossing(case: _Case, touched: Touched) -> None:
     parts, camera = setting.shown(setting.parameters)
     sampled = sample(parts, camera, setting.size, layers=2, sampler=setting.options.get("sampler", "auto"))
     apron = sampled.apron
-    part = setting.engine.to_numpy(sampled.part) if setting.engine.owns(sampled.row) else np.asarray(sampled.part)
+    part = _on_host(sampled.part)
     front, second = part[0], part[1] if len(part) > 1 else np.full_like(part[0], -1)
     mask = np.zeros(front.shape, bool)
     for axis in (0, 1):
@@ -208,11 +212,11 @@ def _colors(case: _Case, touched: Touched) -> None:
     """Colours finer than pixels: what is off lies inside of surfaces, and more samples mend it."""
     setting, number = case.setting, case.number
     taken = setting.options.get("supersample", 1)
-    inside = ~_thin_and_outlines(setting, taken)[1]
+    inside = ~_thin_and_outlines(setting)[1]
     if case.error.sharp[inside].sum() < LARGE_SHARE * case.error.sharp.sum():
         return
     step = number.slope.step * SHORTER  # Over a pixel, fine colours change to and fro.
-    after, before = (setting.engine.to_numpy(setting.hard(number.direction, by, FINE)) for by in (step / 2, -step / 2))
+    after, before = (setting.engine.to_numpy(setting.hard(number.direction, by, DENSE)) for by in (step / 2, -step / 2))
     true, finer = (after.astype(np.float64) - before) / SHORTER, {**case.options, "supersample": _more(taken)}
     pushed = setting.push(number.direction, **finer) * number.slope.step
     was, left = (float(((x - true)[inside] ** 2).sum()) ** 0.5 for x in (case.pushed, pushed))
@@ -231,7 +235,7 @@ def _samples(case: _Case, touched: Touched) -> None:
     if before is None:
         return
     gain, share = np.maximum(before.sharp - case.error.sharp, 0), case.gained(before)
-    thin, strong = _thin_and_outlines(case.setting, taken)[0], case.strong(before)
+    thin, strong = _thin_and_outlines(case.setting)[0], case.strong(before)
     better = f"with supersample={_more(taken)} it is {before.norm / max(case.error.norm, 1e-30):.2g} times better."
     held = float(gain[thin].sum() / max(gain.sum(), 1e-30))
     if held >= LARGE_SHARE:
@@ -252,36 +256,45 @@ def _each(count: int) -> str:
     return "one sample a pixel" if count == 1 else f"{count} × {count} samples a pixel"
 
 
-def _thin_and_outlines(setting: Setting, taken: int) -> tuple[np.ndarray, np.ndarray]:
+_MAPS: WeakKeyDictionary[Setting, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
+
+
+def _thin_and_outlines(setting: Setting) -> tuple[np.ndarray, np.ndarray]:
     """The pixels (H, W) bool around what is thinner than a sample, and those around outlines."""
+    if setting not in _MAPS:
+        _MAPS[setting] = _map(setting)
+    return _MAPS[setting]
+
+
+def _map(setting: Setting) -> tuple[np.ndarray, np.ndarray]:
     from scipy.ndimage import binary_dilation, binary_opening
 
+    (height, width), taken = setting.size, setting.options.get("supersample", 1)
+    across = min(FINE, max(2, int((CELLS / (height * width)) ** 0.5 / taken)))  # Cells a sample.
+    fine = across * taken
     parts, camera = setting.shown(setting.parameters)
-    fine = FINE * taken
-    found = sample(
-        parts, camera, setting.size, layers=1, supersample=fine, sampler=setting.options.get("sampler", "auto")
-    )
+    sampler = setting.options.get("sampler", "auto")
+    found = sample(parts, camera, setting.size, layers=1, supersample=fine, sampler=sampler)
     apron = found.apron
-    to_numpy = setting.engine.to_numpy if setting.engine.owns(found.row) else np.asarray
-    part, depth = (to_numpy(x)[0, apron:-apron, apron:-apron] for x in (found.part, found.depth))
+    part, depth = (_on_host(x)[0, apron:-apron, apron:-apron] for x in (found.part, found.depth))
     jump = max(JUMP * np.ptp(depth[part >= 0]), FLAT * depth.max()) if (part >= 0).any() else 0.0
-    along = np.hypot(*np.indices((FINE, FINE)) - (FINE - 1) / 2) <= FINE / 2 - 0.5  # A disk as wide as a sample.
-    thin = np.zeros(part.shape, bool)
+    disk = np.hypot(*np.indices((across, across)) - (across - 1) / 2) <= across / 2 - 0.5  # As wide as a sample.
+    thin, jumps = np.zeros(part.shape, bool), np.zeros(part.shape, bool)
     for index in np.unique(part):
-        mask = np.pad(part == index, FINE, mode="edge")
-        thin |= (mask & ~binary_opening(mask, along))[FINE:-FINE, FINE:-FINE]
-    jumps = np.zeros(part.shape, bool)
+        mask = np.pad(part == index, across, mode="edge")
+        thin |= (mask & ~binary_opening(mask, disk))[across:-across, across:-across]
     for axis in (0, 1):
-        step = np.abs(np.diff(depth, axis=axis)) > jump
-        change = (np.diff(part, axis=axis) != 0) | step
+        change = (np.diff(part, axis=axis) != 0) | (np.abs(np.diff(depth, axis=axis)) > jump)
         jumps |= np.pad(change, [(0, 1) if i == axis else (0, 0) for i in (0, 1)])
-    height, width = setting.size
 
     def pixels(mask: np.ndarray, least: float) -> np.ndarray:
         return mask.reshape(height, fine, width, fine).mean(axis=(1, 3)) > least
 
-    # A corner that a disk does not reach into is less than a twentieth of a sample.
-    return binary_dilation(pixels(thin, 0.1), iterations=3), binary_dilation(pixels(jumps, 0), iterations=2)
+    return binary_dilation(pixels(thin, CORNER), iterations=3), binary_dilation(pixels(jumps, 0), iterations=2)
+
+
+def _on_host(x: Any) -> np.ndarray:
+    return engine_of(x).to_numpy(x)
 
 
 def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str, widen: int = 2) -> None:

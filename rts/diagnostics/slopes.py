@@ -102,7 +102,7 @@ class Touched(NamedTuple):
         return None if None in found else sorted(p for p in found if p is not None)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Setting:
     """What is looked at: a scene, how it is rendered, and its loss.
 
