@@ -22,7 +22,7 @@ HALVED = 0.5
 NOISY, BETTER = 1.5, 0.8
 """So far above its noise the truth is believed; one that leaves no more than this, and less than that share of the
 error, names a reason, too."""
-LEFT = 0.5
+LEFT = 0.3
 """What remains of the error when the rest is explained, and is no longer looked into."""
 LARGE_SHARE = 0.3
 """Pixels of a kind name a reason if they hold so much of the disagreement."""
@@ -317,6 +317,8 @@ def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: s
 
 def _bias(case: _Case, touched: Touched) -> None:
     """What the nearest built-in configuration shows, too; or nothing that is known."""
+    if case.findings and case.error.norm < HALVED * case.whole.norm:
+        return
     off = _off(case.pushed, case.number.true)
     mask, share = case.strong(case.error), case.error.norm**2 / case.whole.norm**2
     found = nearest(case.setting, case.number, touched.parts, case.options)
