@@ -61,6 +61,11 @@ class _Error(NamedTuple):
         image = low_pass(pushed - true)
         return cls(image, float(np.linalg.norm(image)), ((pushed - true) ** 2).sum(axis=-1))
 
+    def within(self, mask: np.ndarray) -> _Error:
+        """That of some pixels (H, W) bool."""
+        image = self.image * mask[..., None]
+        return _Error(image, float(np.linalg.norm(image)), self.sharp * mask)
+
     @property
     def energy(self) -> np.ndarray:
         """(H, W)."""
@@ -76,6 +81,7 @@ class _Case:
         options: of `rts.render`, those of the experiments that helped.
         pushed: the derivative with these.
         error: of this.
+        left: (H, W) bool, the pixels that are not explained.
         noise: of the truth, as `error.norm`.
         whole: the error at first.
         findings: what was found.
@@ -87,6 +93,7 @@ class _Case:
         self.pushed = number.pushed
         self.whole = self.error = _Error.of(number.pushed, number.true)
         self.noise = float(np.linalg.norm(low_pass(number.noise)))
+        self.left = np.ones(setting.size, bool)
         self.findings: list[Finding] = []
 
     @property
@@ -104,7 +111,7 @@ class _Case:
         """The error before, if options make it much smaller, which are kept then; else None."""
         changed = {**self.options, **options}
         pushed = self.setting.push(self.number.direction, **changed) * self.number.slope.step
-        error, before = _Error.of(pushed, self.number.true), self.error
+        error, before = _Error.of(pushed, self.number.true).within(self.left), self.error
         least = NOISY * self.noise
         if error.norm > HALVED * before.norm and not (error.norm < least and error.norm < BETTER * before.norm):
             return None
@@ -158,7 +165,9 @@ def _layers(case: _Case, touched: Touched) -> None:
     mask, share, enough = case.strong(before), case.gained(before), DEEP
     for count in range(layers + 1, DEEP):
         pushed = case.setting.push(case.number.direction, **{**case.options, "layers": count}) * case.number.slope.step
-        if _Error.of(pushed, case.number.true).norm <= max(1.1 * case.error.norm, HALVED * before.norm):
+        if _Error.of(pushed, case.number.true).within(case.left).norm <= max(
+            1.1 * case.error.norm, HALVED * before.norm
+        ):
             enough = count
             break
     because = f"what it changes, or uncovers, lies deeper than the K = {layers} layers that are kept"
@@ -310,9 +319,8 @@ def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: s
         return
     share = held * case.error.norm**2 / case.whole.norm**2
     case.findings.append(Finding(kind, because, advice, near & case.strong(case.error), share))
-    # What they hold is explained.
-    image = case.error.image * ~near[..., None]
-    case.error = _Error(image, float(np.linalg.norm(image)), case.error.sharp * ~near)
+    case.left &= ~near
+    case.error = case.error.within(case.left)
 
 
 def _bias(case: _Case, touched: Touched) -> None:
