@@ -266,7 +266,7 @@ SCENES = {
     turning: "bias",
     crossing: "crossing",
 }
-JAX = (cut, hidden, thin)
+JAX = (cut, culled, outlines)
 CASES = [*((make, "torch-cpu") for make in SCENES), *((make, "jax") for make in JAX)]
 
 
