@@ -1,4 +1,4 @@
-"""The same derivative of the nearest configuration that is known well: a sphere or a box that moves alike."""
+"""A derivative of the nearest configuration that is known well: a sphere or a box that moves alike."""
 
 from __future__ import annotations
 
