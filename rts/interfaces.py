@@ -97,7 +97,7 @@ class Surface(Evaluator):
         return ()
 
     def unbounded(self) -> Surface | None:
-        """The same surface without bounds on its derivatives; None where it has none, which is the default.
+        """This surface without bounds on its derivatives; None where it has none, which is the default.
 
         `rts.check_gradient` looks at it, to tell whether such a bound is why a gradient is off.
         """

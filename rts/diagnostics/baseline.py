@@ -18,7 +18,7 @@ from rts.interfaces import Part
 from rts.trees import Tree, leaves, map_leaves
 
 SUBDIVISIONS = 4
-"""Of the sphere."""
+"""How often the sphere is subdivided."""
 FEWEST = 8
 """Pixels of an object of which a sphere or a box can be made."""
 SAMPLES = 8

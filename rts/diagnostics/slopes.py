@@ -261,7 +261,7 @@ class Setting:
 
     @cached_property
     def _gradients(self) -> dict[Place, list[np.ndarray]]:
-        """Of each array of the engine that some derivative leads to, that of a random sum of it in the parameters."""
+        """For each array that some derivative leads to, the gradient of a random sum of it in the parameters."""
         engine, found = self.engine, {}
         places, arrays = self._arrays(self.shown(self.parameters))
         for k, (place, x) in enumerate(zip(places, arrays, strict=True)):
