@@ -291,7 +291,8 @@ def _map(setting: Setting) -> tuple[np.ndarray, np.ndarray]:
     thin, jumps = np.zeros(part.shape, bool), np.zeros(part.shape, bool)
     for index in np.unique(part):
         mask = np.pad(part == index, across, mode="edge")
-        thin |= (mask & ~binary_opening(mask, disk))[across:-across, across:-across]
+        opened: Any = binary_opening(mask, disk)
+        thin |= (mask & ~opened)[across:-across, across:-across]
     for axis in (0, 1):
         change = (np.diff(part, axis=axis) != 0) | (np.abs(np.diff(depth, axis=axis)) > jump)
         jumps |= np.pad(change, [(0, 1) if i == axis else (0, 0) for i in (0, 1)])
@@ -312,7 +313,7 @@ def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: s
 
     if not mask.any():
         return
-    near = binary_dilation(mask, iterations=widen) if widen else mask
+    near: Any = binary_dilation(mask, iterations=widen) if widen else mask
     energy = case.error.energy
     held = float(energy[near].sum() / max(energy.sum(), 1e-30))
     if held < LARGE_SHARE:
