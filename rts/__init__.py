@@ -4,6 +4,7 @@ Find where camera rays meet a surface with any ordinary renderer; evaluate the s
 differentiate only that.
 """
 
+from rts import regularizers
 from rts.adapting import unwrapped
 from rts.camera import Camera
 from rts.diagnostics.gradients import check_gradient, gradient_image
@@ -110,6 +111,7 @@ __all__ = [
     "plugin",
     "plugins",
     "prepare",
+    "regularizers",
     "render",
     "render_samples",
     "rigid",

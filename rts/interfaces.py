@@ -96,6 +96,13 @@ class Surface(Evaluator):
         """
         return ()
 
+    def unbounded(self) -> Surface | None:
+        """This surface without bounds on its derivatives; None where it has none, which is the default.
+
+        `rts.check_gradient` looks at it, to tell whether such a bound is why a gradient is off.
+        """
+        return None
+
     @classmethod
     def example(cls) -> Part | None:
         """A small part to try the surface with, or None.

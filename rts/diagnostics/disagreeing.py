@@ -1,0 +1,396 @@
+"""Why the derivative of an image disagrees with the truth: experiments that make it agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from rts.diagnostics import variants
+from rts.diagnostics.baseline import nearest
+from rts.diagnostics.comparison.scores import low_pass
+from rts.diagnostics.reasons import Finding
+from rts.diagnostics.slopes import DEEP, Number, Setting, Touched
+from rts.diagnostics.vanishing import why_constant
+from rts.engines import engine_of
+from rts.rendering import sample
+
+HALVED = 0.5
+"""An experiment names a reason if it leaves less than this share of the error."""
+NOISY, BETTER = 1.5, 0.8
+"""So far above its noise the truth is believed; one that leaves no more than this, and less than that share of the
+error, names a reason, too."""
+LEFT = 0.3
+"""What remains of the error when the rest is explained, and is no longer looked into."""
+LARGE_SHARE = 0.3
+"""Pixels of a kind name a reason if they hold so much of the disagreement."""
+STRONG = 0.1
+"""A pixel disagrees if it is off by this share of the pixel that is most."""
+FINE, CELLS = 8, 2**22
+"""Cells along each side of a sample, to see what is thinner; fewer where there would be more than so many in all."""
+JUMP, FLAT = 0.05, 1e-3
+"""Depth jumps where it changes, from cell to cell, by such a share of all depths' span, and such a share of depth."""
+CORNER = 0.1
+"""The share of a pixel that the disk may leave of corners, without anything being thin there."""
+ALIKE = 0.5
+"""The baseline is off, too, if by this share of what the scene is off by."""
+SHORTER, DENSE = 0.25, 8
+"""The step of differences of fine colours, as a share of that of others; the square root of their samples a pixel."""
+AGAIN = 4
+"""Samples a pixel, along each axis, that experiments take instead of one."""
+
+
+class _Error(NamedTuple):
+    """By how much a derivative image is off the truth.
+
+    Attributes:
+        image: (H, W, 4), through the low-pass of `scores`.
+        norm: of it.
+        sharp: (H, W), its energy without the low-pass.
+    """
+
+    image: np.ndarray
+    norm: float
+    sharp: np.ndarray
+
+    @classmethod
+    def of(cls, pushed: np.ndarray, true: np.ndarray) -> _Error:
+        """The error of a derivative image."""
+        image = low_pass(pushed - true)
+        return cls(image, float(np.linalg.norm(image)), ((pushed - true) ** 2).sum(axis=-1))
+
+    def within(self, mask: np.ndarray) -> _Error:
+        """That of some pixels (H, W) bool."""
+        image = self.image * mask[..., None]
+        return _Error(image, float(np.linalg.norm(image)), self.sharp * mask)
+
+    @property
+    def energy(self) -> np.ndarray:
+        """(H, W)."""
+        return (self.image**2).sum(axis=-1)
+
+
+class _Case:
+    """A number whose derivatives disagree, and how far it has been explained.
+
+    Attributes:
+        setting: what is looked at.
+        number: the number.
+        options: of `rts.render`, those of the experiments that helped.
+        pushed: the derivative with these.
+        error: of this.
+        left: (H, W) bool, the pixels that are not explained.
+        noise: of the truth, as `error.norm`.
+        whole: the error at first.
+        findings: what was found.
+    """
+
+    def __init__(self, setting: Setting, number: Number):
+        self.setting, self.number = setting, number
+        self.options: dict[str, Any] = {"capacity": None}
+        self.pushed = number.pushed
+        self.whole = self.error = _Error.of(number.pushed, number.true)
+        self.noise = float(np.linalg.norm(low_pass(number.noise)))
+        self.left = np.ones(setting.size, bool)
+        self.findings: list[Finding] = []
+
+    @property
+    def open(self) -> bool:
+        """Whether something is left to explain."""
+        return self.error.norm > max(NOISY * self.noise, LEFT * self.whole.norm)
+
+    def strong(self, error: _Error) -> np.ndarray:
+        """(H, W) bool, the pixels that disagree most."""
+        size = np.abs(self.number.pushed - self.number.true).max(axis=-1)
+        energy = error.energy
+        return (size > STRONG * size.max()) & (energy > STRONG**2 * energy.max())
+
+    def try_out(self, **options: Any) -> _Error | None:
+        """The error before, if options make it much smaller, which are kept then; else None."""
+        changed = {**self.options, **options}
+        pushed = self.setting.push(self.number.direction, **changed) * self.number.slope.step
+        error, before = _Error.of(pushed, self.number.true).within(self.left), self.error
+        least = NOISY * self.noise
+        if error.norm > HALVED * before.norm and not (error.norm < least and error.norm < BETTER * before.norm):
+            return None
+        self.options, self.pushed, self.error = changed, pushed, error
+        return before
+
+    def gained(self, before: _Error) -> float:
+        """Which share of the whole went with the last experiment."""
+        return (before.norm**2 - self.error.norm**2) / self.whole.norm**2
+
+
+def _constants(case: _Case, touched: Touched) -> None:
+    found = why_constant(case.setting, touched)
+    everything = len(touched.all) == len(touched.constant) + len(touched.cut)
+    mask, share = case.strong(case.whole), 1.0 if everything and not case.number.pushed.any() else None
+    case.findings += [f._replace(mask=mask, share=share) for f in found]
+
+
+def _outlines(case: _Case, touched: Touched) -> None:
+    """A splatter that gives outlines no derivative, or hides what a better one shows."""
+    splatter = case.setting.options.get("splatter", "auto")
+    if splatter in ("auto", "visible"):
+        return
+    before = case.try_out(splatter="visible")
+    if before is not None:
+        told = f"splatter={splatter!r}" if isinstance(splatter, str) else f"the splatter {type(splatter).__name__}"
+        because = f"{told} has not the derivative of outlines that 'visible' has"
+        advice = "Leave out splatter=, or say 'visible'."
+        case.findings.append(Finding("outlines", because, advice, case.strong(before), case.gained(before)))
+
+
+def _transparent(case: _Case, touched: Touched) -> None:
+    """Shaders that are not opaque, beneath a splatter that lets nothing shine through."""
+    if case.setting.opaque or case.setting.options.get("splatter", "auto") == "multi":
+        return
+    before, advice = case.try_out(splatter="multi"), "Say splatter='multi'."
+    if before is None:
+        before, advice = case.try_out(splatter="multi", layers=DEEP), f"Say splatter='multi', layers={DEEP}."
+    if before is not None:
+        because = "shaders are not opaque, but the splatter shows the front of what it covers"
+        case.findings.append(Finding("transparent", because, advice, case.strong(before), case.gained(before)))
+
+
+def _layers(case: _Case, touched: Touched) -> None:
+    layers = case.setting.options.get("layers", 2)
+    if isinstance(layers, str) or layers >= DEEP:
+        return
+    before = case.try_out(layers=DEEP)
+    if before is None:
+        return
+    mask, share, enough = case.strong(before), case.gained(before), DEEP
+    for count in range(layers + 1, DEEP):
+        pushed = case.setting.push(case.number.direction, **{**case.options, "layers": count}) * case.number.slope.step
+        if _Error.of(pushed, case.number.true).within(case.left).norm <= max(
+            1.1 * case.error.norm, HALVED * before.norm
+        ):
+            enough = count
+            break
+    because = f"what it changes, or uncovers, lies deeper than the K = {layers} layers that are kept"
+    advice = f"Raise layers to {enough}, or say layers='auto'." if case.setting.opaque else f"Raise layers to {enough}."
+    case.findings.append(Finding("layers", because, advice, mask, share))
+
+
+def _bounded(case: _Case, touched: Touched) -> None:
+    """Surfaces that bound derivatives where they are near-singular."""
+    if all(part.surface.unbounded() is None for part in case.setting.parts):
+        return
+    pushed = case.setting.push(case.number.direction, variants.unbounded, **case.options) * case.number.slope.step
+    change = np.nan_to_num(np.abs(pushed - case.pushed), nan=np.inf, posinf=np.inf).max(axis=-1)
+    mask = change > STRONG * max(np.abs(case.number.true).max(), np.abs(case.pushed).max())
+    _by_pixels(
+        case,
+        mask,
+        "bounded",
+        "field values at the ends of lattice edges are so nearly alike there that crossings move without bound; the "
+        "surface bounds their derivative",
+        "Smooth the field, or take motion='normal' or near_singular='drop'.",
+    )
+
+
+def _crossing(case: _Case, touched: Touched) -> None:
+    """Lines where parts pass through one another."""
+    setting = case.setting
+    if len(setting.parts) < 2:
+        return
+    parts, camera = setting.shown(setting.parameters)
+    sampled = sample(parts, camera, setting.size, layers=2, sampler=setting.options.get("sampler", "auto"))
+    apron = sampled.apron
+    part = _on_host(sampled.part)
+    front, second = part[0], part[1] if len(part) > 1 else np.full_like(part[0], -1)
+    mask = np.zeros(front.shape, bool)
+    for axis in (0, 1):
+        a, b = (tuple(slice(s, n) if i == axis else slice(None) for i in (0, 1)) for s, n in ((0, -1), (1, None)))
+        swaps = (front[a] != front[b]) & (front[a] == second[b]) & (second[a] == front[b]) & (second[a] >= 0)
+        mask[a] |= swaps
+        mask[b] |= swaps
+    _by_pixels(
+        case,
+        mask[apron:-apron, apron:-apron],
+        "crossing",
+        "parts pass through one another there, and their line of crossing moves otherwise than either",
+        "Part them, or model the line as an edge of both.",
+    )
+
+
+def _colors(case: _Case, touched: Touched) -> None:
+    """Colours finer than pixels: what is off lies inside of surfaces, and more samples mend it."""
+    setting, number = case.setting, case.number
+    taken = setting.options.get("supersample", 1)
+    inside = ~_thin_and_outlines(setting)[1]
+    if case.error.sharp[inside].sum() < LARGE_SHARE * case.error.sharp.sum():
+        return
+    step = number.slope.step * SHORTER  # Over a pixel, fine colours change to and fro.
+    after, before = (setting.engine.to_numpy(setting.hard(number.direction, by, DENSE)) for by in (step / 2, -step / 2))
+    true, finer = (after.astype(np.float64) - before) / SHORTER, {**case.options, "supersample": _more(taken)}
+    pushed = setting.push(number.direction, **finer) * number.slope.step
+    was, left = (float(((x - true)[inside] ** 2).sum()) ** 0.5 for x in (case.pushed, pushed))
+    if left > HALVED * was:
+        return
+    because = f"colours change within a sample there ({_each(taken)}), inside of surfaces"
+    times = was / max(left, 1e-30)
+    advice = f"Blur them to the size of a pixel, or take more samples: with supersample={_more(taken)} "
+    _by_pixels(case, inside, "colors", because, f"{advice}it is {times:.2g} times better.", widen=0)
+
+
+def _samples(case: _Case, touched: Touched) -> None:
+    """Too few samples, for what is thin or for outlines."""
+    taken = case.setting.options.get("supersample", 1)
+    before = case.try_out(supersample=_more(taken))
+    if before is None:
+        return
+    gain, share = np.maximum(before.sharp - case.error.sharp, 0), case.gained(before)
+    thin, strong = _thin_and_outlines(case.setting)[0], case.strong(before)
+    better = f"with supersample={_more(taken)} it is {before.norm / max(case.error.norm, 1e-30):.2g} times better."
+    held = float(gain[thin].sum() / max(gain.sum(), 1e-30))
+    if held >= LARGE_SHARE:
+        because = f"the scene is thinner than a sample there ({_each(taken)})"
+        case.findings.append(Finding("thin", because, f"Take more samples: {better}", strong & thin, share * held))
+    if 1 - held >= LARGE_SHARE:
+        because = f"{_each(taken)} is too little for these outlines"
+        advice = better[0].upper() + better[1:]
+        case.findings.append(Finding("samples", because, advice, strong & ~thin, share * (1 - held)))
+
+
+def _more(taken: int) -> int:
+    """Samples along each axis of a pixel, for an experiment with more of them."""
+    return AGAIN if taken == 1 else 2 * taken
+
+
+def _each(count: int) -> str:
+    return "one sample a pixel" if count == 1 else f"{count} × {count} samples a pixel"
+
+
+_MAPS: WeakKeyDictionary[Setting, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
+
+
+def _thin_and_outlines(setting: Setting) -> tuple[np.ndarray, np.ndarray]:
+    """The pixels (H, W) bool around what is thinner than a sample, and those around outlines."""
+    if setting not in _MAPS:
+        _MAPS[setting] = _map(setting)
+    return _MAPS[setting]
+
+
+def _map(setting: Setting) -> tuple[np.ndarray, np.ndarray]:
+    from scipy.ndimage import binary_dilation, binary_opening
+
+    (height, width), taken = setting.size, setting.options.get("supersample", 1)
+    across = min(FINE, max(2, int((CELLS / (height * width)) ** 0.5 / taken)))  # Cells a sample.
+    fine = across * taken
+    parts, camera = setting.shown(setting.parameters)
+    sampler = setting.options.get("sampler", "auto")
+    found = sample(parts, camera, setting.size, layers=1, supersample=fine, sampler=sampler)
+    apron = found.apron
+    part, depth = (_on_host(x)[0, apron:-apron, apron:-apron] for x in (found.part, found.depth))
+    jump = max(JUMP * np.ptp(depth[part >= 0]), FLAT * depth.max()) if (part >= 0).any() else 0.0
+    disk = np.hypot(*np.indices((across, across)) - (across - 1) / 2) <= across / 2 - 0.5  # As wide as a sample.
+    thin, jumps = np.zeros(part.shape, bool), np.zeros(part.shape, bool)
+    for index in np.unique(part):
+        mask = np.pad(part == index, across, mode="edge")
+        opened: Any = binary_opening(mask, disk)
+        thin |= (mask & ~opened)[across:-across, across:-across]
+    for axis in (0, 1):
+        change = (np.diff(part, axis=axis) != 0) | (np.abs(np.diff(depth, axis=axis)) > jump)
+        jumps |= np.pad(change, [(0, 1) if i == axis else (0, 0) for i in (0, 1)])
+
+    def pixels(mask: np.ndarray, least: float) -> np.ndarray:
+        return mask.reshape(height, fine, width, fine).mean(axis=(1, 3)) > least
+
+    return binary_dilation(pixels(thin, CORNER), iterations=3), binary_dilation(pixels(jumps, 0), iterations=2)
+
+
+def _on_host(x: Any) -> np.ndarray:
+    return engine_of(x).to_numpy(x)
+
+
+def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str, widen: int = 2) -> None:
+    """Name a reason if pixels around the mask hold much of what is left."""
+    from scipy.ndimage import binary_dilation
+
+    if not mask.any():
+        return
+    near: Any = binary_dilation(mask, iterations=widen) if widen else mask
+    energy = case.error.energy
+    held = float(energy[near].sum() / max(energy.sum(), 1e-30))
+    if held < LARGE_SHARE:
+        return
+    share = held * case.error.norm**2 / case.whole.norm**2
+    case.findings.append(Finding(kind, because, advice, near & case.strong(case.error), share))
+    case.left &= ~near
+    case.error = case.error.within(case.left)
+
+
+def _bias(case: _Case, touched: Touched) -> None:
+    """What the nearest built-in configuration shows, too; or nothing that is known."""
+    if case.findings and case.error.norm < HALVED * case.whole.norm:
+        return
+    off = _off(case.pushed, case.number.true)
+    mask, share = case.strong(case.error), case.error.norm**2 / case.whole.norm**2
+    found = nearest(case.setting, case.number, touched.parts, case.options)
+    if found is not None:
+        theirs = _off(found.pushed, found.true)
+        ratio = f"{found.slope / found.difference:.2f}" if found.difference else "–"
+        told = f"{found.name} of this size, in this place, moved alike"
+        if theirs >= ALIKE * off:
+            because = (
+                f"a known bias of the library: its derivative image is off by {off:.0%} of its size, that of {told} by "
+                f"{theirs:.0%} (ratio {ratio})"
+            )
+            advice = (
+                "More samples a pixel lessen it where things shift; where round things turn, outlines move as the "
+                "samples inside of them do, and nothing helps but other views."
+            )
+            case.findings.append(Finding("bias", because, advice, mask, share))
+            return
+        because = f"no experiment makes it agree; {told} is off by {theirs:.0%}, this by {off:.0%}"
+    else:
+        because = "no experiment makes it agree"
+    case.findings.append(Finding("unknown", because, "", mask, share))
+
+
+def _off(pushed: np.ndarray, true: np.ndarray) -> float:
+    a, b = low_pass(pushed), low_pass(true)
+    return float(np.linalg.norm(a - b) / max(np.linalg.norm(a), np.linalg.norm(b), 1e-30))
+
+
+EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
+    _constants,
+    _outlines,
+    _transparent,
+    _layers,
+    _crossing,
+    _bounded,
+    _colors,
+    _samples,
+    _bias,
+)
+"""From the cheap and certain to the dear; each adds what it finds to the case."""
+
+
+def why_off(setting: Setting, number: Number, touched: Touched, going: Callable[[], bool]) -> list[Finding]:
+    """Why the derivatives of a number disagree.
+
+    Args:
+        setting: what is looked at.
+        number: the number.
+        touched: what of the scene it changes.
+        going: whether there is time for another experiment.
+    """
+    case = _Case(setting, number)
+    for experiment in EXPERIMENTS:
+        if not going():
+            break
+        if experiment is _constants or (case.open and not _all_constant(case)):
+            experiment(case, touched)
+    if going() and not case.findings:
+        because = "the derivative images agree as well as the truth is known, and only the loss does not"
+        return [Finding("unknown", because, "Take more samples a pixel for the truth, samples=16 say.")]
+    return case.findings
+
+
+def _all_constant(case: _Case) -> bool:
+    return any(f.kind == "constant" and f.share == 1 for f in case.findings)
