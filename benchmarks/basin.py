@@ -40,11 +40,11 @@ SIZE = (64, 64)
 MESHES = {"teapot": "teapot_2464", "bunny": "bunny_5k", "nefertiti": "nefertiti"}
 FACES = 5000
 """Meshes of more are decimated to so many."""
-ANGLES = (10, 20, 30, 40, 50, 70, 90)
+ANGLES = (10, 25, 40, 50, 70, 90)
 SHIFT = 0.004
 """Of the size, for each degree: 10 % at 25°, as in `pose_recovery`."""
 DONE_ANGLE, DONE_SHIFT = 2.0, 0.01
-DEODR_STEPS, DEODR_RATE = 200, 0.02
+DEODR_STEPS, DEODR_RATE = 150, 0.02
 SEEDS = 20
 
 
@@ -57,12 +57,14 @@ class Method(NamedTuple):
 
 
 METHODS = {
-    "plain": Method("plain: full resolution only", "#5C6068", None),
-    "pyramid": Method("pyramid", "#D55E00", rts.pyramid(SIZE)),
+    "pyramid": Method("rts.pyramid: coarse, many samples, blurred; the default", "#D55E00", rts.pyramid(SIZE)),
     "sigma": Method(
-        "σ continuation at full resolution", "#0072B2", [Stage(sigma=8), Stage(sigma=4), Stage(sigma=2), Stage()]
+        "σ continuation at full resolution: 8, 4, 2 pixels, none",
+        "#0072B2",
+        [Stage(sigma=8), Stage(sigma=4), Stage(sigma=2), Stage()],
     ),
-    "both": Method("pyramid, blurred", "#009E73", [Stage(0.25, sigma=2), Stage(0.5, sigma=1), Stage()]),
+    "resolutions": Method("resolutions alone: 16², 32², 64²", "#E69F00", [Stage(0.25), Stage(0.5), Stage()]),
+    "plain": Method("plain: full resolution only", "#5C6068", None),
     "DEODR": Method(f"DEODR, Adam ({DEODR_STEPS} steps)", PEER_COLORS["DEODR"], None),
 }
 

@@ -44,12 +44,12 @@ def turned(size, *, channels=1, camera=CAMERA, **options):
 @pytest.mark.parametrize(
     ("size", "options", "sides"),
     [
-        ((256, 256), {}, [32, 64, 128, 256]),
-        ((100, 320), {"largest": 256}, [32, 64, 128, 256]),
-        ((320, 100), {"coarsest": 100}, [160, 320]),
-        ((97, 31), {}, [24, 48, 97]),
-        ((47, 47), {}, [47]),
-        ((7, 5), {"coarsest": 1}, [1, 3, 7]),
+        ((256, 256), {}, [16, 16, 32, 64, 128, 256]),
+        ((100, 320), {"largest": 256}, [16, 16, 32, 64, 128, 256]),
+        ((320, 100), {"coarsest": 100}, [160, 160, 320]),
+        ((97, 31), {}, [24, 24, 48, 97]),
+        ((20, 12), {}, [20, 20, 20]),
+        ((7, 5), {"coarsest": 1}, [1, 1, 3, 7]),
     ],
 )
 def test_a_pyramid_doubles_from_its_coarsest_side(size, options, sides):
@@ -58,7 +58,8 @@ def test_a_pyramid_doubles_from_its_coarsest_side(size, options, sides):
     assert [max(s) for s in found] == sides
     for height, width in found:
         assert abs(height - width * size[0] / size[1]) <= max(1, size[0] / size[1])
-    assert all(stage.sigma == 0 and stage.supersample is None for stage in stages)
+    assert [stage.sigma for stage in stages] == [sides[0] / 8, sides[0] / 16, *[0] * (len(sides) - 2)]
+    assert stages[-1].supersample is None and all(stage.supersample > 1 for stage in stages[:-1])
 
 
 def test_pixels_that_overlap_in_part_count_by_their_share():
@@ -181,7 +182,7 @@ def test_coarse_pixels_find_the_tooth_that_fine_ones_miss(target):
 def test_a_fit_says_what_it_did_at_each_stage():
     torch = pytest.importorskip("torch")
     residuals, seen = turned((48, 48), splatter="single"), []
-    schedule = rts.pyramid((48, 48), coarsest=12)
+    schedule = [rts.Stage(0.25), rts.Stage(0.5), rts.Stage()]
     fit = rts.fit(
         residuals, torch.zeros(6), method="lm", schedule=schedule, callback=lambda *given: seen.append(given), steps=9
     )

@@ -15,8 +15,10 @@ from rts.engines import constants, engine_of, namespace
 from rts.errors import InputError
 from rts.trees import Array
 
-COARSEST = 24
-"""A pyramid starts at least here: an edge pulls over one pixel only, so coarse pixels reach further."""
+COARSEST, WIDEST = 16, 1 / 8
+"""A pyramid's first stage has at least so many pixels along the longer side, and this share of them as σ."""
+SAMPLES, FEWER_SAMPLES = 4, 2
+"""A pixel along each axis: at the coarsest resolution, where points jump over outlines, and between it and the last."""
 
 
 @dataclass(frozen=True)
@@ -53,15 +55,20 @@ class Stage:
 
 
 def pyramid(size: tuple[int, int], *, coarsest: int = COARSEST, largest: int | None = None) -> tuple[Stage, ...]:
-    """The schedule of resolutions from coarse to fine, each twice the one before.
+    """The schedule to take where the start is far off: from coarse and blurred images to fine ones.
 
-    An edge pulls over one pixel only. So a fit at coarse pixels finds its way from farther off, and one at fine pixels
-    ends more exactly.
+    An outline pulls over one pixel only, and what it pulls at is the nearest outline, be it the right one or not. Blurred
+    images show where most of an object is. So the first stages are of few pixels, with many samples each, and blurred by
+    an eighth of the image, then by half as much; the ones after have twice the resolution of the one before; the last is
+    the image itself. How far off a start may be: benchmarks/RESULTS.md, "Basin of convergence".
 
     Args:
         size: (height, width) of the residuals.
-        coarsest: the longer side of the first stage has this many pixels, or up to twice as many.
+        coarsest: the longer side of the first stages has this many pixels, or up to twice as many.
         largest: the longer side of the last stage has at most so many; None for all.
+
+    Returns:
+        Three stages or more.
 
     Raises:
         InputError: an argument that is no count of pixels.
@@ -73,7 +80,13 @@ def pyramid(size: tuple[int, int], *, coarsest: int = COARSEST, largest: int | N
     sides = [longer if largest is None else min(largest, longer)]
     while sides[0] >= 2 * coarsest:
         sides.insert(0, sides[0] // 2)
-    return tuple(Stage(side / longer) for side in sides)
+    first, sigma = sides[0] / longer, WIDEST * sides[0]
+    return (
+        Stage(first, SAMPLES, sigma),
+        Stage(first, SAMPLES, sigma / 2),
+        *(Stage(side / longer, FEWER_SAMPLES) for side in sides[1:-1]),
+        Stage(sides[-1] / longer),
+    )
 
 
 def checked_schedule(schedule: Any) -> Sequence[Stage]:
