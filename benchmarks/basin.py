@@ -40,7 +40,7 @@ SIZE = (64, 64)
 MESHES = {"teapot": "teapot_2464", "bunny": "bunny_5k", "nefertiti": "nefertiti"}
 FACES = 5000
 """Meshes of more are decimated to so many."""
-ANGLES = (10, 25, 40, 50, 70, 90)
+ANGLES = (10, 30, 50, 70, 90)
 SHIFT = 0.004
 """Of the size, for each degree: 10 % at 25°, as in `pose_recovery`."""
 DONE_ANGLE, DONE_SHIFT = 2.0, 0.01
@@ -214,6 +214,7 @@ def main() -> None:
     parser.add_argument("--angles", nargs="+", type=float, default=ANGLES)
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--add", action="store_true", help="keep what basin.json of the output holds of others")
     parser.add_argument("--draw", action="store_true", help="only draw what basin.json of the output holds")
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
@@ -221,10 +222,14 @@ def main() -> None:
     if args.draw:
         rows = json.loads(path.read_text())["rows"]
     else:
-        begun = time.perf_counter()
         rows = run(args)
-        held = {"size": SIZE, "shift": SHIFT, "minutes": (time.perf_counter() - begun) / 60, "rows": rows}
-        path.write_text(json.dumps(held, indent=None, separators=(",", ":")).replace("},{", "},\n{") + "\n")
+        if args.add and path.exists():
+            new = {(r["mesh"], r["method"], r["start"]) for r in rows}
+            old = json.loads(path.read_text())["rows"]
+            rows += [r for r in old if (r["mesh"], r["method"], r["start"]) not in new]
+            rows.sort(key=order)
+        text = json.dumps({"size": SIZE, "shift": SHIFT, "rows": rows}, separators=(",", ":"))
+        path.write_text(text.replace("},{", "},\n{") + "\n")
     text = summary(rows)
     path.with_suffix(".md").write_text(text + "\n")
     draw(rows, path.with_suffix(".png"))
@@ -247,7 +252,12 @@ def run(args: argparse.Namespace) -> list[dict]:
                 f"{name} {method} {angle:g}°: {sum(r['success'] for r in found)} of {len(found)}, {seconds:.0f} s",
                 flush=True,
             )
-    return sorted(rows, key=lambda r: (list(METHODS).index(r["method"]), r["start"], r["mesh"], r["seed"]))
+    return sorted(rows, key=order)
+
+
+def order(row: dict) -> tuple:
+    """What rows are sorted by."""
+    return list(METHODS).index(row["method"]), row["start"], row["mesh"], row["seed"]
 
 
 if __name__ == "__main__":

@@ -57,10 +57,10 @@ class Stage:
 def pyramid(size: tuple[int, int], *, coarsest: int = COARSEST, largest: int | None = None) -> tuple[Stage, ...]:
     """The schedule to take where the start is far off: from coarse and blurred images to fine ones.
 
-    An outline pulls over one pixel only, and what it pulls at is the nearest outline, be it the right one or not. Blurred
-    images show where most of an object is. So the first stages are of few pixels, with many samples each, and blurred by
-    an eighth of the image, then by half as much; the ones after have twice the resolution of the one before; the last is
-    the image itself. How far off a start may be: benchmarks/RESULTS.md, "Basin of convergence".
+    An outline pulls over one pixel only, and at whatever outline is nearest, be it the right one or not. Blurred images
+    show where most of an object is. So the first stages are of few pixels, with many samples each, and blurred by an
+    eighth of the image, then by half as much; those after double the resolution; the last is the image itself. From how
+    far off poses are found: benchmarks/RESULTS.md, "Basin of convergence".
 
     Args:
         size: (height, width) of the residuals.
