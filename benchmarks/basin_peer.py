@@ -27,6 +27,7 @@ class DeodrViews:
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, views: Sequence[np.ndarray], side: int):
+        from deodr.differentiable_renderer_cython import renderSceneCpp
 
         self.vertices = vertices.astype(np.float64)
         self.turns = [view[:3, :3] for view in views]
