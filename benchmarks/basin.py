@@ -5,7 +5,7 @@ from meshes of some thousand faces. A start is turned by 10° to 90° about a ra
 0.4 % of the object's size (the diameter of its bounding sphere) along a random direction. It succeeds where it ends
 within 2° and 1 %.
 
-    python -m benchmarks.basin                     # all, on two processes
+    python -m benchmarks.basin                     # all; basin.json keeps what it holds of other starts and methods
     python -m benchmarks.basin --angles 50 --methods plain pyramid --seeds 5 -o /tmp/basin
     python -m benchmarks.basin --draw              # only draw what basin.json holds
 """
@@ -133,9 +133,9 @@ def measure(name: str, method: str, angle: float, seeds: int) -> list[dict]:
     torch.set_num_threads(1)
     solve, rows = solver(name, method), []
     for seed in range(seeds):
-        begun = time.perf_counter()
+        begun = time.process_time()
         pose, loss, steps = solve(start(seed, angle))
-        seconds = time.perf_counter() - begun
+        seconds = time.process_time() - begun
         off, shift = turn(pose), float(np.linalg.norm(pose[3:]) / DIAMETER)
         rows.append(
             {
@@ -166,7 +166,7 @@ def counted(rows: list[dict]) -> dict[tuple[str, float], list[dict]]:
 
 
 def summary(rows: list[dict]) -> str:
-    """A table in Markdown: how many succeeded, by method and start; and medians of steps and seconds."""
+    """A table in Markdown: how many succeeded, by method and start; and medians of steps and of seconds on one core."""
     groups, angles = counted(rows), sorted({row["start"] for row in rows})
     lines = []
     for method in [m for m in METHODS if any(row["method"] == m for row in rows)]:
@@ -175,7 +175,7 @@ def summary(rows: list[dict]) -> str:
         steps, seconds = (statistics.median(r[key] for r in own) for key in ("steps", "seconds"))
         lines.append([METHODS[method].label, *map(str, cells), f"{steps:.0f}", f"{seconds:.2f}"])
     heads = [f"{a:g}°, {100 * SHIFT * a:g} %" for a in angles]
-    return table(["method", *heads, "steps", "s"], lines)
+    return table(["method", *heads, "steps", "s of one core"], lines)
 
 
 def draw(rows: list[dict], path: Path) -> None:
@@ -214,45 +214,34 @@ def main() -> None:
     parser.add_argument("--angles", nargs="+", type=float, default=ANGLES)
     parser.add_argument("--seeds", type=int, default=SEEDS)
     parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--add", action="store_true", help="keep what basin.json of the output holds of others")
     parser.add_argument("--draw", action="store_true", help="only draw what basin.json of the output holds")
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
     path = args.output / "basin.json"
-    if args.draw:
-        rows = json.loads(path.read_text())["rows"]
-    else:
-        rows = run(args)
-        if args.add and path.exists():
-            new = {(r["mesh"], r["method"], r["start"]) for r in rows}
-            old = json.loads(path.read_text())["rows"]
-            rows += [r for r in old if (r["mesh"], r["method"], r["start"]) not in new]
-            rows.sort(key=order)
-        text = json.dumps({"size": SIZE, "shift": SHIFT, "rows": rows}, separators=(",", ":"))
-        path.write_text(text.replace("},{", "},\n{") + "\n")
+    rows = json.loads(path.read_text())["rows"] if path.exists() else []
+    if not args.draw:
+        rows = run(args, rows, path)
     text = summary(rows)
     path.with_suffix(".md").write_text(text + "\n")
     draw(rows, path.with_suffix(".png"))
     print(text)
 
 
-def run(args: argparse.Namespace) -> list[dict]:
-    """All rows, on several processes of one thread each."""
+def run(args: argparse.Namespace, rows: list[dict], path: Path) -> list[dict]:
+    """All rows, those that there were of others included, by several processes of one thread each."""
     os.environ |= {"RTS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # Before the processes begin.
     jobs = [(name, method, a, args.seeds) for a in args.angles for name in args.meshes for method in args.methods]
-    rows: list[dict] = []
     with ProcessPoolExecutor(args.processes, get_context("spawn")) as pool:
-        futures = {pool.submit(measure, *job): job for job in jobs}
+        futures = {pool.submit(measure, *job): job[:3] for job in jobs}
         for future in as_completed(futures):
-            name, method, angle, _ = futures[future]
-            found = future.result()
-            rows += found
-            seconds = sum(row["seconds"] for row in found)
-            print(
-                f"{name} {method} {angle:g}°: {sum(r['success'] for r in found)} of {len(found)}, {seconds:.0f} s",
-                flush=True,
-            )
-    return sorted(rows, key=order)
+            (name, method, angle), found = futures[future], future.result()
+            rows = [r for r in rows if (r["mesh"], r["method"], r["start"]) != (name, method, angle)] + found
+            rows.sort(key=order)
+            text = json.dumps({"size": SIZE, "shift": SHIFT, "rows": rows}, separators=(",", ":"))
+            path.write_text(text.replace("},{", "},\n{") + "\n")
+            wins, seconds = (sum(row[key] for row in found) for key in ("success", "seconds"))
+            print(f"{name} {method} {angle:g}°: {wins} of {len(found)}, {seconds:.0f} s", flush=True)
+    return rows
 
 
 def order(row: dict) -> tuple:
