@@ -102,10 +102,10 @@ def solver(name: str, method: str) -> Callable[[np.ndarray], tuple[np.ndarray, f
     vertices, faces = shape(name)
     part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {"vertices": vertices}, "silhouette")
     cameras = [camera(eye(*angles)) for angles in VIEWS]
-    goals = [supersampled(part, seen, SIZE, 4)[..., 3] for seen in cameras]
     if method == "DEODR":
-        views = DeodrViews(vertices, faces, [np.asarray(seen.view) for seen in cameras], goals)
+        views = DeodrViews(vertices, faces, [np.asarray(seen.view) for seen in cameras], SIZE[0])
         return lambda first: views.fit(first, DEODR_STEPS, DEODR_RATE)
+    goals = [supersampled(part, seen, SIZE, 4)[..., 3] for seen in cameras]
 
     def moved(pose):
         return part.replace(transform=rts.rigid(pose))
