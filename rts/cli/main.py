@@ -307,7 +307,7 @@ def fit_pose(
     found = fit(parts, mask, seen, bounds, engine=chosen, method=method, steps=steps)
     files = write_report(output, found, parts, seen, mask)
     _say(
-        f"loss {found.history[0]:.3g} → {found.loss:.3g} in {len(found.history)} steps, {_sum(found.levels)} from "
+        f"loss {found.first_loss:.3g} → {found.loss:.3g} in {len(found.history)} steps, {_sum(found.levels)} from "
         f"coarse and blurred pixels to fine, {found.seconds:.1f} s (at the finest, {found.reason}); wrote"
     )
     _say_written(files)

@@ -15,6 +15,7 @@ from rts.engines import Engine, engine_named
 from rts.errors import InputError, PluginError
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
+from rts.fitting.least_squares import mean_square
 from rts.fitting.schedule import Stage, box_filtered, pyramid
 from rts.interfaces import Part
 from rts.operations.linear import matmul
@@ -34,9 +35,10 @@ class PoseFit(NamedTuple):
         center: (3,) world.
         matrix: (4, 4), world from the model as loaded.
         trail: the best matrix so far, at each step.
-        history: the loss at each step: mean square of the difference of silhouettes, at that step's
-            resolution.
-        levels: how many steps were made at each resolution, from coarse to fine.
+        history: the loss at each step: mean square of the difference of silhouettes, at that step's resolution and
+            blur.
+        levels: how many steps were made at each stage, from coarse to fine.
+        first_loss: the loss of the start at full resolution.
         loss: the lowest loss at full resolution.
         reason: why it stopped there.
         seconds: wall time.
@@ -49,6 +51,7 @@ class PoseFit(NamedTuple):
     trail: list[np.ndarray]
     history: list[float]
     levels: list[int]
+    first_loss: float
     loss: float
     reason: str
     seconds: float
@@ -116,12 +119,14 @@ def fit_pose(
     def note(step: int, pose: Array, loss: float) -> None:
         met.append(chosen.to_numpy(pose).astype(np.float64) * weights)
 
+    residuals = _residuals(parts, camera, target, bounds, weights, chosen)
+    start, schedule = chosen.constant(np.zeros(6, np.float32)), pyramid(target.shape, largest=LARGEST_SIDE)
     result = fit(
-        _residuals(parts, camera, target, bounds, weights, chosen),
-        chosen.constant(np.zeros(6, np.float32)),
+        residuals,
+        start,
         method=method,
         steps=steps,
-        schedule=pyramid(target.shape, largest=LARGEST_SIDE),
+        schedule=schedule,
         callback=note,
         progress=progress,
     )
@@ -136,6 +141,7 @@ def fit_pose(
         trail,
         result.history,
         levels,
+        float(mean_square(residuals.at_stage(schedule[-1])(start))),
         result.loss,
         result.reason,
         result.seconds,
@@ -143,7 +149,7 @@ def fit_pose(
 
 
 def _best_so_far(met: list[np.ndarray], result: Fit) -> list[np.ndarray]:
-    """Of the parameters met at each step, those with the lowest loss at its stage so far.
+    """The parameters with the lowest loss of each step and those before it at its stage.
 
     Levenberg–Marquardt reports rejected trials too.
     """

@@ -45,7 +45,7 @@ class Fit(NamedTuple):
 
     With a schedule, parameters, loss and reason are those of the last stage.
 
-    Printed, it is three lines, without history and values.
+    Printed, it is three lines, without history and values; of losses the first and the lowest of the last stage.
     """
 
     parameters: Tree
@@ -57,7 +57,8 @@ class Fit(NamedTuple):
     stages: tuple[int, ...]
 
     def __repr__(self) -> str:
-        first = f"{self.history[0]:.4g} → " if self.history else ""
+        # Losses of stages are those of other images.
+        first = f"{self.history[-self.stages[-1]]:.4g} → " if self.stages[-1] else ""
         steps = "1 step" if self.steps == 1 else f"{self.steps} steps"
         if len(self.stages) > 1:
             steps += f" ({' + '.join(map(str, self.stages))})"
