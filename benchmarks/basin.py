@@ -166,16 +166,16 @@ def counted(rows: list[dict]) -> dict[tuple[str, float], list[dict]]:
 
 
 def summary(rows: list[dict]) -> str:
-    """A table in Markdown: how many succeeded, by method and start; and medians of steps and of seconds on one core."""
+    """A table in Markdown: how many succeeded, by method and start; and the median of steps."""
     groups, angles = counted(rows), sorted({row["start"] for row in rows})
     lines = []
     for method in [m for m in METHODS if any(row["method"] == m for row in rows)]:
         own = [row for row in rows if row["method"] == method]
-        cells = [sum(r["success"] for r in groups[method, a]) if (method, a) in groups else "" for a in angles]
-        steps, seconds = (statistics.median(r[key] for r in own) for key in ("steps", "seconds"))
-        lines.append([METHODS[method].label, *map(str, cells), f"{steps:.0f}", f"{seconds:.2f}"])
+        found = [groups.get((method, angle), []) for angle in angles]
+        cells = [f"{sum(r['success'] for r in group)} of {len(group)}" if group else "" for group in found]
+        lines.append([METHODS[method].label, *cells, f"{statistics.median(r['steps'] for r in own):.0f}"])
     heads = [f"{a:g}°, {100 * SHIFT * a:g} %" for a in angles]
-    return table(["method", *heads, "steps", "s of one core"], lines)
+    return table(["method", *heads, "steps"], lines)
 
 
 def draw(rows: list[dict], path: Path) -> None:
@@ -183,21 +183,19 @@ def draw(rows: list[dict], path: Path) -> None:
     from matplotlib.figure import Figure
 
     groups, angles = counted(rows), sorted({row["start"] for row in rows})
-    most = max(len(group) for group in groups.values())
     figure = Figure(figsize=(8, 4.6), layout="constrained")
     axes = figure.subplots()
     for name, method in METHODS.items():
         known = [a for a in angles if (name, a) in groups]
-        wins = [sum(row["success"] for row in groups[name, a]) for a in known]
-        axes.plot(
-            known, wins, "x--" if name == "DEODR" else "o-", color=method.color, label=method.label, linewidth=1.8
-        )
+        wins = [100 * statistics.mean(row["success"] for row in groups[name, a]) for a in known]
+        style = "x--" if name == "DEODR" else "o-"
+        axes.plot(known, wins, style, color=method.color, label=method.label, linewidth=1.8)
     axes.set(
         xticks=angles,
         xticklabels=[f"{a:g}°\n{100 * SHIFT * a:g} %" for a in angles],
-        ylim=(-0.02 * most, 1.04 * most),
+        ylim=(-2, 104),
         xlabel="offset of the start: turn, and shift over the object's size",
-        ylabel=f"found, of {most}",
+        ylabel="starts that lead to the pose, %",
         title=f"Poses from three silhouettes of {SIZE[1]}²; Levenberg–Marquardt where nothing else is said",
     )
     axes.axvline(50, color="#9aa0a8", linewidth=0.8, linestyle=":")
