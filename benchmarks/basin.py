@@ -58,6 +58,11 @@ class Method(NamedTuple):
 
 METHODS = {
     "pyramid": Method("rts.pyramid: coarse, many samples, blurred; the default", "#D55E00", rts.pyramid(SIZE)),
+    "wider": Method(
+        "rts.pyramid after a stage of twice the blur",
+        "#009E73",
+        [Stage(0.25, 4, 2.0), *rts.pyramid(SIZE)],
+    ),
     "sigma": Method(
         "σ continuation at full resolution: 8, 4, 2 pixels, none",
         "#0072B2",

@@ -368,7 +368,7 @@ def test_fit_pose_with_adam_lowers_the_loss(model, tmp_path):
     succeed("render", model, "-o", tmp_path / "t.png", "--size", 48, "--camera", "36,20", *white_on_black)
     arguments = model, tmp_path / "t.png", "-o", tmp_path / "o", "--method", "adam", "--steps", 30
     output = succeed("fit-pose", *arguments)
-    before, after = (float(x) for x in re.search(r"loss (\S+) → (\S+) in 90 steps", output).groups())
+    before, after = (float(x) for x in re.search(r"loss (\S+) → (\S+) in 60 steps", output).groups())
     assert after < before / 4
 
 
@@ -376,7 +376,7 @@ def test_fit_pose_says_how_many_steps_it_made_where(model, tmp_path):
     pytest.importorskip("torch")
     succeed("render", model, "-o", tmp_path / "t.png", "--size", 48, "--shader", "silhouette")
     output = succeed("fit-pose", model, tmp_path / "t.png", "-o", tmp_path / "o", "--steps", 3, "--camera", "45,30")
-    assert "in 9 steps, 3 + 3 + 3 from coarse and blurred pixels to fine, " in output
+    assert "in 6 steps, 3 + 3 from coarse and blurred pixels to fine, " in output
     assert "s (at the finest, all 3 steps made); wrote" in output
 
 

@@ -15,7 +15,7 @@ from rts.engines import constants, engine_of, namespace
 from rts.errors import InputError
 from rts.trees import Array
 
-COARSEST, WIDEST = 16, 1 / 8
+COARSEST, BLUR = 16, 1 / 16
 """A pyramid's first stage has at least so many pixels along the longer side, and this share of them as σ."""
 SAMPLES, FEWER_SAMPLES = 4, 2
 """A pixel along each axis: at the coarsest resolution, where points jump over outlines, and between it and the last."""
@@ -58,17 +58,17 @@ def pyramid(size: tuple[int, int], *, coarsest: int = COARSEST, largest: int | N
     """The schedule to take where the start is far off: from coarse and blurred images to fine ones.
 
     An outline pulls over one pixel only, and at whatever outline is nearest, be it the right one or not. Blurred images
-    show where most of an object is. So the first stages are of few pixels, with many samples each, and blurred by an
-    eighth of the image, then by half as much; those after double the resolution; the last is the image itself. From how
-    far off poses are found: benchmarks/RESULTS.md, "Basin of convergence".
+    show where most of an object is. So the first stage is of few pixels, with many samples each, and blurred by a
+    sixteenth of the image; those after double the resolution; the last is the image itself. From how far off poses are
+    found: benchmarks/RESULTS.md, "Basin of convergence".
 
     Args:
         size: (height, width) of the residuals.
-        coarsest: the longer side of the first stages has this many pixels, or up to twice as many.
+        coarsest: the longer side of the first stage has this many pixels, or up to twice as many.
         largest: the longer side of the last stage has at most so many; None for all.
 
     Returns:
-        Three stages or more.
+        Two stages or more.
 
     Raises:
         InputError: an argument that is no count of pixels.
@@ -80,10 +80,8 @@ def pyramid(size: tuple[int, int], *, coarsest: int = COARSEST, largest: int | N
     sides = [longer if largest is None else min(largest, longer)]
     while sides[0] >= 2 * coarsest:
         sides.insert(0, sides[0] // 2)
-    first, sigma = sides[0] / longer, WIDEST * sides[0]
     return (
-        Stage(first, SAMPLES, sigma),
-        Stage(first, SAMPLES, sigma / 2),
+        Stage(sides[0] / longer, SAMPLES, BLUR * sides[0]),
         *(Stage(side / longer, FEWER_SAMPLES) for side in sides[1:-1]),
         Stage(sides[-1] / longer),
     )
