@@ -42,7 +42,7 @@ FACES = 5000
 """Meshes of more are decimated to so many."""
 ANGLES = (10, 30, 50, 70, 90)
 SHIFT = 0.004
-"""Of the size, for each degree: 10 % at 25°, as in `pose_recovery`."""
+"""Share of the size that a start is shifted by for each degree: 10 % at 25°, as in `pose_recovery`."""
 DONE_ANGLE, DONE_SHIFT = 2.0, 0.01
 DEODR_STEPS, DEODR_RATE = 150, 0.02
 SEEDS = 20
