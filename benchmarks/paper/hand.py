@@ -1,4 +1,4 @@
-"""A hand fitted to three photographs (section 4.2, "Hand mesh optimization"): which splatter stands which learning rate.
+"""A hand fitted to three photographs (section 4.2, "Hand mesh optimization"): who stands which learning rate.
 
 Vertices, their colours and a pose a view are fitted by Adam, with an as-rigid-as-possible energy; a solid rectangle is
 behind the hand. Cameras do not exist: poses begin at the values of `setup.json`, and each seed moves them. Every
@@ -98,11 +98,17 @@ def start(seed: int) -> dict[str, Any]:
     return {k: torch.tensor(v / UNITS[k], dtype=torch.float32) for k, v in arrays.items()}
 
 
+def moved(offsets: Any) -> Any:
+    """Vertices (V, 3) with offsets, an array of torch or NumPy."""
+    vertices = hand()[0]
+    return (vertices if isinstance(offsets, np.ndarray) else offsets.new_tensor(vertices)) + UNITS["offsets"] * offsets
+
+
 def scene(parameters: dict[str, Any], view: int) -> tuple[rts.Part, rts.Part]:
     """The hand as a view sees it, and the rectangle behind it."""
-    vertices, faces = hand()
+    faces = hand()[1]
     theta = {
-        "vertices": vertices + UNITS["offsets"] * parameters["offsets"],
+        "vertices": moved(parameters["offsets"]),
         "colors": UNITS["colors"] * parameters["colors"],
     }
     mesh = rts.plugin("rts.surfaces", "mesh")
@@ -131,8 +137,8 @@ def judged(parameters: dict[str, Any]) -> np.ndarray:
             shift = np.eye(4)
             shift[0, 3], shift[1, 3] = -2 * dx / size[1], 2 * dy / size[0]
             closed = camera().for_size(size)
-            moved = closed.replace(projection=shift @ np.asarray(closed.projection))
-            total = total + rts.render(parts, moved, size, splatter="none", layers=1)[..., :3] / 9
+            view_ = closed.replace(projection=shift @ np.asarray(closed.projection))
+            total = total + rts.render(parts, view_, size, splatter="none", layers=1)[..., :3] / 9
         found.append(total)
     return np.stack(found)
 
@@ -152,11 +158,9 @@ def run(method: str, factor: float, seed: int, steps: int) -> dict[str, Any]:
     size, options = targets.shape[1:3], METHODS[method]
 
     def terms(parameters):
-        moved = torch.as_tensor(vertices) + UNITS["offsets"] * parameters["offsets"]
         images = [rts.render(scene(parameters, v), camera(), tuple(size), **options)[..., :3] for v in range(3)]
-        return torch.stack(
-            [(torch.stack(images) - targets).square().mean(), RIGIDITY * rigidity(moved) / rigidity.terms]
-        )
+        stretched = rigidity(moved(parameters["offsets"])) / rigidity.terms
+        return torch.stack([(torch.stack(images) - targets).square().mean(), RIGIDITY * stretched])
 
     last: dict[str, Any] = {}
 
@@ -311,6 +315,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
             axes.plot(runs[high][s]["losses"], color=colors[method], alpha=0.8, label=method if s == 0 else None)
     axes.set(yscale="log", xlabel="step", ylabel="loss", title=f"at ×{high}")
     axes.legend(fontsize=8)
+    below: list[tuple[str, np.ndarray]] = []
     pictures = [("photograph", photographs()[0]), ("start", judged(start(0))[0])]
     pictures += [(f"{m}, ×{least[m]}", judged(as_arrays(fits[m][least[m]][0]["parameters"]))[0]) for m in fits]
     if "images" in found["deodr"]:

@@ -88,9 +88,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row("several edges in a pixel", f"Teeth of 0.7 pixels, 1.3 apart. {ERROR}", Derivative(scenes.comb)),
     Row("upright edges", f"A card exactly along the pixels. {ERROR}", Derivative(scenes.upright)),
-    Row(
-        "grazing sheet", f"Striped, seen from half a degree above its plane; rises. {ERROR}", Derivative(scenes.grazing)
-    ),
+    Row("grazing sheet", f"Striped, seen from half a degree above; it rises. {ERROR}", Derivative(scenes.grazing)),
     Row("silhouette leaves the image", f"On three sides. {ERROR}", Derivative(scenes.leaving)),
     Row("crosses the near plane", f"A sphere of which a part is cut off. {ERROR}", Derivative(scenes.through_near)),
     Row("goes on behind the camera", f"A band on the floor. {ERROR}", Derivative(scenes.past_camera)),

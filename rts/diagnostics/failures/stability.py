@@ -84,6 +84,7 @@ def stability(
     steps: int = 80,
     truth_samples: int = 8,
     output: Any = None,
+    fresh: bool = False,
     more: Sequence[Row] = (),
     progress: bool | None = None,
 ) -> Stability:
@@ -100,6 +101,7 @@ def stability(
         steps: of each fit.
         truth_samples: of true derivatives, along each side of a pixel.
         output: a folder for the table, and for what a run that is interrupted goes on from; None to write nothing.
+        fresh: whether to forget what earlier runs have measured; cells do not know of changes of the code.
         more: further rows, before the others.
         progress: whether to show progress; None for where standard error is a terminal.
 
@@ -112,7 +114,10 @@ def stability(
         if not is_count(value):
             raise InputError(f"{name} is {quoted(value)}; expected a whole number, at least 1")
     folder = None if output is None else output_folder(output)
-    journal = Journal(None if folder is None else folder / ".stability.jsonl")
+    kept = None if folder is None else folder / ".stability.jsonl"
+    if fresh and kept is not None:
+        kept.unlink(missing_ok=True)
+    journal = Journal(kept)
     context = Context(seeds, truth_samples, folder, steps)
     found: list[tuple[Row, list[Outcome]]] = []
     with phases(progress) as phase:
