@@ -13,7 +13,7 @@ from rts.diagnostics.comparison.seen import seen
 from rts.diagnostics.comparison.truth import area_image, lattice, truth
 from rts.diagnostics.failures.methods import Method
 from rts.diagnostics.failures.outcome import Context, Outcome, cannot, graded
-from rts.diagnostics.failures.renderers import Unable, renderer, shifted
+from rts.diagnostics.failures.renderers import Unable, quiet, renderer, shifted
 
 ERRORS = 0.2, 0.5
 """Up to where the error of a derivative image is ok, and degraded."""
@@ -39,11 +39,13 @@ class Derivative(NamedTuple):
         scene: () → the scene, at rest where the derivative is taken. Its first mode is looked at.
         reference: () → the scene whose truth is compared with, where that is another one that looks alike.
         pixel: as of `pixel_of`, where that cannot know.
+        double: whether the library computes in float64.
     """
 
     scene: Callable[[], Scene]
     reference: Callable[[], Scene] | None = None
     pixel: float | None = None
+    double: bool = False
 
     def __call__(self, method: Method, context: Context) -> Outcome:
         """The error of the method."""
@@ -65,14 +67,15 @@ class Derivative(NamedTuple):
         """
         scene = self.scene()
         mode = next(iter(scene.directions))
-        drawn = renderer(scene, method)
+        drawn = renderer(scene, method, np.float64 if self.double else np.float32)
         pixel = pixel_of(scene, mode) if self.pixel is None else self.pixel
         found = drawn.derivative(mode) * pixel
         nan = int((~np.isfinite(found)).sum()) + drawn.broken()
         found = np.nan_to_num(found)
         other = scene if self.reference is None else self.reference()
         step = pixel if self.reference is None else pixel_of(other, mode)
-        true = truth(other, mode, step, samples=context.samples, folder=context.folder).derivative
+        with quiet():
+            true = truth(other, mode, step, samples=context.samples, folder=context.folder).derivative
         low = low_pass(true)
         return {
             "error": relative_l2(low_pass(found), low, low),
@@ -148,14 +151,15 @@ class Fitted(NamedTuple):
 
     scene: Callable[[], Scene]
     start: Callable[[np.random.Generator], np.ndarray]
-    rate: float = 0.5
+    rate: float = 0.8
     blur: float = 0.0
 
     def __call__(self, method: Method, context: Context) -> Outcome:
         """How often it converges."""
         scene = self.scene()
         still = parts_of(scene.at(scene.parameters)), scene.at(scene.parameters)[1]
-        target = area_image(*still, scene.size, lattice(4))[..., :3]
+        with quiet():
+            target = area_image(*still, scene.size, lattice(4))[..., :3]
         count = min(context.seeds, SEEDS_OF_MITSUBA) if method.peer == "Mitsuba" else context.seeds
         ends, nan, largest = [], 0, 0.0
         try:

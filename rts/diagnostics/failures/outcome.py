@@ -40,7 +40,7 @@ class Context(NamedTuple):
     seeds: int = 20
     samples: int = 8
     folder: Path | None = None
-    steps: int = 80
+    steps: int = 50
 
 
 class Row(NamedTuple):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import abc
+import contextlib
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import count
 from typing import Any
@@ -28,6 +29,14 @@ Weigh = Callable[[np.ndarray], np.ndarray]
 
 class Unable(Exception):
     """Why a method cannot do what a row asks; a clause."""
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Without the library's warnings: views here are empty, and layers too few, on purpose."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RtsWarning)
+        yield
 
 
 def shifted(scene: Scene, amounts: Array) -> Tree:
@@ -91,8 +100,7 @@ class Own(Renderer):
         self.number = self.engine.namespace.asarray(0.0, dtype=getattr(self.engine.namespace, np.dtype(dtype).name))
 
     def _image(self, parameters: Tree) -> Array:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RtsWarning)  # Views here are empty on purpose.
+        with quiet():
             return render(*self.scene.at(parameters), self.scene.size, **self.options)[..., :3]
 
     def derivative(self, mode: str) -> np.ndarray:
@@ -128,8 +136,7 @@ class Own(Renderer):
 
         def loss(thetas: Tree) -> Array:
             moved = [part.replace(theta=theta) for part, theta in zip(parts, thetas, strict=True)]
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RtsWarning)
+            with quiet():
                 image = render(moved, camera, self.scene.size, **self.options)[..., :3]
             return (image * engine.constant(weights, image)).sum()
 

@@ -211,9 +211,9 @@ def upright() -> Scene:
 
 
 def grazing() -> Scene:
-    """A striped sheet that is seen from half a degree above its plane, and a ball on it; both move."""
+    """A striped sheet that is seen from three degrees above its plane."""
     at, faces = shapes.grid(24, 24)
-    sheet = np.column_stack([at[:, 0], np.zeros(len(at)), at[:, 1]]) @ shapes.rotation_xy(0.01, 0).T
+    sheet = np.column_stack([at[:, 0], np.zeros(len(at)), at[:, 1]]) @ shapes.rotation_xy(0.05, 0).T
     color = 0.5 + 0.4 * np.column_stack([np.sin(9 * at[:, 0]), np.cos(7 * at[:, 0]), np.sin(5 * at[:, 0])])
     return posed("grazing sheet", unlit(sheet, faces, color), ("ty",))
 
@@ -270,7 +270,7 @@ def turning_ball() -> Scene:
 
 
 def plain() -> Scene:
-    """A sphere before a card."""
+    """A sphere, culled, before a card."""
     return scaled(1.0)
 
 
@@ -282,7 +282,7 @@ def scaled(factor: float, away: float = 0.0) -> Scene:
         theta = {**part.theta, "vertices": part.theta["vertices"] * factor + offset}
         return part.replace(theta=theta)
 
-    parts = [moved(sphere(0.5)), moved(card((56, 50), (26, 30), CARD_DEPTH, RED, SIZE))]
+    parts = [moved(sphere(0.5, cull="back")), moved(card((56, 50), (26, 30), CARD_DEPTH, RED, SIZE))]
     camera = Camera.look_at(
         (away, 0.0, DISTANCE * factor), (away, 0, 0), fov_y=shapes.FOV, near=0.5 * factor, far=10.0 * factor
     )
@@ -299,5 +299,5 @@ def with_slivers(shader: str = "unlit") -> Scene:
     extra += [[a, b, count + k] for k, (a, b) in enumerate(faces[100:140, :2])]
     points = np.concatenate([vertices, needles])
     colors = np.concatenate([sphere_.theta["colors"], sphere_.theta["colors"][faces[100:140, 0]]])
-    part = unlit(points, np.concatenate([faces, extra]), colors).replace(shader=shader)
-    return posed("slivers", [part, far.replace(transform=None)])
+    part = unlit(points, np.concatenate([faces, extra]), colors, cull="back").replace(shader=shader)
+    return posed("slivers", [part, far])

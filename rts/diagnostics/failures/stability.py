@@ -81,7 +81,7 @@ def stability(
     methods: Sequence[str] | None = None,
     *,
     seeds: int = 20,
-    steps: int = 80,
+    steps: int = 50,
     truth_samples: int = 8,
     output: Any = None,
     fresh: bool = False,
