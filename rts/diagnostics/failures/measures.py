@@ -64,6 +64,7 @@ class Derivative(NamedTuple):
             error: relative L2 through the low-pass of `scores`.
             largest: the largest derivative of a pixel's colour, over the truth's.
             nan: values that are not finite.
+            truth_error: of the truth itself.
         """
         scene = self.scene()
         mode = next(iter(scene.directions))
@@ -75,12 +76,13 @@ class Derivative(NamedTuple):
         other = scene if self.reference is None else self.reference()
         step = pixel if self.reference is None else pixel_of(other, mode)
         with quiet():
-            true = truth(other, mode, step, samples=context.samples, folder=context.folder).derivative
+            true, noise = truth(other, mode, step, samples=context.samples, folder=context.folder)
         low = low_pass(true)
         return {
             "error": relative_l2(low_pass(found), low, low),
             "largest": float(np.abs(found).max() / max(float(np.abs(true).max()), 1e-30)),
             "nan": nan,
+            "truth_error": noise,
         }
 
 

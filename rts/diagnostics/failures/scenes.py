@@ -162,9 +162,9 @@ def shells() -> Scene:
     return posed("card behind a shell", [sphere(0.45), far], moves=[1], depth=CARD_DEPTH)
 
 
-def coplanar() -> Scene:
-    """Two cards in one plane, which overlap; one slides."""
-    cards = [card((40, 44), (22, 18), DISTANCE, RED, SIZE), card((58, 54), (20, 22), DISTANCE, GREEN, SIZE)]
+def coplanar(apart: float = 0.0) -> Scene:
+    """Two cards in one plane, or some way apart, which overlap; the nearer one slides."""
+    cards = [card((40, 44), (22, 18), DISTANCE, RED, SIZE), card((58, 54), (20, 22), DISTANCE + apart, GREEN, SIZE)]
     return posed("coplanar cards", [*cards, backdrop()], moves=[1])
 
 
@@ -233,8 +233,8 @@ def through_near() -> Scene:
 
 def past_camera() -> Scene:
     """A band on the floor that goes on behind the camera."""
-    points = np.array([[-0.35, -0.5, 6.0], [0.3, -0.5, 6.0], [0.5, -0.5, -3.0], [-0.55, -0.5, -3.0]])
-    return posed("behind the camera", unlit(points, [(0, 1, 2), (0, 2, 3)], RED), depth=2.0)
+    points = np.array([[-0.35, -0.3, 6.0], [0.3, -0.3, 6.0], [0.5, -0.3, -3.0], [-0.55, -0.3, -3.0]])
+    return posed("behind the camera", unlit(points, [(0, 1, 2), (0, 2, 3)], RED), depth=0.9)
 
 
 def empty() -> Scene:
