@@ -293,11 +293,11 @@ def draw(found: dict[str, Any], path: Path) -> None:
     from rts.diagnostics.comparison.style import PEER_COLORS, SPLATTER_COLORS
 
     fits, seeds = found["fits"], range(len(found["start"]))
-    colors = {m: SPLATTER_COLORS[m.split()[0]] for m in fits}
+    colors = {m: SPLATTER_COLORS[m.split(",")[0]] for m in fits}
     factors = list(next(iter(fits.values())))
     least = {m: min(factors, key=lambda f, m=m: np.median([r["error"] for r in fits[m][f]])) for m in fits}
-    high = factors[-2]
-    figure = plt.figure(figsize=(13, 10.5))
+    high, higher = factors[-3], factors[-2]
+    figure = plt.figure(figsize=(13, 9))
     grid = figure.add_gridspec(3, 6, height_ratios=[1.25, 1, 1])
     axes = figure.add_subplot(grid[0, :3])
     for method, runs in fits.items():
@@ -321,9 +321,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
     pictures += [(f"{m}, ×{least[m]}", judged(as_arrays(fits[m][least[m]][0]["parameters"]))[0]) for m in fits]
     if "images" in found["deodr"]:
         pictures.append(("DEODR's fitter", np.array(found["deodr"]["images"])[0]))
-    below = [
-        (f"{m}, ×{f}", judged(as_arrays(fits[m][f][0]["parameters"]))[0]) for f in (factors[-3], high) for m in fits
-    ]
+    below = [(f"{m}, ×{f}", judged(as_arrays(fits[m][f][0]["parameters"]))[0]) for f in (high, higher) for m in fits]
     for row, shown in ((1, pictures), (2, below)):
         for column, (title, image) in enumerate(shown[:6]):
             axes = figure.add_subplot(grid[row, column])
