@@ -36,16 +36,18 @@ class Derivative(NamedTuple):
     """A row that looks at one derivative image.
 
     Attributes:
-        scene: () → the scene, at rest where the derivative is taken. Its first mode is looked at.
+        scene: () → the scene, at rest where the derivative is taken.
         reference: () → the scene whose truth is compared with, where that is another one that looks alike.
         pixel: as of `pixel_of`, where that cannot know.
         double: whether the library computes in float64.
+        mode: which of the scene's modes is looked at; None for the first.
     """
 
     scene: Callable[[], Scene]
     reference: Callable[[], Scene] | None = None
     pixel: float | None = None
     double: bool = False
+    mode: str | None = None
 
     def __call__(self, method: Method, context: Context) -> Outcome:
         """The error of the method."""
@@ -67,7 +69,7 @@ class Derivative(NamedTuple):
             truth_error: of the truth itself.
         """
         scene = self.scene()
-        mode = next(iter(scene.directions))
+        mode = next(iter(scene.directions)) if self.mode is None else self.mode
         drawn = renderer(scene, method, np.float64 if self.double else np.float32)
         pixel = pixel_of(scene, mode) if self.pixel is None else self.pixel
         found = drawn.derivative(mode) * pixel

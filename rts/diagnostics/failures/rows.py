@@ -22,6 +22,8 @@ GRID = (
 )
 NO_EDGES = "`none` has no derivative at outlines, by construction."
 ONE_LAYER = "`single` knows nothing of what lies behind."
+THIN = "What is thinner than a pixel is met by some rays only, and nothing tells of it between them: more samples help."
+COARSE = "An error of one sample a pixel, which tells only between which two centres an edge is: more samples help."
 
 
 def _spread(sizes: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -52,19 +54,19 @@ ROWS: tuple[Row, ...] = (
         "pose",
         f"A box with a colour a face before a pattern; six numbers, from 4 pixels off along each. {FIT}",
         Fitted(scenes.box_pose, POSE),
-        f"{NO_EDGES}",
+        NO_EDGES,
     ),
     Row(
         "square slides behind bunny",
         f"The bunny's faces that look away culled; from up to 8 pixels off. {FIT}",
         Fitted(scenes.square_behind_bunny, SLIDE),
-        f"{NO_EDGES}",
+        NO_EDGES,
     ),
     Row(
         "… behind an open bunny",
         f"Nothing is culled: the square is the third layer. {FIT}",
         Fitted(scenes.square_behind_open_bunny, SLIDE),
-        f"{NO_EDGES}",
+        NO_EDGES,
     ),
     Row(
         "card behind a shell",
@@ -78,25 +80,71 @@ ROWS: tuple[Row, ...] = (
         Several(tuple(Derivative(partial(scenes.stack, count)) for count in (2, 4, 6, 8))),
         f"{NO_EDGES} {ONE_LAYER}",
     ),
-    Row("coplanar surfaces", f"Two cards in one plane overlap; one slides. {ERROR}", Derivative(scenes.coplanar)),
-    Row("… 1e-3 apart", f"As before. {ERROR}", Derivative(partial(scenes.coplanar, 1e-3))),
-    Row("interpenetrating surfaces", f"Two spheres cross; one moves. {ERROR}", Derivative(scenes.crossing)),
+    Row(
+        "coplanar surfaces",
+        f"Two cards in one plane overlap; one slides. {ERROR}",
+        Derivative(scenes.coplanar),
+        (
+            f"{NO_EDGES} Depths tie, so that one card is taken for the continuation of the other, and "
+            "they are averaged; see below."
+        ),
+    ),
+    Row("… 1e-3 apart", f"As before. {ERROR}", Derivative(partial(scenes.coplanar, 1e-3)), f"{NO_EDGES} {COARSE}"),
+    Row(
+        "interpenetrating surfaces",
+        f"Two spheres cross; one moves. {ERROR}",
+        Derivative(scenes.crossing),
+        f"{NO_EDGES} Where surfaces cross, depth does not jump, so splats average both.",
+    ),
     Row(
         "wires of 1, 0.5, 0.25 pixels",
         f"Seven of them over black, slanted. {ERRORS}",
         Several(tuple(Derivative(partial(scenes.wires, width)) for width in (1.0, 0.5, 0.25))),
+        f"{NO_EDGES} {THIN}",
     ),
     Row(
         "gaps of 1, 0.5, 0.25 pixels",
         f"Between two cards of which one moves; white shows through. {ERRORS}",
         Several(tuple(Derivative(partial(scenes.gap, width)) for width in (1.0, 0.5, 0.25))),
+        f"{NO_EDGES} {THIN}",
     ),
-    Row("several edges in a pixel", f"Teeth of 0.7 pixels, 1.3 apart. {ERROR}", Derivative(scenes.comb)),
-    Row("upright edges", f"A card exactly along the pixels. {ERROR}", Derivative(scenes.upright)),
-    Row("grazing sheet", f"Striped, seen from three degrees above; it rises. {ERROR}", Derivative(scenes.grazing)),
-    Row("silhouette leaves the image", f"On three sides. {ERROR}", Derivative(scenes.leaving)),
-    Row("crosses the near plane", f"A sphere of which a part is cut off. {ERROR}", Derivative(scenes.through_near)),
-    Row("goes on behind the camera", f"A band on the floor. {ERROR}", Derivative(scenes.past_camera, pixel=1.0)),
+    Row(
+        "several edges in a pixel",
+        f"Teeth of 0.7 pixels, 1.3 apart. {ERROR}",
+        Derivative(scenes.comb),
+        f"{NO_EDGES} {THIN}",
+    ),
+    Row(
+        "upright edges", f"A card exactly along the pixels. {ERROR}", Derivative(scenes.upright), f"{NO_EDGES} {COARSE}"
+    ),
+    Row(
+        "grazing sheet",
+        f"Striped, seen from three degrees above; it rises. {ERROR}",
+        Derivative(scenes.grazing),
+        f"{NO_EDGES} {COARSE}",
+    ),
+    Row("silhouette leaves the image", f"On three sides. {ERROR}", Derivative(scenes.leaving), f"{NO_EDGES} {COARSE}"),
+    Row(
+        "slides through the near plane",
+        f"A slanted card, cut off there. {ERROR}",
+        Derivative(scenes.through_near),
+        f"{NO_EDGES} {COARSE}",
+    ),
+    Row(
+        "… and comes nearer",
+        f"The card moves towards the camera, and the cut across it. {ERROR}",
+        Derivative(scenes.through_near, pixel=1.0, mode="tz"),
+        (
+            "The edge that the near plane cuts stays where the plane is, while samples move with the "
+            "card: bring the plane nearer."
+        ),
+    ),
+    Row(
+        "reaches behind the camera",
+        f"A band on the floor. {ERROR}",
+        Derivative(scenes.past_camera, pixel=1.0),
+        f"{NO_EDGES} {COARSE}",
+    ),
     Row(
         "empty view",
         "A sphere beside the image. Figure: the norm of the derivative, which is zero.",
@@ -112,29 +160,50 @@ ROWS: tuple[Row, ...] = (
         "A sphere of one colour turns about its middle, and nothing changes. Figure: the low-passed norm of the "
         "derivative over that of the sphere moving. Degraded above 0.1, failed above 0.3.",
         Vanishing(scenes.turning_ball, (0.1, 0.3)),
+        (
+            "Coverage moves with the samples inside the outline, and these turn; the back of the ball, "
+            "turning the other way, is what cancels it in `multi`."
+        ),
     ),
     Row(
         "slivers, triangles of no area",
         f"Among those of a sphere before a card. {ERROR}",
         Several((Derivative(scenes.with_slivers, scenes.plain),)),
+        f"{NO_EDGES} {COARSE}",
     ),
-    Row("scale 1e-4", f"A sphere before a card. {ERROR}", Derivative(partial(scenes.scaled, 1e-4), scenes.plain)),
-    Row("scale 1e4", f"As before. {ERROR}", Derivative(partial(scenes.scaled, 1e4), scenes.plain)),
+    Row(
+        "scale 1e-4",
+        f"A sphere before a card. {ERROR}",
+        Derivative(partial(scenes.scaled, 1e-4), scenes.plain),
+        f"{NO_EDGES} {COARSE}",
+    ),
+    Row(
+        "scale 1e4",
+        f"As before. {ERROR}",
+        Derivative(partial(scenes.scaled, 1e4), scenes.plain),
+        f"{NO_EDGES} {COARSE}",
+    ),
     Row(
         "1e5 away from the origin",
         f"As before, vertices and camera in float64, derivatives in float32. {ERROR}",
         Derivative(partial(scenes.scaled, 1.0, 1e5), scenes.plain),
+        (
+            "Triangles are sampled in float32, whose steps there are 0.008, a third of a pixel: keep "
+            "vertices near the origin of their part."
+        ),
     ),
     Row(
-        "… in float64",
-        f"As before, derivatives in float64. {ERROR}",
-        Derivative(partial(scenes.scaled, 1.0, 1e5), scenes.plain, double=True),
+        "… by a transform, in float64",
+        f"As before; vertices are near the origin of their part, derivatives in float64. {ERROR}",
+        Derivative(partial(scenes.offset, 1e5), scenes.plain, double=True),
+        NO_EDGES,
     ),
     Row(
         "float32 against float64",
         "A sphere before a card. Figure: what the derivative in float32 is off from that in float64, low-passed "
         "relative L2. Degraded above 1e-3, failed above 0.1.",
         fields.precision,
+        NO_EDGES,
     ),
     Row(
         "lattice ties",
@@ -151,39 +220,53 @@ ROWS: tuple[Row, ...] = (
         "density grid by Adam",
         f"The 16³ values of a lattice, one view. {GRID}",
         partial(fields.density_grid, "adam", 0.03),
+        "Steps are as long for values that are seen once in a while as for others, and debris gathers: take SGD.",
     ),
-    Row("… by gradient descent", f"As before. {GRID}", partial(fields.density_grid, "sgd", 300.0)),
+    Row("… by SGD", f"As before. {GRID}", partial(fields.density_grid, "sgd", 100.0), NO_EDGES),
     Row(
         "symmetric trap",
         "A sphere swept along a circle, fitted to a torus seen from its axis (§4.5). Figure: the radii, truly 0.60 and "
         "0.25. Degraded above 0.02 off, failed above 0.1.",
         fields.swept_trap,
+        "The outer outline fixes the sum of the radii, and nothing that is seen opens the hole: take another view.",
     ),
-    Row("… seen from aside", "As before, from where the hole is not hidden by symmetry.", fields.swept_turned),
+    Row(
+        "… seen from aside",
+        "As before, from where the hole is not hidden by symmetry.",
+        fields.swept_turned,
+        NO_EDGES,
+    ),
     Row(
         "card turned, from facing",
         f"About its upright axis by half a radian, from where its silhouette is widest. {FIT}",
         Fitted(scenes.turning_card, _at(scenes.facing_card(), spread=0.0)),
+        NO_EDGES,
     ),
     Row(
         "too far for overlap",
         f"A card of 16 × 12 pixels that begins 18 to 22 pixels off. {FIT}",
         Fitted(scenes.far_card, partial(_ring, 18.0, 22.0), rate=1.5),
+        (
+            f"{NO_EDGES} Images that do not overlap have no slope towards one another; some fits find "
+            "theirs by chance. Blur them."
+        ),
     ),
     Row(
         "… images blurred at first",
         f"As before; both images through a Gaussian of 12 pixels that shrinks to none. {FIT}",
         Fitted(scenes.far_card, partial(_ring, 18.0, 22.0), rate=1.5, blur=12.0),
+        NO_EDGES,
     ),
     Row(
         "fit from behind another",
         f"A card that begins wholly hidden. {FIT}",
         Fitted(scenes.hidden_card, _at(-45.0, 0.0, spread=2.0)),
+        "What is hidden changes no image, so nothing says where it is: start elsewhere, or take another view.",
     ),
     Row(
         "gauge freedom, LM",
         f"A pose made of two: six combinations of twelve numbers change nothing. {FIT}",
         fields.gauge_freedom,
-        f"{NO_EDGES}",
+        NO_EDGES,
     ),
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from rts.diagnostics.comparison import shapes
 from rts.diagnostics.comparison.builtin import data_file, read_mesh
 from rts.diagnostics.comparison.scene import Scene
 from rts.diagnostics.comparison.shapes import CARD_DEPTH, DISTANCE, QUAD, on_screen, pixel, rectangle, unlit
+from rts.engines import engine_of
 from rts.interfaces import Part
 from rts.operations.rigid import rigid
 from rts.trees import Tree
@@ -227,14 +229,15 @@ def leaving() -> Scene:
 
 
 def through_near() -> Scene:
-    """A sphere of which the near plane cuts off a part."""
-    return posed("near plane", sphere(0.35, (0.05, 0.02, 2.5), detail=4), depth=0.7)
+    """A slanted card of which the near plane cuts off a part; sideways, and towards the camera."""
+    corners = np.array([[-0.15, -0.13, -0.35], [0.3, -0.13, -1.0], [0.3, 0.12, -1.0], [-0.15, 0.12, -0.35]])
+    return posed("near plane", unlit(corners + [0, 0, DISTANCE], QUAD, RED), ("tx", "tz"), depth=0.6)
 
 
 def past_camera() -> Scene:
     """A band on the floor that goes on behind the camera."""
-    points = np.array([[-0.35, -0.3, 6.0], [0.3, -0.3, 6.0], [0.5, -0.3, -3.0], [-0.55, -0.3, -3.0]])
-    return posed("behind the camera", unlit(points, [(0, 1, 2), (0, 2, 3)], RED), depth=0.9)
+    points = np.array([[-0.18, -0.3, 6.0], [0.12, -0.3, 6.0], [0.2, -0.3, 0.0], [-0.25, -0.3, 0.0]])
+    return posed("behind the camera", unlit(points, [(0, 1, 2), (0, 2, 3)], RED), depth=1.5)
 
 
 def empty() -> Scene:
@@ -287,6 +290,23 @@ def scaled(factor: float, away: float = 0.0) -> Scene:
         (away, 0.0, DISTANCE * factor), (away, 0, 0), fov_y=shapes.FOV, near=0.5 * factor, far=10.0 * factor
     )
     return posed("sphere before a card", parts, camera=camera, unit=factor)
+
+
+def offset(away: float) -> Scene:
+    """As `plain`, with vertices near the origin of parts whose transforms are far from that of the world."""
+    scene, still = plain(), np.eye(4)
+    still[0, 3] = away
+
+    def at(parameters: Mapping[str, Any]) -> tuple[list[Part], Camera]:
+        parts, camera = scene.at(parameters)
+        moved = []
+        for part in parts:
+            own = np.eye(4) if part.transform is None else part.transform
+            moved.append(part.replace(transform=engine_of(own).constant(still, own) @ own))
+        view = np.asarray(camera.view, np.float64) @ np.linalg.inv(still)
+        return moved, camera.replace(view=view)
+
+    return replace(scene, at=at)
 
 
 def with_slivers(shader: str = "unlit") -> Scene:
