@@ -2,6 +2,7 @@
 
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -125,6 +126,19 @@ def test_every_row_is_told():
     assert len({row.name for row in ROWS}) == len(ROWS)
     assert all(row.note for row in ROWS)
     assert METHOD[DEFAULT].options == {"splatter": "visible", "layers": 2}
+
+
+def test_the_committed_table_is_whole():
+    path = Path(__file__).parent.parent / "benchmarks" / "results" / "stability.json"
+    data = json.loads(path.read_text())
+    own = [i for i, name in enumerate(data["methods"]) if not METHOD[name].peer]
+    assert data["methods"] == list(METHOD)
+    assert [row["name"] for row in data["rows"][1:]] == [row.name for row in ROWS]
+    for row in data["rows"]:
+        cells = row["cells"]
+        assert not cells[data["methods"].index(DEFAULT)]["numbers"].get("nan"), row["name"]
+        if any(cells[i]["verdict"] in ("degraded", "failed") for i in own):
+            assert row["why"], row["name"]
 
 
 def test_the_table_is_written_and_goes_on(tmp_path):

@@ -56,7 +56,7 @@ class Derivative(NamedTuple):
         except Unable as reason:
             return cannot(str(reason))
         more = f", {numbers['nan']} NaN" if numbers["nan"] else ""
-        verdict = graded(numbers["error"], *ERRORS, numbers["nan"])
+        verdict = graded(numbers["error"], *ERRORS, int(numbers["nan"]))
         return Outcome(verdict, f"{numbers['error']:.2f} ({numbers['largest']:.1f}×){more}", numbers)
 
     def numbers(self, method: Method, context: Context) -> dict[str, float]:

@@ -85,11 +85,16 @@ ROWS: tuple[Row, ...] = (
         f"Two cards in one plane overlap; one slides. {ERROR}",
         Derivative(scenes.coplanar),
         (
-            f"{NO_EDGES} Depths tie, so that one card is taken for the continuation of the other, and "
+            f"{NO_EDGES} {ONE_LAYER} Depths tie, so that one card is taken for the continuation of the other, and "
             "they are averaged; see below."
         ),
     ),
-    Row("… 1e-3 apart", f"As before. {ERROR}", Derivative(partial(scenes.coplanar, 1e-3)), f"{NO_EDGES} {COARSE}"),
+    Row(
+        "… 1e-3 apart",
+        f"As before. {ERROR}",
+        Derivative(partial(scenes.coplanar, 1e-3)),
+        f"{NO_EDGES} {ONE_LAYER} {COARSE}",
+    ),
     Row(
         "interpenetrating surfaces",
         f"Two spheres cross; one moves. {ERROR}",
@@ -106,7 +111,7 @@ ROWS: tuple[Row, ...] = (
         "gaps of 1, 0.5, 0.25 pixels",
         f"Between two cards of which one moves; white shows through. {ERRORS}",
         Several(tuple(Derivative(partial(scenes.gap, width)) for width in (1.0, 0.5, 0.25))),
-        f"{NO_EDGES} {THIN}",
+        f"{NO_EDGES} {ONE_LAYER} {THIN}",
     ),
     Row(
         "several edges in a pixel",
@@ -169,19 +174,19 @@ ROWS: tuple[Row, ...] = (
         "slivers, triangles of no area",
         f"Among those of a sphere before a card. {ERROR}",
         Several((Derivative(scenes.with_slivers, scenes.plain),)),
-        f"{NO_EDGES} {COARSE}",
+        f"{NO_EDGES} {ONE_LAYER} {COARSE}",
     ),
     Row(
         "scale 1e-4",
         f"A sphere before a card. {ERROR}",
         Derivative(partial(scenes.scaled, 1e-4), scenes.plain),
-        f"{NO_EDGES} {COARSE}",
+        f"{NO_EDGES} {ONE_LAYER} {COARSE}",
     ),
     Row(
         "scale 1e4",
         f"As before. {ERROR}",
         Derivative(partial(scenes.scaled, 1e4), scenes.plain),
-        f"{NO_EDGES} {COARSE}",
+        f"{NO_EDGES} {ONE_LAYER} {COARSE}",
     ),
     Row(
         "1e5 away from the origin",
@@ -222,7 +227,12 @@ ROWS: tuple[Row, ...] = (
         partial(fields.density_grid, "adam", 0.03),
         "Steps are as long for values that are seen once in a while as for others, and debris gathers: take SGD.",
     ),
-    Row("… by SGD", f"As before. {GRID}", partial(fields.density_grid, "sgd", 100.0), NO_EDGES),
+    Row(
+        "… by SGD",
+        f"As before. {GRID}",
+        partial(fields.density_grid, "sgd", 100.0),
+        f"{NO_EDGES} Debris of one sample a pixel is left: more samples help.",
+    ),
     Row(
         "symmetric trap",
         "A sphere swept along a circle, fitted to a torus seen from its axis (§4.5). Figure: the radii, truly 0.60 and "

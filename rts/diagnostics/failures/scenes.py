@@ -12,7 +12,7 @@ import numpy as np
 from rts.camera import Camera
 from rts.diagnostics.comparison import shapes
 from rts.diagnostics.comparison.builtin import data_file, read_mesh
-from rts.diagnostics.comparison.scene import Scene
+from rts.diagnostics.comparison.scene import Scene, parts_of
 from rts.diagnostics.comparison.shapes import CARD_DEPTH, DISTANCE, QUAD, on_screen, pixel, rectangle, unlit
 from rts.engines import engine_of
 from rts.interfaces import Part
@@ -251,9 +251,9 @@ def covered() -> Scene:
     hidden, both = posed("hidden", parts, moves=[0]), posed("hidden", parts, moves=[1])
 
     def at(parameters: Mapping[str, Any]) -> tuple[list[Part], Camera]:
-        first, camera = hidden.at({"pose": parameters["hidden"]})
-        second, _ = both.at({"pose": parameters["card"]})
-        return [first[0], second[1]], camera
+        first = hidden.at({"pose": parameters["hidden"]})
+        second = both.at({"pose": parameters["card"]})
+        return [parts_of(first)[0], parts_of(second)[1]], first[1]
 
     zero, unit = np.zeros(6), np.eye(6)[3]
     directions = {
@@ -298,9 +298,9 @@ def offset(away: float) -> Scene:
     still[0, 3] = away
 
     def at(parameters: Mapping[str, Any]) -> tuple[list[Part], Camera]:
-        parts, camera = scene.at(parameters)
-        moved = []
-        for part in parts:
+        found = scene.at(parameters)
+        moved, camera = [], found[1]
+        for part in parts_of(found):
             own = np.eye(4) if part.transform is None else part.transform
             moved.append(part.replace(transform=engine_of(own).constant(still, own) @ own))
         view = np.asarray(camera.view, np.float64) @ np.linalg.inv(still)
@@ -311,7 +311,7 @@ def offset(away: float) -> Scene:
 
 def with_slivers(shader: str = "unlit") -> Scene:
     """As `plain`, the sphere with triangles of no area and needles that a float can hardly tell from it."""
-    sphere_, far = plain().at(plain().parameters)[0]
+    sphere_, far = parts_of(plain().at(plain().parameters))
     vertices, faces = sphere_.theta["vertices"], np.asarray(sphere_.surface.faces)
     extra = [[i, i, j] for i, j in faces[:40, :2]] + [[i, i, i] for i in range(20)]
     count = len(vertices)

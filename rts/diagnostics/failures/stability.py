@@ -8,6 +8,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from rts.arguments import quoted
 from rts.checks import is_count
 from rts.diagnostics.comparison.environment import environment
@@ -169,7 +171,8 @@ def _plain(value: Any) -> Any:
         return {key: _plain(v) for key, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(v) for v in value]
-    if isinstance(value, float) or hasattr(value, "dtype"):
-        value = value.item() if hasattr(value, "dtype") else value
-        return (float(f"{value:.4g}") if math.isfinite(value) else str(value)) if isinstance(value, float) else value
+    if isinstance(value, (np.ndarray, np.generic)):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return float(f"{value:.4g}") if math.isfinite(value) else str(value)
     return value
