@@ -16,6 +16,7 @@ from rts.diagnostics.failures.methods import Method
 from rts.diagnostics.failures.outcome import Context, Outcome, cannot, graded
 from rts.diagnostics.failures.renderers import Own, Unable, quiet
 from rts.engines import engine_named
+from rts.errors import InputError
 from rts.fitting.fit import fit
 from rts.interfaces import Part
 from rts.operations.rigid import rigid
@@ -129,7 +130,10 @@ def gauge_freedom(method: Method, context: Context) -> Outcome:
             return image - engine.constant(target, image)
 
         first = engine.constant(start.astype(np.float32))
-        run = fit(residuals, first, method="lm", steps=40, progress=False)
+        try:
+            run = fit(residuals, first, method="lm", steps=40, progress=False)
+        except InputError as error:
+            return Outcome("failed", "no derivative", {"why": str(error), "nan": 0})
         poses = engine.to_numpy(run.parameters).astype(np.float64)
         nan += int((~np.isfinite(poses)).sum())
         drifts.append(float(np.abs(poses - start).max()))

@@ -159,6 +159,7 @@ ROWS: tuple[Row, ...] = (
         "wholly hidden",
         "A sphere behind a card. Figure: the norm of its derivative, which is zero, over that of the card's.",
         Vanishing(scenes.covered, (0.01, 0.1)),
+        NO_EDGES,
     ),
     Row(
         "round object that turns",
