@@ -7,7 +7,7 @@ import inspect
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,9 +16,10 @@ from rts.arguments import quoted
 from rts.arrays import from_numbers, kind_of
 from rts.checks import check_size, is_count, is_real
 from rts.diagnostics.comparison.progress import Phase, phases
-from rts.diagnostics.explaining import explained
-from rts.diagnostics.reasons import Reason, legend, marked
-from rts.diagnostics.slopes import Number, Scene, Setting, Slope, chosen, measured, unit
+from rts.diagnostics.explanation.explaining import explained
+from rts.diagnostics.explanation.reasons import Reason, legend, marked
+from rts.diagnostics.explanation.setting import Scene, Setting
+from rts.diagnostics.explanation.slopes import Number, Slope, chosen, measured, unit
 from rts.engines import Engine, engine_of, is_constant, namespace
 from rts.errors import EmptyImageWarning, InputError, LayersWarning
 from rts.files.srgb import decode_srgb
@@ -103,12 +104,12 @@ class GradientCheck(NamedTuple):
         tolerance: how far a derivative may be off, relative to itself.
         reasons: why slopes differ or vanish, those that explain most first.
         picture: (H, W, 3) linear RGB for `rts.save_image`: the scene, dark, and the pixels of reasons in their colours.
-        note: what was left out when the budget was spent; empty if nothing was.
+        note: what was left out, since the budget was spent, say; empty if nothing was.
     """
 
     slopes: list[Slope]
     tolerance: float
-    reasons: list[Reason] = []  # noqa: RUF012  # Nobody changes it.
+    reasons: Sequence[Reason] = ()
     picture: np.ndarray | None = None
     note: str = ""
 
@@ -118,7 +119,8 @@ class GradientCheck(NamedTuple):
         They may be off by the tolerance, three error bars and what is negligible beside the other slopes. Slopes of
         different units are compared by what a step of a pixel does to the loss.
         """
-        largest = max(abs(s.difference * s.step) for s in self.slopes)
+        effects = [abs(s.difference * s.step) for s in self.slopes]
+        largest = max((x for x in effects if math.isfinite(x)), default=0.0)
         allowed = self.tolerance * abs(slope.difference) + 3 * slope.error + NEGLIGIBLE * largest / slope.step
         return abs(slope.autodiff - slope.difference) <= allowed
 
@@ -203,12 +205,15 @@ def check_gradient(
         setting.require_dependence()
         numbers, count = _looked_at(setting, entries, samples, clock, phase)
         check = GradientCheck([n.slope for n in numbers], tolerance)
-        found, left = explained(setting, numbers, check.agrees, own, clock.going, phase)
+        plain = [n for n in numbers if n.forward]
+        found, left = explained(setting, plain, check.agrees, own, clock.going, phase)
         picture = marked(setting.seen, found)
     notes = [f"{len(numbers)} of {count} numbers were looked at"] if len(numbers) < count else []
-    notes += [f"reasons were not looked for in {left} of them"] if left else []
-    note = f"After {clock.spent:.0f} s the budget was spent: {', and '.join(notes)}." if notes else ""
-    return check._replace(reasons=found, picture=picture, note=note)
+    notes += [f"reasons were not looked for, or not all, in {left} of them"] if left else []
+    told = [f"After {clock.spent:.0f} s the budget was spent: {', and '.join(notes)}."] if notes else []
+    if len(plain) < len(numbers):
+        told.append("Reasons were not looked for, since forward mode does not go through the splatter or a shader.")
+    return check._replace(reasons=found, picture=picture, note=" ".join(told))
 
 
 class _Clock:

@@ -62,7 +62,7 @@ def _outside(proxy: Proxy, local: Camera) -> str | None:
     depth = -(corners @ local.view[2, :3] + local.view[2, 3])
     near, far = local.depth_range()
     if (depth < near).all():
-        where = "behind the camera" if (at[:, 3] <= 0).all() else f"nearer than the near plane, at {near:.3g}"
+        where = "behind the camera" if (at[:, 3] <= 0).all() else f"nearer than the near plane, at {near + 0.0:.3g}"
         return f"lies {where}"
     if (depth > far).all():
         return f"lies beyond the far plane, at {far:.3g}"

@@ -26,6 +26,7 @@ KINDS = {
     "crossing": ("teal", (0, 140, 130)),
     "bias": ("pink", (255, 150, 170)),
     "reach": ("brown", (170, 95, 30)),
+    "infinite": ("gold", (200, 160, 0)),
     "undetermined": ("none", None),
     "unknown": ("white", (255, 255, 255)),
 }
@@ -46,6 +47,7 @@ KINDS = {
 - crossing: parts pass through one another.
 - bias: a bias of the library, which a sphere or a box shows, too.
 - reach: the loss is flat here, beyond the reach of a pixel.
+- infinite: the derivative is NaN, or infinite.
 - undetermined: the image does not determine it, or a combination.
 - unknown: no experiment tells.
 """
@@ -76,7 +78,7 @@ class Reason(NamedTuple):
     """Why derivatives disagree with the truth, or vanish.
 
     Attributes:
-        kind: a key of `rts.diagnostics.reasons.KINDS`.
+        kind: a key of `rts.diagnostics.explanation.reasons.KINDS`.
         parameters: the names of the numbers.
         text: what is so, how much of it, and what to do: a plain sentence or two.
         pixels: (H, W) bool, where it shows.
@@ -128,7 +130,7 @@ def marked(image: np.ndarray, reasons: Sequence[Reason]) -> np.ndarray:
 
     Where two mark a pixel, the earlier one has it.
     """
-    grey = np.clip(image[..., :3].mean(axis=-1) + 0.15 * image[..., 3], 0, 1)
+    grey = np.clip(np.nan_to_num(image[..., :3].mean(axis=-1) + 0.15 * image[..., 3]), 0, 1)
     picture = np.repeat((DIM**2 * grey)[..., None], 3, axis=-1)
     for reason in reversed(reasons):
         color = KINDS[reason.kind][1]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rts.camera import Camera
-from rts.diagnostics.slopes import Change
+from rts.diagnostics.explanation.setting import Change
 from rts.engines import engine_of, namespace
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part, as_surface
@@ -85,8 +85,10 @@ def all_of(*changes: Any) -> Change:
     return change
 
 
-def names(indices: Sequence[int]) -> str:
-    """Parts in words."""
+def names(indices: Sequence[int], word: str = "and") -> str:
+    """Parts in words, such as "parts 0 and 2"."""
     if len(indices) == 1:
         return f"part {indices[0]}"
-    return f"parts {', '.join(map(str, indices[:3]))}{', …' if len(indices) > 3 else ''}"
+    if len(indices) > 3:
+        return f"parts {', '.join(map(str, indices[:3]))}, …"
+    return f"parts {', '.join(map(str, indices[:-1]))} {word} {indices[-1]}"

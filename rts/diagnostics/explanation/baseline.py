@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.camera import Camera
-from rts.diagnostics import variants
 from rts.diagnostics.comparison.shapes import box, icosphere, unlit
-from rts.diagnostics.slopes import Number, Setting, measured
+from rts.diagnostics.explanation import variants
+from rts.diagnostics.explanation.setting import Setting
+from rts.diagnostics.explanation.slopes import Number, measured
 from rts.engines import engine_of, namespace
 from rts.interfaces import Part
 from rts.trees import Tree, leaves, map_leaves
@@ -73,13 +74,15 @@ def nearest(
             setting,
             scene=partial(_scene, setting, number, vertices, faces, motion),
             parameters={"by": setting.engine.constant(np.zeros(()), next(leaves(setting.parameters)))},
-            options={**setting.options, **options, "background": None},
+            options={**setting.options, **options, "background": None, "sampler": "auto"},
         )
         mask = moved.seen[..., 3] > 0.5
         candidates.append(((mask & seen).sum() / max((mask | seen).sum(), 1), name, moved))
     _, name, moved = max(candidates, key=lambda c: c[0])
     direction = map_leaves(namespace(*leaves(moved.parameters)).ones_like, moved.parameters)
     found = measured(moved, name, direction, None, SAMPLES)
+    if not found.forward:
+        return None
     return Baseline(name, found.pushed, found.true, found.slope.autodiff, found.slope.difference)
 
 

@@ -1,9 +1,9 @@
-"""Derivatives of a scene's image and loss in single numbers of its parameters, found in two ways."""
+"""A scene, how it is rendered, and which of its arrays change with its parameters."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any, NamedTuple
@@ -12,13 +12,15 @@ import numpy as np
 
 from rts.arrays import kind_of
 from rts.camera import Camera
-from rts.checks import check_scene
+from rts.checks import check_scene, check_splatter
+from rts.diagnostics.explanation.fineness import Fineness, fineness
 from rts.diagnostics.steps import pixel_step
 from rts.engines import Engine, is_constant, namespace
 from rts.errors import InputError
 from rts.fitting.names import named_leaves
 from rts.interfaces import CheckedPart, Part
-from rts.rendering import render
+from rts.records import Sampled
+from rts.rendering import render, sample
 from rts.sampling.prepared import PreparedParts
 from rts.trees import Array, Tree, leaves, map_leaves
 
@@ -26,50 +28,14 @@ Scene = Callable[[Tree], tuple[Part | Sequence[Part] | PreparedParts, Camera]]
 Change = Callable[[list[Part], Camera], tuple[list[Part], Camera]]
 """Another scene, made of one."""
 
-STEP_UNSEEN = 1e-2
-"""How far the finite differences change a number that nothing seems to depend on."""
 DEPENDS = 1.0
 """How far parameters are changed to see whether the scene depends on them at all."""
 SHORT = 1e-3
 """How far they are changed to see how fast arrays of the scene change."""
 DEEP = 8
 """Layers of the finite differences where shaders are not opaque."""
-
-
-class Slope(NamedTuple):
-    """The derivative of a loss in one number of the parameters, found in two ways.
-
-    Attributes:
-        name: where the number is, such as "pose[2]".
-        autodiff: the derivative through the splatter.
-        difference: the central finite difference of area-sampled hard renders.
-        error: how far the difference may be off: what two sampling grids and two steps disagree on.
-        step: the step of the difference, in units of the number.
-    """
-
-    name: str
-    autodiff: float
-    difference: float
-    error: float
-    step: float
-
-
-class Number(NamedTuple):
-    """One number of the parameters, and what it does to the image.
-
-    Attributes:
-        slope: what it does to the loss.
-        direction: of the parameters' structure, 1 at the number.
-        pushed: (H, W, 4), the derivative of the image through the splatter, for a step of the slope's length.
-        true: (H, W, 4), the finite difference over that step.
-        noise: (H, W, 4), half of what two sampling grids disagree on, signed.
-    """
-
-    slope: Slope
-    direction: Tree
-    pushed: np.ndarray
-    true: np.ndarray
-    noise: np.ndarray
+HELD = 4
+"""How deep functions and objects are searched for arrays that they hold."""
 
 
 class Place(NamedTuple):
@@ -166,9 +132,20 @@ class Setting:
         options = dict(splatter="none", supersample=samples, layers=layers)
         return self.image(self.moved(direction, by), change, **options)
 
-    def push(self, direction: Tree, change: Change | None = None, **options: Any) -> np.ndarray:
-        """The derivative (H, W, 4) of the image along a direction, by forward mode."""
-        return self._pushed(direction, partial(self.drawn, change=change, **options))
+    def push(
+        self, direction: Tree, change: Change | None = None, *, connect: bool = False, **options: Any
+    ) -> np.ndarray:
+        """The derivative (H, W, 4) of the image along a direction, by forward mode.
+
+        Args:
+            direction: of the parameters.
+            change: of the scene.
+            connect: whether arrays that no derivative leads to move, too.
+            **options: of `rts.render`.
+        """
+        one, unit, at = self._line(direction, connect)
+        draw = partial(self.drawn, change=change, **options)
+        return self.engine.to_numpy(self.engine.jvp(lambda t: draw(at(t)), one * 0, unit)[1])
 
     def step(
         self, direction: Tree, change: Change | None = None, *, connect: bool = False, deep: bool = False, **given: Any
@@ -188,10 +165,6 @@ class Setting:
             return self.drawn(at(t), change, **{**given, **options})
 
         return pixel_step(self.engine, image, one * 0, unit, deep=deep)
-
-    def _pushed(self, direction: Tree, draw: Callable[[tuple], Array]) -> np.ndarray:
-        one, unit, at = self._line(direction)
-        return self.engine.to_numpy(self.engine.jvp(lambda t: draw(at(t)), one * 0, unit)[1])
 
     def _line(self, direction: Tree, connect: bool = False) -> tuple[Array, Array, Callable[[Array], tuple]]:
         """One and a unit, and t → the scene of the parameters moved by t along a direction.
@@ -220,18 +193,19 @@ class Setting:
 
         try:
             self.engine.jvp(total, self.parameters, self.parameters)
-        except RuntimeError:
+        except (RuntimeError, TypeError):  # Of torch and of jax.
             return False
         return True
 
     def _by_differences(self, direction: Tree, connect: bool) -> Callable[[Array], tuple]:
         rest, like = self.shown(self.parameters), next(leaves(self.parameters))
         places, here = self._arrays(rest)
-        ends = [self._arrays(self.shown(self.moved(direction, by)))[1] for by in (SHORT, -SHORT)]
+        ends = [self._placed(self.shown(self.moved(direction, by))) for by in (SHORT, -SHORT)]
         tangents = []
-        for place, x, a, b in zip(places, here, *ends, strict=True):
-            floating = is_floating(x)
-            moves = floating and (connect or (self.engine.owns(x) and place in self._gradients))
+        for place, x in zip(places, here, strict=True):
+            a, b = (end.get(place, np.empty(0)) for end in ends)
+            alike = is_floating(x) and np.shape(a) == np.shape(b) == np.shape(x)
+            moves = alike and (connect or (self.engine.owns(x) and place in self._gradients))
             tangent = (a - b) / (2 * SHORT) if moves else None
             tangents.append(tangent if self.engine.owns(x) or tangent is None else self.engine.constant(tangent, like))
 
@@ -259,9 +233,12 @@ class Setting:
                 arrays.append(x)
         return places, arrays
 
+    def _placed(self, found: tuple[Any, Camera]) -> dict[Place, Array]:
+        return dict(zip(*self._arrays(found), strict=True))
+
     @cached_property
-    def _gradients(self) -> dict[Place, list[np.ndarray]]:
-        """For each array that some derivative leads to, the gradient of a random sum of it in the parameters."""
+    def _gradients(self) -> dict[Place, list[np.ndarray | None]]:
+        """For each array that some derivative leads to, the gradient of a random sum of it; None where that is 0."""
         engine, found = self.engine, {}
         places, arrays = self._arrays(self.shown(self.parameters))
         for k, (place, x) in enumerate(zip(places, arrays, strict=True)):
@@ -275,36 +252,68 @@ class Setting:
 
             gradient = [engine.to_numpy(g) for g in leaves(engine.value_and_grad(total)(self.parameters)[1])]
             if any(g.any() for g in gradient):
-                found[place] = gradient
+                found[place] = [g if g.any() else None for g in gradient]
         return found
 
     def touched(self, direction: Tree, step: float) -> Touched:
         """The arrays of the scene that change with a step along a direction."""
-        (places, before), (others, after) = (
-            self._arrays(self.shown(self.moved(direction, by))) for by in (-step / 2, step / 2)
-        )
+        scenes = [self.shown(self.moved(direction, by)) for by in (-step / 2, step / 2)]
+        before, after = map(self._placed, scenes)
         changed, constant, cut = [], [], []
-        if places != others:  # Another number of parts, say.
-            return Touched([], [], [])
         along = [self.engine.to_numpy(d) for d in leaves(direction)]
-        for place, a, b in zip(places, before, after, strict=True):
-            numpy = is_constant(a)
-            x, y = (np.asarray(v) if numpy else self.engine.to_numpy(v) for v in (a, b))
-            if x.shape != y.shape or x.dtype.kind != "f" or np.array_equal(x, y, equal_nan=True):
+        for place in dict.fromkeys([*before, *after]):
+            if place.part is not None and place.part >= len(self.parts):
+                continue  # Of the scene as it is, this is no part.
+            ends = [x.get(place) for x in (before, after)]
+            if all(x is not None for x in ends) and self._alike(*ends):
                 continue
             changed.append(place)
             slopes = self._gradients.get(place)
-            if numpy:
+            if is_constant(next(x for x in ends if x is not None)):
                 constant.append(place)
-            elif slopes is None or not any((g * d).any() for g, d in zip(slopes, along, strict=True)):
+            elif slopes is None or not any((g * d).any() for g, d in zip(slopes, along, strict=True) if g is not None):
                 cut.append(place)
+        for index, pair in enumerate(zip(*(listed_parts(parts) for parts, _ in scenes), strict=False)):
+            for name in ("shader", "surface") if index < len(self.parts) else ():
+                a, b = (list(_held(getattr(part, name), self._is_array)) for part in pair)
+                if len(a) != len(b) or not all(map(self._alike, a, b)):
+                    changed.append(Place(index, name))
+                    constant += [changed[-1]] if is_constant([*a, *b]) else []
         return Touched(changed, constant, cut)
+
+    def _is_array(self, x: Any) -> bool:
+        return isinstance(x, np.ndarray) or self.engine.owns(x)
+
+    def _alike(self, a: Array, b: Array) -> bool:
+        if a is b:
+            return True
+        x, y = (np.asarray(v) if is_constant(v) else self.engine.to_numpy(v) for v in (a, b))
+        return x.shape == y.shape and np.array_equal(x, y, equal_nan=x.dtype.kind == y.dtype.kind == "f")
 
     @cached_property
     def parts(self) -> list[CheckedPart]:
         """The parts of the scene as it is, checked."""
         parts, camera = self.shown(self.parameters)
         return check_scene(listed_parts(parts), camera)[0]
+
+    def sampled(self, **options: Any) -> Sampled:
+        """The samples of the scene as it is, as `rts.sample` gives them."""
+        given = {name: self.options[name] for name in ("sampler", "engine") if name in self.options}
+        return sample(*self.shown(self.parameters), self.size, **given, **options)
+
+    @cached_property
+    def supersample(self) -> int:
+        """Samples along each axis of a pixel."""
+        return self.options.get("supersample", 1)
+
+    @cached_property
+    def fineness(self) -> Fineness:
+        """What is thinner than a sample, and what are outlines."""
+        return fineness(self.sampled, self.size, self.supersample)
+
+    def splats_as(self, name: str) -> bool:
+        """Whether the scene's splatter is of the kind that has this name."""
+        return type(check_splatter(self.options.get("splatter", "auto"))) is type(check_splatter(name))
 
     @cached_property
     def opaque(self) -> bool:
@@ -329,69 +338,24 @@ def listed_parts(parts: Any) -> list[Part]:
     return list(parts) if isinstance(parts, (list, tuple)) else [parts]
 
 
-def measured(setting: Setting, name: str, direction: Tree, slope: float | None, samples: int) -> Number:
-    """What one number does, found in two ways.
-
-    Args:
-        setting: what is looked at.
-        name: of the number.
-        direction: in which it changes.
-        slope: the derivative of the loss by reverse mode; None for that by forward mode.
-        samples: the square root of the number of samples a pixel.
-    """
-    step = setting.step(direction) or _step_of_hidden(setting, direction) or STEP_UNSEEN
-    to_numpy = setting.engine.to_numpy
-
-    def hard(length: float, count: int) -> tuple[float, np.ndarray]:
-        after, before = (setting.hard(direction, sign * length / 2, count) for sign in (1, -1))
-        difference = float(to_numpy(setting.loss(after))) - float(to_numpy(setting.loss(before)))
-        return difference / length, to_numpy(after).astype(np.float64) - to_numpy(before)
-
-    (coarse, image), (fine, other), (wide, _) = hard(step, samples), hard(step, samples + 1), hard(2 * step, samples)
-    error = abs(coarse - fine) / 2 + abs(wide - coarse) / 3
-    pushed = setting.push(direction).astype(np.float64) * step
-    if slope is None:
-        slope = float((setting.weights * pushed).sum() / step)
-    found = Slope(name, slope, (coarse + fine) / 2, error, step)
-    return Number(found, direction, pushed, (image + other) / 2, (image - other) / 2)
-
-
-def _step_of_hidden(setting: Setting, direction: Tree) -> float | None:
-    """A step that moves by a pixel what is behind something, or what no derivative leads to."""
-    touched = setting.touched(direction, STEP_UNSEEN)
-    connect = bool(touched.constant or touched.cut)
-    kept = touched.parts
-
-    def alone(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
-        return [p for i, p in enumerate(parts) if kept is None or i in kept], camera
-
-    return (
-        setting.step(direction, alone, connect=connect, deep=True, layers=DEEP, capacity=None) if touched.all else None
-    )
+def _held(thing: Any, is_array: Callable[[Any], bool], depth: int = HELD) -> Iterator[Array]:
+    """Arrays that a function or an object holds: in its closure, defaults and attributes."""
+    if is_array(thing):
+        yield thing
+    elif depth and not isinstance(thing, (str, bytes, type)):
+        if isinstance(thing, Mapping):
+            inside = list(thing.values())
+        elif isinstance(thing, (list, tuple)):
+            inside = list(thing)
+        else:
+            inside = [getattr(thing, name, None) for name in ("__defaults__", "__self__", "__dict__", "func", "args")]
+            for cell in getattr(thing, "__closure__", None) or ():
+                with contextlib.suppress(ValueError):  # What is not assigned yet.
+                    inside.append(cell.cell_contents)
+        for x in inside:
+            yield from _held(x, is_array, depth - 1)
 
 
 def is_floating(x: Array) -> bool:
     """Whether an array, or a number, is of floating numbers."""
     return np.asarray(x).dtype.kind == "f" if is_constant(x) else namespace(x).isdtype(x.dtype, "real floating")
-
-
-def chosen(gradient: np.ndarray, count: int) -> list[int]:
-    """Indices of the largest entries and of some others, fixed by the seed."""
-    if gradient.size <= count:
-        return list(range(gradient.size))
-    largest = np.argsort(-np.abs(gradient), kind="stable")[: (count + 1) // 2]
-    rest = np.setdiff1d(np.arange(gradient.size), largest)
-    others = np.random.default_rng(0).choice(rest, count - len(largest), replace=False)
-    return sorted(map(int, (*largest, *others)))
-
-
-def unit(engine: Engine, parameters: Tree, number: int, index: int) -> Tree:
-    """The direction in which one number of one leaf changes."""
-    count = iter(range(sum(1 for _ in leaves(parameters))))
-
-    def leaf(p: Array) -> Array:
-        found = np.zeros(math.prod(p.shape))
-        found[index if next(count) == number else slice(0)] = 1
-        return namespace(p).astype(engine.constant(found.reshape(p.shape), p), p.dtype, copy=False)
-
-    return map_leaves(leaf, parameters)

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from rts.diagnostics import variants
-from rts.diagnostics.baseline import nearest
 from rts.diagnostics.comparison.scores import low_pass
-from rts.diagnostics.reasons import Finding
-from rts.diagnostics.slopes import DEEP, Number, Setting, Touched
-from rts.diagnostics.vanishing import why_constant
-from rts.engines import engine_of
-from rts.rendering import sample
+from rts.diagnostics.explanation import variants
+from rts.diagnostics.explanation.baseline import nearest
+from rts.diagnostics.explanation.fineness import on_host
+from rts.diagnostics.explanation.reasons import Finding
+from rts.diagnostics.explanation.setting import DEEP, Change, Setting, Touched
+from rts.diagnostics.explanation.slopes import Number
+from rts.diagnostics.explanation.vanishing import why_constant
 
 HALVED = 0.5
 """An experiment names a reason if it leaves less than this share of the error."""
@@ -28,12 +27,6 @@ LARGE_SHARE = 0.3
 """Pixels of a kind name a reason if they hold so much of the disagreement."""
 STRONG = 0.1
 """A pixel disagrees if it is off by this share of the pixel that is most."""
-FINE, CELLS = 8, 2**22
-"""Cells along each side of a sample, to see what is thinner; fewer where there would be more than so many in all."""
-JUMP, FLAT = 0.05, 1e-3
-"""Depth jumps where it changes, from cell to cell, by such a share of all depths' span, and such a share of depth."""
-CORNER = 0.1
-"""The share of a pixel that the disk may leave of corners, without anything being thin there."""
 ALIKE = 0.5
 """The baseline is off, too, if by this share of what the scene is off by."""
 SHORTER, DENSE = 0.25, 8
@@ -79,6 +72,7 @@ class _Case:
         setting: what is looked at.
         number: the number.
         options: of `rts.render`, those of the experiments that helped.
+        connected: whether arrays that no derivative leads to are taken to have one.
         pushed: the derivative with these.
         error: of this.
         left: (H, W) bool, the pixels that are not explained.
@@ -90,9 +84,10 @@ class _Case:
     def __init__(self, setting: Setting, number: Number):
         self.setting, self.number = setting, number
         self.options: dict[str, Any] = {"capacity": None}
+        self.connected = False
         self.pushed = number.pushed
         self.whole = self.error = _Error.of(number.pushed, number.true)
-        self.noise = float(np.linalg.norm(low_pass(number.noise)))
+        self.noise = number.noise
         self.left = np.ones(setting.size, bool)
         self.findings: list[Finding] = []
 
@@ -107,10 +102,23 @@ class _Case:
         energy = error.energy
         return (size > STRONG * size.max()) & (energy > STRONG**2 * energy.max())
 
+    def push(self, change: Change | None = None, **options: Any) -> np.ndarray:
+        """The derivative of the image, as it is now, with a further change and options."""
+        options = {**self.options, **options}
+        found = self.setting.push(self.number.direction, change, connect=self.connected, **options)
+        return found * self.number.slope.step
+
+    def try_connected(self) -> _Error | None:
+        """As `try_out`, with derivatives where there are none."""
+        self.connected = True
+        before = self.try_out()
+        self.connected = before is not None
+        return before
+
     def try_out(self, **options: Any) -> _Error | None:
         """The error before, if options make it much smaller, which are kept then; else None."""
         changed = {**self.options, **options}
-        pushed = self.setting.push(self.number.direction, **changed) * self.number.slope.step
+        pushed = self.push(**options)
         error, before = _Error.of(pushed, self.number.true).within(self.left), self.error
         least = NOISY * self.noise
         if error.norm > HALVED * before.norm and not (error.norm < least and error.norm < BETTER * before.norm):
@@ -124,28 +132,36 @@ class _Case:
 
 
 def _constants(case: _Case, touched: Touched) -> None:
+    """Arrays that no derivative leads to, if it would agree with one."""
     found = why_constant(case.setting, touched)
-    everything = len(touched.all) == len(touched.constant) + len(touched.cut)
-    mask, share = case.strong(case.whole), 1.0 if everything and not case.number.pushed.any() else None
-    case.findings += [f._replace(mask=mask, share=share) for f in found]
+    if not found:
+        return
+    if len(touched.all) == len(touched.constant) + len(touched.cut) and not case.number.pushed.any():
+        mask = case.strong(case.whole)
+        case.findings += [f._replace(mask=mask, share=1.0) for f in found]
+        return
+    before = case.try_connected()
+    if before is not None:
+        mask, share = case.strong(before), case.gained(before)
+        case.findings += [f._replace(mask=mask, share=share) for f in found]
 
 
 def _outlines(case: _Case, touched: Touched) -> None:
     """A splatter that gives outlines no derivative, or hides what a better one shows."""
     splatter = case.setting.options.get("splatter", "auto")
-    if splatter in ("auto", "visible"):
+    if case.setting.splats_as("visible"):
         return
     before = case.try_out(splatter="visible")
     if before is not None:
         told = f"splatter={splatter!r}" if isinstance(splatter, str) else f"the splatter {type(splatter).__name__}"
-        because = f"{told} has not the derivative of outlines that 'visible' has"
+        because = f"{told} lacks the derivative of outlines that 'visible' has"
         advice = "Leave out splatter=, or say 'visible'."
         case.findings.append(Finding("outlines", because, advice, case.strong(before), case.gained(before)))
 
 
 def _transparent(case: _Case, touched: Touched) -> None:
     """Shaders that are not opaque, beneath a splatter that lets nothing shine through."""
-    if case.setting.opaque or case.setting.options.get("splatter", "auto") == "multi":
+    if case.setting.opaque or case.setting.splats_as("multi"):
         return
     before, advice = case.try_out(splatter="multi"), "Say splatter='multi'."
     if before is None:
@@ -164,8 +180,7 @@ def _layers(case: _Case, touched: Touched) -> None:
         return
     mask, share, enough = case.strong(before), case.gained(before), DEEP
     for count in range(layers + 1, DEEP):
-        pushed = case.setting.push(case.number.direction, **{**case.options, "layers": count}) * case.number.slope.step
-        if _Error.of(pushed, case.number.true).within(case.left).norm <= max(
+        if _Error.of(case.push(layers=count), case.number.true).within(case.left).norm <= max(
             1.1 * case.error.norm, HALVED * before.norm
         ):
             enough = count
@@ -179,8 +194,7 @@ def _bounded(case: _Case, touched: Touched) -> None:
     """Surfaces that bound derivatives where they are near-singular."""
     if all(part.surface.unbounded() is None for part in case.setting.parts):
         return
-    pushed = case.setting.push(case.number.direction, variants.unbounded, **case.options) * case.number.slope.step
-    change = np.nan_to_num(np.abs(pushed - case.pushed), nan=np.inf, posinf=np.inf).max(axis=-1)
+    change = np.nan_to_num(np.abs(case.push(variants.unbounded) - case.pushed), nan=np.inf, posinf=np.inf).max(axis=-1)
     mask = change > STRONG * max(np.abs(case.number.true).max(), np.abs(case.pushed).max())
     _by_pixels(
         case,
@@ -197,10 +211,8 @@ def _crossing(case: _Case, touched: Touched) -> None:
     setting = case.setting
     if len(setting.parts) < 2:
         return
-    parts, camera = setting.shown(setting.parameters)
-    sampled = sample(parts, camera, setting.size, layers=2, sampler=setting.options.get("sampler", "auto"))
-    apron = sampled.apron
-    part = _on_host(sampled.part)
+    sampled = setting.sampled(layers=2)
+    apron, part = sampled.apron, on_host(sampled.part)
     front, second = part[0], part[1] if len(part) > 1 else np.full_like(part[0], -1)
     mask = np.zeros(front.shape, bool)
     for axis in (0, 1):
@@ -220,15 +232,14 @@ def _crossing(case: _Case, touched: Touched) -> None:
 def _colors(case: _Case, touched: Touched) -> None:
     """Colours finer than pixels: what is off lies inside of surfaces, and more samples mend it."""
     setting, number = case.setting, case.number
-    taken = setting.options.get("supersample", 1)
-    inside = ~_thin_and_outlines(setting)[1]
+    taken = setting.supersample
+    inside = ~setting.fineness.outlines
     if case.error.sharp[inside].sum() < LARGE_SHARE * case.error.sharp.sum():
         return
     step = number.slope.step * SHORTER  # Over a pixel, fine colours change to and fro.
     after, before = (setting.engine.to_numpy(setting.hard(number.direction, by, DENSE)) for by in (step / 2, -step / 2))
-    true, finer = (after.astype(np.float64) - before) / SHORTER, {**case.options, "supersample": _more(taken)}
-    pushed = setting.push(number.direction, **finer) * number.slope.step
-    was, left = (float(((x - true)[inside] ** 2).sum()) ** 0.5 for x in (case.pushed, pushed))
+    true, finer = (after.astype(np.float64) - before) / SHORTER, case.push(supersample=_more(taken))
+    was, left = (float(((x - true)[inside] ** 2).sum()) ** 0.5 for x in (case.pushed, finer))
     if left > HALVED * was:
         return
     because = f"colours change within a sample there ({_each(taken)}), inside of surfaces"
@@ -239,12 +250,12 @@ def _colors(case: _Case, touched: Touched) -> None:
 
 def _samples(case: _Case, touched: Touched) -> None:
     """Too few samples, for what is thin or for outlines."""
-    taken = case.setting.options.get("supersample", 1)
+    taken = case.setting.supersample
     before = case.try_out(supersample=_more(taken))
     if before is None:
         return
     gain, share = np.maximum(before.sharp - case.error.sharp, 0), case.gained(before)
-    thin, strong = _thin_and_outlines(case.setting)[0], case.strong(before)
+    thin, strong = case.setting.fineness.thin, case.strong(before)
     better = f"with supersample={_more(taken)} it is {before.norm / max(case.error.norm, 1e-30):.2g} times better."
     held = float(gain[thin].sum() / max(gain.sum(), 1e-30))
     if held >= LARGE_SHARE:
@@ -263,48 +274,6 @@ def _more(taken: int) -> int:
 
 def _each(count: int) -> str:
     return "one sample a pixel" if count == 1 else f"{count} × {count} samples a pixel"
-
-
-_MAPS: WeakKeyDictionary[Setting, tuple[np.ndarray, np.ndarray]] = WeakKeyDictionary()
-
-
-def _thin_and_outlines(setting: Setting) -> tuple[np.ndarray, np.ndarray]:
-    """The pixels (H, W) bool around what is thinner than a sample, and those around outlines."""
-    if setting not in _MAPS:
-        _MAPS[setting] = _map(setting)
-    return _MAPS[setting]
-
-
-def _map(setting: Setting) -> tuple[np.ndarray, np.ndarray]:
-    from scipy.ndimage import binary_dilation, binary_opening
-
-    (height, width), taken = setting.size, setting.options.get("supersample", 1)
-    across = min(FINE, max(2, int((CELLS / (height * width)) ** 0.5 / taken)))  # Cells a sample.
-    fine = across * taken
-    parts, camera = setting.shown(setting.parameters)
-    sampler = setting.options.get("sampler", "auto")
-    found = sample(parts, camera, setting.size, layers=1, supersample=fine, sampler=sampler)
-    apron = found.apron
-    part, depth = (_on_host(x)[0, apron:-apron, apron:-apron] for x in (found.part, found.depth))
-    jump = max(JUMP * np.ptp(depth[part >= 0]), FLAT * depth.max()) if (part >= 0).any() else 0.0
-    disk = np.hypot(*np.indices((across, across)) - (across - 1) / 2) <= across / 2 - 0.5  # As wide as a sample.
-    thin, jumps = np.zeros(part.shape, bool), np.zeros(part.shape, bool)
-    for index in np.unique(part):
-        mask = np.pad(part == index, across, mode="edge")
-        opened: Any = binary_opening(mask, disk)
-        thin |= (mask & ~opened)[across:-across, across:-across]
-    for axis in (0, 1):
-        change = (np.diff(part, axis=axis) != 0) | (np.abs(np.diff(depth, axis=axis)) > jump)
-        jumps |= np.pad(change, [(0, 1) if i == axis else (0, 0) for i in (0, 1)])
-
-    def pixels(mask: np.ndarray, least: float) -> np.ndarray:
-        return mask.reshape(height, fine, width, fine).mean(axis=(1, 3)) > least
-
-    return binary_dilation(pixels(thin, CORNER), iterations=3), binary_dilation(pixels(jumps, 0), iterations=2)
-
-
-def _on_host(x: Any) -> np.ndarray:
-    return engine_of(x).to_numpy(x)
 
 
 def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str, widen: int = 2) -> None:
