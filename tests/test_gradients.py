@@ -40,6 +40,7 @@ def test_a_right_gradient_agrees_with_the_difference(target):
     for s in check.slopes:
         assert abs(s.autodiff - s.difference) <= 0.05 * abs(s.difference) + 3 * s.error
     assert check.slopes[5].difference == pytest.approx(0, abs=1e-6)  # Orthographic: depth is not seen.
+    assert [(r.kind, r.parameters) for r in check.reasons] == [("undetermined", ["shift[2]"])]
 
 
 def test_gradients_that_miss_the_silhouette_are_shown_to_differ():

@@ -104,10 +104,10 @@ def _step_of_hidden(setting: Setting, direction: Tree) -> float | None:
 
 
 def chosen(gradient: np.ndarray, count: int) -> list[int]:
-    """Indices of the largest entries and of some others, fixed by the seed."""
+    """Indices of the largest entries, NaN first, and of some others, fixed by the seed."""
     if gradient.size <= count:
         return list(range(gradient.size))
-    largest = np.argsort(-np.abs(gradient), kind="stable")[: (count + 1) // 2]
+    largest = np.argsort(-np.nan_to_num(np.abs(gradient), nan=np.inf), kind="stable")[: (count + 1) // 2]
     rest = np.setdiff1d(np.arange(gradient.size), largest)
     others = np.random.default_rng(0).choice(rest, count - len(largest), replace=False)
     return sorted(map(int, (*largest, *others)))
