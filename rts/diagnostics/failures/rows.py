@@ -51,9 +51,9 @@ SLIDE = partial(_spread, np.array([8.0]))
 
 ROWS: tuple[Row, ...] = (
     Row(
-        "pose",
-        f"A box with a colour a face before a pattern; six numbers, from 4 pixels off along each. {FIT}",
-        Fitted(scenes.box_pose, POSE),
+        "pose of a box",
+        f"A colour a corner, before a pattern; six numbers, from 4 pixels off along each. {FIT}",
+        Fitted(scenes.colored_box, POSE),
         NO_EDGES,
     ),
     Row(
