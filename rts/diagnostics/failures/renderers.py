@@ -184,10 +184,9 @@ class Other(Renderer):
     def slopes(self, amounts: np.ndarray, weigh: Weigh) -> np.ndarray:
         """See `Renderer`."""
         peer = self._peer(replace(self.scene, parameters=shifted(self.scene, np.asarray(amounts, np.float64))))
-        weights = weigh(self._image(peer))
-        return np.array([peer.gradient(mode, weights)() for mode in self.scene.directions])
-
-    def _image(self, peer: Any) -> np.ndarray:
-        if isinstance(peer, Deodr):
-            return np.asarray(peer._render(peer.vertices, peer.colors))
-        return np.array(peer.scene.render({}, {}, peer.spp, 0), np.float64)
+        modes = list(self.scene.directions)
+        if isinstance(peer, Mitsuba):
+            return peer.slopes(modes, weigh)
+        assert isinstance(peer, Deodr)
+        weights = weigh(peer.image())
+        return np.array([peer.gradient(mode, weights)() for mode in modes])
