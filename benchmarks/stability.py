@@ -124,7 +124,6 @@ def main() -> None:
     if args.rows is None and not args.no_results:
         for name in ("stability.md", "stability.json", "stability.png"):
             shutil.copy(args.output / name, RESULTS / name)
-        shutil.copy(args.output / "hand.png", RESULTS / "stability_hand.png")
     print(f"wrote {args.output}")
 
 

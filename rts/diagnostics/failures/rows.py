@@ -99,7 +99,7 @@ ROWS: tuple[Row, ...] = (
         "interpenetrating surfaces",
         f"Two spheres cross; one moves. {ERROR}",
         Derivative(scenes.crossing),
-        f"{NO_EDGES} Where surfaces cross, depth does not jump, so splats average both.",
+        f"{NO_EDGES} Near outlines of closed surfaces `multi` takes the back for the front; `visible` does not.",
     ),
     Row(
         "wires of 1, 0.5, 0.25 pixels",
