@@ -37,7 +37,7 @@ def hand_row(kept: Journal) -> Row:
         f"the best rate; the highest rate at which no seed ends above {hand.STALLED} of the error at the start. "
         "Degraded where another method stands a higher one."
     )
-    why = "The derivative of `none` moves colours alone; `single` has false derivatives where the hand covers itself."
+    why = "`single` does not know what an outline that moves brings to light; `multi` and `visible` do."
     return Row(HAND, note, partial(_hand, kept), why)
 
 
@@ -124,7 +124,6 @@ def main() -> None:
     if args.rows is None and not args.no_results:
         for name in ("stability.md", "stability.json", "stability.png"):
             shutil.copy(args.output / name, RESULTS / name)
-        shutil.copy(args.output / "hand.png", RESULTS / "stability_hand.png")
     print(f"wrote {args.output}")
 
 

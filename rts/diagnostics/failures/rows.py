@@ -51,9 +51,9 @@ SLIDE = partial(_spread, np.array([8.0]))
 
 ROWS: tuple[Row, ...] = (
     Row(
-        "pose",
-        f"A box with a colour a face before a pattern; six numbers, from 4 pixels off along each. {FIT}",
-        Fitted(scenes.box_pose, POSE),
+        "pose of a box",
+        f"A colour a corner, before a pattern; six numbers, from 4 pixels off along each. {FIT}",
+        Fitted(scenes.colored_box, POSE),
         NO_EDGES,
     ),
     Row(
@@ -99,7 +99,7 @@ ROWS: tuple[Row, ...] = (
         "interpenetrating surfaces",
         f"Two spheres cross; one moves. {ERROR}",
         Derivative(scenes.crossing),
-        f"{NO_EDGES} Where surfaces cross, depth does not jump, so splats average both.",
+        f"{NO_EDGES} Near outlines of closed surfaces `multi` takes the back for the front; `visible` does not.",
     ),
     Row(
         "wires of 1, 0.5, 0.25 pixels",

@@ -109,6 +109,15 @@ def box_pose() -> Scene:
     return posed("box pose", shapes.turned_box(), AXES, size=SMALL)
 
 
+def colored_box() -> Scene:
+    """That box with a colour a corner, its eight corners shared, as other renderers want them."""
+    vertices, faces = shapes.box([-0.45, -0.35, -0.4], [0.45, 0.35, 0.4])
+    corners, became = np.unique(vertices, axis=0, return_inverse=True)
+    hues = 0.5 + 0.45 * np.cos(np.arange(8)[:, None] * [1.7, 2.6, 4.1] + [0, 2, 4])
+    box = unlit(corners @ shapes.rotation_xy(0.5, 0.6).T, became.reshape(-1)[faces], hues)
+    return posed("box pose", [box, shapes.turned_box()[1]], AXES, size=SMALL)
+
+
 @cache
 def _bunny() -> tuple[np.ndarray, np.ndarray]:
     vertices, faces = read_mesh(data_file("square behind bunny", "meshes/bunny_5k.obj"))
