@@ -194,7 +194,8 @@ def draw(rows: list[dict], path: Path) -> None:
         known = [a for a in angles if (name, a) in groups]
         wins = [100 * statistics.mean(row["success"] for row in groups[name, a]) for a in known]
         style = "x--" if name == "DEODR" else "o-"
-        axes.plot(known, wins, style, color=method.color, label=method.label, linewidth=1.8)
+        width = 5 if name == "wider" else 1.8  # Others may lie upon it.
+        axes.plot(known, wins, style, color=method.color, label=method.label, linewidth=width)
     axes.set(
         xticks=angles,
         xticklabels=[f"{a:g}°\n{100 * SHIFT * a:g} %" for a in angles],

@@ -285,7 +285,7 @@ def fit_pose(
     fov: Fov = 40.0,
     up: Up = "y",
 ) -> None:
-    """Find the turn and shift of a model that make its silhouette match a picture's.
+    """Find the turn and shift of a model that make its silhouette match a picture's: coarse, blurred pixels first.
 
     Writes pose.json (axis-angle, translation, 4x4 matrix, loss, iterations, seconds), before.png, after.png,
     target.png, animation.gif and convergence.png.
