@@ -150,7 +150,6 @@ class Fitted(NamedTuple):
         rate: Adam's at the start; it falls along a cosine to a twentieth.
         blur: standard deviation, in pixels, of a Gaussian that images are looked at through at the start; it shrinks
             to zero in the first two thirds of the steps.
-        modes: indices of the modes that are fitted; None for all.
     """
 
     scene: Callable[[], Scene]
@@ -184,9 +183,11 @@ class Fitted(NamedTuple):
 
     def _fit(self, drawn: Any, first: np.ndarray, target: np.ndarray, steps: int) -> tuple[np.ndarray, int, float]:
         """Where Adam ends, how many steps had a slope that was not finite, and the largest slope."""
+        import torch
         from scipy.ndimage import gaussian_filter
 
-        amounts, mean, square, nan, largest = np.array(first, float), 0.0, 0.0, 0, 0.0
+        amounts, nan, largest = torch.tensor(np.array(first, np.float64)), 0, 0.0
+        adam = torch.optim.Adam([amounts], lr=self.rate, betas=(0.9, 0.99), eps=1e-12)
         for step in range(1, steps + 1):
             sigma = self.blur * max(0.0, 1 - step / (steps * 2 / 3))
 
@@ -197,15 +198,14 @@ class Fitted(NamedTuple):
                         rest = gaussian_filter(rest, (sigma, sigma, 0), mode="constant")
                 return 2 * rest / rest.size
 
-            slopes = drawn.slopes(amounts, weigh)
+            slopes = drawn.slopes(amounts.numpy().copy(), weigh)
             bad = ~np.isfinite(slopes)
             nan, slopes = nan + int(bad.sum()), np.where(bad, 0.0, slopes)
             largest = max(largest, float(np.abs(slopes).max()))
-            mean, square = 0.9 * mean + 0.1 * slopes, 0.99 * square + 0.01 * slopes**2
-            length = np.sqrt(square / (1 - 0.99**step)) + 1e-12
-            rate = self.rate * (0.05 + 0.95 * (1 + np.cos(np.pi * step / steps)) / 2)
-            amounts = amounts - rate * (mean / (1 - 0.9**step)) / length
-        return amounts, nan, largest
+            adam.param_groups[0]["lr"] = self.rate * (0.05 + 0.95 * (1 + np.cos(np.pi * step / steps)) / 2)
+            amounts.grad = torch.as_tensor(slopes, dtype=amounts.dtype)
+            adam.step()
+        return amounts.numpy(), nan, largest
 
 
 def distance(scene: Scene, amounts: np.ndarray) -> float:

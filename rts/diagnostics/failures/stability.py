@@ -19,7 +19,7 @@ from rts.diagnostics.failures.methods import METHODS, Method
 from rts.diagnostics.failures.outcome import Context, Outcome, Row, cannot
 from rts.diagnostics.failures.rows import ROWS
 from rts.errors import InputError
-from rts.files.paths import output_folder
+from rts.files.paths import output_folder, writing
 
 MARKS = {"ok": "", "degraded": "~ ", "failed": "✗ ", "cannot": "–"}
 PACKAGES = ("rasterize-then-splat", "numpy", "torch", "deodr", "mitsuba")
@@ -69,8 +69,11 @@ class Stability(NamedTuple):
             InputError: it cannot be written to.
         """
         path = output_folder(folder)
-        (path / "stability.md").write_text(self.markdown())
-        (path / "stability.json").write_text(json.dumps(self.data(), indent=1) + "\n")
+        texts = {"stability.md": self.markdown(), "stability.json": json.dumps(self.data(), indent=1) + "\n"}
+        for name, text in texts.items():
+            with writing(path / name):
+                path.mkdir(parents=True, exist_ok=True)
+                (path / name).write_text(text, encoding="utf-8")
 
 
 def in_words(cell: Outcome) -> str:
