@@ -18,8 +18,8 @@ from rts.checks import check_size, is_count, is_real
 from rts.diagnostics.comparison.progress import Phase, phases
 from rts.diagnostics.explanation.explaining import explained
 from rts.diagnostics.explanation.reasons import Reason, legend, marked
-from rts.diagnostics.explanation.setting import Scene, Setting
 from rts.diagnostics.explanation.slopes import Number, Slope, chosen, measured, unit
+from rts.diagnostics.explanation.subject import Scene, Subject
 from rts.engines import Engine, engine_of, is_constant, namespace
 from rts.errors import EmptyImageWarning, InputError, LayersWarning
 from rts.files.srgb import decode_srgb
@@ -197,17 +197,17 @@ def check_gradient(
         raise InputError(f"there is no option {unknown[0]!r}; expected {', '.join(known)}")
     own = loss is not None
     loss = _scalar(_smooth_weighting(size, engine, parameters) if loss is None else loss, engine)
-    setting = Setting(engine, scene, map_leaves(engine.stop_gradient, parameters), size, options, loss)
+    subject = Subject(engine, scene, map_leaves(engine.stop_gradient, parameters), size, options, loss)
     with _traceable(engine), phases(progress) as phase, warnings.catch_warnings():
         # Why nothing is seen is what the check tells.
         warnings.simplefilter("ignore", EmptyImageWarning)
         warnings.simplefilter("ignore", LayersWarning)
-        setting.require_dependence()
-        numbers, count = _looked_at(setting, entries, samples, clock, phase)
+        subject.require_dependence()
+        numbers, count = _looked_at(subject, entries, samples, clock, phase)
         check = GradientCheck([n.slope for n in numbers], tolerance)
         plain = [n for n in numbers if n.forward]
-        found, left = explained(setting, plain, check.agrees, own, clock.going, phase)
-        picture = marked(setting.seen, found)
+        found, left = explained(subject, plain, check.agrees, own, clock.going, phase)
+        picture = marked(subject.seen, found)
     notes = [f"{len(numbers)} of {count} numbers were looked at"] if len(numbers) < count else []
     notes += [f"reasons were not looked for, or not all, in {left} of them"] if left else []
     told = [f"After {clock.spent:.0f} s the budget was spent: {', and '.join(notes)}."] if notes else []
@@ -233,10 +233,10 @@ class _Clock:
         return self.spent < share * self.budget
 
 
-def _looked_at(setting: Setting, entries: int, samples: int, clock: _Clock, phase: Phase) -> tuple[list[Number], int]:
+def _looked_at(subject: Subject, entries: int, samples: int, clock: _Clock, phase: Phase) -> tuple[list[Number], int]:
     """Some numbers of each array, the first of all arrays first; and how many there were to look at."""
-    engine, parameters = setting.engine, setting.parameters
-    gradient = engine.value_and_grad(lambda p: setting.loss(setting.image(p)))(parameters)[1]
+    engine, parameters = subject.engine, subject.parameters
+    gradient = engine.value_and_grad(lambda p: subject.loss(subject.image(p)))(parameters)[1]
     planned = []
     for number, ((name, value), slope) in enumerate(zip(named_leaves(parameters), leaves(gradient), strict=True)):
         flat = engine.to_numpy(slope).reshape(-1)
@@ -248,7 +248,7 @@ def _looked_at(setting: Setting, entries: int, samples: int, clock: _Clock, phas
     for rank, number, index, label, slope in sorted(planned):
         if found and not clock.going(FOR_SLOPES):
             break
-        found[number, rank] = measured(setting, label, unit(engine, parameters, number, index), slope, samples)
+        found[number, rank] = measured(subject, label, unit(engine, parameters, number, index), slope, samples)
         done()
     return [found[key] for key in sorted(found)], len(planned)
 

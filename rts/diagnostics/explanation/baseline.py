@@ -12,8 +12,8 @@ import numpy as np
 from rts.camera import Camera
 from rts.diagnostics.comparison.shapes import box, icosphere, unlit
 from rts.diagnostics.explanation import variants
-from rts.diagnostics.explanation.setting import Setting
 from rts.diagnostics.explanation.slopes import Number, measured
+from rts.diagnostics.explanation.subject import Subject
 from rts.engines import engine_of, namespace
 from rts.interfaces import Part
 from rts.trees import Tree, leaves, map_leaves
@@ -46,35 +46,35 @@ class Baseline(NamedTuple):
 
 
 def nearest(
-    setting: Setting, number: Number, parts: Sequence[int] | None, options: Mapping[str, Any]
+    subject: Subject, number: Number, parts: Sequence[int] | None, options: Mapping[str, Any]
 ) -> Baseline | None:
     """The sphere or the box whose outline is most like that of what moves; None where nothing is seen to move.
 
     Args:
-        setting: the scene.
+        subject: the scene.
         number: what moves it.
         parts: which parts of it move; None for all.
-        options: of `rts.render`, other than those of the setting.
+        options: of `rts.render`, other than those of the subject.
     """
-    only = variants.alone(range(len(setting.parts)) if parts is None else parts)
+    only = variants.alone(range(len(subject.parts)) if parts is None else parts)
     probe = variants.all_of(only, variants.placed)
     plain: dict[str, Any] = dict(splatter="none", layers=1, supersample=1, background=None, capacity=None)
-    places = setting.engine.to_numpy(setting.image(setting.parameters, probe, **plain)).astype(np.float64)
+    places = subject.engine.to_numpy(subject.image(subject.parameters, probe, **plain)).astype(np.float64)
     seen = places[..., 3] > 0.5
     if seen.sum() < FEWEST:
         return None
     position = places[seen][:, :3]
-    velocity = setting.push(number.direction, probe, **plain)[seen][:, :3].astype(np.float64)
+    velocity = subject.push(number.direction, probe, **plain)[seen][:, :3].astype(np.float64)
     rows = np.column_stack([position, np.ones(len(position))])
     motion = np.linalg.lstsq(rows, velocity, rcond=1e-6)[0]  # (4, 3), velocity = rows @ motion.
-    camera = setting.shown(setting.parameters)[1]
+    camera = subject.shown(subject.parameters)[1]
     candidates = []
     for name, (vertices, faces) in zip(("a sphere", "a box"), _shapes(position, camera), strict=True):
         moved = replace(
-            setting,
-            scene=partial(_scene, setting, number, vertices, faces, motion),
-            parameters={"by": setting.engine.constant(np.zeros(()), next(leaves(setting.parameters)))},
-            options={**setting.options, **options, "background": None, "sampler": "auto"},
+            subject,
+            scene=partial(_scene, subject, number, vertices, faces, motion),
+            parameters={"by": subject.engine.constant(np.zeros(()), next(leaves(subject.parameters)))},
+            options={**subject.options, **options, "background": None, "sampler": "auto"},
         )
         mask = moved.seen[..., 3] > 0.5
         candidates.append(((mask & seen).sum() / max((mask | seen).sum(), 1), name, moved))
@@ -107,12 +107,12 @@ def _shapes(position: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.n
 
 
 def _scene(
-    setting: Setting, number: Number, vertices: np.ndarray, faces: np.ndarray, motion: np.ndarray, parameters: Tree
+    subject: Subject, number: Number, vertices: np.ndarray, faces: np.ndarray, motion: np.ndarray, parameters: Tree
 ) -> tuple[Part, Camera]:
     """The shape, and the camera of the scene, moved as the number moves them."""
-    by, engine = parameters["by"], setting.engine
+    by, engine = parameters["by"], subject.engine
     steps = iter(leaves(number.direction))
-    camera = setting.shown(map_leaves(lambda p: p + by * next(steps), setting.parameters))[1]
+    camera = subject.shown(map_leaves(lambda p: p + by * next(steps), subject.parameters))[1]
     velocity = np.column_stack([vertices, np.ones(len(vertices))]) @ motion
     part = unlit(vertices, faces, COLOR)
     if np.abs(velocity).max() > 0:

@@ -12,8 +12,8 @@ from rts.diagnostics.explanation import variants
 from rts.diagnostics.explanation.baseline import nearest
 from rts.diagnostics.explanation.fineness import on_host
 from rts.diagnostics.explanation.reasons import Finding
-from rts.diagnostics.explanation.setting import DEEP, Change, Setting, Touched
 from rts.diagnostics.explanation.slopes import Number
+from rts.diagnostics.explanation.subject import DEEP, Change, Subject, Touched
 from rts.diagnostics.explanation.vanishing import why_constant
 
 HALVED = 0.5
@@ -69,7 +69,7 @@ class _Case:
     """A number whose derivatives disagree, and how far it has been explained.
 
     Attributes:
-        setting: what is looked at.
+        subject: what is looked at.
         number: the number.
         options: of `rts.render`, those of the experiments that helped.
         connected: whether arrays that no derivative leads to are taken to have one.
@@ -81,14 +81,14 @@ class _Case:
         findings: what was found.
     """
 
-    def __init__(self, setting: Setting, number: Number):
-        self.setting, self.number = setting, number
+    def __init__(self, subject: Subject, number: Number):
+        self.subject, self.number = subject, number
         self.options: dict[str, Any] = {"capacity": None}
         self.connected = False
         self.pushed = number.pushed
         self.whole = self.error = _Error.of(number.pushed, number.true)
         self.noise = number.noise
-        self.left = np.ones(setting.size, bool)
+        self.left = np.ones(subject.size, bool)
         self.findings: list[Finding] = []
 
     @property
@@ -105,7 +105,7 @@ class _Case:
     def push(self, change: Change | None = None, **options: Any) -> np.ndarray:
         """The derivative of the image, as it is now, with a further change and options."""
         options = {**self.options, **options}
-        found = self.setting.push(self.number.direction, change, connect=self.connected, **options)
+        found = self.subject.push(self.number.direction, change, connect=self.connected, **options)
         return found * self.number.slope.step
 
     def try_connected(self) -> _Error | None:
@@ -133,7 +133,7 @@ class _Case:
 
 def _constants(case: _Case, touched: Touched) -> None:
     """Arrays that no derivative leads to, if it would agree with one."""
-    found = why_constant(case.setting, touched)
+    found = why_constant(case.subject, touched)
     if not found:
         return
     if len(touched.all) == len(touched.constant) + len(touched.cut) and not case.number.pushed.any():
@@ -148,8 +148,8 @@ def _constants(case: _Case, touched: Touched) -> None:
 
 def _outlines(case: _Case, touched: Touched) -> None:
     """A splatter that gives outlines no derivative, or hides what a better one shows."""
-    splatter = case.setting.options.get("splatter", "auto")
-    if case.setting.splats_as("visible"):
+    splatter = case.subject.options.get("splatter", "auto")
+    if case.subject.splats_as("visible"):
         return
     before = case.try_out(splatter="visible")
     if before is not None:
@@ -161,7 +161,7 @@ def _outlines(case: _Case, touched: Touched) -> None:
 
 def _transparent(case: _Case, touched: Touched) -> None:
     """Shaders that are not opaque, beneath a splatter that lets nothing shine through."""
-    if case.setting.opaque or case.setting.splats_as("multi"):
+    if case.subject.opaque or case.subject.splats_as("multi"):
         return
     before, advice = case.try_out(splatter="multi"), "Say splatter='multi'."
     if before is None:
@@ -172,7 +172,7 @@ def _transparent(case: _Case, touched: Touched) -> None:
 
 
 def _layers(case: _Case, touched: Touched) -> None:
-    layers = case.setting.options.get("layers", 2)
+    layers = case.subject.options.get("layers", 2)
     if isinstance(layers, str) or layers >= DEEP:
         return
     before = case.try_out(layers=DEEP)
@@ -186,13 +186,13 @@ def _layers(case: _Case, touched: Touched) -> None:
             enough = count
             break
     because = f"what it changes, or uncovers, lies deeper than the K = {layers} layers that are kept"
-    advice = f"Raise layers to {enough}, or say layers='auto'." if case.setting.opaque else f"Raise layers to {enough}."
+    advice = f"Raise layers to {enough}, or say layers='auto'." if case.subject.opaque else f"Raise layers to {enough}."
     case.findings.append(Finding("layers", because, advice, mask, share))
 
 
 def _bounded(case: _Case, touched: Touched) -> None:
     """Surfaces that bound derivatives where they are near-singular."""
-    if all(part.surface.unbounded() is None for part in case.setting.parts):
+    if all(part.surface.unbounded() is None for part in case.subject.parts):
         return
     change = np.nan_to_num(np.abs(case.push(variants.unbounded) - case.pushed), nan=np.inf, posinf=np.inf).max(axis=-1)
     mask = change > STRONG * max(np.abs(case.number.true).max(), np.abs(case.pushed).max())
@@ -208,10 +208,10 @@ def _bounded(case: _Case, touched: Touched) -> None:
 
 def _crossing(case: _Case, touched: Touched) -> None:
     """Lines where parts pass through one another."""
-    setting = case.setting
-    if len(setting.parts) < 2:
+    subject = case.subject
+    if len(subject.parts) < 2:
         return
-    sampled = setting.sampled(layers=2)
+    sampled = subject.sampled(layers=2)
     apron, part = sampled.apron, on_host(sampled.part)
     front, second = part[0], part[1] if len(part) > 1 else np.full_like(part[0], -1)
     mask = np.zeros(front.shape, bool)
@@ -231,13 +231,13 @@ def _crossing(case: _Case, touched: Touched) -> None:
 
 def _colors(case: _Case, touched: Touched) -> None:
     """Colours finer than pixels: what is off lies inside of surfaces, and more samples mend it."""
-    setting, number = case.setting, case.number
-    taken = setting.supersample
-    inside = ~setting.fineness.outlines
+    subject, number = case.subject, case.number
+    taken = subject.supersample
+    inside = ~subject.fineness.outlines
     if case.error.sharp[inside].sum() < LARGE_SHARE * case.error.sharp.sum():
         return
     step = number.slope.step * SHORTER  # Over a pixel, fine colours change to and fro.
-    after, before = (setting.engine.to_numpy(setting.hard(number.direction, by, DENSE)) for by in (step / 2, -step / 2))
+    after, before = (subject.engine.to_numpy(subject.hard(number.direction, by, DENSE)) for by in (step / 2, -step / 2))
     true, finer = (after.astype(np.float64) - before) / SHORTER, case.push(supersample=_more(taken))
     was, left = (float(((x - true)[inside] ** 2).sum()) ** 0.5 for x in (case.pushed, finer))
     if left > HALVED * was:
@@ -250,12 +250,12 @@ def _colors(case: _Case, touched: Touched) -> None:
 
 def _samples(case: _Case, touched: Touched) -> None:
     """Too few samples, for what is thin or for outlines."""
-    taken = case.setting.supersample
+    taken = case.subject.supersample
     before = case.try_out(supersample=_more(taken))
     if before is None:
         return
     gain, share = np.maximum(before.sharp - case.error.sharp, 0), case.gained(before)
-    thin, strong = case.setting.fineness.thin, case.strong(before)
+    thin, strong = case.subject.fineness.thin, case.strong(before)
     better = f"with supersample={_more(taken)} it is {before.norm / max(case.error.norm, 1e-30):.2g} times better."
     held = float(gain[thin].sum() / max(gain.sum(), 1e-30))
     if held >= LARGE_SHARE:
@@ -299,7 +299,7 @@ def _bias(case: _Case, touched: Touched) -> None:
         return
     off = _off(case.pushed, case.number.true)
     mask, share = case.strong(case.error), case.error.norm**2 / case.whole.norm**2
-    found = nearest(case.setting, case.number, touched.parts, case.options)
+    found = nearest(case.subject, case.number, touched.parts, case.options)
     if found is not None:
         theirs = _off(found.pushed, found.true)
         ratio = f"{found.slope / found.difference:.2f}" if found.difference else "–"
@@ -340,16 +340,16 @@ EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
 """From the cheap and certain to the dear; each adds what it finds to the case."""
 
 
-def why_off(setting: Setting, number: Number, touched: Touched, going: Callable[[], bool]) -> list[Finding]:
+def why_off(subject: Subject, number: Number, touched: Touched, going: Callable[[], bool]) -> list[Finding]:
     """Why the derivatives of a number disagree.
 
     Args:
-        setting: what is looked at.
+        subject: what is looked at.
         number: the number.
         touched: what of the scene it changes.
         going: whether there is time for another experiment.
     """
-    case = _Case(setting, number)
+    case = _Case(subject, number)
     for experiment in EXPERIMENTS:
         if not going():
             break

@@ -9,8 +9,8 @@ import numpy as np
 from rts.diagnostics.comparison.progress import Phase
 from rts.diagnostics.explanation.disagreeing import why_off
 from rts.diagnostics.explanation.reasons import Finding, Reason, merged
-from rts.diagnostics.explanation.setting import Setting, Touched
 from rts.diagnostics.explanation.slopes import Number, Slope
+from rts.diagnostics.explanation.subject import Subject, Touched
 from rts.diagnostics.explanation.vanishing import (
     is_quiet,
     undetermined,
@@ -22,7 +22,7 @@ from rts.diagnostics.explanation.vanishing import (
 
 
 def explained(
-    setting: Setting,
+    subject: Subject,
     numbers: Sequence[Number],
     agrees: Callable[[Slope], bool],
     own_loss: bool,
@@ -32,7 +32,7 @@ def explained(
     """Why slopes differ or vanish.
 
     Args:
-        setting: what is looked at.
+        subject: what is looked at.
         numbers: of it.
         agrees: whether a slope's derivatives do.
         own_loss: whether the loss is the user's, and may be flat where images change.
@@ -47,13 +47,13 @@ def explained(
     for number in numbers:
         watch = _Watch(going)
         if watch():
-            findings += [(number.slope.name, f) for f in _why(setting, number, agrees, own_loss, watch)]
+            findings += [(number.slope.name, f) for f in _why(subject, number, agrees, own_loss, watch)]
         left += watch.refused
         done()
     if going():
-        findings += undetermined(setting, numbers)
+        findings += undetermined(subject, numbers)
     done()
-    return merged(findings, setting.size), left
+    return merged(findings, subject.size), left
 
 
 class _Watch:
@@ -68,18 +68,18 @@ class _Watch:
 
 
 def _why(
-    setting: Setting, number: Number, agrees: Callable[[Slope], bool], own_loss: bool, going: Callable[[], bool]
+    subject: Subject, number: Number, agrees: Callable[[Slope], bool], own_loss: bool, going: Callable[[], bool]
 ) -> list[Finding]:
     def touched() -> Touched:
-        return setting.touched(number.direction, number.slope.step)
+        return subject.touched(number.direction, number.slope.step)
 
     if not (np.isfinite(number.pushed).all() and np.isfinite([number.slope.autodiff, number.slope.difference]).all()):
         # Beside a NaN of another number, forward mode may be NaN where reverse mode is not.
         return [] if agrees(number.slope) else why_not_finite(number)
     if is_quiet(number.pushed) and is_quiet(number.true):
-        return why_nothing(setting, number, touched(), going)
+        return why_nothing(subject, number, touched(), going)
     if not agrees(number.slope):
-        return why_off(setting, number, touched(), going)
-    if is_quiet(number.pushed) and (constants := why_constant(setting, touched())):
+        return why_off(subject, number, touched(), going)
+    if is_quiet(number.pushed) and (constants := why_constant(subject, touched())):
         return constants  # The truth is too noisy to tell, but the scene does.
-    return why_flat(setting, number, going) if own_loss else []
+    return why_flat(subject, number, going) if own_loss else []

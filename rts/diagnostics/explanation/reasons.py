@@ -119,9 +119,9 @@ def merged(findings: Sequence[tuple[str, Finding]], size: tuple[int, int]) -> li
             span = f"{high:.0%}" if f"{low:.0%}" == f"{high:.0%}" else f"{low:.0%} to {high:.0%}"
             figures.append(f"{span} of the disagreement")
         told = f" ({', '.join(figures)})" if figures else ""
-        subject = listed(names) if names[0] else ""
-        text = " ".join(filter(None, [f"{subject}{': ' if subject else ''}{because}{told}.", advice]))
-        reasons.append((max(shares, default=1.0), Reason(kind, names if subject else [], text, pixels)))
+        about = listed(names) if names[0] else ""
+        text = " ".join(filter(None, [f"{about}{': ' if about else ''}{because}{told}.", advice]))
+        reasons.append((max(shares, default=1.0), Reason(kind, names if about else [], text, pixels)))
     return [reason for _, reason in sorted(reasons, key=lambda r: -r[0])]
 
 

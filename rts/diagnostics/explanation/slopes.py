@@ -9,7 +9,7 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.diagnostics.comparison.scores import low_pass
-from rts.diagnostics.explanation.setting import DEEP, Setting
+from rts.diagnostics.explanation.subject import DEEP, Subject
 from rts.engines import Engine, namespace
 from rts.interfaces import Part
 from rts.trees import Array, Tree, leaves, map_leaves
@@ -57,41 +57,41 @@ class Number(NamedTuple):
     forward: bool
 
 
-def measured(setting: Setting, name: str, direction: Tree, slope: float | None, samples: int) -> Number:
+def measured(subject: Subject, name: str, direction: Tree, slope: float | None, samples: int) -> Number:
     """What one number does, found in two ways.
 
     Args:
-        setting: what is looked at.
+        subject: what is looked at.
         name: of the number.
         direction: in which it changes.
         slope: the derivative of the loss by reverse mode; None for that by forward mode.
         samples: the square root of the number of samples a pixel.
     """
-    step = setting.step(direction) or _step_of_hidden(setting, direction) or STEP_UNSEEN
-    to_numpy = setting.engine.to_numpy
+    step = subject.step(direction) or _step_of_hidden(subject, direction) or STEP_UNSEEN
+    to_numpy = subject.engine.to_numpy
 
     def hard(length: float, count: int) -> tuple[float, np.ndarray]:
-        after, before = (setting.hard(direction, sign * length / 2, count) for sign in (1, -1))
-        difference = float(to_numpy(setting.loss(after))) - float(to_numpy(setting.loss(before)))
+        after, before = (subject.hard(direction, sign * length / 2, count) for sign in (1, -1))
+        difference = float(to_numpy(subject.loss(after))) - float(to_numpy(subject.loss(before)))
         return difference / length, to_numpy(after).astype(np.float64) - to_numpy(before)
 
     (coarse, image), (fine, other), (wide, _) = hard(step, samples), hard(step, samples + 1), hard(2 * step, samples)
     error = abs(coarse - fine) / 2 + abs(wide - coarse) / 3
     try:
-        pushed, forward = setting.push(direction) * step, True
+        pushed, forward = subject.push(direction) * step, True
     except (RuntimeError, TypeError):  # Of torch and of jax, for a user's own operation.
         pushed, forward = np.full_like(image, np.nan), False
     if slope is None:
-        slope = float((setting.weights * pushed.astype(np.float64)).sum() / step)
+        slope = float((subject.weights * pushed.astype(np.float64)).sum() / step)
     found = Slope(name, slope, (coarse + fine) / 2, error, step)
     noise = float(np.linalg.norm(low_pass((image - other) / 2)))
     true = ((image + other) / 2).astype(np.float32)
     return Number(found, direction, pushed.astype(np.float32), true, noise, forward)
 
 
-def _step_of_hidden(setting: Setting, direction: Tree) -> float | None:
+def _step_of_hidden(subject: Subject, direction: Tree) -> float | None:
     """A step that moves by a pixel what is behind something, or what no derivative leads to."""
-    touched = setting.touched(direction, STEP_UNSEEN)
+    touched = subject.touched(direction, STEP_UNSEEN)
     connect = bool(touched.constant or touched.cut)
     kept = touched.parts
 
@@ -99,7 +99,7 @@ def _step_of_hidden(setting: Setting, direction: Tree) -> float | None:
         return [p for i, p in enumerate(parts) if kept is None or i in kept], camera
 
     return (
-        setting.step(direction, alone, connect=connect, deep=True, layers=DEEP, capacity=None) if touched.all else None
+        subject.step(direction, alone, connect=connect, deep=True, layers=DEEP, capacity=None) if touched.all else None
     )
 
 

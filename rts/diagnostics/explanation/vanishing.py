@@ -11,8 +11,8 @@ import numpy as np
 from rts.checks import check_scene
 from rts.diagnostics.explanation import variants
 from rts.diagnostics.explanation.reasons import Finding
-from rts.diagnostics.explanation.setting import DEEP, Change, Setting, Touched, listed_parts
 from rts.diagnostics.explanation.slopes import Number
+from rts.diagnostics.explanation.subject import DEEP, Change, Subject, Touched, listed_parts
 from rts.fitting.dependence import directions_in_words
 from rts.sampling.emptiness import out_of_view
 from rts.trees import leaves, map_leaves
@@ -52,19 +52,19 @@ def why_not_finite(number: Number) -> list[Finding]:
     return [Finding("infinite", "the derivative of the image is not finite", advice, mask)]
 
 
-def why_nothing(setting: Setting, number: Number, touched: Touched, going: Callable[[], bool]) -> list[Finding]:
+def why_nothing(subject: Subject, number: Number, touched: Touched, going: Callable[[], bool]) -> list[Finding]:
     """Why neither derivative sees a number; nothing if there is no time to find out."""
     if not touched.all:
         return [Finding("unused", "nothing in the scene changes with it", "Use it, or leave it out.")]
-    constants = why_constant(setting, touched)
+    constants = why_constant(subject, touched)
     if constants and len(touched.all) == len(touched.constant) + len(touched.cut):
         return constants
-    indices = list(range(len(setting.parts))) if touched.parts is None else touched.parts
-    what, trial = variants.names(indices), _Trial(setting, number)
+    indices = list(range(len(subject.parts))) if touched.parts is None else touched.parts
+    what, trial = variants.names(indices), _Trial(subject, number)
     for experiment in (_culled, _hidden, _hidden_by_itself, _outside):
         if not going():
             return []
-        found = experiment(setting, trial, indices, what)
+        found = experiment(subject, trial, indices, what)
         if found is not None:
             return [found]
     return [
@@ -76,8 +76,8 @@ def why_nothing(setting: Setting, number: Number, touched: Touched, going: Calla
     ]
 
 
-def _culled(setting: Setting, trial: _Trial, indices: list[int], what: str) -> Finding | None:
-    if all(setting.parts[i].cull != "back" for i in indices):
+def _culled(subject: Subject, trial: _Trial, indices: list[int], what: str) -> Finding | None:
+    if all(subject.parts[i].cull != "back" for i in indices):
         return None
     for change, hidden in (
         (variants.unculled, ""),
@@ -90,9 +90,9 @@ def _culled(setting: Setting, trial: _Trial, indices: list[int], what: str) -> F
     return None
 
 
-def _hidden(setting: Setting, trial: _Trial, indices: list[int], what: str) -> Finding | None:
-    others = [i for i in range(len(setting.parts)) if i not in indices]
-    mask = trial.shown(variants.alone(indices)) if others else np.zeros(setting.size, bool)
+def _hidden(subject: Subject, trial: _Trial, indices: list[int], what: str) -> Finding | None:
+    others = [i for i in range(len(subject.parts)) if i not in indices]
+    mask = trial.shown(variants.alone(indices)) if others else np.zeros(subject.size, bool)
     if not mask.any():
         return None
     because = f"what it changes of {what} is hidden behind {variants.names(others, 'or')}; alone it is seen"
@@ -100,7 +100,7 @@ def _hidden(setting: Setting, trial: _Trial, indices: list[int], what: str) -> F
     return Finding("hidden", because, advice, mask)
 
 
-def _hidden_by_itself(setting: Setting, trial: _Trial, indices: list[int], what: str) -> Finding | None:
+def _hidden_by_itself(subject: Subject, trial: _Trial, indices: list[int], what: str) -> Finding | None:
     mask = trial.shown(variants.transparent, layers=DEEP, splatter="multi")
     if not mask.any():
         return None
@@ -108,10 +108,10 @@ def _hidden_by_itself(setting: Setting, trial: _Trial, indices: list[int], what:
     return Finding("hidden", because, "Take a view that shows it.", mask)
 
 
-def _outside(setting: Setting, trial: _Trial, indices: list[int], what: str) -> Finding | None:
-    found = setting.shown(setting.parameters)
+def _outside(subject: Subject, trial: _Trial, indices: list[int], what: str) -> Finding | None:
+    found = subject.shown(subject.parameters)
     parts, camera = check_scene(listed_parts(found[0]), found[1])
-    causes = {out_of_view(parts[i], camera.for_size(setting.size)) for i in indices}
+    causes = {out_of_view(parts[i], camera.for_size(subject.size)) for i in indices}
     if len(causes) == 1 and (cause := causes.pop()):
         because = f"{what if len(indices) == 1 else f'each of {what}'} {cause}"
     elif trial.seen_outside() or trial.seen_outside(variants.all_of(variants.alone(indices), variants.unculled)):
@@ -121,9 +121,9 @@ def _outside(setting: Setting, trial: _Trial, indices: list[int], what: str) -> 
     return Finding("outside", because, "Move it into the view, or turn the camera.")
 
 
-def why_constant(setting: Setting, touched: Touched) -> list[Finding]:
+def why_constant(subject: Subject, touched: Touched) -> list[Finding]:
     """Arrays that a number changes, to which no derivative leads."""
-    engine, found = setting.engine.name, []
+    engine, found = subject.engine.name, []
     for places, why, advice in (
         (touched.constant, "NumPy, and therefore constant", f"Make it of {engine} arrays throughout."),
         (
@@ -142,8 +142,8 @@ def why_constant(setting: Setting, touched: Touched) -> list[Finding]:
 class _Trial:
     """Tries whether a number is seen in a changed scene."""
 
-    def __init__(self, setting: Setting, number: Number):
-        self.setting, self.number = setting, number
+    def __init__(self, subject: Subject, number: Number):
+        self.subject, self.number = subject, number
 
     def shown(self, change: Change, **options: Any) -> np.ndarray:
         """(H, W) bool, the pixels that the number changes in the changed scene, but not in the scene as it is."""
@@ -151,15 +151,15 @@ class _Trial:
 
     def seen_outside(self, change: Change | None = None) -> bool:
         """Whether a larger window, or a camera that is moved back, sees what changes."""
-        height, width = self.setting.size
+        height, width = self.subject.size
         apron = max(height, width)
         larger = height + 2 * apron, width + 2 * apron
         changes = [] if change is None else [change]
-        mask = self._changed(variants.all_of(*changes, variants.wider(self.setting.size, apron)), size=larger)
+        mask = self._changed(variants.all_of(*changes, variants.wider(self.subject.size, apron)), size=larger)
         mask[apron : apron + height, apron : apron + width] = False
         if mask.any():
             return True
-        near = abs(float(self.setting.shown(self.setting.parameters)[1].for_size(self.setting.size).depth_range()[0]))
+        near = abs(float(self.subject.shown(self.subject.parameters)[1].for_size(self.subject.size).depth_range()[0]))
         moved = (variants.all_of(*changes, variants.farther(d * (near or 1.0))) for d in DISTANCES)
         return any(self.shown(m).any() for m in moved)
 
@@ -170,28 +170,28 @@ class _Trial:
     def _changed(self, change: Change | None, **options: Any) -> np.ndarray:
         given = {"splatter": "auto", "background": None, "capacity": None, "supersample": 1, **options}
         direction = self.number.direction
-        step = self.setting.step(direction, change, deep=True, **given) or self.number.slope.step
-        pushed = self.setting.push(direction, change, **given) * step
+        step = self.subject.step(direction, change, deep=True, **given) or self.number.slope.step
+        pushed = self.subject.push(direction, change, **given) * step
         return np.abs(pushed).max(axis=-1) > QUIET
 
 
 # --------------------------------------------------------------------------------------------------- flat losses
 
 
-def why_flat(setting: Setting, number: Number, going: Callable[[], bool]) -> list[Finding]:
+def why_flat(subject: Subject, number: Number, going: Callable[[], bool]) -> list[Finding]:
     """Whether the loss is flat around a number that is seen, though a larger move changes it; if there is time."""
-    engine, step = setting.engine, number.slope.step
+    engine, step = subject.engine, number.slope.step
     samples = 2
 
     def at(pixels: float) -> float:
-        return float(engine.to_numpy(setting.loss(setting.hard(number.direction, pixels * step, samples))))
+        return float(engine.to_numpy(subject.loss(subject.hard(number.direction, pixels * step, samples))))
 
     if not going():
         return []
     here = at(0)
     near = max(abs(at(sign * by) - here) for sign in (1, -1) for by in (1, 2))
     by, far = 4, 0.0
-    while by <= max(setting.size) and not far:
+    while by <= max(subject.size) and not far:
         if not going():
             return []
         change = max(abs(at(sign * by) - here) for sign in (1, -1))
@@ -207,22 +207,22 @@ def why_flat(setting: Setting, number: Number, going: Callable[[], bool]) -> lis
         f"the loss is flat here: moves of two pixels do not change it, one of {by} pixels does{share}; a derivative "
         f"reaches one pixel"
     )
-    sigma = _seen_by_blur(setting, number)
+    sigma = _seen_by_blur(subject, number)
     look = f" (a Gaussian of {sigma} pixels sees it)" if sigma else ""
     advice = f"Start nearer, or compare coarser or blurred images first{look}."
     return [Finding("reach", because, advice, mask)]
 
 
-def _seen_by_blur(setting: Setting, number: Number) -> int | None:
+def _seen_by_blur(subject: Subject, number: Number) -> int | None:
     """Standard deviation of the Gaussian, pixels, through which the loss of images has a slope."""
     from scipy.ndimage import gaussian_filter
 
-    engine, like = setting.engine, next(leaves(setting.parameters))
-    ends = [engine.to_numpy(setting.hard(number.direction, by * number.slope.step, 2)) for by in (-0.5, 0, 0.5)]
+    engine, like = subject.engine, next(leaves(subject.parameters))
+    ends = [engine.to_numpy(subject.hard(number.direction, by * number.slope.step, 2)) for by in (-0.5, 0, 0.5)]
     sigma = 2
-    while sigma <= max(setting.size) / 2:
+    while sigma <= max(subject.size) / 2:
         blurred = [engine.constant(gaussian_filter(x, (sigma, sigma, 0), mode="constant"), like) for x in ends]
-        before, here, after = (float(engine.to_numpy(setting.loss(x))) for x in blurred)
+        before, here, after = (float(engine.to_numpy(subject.loss(x))) for x in blurred)
         if abs(after - before) > FLAT * abs(here):
             return sigma
         sigma *= 2
@@ -232,13 +232,13 @@ def _seen_by_blur(setting: Setting, number: Number) -> int | None:
 # -------------------------------------------------------------------------------------------------- combinations
 
 
-def undetermined(setting: Setting, numbers: Sequence[Number]) -> list[tuple[str, Finding]]:
+def undetermined(subject: Subject, numbers: Sequence[Number]) -> list[tuple[str, Finding]]:
     """Combinations of numbers along which the image stays as it is, though each of them changes it."""
     numbers = [n for n in numbers if np.isfinite(n.pushed).all() and not is_quiet(n.pushed)]
     if len(numbers) < 2:
         return []
     gram = np.zeros((len(numbers), len(numbers)))
-    for row in range(setting.size[0]):  # So that not all are held once more.
+    for row in range(subject.size[0]):  # So that not all are held once more.
         columns = np.stack([n.pushed[row].reshape(-1) for n in numbers]).astype(np.float64)
         gram += columns @ columns.T
     lengths = np.sqrt(np.diag(gram))
@@ -246,7 +246,7 @@ def undetermined(setting: Setting, numbers: Sequence[Number]) -> list[tuple[str,
     units = lengths / np.array([n.slope.step for n in numbers])  # Of the image, for a unit of the number.
     found = []
     for value, vector in zip(values, vectors, strict=True):
-        if np.sqrt(max(value, 0)) > OPEN or not _stays(setting, numbers, vector / lengths):
+        if np.sqrt(max(value, 0)) > OPEN or not _stays(subject, numbers, vector / lengths):
             continue
         found.append(vector / units)
     if not found:
@@ -258,7 +258,7 @@ def undetermined(setting: Setting, numbers: Sequence[Number]) -> list[tuple[str,
     return [("", Finding("undetermined", because, advice))]
 
 
-def _stays(setting: Setting, numbers: Sequence[Number], weights: np.ndarray) -> bool:
+def _stays(subject: Subject, numbers: Sequence[Number], weights: np.ndarray) -> bool:
     """Whether the image stays when numbers are moved together, by a step of the one that moves most."""
     weights = weights / np.abs(weights).max()
     largest = numbers[int(np.argmax(np.abs(weights)))]
@@ -268,7 +268,7 @@ def _stays(setting: Setting, numbers: Sequence[Number], weights: np.ndarray) -> 
         directions = [list(leaves(n.direction)) for n in numbers]
         total = iter([sum(b * d for b, d in zip(parts, ds, strict=True)) for ds in zip(*directions, strict=True)])
         direction = map_leaves(lambda _: next(total), numbers[0].direction)
-        return setting.engine.to_numpy(setting.hard(direction, 1.0, 4))
+        return subject.engine.to_numpy(subject.hard(direction, 1.0, 4))
 
     change = np.linalg.norm(image(1) - image(-1))
     return bool(change <= OPEN_TRUE * np.linalg.norm(largest.true))

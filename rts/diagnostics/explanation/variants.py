@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rts.camera import Camera
-from rts.diagnostics.explanation.setting import Change
+from rts.diagnostics.explanation.subject import Change
 from rts.engines import engine_of, namespace
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part, as_surface

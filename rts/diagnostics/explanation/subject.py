@@ -69,7 +69,7 @@ class Touched(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
+class Subject:
     """What is looked at: a scene, how it is rendered, and its loss.
 
     Attributes:
