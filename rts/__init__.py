@@ -27,6 +27,7 @@ from rts.files.models import load
 from rts.files.views import View, load_views
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
+from rts.fitting.schedule import Stage, pyramid
 from rts.gbuffer import GBuffer
 from rts.interfaces import (
     Evaluator,
@@ -89,6 +90,7 @@ __all__ = [
     "Shader",
     "Splats",
     "Splatter",
+    "Stage",
     "Surface",
     "ToleranceWarning",
     "TriangleSampler",
@@ -111,6 +113,7 @@ __all__ = [
     "plugin",
     "plugins",
     "prepare",
+    "pyramid",
     "regularizers",
     "render",
     "render_samples",

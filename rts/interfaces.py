@@ -26,6 +26,7 @@ from rts.trees import Array, Tree, map_leaves, record
 
 if TYPE_CHECKING:
     from rts.camera import Camera
+    from rts.fitting.schedule import Stage
 
 
 # ------------------------------------------------------------------------------------------------------------ surfaces
@@ -95,6 +96,13 @@ class Surface(Evaluator):
             theta: θ; NumPy arrays are constants, others may be of any engine.
         """
         return ()
+
+    def unbounded(self) -> Surface | None:
+        """This surface without bounds on its derivatives; None where it has none, which is the default.
+
+        `rts.check_gradient` looks at it, to tell whether such a bound is why a gradient is off.
+        """
+        return None
 
     @classmethod
     def example(cls) -> Part | None:
@@ -467,14 +475,20 @@ class Residuals(Plugin):
 
     Attributes:
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
+        has_stages: whether it can be had at other resolutions; True in a class with its own `at_stage`.
     """
 
-    FLAGS = {"normal_equations": "sums_products"}
+    FLAGS = {"normal_equations": "sums_products", "at_stage": "has_stages"}
     sums_products: bool = False
+    has_stages: bool = False
 
     @abc.abstractmethod
     def __call__(self, parameters: Tree) -> Array:
         """Residuals, of any shape."""
+
+    def at_stage(self, stage: Stage) -> Callable[[Tree], Array]:
+        """The residuals at another resolution, for `rts.fit` with a schedule."""
+        raise NotImplementedError
 
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
         """Mean square () of the n residuals r, JᵀJ / n (U, U) and Jᵀr / n (U,) for their Jacobian J.

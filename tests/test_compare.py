@@ -1,7 +1,9 @@
 """`rts.diagnostics.compare` and `rts.tune`: truth, errors, times, what is kept of them, and the command line."""
 
 import json
+import math
 import random
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from rts.diagnostics.comparison import measure, truth, turns
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.scene import moving
 from rts.diagnostics.comparison.scores import loss_weights, scores
+from rts.diagnostics.comparison.search import Search
 from rts.diagnostics.comparison.settings import Setting, _no_worse, limited, worth_timing
 from rts.diagnostics.tune import tune
 from rts.engines import engine_named
@@ -531,6 +534,24 @@ class TestTune:
         parts, camera = tuned.scene(moved)
         rts.render(parts, camera, (32, 32), **tuned.settings).sum().backward()
         assert moved.grad < -10
+
+    def test_what_was_passed_over_is_found_once(self):
+        """Settings of equal work, passed over for the errors with fewer samples, do not rule each other out."""
+
+        class Measured:
+            scene = SimpleNamespace(directions={"translation": None})
+            engine = SimpleNamespace(name="torch")
+
+            def work(self, group, setting):
+                return min(setting.layers, 3), setting.supersample, 1.0
+
+            def scores(self, mode, setting):
+                return {"error": 0.05 if setting.supersample == 4 else 1.0}
+
+        search = Search(Measured(), {"raster": ""}, 0.1, math.inf, lambda name, count: lambda: None)
+        cells = [Setting("visible", k, s) for s in (1, 2, 3, 4) for k in (4, 8)]
+        search.bounds.update((s, 1.0) for s in cells[:-2])
+        assert search._within(cells) == [Setting("visible", 4, 4)]
 
     def test_budget(self, kept):
         """What is known when it is spent is what is taken."""

@@ -33,13 +33,14 @@ def parameters_of(target):
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_a_right_gradient_agrees_with_the_difference(target):
-    check = rts.check_gradient(card, parameters_of(target), SIZE, supersample=4)
+    check = rts.check_gradient(card, parameters_of(target), SIZE, supersample=4, budget_s=600)
     assert check.ok
     names = [s.name for s in check.slopes]
     assert names == ["color[0]", "color[1]", "color[2]", "shift[0]", "shift[1]", "shift[2]"]
     for s in check.slopes:
         assert abs(s.autodiff - s.difference) <= 0.05 * abs(s.difference) + 3 * s.error
     assert check.slopes[5].difference == pytest.approx(0, abs=1e-6)  # Orthographic: depth is not seen.
+    assert [(r.kind, r.parameters) for r in check.reasons] == [("undetermined", ["shift[2]"])]
 
 
 def test_gradients_that_miss_the_silhouette_are_shown_to_differ():

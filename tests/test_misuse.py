@@ -236,6 +236,13 @@ CALLS = {
     "fit.tolerance": lambda v: rts.fit(lambda p: p, START(), tolerance=v),
     "fit.patience": lambda v: rts.fit(lambda p: p, START(), patience=v),
     "fit.callback": lambda v: rts.fit(lambda p: p, START(), callback=v),
+    "fit.schedule": lambda v: rts.fit(lambda p: p, START(), schedule=v),
+    "Stage.scale": lambda v: rts.Stage(v),
+    "Stage.supersample": lambda v: rts.Stage(supersample=v),
+    "Stage.sigma": lambda v: rts.Stage(sigma=v),
+    "pyramid.size": lambda v: rts.pyramid(v),
+    "pyramid.coarsest": lambda v: rts.pyramid(SIZE, coarsest=v),
+    "pyramid.largest": lambda v: rts.pyramid(SIZE, largest=v),
     "check_gradient.scene": lambda v: rts.check_gradient(v, START(), SIZE),
     "check_gradient.parameters": lambda v: rts.check_gradient(lambda p: (scene(p), CAMERA), v, SIZE),
     "check_gradient.size": lambda v: rts.check_gradient(lambda p: (scene(p), CAMERA), START(), v),
@@ -269,6 +276,7 @@ OPTIONAL = """
     prepare.size
     Part.transform Mesh.indices look_at.aspect look_at.near look_at.far within.transform splatter.calibration
     ImageResiduals.weights fit.steps fit.learning_rate fit.callback gradient_image.scale
+    fit.schedule Stage.supersample pyramid.largest
     Isosurface.band Isosurface.lipschitz Isosurface.reads Isosurface.attributes Sdf.lipschitz Sdf.steps
     NarrowBand.lipschitz NarrowBand.coarse
 """
@@ -277,7 +285,7 @@ NUMBERS = """
     orthographic.height from_opencv.near from_opencv.pixel_center from_pytorch3d.focal_length from_blender.focal
     splatter.sigma splatter.calibration exact_calibration.sigma save_animation.fps fit.learning_rate fit.tolerance
     gradient_image.scale Bezier.tolerance tessellate.rate Isosurface.isovalue Isosurface.lipschitz Sdf.radius
-    Sdf.lipschitz NarrowBand.lipschitz
+    Sdf.lipschitz NarrowBand.lipschitz Stage.sigma
 """
 ACCEPTED = {
     "None": OPTIONAL.split(),

@@ -74,7 +74,7 @@ def run(folder: Path, engine: str | None = None, progress: bool | None = None) -
     }
     summary: dict[str, Any] = {
         **errors,
-        "loss": {"start": found.history[0], "end": found.loss},
+        "loss": {"start": found.first_loss, "end": found.loss},
         "steps": len(found.history),
         "seconds": found.seconds,
         "triangles": len(model[0].surface.faces),

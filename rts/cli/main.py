@@ -280,12 +280,12 @@ def fit_pose(
     surface: Surface = "mesh",
     engine: Annotated[str, typer.Option(help="torch or jax; auto is whichever is installed.")] = "auto",
     method: Annotated[str, typer.Option(help="lm (Levenberg–Marquardt), adam or sgd.")] = "lm",
-    steps: Annotated[int | None, typer.Option(help="At most so many at each of the resolutions.")] = None,
+    steps: Annotated[int | None, typer.Option(help="At most so many at each stage.")] = None,
     camera: Camera_ = "30,20",
     fov: Fov = 40.0,
     up: Up = "y",
 ) -> None:
-    """Find the turn and shift of a model that make its silhouette match a picture's.
+    """Find the turn and shift of a model that make its silhouette match a picture's: coarse, blurred pixels first.
 
     Writes pose.json (axis-angle, translation, 4x4 matrix, loss, iterations, seconds), before.png, after.png,
     target.png, animation.gif and convergence.png.
@@ -306,11 +306,9 @@ def fit_pose(
     chosen = None if engine == "auto" else engine
     found = fit(parts, mask, seen, bounds, engine=chosen, method=method, steps=steps)
     files = write_report(output, found, parts, seen, mask)
-    several = len(found.levels) > 1
     _say(
-        f"loss {found.history[0]:.3g} → {found.loss:.3g} in {len(found.history)} steps"
-        f"{f', {_sum(found.levels)} from coarse pixels to fine' if several else ''}, "
-        f"{found.seconds:.1f} s ({'at the finest, ' if several else ''}{found.reason}); wrote"
+        f"loss {found.first_loss:.3g} → {found.loss:.3g} in {len(found.history)} steps, {_sum(found.levels)} from "
+        f"coarse and blurred pixels to fine, {found.seconds:.1f} s (at the finest, {found.reason}); wrote"
     )
     _say_written(files)
     _say_skipped_plot(files)

@@ -13,8 +13,10 @@ from rts.camera import Camera
 from rts.cli.views import Bounds
 from rts.engines import Engine, engine_named
 from rts.errors import InputError, PluginError
-from rts.fitting.fit import fit
+from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
+from rts.fitting.least_squares import mean_square
+from rts.fitting.schedule import Stage, box_filtered, pyramid
 from rts.interfaces import Part
 from rts.operations.linear import matmul
 from rts.operations.rigid import rigid
@@ -22,9 +24,6 @@ from rts.trees import Array
 
 LARGEST_SIDE = 256
 """Pixels of the longer side of the image that is fitted."""
-
-COARSEST_SIDE = 24
-"""The pyramid starts at least here: an edge pulls over one pixel only, so coarse pixels reach further."""
 
 
 class PoseFit(NamedTuple):
@@ -36,9 +35,10 @@ class PoseFit(NamedTuple):
         center: (3,) world.
         matrix: (4, 4), world from the model as loaded.
         trail: the best matrix so far, at each step.
-        history: the loss at each step: mean square of the difference of silhouettes, at that step's
-            resolution.
-        levels: how many steps were made at each resolution, from coarse to fine.
+        history: the loss at each step: mean square of the difference of silhouettes, at that step's resolution and
+            blur.
+        levels: how many steps were made at each stage, from coarse to fine.
+        first_loss: the loss of the start at full resolution.
         loss: the lowest loss at full resolution.
         reason: why it stopped there.
         seconds: wall time.
@@ -51,6 +51,7 @@ class PoseFit(NamedTuple):
     trail: list[np.ndarray]
     history: list[float]
     levels: list[int]
+    first_loss: float
     loss: float
     reason: str
     seconds: float
@@ -84,11 +85,8 @@ def silhouette_of(image: np.ndarray) -> np.ndarray:
 
 def shrunk(mask: np.ndarray, largest: int) -> np.ndarray:
     """(h, w) box-filtered so that the longer side is at most `largest`."""
-    from PIL import Image
-
-    scale = min(1.0, largest / max(mask.shape))
-    height, width = (max(1, round(s * scale)) for s in mask.shape)
-    return np.asarray(Image.fromarray(mask).resize((width, height), Image.Resampling.BOX))
+    size = Stage(min(1.0, largest / max(mask.shape))).size(mask.shape)
+    return box_filtered(mask[..., None], size)[..., 0]
 
 
 def fit_pose(
@@ -115,39 +113,52 @@ def fit_pose(
         progress: see `rts.fit`.
     """
     chosen = _engine(engine or available_engine())
-    pose = chosen.constant(np.zeros(6, np.float32))
     weights = np.repeat([1.0, bounds.radius], 3)
-    trail: list[np.ndarray] = []
-    levels: list[list[float]] = []
-    seconds, result = 0.0, None
-    for mask in _pyramid(target):
-        levels.append([])
+    met: list[np.ndarray] = []
 
-        def note(step: int, p: Array, loss: float) -> None:
-            # Levenberg–Marquardt reports rejected trials too: those repeat the last pose.
-            best = step == 0 or loss < min(levels[-1])
-            trail.append(_matrix(chosen.to_numpy(p) * weights, bounds) if best else trail[-1])
-            levels[-1].append(loss)
+    def note(step: int, pose: Array, loss: float) -> None:
+        met.append(chosen.to_numpy(pose).astype(np.float64) * weights)
 
-        result = fit(
-            _residuals(parts, camera, mask, bounds, weights, chosen),
-            pose,
-            method=method,
-            steps=steps,
-            callback=note,
-            progress=progress,
-        )
-        pose = result.parameters
-        seconds += result.seconds
-    assert result is not None  # A pyramid has at least one level.
-    found = chosen.to_numpy(pose).astype(np.float64) * weights
-    matrix = _matrix(found, bounds)
-    trail.append(matrix)
-    history = sum(levels, [])
-    counts = [len(level) for level in levels]
-    return PoseFit(
-        found[:3], found[3:], bounds.center, matrix, trail, history, counts, result.loss, result.reason, seconds
+    residuals = _residuals(parts, camera, target, bounds, weights, chosen)
+    start, schedule = chosen.constant(np.zeros(6, np.float32)), pyramid(target.shape, largest=LARGEST_SIDE)
+    result = fit(
+        residuals,
+        start,
+        method=method,
+        steps=steps,
+        schedule=schedule,
+        callback=note,
+        progress=progress,
     )
+    found = chosen.to_numpy(result.parameters).astype(np.float64) * weights
+    trail = [_matrix(pose, bounds) for pose in (*_best_so_far(met, result), found)]
+    levels = list(result.stages)
+    return PoseFit(
+        found[:3],
+        found[3:],
+        bounds.center,
+        trail[-1],
+        trail,
+        result.history,
+        levels,
+        float(mean_square(residuals.at_stage(schedule[-1])(start))),
+        result.loss,
+        result.reason,
+        result.seconds,
+    )
+
+
+def _best_so_far(met: list[np.ndarray], result: Fit) -> list[np.ndarray]:
+    """The parameters with the lowest loss of each step and those before it at its stage.
+
+    Levenberg–Marquardt reports rejected trials too.
+    """
+    found, first = [], 0
+    for count in result.stages:
+        losses = result.history[first : first + count]
+        found += [met[first + min(range(k + 1), key=losses.__getitem__)] for k in range(count)]
+        first += count
+    return found
 
 
 def _engine(name: str) -> Engine:
@@ -158,21 +169,13 @@ def _engine(name: str) -> Engine:
 
 
 def _residuals(
-    parts: Sequence[Part], camera: Camera, mask: np.ndarray, bounds: Bounds, weights: np.ndarray, engine: Engine
+    parts: Sequence[Part], camera: Camera, target: np.ndarray, bounds: Bounds, weights: np.ndarray, engine: Engine
 ) -> ImageResiduals:
     def silhouettes(pose: Array) -> list[Part]:
         transform = rigid(pose * engine.constant(weights, pose), bounds.center)
         return posed(parts, transform, "silhouette")
 
-    return ImageResiduals(silhouettes, camera, mask.shape, mask, layers=1, splatter="single")
-
-
-def _pyramid(target: np.ndarray) -> list[np.ndarray]:
-    """The target from coarse to fine, each twice the one before."""
-    sides = [min(LARGEST_SIDE, max(target.shape))]
-    while sides[0] >= 2 * COARSEST_SIDE:
-        sides.insert(0, sides[0] // 2)
-    return [shrunk(target, side) for side in sides]
+    return ImageResiduals(silhouettes, camera, target.shape, target, layers=1, splatter="single")
 
 
 def _matrix(pose: np.ndarray, bounds: Bounds) -> np.ndarray:

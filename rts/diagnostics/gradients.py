@@ -5,33 +5,34 @@ from __future__ import annotations
 import contextlib
 import inspect
 import math
+import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rts.arguments import quoted
 from rts.arrays import from_numbers, kind_of
-from rts.camera import Camera
 from rts.checks import check_size, is_count, is_real
-from rts.diagnostics.steps import pixel_step
+from rts.diagnostics.comparison.progress import Phase, phases
+from rts.diagnostics.explanation.explaining import explained
+from rts.diagnostics.explanation.reasons import Reason, legend, marked
+from rts.diagnostics.explanation.slopes import Number, Slope, chosen, measured, unit
+from rts.diagnostics.explanation.subject import Scene, Subject
 from rts.engines import Engine, engine_of, is_constant, namespace
-from rts.errors import InputError
+from rts.errors import EmptyImageWarning, InputError, LayersWarning
 from rts.files.srgb import decode_srgb
 from rts.fitting.dependence import differentiable
 from rts.fitting.names import named_leaves
 from rts.fitting.run import untraceable
-from rts.interfaces import Part
 from rts.rendering import render
 from rts.trees import Array, Tree, leaves, map_leaves
 
-Scene = Callable[[Tree], tuple[Part | Sequence[Part], Camera]]
-
-STEP_UNSEEN = 1e-2
-"""How far the finite differences change a number that nothing seems to depend on."""
 NEGLIGIBLE = 0.01
 """What does not matter, as a share of the largest effect of a step."""
+FOR_SLOPES = 0.6
+"""The share of the budget after which no further number is begun, so that reasons can be found."""
 LOSS_SMOOTHNESS = 4.0
 """Standard deviation of the Gaussian that smooths the weights of the default loss, pixels."""
 
@@ -95,34 +96,22 @@ def gradient_image(
     return GradientImage(derivative, float(scale) if scale is not None else largest or 1.0)
 
 
-class Slope(NamedTuple):
-    """The derivative of a loss in one number of the parameters, found in two ways.
-
-    Attributes:
-        name: where the number is, such as "pose[2]".
-        autodiff: the derivative through the splatter.
-        difference: the central finite difference of area-sampled hard renders.
-        error: how far the difference may be off: what two sampling grids and two steps disagree on.
-        step: the step of the difference, in units of the number.
-    """
-
-    name: str
-    autodiff: float
-    difference: float
-    error: float
-    step: float
-
-
 class GradientCheck(NamedTuple):
-    """The result of `check_gradient`; as a string, a table.
+    """The result of `check_gradient`; as a string, a table and what explains it.
 
     Attributes:
         slopes: one for each number that was looked at.
         tolerance: how far a derivative may be off, relative to itself.
+        reasons: why slopes differ or vanish, those that explain most first.
+        picture: (H, W, 3) linear RGB for `rts.save_image`: the scene, dark, and the pixels of reasons in their colours.
+        note: what was left out, since the budget was spent, say; empty if nothing was.
     """
 
     slopes: list[Slope]
     tolerance: float
+    reasons: Sequence[Reason] = ()
+    picture: np.ndarray | None = None
+    note: str = ""
 
     def agrees(self, slope: Slope) -> bool:
         """Whether autodiff and the difference agree.
@@ -130,7 +119,8 @@ class GradientCheck(NamedTuple):
         They may be off by the tolerance, three error bars and what is negligible beside the other slopes. Slopes of
         different units are compared by what a step of a pixel does to the loss.
         """
-        largest = max(abs(s.difference * s.step) for s in self.slopes)
+        effects = [abs(s.difference * s.step) for s in self.slopes]
+        largest = max((x for x in effects if math.isfinite(x)), default=0.0)
         allowed = self.tolerance * abs(slope.difference) + 3 * slope.error + NEGLIGIBLE * largest / slope.step
         return abs(slope.autodiff - slope.difference) <= allowed
 
@@ -148,7 +138,9 @@ class GradientCheck(NamedTuple):
             lines.append(
                 f"{s.name:{max(width, 9)}} {s.autodiff:11.4g} {s.difference:11.4g} {s.error:12.2g} {ratio}{verdict}"
             )
-        return "\n".join(lines)
+        lines += [f"- {reason.kind}: {reason.text}" for reason in self.reasons]
+        colors = legend(self.reasons)
+        return "\n".join([*lines, *([f"In the picture: {colors}."] if colors else []), *filter(None, [self.note])])
 
 
 def check_gradient(
@@ -160,12 +152,16 @@ def check_gradient(
     entries: int = 6,
     samples: int = 8,
     tolerance: float = 0.1,
+    budget_s: float = 60.0,
+    progress: bool | None = None,
     **options: Any,
 ) -> GradientCheck:
-    """Compare the gradient of a loss of a rendered scene with finite differences, to see whether it can be trusted.
+    """Compare the gradient of a loss of a rendered scene with finite differences, and say why they differ or vanish.
 
     The differences are of images without splatting, of `samples`² and (`samples` + 1)² samples a pixel, over a step
-    that moves what moves fastest by one pixel, and over twice that step.
+    that moves what moves fastest by one pixel, and over twice that step. Where the two disagree, and where nothing
+    changes at all, experiments on the scene tell why: without culling, alone, with more layers or samples, from
+    farther away, and so on.
 
     Args:
         scene: parameters → (parts, camera).
@@ -175,11 +171,15 @@ def check_gradient(
         entries: how many numbers to look at in each array: those of largest gradient, and some at random.
         samples: the square root of the number of samples a pixel.
         tolerance: how far a derivative may be off, relative to itself.
+        budget_s: seconds after which nothing more is begun; what was looked at until then is returned. At least one
+            number is looked at.
+        progress: a bar on standard error; None for where that is a terminal.
         **options: splatter, layers, supersample, background, … of `rts.render`.
 
     Raises:
         InputError: parameters that have no derivative, or arguments that `rts.render` refuses.
     """
+    clock = _Clock(budget_s)
     _check_function("scene", scene, "a function: parameters → (parts, camera)")
     if loss is not None:
         _check_function("loss", loss, "a function: image (H, W, 4) → scalar, or None")
@@ -190,33 +190,67 @@ def check_gradient(
             raise InputError(f"{name} is {quoted(count)}; expected an integer of at least 1")
     if not (is_real(tolerance) and 0 <= tolerance < math.inf):
         raise InputError(f"tolerance is {quoted(tolerance)}; expected a number, at least 0")
+    if not (progress is None or isinstance(progress, bool)):
+        raise InputError(f"progress is {quoted(progress)}; expected True, False, or None for where there is a terminal")
     known = [n for n in inspect.signature(render).parameters if n not in ("parts", "camera", "size")]
     if unknown := [name for name in options if name not in known]:
         raise InputError(f"there is no option {unknown[0]!r}; expected {', '.join(known)}")
+    own = loss is not None
     loss = _scalar(_smooth_weighting(size, engine, parameters) if loss is None else loss, engine)
+    subject = Subject(engine, scene, map_leaves(engine.stop_gradient, parameters), size, options, loss)
+    with _traceable(engine), phases(progress) as phase, warnings.catch_warnings():
+        # Why nothing is seen is what the check tells.
+        warnings.simplefilter("ignore", EmptyImageWarning)
+        warnings.simplefilter("ignore", LayersWarning)
+        subject.require_dependence()
+        numbers, count = _looked_at(subject, entries, samples, clock, phase)
+        check = GradientCheck([n.slope for n in numbers], tolerance)
+        plain = [n for n in numbers if n.forward]
+        found, left = explained(subject, plain, check.agrees, own, clock.going, phase)
+        picture = marked(subject.seen, found)
+    notes = [f"{len(numbers)} of {count} numbers were looked at"] if len(numbers) < count else []
+    notes += [f"reasons were not looked for, or not all, in {left} of them"] if left else []
+    told = [f"After {clock.spent:.0f} s the budget was spent: {', and '.join(notes)}."] if notes else []
+    if len(plain) < len(numbers):
+        told.append("Reasons were not looked for, since forward mode does not go through the splatter or a shader.")
+    return check._replace(reasons=found, picture=picture, note=" ".join(told))
 
-    def image(p: Tree, **changes: Any) -> Array:
-        found = scene(p)
-        if not isinstance(found, tuple) or len(found) != 2:
-            raise InputError(f"scene gave {kind_of(found)}; expected (parts, camera)")
-        return render(*found, size, **{**options, **changes})
 
-    with _traceable(engine):
-        value, gradient = engine.value_and_grad(lambda p: loss(image(p)))(parameters)
-    slopes = []
+class _Clock:
+    """Seconds since it was made, and whether some are left."""
+
+    def __init__(self, budget: float):
+        if not (is_real(budget) and 0 < budget):
+            raise InputError(f"budget_s is {quoted(budget)}; expected a positive number of seconds")
+        self.budget, self.start = float(budget), time.perf_counter()
+
+    @property
+    def spent(self) -> float:
+        return time.perf_counter() - self.start
+
+    def going(self, share: float = 1.0) -> bool:
+        """Whether that share of the budget is not spent yet."""
+        return self.spent < share * self.budget
+
+
+def _looked_at(subject: Subject, entries: int, samples: int, clock: _Clock, phase: Phase) -> tuple[list[Number], int]:
+    """Some numbers of each array, the first of all arrays first; and how many there were to look at."""
+    engine, parameters = subject.engine, subject.parameters
+    gradient = engine.value_and_grad(lambda p: subject.loss(subject.image(p)))(parameters)[1]
+    planned = []
     for number, ((name, value), slope) in enumerate(zip(named_leaves(parameters), leaves(gradient), strict=True)):
         flat = engine.to_numpy(slope).reshape(-1)
-        for index in _chosen(flat, entries):
-            direction = _unit(engine, parameters, number, index)
-            step = pixel_step(engine, image, parameters, direction) or STEP_UNSEEN
-            hard = partial(_difference, engine, loss, partial(image, splatter="none"), parameters, direction)
-            coarse, fine, wide = hard(step, samples), hard(step, samples + 1), hard(2 * step, samples)
-            difference = (coarse + fine) / 2
-            error = abs(coarse - fine) / 2 + abs(wide - coarse) / 3
+        for rank, index in enumerate(chosen(flat, entries)):
             place = ", ".join(map(str, np.unravel_index(index, value.shape)))
             label = f"{name}[{place}]" if value.shape else name
-            slopes.append(Slope(label, float(flat[index]), difference, error, step))
-    return GradientCheck(slopes, tolerance)
+            planned.append((rank, number, index, label, float(flat[index])))
+    found, done = {}, phase("derivatives", len(planned))
+    for rank, number, index, label, slope in sorted(planned):
+        if found and not clock.going(FOR_SLOPES):
+            break
+        found[number, rank] = measured(subject, label, unit(engine, parameters, number, index), slope, samples)
+        done()
+    return [found[key] for key in sorted(found)], len(planned)
 
 
 # --------------------------------------------------------------------------------------------------- parameters
@@ -267,52 +301,12 @@ def _scalar(loss: Callable[[Array], Array], engine: Engine) -> Callable[[Array],
     """The loss, refused where it is no scalar of the engine."""
 
     def call(image: Array) -> Array:
-        if not engine.owns(image):
-            raise InputError(f"the image is {kind_of(image)}: nothing in the scene depends on the parameters")
         value = loss(image)
         if not engine.owns(value) or value.shape != ():
             raise InputError(f"loss gave {kind_of(value)}; expected a {engine.name} scalar, of shape ()")
         return value
 
     return call
-
-
-def _chosen(gradient: np.ndarray, count: int) -> list[int]:
-    """Indices of the largest entries and of some others, fixed by the seed."""
-    if gradient.size <= count:
-        return list(range(gradient.size))
-    largest = np.argsort(-np.abs(gradient), kind="stable")[: (count + 1) // 2]
-    rest = np.setdiff1d(np.arange(gradient.size), largest)
-    others = np.random.default_rng(0).choice(rest, count - len(largest), replace=False)
-    return sorted(map(int, (*largest, *others)))
-
-
-def _unit(engine: Engine, parameters: Tree, number: int, index: int) -> Tree:
-    """The direction in which one number of one leaf changes."""
-    count = iter(range(sum(1 for _ in leaves(parameters))))
-
-    def leaf(p: Array) -> Array:
-        unit = np.zeros(math.prod(p.shape))
-        unit[index if next(count) == number else slice(0)] = 1
-        return namespace(p).astype(engine.constant(unit.reshape(p.shape), p), p.dtype, copy=False)
-
-    return map_leaves(leaf, parameters)
-
-
-# ------------------------------------------------------------------------------------------- finite differences
-
-
-def _difference(
-    engine: Engine, loss: Callable, image: Callable, parameters: Tree, direction: Tree, step: float, samples: int
-) -> float:
-    """Central difference of the loss of hard images."""
-
-    def at(by: float) -> float:
-        steps = iter(leaves(direction))
-        moved = map_leaves(lambda p: p + by * next(steps), parameters)
-        return float(engine.to_numpy(loss(image(moved, supersample=samples))))
-
-    return (at(step / 2) - at(-step / 2)) / step
 
 
 def _smooth_weighting(size: tuple[int, int], engine: Engine, parameters: Tree) -> Callable[[Array], Array]:

@@ -16,24 +16,31 @@ STEP_PIXELS = 1.0
 """How far a step moves what moves fastest in the image."""
 STEP_COLOR = 0.05
 """How far a step changes the colour that changes fastest, where nothing moves."""
+FADING = 0.7
+"""What deeper layers count for, less and less, so that motions of two of them cannot cancel."""
 
 
 class _Probe(Splatter):
-    """A splatter that shows where samples are on the image, or their colour."""
+    """A splatter that shows where samples are on the image, or their colour; of the front layer, or of all."""
 
-    def __init__(self, color: bool):
-        self.color = color
+    def __init__(self, color: bool, deep: bool):
+        self.color, self.deep = color, deep
 
     def image(self, splats: Splats) -> Array:
         positions, rgba, row = splats.positions, splats.rgba, splats.row
         xp = namespace(positions, rgba, row)
         values = rgba if self.color else xp.concat([positions[:, :2]] * 2, axis=1)
-        index = xp.reshape(xp.where(row[0] >= 0, row[0], 0), (-1,))
-        shown = xp.reshape(xp.take(values, index, axis=0), (*row.shape[1:], 4))
-        return xp.where((row[0] >= 0)[..., None], shown, 0.0)
+        total = 0.0
+        for k in range(row.shape[0] if self.deep else 1):
+            index = xp.reshape(xp.where(row[k] >= 0, row[k], 0), (-1,))
+            shown = xp.reshape(xp.take(values, index, axis=0), (*row.shape[1:], 4))
+            total = total + FADING**k * xp.where((row[k] >= 0)[..., None], shown, 0.0)
+        return total
 
 
-def pixel_step(engine: Engine, image: Callable[..., Array], parameters: Tree, direction: Tree) -> float | None:
+def pixel_step(
+    engine: Engine, image: Callable[..., Array], parameters: Tree, direction: Tree, *, deep: bool = False
+) -> float | None:
     """A step along a direction that moves the image by a pixel or, where nothing moves, changes its colour.
 
     None where neither changes.
@@ -43,9 +50,10 @@ def pixel_step(engine: Engine, image: Callable[..., Array], parameters: Tree, di
         image: parameters and options of `rts.render` → (H, W, 4).
         parameters: where derivatives are looked at.
         direction: of their structure.
+        deep: whether to look at all layers that are kept, not only at the front one.
     """
     for color, wanted in ((False, STEP_PIXELS), (True, STEP_COLOR)):
-        probe = partial(image, splatter=_Probe(color), supersample=1, background=None)
+        probe = partial(image, splatter=_Probe(color, deep), supersample=1, background=None)
         speed = np.abs(engine.to_numpy(engine.jvp(probe, parameters, direction)[1])).max(initial=0.0)
         if speed > 1e-6:
             return float(wanted / speed)

@@ -126,9 +126,8 @@ def tune(
         suited = measured.samplers(possible)
         if not suited:
             raise InputError(f"no sampler suits {found.name!r}: {'; '.join(measured.left_out)}")
-        chosen, reasons, error, seconds = Search(measured, tolerance, deadline, phase).run(
-            named, measured.kinds(suited)
-        )
+        search = Search(measured, measured.kinds(suited), tolerance, deadline, phase)
+        chosen, reasons, error, seconds = search.run(named)
     at = measured.forms(TOGETHER)[chosen.rate].at
     own = None if measured.scene.separate else measured.engine
     parts = stopped(parts_of(at(measured.scene.moved(next(iter(measured.scene.directions)), 0.0, own))))

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.adapting import adapted
+from rts.adapting import adapted, unwrapped
 from rts.arguments import quoted
 from rts.arrays import kind_of
 from rts.checks import is_count, is_real
@@ -20,6 +20,7 @@ from rts.fitting.dependence import differentiable, refuse_independent
 from rts.fitting.least_squares import levenberg_marquardt, mean_square
 from rts.fitting.names import listed, named_leaves, one_line
 from rts.fitting.run import LONGEST_REASON, NO_GRADIENT, Astray, Report, Run, progress_bar, require
+from rts.fitting.schedule import Stage, checked_schedule
 from rts.interfaces import Residuals
 from rts.trees import Array, Tree, leaves, map_leaves
 
@@ -34,13 +35,17 @@ class Fit(NamedTuple):
         parameters: the parameters with the lowest loss met.
         loss: that loss.
         history: the loss at the start and after each update; for Levenberg–Marquardt of each trial, accepted or not.
+            With a schedule those of all stages, one after the other.
         steps: number of losses computed, the one at the start included.
         reason: why it stopped, in one line; and what the residuals leave open: arrays whose gradient was zero
             throughout and, for Levenberg–Marquardt, combinations of parameters that change nothing, such as
             "light.direction along (0.30, 0.50, 0.81)". These stay as they were.
         seconds: wall time, compilation included.
+        stages: how many of the steps were made at each stage of the schedule; one number without a schedule.
 
-    Printed, it is three lines, without history and values.
+    With a schedule, parameters, loss and reason are those of the last stage.
+
+    Printed, it is three lines, without history and values; of losses the first and the lowest of the last stage.
     """
 
     parameters: Tree
@@ -49,10 +54,14 @@ class Fit(NamedTuple):
     steps: int
     reason: str
     seconds: float
+    stages: tuple[int, ...]
 
     def __repr__(self) -> str:
-        first = f"{self.history[0]:.4g} → " if self.history else ""
+        # Losses of stages are those of other images.
+        first = f"{self.history[-self.stages[-1]]:.4g} → " if self.stages[-1] else ""
         steps = "1 step" if self.steps == 1 else f"{self.steps} steps"
+        if len(self.stages) > 1:
+            steps += f" ({' + '.join(map(str, self.stages))})"
         held = [f"{name} {tuple(x.shape)}" for name, x in named_leaves(self.parameters)]
         return (
             f"loss {first}{self.loss:.4g} in {steps} and {self.seconds:.3g} s\n"
@@ -70,6 +79,7 @@ def fit(
     learning_rate: float | None = None,
     tolerance: float = 1e-6,
     patience: int = 50,
+    schedule: Sequence[Stage] | None = None,
     callback: Report | None = None,
     progress: bool | None = None,
     jit: bool = True,
@@ -89,11 +99,13 @@ def fit(
         method: "adam" or "sgd" (torch.optim or optax, on the gradient of the loss), or "lm": Levenberg–Marquardt on the
             sum of squares, by the forward-mode Jacobian, for up to some hundred unknowns.
         loss: reduces residuals to a scalar, for Adam and SGD; Levenberg–Marquardt always takes the mean square.
-        steps: at most so many losses are computed, the first at the start; default 200, for "lm" 50.
+        steps: at most so many losses are computed at each stage, the first at its start; default 200, for "lm" 50.
         learning_rate: the rate of Adam (default 0.01) or SGD (default 0.1).
         tolerance: stop when the loss has not fallen by this fraction in `patience` steps ("lm": in an accepted step).
         patience: the number of steps that `tolerance` speaks of; not for "lm".
-        callback: called as `callback(step, parameters, loss)`; a true result stops the fit.
+        schedule: stages, one after the other, each from where the one before ended: the resolutions at which images are
+            compared, such as `rts.pyramid(size)`. For `ImageResiduals`, or residuals with a method `at_stage`.
+        callback: called as `callback(step, parameters, loss)`; a true result stops the fit, later stages included.
         progress: show a progress bar with loss and ms/iteration; default only on a terminal.
         jit: compile with jax (no effect on torch). Turn off if `residuals` cannot be traced.
 
@@ -105,25 +117,38 @@ def fit(
     known = _check_functions(residuals, loss, callback)
     _check_method(method, loss, steps, learning_rate)
     _check_limits(tolerance, patience)
+    stages = _stages(known, schedule)
     engine = _checked_engine(parameters)
     names = [name for name, _ in named_leaves(parameters)]
     # Private copies: neither the caller's later changes nor the graph that made them may reach the result.
     parameters = map_leaves(partial(_copied, engine), parameters)
+    rate = LEARNING_RATES.get(method, 0.0) if learning_rate is None else float(learning_rate)
     start = time.perf_counter()
-    run = Run(int(steps or STEPS[method]), callback, tolerance, patience)
-    with progress_bar(progress, run.steps, method, run):
-        try:
-            checked = _checked(residuals, engine, run)
-            if method == "lm":
-                own = known.normal_equations if known.sums_products else None
-                supersample = getattr(residuals, "supersample", None)
-                levenberg_marquardt(checked, parameters, engine, run, jit, own, supersample)
-            else:
-                rate = LEARNING_RATES[method] if learning_rate is None else float(learning_rate)
-                _descend(checked, _scalar(loss, engine), parameters, engine, method, rate, run, jit)
-        except Astray as stop:
-            run.stop(str(stop))
-    return Fit(run.best, run.best_loss, run.history, len(run.history), run.told(names), time.perf_counter() - start)
+    runs: list[Run] = []
+    for number, stage in enumerate(stages, 1):
+        run = Run(int(steps or STEPS[method]), callback, tolerance, patience, sum(len(r.history) for r in runs))
+        bar = method if len(stages) == 1 else f"{method} {number}/{len(stages)}"
+        with progress_bar(progress, run.steps, bar, run):
+            try:
+                checked = _checked(stage, engine, run)
+                if method == "lm":
+                    own = stage.normal_equations if stage.sums_products else None
+                    supersample = getattr(stage, "supersample", None)
+                    levenberg_marquardt(checked, parameters, engine, run, jit, own, supersample)
+                else:
+                    _descend(checked, _scalar(loss, engine), parameters, engine, method, rate, run, jit)
+            except Astray as stop:
+                run.stop(str(stop))
+        runs.append(run)
+        if run.best is not None:
+            parameters = run.best
+        if run.asked:
+            break
+    history = [value for run in runs for value in run.history]
+    counts = tuple(len(run.history) for run in runs)
+    lowest = [run.best_loss for run in runs if run.history][-1]
+    reason = runs[-1].told(names)
+    return Fit(parameters, lowest, history, len(history), reason, time.perf_counter() - start, counts)
 
 
 def _copied(engine: Engine, x: Array) -> Array:
@@ -156,11 +181,11 @@ def _descend(
     evaluate = engine.jit(evaluate) if jit else evaluate
     step = engine.optimizer(method, rate, parameters)
     while True:
-        start = not run.history
+        start = run.fresh
         value, gradient, finite, mattered = run.attempt(engine, evaluate, parameters)
         require(math.isfinite(value), f"the loss is {float(value)}", start)
         run.note_gradient([*map(bool, mattered)])
-        if start and not any(run.mattered):
+        if not run.history and not any(run.mattered):
             refuse_independent(residuals, loss, parameters, engine)
         if not run.record(parameters, float(value)):
             return
@@ -189,6 +214,22 @@ def _check_functions(residuals: Any, loss: Any, callback: Any) -> Residuals:
     if callback is not None and not callable(callback):
         raise InputError(f"callback is {quoted(callback)}; expected a function of step, parameters and loss, or None")
     return known
+
+
+def _stages(residuals: Residuals, schedule: Any) -> list[Residuals]:
+    """The residuals at each stage of a schedule; without one, as they are."""
+    if schedule is None:
+        return [residuals]
+    schedule = checked_schedule(schedule)
+    if not residuals.has_stages:
+        raise InputError(
+            f"residuals is {quoted(unwrapped(residuals))}, whose resolution nobody knows; with a schedule pass "
+            f"rts.ImageResiduals, or an object with a method at_stage(stage); see rts.Residuals"
+        )
+    found = [adapted(residuals.at_stage(stage), Residuals) for stage in schedule]
+    if None in found:
+        raise InputError("at_stage gave no function of the parameters; expected residuals")
+    return found
 
 
 def _check_method(method: str, loss: Callable, steps: int | None, learning_rate: float | None) -> None:

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any, Literal
 
 from rts.arguments import quoted
 from rts.arrays import described, from_numbers, is_finite, kind_of, shape_of
 from rts.camera import Camera
-from rts.checks import check_background, check_floating, check_sampler, check_scene, check_size, check_splatter
+from rts.checks import (
+    check_background,
+    check_floating,
+    check_ratio,
+    check_sampler,
+    check_scene,
+    check_size,
+    check_splatter,
+)
 from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting
 from rts.errors import InputError
 from rts.fitting.least_squares import flatten, normal_equations
 from rts.fitting.names import one_line
+from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.interfaces import CheckedPart, Part, Residuals, Splatter
 from rts.records import Splats
 from rts.rendering import _bands as bands_of
@@ -83,6 +93,7 @@ class ImageResiduals(Residuals):
         self._background = check_background(background, self.size)
         self.supersample = int(supersample)
         self._sampling: dict[str, Any] = {"sampler": check_sampler(sampler), "layers": layers, "capacity": capacity}
+        self._full, self._sigma = self.size, 0.0
 
     def __call__(self, parameters: Tree) -> Array:
         """`weights * (image − target)`, of the target's shape."""
@@ -101,10 +112,40 @@ class ImageResiduals(Residuals):
         difference = image[..., CHANNELS[self._channels]] - target
         if weights is not None:
             difference = difference * weights
+        if self._sigma:
+            difference = blurred(difference, self._sigma)
         return namespace(image).reshape(difference, tuple(self._target.shape))
+
+    def at_stage(self, stage: Stage) -> ImageResiduals:
+        """The residuals at another resolution, for the same camera and extent of the image; see `rts.fit`.
+
+        Target and background are box-filtered. Where there are weights, the target's pixels count by their squares: an
+        image that is constant over each coarse pixel has the same sum of squares, but for a constant, as before.
+        Differences are blurred with their weights; those take the Jacobian for Levenberg–Marquardt.
+
+        Args:
+            stage: the resolution.
+        """
+        made = copy(self)
+        made._sigma = float(stage.sigma)
+        made.supersample = self.supersample if stage.supersample is None else int(stage.supersample)
+        made.size = stage.size(self.size)
+        if made.size != self.size:
+            made._target, made._weights = _shrunk(self._target, self._weights, made.size)
+            if self._background is not None and len(self._background.shape) == 3:
+                made._background = box_filtered(self._background, made.size)
+        return made
 
     def scene(self, parameters: Tree) -> tuple[Any, Camera]:
         """Parts and camera for these parameters."""
+        parts, camera = self._scene_as_given(parameters)
+        if self.size != self._full:
+            # Sides are rounded: the ratio of fewer pixels may be another, what they show is the same.
+            check_ratio(camera, self._full)
+            camera = camera.for_size(self._full).replace(aspect=None)
+        return parts, camera
+
+    def _scene_as_given(self, parameters: Tree) -> tuple[Any, Camera]:
         found = self._scene(parameters)
         if isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Camera):
             return found[0], found[1]
@@ -124,7 +165,12 @@ class ImageResiduals(Residuals):
         """Mean square () of the n residuals, JᵀJ / n (U, U) and Jᵀr / n (U,) for the U numbers in the parameters."""
         engine = engine_of(parameters)
         splatter, found = self._splatter, None
-        if splatter.sums_products and engine.differentiates and (self.supersample == 1 or splatter.averages):
+        if (
+            not self._sigma
+            and splatter.sums_products
+            and engine.differentiates
+            and (self.supersample == 1 or splatter.averages)
+        ):
             found = self._swept(splatter, parameters, engine)
         return normal_equations(self, parameters, engine) if found is None else found
 
@@ -193,6 +239,22 @@ class ImageResiduals(Residuals):
                 background = xp.concat([background, xp.ones_like(background[..., :1])], axis=-1)
             background = xp.broadcast_to(background, (*self.size, 4))
         return target, weights, background
+
+
+def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tuple[Array, Array | None]:
+    """Target and weights in fewer pixels (h, w), with as many axes and channels as before."""
+    xp, kind = namespace(target, weights), target.shape
+    weights, target = constants((weights, target), engine_of(target, weights), exemplar((target, weights)))
+    target = xp.reshape(target, (*kind[:2], -1))
+    if weights is None:
+        return xp.reshape(box_filtered(target, size), (*size, *kind[2:])), None
+    shape = weights.shape
+    counts = xp.reshape(weights, (*kind[:2], -1)) ** 2
+    total = box_filtered(counts, size)
+    known = total > 0
+    mean = box_filtered(counts * target, size) / xp.where(known, total, xp.ones_like(total))
+    small = xp.where(known, mean, box_filtered(target, size))
+    return xp.reshape(small, (*size, *kind[2:])), xp.reshape(xp.sqrt(total), (*size, *shape[2:]))
 
 
 def _checked(parts: Parts, camera: Camera) -> tuple[list[CheckedPart], Camera]:

@@ -118,7 +118,7 @@ def levenberg_marquardt(
         run.note_gradient([bool(d.any()) for d in _split(np.diag(linear.matrix), sizes)])
         return linear, _Model(linear, sizes)
 
-    here, model = taken(linearize(vector), start=True)
+    here, model = taken(linearize(vector), start=run.fresh)
     going = run.record(unflatten(vector), here.value)
     damping, growth = FIRST_DAMPING, 2.0
     promising, jumps = True, False

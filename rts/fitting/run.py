@@ -33,9 +33,11 @@ class Run:
         mattered: of each array of the parameters, whether its gradient was ever other than zero.
         remarks: what else is to be told of the outcome, beside why it stopped.
         residuals: how many numbers the residuals are, once that is known.
+        asked: whether the callback has asked to stop.
     """
 
-    def __init__(self, steps: int, callback: Report | None, tolerance: float, patience: int):
+    def __init__(self, steps: int, callback: Report | None, tolerance: float, patience: int, before: int = 0):
+        self.before, self.asked = before, False
         self.steps, self.callback, self.tolerance, self.patience = steps, callback, tolerance, patience
         self.history: list[float] = []
         self.best: Tree = None
@@ -56,9 +58,16 @@ class Run:
             self.best, self.best_loss = parameters, loss
         if loss < self._reference - margin:
             self._reference, self._last_gain = loss, len(self.history)
-        if self.callback is not None and self.callback(len(self.history) - 1, parameters, loss):
+        if self.callback is not None:
+            self.asked = bool(self.callback(self.before + len(self.history) - 1, parameters, loss))
+        if self.asked:
             return self.stop("the callback asked to")
         return self.left > 0
+
+    @property
+    def fresh(self) -> bool:
+        """Whether no loss is known yet, of earlier stages neither: what goes wrong is the caller's to put right."""
+        return not self.history and not self.before
 
     def note_gradient(self, mattered: Sequence[bool]) -> None:
         """Note which arrays of the parameters have a gradient other than zero."""
@@ -98,7 +107,7 @@ class Run:
             original = error if isinstance(error, RtsError) else engine.take_error() or untraceable(error, engine)
             if original is None:
                 raise
-            if self.history and isinstance(original, InputError):
+            if not self.fresh and isinstance(original, InputError):
                 raise Astray(str(original)) from error
             if original is error:
                 raise

@@ -9,6 +9,7 @@ import numpy as np
 from rts.camera import Camera
 from rts.engines import stopped, value_of
 from rts.interfaces import CheckedPart, TriangleSurface
+from rts.records import Proxy
 from rts.trees import Tree, map_leaves
 
 
@@ -32,23 +33,43 @@ def _cause(part: CheckedPart, camera: Camera) -> str:
     proxy = part.surface.proxy(inputs, local, (1, 1))
     if not len(proxy.faces):
         return "{} " + part.surface.why_no_triangles(inputs).replace("{", "{{").replace("}", "}}")
-    corners = proxy.vertices[np.unique(proxy.faces)].astype(np.float64)
-    at = np.concatenate([corners, np.ones((len(corners), 1))], axis=1) @ (local.projection @ local.view).T
-    depth = -(corners @ local.view[2, :3] + local.view[2, 3])
-    near, far = local.depth_range()
-    if (depth < near).all():
-        where = "behind the camera" if (at[:, 3] <= 0).all() else f"nearer than the near plane, at {near:.3g}"
-        return "{} lies " + where
-    if (depth > far).all():
-        return f"{{}} lies beyond the far plane, at {far:.3g}"
-    for axis, sign, side in ((0, 1, "right"), (0, -1, "left"), (1, 1, "top"), (1, -1, "bottom")):
-        if (sign * at[:, axis] > at[:, 3]).all():
-            return f"{{}} lies outside of the view, beyond its {side} edge"
+    outside = _outside(proxy, local)
+    if outside is not None:
+        return f"{{}} {outside}"
     if part.cull == "back":
         return "all that is in sight of {} is seen from behind, which cull='back' leaves out"
     if part.shader.opaque:
         return "{} lies between the centres of pixels, or beside the view"
     return "the shader of {} gives an alpha of 0, or it lies between the centres of pixels"
+
+
+def out_of_view(part: CheckedPart, camera: Camera) -> str | None:
+    """Where a part lies if not in the view, beginning with a verb; None where some of it may be, or nobody knows."""
+    if not isinstance(part.surface, TriangleSurface):
+        return None
+    known = _known((part.surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))
+    if known is None:
+        return None
+    inputs, local = known
+    proxy = part.surface.proxy(inputs, local, (1, 1))
+    return _outside(proxy, local) if len(proxy.faces) else None
+
+
+def _outside(proxy: Proxy, local: Camera) -> str | None:
+    """Where triangles lie, all of them, if not in the view."""
+    corners = proxy.vertices[np.unique(proxy.faces)].astype(np.float64)
+    at = np.concatenate([corners, np.ones((len(corners), 1))], axis=1) @ (local.projection @ local.view).T
+    depth = -(corners @ local.view[2, :3] + local.view[2, 3])
+    near, far = local.depth_range()
+    if (depth < near).all():
+        where = "behind the camera" if (at[:, 3] <= 0).all() else f"nearer than the near plane, at {near + 0.0:.3g}"
+        return f"lies {where}"
+    if (depth > far).all():
+        return f"lies beyond the far plane, at {far:.3g}"
+    for axis, sign, side in ((0, 1, "right"), (0, -1, "left"), (1, 1, "top"), (1, -1, "bottom")):
+        if (sign * at[:, axis] > at[:, 3]).all():
+            return f"lies outside of the view, beyond its {side} edge"
+    return None
 
 
 def _known(tree: Tree) -> Tree | None:

@@ -312,6 +312,14 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         along, free = per_level(within * gradient(level, points)), xp.min(within, axis=-1, keepdims=True)
         return engine.stop_gradient(xp.concat([points, along, (1 - free) * level(points)[:, None]], axis=-1))
 
+    def unbounded(self) -> Isosurface | None:
+        """See `rts.Surface`: with near-singular edges as they are."""
+        if self.near_singular != "bound":
+            return None
+        found = copy.copy(self)
+        found.near_singular = "keep"
+        return found
+
     def normal(self, theta: Mapping[str, Tree], position: Array) -> Array:
         """The field's, and in caps that of the bounds' side."""
         xp, caps = namespace(position), self._caps(engine_of(position).stop_gradient(position))

@@ -74,7 +74,7 @@ def _scene(name: str, parts: Part | Sequence[Part], **options: Any) -> Scene:
     return moving(name, parts, shapes.camera(), SIZE, note=BUILTIN[name].note, **options)
 
 
-def _file(scene: str, file: str) -> Path:
+def data_file(scene: str, file: str) -> Path:
     """A file of the test data."""
     path = Path(os.environ.get(VARIABLE) or FOLDER) / file
     if not path.is_file():
@@ -101,7 +101,7 @@ def _upright(points: np.ndarray, ax: float, ay: float) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------- meshes
 
 
-def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
+def read_mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float64 and faces (T, 3)."""
     (part,) = load(path)
     vertices, faces = part.surface.tessellate(part.theta, 1)
@@ -109,7 +109,7 @@ def _mesh(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _bunny_and_square(scene: str) -> list[Part]:
-    vertices, faces = _mesh(_file(scene, BUILTIN[scene].data[0]))
+    vertices, faces = read_mesh(data_file(scene, BUILTIN[scene].data[0]))
     parts = shapes.bunny_and_square(normalised(vertices) @ rotation_xy(0.1, 0.4).T, faces)
     return [part.replace(cull="back") for part in parts]
 
@@ -135,13 +135,13 @@ def bunny_before_square() -> Scene:
 def textured_spot() -> Scene:
     """A cow with a texture."""
     name = "textured spot"
-    obj, _ = (_file(name, file) for file in BUILTIN[name].data)
+    obj, _ = (data_file(name, file) for file in BUILTIN[name].data)
     return _scene(name, shapes.textured_spot(obj.parent))
 
 
 def nefertiti() -> Scene:
     """A scanned bust."""
-    vertices, faces = _mesh(_file("nefertiti", BUILTIN["nefertiti"].data[0]))
+    vertices, faces = read_mesh(data_file("nefertiti", BUILTIN["nefertiti"].data[0]))
     color = np.array([0.9, 0.75, 0.55])
     return _scene("nefertiti", shapes.mesh(_upright(vertices, 0.1, 0.4), faces, "lambert", "back", color=color))
 
@@ -195,7 +195,7 @@ def _standing(part: Part, entry: str, color: Sequence[float]) -> Part:
 def bezier_teapot() -> Scene:
     """Newell's teapot."""
     name = "bezier teapot"
-    (part,) = load(_file(name, BUILTIN[name].data[0]), surface="bezier")
+    (part,) = load(data_file(name, BUILTIN[name].data[0]), surface="bezier")
     part, exact = _with_exact(_standing(part, "points", [0.9, 0.55, 0.3]))
     return _scene(name, part, exact=exact)
 
@@ -203,7 +203,7 @@ def bezier_teapot() -> Scene:
 def subdivided_rook() -> Scene:
     """A chess rook."""
     name = "subdivided rook"
-    (part,) = load(_file(name, BUILTIN[name].data[0]), surface="subdivision")
+    (part,) = load(data_file(name, BUILTIN[name].data[0]), surface="subdivision")
     part, exact = _with_exact(_standing(part, "vertices", [0.75, 0.8, 0.9]))
     return _scene(name, part, exact=exact)
 

@@ -56,6 +56,10 @@ class Deodr(Peer):
         view = np.array([[1.0, TURN, 0, 0], [TURN, -1, 0, 0], [0, 0, -1, 0]])
         self.camera = Camera(view, intrinsic, height, width)
 
+    def image(self) -> np.ndarray:
+        """The image (H, W, 3) of the scene at rest."""
+        return self._render(self.vertices, self.colors)
+
     def _render(self, vertices: np.ndarray, colors: np.ndarray) -> np.ndarray:
         """The image (H, W, 3)."""
         self.scene.mesh.set_vertices(vertices)

@@ -8,7 +8,7 @@ which DRJIT_LIBLLVM_PATH may name.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from typing import Any
@@ -173,6 +173,25 @@ class Mitsuba(Peer):
         image = self.scene.render(values, {key: value for key, (value, _) in moving.items()}, self.spp, seed)
         dr.forward(t)
         return np.array(dr.grad(image), np.float64)
+
+    def slopes(self, modes: Sequence[str], weigh: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """dL/dt (modes,) along several modes, by one pass in reverse mode.
+
+        Args:
+            modes: keys of the scene's `directions`.
+            weigh: the image (H, W, 3) → the derivative of L with respect to it.
+        """
+        dr = import_module("drjit")
+        moving = [self.scene.moving(mode) for mode in modes]
+        rest = {key: value for found in moving for key, (value, _) in found.items()}
+        values = {key: value + 0 for key, value in rest.items()}
+        dr.enable_grad(list(values.values()))
+        image = self.scene.render(values, rest, self.spp, 0)
+        weights = mitsuba().TensorXf(np.asarray(weigh(np.array(image, np.float64)), np.float32))
+        dr.backward(dr.sum(image * weights, axis=None))
+        gradients = {key: np.array(dr.grad(value)) for key, value in values.items()}
+        slopes = [sum(np.sum(gradients[k] * np.array(change)) for k, (_, change) in found.items()) for found in moving]
+        return np.array(slopes, np.float64)
 
     def gradient(self, mode: str, weights: np.ndarray | None = None) -> Callable[[], float]:
         """See `Peer`; every call has the same samples."""

@@ -54,26 +54,29 @@ class Search:
 
     Args:
         measured: the scene, and what is known of it.
+        samplers: names, each with the one whose errors it shares; "" for the usual one.
         tolerance: of the error.
         deadline: when to stop measuring, on the clock of `time.perf_counter`.
         phase: shows progress.
     """
 
-    def __init__(self, measured: Measurements, tolerance: float, deadline: float, phase: Phase):
-        self.measured, self.tolerance, self.deadline, self.phase = measured, tolerance, deadline, phase
+    def __init__(
+        self,
+        measured: Measurements,
+        samplers: Mapping[str, str],
+        tolerance: float,
+        deadline: float,
+        phase: Phase,
+    ):
+        self.measured, self.samplers, self.phase = measured, samplers, phase
+        self.tolerance, self.deadline = tolerance, deadline
         self.modes = list(measured.scene.directions)
         self.bounds: dict[Setting, float] = {}
         self.engine = measured.engine.name
         self.late = False
 
-    def run(self, splatters: Sequence[str], samplers: Mapping[str, str]) -> Found:
-        """The best that is found in time.
-
-        Args:
-            splatters: names.
-            samplers: names, each with the one whose errors it shares; "" for the usual one.
-        """
-        self.samplers = samplers
+    def run(self, splatters: Sequence[str]) -> Found:
+        """The best of these splatters that is found in time."""
         cells: list[Setting] = []
         within: list[Setting] = []
         for kind in dict.fromkeys(self.samplers.values()):
@@ -156,8 +159,8 @@ class Search:
                 passed.append(setting)
             elif not self._looked_at(setting, found):
                 break
-        for setting in passed if not found else ():
-            if not self._looked_at(setting, found):
+        for setting in [] if found else passed:
+            if not self._needless(setting, found) and not self._looked_at(setting, found):
                 break
         return found
 

@@ -1,0 +1,122 @@
+"""A derivative of the nearest configuration that is known well: a sphere or a box that moves alike."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.diagnostics.comparison.shapes import box, icosphere, unlit
+from rts.diagnostics.explanation import variants
+from rts.diagnostics.explanation.slopes import Number, measured
+from rts.diagnostics.explanation.subject import Subject
+from rts.engines import engine_of, namespace
+from rts.interfaces import Part
+from rts.trees import Tree, leaves, map_leaves
+
+SUBDIVISIONS = 4
+"""How often the sphere is subdivided."""
+FEWEST = 8
+"""Pixels of an object of which a sphere or a box can be made."""
+SAMPLES = 8
+"""The square root of the number of samples a pixel of its truth."""
+COLOR = (0.9, 0.6, 0.3)
+
+
+class Baseline(NamedTuple):
+    """What the nearest configuration shows.
+
+    Attributes:
+        name: "a sphere" or "a box".
+        pushed: (H, W, 4), as of a `Number`.
+        true: (H, W, 4), as of a `Number`.
+        slope: the derivative of the loss through the splatter.
+        difference: the finite difference.
+    """
+
+    name: str
+    pushed: np.ndarray
+    true: np.ndarray
+    slope: float
+    difference: float
+
+
+def nearest(
+    subject: Subject, number: Number, parts: Sequence[int] | None, options: Mapping[str, Any]
+) -> Baseline | None:
+    """The sphere or the box whose outline is most like that of what moves; None where nothing is seen to move.
+
+    Args:
+        subject: the scene.
+        number: what moves it.
+        parts: which parts of it move; None for all.
+        options: of `rts.render`, other than those of the subject.
+    """
+    only = variants.alone(range(len(subject.parts)) if parts is None else parts)
+    probe = variants.all_of(only, variants.placed)
+    plain: dict[str, Any] = dict(splatter="none", layers=1, supersample=1, background=None, capacity=None)
+    places = subject.engine.to_numpy(subject.image(subject.parameters, probe, **plain)).astype(np.float64)
+    seen = places[..., 3] > 0.5
+    if seen.sum() < FEWEST:
+        return None
+    position = places[seen][:, :3]
+    velocity = subject.push(number.direction, probe, **plain)[seen][:, :3].astype(np.float64)
+    rows = np.column_stack([position, np.ones(len(position))])
+    motion = np.linalg.lstsq(rows, velocity, rcond=1e-6)[0]  # (4, 3), velocity = rows @ motion.
+    camera = subject.shown(subject.parameters)[1]
+    candidates = []
+    for name, (vertices, faces) in zip(("a sphere", "a box"), _shapes(position, camera), strict=True):
+        moved = replace(
+            subject,
+            scene=partial(_scene, subject, number, vertices, faces, motion),
+            parameters={"by": subject.engine.constant(np.zeros(()), next(leaves(subject.parameters)))},
+            options={**subject.options, **options, "background": None, "sampler": "auto"},
+        )
+        mask = moved.seen[..., 3] > 0.5
+        candidates.append(((mask & seen).sum() / max((mask | seen).sum(), 1), name, moved))
+    _, name, moved = max(candidates, key=lambda c: c[0])
+    direction = map_leaves(namespace(*leaves(moved.parameters)).ones_like, moved.parameters)
+    found = measured(moved, name, direction, None, SAMPLES)
+    if not found.forward:
+        return None
+    return Baseline(name, found.pushed, found.true, found.slope.autodiff, found.slope.difference)
+
+
+def _shapes(position: np.ndarray, camera: Camera) -> list[tuple[np.ndarray, np.ndarray]]:
+    """A sphere and a box about points (N, 3) that are seen from a camera: vertices and faces, world space."""
+    view = np.asarray(engine_of(camera.view).to_numpy(camera.view), np.float64)
+    local = position @ view[:3, :3].T + view[:3, 3]
+    low, high = np.percentile(local, 1, axis=0), np.percentile(local, 99, axis=0)
+    half, middle = (high - low) / 2, (high + low) / 2
+    # Of something round only the half before its outline is seen.
+    depth = max(high[2] - low[2], 1e-3 * half[:2].max())
+    sphere, triangles = icosphere(SUBDIVISIONS)
+    back = np.linalg.inv(view)
+
+    def world(points: np.ndarray) -> np.ndarray:
+        return points @ back[:3, :3].T + back[:3, 3]
+
+    flat = half[:2].max() + 1e-9
+    round_ = sphere * [half[0], half[1], max(depth, 0.2 * flat)] + [*middle[:2], low[2]]
+    corners, faces = box([*low[:2], high[2] - depth], high)
+    return [(world(round_), triangles), (world(corners), faces)]
+
+
+def _scene(
+    subject: Subject, number: Number, vertices: np.ndarray, faces: np.ndarray, motion: np.ndarray, parameters: Tree
+) -> tuple[Part, Camera]:
+    """The shape, and the camera of the scene, moved as the number moves them."""
+    by, engine = parameters["by"], subject.engine
+    steps = iter(leaves(number.direction))
+    camera = subject.shown(map_leaves(lambda p: p + by * next(steps), subject.parameters))[1]
+    velocity = np.column_stack([vertices, np.ones(len(vertices))]) @ motion
+    part = unlit(vertices, faces, COLOR)
+    if np.abs(velocity).max() > 0:
+        part = part.replace(
+            theta={**part.theta, "vertices": engine.constant(vertices, by) + by * engine.constant(velocity, by)}
+        )
+    return part, camera

@@ -1,0 +1,361 @@
+"""Why the derivative of an image disagrees with the truth: experiments that make it agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.diagnostics.comparison.scores import low_pass
+from rts.diagnostics.explanation import variants
+from rts.diagnostics.explanation.baseline import nearest
+from rts.diagnostics.explanation.fineness import on_host
+from rts.diagnostics.explanation.reasons import Finding
+from rts.diagnostics.explanation.slopes import Number
+from rts.diagnostics.explanation.subject import DEEP, Change, Subject, Touched
+from rts.diagnostics.explanation.vanishing import why_constant
+
+HALVED = 0.5
+"""An experiment names a reason if it leaves less than this share of the error."""
+NOISY, BETTER = 1.5, 0.8
+"""So far above its noise the truth is believed; one that leaves no more than this, and less than that share of the
+error, names a reason, too."""
+LEFT = 0.3
+"""What remains of the error when the rest is explained, and is no longer looked into."""
+LARGE_SHARE = 0.3
+"""Pixels of a kind name a reason if they hold so much of the disagreement."""
+STRONG = 0.1
+"""A pixel disagrees if it is off by this share of the pixel that is most."""
+ALIKE = 0.5
+"""The baseline is off, too, if by this share of what the scene is off by."""
+SHORTER, DENSE = 0.25, 8
+"""The step of differences of fine colours, as a share of that of others; the square root of their samples a pixel."""
+AGAIN = 4
+"""Samples a pixel, along each axis, that experiments take instead of one."""
+
+
+class _Error(NamedTuple):
+    """By how much a derivative image is off the truth.
+
+    Attributes:
+        image: (H, W, 4), through the low-pass of `scores`.
+        norm: of it.
+        sharp: (H, W), its energy without the low-pass.
+    """
+
+    image: np.ndarray
+    norm: float
+    sharp: np.ndarray
+
+    @classmethod
+    def of(cls, pushed: np.ndarray, true: np.ndarray) -> _Error:
+        """The error of a derivative image."""
+        image = low_pass(pushed - true)
+        return cls(image, float(np.linalg.norm(image)), ((pushed - true) ** 2).sum(axis=-1))
+
+    def within(self, mask: np.ndarray) -> _Error:
+        """That of some pixels (H, W) bool."""
+        image = self.image * mask[..., None]
+        return _Error(image, float(np.linalg.norm(image)), self.sharp * mask)
+
+    @property
+    def energy(self) -> np.ndarray:
+        """(H, W)."""
+        return (self.image**2).sum(axis=-1)
+
+
+class _Case:
+    """A number whose derivatives disagree, and how far it has been explained.
+
+    Attributes:
+        subject: what is looked at.
+        number: the number.
+        options: of `rts.render`, those of the experiments that helped.
+        connected: whether arrays that no derivative leads to are taken to have one.
+        pushed: the derivative with these.
+        error: of this.
+        left: (H, W) bool, the pixels that are not explained.
+        noise: of the truth, as `error.norm`.
+        whole: the error at first.
+        findings: what was found.
+    """
+
+    def __init__(self, subject: Subject, number: Number):
+        self.subject, self.number = subject, number
+        self.options: dict[str, Any] = {"capacity": None}
+        self.connected = False
+        self.pushed = number.pushed
+        self.whole = self.error = _Error.of(number.pushed, number.true)
+        self.noise = number.noise
+        self.left = np.ones(subject.size, bool)
+        self.findings: list[Finding] = []
+
+    @property
+    def open(self) -> bool:
+        """Whether something is left to explain."""
+        return self.error.norm > max(NOISY * self.noise, LEFT * self.whole.norm)
+
+    def strong(self, error: _Error) -> np.ndarray:
+        """(H, W) bool, the pixels that disagree most."""
+        size = np.abs(self.number.pushed - self.number.true).max(axis=-1)
+        energy = error.energy
+        return (size > STRONG * size.max()) & (energy > STRONG**2 * energy.max())
+
+    def push(self, change: Change | None = None, **options: Any) -> np.ndarray:
+        """The derivative of the image, as it is now, with a further change and options."""
+        options = {**self.options, **options}
+        found = self.subject.push(self.number.direction, change, connect=self.connected, **options)
+        return found * self.number.slope.step
+
+    def try_connected(self) -> _Error | None:
+        """As `try_out`, with derivatives where there are none."""
+        self.connected = True
+        before = self.try_out()
+        self.connected = before is not None
+        return before
+
+    def try_out(self, **options: Any) -> _Error | None:
+        """The error before, if options make it much smaller, which are kept then; else None."""
+        changed = {**self.options, **options}
+        pushed = self.push(**options)
+        error, before = _Error.of(pushed, self.number.true).within(self.left), self.error
+        least = NOISY * self.noise
+        if error.norm > HALVED * before.norm and not (error.norm < least and error.norm < BETTER * before.norm):
+            return None
+        self.options, self.pushed, self.error = changed, pushed, error
+        return before
+
+    def gained(self, before: _Error) -> float:
+        """Which share of the whole went with the last experiment."""
+        return (before.norm**2 - self.error.norm**2) / self.whole.norm**2
+
+
+def _constants(case: _Case, touched: Touched) -> None:
+    """Arrays that no derivative leads to, if it would agree with one."""
+    found = why_constant(case.subject, touched)
+    if not found:
+        return
+    if len(touched.all) == len(touched.constant) + len(touched.cut) and not case.number.pushed.any():
+        mask = case.strong(case.whole)
+        case.findings += [f._replace(mask=mask, share=1.0) for f in found]
+        return
+    before = case.try_connected()
+    if before is not None:
+        mask, share = case.strong(before), case.gained(before)
+        case.findings += [f._replace(mask=mask, share=share) for f in found]
+
+
+def _outlines(case: _Case, touched: Touched) -> None:
+    """A splatter that gives outlines no derivative, or hides what a better one shows."""
+    splatter = case.subject.options.get("splatter", "auto")
+    if case.subject.splats_as("visible"):
+        return
+    before = case.try_out(splatter="visible")
+    if before is not None:
+        told = f"splatter={splatter!r}" if isinstance(splatter, str) else f"the splatter {type(splatter).__name__}"
+        because = f"{told} lacks the derivative of outlines that 'visible' has"
+        advice = "Leave out splatter=, or say 'visible'."
+        case.findings.append(Finding("outlines", because, advice, case.strong(before), case.gained(before)))
+
+
+def _transparent(case: _Case, touched: Touched) -> None:
+    """Shaders that are not opaque, beneath a splatter that lets nothing shine through."""
+    if case.subject.opaque or case.subject.splats_as("multi"):
+        return
+    before, advice = case.try_out(splatter="multi"), "Say splatter='multi'."
+    if before is None:
+        before, advice = case.try_out(splatter="multi", layers=DEEP), f"Say splatter='multi', layers={DEEP}."
+    if before is not None:
+        because = "shaders are not opaque, but the splatter shows the front of what it covers"
+        case.findings.append(Finding("transparent", because, advice, case.strong(before), case.gained(before)))
+
+
+def _layers(case: _Case, touched: Touched) -> None:
+    layers = case.subject.options.get("layers", 2)
+    if isinstance(layers, str) or layers >= DEEP:
+        return
+    before = case.try_out(layers=DEEP)
+    if before is None:
+        return
+    mask, share, enough = case.strong(before), case.gained(before), DEEP
+    for count in range(layers + 1, DEEP):
+        if _Error.of(case.push(layers=count), case.number.true).within(case.left).norm <= max(
+            1.1 * case.error.norm, HALVED * before.norm
+        ):
+            enough = count
+            break
+    because = f"what it changes, or uncovers, lies deeper than the K = {layers} layers that are kept"
+    advice = f"Raise layers to {enough}, or say layers='auto'." if case.subject.opaque else f"Raise layers to {enough}."
+    case.findings.append(Finding("layers", because, advice, mask, share))
+
+
+def _bounded(case: _Case, touched: Touched) -> None:
+    """Surfaces that bound derivatives where they are near-singular."""
+    if all(part.surface.unbounded() is None for part in case.subject.parts):
+        return
+    change = np.nan_to_num(np.abs(case.push(variants.unbounded) - case.pushed), nan=np.inf, posinf=np.inf).max(axis=-1)
+    mask = change > STRONG * max(np.abs(case.number.true).max(), np.abs(case.pushed).max())
+    _by_pixels(
+        case,
+        mask,
+        "bounded",
+        "field values at the ends of lattice edges are so nearly alike there that crossings move without bound; the "
+        "surface bounds their derivative",
+        "Smooth the field, or take motion='normal' or near_singular='drop'.",
+    )
+
+
+def _crossing(case: _Case, touched: Touched) -> None:
+    """Lines where parts pass through one another."""
+    subject = case.subject
+    if len(subject.parts) < 2:
+        return
+    sampled = subject.sampled(layers=2)
+    apron, part = sampled.apron, on_host(sampled.part)
+    front, second = part[0], part[1] if len(part) > 1 else np.full_like(part[0], -1)
+    mask = np.zeros(front.shape, bool)
+    for axis in (0, 1):
+        a, b = (tuple(slice(s, n) if i == axis else slice(None) for i in (0, 1)) for s, n in ((0, -1), (1, None)))
+        swaps = (front[a] != front[b]) & (front[a] == second[b]) & (second[a] == front[b]) & (second[a] >= 0)
+        mask[a] |= swaps
+        mask[b] |= swaps
+    _by_pixels(
+        case,
+        mask[apron:-apron, apron:-apron],
+        "crossing",
+        "parts pass through one another there, and their line of crossing moves otherwise than either",
+        "Part them, or model the line as an edge of both.",
+    )
+
+
+def _colors(case: _Case, touched: Touched) -> None:
+    """Colours finer than pixels: what is off lies inside of surfaces, and more samples mend it."""
+    subject, number = case.subject, case.number
+    taken = subject.supersample
+    inside = ~subject.fineness.outlines
+    if case.error.sharp[inside].sum() < LARGE_SHARE * case.error.sharp.sum():
+        return
+    step = number.slope.step * SHORTER  # Over a pixel, fine colours change to and fro.
+    after, before = (subject.engine.to_numpy(subject.hard(number.direction, by, DENSE)) for by in (step / 2, -step / 2))
+    true, finer = (after.astype(np.float64) - before) / SHORTER, case.push(supersample=_more(taken))
+    was, left = (float(((x - true)[inside] ** 2).sum()) ** 0.5 for x in (case.pushed, finer))
+    if left > HALVED * was:
+        return
+    because = f"colours change within a sample there ({_each(taken)}), inside of surfaces"
+    times = was / max(left, 1e-30)
+    advice = f"Blur them to the size of a pixel, or take more samples: with supersample={_more(taken)} "
+    _by_pixels(case, inside, "colors", because, f"{advice}it is {times:.2g} times better.", widen=0)
+
+
+def _samples(case: _Case, touched: Touched) -> None:
+    """Too few samples, for what is thin or for outlines."""
+    taken = case.subject.supersample
+    before = case.try_out(supersample=_more(taken))
+    if before is None:
+        return
+    gain, share = np.maximum(before.sharp - case.error.sharp, 0), case.gained(before)
+    thin, strong = case.subject.fineness.thin, case.strong(before)
+    better = f"with supersample={_more(taken)} it is {before.norm / max(case.error.norm, 1e-30):.2g} times better."
+    held = float(gain[thin].sum() / max(gain.sum(), 1e-30))
+    if held >= LARGE_SHARE:
+        because = f"the scene is thinner than a sample there ({_each(taken)})"
+        case.findings.append(Finding("thin", because, f"Take more samples: {better}", strong & thin, share * held))
+    if 1 - held >= LARGE_SHARE:
+        because = f"{_each(taken)} is too little for these outlines"
+        advice = better[0].upper() + better[1:]
+        case.findings.append(Finding("samples", because, advice, strong & ~thin, share * (1 - held)))
+
+
+def _more(taken: int) -> int:
+    """Samples along each axis of a pixel, for an experiment with more of them."""
+    return AGAIN if taken == 1 else 2 * taken
+
+
+def _each(count: int) -> str:
+    return "one sample a pixel" if count == 1 else f"{count} × {count} samples a pixel"
+
+
+def _by_pixels(case: _Case, mask: np.ndarray, kind: str, because: str, advice: str, widen: int = 2) -> None:
+    """Name a reason if pixels around the mask hold much of what is left."""
+    from scipy.ndimage import binary_dilation
+
+    if not mask.any():
+        return
+    near: Any = binary_dilation(mask, iterations=widen) if widen else mask
+    energy = case.error.energy
+    held = float(energy[near].sum() / max(energy.sum(), 1e-30))
+    if held < LARGE_SHARE:
+        return
+    share = held * case.error.norm**2 / case.whole.norm**2
+    case.findings.append(Finding(kind, because, advice, near & case.strong(case.error), share))
+    case.left &= ~near
+    case.error = case.error.within(case.left)
+
+
+def _bias(case: _Case, touched: Touched) -> None:
+    """What the nearest built-in configuration shows, too; or nothing that is known."""
+    if case.findings and case.error.norm < HALVED * case.whole.norm:
+        return
+    off = _off(case.pushed, case.number.true)
+    mask, share = case.strong(case.error), case.error.norm**2 / case.whole.norm**2
+    found = nearest(case.subject, case.number, touched.parts, case.options)
+    if found is not None:
+        theirs = _off(found.pushed, found.true)
+        ratio = f"{found.slope / found.difference:.2f}" if found.difference else "–"
+        told = f"{found.name} of this size, in this place, moved alike"
+        if theirs >= ALIKE * off:
+            because = (
+                f"a known bias of the library: its derivative image is off by {off:.0%} of its size, that of {told} by "
+                f"{theirs:.0%} (ratio {ratio})"
+            )
+            case.findings.append(Finding("bias", because, "More samples a pixel lessen it.", mask, share))
+            return
+        because = f"no experiment makes it agree; {told} is off by {theirs:.0%}, this by {off:.0%}"
+    else:
+        because = "no experiment makes it agree"
+    case.findings.append(Finding("unknown", because, "", mask, share))
+
+
+def _off(pushed: np.ndarray, true: np.ndarray) -> float:
+    a, b = low_pass(pushed), low_pass(true)
+    return float(np.linalg.norm(a - b) / max(np.linalg.norm(a), np.linalg.norm(b), 1e-30))
+
+
+EXPERIMENTS: tuple[Callable[[_Case, Touched], None], ...] = (
+    _constants,
+    _outlines,
+    _transparent,
+    _layers,
+    _crossing,
+    _bounded,
+    _colors,
+    _samples,
+    _bias,
+)
+"""From the cheap and certain to the dear; each adds what it finds to the case."""
+
+
+def why_off(subject: Subject, number: Number, touched: Touched, going: Callable[[], bool]) -> list[Finding]:
+    """Why the derivatives of a number disagree.
+
+    Args:
+        subject: what is looked at.
+        number: the number.
+        touched: what of the scene it changes.
+        going: whether there is time for another experiment.
+    """
+    case = _Case(subject, number)
+    for experiment in EXPERIMENTS:
+        if not going():
+            break
+        if experiment is _constants or (case.open and not _all_constant(case)):
+            experiment(case, touched)
+    if going() and not case.findings:
+        because = "the derivative images agree as well as the truth is known, and only the loss does not"
+        return [Finding("unknown", because, "Take more samples a pixel for the truth, samples=16 say.")]
+    return case.findings
+
+
+def _all_constant(case: _Case) -> bool:
+    return any(f.kind == "constant" and f.share == 1 for f in case.findings)

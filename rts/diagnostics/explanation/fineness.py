@@ -1,0 +1,81 @@
+"""Which pixels of a scene hold what is thinner than a sample, and which hold outlines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.engines import engine_of
+from rts.records import Sampled
+
+FINE, CELLS = 8, 2**22
+"""Cells along each side of a sample, to see what is thinner; fewer where there would be more than so many in all."""
+JUMP, FLAT = 0.05, 1e-3
+"""Depth jumps where it changes, from cell to cell, by such a share of all depths' span, and such a share of depth."""
+CORNER = 0.1
+"""The share of a pixel that the disk may leave of corners, without anything being thin there."""
+
+
+class Fineness(NamedTuple):
+    """Two masks (H, W) bool.
+
+    Attributes:
+        thin: the pixels around what is thinner than a sample.
+        outlines: those around outlines.
+    """
+
+    thin: np.ndarray
+    outlines: np.ndarray
+
+
+def fineness(sampled: Callable[..., Sampled], size: tuple[int, int], taken: int) -> Fineness:
+    """What is fine in a scene.
+
+    Args:
+        sampled: options of `rts.sample` → samples of the scene.
+        size: (height, width).
+        taken: samples along each axis of a pixel.
+    """
+    from scipy.ndimage import binary_dilation
+
+    height, width = size
+    across = min(FINE, max(2, int((CELLS / (height * width)) ** 0.5 / taken)))  # Cells a sample.
+    fine = across * taken
+    found = sampled(layers=1, supersample=fine)
+    apron = found.apron
+    part, depth = (on_host(x)[0, apron:-apron, apron:-apron] for x in (found.part, found.depth))
+    jump = max(JUMP * np.ptp(depth[part >= 0]), FLAT * depth.max()) if (part >= 0).any() else 0.0
+    jumps = np.zeros(part.shape, bool)
+    for axis in (0, 1):
+        change = (np.diff(part, axis=axis) != 0) | (np.abs(np.diff(depth, axis=axis)) > jump)
+        jumps |= np.pad(change, [(0, 1) if i == axis else (0, 0) for i in (0, 1)])
+
+    def pixels(mask: np.ndarray, least: float) -> np.ndarray:
+        return mask.reshape(height, fine, width, fine).mean(axis=(1, 3)) > least
+
+    thin: Any = binary_dilation(pixels(_thinner(part, across), CORNER), iterations=3)
+    outlines: Any = binary_dilation(pixels(jumps, 0), iterations=2)
+    return Fineness(thin, outlines)
+
+
+def _thinner(part: np.ndarray, across: int) -> np.ndarray:
+    """The cells of parts, or of the space between them, that no disk of so many cells across covers."""
+    from scipy.ndimage import binary_opening, find_objects
+
+    disk = np.hypot(*np.indices((across, across)) - (across - 1) / 2) <= across / 2 - 0.5
+    thin, labels = np.zeros(part.shape, bool), part.astype(np.int32) + 2  # -1 where there is no part.
+    for label, box in enumerate(find_objects(labels), 1):
+        if box is None:
+            continue
+        window = tuple(slice(max(0, b.start - across), b.stop + across) for b in box)
+        mask = np.pad(labels[window] == label, across, mode="edge")
+        opened: Any = binary_opening(mask, disk)
+        thin[window] |= (mask & ~opened)[across:-across, across:-across]
+    return thin
+
+
+def on_host(x: Any) -> np.ndarray:
+    """An array as NumPy."""
+    return engine_of(x).to_numpy(x)

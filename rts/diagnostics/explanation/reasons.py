@@ -1,0 +1,148 @@
+"""Why a derivative disagrees with the truth, or vanishes: reasons in words, and what marks them in a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.files.srgb import decode_srgb
+from rts.fitting.names import listed
+
+KINDS = {
+    "constant": ("orange", (255, 150, 0)),
+    "unused": ("none", None),
+    "outside": ("none", None),
+    "hidden": ("blue", (60, 110, 255)),
+    "culled": ("sky blue", (90, 200, 255)),
+    "outlines": ("red", (255, 40, 40)),
+    "transparent": ("cyan", (0, 255, 255)),
+    "layers": ("magenta", (255, 60, 220)),
+    "thin": ("yellow", (250, 230, 40)),
+    "colors": ("green", (40, 200, 70)),
+    "samples": ("olive", (150, 150, 30)),
+    "bounded": ("violet", (150, 60, 255)),
+    "crossing": ("teal", (0, 140, 130)),
+    "bias": ("pink", (255, 150, 170)),
+    "reach": ("brown", (170, 95, 30)),
+    "infinite": ("gold", (200, 160, 0)),
+    "undetermined": ("none", None),
+    "unknown": ("white", (255, 255, 255)),
+}
+"""The kinds of reasons, each with the colour, 8-bit sRGB, of the pixels that it marks.
+
+- constant: it reaches the scene as NumPy, or cut off from derivatives.
+- unused: nothing in the scene changes with it.
+- outside: what it moves is outside of the view, or behind the near plane.
+- hidden: what it moves is behind something.
+- culled: what it moves is seen from behind, and cull="back".
+- outlines: the splatter gives outlines no derivative.
+- transparent: shaders are not opaque, and the splatter takes them to be.
+- layers: deeper than K layers.
+- thin: thinner than a sample.
+- colors: colours finer than pixels.
+- samples: too few samples a pixel, for other reasons.
+- bounded: near-singular crossings, whose derivatives the surface bounds.
+- crossing: parts pass through one another.
+- bias: a bias of the library, which a sphere or a box shows, too.
+- reach: the loss is flat here, beyond the reach of a pixel.
+- infinite: the derivative is NaN, or infinite.
+- undetermined: the image does not determine it, or a combination.
+- unknown: no experiment tells.
+"""
+
+DIM = 0.35
+"""How bright the scene is beneath the marks."""
+
+
+class Finding(NamedTuple):
+    """What an experiment found of one number.
+
+    Attributes:
+        kind: a key of `KINDS`.
+        because: what is so; goes on after "name: ".
+        advice: what to do, a sentence; may be empty.
+        mask: (H, W) bool, the pixels; None for none.
+        share: of the disagreement; None where there is none.
+    """
+
+    kind: str
+    because: str
+    advice: str = ""
+    mask: np.ndarray | None = None
+    share: float | None = None
+
+
+class Reason(NamedTuple):
+    """Why derivatives disagree with the truth, or vanish.
+
+    Attributes:
+        kind: a key of `rts.diagnostics.explanation.reasons.KINDS`.
+        parameters: the names of the numbers.
+        text: what is so, how much of it, and what to do: a plain sentence or two.
+        pixels: (H, W) bool, where it shows.
+    """
+
+    kind: str
+    parameters: list[str]
+    text: str
+    pixels: np.ndarray
+
+    @property
+    def color(self) -> str:
+        """The colour of its pixels in the picture, in words; "none" where it marks none."""
+        return KINDS[self.kind][0]
+
+
+def merged(findings: Sequence[tuple[str, Finding]], size: tuple[int, int]) -> list[Reason]:
+    """One reason for all numbers of which the same was found, those of the largest share first.
+
+    Args:
+        findings: each with the name of its number.
+        size: (height, width).
+    """
+    groups: dict[tuple[str, str, str], list[tuple[str, Finding]]] = {}
+    for name, found in findings:
+        groups.setdefault((found.kind, found.because, found.advice), []).append((name, found))
+    reasons = []
+    for (kind, because, advice), members in groups.items():
+        pixels = np.zeros(size, bool)
+        for _, found in members:
+            if found.mask is not None:
+                pixels |= found.mask
+        shares = [found.share for _, found in members if found.share is not None]
+        names = [name for name, _ in members]
+        figures = [f"{pixels.sum()} pixels"] if pixels.any() else []
+        if shares:
+            low, high = min(shares), max(shares)
+            span = f"{high:.0%}" if f"{low:.0%}" == f"{high:.0%}" else f"{low:.0%} to {high:.0%}"
+            figures.append(f"{span} of the disagreement")
+        told = f" ({', '.join(figures)})" if figures else ""
+        about = listed(names) if names[0] else ""
+        text = " ".join(filter(None, [f"{about}{': ' if about else ''}{because}{told}.", advice]))
+        reasons.append((max(shares, default=1.0), Reason(kind, names if about else [], text, pixels)))
+    return [reason for _, reason in sorted(reasons, key=lambda r: -r[0])]
+
+
+def marked(image: np.ndarray, reasons: Sequence[Reason]) -> np.ndarray:
+    """The image (H, W, 4), dark and grey, with the pixels of reasons in their colours: (H, W, 3) linear.
+
+    Where two mark a pixel, the earlier one has it.
+    """
+    grey = np.clip(np.nan_to_num(image[..., :3].mean(axis=-1) + 0.15 * image[..., 3]), 0, 1)
+    picture = np.repeat((DIM**2 * grey)[..., None], 3, axis=-1)
+    for reason in reversed(reasons):
+        color = KINDS[reason.kind][1]
+        if color is not None and reason.pixels.any():
+            picture[reason.pixels] = decode_srgb(np.array(color) / 255)
+    return picture
+
+
+def legend(reasons: Sequence[Reason]) -> str:
+    """Which colour stands for what in the picture; empty where nothing is marked."""
+    told: dict[str, int] = {}
+    for reason in reasons:
+        if reason.pixels.any() and reason.color != "none":
+            told[reason.kind] = told.get(reason.kind, 0) + int(reason.pixels.sum())
+    return ", ".join(f"{KINDS[kind][0]} = {kind}" for kind in told)

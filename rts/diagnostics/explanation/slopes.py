@@ -1,0 +1,125 @@
+"""Derivatives of a scene's image and loss in single numbers of its parameters, found in two ways."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.diagnostics.comparison.scores import low_pass
+from rts.diagnostics.explanation.subject import DEEP, Subject
+from rts.engines import Engine, namespace
+from rts.interfaces import Part
+from rts.trees import Array, Tree, leaves, map_leaves
+
+STEP_UNSEEN = 1e-2
+"""How far the finite differences change a number that nothing seems to depend on."""
+
+
+class Slope(NamedTuple):
+    """The derivative of a loss in one number of the parameters, found in two ways.
+
+    Attributes:
+        name: where the number is, such as "pose[2]".
+        autodiff: the derivative through the splatter.
+        difference: the central finite difference of area-sampled hard renders.
+        error: how far the difference may be off: what two sampling grids and two steps disagree on.
+        step: the step of the difference, in units of the number.
+    """
+
+    name: str
+    autodiff: float
+    difference: float
+    error: float
+    step: float
+
+
+class Number(NamedTuple):
+    """One number of the parameters, and what it does to the image.
+
+    Attributes:
+        slope: what it does to the loss.
+        direction: of the parameters' structure, 1 at the number.
+        pushed: (H, W, 4) float32, the derivative of the image through the splatter, for a step of the slope's length;
+            NaN where forward mode does not go through it.
+        true: (H, W, 4) float32, the finite difference over that step.
+        noise: half of what two sampling grids disagree on; the norm of its low-pass.
+        forward: whether forward mode goes through the splatter.
+    """
+
+    slope: Slope
+    direction: Tree
+    pushed: np.ndarray
+    true: np.ndarray
+    noise: float
+    forward: bool
+
+
+def measured(subject: Subject, name: str, direction: Tree, slope: float | None, samples: int) -> Number:
+    """What one number does, found in two ways.
+
+    Args:
+        subject: what is looked at.
+        name: of the number.
+        direction: in which it changes.
+        slope: the derivative of the loss by reverse mode; None for that by forward mode.
+        samples: the square root of the number of samples a pixel.
+    """
+    step = subject.step(direction) or _step_of_hidden(subject, direction) or STEP_UNSEEN
+    to_numpy = subject.engine.to_numpy
+
+    def hard(length: float, count: int) -> tuple[float, np.ndarray]:
+        after, before = (subject.hard(direction, sign * length / 2, count) for sign in (1, -1))
+        difference = float(to_numpy(subject.loss(after))) - float(to_numpy(subject.loss(before)))
+        return difference / length, to_numpy(after).astype(np.float64) - to_numpy(before)
+
+    (coarse, image), (fine, other), (wide, _) = hard(step, samples), hard(step, samples + 1), hard(2 * step, samples)
+    error = abs(coarse - fine) / 2 + abs(wide - coarse) / 3
+    try:
+        pushed, forward = subject.push(direction) * step, True
+    except (RuntimeError, TypeError):  # Of torch and of jax, for a user's own operation.
+        pushed, forward = np.full_like(image, np.nan), False
+    if slope is None:
+        slope = float((subject.weights * pushed.astype(np.float64)).sum() / step)
+    found = Slope(name, slope, (coarse + fine) / 2, error, step)
+    noise = float(np.linalg.norm(low_pass((image - other) / 2)))
+    true = ((image + other) / 2).astype(np.float32)
+    return Number(found, direction, pushed.astype(np.float32), true, noise, forward)
+
+
+def _step_of_hidden(subject: Subject, direction: Tree) -> float | None:
+    """A step that moves by a pixel what is behind something, or what no derivative leads to."""
+    touched = subject.touched(direction, STEP_UNSEEN)
+    connect = bool(touched.constant or touched.cut)
+    kept = touched.parts
+
+    def alone(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
+        return [p for i, p in enumerate(parts) if kept is None or i in kept], camera
+
+    return (
+        subject.step(direction, alone, connect=connect, deep=True, layers=DEEP, capacity=None) if touched.all else None
+    )
+
+
+def chosen(gradient: np.ndarray, count: int) -> list[int]:
+    """Indices of the largest entries, NaN first, and of some others, fixed by the seed."""
+    if gradient.size <= count:
+        return list(range(gradient.size))
+    largest = np.argsort(-np.nan_to_num(np.abs(gradient), nan=np.inf), kind="stable")[: (count + 1) // 2]
+    rest = np.setdiff1d(np.arange(gradient.size), largest)
+    others = np.random.default_rng(0).choice(rest, count - len(largest), replace=False)
+    return sorted(map(int, (*largest, *others)))
+
+
+def unit(engine: Engine, parameters: Tree, number: int, index: int) -> Tree:
+    """The direction in which one number of one leaf changes."""
+    count = iter(range(sum(1 for _ in leaves(parameters))))
+
+    def leaf(p: Array) -> Array:
+        found = np.zeros(math.prod(p.shape))
+        found[index if next(count) == number else slice(0)] = 1
+        return namespace(p).astype(engine.constant(found.reshape(p.shape), p), p.dtype, copy=False)
+
+    return map_leaves(leaf, parameters)

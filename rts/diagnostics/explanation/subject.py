@@ -1,0 +1,361 @@
+"""A scene, how it is rendered, and which of its arrays change with its parameters."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.arrays import kind_of
+from rts.camera import Camera
+from rts.checks import check_scene, check_splatter
+from rts.diagnostics.explanation.fineness import Fineness, fineness
+from rts.diagnostics.steps import pixel_step
+from rts.engines import Engine, is_constant, namespace
+from rts.errors import InputError
+from rts.fitting.names import named_leaves
+from rts.interfaces import CheckedPart, Part
+from rts.records import Sampled
+from rts.rendering import render, sample
+from rts.sampling.prepared import PreparedParts
+from rts.trees import Array, Tree, leaves, map_leaves
+
+Scene = Callable[[Tree], tuple[Part | Sequence[Part] | PreparedParts, Camera]]
+Change = Callable[[list[Part], Camera], tuple[list[Part], Camera]]
+"""Another scene, made of one."""
+
+DEPENDS = 1.0
+"""How far parameters are changed to see whether the scene depends on them at all."""
+SHORT = 1e-3
+"""How far they are changed to see how fast arrays of the scene change."""
+DEEP = 8
+"""Layers of the finite differences where shaders are not opaque."""
+HELD = 4
+"""How deep functions and objects are searched for arrays that they hold."""
+
+
+class Place(NamedTuple):
+    """An array of a scene: of which part, None for the camera, and its name there."""
+
+    part: int | None
+    name: str
+
+    def __str__(self) -> str:
+        return f"the camera's {self.name}" if self.part is None else f"part {self.part}'s {self.name}"
+
+
+class Touched(NamedTuple):
+    """Which arrays of a scene change with a number.
+
+    Attributes:
+        all: those that change.
+        constant: those of them that are NumPy.
+        cut: those of them that are arrays of the engine, though no derivative leads to them.
+    """
+
+    all: list[Place]
+    constant: list[Place]
+    cut: list[Place]
+
+    @property
+    def parts(self) -> list[int] | None:
+        """The parts that change; None for all, since the camera does."""
+        found = {place.part for place in self.all}
+        return None if None in found else sorted(p for p in found if p is not None)
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """What is looked at: a scene, how it is rendered, and its loss.
+
+    Attributes:
+        engine: of the parameters.
+        scene: parameters → (parts, camera).
+        parameters: without marks of their own.
+        size: (height, width).
+        options: of `rts.render`.
+        loss: image → scalar.
+    """
+
+    engine: Engine
+    scene: Scene
+    parameters: Tree
+    size: tuple[int, int]
+    options: Mapping[str, Any]
+    loss: Callable[[Array], Array]
+
+    def shown(self, parameters: Tree) -> tuple[Any, Camera]:
+        """What the scene gives."""
+        found = self.scene(parameters)
+        if not isinstance(found, tuple) or len(found) != 2:
+            raise InputError(f"scene gave {kind_of(found)}; expected (parts, camera)")
+        return found
+
+    def drawn(self, found: tuple[Any, Camera], change: Change | None = None, size: Any = None, **options: Any) -> Array:
+        """The image of parts and a camera; a NumPy one becomes a constant of the engine."""
+        parts, camera = found if change is None else change(listed_parts(found[0]), found[1])
+        image = render(parts, camera, size or self.size, **{**self.options, **options})
+        return image if self.engine.owns(image) else self.engine.constant(image, next(leaves(self.parameters)))
+
+    def image(self, parameters: Tree, change: Change | None = None, **options: Any) -> Array:
+        """The image (H, W, 4) of the changed scene."""
+        return self.drawn(self.shown(parameters), change, **options)
+
+    def require_dependence(self) -> None:
+        """Refuse a scene of NumPy arrays which do not change with the parameters.
+
+        Raises:
+            InputError: nothing depends on them.
+        """
+        found = self.shown(self.parameters)
+        image = render(*found, self.size, **self.options)
+        if self.engine.owns(image):
+            return
+        ones = map_leaves(self.engine.namespace.ones_like, self.parameters)
+        if not self.touched(ones, DEPENDS).all:
+            raise InputError(f"the image is {kind_of(image)}: nothing in the scene depends on the parameters")
+
+    def moved(self, direction: Tree, by: float) -> Tree:
+        """The parameters, moved."""
+        steps = iter(leaves(direction))
+        return map_leaves(lambda p: p + by * next(steps), self.parameters)
+
+    def hard(self, direction: Tree, by: float, samples: int, change: Change | None = None) -> Array:
+        """The image without splatting, of `samples`² samples a pixel, of the moved parameters."""
+        layers = self.options.get("layers", 2)
+        if not self.opaque:
+            layers = max(DEEP, 0 if isinstance(layers, str) else layers)
+        options = dict(splatter="none", supersample=samples, layers=layers)
+        return self.image(self.moved(direction, by), change, **options)
+
+    def push(
+        self, direction: Tree, change: Change | None = None, *, connect: bool = False, **options: Any
+    ) -> np.ndarray:
+        """The derivative (H, W, 4) of the image along a direction, by forward mode.
+
+        Args:
+            direction: of the parameters.
+            change: of the scene.
+            connect: whether arrays that no derivative leads to move, too.
+            **options: of `rts.render`.
+        """
+        one, unit, at = self._line(direction, connect)
+        draw = partial(self.drawn, change=change, **options)
+        return self.engine.to_numpy(self.engine.jvp(lambda t: draw(at(t)), one * 0, unit)[1])
+
+    def step(
+        self, direction: Tree, change: Change | None = None, *, connect: bool = False, deep: bool = False, **given: Any
+    ) -> float | None:
+        """What `pixel_step` gives of a changed scene.
+
+        Args:
+            direction: of the parameters.
+            change: of the scene.
+            connect: whether arrays that no derivative leads to move, too.
+            deep: whether to look at hidden layers, too.
+            **given: options of `rts.render`.
+        """
+        one, unit, at = self._line(direction, connect)
+
+        def image(t: Array, **options: Any) -> Array:
+            return self.drawn(at(t), change, **{**given, **options})
+
+        return pixel_step(self.engine, image, one * 0, unit, deep=deep)
+
+    def _line(self, direction: Tree, connect: bool = False) -> tuple[Array, Array, Callable[[Array], tuple]]:
+        """One and a unit, and t → the scene of the parameters moved by t along a direction.
+
+        The scene function is differentiated if it can be. One that looks at values, as NumPy does, cannot be by some
+        engines' forward mode: then its arrays move by differences, and those that no derivative leads to rest.
+        """
+        xp = self.engine.namespace
+        one = self.engine.constant(np.ones(()), next(leaves(self.parameters)))
+
+        def at(t: Array) -> tuple:
+            steps = iter(leaves(direction))
+            return self.shown(
+                map_leaves(lambda p: p + xp.astype(t, p.dtype, copy=False) * next(steps), self.parameters)
+            )
+
+        return one, one, at if self._forward and not connect else self._by_differences(direction, connect)
+
+    @cached_property
+    def _forward(self) -> bool:
+        """Whether forward mode goes through the scene function."""
+
+        def total(p: Tree) -> Array:
+            self.shown(p)
+            return sum(self.engine.namespace.sum(x) for x in leaves(p))
+
+        try:
+            self.engine.jvp(total, self.parameters, self.parameters)
+        except (RuntimeError, TypeError):  # Of torch and of jax.
+            return False
+        return True
+
+    def _by_differences(self, direction: Tree, connect: bool) -> Callable[[Array], tuple]:
+        rest, like = self.shown(self.parameters), next(leaves(self.parameters))
+        places, here = self._arrays(rest)
+        ends = [self._placed(self.shown(self.moved(direction, by))) for by in (SHORT, -SHORT)]
+        tangents = []
+        for place, x in zip(places, here, strict=True):
+            a, b = (end.get(place, np.empty(0)) for end in ends)
+            alike = is_floating(x) and np.shape(a) == np.shape(b) == np.shape(x)
+            moves = alike and (connect or (self.engine.owns(x) and place in self._gradients))
+            tangent = (a - b) / (2 * SHORT) if moves else None
+            tangents.append(tangent if self.engine.owns(x) or tangent is None else self.engine.constant(tangent, like))
+
+        def at(t: Array) -> tuple:
+            it, xp = iter(tangents), self.engine.namespace
+
+            def leaf(x: Array) -> Array:
+                tangent = next(it)
+                if tangent is None:
+                    return x
+                x = x if self.engine.owns(x) else self.engine.constant(np.asarray(x), like)
+                return x + xp.astype(t, x.dtype, copy=False) * tangent
+
+            return tuple(map_leaves(leaf, [listed_parts(rest[0]), rest[1]]))
+
+        return at
+
+    # ------------------------------------------------------------------------------------------ arrays of the scene
+
+    def _arrays(self, found: tuple[Any, Camera]) -> tuple[list[Place], list[Array]]:
+        places, arrays = [], []
+        for index, part in enumerate([*listed_parts(found[0]), found[1]]):
+            for name, x in named_leaves(part):
+                places.append(Place(None if isinstance(part, Camera) else index, name))
+                arrays.append(x)
+        return places, arrays
+
+    def _placed(self, found: tuple[Any, Camera]) -> dict[Place, Array]:
+        return dict(zip(*self._arrays(found), strict=True))
+
+    @cached_property
+    def _gradients(self) -> dict[Place, list[np.ndarray | None]]:
+        """For each array that some derivative leads to, the gradient of a random sum of it; None where that is 0."""
+        engine, found = self.engine, {}
+        places, arrays = self._arrays(self.shown(self.parameters))
+        for k, (place, x) in enumerate(zip(places, arrays, strict=True)):
+            if not engine.owns(x) or not is_floating(x):
+                continue
+            weights = np.random.default_rng(k).normal(size=tuple(x.shape))
+
+            def total(p: Tree, k: int = k, weights: np.ndarray = weights) -> Array:
+                y = self._arrays(self.shown(p))[1][k]
+                return namespace(y).sum(y * engine.constant(weights, y))
+
+            gradient = [engine.to_numpy(g) for g in leaves(engine.value_and_grad(total)(self.parameters)[1])]
+            if any(g.any() for g in gradient):
+                found[place] = [g if g.any() else None for g in gradient]
+        return found
+
+    def touched(self, direction: Tree, step: float) -> Touched:
+        """The arrays of the scene that change with a step along a direction."""
+        scenes = [self.shown(self.moved(direction, by)) for by in (-step / 2, step / 2)]
+        before, after = map(self._placed, scenes)
+        changed, constant, cut = [], [], []
+        along = [self.engine.to_numpy(d) for d in leaves(direction)]
+        for place in dict.fromkeys([*before, *after]):
+            if place.part is not None and place.part >= len(self.parts):
+                continue  # Of the scene as it is, this is no part.
+            ends = [x.get(place) for x in (before, after)]
+            if all(x is not None for x in ends) and self._alike(*ends):
+                continue
+            changed.append(place)
+            slopes = self._gradients.get(place)
+            if is_constant(next(x for x in ends if x is not None)):
+                constant.append(place)
+            elif slopes is None or not any((g * d).any() for g, d in zip(slopes, along, strict=True) if g is not None):
+                cut.append(place)
+        for index, pair in enumerate(zip(*(listed_parts(parts) for parts, _ in scenes), strict=False)):
+            for name in ("shader", "surface") if index < len(self.parts) else ():
+                a, b = (list(_held(getattr(part, name), self._is_array)) for part in pair)
+                if len(a) != len(b) or not all(map(self._alike, a, b)):
+                    changed.append(Place(index, name))
+                    constant += [changed[-1]] if is_constant([*a, *b]) else []
+        return Touched(changed, constant, cut)
+
+    def _is_array(self, x: Any) -> bool:
+        return isinstance(x, np.ndarray) or self.engine.owns(x)
+
+    def _alike(self, a: Array, b: Array) -> bool:
+        if a is b:
+            return True
+        x, y = (np.asarray(v) if is_constant(v) else self.engine.to_numpy(v) for v in (a, b))
+        return x.shape == y.shape and np.array_equal(x, y, equal_nan=x.dtype.kind == y.dtype.kind == "f")
+
+    @cached_property
+    def parts(self) -> list[CheckedPart]:
+        """The parts of the scene as it is, checked."""
+        parts, camera = self.shown(self.parameters)
+        return check_scene(listed_parts(parts), camera)[0]
+
+    def sampled(self, **options: Any) -> Sampled:
+        """The samples of the scene as it is, as `rts.sample` gives them."""
+        given = {name: self.options[name] for name in ("sampler", "engine") if name in self.options}
+        return sample(*self.shown(self.parameters), self.size, **given, **options)
+
+    @cached_property
+    def supersample(self) -> int:
+        """Samples along each axis of a pixel."""
+        return self.options.get("supersample", 1)
+
+    @cached_property
+    def fineness(self) -> Fineness:
+        """What is thinner than a sample, and what are outlines."""
+        return fineness(self.sampled, self.size, self.supersample)
+
+    def splats_as(self, name: str) -> bool:
+        """Whether the scene's splatter is of the kind that has this name."""
+        return type(check_splatter(self.options.get("splatter", "auto"))) is type(check_splatter(name))
+
+    @cached_property
+    def opaque(self) -> bool:
+        """Whether all shaders promise to be."""
+        return all(part.shader.opaque for part in self.parts)
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """(H, W, 4), the derivative of the loss in the image."""
+        return self.engine.to_numpy(self.engine.value_and_grad(self.loss)(self.image(self.parameters))[1])
+
+    @cached_property
+    def seen(self) -> np.ndarray:
+        """(H, W, 4), the image."""
+        return self.engine.to_numpy(self.image(self.parameters))
+
+
+def listed_parts(parts: Any) -> list[Part]:
+    """The parts in a list, without what was built for them."""
+    if isinstance(parts, PreparedParts):
+        parts = parts.parts
+    return list(parts) if isinstance(parts, (list, tuple)) else [parts]
+
+
+def _held(thing: Any, is_array: Callable[[Any], bool], depth: int = HELD) -> Iterator[Array]:
+    """Arrays that a function or an object holds: in its closure, defaults and attributes."""
+    if is_array(thing):
+        yield thing
+    elif depth and not isinstance(thing, (str, bytes, type)):
+        if isinstance(thing, Mapping):
+            inside = list(thing.values())
+        elif isinstance(thing, (list, tuple)):
+            inside = list(thing)
+        else:
+            inside = [getattr(thing, name, None) for name in ("__defaults__", "__self__", "__dict__", "func", "args")]
+            for cell in getattr(thing, "__closure__", None) or ():
+                with contextlib.suppress(ValueError):  # What is not assigned yet.
+                    inside.append(cell.cell_contents)
+        for x in inside:
+            yield from _held(x, is_array, depth - 1)
+
+
+def is_floating(x: Array) -> bool:
+    """Whether an array, or a number, is of floating numbers."""
+    return np.asarray(x).dtype.kind == "f" if is_constant(x) else namespace(x).isdtype(x.dtype, "real floating")

@@ -1,0 +1,94 @@
+"""Scenes made of a scene, to see by experiment what stands in the way of a derivative."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.diagnostics.explanation.subject import Change
+from rts.engines import engine_of, namespace
+from rts.gbuffer import GBuffer
+from rts.interfaces import Part, as_surface
+from rts.registry import instance
+from rts.trees import Array, Tree
+
+CLEAR = 0.5
+"""Alpha of what is made transparent, of that which it was."""
+
+
+def alone(kept: Collection[int]) -> Change:
+    """Some parts without the others."""
+    return lambda parts, camera: ([p for i, p in enumerate(parts) if i in kept], camera)
+
+
+def unculled(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
+    """The scene with both sides of all triangles."""
+    return [p.replace(cull="none") for p in parts], camera
+
+
+def transparent(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
+    """The scene with parts that can be looked through."""
+
+    def through(part: Part) -> Callable[..., Array]:
+        shader = instance("rts.shaders", part.shader)
+        return lambda theta, gbuffer, camera: CLEAR * shader(theta, gbuffer, camera)
+
+    return [p.replace(shader=through(p)) for p in parts], camera
+
+
+def unbounded(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
+    """The scene of surfaces whose derivatives are as large as they come."""
+    surfaces = [as_surface(p.surface).unbounded() for p in parts]
+    return [p if s is None else p.replace(surface=s) for p, s in zip(parts, surfaces, strict=True)], camera
+
+
+def wider(size: tuple[int, int], apron: int) -> Change:
+    """The scene through a larger window; for images of `apron` more pixels on every side."""
+    return lambda parts, camera: (parts, camera.with_apron(size, apron))
+
+
+def farther(distance: float) -> Change:
+    """The scene from a camera that is moved back along its axis, or ahead where the distance is negative."""
+    change = np.eye(4)
+    change[2, 3] = -distance
+
+    def moved(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
+        engine = engine_of(camera.view)
+        back = engine.constant(change, camera.view) if engine.differentiates else change
+        return parts, camera.replace(view=back @ camera.view)
+
+    return moved
+
+
+def placed(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
+    """The scene where the colour of each sample is its place in the world."""
+
+    def place(theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+        position = gbuffer["position"]
+        xp = namespace(position)
+        return xp.concat([position, xp.ones_like(position[:, :1])], axis=-1)
+
+    return [p.replace(shader=place) for p in parts], camera
+
+
+def all_of(*changes: Any) -> Change:
+    """One change after another."""
+
+    def change(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
+        for one in changes:
+            parts, camera = one(parts, camera)
+        return parts, camera
+
+    return change
+
+
+def names(indices: Sequence[int], word: str = "and") -> str:
+    """Parts in words, such as "parts 0 and 2"."""
+    if len(indices) == 1:
+        return f"part {indices[0]}"
+    if len(indices) > 3:
+        return f"parts {', '.join(map(str, indices[:3]))}, …"
+    return f"parts {', '.join(map(str, indices[:-1]))} {word} {indices[-1]}"

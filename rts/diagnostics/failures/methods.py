@@ -1,0 +1,34 @@
+"""The columns of the table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+
+class Method(NamedTuple):
+    """A way to render.
+
+    Attributes:
+        name: of the column.
+        options: of `rts.render`; of a peer, its settings.
+        peer: "DEODR" or "Mitsuba"; "" for the library itself.
+    """
+
+    name: str
+    options: Mapping[str, Any]
+    peer: str = ""
+
+
+METHODS = (
+    Method("none", {"splatter": "none", "layers": 1}),
+    Method("single", {"splatter": "single", "layers": 1}),
+    Method("multi, K = 2", {"splatter": "multi", "layers": 2}),
+    Method("visible", {"splatter": "visible", "layers": 2}),
+    Method("visible, auto", {"splatter": "visible", "layers": "auto"}),
+    Method("visible, 2 × 2", {"splatter": "visible", "layers": 2, "supersample": 2}),
+    Method("DEODR", {}, "DEODR"),
+    Method("Mitsuba", {"spp": 16}, "Mitsuba"),
+)
+DEFAULT = "visible"
+"""The column of what `rts.render` does unless told otherwise."""

@@ -1,0 +1,135 @@
+"""Schedules: at which resolutions, one after the other, residuals of images are made small."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rts.arguments import check_pixels, quoted
+from rts.checks import is_count, is_real
+from rts.engines import constants, engine_of, namespace
+from rts.errors import InputError
+from rts.trees import Array
+
+COARSEST, BLUR = 16, 1 / 16
+"""A pyramid's first stage has at least so many pixels along the longer side, and this share of them as σ."""
+SAMPLES, FEWER_SAMPLES = 4, 2
+"""A pixel along each axis: at the coarsest resolution, where points jump over outlines, and between it and the last."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """At what resolution images are compared for a while; see `fit`.
+
+    Attributes:
+        scale: the share of the residuals' own resolution along each axis, in (0, 1].
+        supersample: samples a pixel along each axis; None for as many as the residuals have.
+        sigma: standard deviation of the Gaussian that blurs the differences, pixels of this stage; 0 for none.
+
+    Raises:
+        InputError: a number out of its range.
+    """
+
+    scale: float = 1.0
+    supersample: int | None = None
+    sigma: float = 0.0
+
+    def __post_init__(self):
+        if not (is_real(self.scale) and 0 < self.scale <= 1):
+            raise InputError(f"scale is {quoted(self.scale)}; expected a share of the resolution, in (0, 1]")
+        if self.supersample is not None and not is_count(self.supersample):
+            raise InputError(
+                f"supersample is {quoted(self.supersample)}; expected an integer of at least 1, or None for as before"
+            )
+        if not (is_real(self.sigma) and 0 <= self.sigma < math.inf):
+            raise InputError(f"sigma is {quoted(self.sigma)}; expected a number of pixels, at least 0")
+
+    def size(self, full: tuple[int, int]) -> tuple[int, int]:
+        """(height, width) of images that are (height, width) in full: rounded, at least one pixel."""
+        height, width = (max(1, round(self.scale * n)) for n in full)
+        return height, width
+
+
+def pyramid(size: tuple[int, int], *, coarsest: int = COARSEST, largest: int | None = None) -> tuple[Stage, ...]:
+    """The schedule to take where the start is far off: from coarse and blurred images to fine ones.
+
+    An outline pulls over one pixel only, and at whatever outline is nearest, be it the right one or not. Blurred images
+    show where most of an object is. So the first stage is of few pixels, with many samples each, and blurred by a
+    sixteenth of the image; those after double the resolution; the last is the image itself. From how far off poses are
+    found: benchmarks/RESULTS.md, "Basin of convergence".
+
+    Args:
+        size: (height, width) of the residuals.
+        coarsest: the longer side of the first stage has this many pixels, or up to twice as many.
+        largest: the longer side of the last stage has at most so many; None for all.
+
+    Returns:
+        Two stages or more.
+
+    Raises:
+        InputError: an argument that is no count of pixels.
+    """
+    longer = max(check_pixels(size))
+    for name, value in (("coarsest", coarsest), ("largest", largest)):
+        if not is_count(value) and not (name == "largest" and value is None):
+            raise InputError(f"{name} is {quoted(value)}; expected a number of pixels, at least 1")
+    sides = [longer if largest is None else min(largest, longer)]
+    while sides[0] >= 2 * coarsest:
+        sides.insert(0, sides[0] // 2)
+    return (
+        Stage(sides[0] / longer, SAMPLES, BLUR * sides[0]),
+        *(Stage(side / longer, FEWER_SAMPLES) for side in sides[1:-1]),
+        Stage(sides[-1] / longer),
+    )
+
+
+def checked_schedule(schedule: Any) -> Sequence[Stage]:
+    """The stages of a schedule that a user gave."""
+    stages = tuple(schedule) if isinstance(schedule, (list, tuple)) else ()
+    if not stages or not all(isinstance(stage, Stage) for stage in stages):
+        raise InputError(
+            f"schedule is {quoted(schedule)}; expected a list of rts.Stage, such as rts.pyramid(size), or None"
+        )
+    return stages
+
+
+# -------------------------------------------------------------------------------------------------- images
+
+
+def box_filtered(image: Array, size: tuple[int, int]) -> Array:
+    """An image (H, W, C) in fewer pixels (h, w, C): each the mean over its area, also where pixels overlap in part."""
+    return _along_axes(image, *(_box(few, many) for few, many in zip(size, image.shape[:2], strict=True)))
+
+
+def blurred(image: Array, sigma: float) -> Array:
+    """An image (H, W, C) blurred by a Gaussian; it is zero beyond its border."""
+    return _along_axes(image, *(_gaussian(n, sigma) for n in image.shape[:2]))
+
+
+def _along_axes(image: Array, down: np.ndarray, across: np.ndarray) -> Array:
+    """The image (H, W, C) with its columns multiplied by a matrix (h, H), and its rows by one (w, W)."""
+    xp = namespace(image)
+    down, across = (xp.astype(x, image.dtype, copy=False) for x in constants((down, across), engine_of(image), image))
+    height, width, channels = image.shape
+    columns = xp.reshape(down @ xp.reshape(image, (height, -1)), (-1, width, channels))
+    return across @ columns
+
+
+def _box(few: int, many: int) -> np.ndarray:
+    """(few, many) shares of the pixels of a row in each of fewer ones."""
+    edges, cells = np.arange(few + 1) * (many / few), np.arange(many + 1.0)
+    shared = np.minimum(edges[1:, None], cells[1:]) - np.maximum(edges[:-1, None], cells[:-1])
+    return shared.clip(0) * (few / many)
+
+
+def _gaussian(count: int, sigma: float) -> np.ndarray:
+    """(count, count) weights of the pixels of a row in each, those beyond its ends left out."""
+    reach = math.ceil(4 * sigma)
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    taps /= taps.sum()
+    offset = np.arange(count) - np.arange(count)[:, None]
+    return np.where(abs(offset) <= reach, taps[np.clip(offset + reach, 0, 2 * reach)], 0.0)
