@@ -16,7 +16,7 @@ from rts_backends.fused import splatters as fused
 pytestmark = pytest.mark.splatting
 
 DISTANCE, RADIUS = 3.2, 0.7
-"""Of the camera from the sphere's centre, and the sphere's."""
+"""The camera from the sphere's centre, and the sphere's."""
 
 
 def pushed(splatter, splats, tangent, target="torch-cpu"):
