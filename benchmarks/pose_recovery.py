@@ -77,7 +77,7 @@ class Views:
 class Task:
     """One mesh seen from some views."""
 
-    def __init__(self, part: rts.Part, views: list[rts.Camera], engine: str, splatter: str):
+    def __init__(self, part: rts.Part, views: list[rts.Camera], engine: str, splatter: Any, layers: int = 1):
         self.engine = engine
 
         def moved(pose):
@@ -85,7 +85,9 @@ class Task:
 
         self.residuals = Views(
             [
-                rts.ImageResiduals(moved, v, SIZE, supersampled(part, v, SIZE, 4)[..., 3], layers=1, splatter=splatter)
+                rts.ImageResiduals(
+                    moved, v, SIZE, supersampled(part, v, SIZE, 4)[..., 3], layers=layers, splatter=splatter
+                )
                 for v in views
             ]
         )

@@ -45,6 +45,7 @@ from rts.sampling.emptiness import why_empty
 from rts.sampling.merging import merge
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.pruning import Everything, as_needed, needed_by, prune
+from rts.splatting.visible import Visible
 from rts.trees import Array, Tree
 
 BAND = 2**20
@@ -140,7 +141,7 @@ def sample(
         size: as in `render`.
         sampler: as in `render`.
         splatter: the splatter that the samples are for: the apron suits its reach, and hidden samples that it does not
-            need are dropped. None keeps all, with an apron for a reach of 1.
+            need are dropped. None keeps all, with an apron that suits every built-in splatter.
         layers: as in `render`.
         supersample: as in `render`.
         capacity: as in `render`.
@@ -286,6 +287,7 @@ def render_samples(
             f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
             f"{apron_of(splatter)}; give it to rts.sample, too"
         )
+    sampled = _narrowed(sampled, apron - apron_of(splatter))
     background = check_background(background, size)
     suited = scene.suiting(sampled, background)
     return _over_background(_splatted(sampled, scene, scene.camera, suited, splatter), background)
@@ -294,9 +296,19 @@ def render_samples(
 def apron_of(splatter: Splatter | None) -> int:
     """How many cells to sample on each side beyond the image: as many as the splatter reaches, and one more.
 
-    Samples within reach show in the image, and pairing looks at one cell beside theirs.
+    Samples within reach have an effect on the image, and pairing looks at one cell beside theirs. None stands for
+    `Visible`, which reaches farthest of the built-in ones.
     """
-    return (Splatter if splatter is None else splatter).reach + 1
+    return (Visible if splatter is None else splatter).reach + 1
+
+
+def _narrowed(sampled: Sampled, cells: int) -> Sampled:
+    """Samples with an apron that is narrower by some cells."""
+    if cells == 0:
+        return sampled
+    rows, columns = (slice(cells, n - cells) for n in sampled.row.shape[1:])
+    row, depth = (x[:, rows, columns] for x in (sampled.row, sampled.depth))
+    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells)
 
 
 def _splatted(sampled: Sampled, scene: _Scene, window: Camera, suited: tuple, splatter: Splatter) -> Array:
@@ -356,14 +368,14 @@ def to_splats(
         check_splats(index, part, world, positions[-1], rgba, sampled.row, first)
         colors.append(constants(rgba, engine, dtype))
         first += samples.ids.shape[-2]
-    row = sampled.row
+    row, part = sampled.row, sampled.part
     if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
         # A shader may close over arrays of an engine that the scene has none of.
-        positions, colors, row = constants((positions, colors, row), *suiting(positions, colors))
+        positions, colors, row, part = constants((positions, colors, row, part), *suiting(positions, colors))
     if len(parts) == 1:
-        return Splats(positions[0], colors[0], row, border=apron)
+        return Splats(positions[0], colors[0], row, part, border=apron)
     xp = namespace(row)
-    return Splats(xp.concat(positions), xp.concat(colors), row, border=apron)
+    return Splats(xp.concat(positions), xp.concat(colors), row, part, border=apron)
 
 
 def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:

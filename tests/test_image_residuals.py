@@ -16,7 +16,7 @@ from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
 from rts_backends.fused import normal_equations as fused_normal
 from rts_backends.fused import splatters as fused
-from rts_backends.fused.cells import Cells, Settings
+from rts_backends.fused.cells import Cells
 
 pytestmark = pytest.mark.fitting
 
@@ -197,7 +197,7 @@ def test_bands_of_a_supersampled_image_add_up(target, monkeypatch):
     found = check(residuals, start(target), 1e-4)
     assert len(sweeps) == 6 and {len(args[3]) for args in sweeps} == {4, 5}  # Rows of unlike number.
     for a, b in zip(map(to_numpy, found), map(to_numpy, whole), strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=1e-5 * np.abs(b).max())
+        np.testing.assert_allclose(a, b, rtol=0, atol=3e-5 * np.abs(b).max())
 
 
 @pytest.mark.parametrize("side", [1, 7, 33])
@@ -340,7 +340,7 @@ def splats_of(kind, layers=2, size=(40, 150), dtype=np.float64, seed=0):
     rgba = rng.random((len(k), 4))
     tangents = rng.normal(size=(3, len(k), 3)), rng.normal(size=(3, len(k), 4))
     kernel = {"single": fused.Single, "multi": fused.Multi, "visible": fused.Visible}[kind]()
-    settings = Settings(kind, kernel.sigma, kernel.epsilon, kernel.gamma, 2)
+    settings = kernel._settings(2)
     splats = Cells(settings, positions.astype(dtype), rgba.astype(dtype), row)
     return splats, *(t.astype(dtype) for t in tangents)
 
@@ -448,7 +448,7 @@ def test_a_pose_is_found_as_from_a_function(jit, target, monkeypatch):
 def test_adam_takes_them_for_the_function_that_they_are():
     goal, _ = fields(3)
     residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal)
-    fit = rts.fit(residuals, start("torch-cpu"), steps=3)
+    fit = rts.fit(residuals, start("torch-cpu"), steps=3, learning_rate=1e-3)
     assert fit.history[0] == pytest.approx(float((residuals(start("torch-cpu")) ** 2).mean()), rel=1e-5)
     assert fit.loss < fit.history[0]
 

@@ -10,6 +10,7 @@ from helpers import ALL, DIFFERENTIABLE, arrays, derivative, gradient, to_numpy
 import rts
 from rts import Camera, InputError, Part, Samples
 from rts.sampling import settling
+from rts.testing.compatibility import APRON
 from rts.threads import read_only
 from rts_surfaces import bicubic, tiles
 
@@ -202,8 +203,8 @@ def test_newells_teapot_has_few_triangles_and_samples_at_the_centres_of_pixels(d
     theta = {"points": part.theta["points"].astype(np.float64)}
     position = part.surface.evaluate(theta, sampled.samples[0])["position"]
     layer, y, x = np.nonzero(sampled.row >= 0)
-    wide = camera.for_size(size).with_apron(size, 2)
-    pixels = wide.project(position[sampled.row[layer, y, x]], (260, 260))
+    wide = camera.for_size(size).with_apron(size, APRON)
+    pixels = wide.project(position[sampled.row[layer, y, x]], sampled.row.shape[1:])
     off = np.abs(pixels[:, :2] - np.stack([x, y], axis=-1) - 0.5).max(axis=1)
     assert off.max() < 1e-3
     np.testing.assert_allclose(pixels[:, 2], sampled.depth[layer, y, x], rtol=1e-5)

@@ -148,13 +148,15 @@ def test_constant_surfaces_are_evaluated_only_where_needed():
     sizes = []
     for splatter in (None, "visible"):
         calls.clear()
-        sample(part, CAMERA, SIZE, splatter=splatter, layers=2)
+        sample(part, CAMERA, (96, 112), splatter=splatter, layers=2)
         sizes.append(max(calls))
-    assert sizes[1] < 0.6 * sizes[0]
+    assert sizes[1] < 0.7 * sizes[0]
 
 
 def test_a_splatter_that_does_not_say_what_it_needs_gets_everything():
     class Own:
+        reach = splatting.Visible.reach
+
         def splat(self, positions, rgba, row):
             return rts.plugin("splatters", "visible")().splat(positions, rgba, row)
 
@@ -211,7 +213,7 @@ def test_a_splatter_that_needs_what_is_not_there_gets_no_ghosts():
 def test_auto_layers_of_a_surface_that_the_automatic_sampler_casts_rays_at():
     part = rts.Part(Ellipsoid(), {"center": np.zeros(3), "radii": np.array([0.8, 0.6, 0.7])})
     sampled = sample(part, CAMERA, SIZE, splatter="visible", layers="auto")
-    assert sampled.row.shape[0] == 1
+    assert sampled.row.shape[0] == 2
     rays = sample(part, CAMERA, SIZE, sampler="rays", splatter="visible", layers=2)
     assert (sample(part, CAMERA, SIZE, splatter="visible", layers=2).row >= 0).sum() == (rays.row >= 0).sum()
 
@@ -227,7 +229,7 @@ def test_auto_layers_with_a_sampler_that_does_not_ask_what_is_needed():
 
 @pytest.mark.parametrize("target", ALL)
 @pytest.mark.parametrize(
-    "name, expected", [("closed box", 1), ("cards", 4), ("sphere before a card", 3), ("interpenetrating", 4)]
+    "name, expected", [("closed box", 2), ("cards", 4), ("sphere before a card", 3), ("interpenetrating", 4)]
 )
 def test_auto_takes_the_layers_that_count(name, expected, target):
     parts = map_leaves(lambda x: arrays(target, x), SCENES[name])
@@ -298,12 +300,22 @@ def far_scene(seed, offset, count):
     return parts, rts.Camera.look_at(place + (0.3, 0.4, 4.0), place, fov_y=50, aspect=1.0)
 
 
+class Keeping(rts.Splatter):
+    """Needs all samples, out to where another splatter looks."""
+
+    def __init__(self, splatter):
+        self.reach = rts.plugin("rts.splatters", splatter).reach
+
+    def image(self, splats):
+        raise NotImplementedError
+
+
 def both_ways(parts, camera, splatter):
     """Images and gradients of the vertices, by torch, of all samples and of those that are needed; and their counts."""
     torch = pytest.importorskip("torch")
     weights = torch.tensor(np.random.default_rng(0).normal(size=(16, 16, 4)), dtype=torch.float32)
     found = []
-    for chosen in (None, splatter):
+    for chosen in (Keeping(splatter), splatter):
         vertices = [torch.tensor(p.theta["vertices"], requires_grad=True) for p in parts]
         moving = with_vertices(parts, vertices)
         sampled = sample(moving, camera, (16, 16), splatter=chosen, layers=3)

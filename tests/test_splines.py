@@ -6,6 +6,7 @@ from helpers import DIFFERENTIABLE, arrays, to_numpy
 
 import rts
 from rts import Camera, InputError, Part, Samples
+from rts.testing.compatibility import APRON
 from rts_surfaces import tiles
 from rts_surfaces.bspline import extraction
 
@@ -136,8 +137,8 @@ def test_samples_reproject_to_the_centres_of_their_pixels():
         sampled = rts.sample(part, CAMERA, SIZE)
         position = at_samples(part, sampled.samples[0])
         cells = np.argwhere(sampled.row >= 0)
-        wide = CAMERA.for_size(SIZE).with_apron(SIZE, 2)
-        pixels = wide.project(position[sampled.row[tuple(cells.T)]], (SIZE[0] + 4, SIZE[1] + 4))
+        wide = CAMERA.for_size(SIZE).with_apron(SIZE, APRON)
+        pixels = wide.project(position[sampled.row[tuple(cells.T)]], sampled.row.shape[1:])
         off = np.abs(pixels[:, :2] - cells[:, :0:-1] - 0.5).max(axis=1)
         # float32 for u and v; the compiled splatters ask for 2.5e-4.
         assert off.max() < 2.5e-4

@@ -166,7 +166,7 @@ def test_prepared_parts_are_rendered_in_bands(narrow_bands):
 def test_sampled_knows_its_samples_a_pixel():
     part = rts.Part(MESH(FACES), {"vertices": CORNERS, "colors": RGB}, "unlit")
     sampled = rts.sample(part, CAMERA, SIZE, supersample=2)
-    assert sampled.row.shape == (2, 2 * SIZE[0] + 4, 2 * SIZE[1] + 4) and sampled.supersample == 2
+    assert sampled.row.shape == (2, *(2 * n + 2 * sampled.apron for n in SIZE)) and sampled.supersample == 2
     np.testing.assert_array_equal(rts.render_samples(sampled, part, CAMERA), image(CORNERS, 2))
 
 

@@ -11,6 +11,7 @@ from seen import CAMERA, SIZE, VIEWS, loss_of
 import rts
 from rts import Samples
 from rts.testing import SurfaceConformance
+from rts.testing.compatibility import APRON
 
 pytestmark = pytest.mark.sampling
 
@@ -124,7 +125,7 @@ def test_layers_of_the_torus_are_front_to_back_on_centres_of_pixels(view):
     assert (np.diff(samples.depth, axis=0) > 0)[covered[1:]].all()
     k, y, x = np.nonzero(covered)
     position = TORUS.surface.evaluate(TORUS.theta, samples)["position"][samples.row[covered]]
-    seen = camera.with_apron(SIZE, 2).project(position.astype(np.float64), samples.row.shape[1:])
+    seen = camera.with_apron(SIZE, APRON).project(position.astype(np.float64), samples.row.shape[1:])
     np.testing.assert_allclose(seen[:, :2], np.stack([x, y], axis=-1) + 0.5, rtol=0, atol=0.02)
     np.testing.assert_allclose(seen[:, 2], samples.depth[covered], rtol=1e-5)
 

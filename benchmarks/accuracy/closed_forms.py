@@ -139,6 +139,8 @@ CLOSED_FORMS: dict[str, Callable[[int], ClosedForm]] = {
     "half-plane": _half_plane,
     "disk": _disk,
     "sphere": _sphere,
+    "sphere rolls": _sphere,
+    "sphere rolls back": _sphere,
     "ramp": _ramp,
     "box over card": lambda size: _box_over_card(size, "box"),
     "card behind box": lambda size: _box_over_card(size, "card"),

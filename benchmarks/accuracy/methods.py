@@ -54,8 +54,14 @@ def name_of(splatter: str, layers: int, supersample: int = 1) -> str:
 
 
 def ours(scene: scenes.Scene, splatter: str, layers: int, supersample: int = 1) -> Method:
-    """A splatter of this library; `multi, calibrated` has the constants of `visible`."""
+    """A splatter of this library, or one with other settings.
+
+    `multi, calibrated` has the constants of `visible`; outlines of `visible, by samples` move as the samples inside of
+    them.
+    """
     chosen = splatter
+    if splatter == "visible, by samples":
+        chosen = rts.plugin("rts.splatters", "visible")(rims=False)
     if splatter == "multi, calibrated":
         visible = rts.plugin("rts.splatters", "visible")()
         chosen = rts.plugin("rts.splatters", "multi")(epsilon=visible.epsilon, calibration=visible.calibration)
@@ -82,6 +88,7 @@ def splatters(scene: scenes.Scene) -> list[Method]:
     found = [ours(scene, "single", 1, s) for s in (1, 2)]
     found += [ours(scene, name, k, s) for name in ("multi", "visible") for k in scene.layers for s in (1, 2)]
     found.append(ours(scene, "multi, calibrated", most))
+    found += [ours(scene, "visible, by samples", most, s) for s in (1, 2)]
     if scene.name in CASES:
         found += [ours(scene, "none", 1), ours(scene, "visible", most, 4)]
     return found

@@ -2,7 +2,8 @@
 
 Derivative images by forward mode are scored against differences of area-sampled renders over one pixel, as
 `truth` defines, and after its low-pass against the derivative itself: a closed form, or a difference over a quarter of
-a pixel. Writes tables (accuracy.md), all numbers (accuracy.json) and three figures:
+a pixel, or over more where outlines hardly move. Writes tables (accuracy.md), all numbers (accuracy.json) and three
+figures:
 
     python -m benchmarks.accuracy.run -o out/accuracy
 """
@@ -45,7 +46,7 @@ class References(NamedTuple):
 
 def references(scene: scenes.Scene, folder: Path) -> References:
     closed = closed_form(scene)
-    return References(truth(scene, folder), closed.truth() if closed else truth(scene, folder, 0.25))
+    return References(truth(scene, folder), closed.truth() if closed else truth(scene, folder, scene.step))
 
 
 def score(scene: str, method: Method, against: References) -> tuple[dict, np.ndarray]:

@@ -34,6 +34,7 @@ class Scene:
         directions: for each part the (4, 4) derivative of its transform in t, or None where it rests.
         layers: the numbers of layers K to try: the fewest that may do, and more.
         note: what moves, and what is hard about it.
+        step: in t, of the difference that stands for the derivative; where outlines hardly move, a small one is noise.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Scene:
     directions: tuple[np.ndarray | None, ...]
     layers: tuple[int, ...]
     note: str
+    step: float = 0.25
 
     @property
     def camera(self) -> rts.Camera:
@@ -63,6 +65,13 @@ def motion(depth: float, size: int, sign: float = 1.0) -> np.ndarray:
     """Derivative (4, 4) of a motion along +x by one pixel at a depth."""
     matrix = np.zeros((4, 4))
     matrix[0, 3] = sign * pixel(depth, size)
+    return matrix
+
+
+def turn(size: int, pixels: float = 1.0) -> np.ndarray:
+    """Derivative (4, 4) of a turn about +y, by pixels at distance 1 from the axis; linear in t, as all motions."""
+    matrix = np.zeros((4, 4))
+    matrix[0, 2], matrix[2, 0] = pixels * pixel(DISTANCE, size), -pixels * pixel(DISTANCE, size)
     return matrix
 
 
@@ -212,33 +221,93 @@ def _spot() -> rts.Part:
 
 
 def spot(size: int, turns: bool = False) -> Scene:
-    direction = motion(DISTANCE, size)
-    if turns:
-        # Linear in t, as every motion here: a rotation about +y whose speed is one pixel at distance 1 from the axis.
-        direction = np.zeros((4, 4))
-        direction[0, 2], direction[2, 0] = pixel(DISTANCE, size), -pixel(DISTANCE, size)
     return Scene(
         "spot turns" if turns else "spot",
         (size, size),
         (_spot(),),
-        (direction,),
+        (turn(size) if turns else motion(DISTANCE, size),),
         (1, 2),
         "textured spot, culled, " + ("turns about +y, a pixel at distance 1 from the axis" if turns else "moves"),
+        1.0 if turns else 0.25,
+    )
+
+
+def bunny_turns(size: int, cull: str = "back") -> Scene:
+    return Scene(
+        "bunny turns" if cull == "back" else "bunny turns unculled",
+        (size, size),
+        (_bunny_and_square()[0].replace(cull=cull),),
+        (turn(size),),
+        (1, 2) if cull == "back" else (2, 4),
+        f"the bunny turns about +y, a pixel at distance 1 from the axis; cull {cull}",
+        1.0,
+    )
+
+
+def teapot_turns(size: int) -> Scene:
+    """The teapot is open, and its parts pass through one another."""
+    vertices, faces = mesh("teapot")
+    return Scene(
+        "teapot turns",
+        (size, size),
+        (shapes.bunny_and_square(vertices, faces)[0],),
+        (turn(size),),
+        (2, 4),
+        "the teapot, unculled, turns about +y, a pixel at distance 1 from the axis",
+        1.0,
+    )
+
+
+FINGER_PLACE, FINGER_RADII, KNUCKLE = (0.1, -0.05, 1.05), (0.3, 0.14, 0.14), (0.36, -0.05, 0.91)
+
+
+def finger_turns(size: int) -> Scene:
+    """Most of the finger's outline is before the face."""
+    vertices, faces = icosphere(6)
+    away = np.eye(4)
+    away[:3, 3] = -np.array(KNUCKLE)
+    return Scene(
+        "finger turns",
+        (size, size),
+        (
+            unlit(SPHERE_RADIUS * vertices, faces, 0.5 + 0.3 * np.sin(4 * vertices)),
+            unlit(vertices * FINGER_RADII @ rotation_xy(0.0, 0.5).T + FINGER_PLACE, faces, SPHERE_COLOR),
+        ),
+        (None, turn(size, 2.0) @ away),
+        (2, 4),
+        "a finger before a face, unculled: an ellipsoid turns about one of its ends before a sphere",
+        1.0,
     )
 
 
 SPHERE_RADIUS, SPHERE_COLOR = 0.7, (0.9, 0.7, 0.2)
 
 
-def sphere(size: int) -> Scene:
+def sphere(size: int, pixels: float = 0.0) -> Scene:
+    """A turn about the centre, by pixels at distance 1, leaves the image of a sphere as it is."""
     vertices, faces = icosphere(6)
     return Scene(
-        "sphere",
+        {0.0: "sphere", 2.0: "sphere rolls", -2.0: "sphere rolls back"}[pixels],
         (size, size),
         (unlit(SPHERE_RADIUS * vertices, faces, SPHERE_COLOR),),
-        (motion(DISTANCE, size),),
+        (motion(DISTANCE, size) + turn(size, pixels),),
         (1, 2),
-        "a closed, unculled sphere in one colour moves over black",
+        "a closed, unculled sphere in one colour moves over black"
+        + (f", and turns by {pixels:g} pixels at distance 1 from its axis" if pixels else ""),
+    )
+
+
+def textured_sphere_turns(size: int) -> Scene:
+    vertices, faces = icosphere(6)
+    colors = 0.5 + 0.4 * np.sin(vertices @ np.array([[5.0, 1.0, -3.0], [2.0, 6.0, 1.0], [-4.0, 2.0, 5.0]]))
+    return Scene(
+        "textured sphere turns",
+        (size, size),
+        (unlit(SPHERE_RADIUS * vertices, faces, colors),),
+        (turn(size),),
+        (1, 2),
+        "a closed, unculled sphere turns; its colours change along it and its outline stands still",
+        1.0,
     )
 
 
@@ -312,7 +381,14 @@ SCENES: dict[str, Callable[[int], Scene]] = {
     "spheres": spheres,
     "spot": spot,
     "spot turns": lambda size: spot(size, turns=True),
+    "bunny turns": bunny_turns,
+    "bunny turns unculled": lambda size: bunny_turns(size, "none"),
+    "teapot turns": teapot_turns,
+    "finger turns": finger_turns,
     "sphere": sphere,
+    "sphere rolls": lambda size: sphere(size, 2.0),
+    "sphere rolls back": lambda size: sphere(size, -2.0),
+    "textured sphere turns": textured_sphere_turns,
     "half-plane": half_plane,
     "disk": disk,
     "ramp": ramp,

@@ -214,8 +214,9 @@ class ImageResiduals(Residuals):
         (positions, rgba), (t_positions, t_rgba) = engine.jacobian(splats)(vector)
         band = slice(top, top + rows)
         target, weights, background = (None if x is None else x[band] for x in self._constants(vector))
+        row, part = constants((sampled.row, sampled.part), engine, vector)
         return splatter.normal_equations(
-            Splats(positions, rgba, constants(sampled.row, engine, vector), border=sampled.apron),
+            Splats(positions, rgba, row, part, border=sampled.apron),
             t_positions,
             t_rgba if colored else None,
             target,

@@ -65,8 +65,8 @@ class Inspection(Needed):
     """Takes note of how many layers there are where hidden ones count.
 
     Attributes:
-        most: the largest number of layers in a cell that needs more than its front, at least 1; None before a call.
-        beyond: (L,) number of such cells that have an l-th layer.
+        most: the largest number of layers that a cell needs, at least 1; None before a call.
+        beyond: (L,) number of cells that need an l-th layer.
         short: number of cells whose layers ran out as they were refined: there may be more behind.
     """
 
@@ -79,7 +79,7 @@ class Inspection(Needed):
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `Needed`."""
         kept = covered if self._needed is None else self._needed(covered, depth)
-        counted = (covered[1:] & kept[1:].any(axis=0)).reshape(len(covered) - 1, -1).sum(axis=1)
+        counted = kept[1:].reshape(len(covered) - 1, -1).sum(axis=1)
         counted = np.append(max(1, covered.shape[1] * covered.shape[2]), counted)
         with self._lock:
             if len(self.beyond) == len(counted):
@@ -116,7 +116,7 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: AnyNeeded | None)
         taken: samples the scene with a number of layers, less what a `Needed` drops.
         needed: says which samples the splatter needs.
     """
-    count = 2
+    count = 3  # A closed surface before nothing needs two: the second at its outlines.
     while True:
         # At the limit one more is taken, to know what is missing there.
         inspection = Inspection(needed)

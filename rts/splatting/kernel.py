@@ -63,11 +63,11 @@ class Kernel(Splatter):
         """See `rts.Splatter`."""
         if splats.rgba.shape[0] == 0:
             return nothing(splats.rgba, splats.row)
-        return self.accumulate(splats.positions, splats.rgba, splats.row)
+        return self.accumulate(splats)
 
     @abc.abstractmethod
-    def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
-        """The image of all cells (H, W, 4), if there is at least one sample; see `rts.Splats` for the arguments."""
+    def accumulate(self, splats: Splats) -> Array:
+        """The image of all cells (H, W, 4), if there is at least one sample."""
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`: fronts, and the hidden layers around targets that are not `plain`."""
@@ -89,19 +89,29 @@ class Kernel(Splatter):
         """The calibration as a number."""
         return exact_calibration(self.sigma) if self.calibration is None else self.calibration
 
-    def weights(self, position: Array) -> tuple[dict[int, Array], dict[int, Array]]:
-        """Factors (x, y) of the weights w(u, v) = x[u] · y[v] of cells (h, w), of which the first is cell (−1, −1)."""
-        xp = namespace(position)
+    def offsets(self, position: Array) -> tuple[Array, Array]:
+        """Calibrated offsets (x, y) of samples from the centres of cells (h, w), of which the first is (−1, −1)."""
         height, width = position.shape[:2]
         constant = engine_of(position).constant
-        rx = self.gamma * (position[..., 0] - constant(np.arange(width) - 0.5, position))
-        ry = self.gamma * (position[..., 1] - constant(np.arange(height) - 0.5, position)[:, None])
+        return (
+            self.gamma * (position[..., 0] - constant(np.arange(width) - 0.5, position)),
+            self.gamma * (position[..., 1] - constant(np.arange(height) - 0.5, position)[:, None]),
+        )
+
+    def weights(self, position: Array) -> tuple[dict[int, Array], dict[int, Array]]:
+        """Factors (x, y) of the weights w(u, v) = x[u] · y[v] of cells (h, w), of which the first is (−1, −1)."""
+        rx, ry = self.offsets(position)
+        return {u: self._factor(u - rx) for u in OFFSETS}, {v: self._factor(v - ry) for v in OFFSETS}
+
+    def weight(self, offset: Array, u: int, v: int) -> Array:
+        """The weight w(u, v) of samples with calibrated offsets (…, 2)."""
+        return self._factor(u - offset[..., 0]) * self._factor(v - offset[..., 1])
+
+    def _factor(self, distance: Array) -> Array:
+        """A weight's factor for the distance along one axis."""
         scale = 1 / (2 * self.sigma**2)
         peak = math.sqrt(1 + self.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
-        return (
-            {u: peak * xp.exp(-((u - rx) ** 2) * scale) for u in OFFSETS},
-            {v: peak * xp.exp(-((v - ry) ** 2) * scale) for v in OFFSETS},
-        )
+        return peak * namespace(distance).exp(-(distance**2) * scale)
 
 
 def exact_calibration(sigma: float, reach: int = 1) -> float:

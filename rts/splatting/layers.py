@@ -12,6 +12,7 @@ import numpy as np
 from rts.engines import namespace
 from rts.errors import InputError
 from rts.operations.operation import known_value
+from rts.records import Splats
 from rts.trees import Array
 
 OFFSETS = (-1, 0, 1)
@@ -37,11 +38,21 @@ class Depths:
         """Depths of each layer (h, w), finite, and where they are covered (K, h, w), both with the border."""
         self.xp = namespace(covered, depth[0])
         self.size = covered.shape[1] - 2, covered.shape[2] - 2
-        self._covered = covered[0]
-        self._depth = _beyond(depth, covered)
-        front = self._depth[0][None], self.xp.where(self._covered, 0, -1)[None]
+        self.covered = covered
+        self._depth, self.extent = _beyond(depth, covered)
+        front = self._depth[0][None], self.xp.where(covered[0], 0, -1)[None]
         self._front = bordered(front[0])[0], bordered(front[1])[0] >= 0
         self.target = self.source(0, 0)
+
+    @property
+    def gap(self) -> Array:
+        """How far the second layer lies behind the first (h, w), with the border."""
+        return self._depth[1] - self._depth[0]
+
+    def front(self, u: int, v: int) -> tuple[Array, Array]:
+        """Depth of the front from whose cell (u, v) leads to each target, up to two cells away, and if there is one."""
+        depth, covered = (self.at(x, u, v, border=2) for x in self._front)
+        return depth, covered
 
     def source(self, u: int, v: int) -> list[Array]:
         """Depths of the sources' layers, K times (H, W)."""
@@ -49,7 +60,7 @@ class Depths:
 
     def covers(self, u: int, v: int) -> Array:
         """Whether the sources have any layer."""
-        return self.at(self._covered, u, v)
+        return self.at(self.covered[0], u, v)
 
     def pairing(self, u: int, v: int) -> tuple[Array, Array]:
         """The number s of `Multi`, and the distance of the depths that it pairs, (H, W) both."""
@@ -75,7 +86,7 @@ class Depths:
         source, target = self.at(self._depth[0], u, v), self.target[0]
         found = xp.zeros_like(target, dtype=xp.bool)
         for end, start, steps in ((source, target, -1), (target, source, 2)):
-            before, covered = (self.at(x, steps * u, steps * v, border=2) for x in self._front)
+            before, covered = self.front(steps * u, steps * v)
             found = found | (covered & (xp.abs(end - (2 * start - before)) < limit))
         return found
 
@@ -88,14 +99,15 @@ class Depths:
 class Layers(Depths):
     """`Depths` with weights and colours."""
 
-    def __init__(self, weights: Callable[[Array], Any], positions: Array, rgba: Array, row: Array):
-        """Layers of packed samples (`rts.Splats`); `weights` is that of `rts.splatting.Kernel`."""
-        check_rows(row, positions.shape[0])
-        cells = bordered(row)
-        position = [unpack(positions, cells[k]) for k in range(row.shape[0])]
-        super().__init__([p[..., 2] for p in position], cells >= 0)
-        self._color = [_weighted(unpack(rgba, c), (c >= 0)[..., None]) for c in (cells[k] for k in range(row.shape[0]))]
-        self._weights = [weights(p) for p in position]
+    def __init__(self, weights: Callable[[Array], Any], splats: Splats):
+        """Layers of packed samples; `weights` is that of `rts.splatting.Kernel`."""
+        check_rows(splats.row, splats.positions.shape[0])
+        cells = bordered(splats.row)
+        every = [cells[k] for k in range(splats.row.shape[0])]
+        self.position = [unpack(splats.positions, c) for c in every]
+        super().__init__([p[..., 2] for p in self.position], cells >= 0)
+        self._color = [_weighted(unpack(splats.rgba, c), (c >= 0)[..., None]) for c in every]
+        self._weights = [weights(p) for p in self.position]
 
     def splats(self, u: int, v: int) -> list[Array]:
         """What the sources' layers give, K times (H, W, 5): weighted colours and the weight."""
@@ -119,13 +131,13 @@ def unpack(values: Array, cells: Array) -> Array:
     return xp.reshape(xp.take(values, index, axis=0), (*cells.shape, values.shape[1]))
 
 
-def bordered(row: Array) -> Array:
-    """`row` with a border of one cell of −1."""
-    xp = namespace(row)
-    side = xp.full_like(row[:, :, :1], -1)
-    row = xp.concat([side, row, side], axis=2)
-    end = xp.full_like(row[:, :1, :], -1)
-    return xp.concat([end, row, end], axis=1)
+def bordered(cells: Array, value: int = -1) -> Array:
+    """Cells (K, H, W) with a border of one cell of a value."""
+    xp = namespace(cells)
+    side = xp.full_like(cells[:, :, :1], value)
+    cells = xp.concat([side, cells, side], axis=2)
+    end = xp.full_like(cells[:, :1, :], value)
+    return xp.concat([end, cells, end], axis=1)
 
 
 def _weighted(rgba: Array, covered: Array) -> Array:
@@ -139,16 +151,18 @@ def normalised(total: Array, xp: Any) -> Array:
     return total[..., :4] / xp.clip(total[..., 4:], 1.0, None)
 
 
-def _beyond(depth: list[Array], covered: Array) -> list[Array]:
-    """Depths of each layer; an empty cell lies beyond everything, at a distance of the scene's own scale.
+def _beyond(depth: list[Array], covered: Array) -> tuple[list[Array], Array]:
+    """Depths of each layer, and their extent, the camera's included.
 
-    It is at least as far from any layer as two layers are from each other, so that none pairs with it for being near.
+    An empty cell lies beyond everything, at a distance of the scene's own scale. It is at least as far from any layer
+    as two layers are from each other, so that none pairs with it for being near.
     """
     xp = namespace(covered, depth[0])
     depth = [xp.where(covered[k], z, 0.0) for k, z in enumerate(depth)]
     every = xp.stack(depth)
-    farthest = 2 * (xp.clip(xp.max(every), 0.0, None) - xp.clip(xp.min(every), None, 0.0))
-    return [xp.where(covered[k], z, xp.where(farthest > 0, farthest, 1.0)) for k, z in enumerate(depth)]
+    extent = xp.clip(xp.max(every), 0.0, None) - xp.clip(xp.min(every), None, 0.0)
+    beyond = xp.where(extent > 0, 2 * extent, 1.0)
+    return [xp.where(covered[k], z, beyond) for k, z in enumerate(depth)], extent
 
 
 def all_of(conditions: list[Array]) -> Array:

@@ -51,11 +51,11 @@ class Plain(Splatter):
 class Single(Kernel):
     """One layer, occlusion ignored (paper eq. 1–3): only the front layer of `row` is splatted."""
 
-    def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
+    def accumulate(self, splats: Splats) -> Array:
         """See `Kernel`."""
-        layers = Layers(self.weights, positions, rgba, row[:1])
+        layers = Layers(self.weights, splats.replace(row=splats.row[:1]))
         total = sum(layers.splats(u, v)[0] for u, v in NEIGHBOURS)
-        return normalised(total, namespace(rgba))
+        return normalised(total, layers.xp)
 
     def plain(self, depths: Depths, margin: float) -> Array:
         """See `Kernel`: every target, since hidden layers are not splatted."""
@@ -72,10 +72,10 @@ class Multi(Kernel):
     of the target. Back faces of a closed surface pair with what lies behind them: cull them (`Part.cull`).
     """
 
-    def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
+    def accumulate(self, splats: Splats) -> Array:
         """See `Kernel`."""
-        xp = namespace(positions, rgba, row)
-        layers = Layers(self.weights, positions, rgba, row)
+        layers = Layers(self.weights, splats)
+        xp = layers.xp
         buffers = [0.0, 0.0, 0.0]
         for u, v in NEIGHBOURS:
             s, _ = layers.pairing(u, v)

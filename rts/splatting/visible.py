@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rts.engines import namespace
+import numpy as np
+
+from rts.engines import engine_of
+from rts.records import Splats
+from rts.splatting import rims
 from rts.splatting.kernel import Kernel
 from rts.splatting.layers import NEIGHBOURS, Depths, Layers, all_of, nearest, normalised, over
 from rts.trees import Array
 
-CONTINUED = 0.5
+CONTINUED = 0.8
 """Share of the error of plain pairing below which `Visible` takes the line of a front layer for its continuation."""
 
 
@@ -18,7 +22,7 @@ class Visible(Kernel):
     """`Multi` with a calibrated derivative, where opaque layers of one source hide each other.
 
     Pairing is that of `Multi`, but front layers also pair (s = 0) where one lies on the line through the other and its
-    next cell, or off it by less than half of the smallest of A and B: depth that changes fast, as on the sides of a box
+    next cell, or off it by less than 0.8 of the smallest of A and B: depth that changes fast, as on the sides of a box
     near its outline, is nearer to a back face than to itself.
 
     Each buffer gets at most one layer of a source. An empty target takes the source's front layer, at the surface. A
@@ -27,16 +31,21 @@ class Visible(Kernel):
     and the others the layer l > s whose depth is nearest to z_q[m]; where there is no m, nothing.
 
     Closed surfaces need no culling, if K reaches through their back faces to what lies behind.
+
+    Attributes:
+        rims: whether coverage moves as outlines do, extrapolated from the samples inside of them (`rims.py`); otherwise
+            it moves as the samples, which on a smooth rim that turns move faster. The image is the same.
     """
 
     epsilon: float = 1e-3
     calibration: float | None = None
+    rims: bool = True
+    reach = 3  # Depths three cells away may decide how an outline moves.
 
-    def accumulate(self, positions: Array, rgba: Array, row: Array) -> Array:
+    def accumulate(self, splats: Splats) -> Array:
         """See `Kernel`."""
-        xp = namespace(positions, rgba, row)
-        layers = Layers(self.weights, positions, rgba, row)
-        shift = {}
+        layers, row = Layers(self.weights, splats), splats.row
+        xp, shift = layers.xp, {}
         for n in NEIGHBOURS:
             s, off = layers.pairing(*n)
             shift[n] = xp.where((row[0] < 0) | layers.continues(*n, CONTINUED * off), 0, s)
@@ -51,13 +60,22 @@ class Visible(Kernel):
         for n, s in shift.items():
             hidden = xp.where(s < 0, 0, nearest(layers.source(*n), revealed, s, xp))
             hidden = xp.where(m < none, hidden, none)
-            for k, splats in enumerate(layers.splats(*n)):
+            for k, given in enumerate(layers.splats(*n)):
                 if k == 0:
-                    front = front + xp.where((s > 0)[..., None], splats, 0.0)
-                surface = surface + xp.where((s == k)[..., None], splats, 0.0)
-                behind = behind + xp.where((hidden == k)[..., None], splats, 0.0)
-        front, surface, behind = (normalised(b, xp) for b in (front, surface, behind))
-        return over(front, over(surface, behind))
+                    front = front + xp.where((s > 0)[..., None], given, 0.0)
+                surface = surface + xp.where((s == k)[..., None], given, 0.0)
+                behind = behind + xp.where((hidden == k)[..., None], given, 0.0)
+        colors = [normalised(b, xp) for b in (front, surface, behind)]
+        if self.rims and engine_of(splats.positions).differentiates:
+            gains = rims.gains(self, layers, shift, splats.part)
+            for i, (total, gain) in enumerate(zip((front, surface), gains, strict=True)):
+                colors[i] = colors[i] + rims.spread(total, gain)
+        return over(colors[0], over(*colors[1:]))
+
+    def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """See `rts.Splatter`: those of `Kernel`, and second layers beside outlines, which may be chords' other ends."""
+        kept = super().needed(covered, depth)
+        return kept | rims.chords(covered) if self.rims else kept
 
     def plain(self, depths: Depths, margin: float) -> Array:
         """See `Kernel`: where no source has a hidden layer in play."""

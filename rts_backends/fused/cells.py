@@ -14,12 +14,14 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.errors import InputError
+from rts.splatting import rims
 from rts.splatting.kernel import LEAST_EPSILON
 from rts.splatting.layers import OFFSETS, check_rows
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only
 from rts_backends.fused import choices as listing
-from rts_backends.fused import mixed, stencil
+from rts_backends.fused import mixed, outlines, stencil
+from rts_backends.fused.outlines import Outlines
 from rts_backends.fused.survey import BLOCK, survey
 
 
@@ -32,6 +34,7 @@ class Settings(NamedTuple):
         epsilon: excess of the weights' sum over one.
         gamma: the calibration.
         border: rows and columns at each side of the cells that are no part of the image.
+        rims: whether coverage moves as outlines do, in `visible`.
     """
 
     kind: str
@@ -39,6 +42,7 @@ class Settings(NamedTuple):
     epsilon: float
     gamma: float
     border: int = 0
+    rims: bool = False
 
 
 class Choices(NamedTuple):
@@ -53,6 +57,7 @@ class Choices(NamedTuple):
         sums: (M, 3, 5), of each buffer the colours over the weight, taken as at least one, and the weight.
         states: (H, W) uint8, states of targets (`survey.py`); mixed ones are EMPTY here.
         repeated: whether a sample stands in several cells, which would add to its gradient at the same time.
+        extent: of the depths, the camera's included.
     """
 
     mixed: np.ndarray
@@ -62,6 +67,7 @@ class Choices(NamedTuple):
     sums: np.ndarray
     states: np.ndarray
     repeated: bool
+    extent: float
 
 
 class Cells:
@@ -73,6 +79,7 @@ class Cells:
         rgba: (N, 4), of the same dtype, premultiplied colours.
         row: (K, H, W) signed integers, the sample of each cell, or −1.
         choices: the choices for the same samples, if they are known.
+        part: (K, H, W) integers, the part of each sample; None, or no layers, where that is not known.
 
     Raises:
         InputError: shapes that do not fit, or `row` refers to a sample that is not there.
@@ -85,6 +92,7 @@ class Cells:
         rgba: np.ndarray,
         row: np.ndarray,
         choices: Choices | None = None,
+        part: np.ndarray | None = None,
     ):
         if positions.shape[1:] != (3,) or rgba.shape != (len(positions), 4):
             given = f"{positions.shape} and {rgba.shape}"
@@ -93,7 +101,9 @@ class Cells:
         if choices is None:
             check_rows(row, len(positions))
         self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
+        self.part = read_only(self.row[:0] if part is None else part, np.int32)
         self.visible, self.border = settings.kind == "visible", settings.border
+        self.rims = self.visible and settings.rims
         self._numbers = tuple(map(positions.dtype.type, _scale_and_peak(settings) + (settings.gamma,)))
         self._reach = positions.dtype.type(_reach(settings))
         if choices is not None:
@@ -140,7 +150,8 @@ class Cells:
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
         least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
         # See `rts.splatting.layers`: nothing is nearer to what is beyond everything than to a front.
-        beyond = 2 * (largest - least) if least < 0 or largest > 0 else kind.type(1)
+        extent = largest - least
+        beyond = 2 * extent if least < 0 or largest > 0 else kind.type(1)
         if layers > 1:
             given = self.row, self.visible, beyond, hidden, states
             parallel(listing.find, height, self.positions, *given, marks, counts, work=self.row.size)
@@ -153,7 +164,34 @@ class Cells:
             given = self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states
             arrays = self.positions, self.rgba, self.row, *self._numbers
             parallel(listing.choose, height, *arrays, *given, work=500 * len(columns))
-        return Choices(marks, offsets, columns, ranges, sums, states, repeated)
+        return Choices(marks, offsets, columns, ranges, sums, states, repeated, extent)
+
+    @cached_property
+    def outlines(self) -> Outlines:
+        """How outlines move, and what that changes; nothing without rims."""
+        _, height, width = self.row.shape
+        choices, kind, counts = self.choices, self.positions.dtype, np.zeros(height, np.int64)
+        ends, marks = np.empty((height, width), np.uint16), np.empty((height, width), np.uint8)
+        if self.rims:
+            listed = choices.mixed, choices.offsets, choices.columns, choices.ranges
+            given = self.positions, self.row, self._reach, choices.states, *listed, ends, marks, counts
+            parallel(outlines.find, height, *given, work=self.row[0].size)
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        found = Outlines(
+            np.empty((height, width), kind),
+            np.empty((height, width), np.int32),
+            offsets,
+            np.empty(offsets[-1], np.int32),
+            np.empty((offsets[-1], 9), np.uint8),
+            np.empty((offsets[-1], 9, 2), kind),
+            np.empty((offsets[-1], 2, 4), kind),
+        )
+        if len(found.columns):
+            rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
+            arrays = self.positions, self.rgba, self.row, *self._numbers, self.part, kind.type(choices.extent), rules
+            listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
+            parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=200 * len(found.columns))
+        return found
 
     def image(self, out: np.ndarray) -> None:
         """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""
@@ -183,6 +221,8 @@ class Cells:
             adjoints = np.empty((count, 3, 5), g.dtype)
             parallel(mixed.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=self._mixed_work // 5)
             parallel(mixed.pull, height, *self.mixed_arguments, adjoints, *found, work=self._mixed_work)
+        if self.rims and g_positions is not None:
+            outlines.pull(self.row, self.outlines, self.border, g, g_positions)
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
         """Fill tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4), or None."""
@@ -196,6 +236,9 @@ class Cells:
         if len(self.choices.columns):
             given = *self.mixed_arguments, self.choices.sums, tangents, self.border
             parallel(mixed.push, out.shape[1], *given, out, work=self._mixed_work * len(out))
+        if self.rims and t_positions is not None:
+            given = self.row, self.outlines, tangents[0], self.border
+            parallel(outlines.push, out.shape[1], *given, out, work=80 * len(self.outlines.columns) * len(out))
 
     def _vjp_of_repeated(self, g: np.ndarray, *results: np.ndarray | None) -> None:
         """`vjp` with a copy of the sample for each cell, whose gradients are then added in the order of the cells."""
@@ -205,6 +248,7 @@ class Cells:
         own[covered] = np.arange(len(index), dtype=np.int32)
         copy = object.__new__(Cells)
         copy.__dict__.update(self.__dict__, choices=self.choices._replace(repeated=False), row=read_only(own))
+        copy.__dict__.pop("outlines", None)  # They name samples.
         copy.positions, copy.rgba = read_only(self.positions[index]), read_only(self.rgba[index])
         found = [None if x is None else np.zeros((len(index), x.shape[1]), x.dtype) for x in results]
         copy.vjp(g, *found)

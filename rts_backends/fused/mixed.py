@@ -8,7 +8,7 @@ from rts_backends.fused.rows import compiled, exp, kernel
 
 
 @compiled
-def _splat(positions, i, y, x, u, v, scale, peak, gamma):
+def splat(positions, i, y, x, u, v, scale, peak, gamma):
     """Weight of sample i of cell (y, x) at offset (u, v), and how far the target lies from it along x and y."""
     kind, half = positions.dtype.type, positions.dtype.type(0.5)
     dx = kind(u) - gamma * (positions[i, 0] - (kind(x) + half))
@@ -31,7 +31,7 @@ def sums_of(total, positions, rgba, row, y, x, choice, scale, peak, gamma):
             for k in range(choice[n, b, 0], choice[n, b, 1]):
                 i = row[k, py, px]
                 if i >= 0:
-                    w, _, _ = _splat(positions, i, py, px, u, v, scale, peak, gamma)
+                    w, _, _ = splat(positions, i, py, px, u, v, scale, peak, gamma)
                     for c in range(4):
                         total[b, c] += w * rgba[i, c]
                     total[b, 4] += w
@@ -101,7 +101,7 @@ def pull(
                             i = row[k, y, x]
                             if i < 0:
                                 continue
-                            w, dx, dy = _splat(positions, i, y, x, u, v, scale, peak, gamma)
+                            w, dx, dy = splat(positions, i, y, x, u, v, scale, peak, gamma)
                             h = adjoints[d, b, 4]
                             for c in range(4):
                                 h += adjoints[d, b, c] * rgba[i, c]
@@ -148,7 +148,7 @@ def changes_of(changes, total, positions, rgba, row, y, x, choice, scale, peak, 
                 i = row[k, py, px]
                 if i < 0:
                     continue
-                w, dx, dy = _splat(positions, i, py, px, u, v, scale, peak, gamma)
+                w, dx, dy = splat(positions, i, py, px, u, v, scale, peak, gamma)
                 for t in range(len(changes)):
                     dw = slope * w * (dx * t_positions[t, i, 0] + dy * t_positions[t, i, 1]) if moved else zero
                     for c in range(4):

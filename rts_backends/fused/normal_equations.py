@@ -21,6 +21,7 @@ from rts.threads import parallel, read_only
 from rts.trees import Array
 from rts_backends.fused.cells import Cells, Settings
 from rts_backends.fused.mixed import changes_of
+from rts_backends.fused.outlines import gain
 from rts_backends.fused.rows import (
     PITCH,
     SOURCE,
@@ -56,9 +57,9 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
     Args:
         settings: the splatter, as numbers.
         engine: the engine of the arrays.
-        *given: positions, rgba, row and the arguments of `normal_equations` from `t_positions`, arrays or None.
+        *given: positions, rgba, row, part and the arguments of `normal_equations` from `t_positions`, arrays or None.
     """
-    positions, rgba, row, t_positions, _, target = given[:6]
+    positions, rgba, row, _, t_positions, _, target = given[:7]
     kind = {32: np.float32, 64: np.float64}.get(engine.namespace.finfo(positions.dtype).bits)
     there = [x for x in given if x is not None]
     if kind is None or rgba.dtype != positions.dtype or not engine.on_host(*there):
@@ -70,9 +71,9 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
     def host(*arrays: Any) -> tuple[np.ndarray, ...]:
         it = iter(arrays)
         whole: list[Any] = [next(it) if there else None for there in present]
-        positions, rgba, row, *rest = whole
+        positions, rgba, row, part, *rest = whole
         used = int(row.max(initial=-1)) + 1  # Under `jit` many more rows may be allotted.
-        cells = Cells(settings, positions[:used], rgba[:used], row)
+        cells = Cells(settings, positions[:used], rgba[:used], row, part=part)
         return tuple(np.asarray(x, kind) for x in normal_equations(cells, *rest))
 
     count = t_positions.shape[0]
@@ -105,7 +106,8 @@ def normal_equations(
     fields = (read_only(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
     bands, fine = -(-len(target) // BAND), _cells_a_pixel(cells.row.shape, cells.border, target.shape)
     sums = np.zeros((bands, count + 1, count + 1))
-    given = cells.plain_arguments, cells.row, cells.choices, tangents, tuple(fields), cells.border, fine
+    drawn = cells.plain_arguments, cells.row, cells.choices, cells.outlines
+    given = *drawn, tangents, tuple(fields), cells.border, fine
     parallel(_accumulate, bands, ALPHA if target.shape[2] == 1 else COLORS, *given, sums)
     total = sums.sum(axis=0) / max(target.size, 1)
     matrix = total[:count, :count]
@@ -123,7 +125,7 @@ def _any(tangents: np.ndarray) -> bool:
 
 
 @kernel
-def _accumulate(start, stop, planes, plain, row, choices, tangents, fields, border, fine, sums):
+def _accumulate(start, stop, planes, plain, row, choices, outlines, tangents, fields, border, fine, sums):
     """Products (B, T + 1, T + 1) of tangents and, last, residuals in bands [start, stop); the lower triangles.
 
     Of rows of pixels that are means of `fine` rows and columns of cells.
@@ -176,6 +178,7 @@ def _accumulate(start, stop, planes, plain, row, choices, tangents, fields, bord
                         tangent_row(to, value, layers, count, planes)
                     composite(value, layers, count)
                     _mix(change, value, plain, row, choices, tangents, border, y, left, count, changes)
+                    _move_outlines(change, row, outlines, t_positions, border, y, left, count)
                 else:
                     fill(value, rgba, row[0, y + border, border:], choices.states[y + border, border:], left, count)
                 if fine > 1:
@@ -223,6 +226,19 @@ def _mix(change, value, plain, row, choices, tangents, border, y, left, count, c
                 own = changes[n]
                 d_back = own[1, c] - own[1, 3] * total[2, c] + (one - total[1, 3]) * own[2, c]
                 change[n, c * PITCH + j] = own[0, c] - own[0, 3] * back + (one - total[0, 3]) * d_back
+
+
+@compiled
+def _move_outlines(change, row, outlines, t_positions, border, y, left, count):
+    """Add what moving outlines change in a row of a tile."""
+    for d in range(outlines.offsets[y + border], outlines.offsets[y + border + 1]):
+        j = outlines.columns[d] - border - left
+        if not 0 <= j < count:
+            continue
+        for n in range(len(change)):
+            front, surface = gain(d, t_positions[n], row, outlines, y + border)
+            for c in range(4):
+                change[n, c * PITCH + j] += front * outlines.changes[d, 0, c] + surface * outlines.changes[d, 1, c]
 
 
 @compiled

@@ -12,12 +12,15 @@ from rts.threads import parallel
 HALO = 3
 """Rows that the decision for a row looks at on either side: its marks, their neighbours, and those one farther on."""
 
+MIXED, RING = 1, 2
+"""Marks of targets at which more than fronts may count, and of cells beside empty ones."""
+
 compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
 
 
-def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, epsilon: float) -> np.ndarray:
-    """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W); for `Visible`, or for `Multi`."""
+def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, rims: bool, epsilon: float) -> np.ndarray:
+    """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W); for `Visible`, with or without rims, or `Multi`."""
     layers, height, _ = covered.shape
     if layers == 1 or not (visible or epsilon >= LEAST_EPSILON):
         return covered
@@ -26,7 +29,7 @@ def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, epsilon: float
     parallel(_extent, height, covered, depth, extent, work=covered.size // 4)
     least, largest, kind = extent[0].min(initial=0), extent[1].max(initial=0), depth.dtype.type
     numbers = kind(2 * (largest - least)), kind(TIE * max(largest, -least)), kind(CONTINUED)
-    parallel(_keep, height, covered, depth, visible, *numbers, kept, work=2 * covered.size)
+    parallel(_keep, height, covered, depth, visible, rims, *numbers, kept, work=2 * covered.size)
     return kept
 
 
@@ -51,27 +54,31 @@ def _enlarge(low, high, covered, depth):
 
 
 @kernel
-def _keep(start, stop, covered, depth, visible, beyond, margin, continued, kept):
-    """Keep the fronts of rows [start, stop), and hidden layers around targets at which more than fronts may count."""
+def _keep(start, stop, covered, depth, visible, rims, beyond, margin, continued, kept):
+    """Keep the fronts of rows [start, stop), and hidden layers around marks: of RING alone, the second."""
     layers, height, width = covered.shape
     # From row start − HALO on: depths with a border, NaN where there is nothing; least and largest front, least hidden.
     rows = stop - start + 2 * HALO
     z = np.full((layers, rows, width + 2), np.nan, depth.dtype)
     bounds = np.empty((rows, 3, width), depth.dtype)
+    marks, empty = np.zeros((rows, width + 2), np.uint8), np.zeros((rows, width + 2), np.uint8)
     for r in range(rows):
         y = start - HALO + r
         if 0 <= y < height:
             for k in range(layers):
                 _load(z[k, r], covered[k, y], depth[k, y])
+            empty[r, 1:-1] = 1 - covered[0, y].astype(np.uint8)
         _bound(bounds[r, 0], bounds[r, 1], bounds[r, 2], z[0, r], z[1, r])
-    marks = np.zeros((rows, width + 2), np.uint8)
     for r in range(HALO - 1, rows - HALO + 1):
         _mark(marks[r, 1:], z, r, bounds, visible, beyond, margin, continued)
+        if rims:
+            _mark_ring(marks[r, 1:-1], empty[r - 1], empty[r], empty[r + 1])
     for y in range(start, stop):
         r = y - start + HALO
         kept[0, y] = covered[0, y]
         for k in range(1, layers):
-            _spread(kept[k, y], covered[k, y], marks[r - 1], marks[r], marks[r + 1])
+            which = np.uint8(MIXED | RING if k == 1 else MIXED)
+            _spread(kept[k, y], covered[k, y], which, marks[r - 1], marks[r], marks[r + 1])
 
 
 @compiled
@@ -179,8 +186,17 @@ def _continued(z, r, x, beyond, margin, continued):
 
 
 @compiled
-def _spread(kept, covered, above, level, below):
-    """Keep what lies around marks."""
+def _mark_ring(marks, above, level, below):
+    """Mark the cells of a row that lie beside empty ones."""
+    for x in range(len(marks)):
+        around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 2]
+        if (around | below[x] | below[x + 1] | below[x + 2]) > level[x + 1]:
+            marks[x] |= RING
+
+
+@compiled
+def _spread(kept, covered, which, above, level, below):
+    """Keep what lies around marks of some kinds."""
     for x in range(len(kept)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
-        kept[x] = covered[x] & ((around | below[x] | below[x + 1] | below[x + 2]) != 0)
+        kept[x] = covered[x] & (((around | below[x] | below[x + 1] | below[x + 2]) & which) != 0)

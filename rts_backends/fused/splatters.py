@@ -28,7 +28,7 @@ class _Fused(splatting.Kernel):
         """See `rts.splatting.Kernel`."""
         if splats.rgba.shape[0] == 0:
             return super().image(splats)
-        return IMAGE(splats.positions, splats.rgba, splats.row, settings=self._settings(0))
+        return self._of(splats, 0)
 
     def cropped(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
@@ -36,7 +36,12 @@ class _Fused(splatting.Kernel):
             return super().cropped(splats)
         if splats.rgba.shape[0] == 0:
             return without_border(super().image(splats), splats.border)
-        return IMAGE(splats.positions, splats.rgba, splats.row, settings=self._settings(splats.border))
+        return self._of(splats, splats.border)
+
+    def _of(self, splats: Splats, border: int) -> Array:
+        """The image without a border."""
+        part = splats.row[:0, :, :] if splats.part is None else splats.part
+        return IMAGE(splats.positions, splats.rgba, splats.row, part, settings=self._settings(border))
 
     def _settings(self, border: int) -> Settings:
         return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border)
@@ -55,7 +60,7 @@ class _Fused(splatting.Kernel):
             return None
         from rts_backends.fused import normal_equations
 
-        given = splats.positions, splats.rgba, splats.row, t_positions, t_rgba, target, weights, background
+        given = splats.positions, splats.rgba, splats.row, splats.part, t_positions, t_rgba, target, weights, background
         return normal_equations.equations(self._settings(splats.border), engine_of(given), *given)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -64,7 +69,7 @@ class _Fused(splatting.Kernel):
             return super().needed(covered, depth)
         from rts_backends.fused import pruning
 
-        return pruning.needed(covered, depth, self.kind == "visible", self.epsilon)
+        return pruning.needed(covered, depth, self.kind == "visible", self._settings(0).rims, self.epsilon)
 
 
 class Single(_Fused, splatting.Single):
@@ -84,38 +89,43 @@ class Visible(_Fused, splatting.Visible):
 
     kind = "visible"
 
+    def _settings(self, border: int) -> Settings:
+        return super()._settings(border)._replace(rims=self.rims)
+
 
 # ---------------------------------------------------------------------------------------------------- the operation
 
 _SPECIFICATIONS = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}
 
 
-def _specification(positions: Array, rgba: Array, row: Array, *, settings: Settings) -> Array:
-    kernel = _SPECIFICATIONS[settings.kind](settings.sigma, settings.epsilon, settings.gamma)
-    return without_border(kernel.accumulate(positions, rgba, row), settings.border)
+def _specification(positions: Array, rgba: Array, row: Array, part: Array, *, settings: Settings) -> Array:
+    given = settings.sigma, settings.epsilon, settings.gamma
+    options = {"rims": settings.rims} if settings.kind == "visible" else {}
+    splats = Splats(positions, rgba, row, part if part.shape[0] else None)
+    return without_border(_SPECIFICATIONS[settings.kind](*given, **options).accumulate(splats), settings.border)
 
 
-def _shape(positions: tuple, rgba: tuple, row: tuple, *, settings: Settings) -> tuple[int, ...]:
+def _shape(positions: tuple, rgba: tuple, row: tuple, part: tuple, *, settings: Settings) -> tuple[int, ...]:
     return *(max(0, n - 2 * settings.border) for n in row[1:]), 4
 
 
 def _forward(operands: Arrays, out: np.ndarray, *, settings: Settings) -> Choices | None:
-    positions, rgba, row = operands
-    cells = Cells(settings, positions, rgba, row)
+    positions, rgba, row, part = operands
+    cells = Cells(settings, positions, rgba, row, part=part)
     cells.image(out)
     return cells.choices if out.size else None
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, settings: Settings, kept: Choices | None) -> None:
-    positions, rgba, row = operands
+    positions, rgba, row, part = operands
     t_positions, t_rgba = tangents
-    Cells(settings, positions, rgba, row, kept).jvp(t_positions, t_rgba, out)
+    Cells(settings, positions, rgba, row, kept, part).jvp(t_positions, t_rgba, out)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings, kept: Choices | None) -> None:
-    positions, rgba, row = operands
+    positions, rgba, row, part = operands
     g_positions, g_rgba = results
-    Cells(settings, positions, rgba, row, kept).vjp(g, g_positions, g_rgba)
+    Cells(settings, positions, rgba, row, kept, part).vjp(g, g_positions, g_rgba)
 
 
 def _used(operands: Arrays) -> int:
@@ -126,7 +136,7 @@ _OPTIONS: dict[str, Any] = {"differentiable": 2, "packed": (0, 1), "used": _used
 IMAGE = Operation(
     "rts.image",
     _specification,
-    (2, 2, 3),
+    (2, 2, 3, 3),
     _shape,
     _forward,
     _push,
@@ -135,4 +145,6 @@ IMAGE = Operation(
     sweeps=True,
     **_OPTIONS,
 )
-"""The image (H, W, 4) of positions (N, 3), rgba (N, 4) and row (K, H, W), without the settings' border."""
+"""The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W) and part, without the settings' border.
+
+`part` is that of `rts.Splats`; (0, H, W) where it is not known."""

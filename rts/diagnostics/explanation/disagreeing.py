@@ -309,11 +309,7 @@ def _bias(case: _Case, touched: Touched) -> None:
                 f"a known bias of the library: its derivative image is off by {off:.0%} of its size, that of {told} by "
                 f"{theirs:.0%} (ratio {ratio})"
             )
-            advice = (
-                "More samples a pixel lessen it where things shift; where round things turn, outlines move as the "
-                "samples inside of them do, and nothing helps but other views."
-            )
-            case.findings.append(Finding("bias", because, advice, mask, share))
+            case.findings.append(Finding("bias", because, "More samples a pixel lessen it.", mask, share))
             return
         because = f"no experiment makes it agree; {told} is off by {theirs:.0%}, this by {off:.0%}"
     else:

@@ -1,0 +1,194 @@
+"""How outlines move: coverage has a motion of its own, extrapolated from samples to the outline beside them.
+
+A sample lies up to a pixel or two inside of the outline that its weights stand for. Where the surface turns, it moves
+faster than the outline: on a rim of radius R pixels, a sample δ pixels inside is nearer by √(2Rδ). So coverage moves as
+
+    P̂ = P in value,    dP̂(p) = dP(p) + β (dP(p) − dP(partner)),
+
+in x and y, where β and the partner of each cell p are decisions without a derivative. Directions n lead from a cell to
+its eight neighbours. One is off where p + n is empty or not paired front to front with p; usable where n is off, −n is
+not, and p₁ = p − n is covered; deep where p₂ = p − 2n continues the surface, too, and the depths of the three fall off
+as those of a smooth rim do. In order:
+
+- Chord: p has a second layer of the same part, and the square of the gap between its two layers runs to zero along a
+  usable direction. The partner is that layer, β = −½: the middle of a quadric's chord moves as its rim does.
+- Root: there is a deep direction. The partner is p₁. On a rim depth is z − k √e, with e the distance to the outline in
+  steps of n; with r = (z(p) − z(p₁)) / (z(p₁) − z(p₂)) then √e / (√(1 + e) − √e) = (1 + 2r − r²) / 2r (r − 1) = β.
+- Line: there is a usable direction. The partner is p₁, β = ½: an edge lies half a pixel beyond its samples, on average.
+
+Of several directions the one is taken that points most along the sum of all that are off.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rts.engines import namespace, stopped
+from rts.splatting.kernel import Kernel
+from rts.splatting.layers import NEIGHBOURS, Layers, bordered
+from rts.trees import Array
+
+LEAST, LARGEST = 1.23, 2.5
+"""The ratio r from which depths are those of a smooth rim, 1.5 pixels away; and the bound of β."""
+FLAT = 1e-5
+"""Differences of depth below this share of the farthest depth are rounding."""
+CONVERGING = 1.5
+"""Ratio of the squares of two gaps, a pixel apart, from which a surface closes within two pixels."""
+HALF = 0.5
+"""β of the line, and −β of the chord."""
+
+AROUND = [n for n in NEIGHBOURS if n != (0, 0)]
+
+Steps = tuple[int, int]
+
+
+def gains(kernel: Kernel, layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tuple[Array, Array]:
+    """What moving outlines add to the coverage by moving samples: zeros with derivatives (H, W).
+
+    Fronts of sources move as their outlines; at the surface of a covered target all move as the target's.
+
+    Args:
+        kernel: the splatter.
+        layers: its samples.
+        shift: for each offset (u, v) from source to target, the targets' number s; 0 at empty targets.
+        part: (K, H, W), the part of each sample, or None.
+
+    Returns:
+        The gains in front, and at the surface.
+    """
+    xp, motion = layers.xp, _motions(layers)
+    outline = outline_motion(layers, shift, part, motion)
+    around = bordered(xp.permute_dims(outline, (2, 0, 1)), 0)
+    around = xp.permute_dims(around, (1, 2, 0))
+    offsets = xp.stack(kernel.offsets(layers.position[0]), axis=-1)
+    front, surface = 0.0, 0.0
+    for n, s in shift.items():
+        own = layers.at(offsets, *n)
+        joined = (layers.covers(0, 0) & (s == 0))[..., None]
+        change = xp.where(joined, outline, layers.at(around, *n)) - layers.at(motion[0], *n)
+        gain = kernel.weight(own + kernel.gamma * change, *n) - kernel.weight(own, *n)
+        front = front + xp.where(layers.covers(*n) & (s > 0), gain, 0.0)
+        surface = surface + xp.where(layers.covers(*n) & (s == 0), gain, 0.0)
+    return front, surface
+
+
+def spread(total: Array, gain: Array) -> Array:
+    """What a buffer's colours (H, W, 4) gain with its coverage: their mean, where they do not fill the target.
+
+    Args:
+        total: the buffer's sums (H, W, 5), colours and weight.
+        gain: of its coverage (H, W).
+    """
+    xp, weight = namespace(total), total[..., 4]
+    partial = (weight > 0) & (weight < 1)
+    return (xp.where(partial, gain, 0.0) / xp.where(partial, weight, 1.0))[..., None] * total[..., :4]
+
+
+def outline_motion(layers: Layers, shift: dict[Steps, Array], part: Array | None, motion: list[Array]) -> Array:
+    """P̂ without its value (H, W, 2): zeros, with the derivative of the outline beside each cell.
+
+    Args:
+        layers: the samples.
+        shift: see `gains`.
+        part: see `gains`.
+        motion: the motions of samples of each layer (h, w, 2), zeros with derivatives, with a border of one cell.
+    """
+    xp, own = layers.xp, layers.at(motion[0], 0, 0)
+    chord, beta, inward = rules(layers, shift, part)
+    partner = sum(xp.where((inward == i)[..., None], layers.at(motion[0], *n), 0.0) for i, n in enumerate(AROUND))
+    if len(motion) > 1:
+        partner = xp.where(chord[..., None], layers.at(motion[1], 0, 0), partner)
+    return own + beta[..., None] * (own - partner)
+
+
+def rules(layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tuple[Array, Array, Array]:
+    """Whether a cell's partner is its own second layer, β, and the direction n from its partner's cell, (H, W) each.
+
+    The direction is a place in AROUND, −1 where there is no partner or it is in the cell itself.
+    """
+    xp, (z, _) = layers.xp, layers.front(0, 0)
+    z = stopped(z)
+    off = _off(layers, shift)
+    usable = {n: off[n] & layers.covers(*n) & ~off[_reversed(n)] for n in AROUND}
+    outward = tuple(sum(xp.where(o, n[i], 0) for n, o in off.items()) for i in (0, 1))
+    best, inward = (xp.full_like(shift[0, 0], x) for x in (-1000, -1))
+    deep, beta = inward > 0, xp.zeros_like(z)
+    for i, n in enumerate(AROUND):
+        ratio = _ratio(layers, z, n, off)
+        rim = usable[n] & (ratio > LEAST)
+        along = n[0] * outward[0] + n[1] * outward[1]
+        # Ordered as n · outward / ‖n‖ is, in whole numbers.
+        score = along * xp.abs(along) * (3 - abs(n[0]) - abs(n[1]))
+        take = usable[n] & ((rim & ~deep) | ((rim == deep) & (score > best)))
+        best, inward, deep = xp.where(take, score, best), xp.where(take, i, inward), deep | (take & rim)
+        beta = xp.where(take, xp.where(rim, _root(xp.where(rim, ratio, 2.0), xp), HALF), beta)
+    chord = _chord(layers, usable, part)
+    return chord, xp.where(chord, -HALF, beta), xp.where(chord, -1, inward)
+
+
+def chords(covered: np.ndarray) -> np.ndarray:
+    """The second layers (K, H, W) that lie beside the outlines of fronts before nothing."""
+    ring = covered[0] & _spread(~covered[0])
+    return covered & _spread(ring) & (np.arange(len(covered)) == 1)[:, None, None]
+
+
+def _spread(cells: np.ndarray) -> np.ndarray:
+    """Cells (H, W) and those beside them."""
+    height, width = cells.shape
+    wide = np.pad(cells, 1)
+    return np.logical_or.reduce([wide[v : v + height, u : u + width] for v in range(3) for u in range(3)])
+
+
+def _motions(layers: Layers) -> list[Array]:
+    """Positions in x and y of the first two layers less their value: (h, w, 2) each, with the border."""
+    found = []
+    for k, position in enumerate(layers.position[:2]):
+        xy = position[..., :2]
+        found.append(layers.xp.where(layers.covered[k][..., None], xy - stopped(xy), 0.0))
+    return found
+
+
+def _off(layers: Layers, shift: dict[Steps, Array]) -> dict[Steps, Array]:
+    """Directions in which cells' fronts end; none leads out of the array."""
+    xp, there = layers.xp, layers.covers(0, 0)
+    inside = bordered(xp.zeros_like(shift[0, 0])[None])[0] >= 0
+    found = {}
+    for n in AROUND:
+        # Pairing is symmetric: what matters is whether p + n, as a source of p, is paired front to front.
+        back = _reversed(n)
+        found[n] = there & layers.at(inside, *back) & (~layers.covers(*back) | (shift[back] != 0))
+    return found
+
+
+def _ratio(layers: Layers, z: Array, n: Steps, off: dict[Steps, Array]) -> Array:
+    """The ratio r along a direction; 0 where p₂ does not continue the surface, or does not fall off."""
+    xp, back = layers.xp, _reversed(n)
+    (z1, _), (z2, there) = layers.front(*n), layers.front(2 * n[0], 2 * n[1])
+    z1, z2 = stopped(z1), stopped(z2)
+    ends = layers.at(bordered(xp.where(off[back], 1, 0)[None])[0], *n) == 1
+    slope = z1 - z2
+    falls = there & ~ends & (slope > FLAT * stopped(layers.extent))
+    return xp.where(falls, (z - z1) / xp.where(falls, slope, 1.0), 0.0)
+
+
+def _root(ratio: Array, xp: Any) -> Array:
+    """β of a smooth rim."""
+    return xp.clip((1 + 2 * ratio - ratio * ratio) / (2 * ratio * (ratio - 1)), 0.0, LARGEST)
+
+
+def _chord(layers: Layers, usable: dict[Steps, Array], part: Array | None) -> Array:
+    """Where a cell's first two layers are of one part and close along a usable direction."""
+    if part is None or len(layers.position) < 2:
+        return layers.covers(0, 0) & False
+    both, gap = layers.covered[1], stopped(layers.gap)
+    own, closes = layers.at(gap, 0, 0), False
+    for n in AROUND:
+        inner = layers.at(gap, *n)
+        closes = closes | (usable[n] & layers.at(both, *n) & (CONVERGING * own * own <= inner * inner))
+    return closes & layers.at(both, 0, 0) & (part[0] == part[1])
+
+
+def _reversed(n: Steps) -> Steps:
+    return -n[0], -n[1]

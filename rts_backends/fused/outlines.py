@@ -1,0 +1,407 @@
+"""Outlines that move as `rts.splatting.rims` says: what their motion adds to derivatives of the compiled `Visible`.
+
+With v̂ the motion of the outline beside a cell, and v that of its front, what a source of weight w adds to the
+derivative of a target is ∂w · (v̂ − v) times the change of the target's colour with the coverage of one buffer. Only
+targets count that a buffer covers in part. They are few: the gradient adds up in their order, on one thread.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from rts_backends.fused.mixed import splat
+from rts_backends.fused.survey import FLAT
+
+NOTHING, FRONT, JOINED, SURFACE = 0, 1, 2, 3
+"""What a source gives to a target: nothing, or coverage of the buffer in front as its outline moves; of that at the
+surface as the target's outline moves; of that at the surface, over nothing, as its own does."""
+
+
+compiled = numba.njit(nogil=True)
+kernel = numba.njit(nogil=True, cache=True)
+
+
+class Rules(NamedTuple):
+    """Numbers of `rts.splatting.rims`, in the dtype of the positions."""
+
+    least: float
+    largest: float
+    flat: float
+    converging: float
+    half: float
+
+
+class Outlines(NamedTuple):
+    """How outlines move, and the targets that they cover in part.
+
+    Attributes:
+        beta: (H, W), β of the targets below that are covered; 0 where the front's own motion is the outline's.
+        partner: (H, W) int32, the partner's sample where β is not 0.
+        offsets: (H + 1,) int64, where the targets of each row begin in the lists below.
+        columns: (M,) int32, their columns.
+        gives: (M, 9) uint8, what each source gives; source 3 (v + 1) + (u + 1) lies at −(u, v).
+        slopes: (M, 9, 2), of the weights of sources that give something, with their position.
+        changes: (M, 2, 4), of the target's colour with coverage in front, and at the surface.
+    """
+
+    beta: np.ndarray
+    partner: np.ndarray
+    offsets: np.ndarray
+    columns: np.ndarray
+    gives: np.ndarray
+    slopes: np.ndarray
+    changes: np.ndarray
+
+
+@kernel
+def find(start, stop, positions, row, reach, states, mixed, offsets, columns, ranges, ends, marks, counts):
+    """Find where fronts end in rows [start, stop), and mark targets that may be covered in part.
+
+    Args:
+        start: first row.
+        stop: end of the rows.
+        positions: (N, 3).
+        row: (K, H, W).
+        reach: pixels that a sample may lie off its cell's centre, so that weights are sure to add up to one.
+        states: (H, W) of `survey.py`.
+        mixed: (H, W), see `rts_backends.fused.cells.Choices`, as `offsets`, `columns` and `ranges`.
+        offsets: (H + 1,).
+        columns: (M,).
+        ranges: (M, 9, 3, 2).
+        ends: (H, W) uint16, to be filled: bit 3 (v + 1) + (u + 1) where a front ends towards (u, v).
+        marks: (H, W) uint8, to be filled.
+        counts: (H,) zeros, to be filled with the number of marks.
+    """
+    _, height, width = row.shape
+    # Of the cells of three rows and one more at each side: bits for what is empty, covered, and not sure to fill.
+    cells = np.empty((3, width + 2), np.uint8)
+    for y in range(start, stop):
+        for v in range(3):
+            if y == start or v == 2:
+                _look(cells[(y + v) % 3], positions, row[0], states, y + v - 1, reach)
+        above, level, below = cells[y % 3], cells[(y + 1) % 3], cells[(y + 2) % 3]
+        for x in range(width):
+            around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
+            around |= below[x] | below[x + 1] | below[x + 2]
+            marks[y, x] = np.uint8((around & COVERED != 0) & (around & LOOSE != 0)) | mixed[y, x]
+            ends[y, x] = np.uint16(around & EMPTY)
+        for x in range(width):
+            counts[y] += marks[y, x]
+            if ends[y, x]:
+                ends[y, x] = _ends_before_nothing(above, level, below, x) if level[x + 1] & COVERED else 0
+        for d in range(offsets[y], offsets[y + 1]):
+            ends[y, columns[d]] |= _ends_before_others(ranges[d], row, y, columns[d])
+
+
+EMPTY, COVERED, LOOSE = np.uint8(1), np.uint8(2), np.uint8(4)
+"""Bits of a cell: in the array without a sample, with one, and not sure to fill its share of what is around it."""
+
+
+@compiled
+def _look(cells, positions, row, states, y, reach):
+    """Bits of a row of cells, and of one cell at each side."""
+    height, width = row.shape
+    half = positions.dtype.type(0.5)
+    cells[:] = LOOSE
+    if not 0 <= y < height:
+        return
+    middle = positions.dtype.type(y) + half
+    for x in range(width):
+        if states[y, x] == FLAT:
+            cells[x + 1] = COVERED
+            continue
+        i = row[y, x]
+        if i < 0:
+            cells[x + 1] = EMPTY | LOOSE
+            continue
+        off = max(abs(positions[i, 0] - (positions.dtype.type(x) + half)), abs(positions[i, 1] - middle))
+        cells[x + 1] = COVERED if off <= reach else COVERED | LOOSE
+
+
+@compiled
+def _ends_before_nothing(above, level, below, x):
+    """Directions in which neighbours of cell x are empty, as bits."""
+    bits = 0
+    for u in range(3):
+        bits |= (above[x + u] & EMPTY) << u
+        bits |= (level[x + u] & EMPTY) << (3 + u)
+        bits |= (below[x + u] & EMPTY) << (6 + u)
+    return np.uint16(bits)
+
+
+@compiled
+def _ends_before_others(choice, row, y, x):
+    """Directions in which neighbours of a mixed target are covered, and not paired front to front, as bits."""
+    _, height, width = row.shape
+    bits = 0
+    for n in range(9):
+        py, px = y + 1 - n // 3, x + 1 - n % 3
+        if n != 4 and 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0:
+            if not (choice[n, 1, 0] == 0 and choice[n, 1, 1] == 1):
+                bits |= 1 << (8 - n)
+    return np.uint16(bits)
+
+
+@compiled
+def _rule(positions, row, part, ends, y, x, extent, rules):
+    """β and the partner's sample of a cell whose front ends somewhere."""
+    along_x, along_y = 0, 0
+    for n in range(9):
+        if ends[y, x] >> n & 1:
+            along_x, along_y = along_x + n % 3 - 1, along_y + n // 3 - 1
+    one = positions.dtype.type(1)
+    two, beta, partner = one + one, positions.dtype.type(0), -1
+    best, deep = -1000, False
+    for n in range(9):
+        u, v = n % 3 - 1, n // 3 - 1
+        if not _usable(row, ends, y, x, n):
+            continue
+        if _closes(positions, row, part, y, x, y - v, x - u, rules.converging):
+            return -rules.half, row[1, y, x]
+        ratio = _ratio(positions, row, ends, y, x, n, rules.flat * extent)
+        rim, along = ratio > rules.least, u * along_x + v * along_y
+        score = along * abs(along) * (3 - abs(u) - abs(v))
+        if (rim and not deep) or (rim == deep and score > best):
+            best, deep, partner = score, rim, row[0, y - v, x - u]
+            beta = rules.half
+            if rim:
+                root = (one + two * ratio - ratio * ratio) / (two * ratio * (ratio - one))
+                beta = min(max(root, positions.dtype.type(0)), rules.largest)
+    return beta, partner
+
+
+@compiled
+def _usable(row, ends, y, x, n):
+    """Whether the front of a cell ends in direction n, and not in the other, where there is a cell with a sample."""
+    _, height, width = row.shape
+    py, px = y + 1 - n // 3, x + 1 - n % 3
+    if not (ends[y, x] >> n & 1) or ends[y, x] >> (8 - n) & 1:
+        return False
+    return 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0
+
+
+@compiled
+def _ratio(positions, row, ends, y, x, n, flat):
+    """The ratio r of `rts.splatting.rims` along a usable direction; 0 where the surface does not go on, or not fall."""
+    _, height, width = row.shape
+    v, u = n // 3 - 1, n % 3 - 1
+    zero = positions.dtype.type(0)
+    py, px = y - 2 * v, x - 2 * u
+    if not (0 <= py < height and 0 <= px < width) or row[0, py, px] < 0 or ends[y - v, x - u] >> (8 - n) & 1:
+        return zero
+    middle = positions[row[0, y - v, x - u], 2]
+    slope = middle - positions[row[0, py, px], 2]
+    return (positions[row[0, y, x], 2] - middle) / slope if slope > flat else zero
+
+
+@compiled
+def _closes(positions, row, part, y, x, py, px, converging):
+    """Whether the first two layers of a cell are of one part, and the gap between them runs to zero from (py, px)."""
+    if len(part) < 2 or row[1, y, x] < 0 or row[1, py, px] < 0 or part[0, y, x] != part[1, y, x]:
+        return False
+    own = positions[row[1, y, x], 2] - positions[row[0, y, x], 2]
+    inner = positions[row[1, py, px], 2] - positions[row[0, py, px], 2]
+    return converging * own * own <= inner * inner
+
+
+@kernel
+def fill(
+    start,
+    stop,
+    positions,
+    rgba,
+    row,
+    scale,
+    peak,
+    gamma,
+    part,
+    extent,
+    rules,
+    mixed,
+    ranges,
+    sums,
+    firsts,
+    ends,
+    marks,
+    found,
+):
+    """Decide how outlines move in rows [start, stop), as `rts.splatting.rims.rules` does, and list the marked targets.
+
+    Args:
+        start: first row.
+        stop: end of the rows.
+        positions: (N, 3).
+        rgba: (N, 4).
+        row: (K, H, W).
+        scale: the exponent's factor.
+        peak: of the weights, along one axis.
+        gamma: the calibration.
+        part: (K, H, W), the part of each sample, or no layers.
+        extent: of the depths.
+        rules: numbers of the rules.
+        mixed: (H, W), see `rts_backends.fused.cells.Choices`, as `ranges` and `sums`.
+        ranges: (M, 9, 3, 2).
+        sums: (M, 3, 5).
+        firsts: (H + 1,), where the mixed targets of each row begin.
+        ends: (H, W) of `find`.
+        marks: (H, W) of `find`.
+        found: `Outlines`, to be filled but for its offsets.
+    """
+    own, plain = np.zeros((3, 5), positions.dtype), np.zeros((9, 3, 2), ranges.dtype)
+    slope = positions.dtype.type(2) * scale * gamma
+    plain[:, 1, 1] = 1
+    for y in range(start, stop):
+        d, m = found.offsets[y], firsts[y]
+        for x in range(marks.shape[1]):
+            if not marks[y, x]:
+                continue
+            if row[0, y, x] >= 0:
+                found.beta[y, x] = positions.dtype.type(0)
+                if ends[y, x]:
+                    found.beta[y, x], found.partner[y, x] = _rule(positions, row, part, ends, y, x, extent, rules)
+            found.columns[d] = x
+            _weigh(own[1], found.slopes[d], positions, rgba, row, y, x, scale, peak, gamma, slope)
+            if mixed[y, x]:
+                _list(found.gives[d], found.changes[d], ranges[m], sums[m], row, y, x)
+                m += 1
+            else:
+                _list(found.gives[d], found.changes[d], plain, own, row, y, x)
+            d += 1
+
+
+@compiled
+def _weigh(total, slopes, positions, rgba, row, y, x, scale, peak, gamma, slope):
+    """Sums (5,) of the fronts around a target, colours over the weight; and the slopes (9, 2) of their weights."""
+    _, height, width = row.shape
+    total[:] = total.dtype.type(0)
+    for n in range(9):
+        v, u = n // 3 - 1, n % 3 - 1
+        py, px = y - v, x - u
+        if not (0 <= py < height and 0 <= px < width) or row[0, py, px] < 0:
+            continue
+        i = row[0, py, px]
+        w, dx, dy = splat(positions, i, py, px, u, v, scale, peak, gamma)
+        slopes[n, 0], slopes[n, 1] = slope * w * dx, slope * w * dy
+        for c in range(4):
+            total[c] += w * rgba[i, c]
+        total[4] += w
+    if total[4] > 1:
+        for c in range(4):
+            total[c] /= total[4]
+
+
+@compiled
+def _list(gives, changes, choice, total, row, y, x):
+    """What the sources of a target give, and how its colour changes with the coverage of its buffers."""
+    _, height, width = row.shape
+    zero, one = total.dtype.type(0), total.dtype.type(1)
+    front, surface = zero < total[0, 4] < one, zero < total[1, 4] < one
+    for c in range(4):
+        under = total[1, c] + (one - total[1, 3]) * total[2, c]
+        changes[0, c] = (total[0, c] - total[0, 3] * under) / total[0, 4] if front else zero
+        through = (one - total[0, 3]) * (total[1, c] - total[1, 3] * total[2, c])
+        changes[1, c] = through / total[1, 4] if surface else zero
+    for n in range(9):
+        py, px = y + 1 - n // 3, x + 1 - n % 3
+        gives[n] = NOTHING
+        if not (0 <= py < height and 0 <= px < width) or row[0, py, px] < 0:
+            continue
+        if front and choice[n, 0, 1] == 1:
+            gives[n] = FRONT
+        elif surface and choice[n, 1, 0] == 0 and choice[n, 1, 1] == 1:
+            gives[n] = JOINED if row[0, y, x] >= 0 else SURFACE
+
+
+@compiled
+def _outline(t_positions, row, beta, partner, y, x, axis):
+    """The motion v̂ of the outline beside a cell, along an axis."""
+    b, own = beta[y, x], t_positions[row[0, y, x], axis]
+    return own + b * (own - t_positions[partner[y, x], axis]) if b != 0 else own
+
+
+@compiled
+def gain(d, t_positions, row, outlines, y):
+    """What moving outlines add to the coverage of a target's buffers in front and at the surface, along a tangent."""
+    front, surface = outlines.slopes.dtype.type(0), outlines.slopes.dtype.type(0)
+    x, beta, partner = outlines.columns[d], outlines.beta, outlines.partner
+    for n in range(9):
+        given = outlines.gives[d, n]
+        if given == NOTHING:
+            continue
+        v, u = n // 3 - 1, n % 3 - 1
+        i, qy, qx = row[0, y - v, x - u], y - v, x - u
+        if given == JOINED:
+            qy, qx = y, x
+        along = outlines.slopes[d, n, 0] * (_outline(t_positions, row, beta, partner, qy, qx, 0) - t_positions[i, 0])
+        along += outlines.slopes[d, n, 1] * (_outline(t_positions, row, beta, partner, qy, qx, 1) - t_positions[i, 1])
+        if given == FRONT:
+            front += along
+        else:
+            surface += along
+    return front, surface
+
+
+@kernel
+def push(start, stop, row, outlines, t_positions, border, out):
+    """Add to rows [start, stop) of the tangents (T, H, W, 4)."""
+    for y in range(start + border, stop + border):
+        for d in range(outlines.offsets[y], outlines.offsets[y + 1]):
+            x = outlines.columns[d] - border
+            if not 0 <= x < out.shape[2]:
+                continue
+            for t in range(len(out)):
+                front, surface = gain(d, t_positions[t], row, outlines, y)
+                for c in range(4):
+                    change = front * outlines.changes[d, 0, c] + surface * outlines.changes[d, 1, c]
+                    out[t, y - border, x, c] += change
+
+
+@kernel
+def pull(row, outlines, border, g, g_positions):
+    """Add to the gradients of positions (N, 3) what outlines give, from that of the image."""
+    height, width, _ = g.shape
+    zero = g_positions.dtype.type(0)
+    for y in range(border, height + border):
+        for d in range(outlines.offsets[y], outlines.offsets[y + 1]):
+            x = outlines.columns[d]
+            if not 0 <= x - border < width:
+                continue
+            front, surface = zero, zero
+            for c in range(4):
+                front += g[y - border, x - border, c] * outlines.changes[d, 0, c]
+                surface += g[y - border, x - border, c] * outlines.changes[d, 1, c]
+            if front == zero and surface == zero:
+                continue
+            joined_x, joined_y = zero, zero
+            for n in range(9):
+                given = outlines.gives[d, n]
+                if given == NOTHING:
+                    continue
+                py, px = y + 1 - n // 3, x + 1 - n % 3
+                h = front if given == FRONT else surface
+                h_x, h_y = h * outlines.slopes[d, n, 0], h * outlines.slopes[d, n, 1]
+                i = row[0, py, px]
+                g_positions[i, 0] -= h_x
+                g_positions[i, 1] -= h_y
+                if given == JOINED:
+                    joined_x, joined_y = joined_x + h_x, joined_y + h_y
+                else:
+                    _add(g_positions, row, outlines, py, px, h_x, h_y)
+            if joined_x != zero or joined_y != zero:
+                _add(g_positions, row, outlines, y, x, joined_x, joined_y)
+
+
+@compiled
+def _add(g_positions, row, outlines, y, x, g_x, g_y):
+    """Hand the gradient of the motion of the outline beside a cell to its front and its partner."""
+    i, j, b = row[0, y, x], outlines.partner[y, x], outlines.beta[y, x]
+    g_positions[i, 0] += g_x
+    g_positions[i, 1] += g_y
+    if b != 0:
+        g_positions[i, 0] += b * g_x
+        g_positions[i, 1] += b * g_y
+        g_positions[j, 0] -= b * g_x
+        g_positions[j, 1] -= b * g_y
