@@ -1,0 +1,491 @@
+"""Lines where surfaces pass through one another, as `rts.splatting.crossings` says, for the compiled `Visible`.
+
+Pairs are found by a test that vector instructions do and that few other cells pass: on either side of a line the gap
+between two layers grows. Targets beside a line have their derivative from here, in place of all that others add. They
+are few: the gradient adds up in their order, on one thread.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from rts.splatting import crossings as specification
+from rts.splatting.kernel import TIE
+from rts.threads import parallel
+from rts_backends.fused.mixed import splat
+from rts_backends.fused.survey import FLAT
+
+BORDER = 3
+"""Of the array of gaps: so far from a cell are those that decide whether it is in a pair with a neighbour."""
+STEPS = ((1, 0), (0, 1), (1, 1), (1, -1))
+"""Steps (x, y) from one cell of each pair to the other, which bits 0 to 3 stand for."""
+NEITHER, SHEET_A, SHEET_B = 2, 0, 1
+"""Of which sheet a source is."""
+
+compiled = numba.njit(nogil=True)
+kernel = numba.njit(nogil=True, cache=True)
+
+
+class Rules(NamedTuple):
+    """Numbers of `rts.splatting.crossings`, in the dtype of the depths."""
+
+    least: float
+    largest: float
+    direct: float
+    fit: float
+
+    @classmethod
+    def of(cls, extent: np.floating) -> Rules:
+        """For depths of an extent, the camera's included."""
+        kind = type(extent)
+        numbers = specification.LARGEST, specification.DIRECT, specification.FIT
+        return cls(kind(TIE) * extent, *map(kind, numbers))
+
+
+class Crossings(NamedTuple):
+    """The targets beside lines, and what their derivative is made of.
+
+    Attributes:
+        offsets: (H + 1,) int64, where the cells of each row begin in the lists below.
+        columns: (M,) int32, their columns; negative where a cell's derivative is not that of a line.
+        sheets: (M, 9) uint8, of which sheet each source is; source 3 (v + 1) + (u + 1) lies at −(u, v).
+        weights: (M, 9, 3), of the sources' fronts in that of all: the weight, and its slopes with their position.
+        colors: (M, 2, 4), the sheets' mean colours.
+        slopes: (M, 5), by how much of the difference of these the colour changes with the rate of ġ; ∇z of the sheets.
+    """
+
+    offsets: np.ndarray
+    columns: np.ndarray
+    sheets: np.ndarray
+    weights: np.ndarray
+    colors: np.ndarray
+    slopes: np.ndarray
+
+
+def nothing(height: int, kind: np.dtype) -> Crossings:
+    """No targets in so many rows."""
+    return _empty(np.zeros(height + 1, np.int64), kind)
+
+
+def _empty(offsets: np.ndarray, kind: np.dtype) -> Crossings:
+    count = offsets[-1]
+    shapes = (count, 9, 3), (count, 2, 4), (count, 5)
+    arrays = (np.empty(shape, kind) for shape in shapes)
+    return Crossings(offsets, np.empty(count, np.int32), np.empty((count, 9), np.uint8), *arrays)
+
+
+def listed(arrays: tuple, choices: tuple, extent: np.floating) -> Crossings:
+    """The targets beside lines.
+
+    Args:
+        arrays: positions (N, 3), rgba (N, 4), row (K, H, W), and the splatter's scale, peak and gamma.
+        choices: see `rts_backends.fused.cells.Choices`.
+        extent: of the depths, the camera's included.
+    """
+    positions, _, row = arrays[:3]
+    _, height, width = row.shape
+    kind = positions.dtype
+    if len(row) < 2 or not (row[1] >= 0).any():
+        return nothing(height, kind)
+    z, gap = np.empty((2, height, width), kind), _gaps(height, width, kind)
+    parallel(_gather, height, positions, row, z, gap, work=row[0].size)
+    rules = Rules.of(extent)
+    bits, some = _pairs(z, gap, rules)
+    if not some.any():
+        return nothing(height, kind)
+    around, counts = np.zeros((height, width), np.uint16), np.zeros(height, np.int64)
+    parallel(_list, height, bits, some, choices.states, around, counts, work=row[0].size)
+    found = _empty(np.concatenate([[0], np.cumsum(counts)]), kind)
+    listed = choices.mixed, choices.offsets, choices.columns, choices.ranges
+    parallel(_fill, height, *arrays, *listed, z, gap, around, rules, found, work=1000 * len(found.columns))
+    return found
+
+
+def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np.ndarray) -> None:
+    """Mark in `kept` (K, H, W) what `rts.splatting.crossings.sheets` keeps."""
+    _, height, width = covered.shape
+    gap = _gaps(height, width, depth.dtype)
+    parallel(_subtract, height, covered, depth, gap, work=covered[0].size // 2)
+    bits, some = _pairs(depth, gap, Rules.of(extent))
+    if some.any():
+        parallel(_keep, height, covered, bits, some, specification.KEPT, kept, work=covered[0].size)
+
+
+def _gaps(height: int, width: int, kind: np.dtype) -> np.ndarray:
+    return np.full((height + 2 * BORDER, width + 2 * BORDER), np.inf, kind)
+
+
+def _pairs(z: np.ndarray, gap: np.ndarray, rules: Rules) -> tuple[np.ndarray, np.ndarray]:
+    """Bits (H, W) of the steps from each cell to the other of a pair, and whether there are any in each row."""
+    height, width = z.shape[1:]
+    bits, some = np.zeros((height, width), np.uint8), np.zeros(height, np.bool_)
+    parallel(_find, height, z, gap, rules, bits, some, work=4 * bits.size)
+    return bits, some
+
+
+@kernel
+def _gather(start, stop, positions, row, z, gap):
+    """Depths of the first two layers, where there are both, and the gaps between them."""
+    for y in range(start, stop):
+        for x in range(row.shape[2]):
+            i, j = row[0, y, x], row[1, y, x]
+            if i >= 0 and j >= 0:
+                z[0, y, x], z[1, y, x] = positions[i, 2], positions[j, 2]
+                gap[y + BORDER, x + BORDER] = positions[j, 2] - positions[i, 2]
+
+
+@kernel
+def _subtract(start, stop, covered, depth, gap):
+    """The gaps between the first two layers."""
+    infinity = gap.dtype.type(np.inf)
+    for y in range(start, stop):
+        _subtract_row(gap[y + BORDER, BORDER:-BORDER], covered[0, y], covered[1, y], depth[0, y], depth[1, y], infinity)
+
+
+@compiled
+def _subtract_row(gap, covered0, covered1, depth0, depth1, infinity):
+    for x in range(len(gap)):
+        gap[x] = depth1[x] - depth0[x] if covered0[x] & covered1[x] else infinity
+
+
+@kernel
+def _find(start, stop, z, gap, rules, bits, some):
+    """Find pairs whose first cell lies in rows [start, stop)."""
+    _, _, width = z.shape
+    marks = np.empty((4, width), np.bool_)
+    for y in range(start, stop):
+        for i in range(4):
+            u, v = STEPS[i]
+            before, here = gap[y + BORDER - v, BORDER - u :], gap[y + BORDER, BORDER:]
+            there, after = gap[y + BORDER + v, BORDER + u :], gap[y + BORDER + 2 * v, BORDER + 2 * u :]
+            _suspect(marks[i], before, here, there, after)
+        for x in range(width):
+            if not (marks[0, x] | marks[1, x] | marks[2, x] | marks[3, x]):
+                continue
+            for i in range(4):
+                if marks[i, x] and _crosses(z, gap, rules, y, x, STEPS[i][1], STEPS[i][0]):
+                    bits[y, x] |= np.uint8(1 << i)
+                    some[y] = True
+
+
+@compiled
+def _suspect(marks, before, here, there, after):
+    """Mark cells where the gap grows on both sides of a pair, or one side is not known: infinity.
+
+    R is at least what the gaps alone change by, |before − 2 here − there| + |after − 2 there − here|.
+    """
+    least = here.dtype.type(2.49)
+    for x in range(len(marks)):
+        marks[x] = before[x] + after[x] > least * (here[x] + there[x])
+
+
+@compiled
+def _crosses(z, gap, rules, y, x, v, u):
+    """Whether a line runs between a cell and the one a step (u, v) farther on."""
+    ratio = _ratio(z, gap, rules, y, x, v, u)
+    if not ratio < rules.largest:
+        return False
+    return ratio < _ratio(z, gap, rules, y - v, x - u, v, u) and ratio <= _ratio(z, gap, rules, y + v, x + u, v, u)
+
+
+@compiled
+def _two(gap, y, x):
+    """Whether a cell has two layers."""
+    return gap[y + BORDER, x + BORDER] < np.inf
+
+
+@compiled
+def _ratio(z, gap, rules, y, x, v, u):
+    """R / (h(q) + h(p)) of a cell q and the one p a step (u, v) farther on; infinity where they are no pair."""
+    infinity, two = gap.dtype.type(np.inf), gap.dtype.type(2)
+    if not (_two(gap, y, x) and _two(gap, y + v, x + u)):
+        return infinity
+    before, after = _two(gap, y - v, x - u), _two(gap, y + 2 * v, x + 2 * u)
+    total = gap[y + BORDER, x + BORDER] + gap[y + v + BORDER, x + u + BORDER]
+    if not (before or after) or not total > rules.least:
+        return infinity
+    q0, q1, p0, p1 = z[0, y, x], z[1, y, x], z[0, y + v, x + u], z[1, y + v, x + u]
+    change0, change1, direct0, direct1 = infinity, infinity, infinity, infinity
+    if before:
+        b0, b1 = z[0, y - v, x - u], z[1, y - v, x - u]
+        change0 = abs(b0 - two * q0 + p1) + abs(b1 - two * q1 + p0)
+        direct0 = abs(b0 - two * q0 + p0) + abs(b1 - two * q1 + p1)
+    if after:
+        f0, f1 = z[0, y + 2 * v, x + 2 * u], z[1, y + 2 * v, x + 2 * u]
+        change1 = abs(f0 - two * p0 + q1) + abs(f1 - two * p1 + q0)
+        direct1 = abs(f0 - two * p0 + q0) + abs(f1 - two * p1 + q1)
+    change = change0 + change1 if before and after else two * min(change0, change1)
+    direct = direct0 + direct1 if before and after else two * min(direct0, direct1)
+    return change / total if change < rules.direct * direct else infinity
+
+
+@kernel
+def _keep(start, stop, covered, bits, some, reach, kept):
+    """Keep the first two layers of rows [start, stop) near pairs."""
+    _, height, width = covered.shape
+    for y in range(start, stop):
+        for py in range(max(y - reach - 1, 0), min(y + reach + 2, height)):
+            if not some[py]:
+                continue
+            for x in range(width):
+                if not bits[py, x]:
+                    continue
+                for i in range(4):
+                    if bits[py, x] >> i & 1:
+                        for step in range(2):
+                            qx, qy = x + step * STEPS[i][0], py + step * STEPS[i][1]
+                            if abs(qy - y) <= reach:
+                                _keep_around(kept[0, y], covered[0, y], qx, reach)
+                                _keep_around(kept[1, y], covered[1, y], qx, reach)
+
+
+@compiled
+def _keep_around(kept, covered, x, reach):
+    for i in range(max(x - reach, 0), min(x + reach + 1, len(kept))):
+        kept[i] |= covered[i]
+
+
+@kernel
+def _list(start, stop, bits, some, states, around, counts):
+    """The steps from each cell to the others of its pairs, as bits 3 (v + 1) + (u + 1); and how many cells have any.
+
+    A target amid one colour keeps the derivative it has, which is that of a line.
+    """
+    height, width = bits.shape
+    for y in range(start, stop):
+        if not (some[max(y - 1, 0)] or some[y] or some[min(y + 1, height - 1)]):
+            continue
+        for x in range(width):
+            if states[y, x] == FLAT:
+                continue
+            found = 0
+            for i in range(4):
+                u, v = STEPS[i]
+                if bits[y, x] >> i & 1:
+                    found |= 1 << (3 * (v + 1) + u + 1)
+                if 0 <= y - v < height and 0 <= x - u and bits[y - v, x - u] >> i & 1:
+                    found |= 1 << (3 * (1 - v) + 1 - u)
+            around[y, x] = found
+            counts[y] += found != 0
+
+
+@kernel
+def _fill(
+    start,
+    stop,
+    positions,
+    rgba,
+    row,
+    scale,
+    peak,
+    gamma,
+    mixed,
+    firsts,
+    columns,
+    ranges,
+    z,
+    gap,
+    around,
+    rules,
+    found,
+):
+    """Decide of which sheet the sources of the cells of pairs in rows [start, stop) are, and fill the lists."""
+    slopes, plain = np.empty(4, positions.dtype), np.zeros((9, 3, 2), ranges.dtype)
+    plain[:, 1, 1] = 1
+    for y in range(start, stop):
+        d, m = found.offsets[y], firsts[y]
+        for x in range(row.shape[2] if found.offsets[y + 1] > d else 0):
+            if not around[y, x]:
+                continue
+            choice = plain
+            if mixed[y, x]:
+                while columns[m] < x:
+                    m += 1
+                choice = ranges[m]
+            found.columns[d] = -1
+            _sort(found.sheets[d], choice, row, around[y, x], y, x)
+            if _incline(slopes, found.sheets[d], z, gap, y, x) and _complete(
+                found.sheets[d], slopes, z, gap, rules.fit, y, x
+            ):
+                _weigh(d, found, slopes, positions, rgba, row, y, x, scale, peak, gamma)
+            d += 1
+
+
+@compiled
+def _sort(sheets, choice, row, around, y, x):
+    """Of which sheet sources are by pairs, and by layers paired front to front."""
+    _, height, width = row.shape
+    for n in range(9):
+        py, px = y + 1 - n // 3, x + 1 - n % 3
+        sheets[n] = NEITHER
+        if around >> (8 - n) & 1:
+            sheets[n] = SHEET_B
+        elif 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0:
+            if choice[n, 1, 0] == 0 and choice[n, 1, 1] == 1:
+                sheets[n] = SHEET_A
+
+
+@compiled
+def _incline(slopes, sheets, z, gap, y, x):
+    """Fill the slopes of the sheets a and b, along x and y each; whether they are known."""
+    for axis in range(2):
+        # The sources ahead and behind.
+        ahead, behind = (3, 5) if axis == 0 else (1, 7)
+        u, v = 1 - axis, axis
+        first, second = sheets[ahead] != NEITHER, sheets[behind] != NEITHER
+        first, second = first and _two(gap, y + v, x + u), second and _two(gap, y - v, x - u)
+        if not (first or second):
+            return False
+        for k in range(2):
+            change, change_behind = slopes.dtype.type(0), slopes.dtype.type(0)
+            if first:
+                change = z[k ^ sheets[ahead], y + v, x + u] - z[k, y, x]
+            if second:
+                change_behind = -(z[k ^ sheets[behind], y - v, x - u] - z[k, y, x])
+            both = (change + change_behind) / slopes.dtype.type(2)
+            slopes[2 * k + axis] = both if first and second else change if first else change_behind
+    return True
+
+
+@compiled
+def _complete(sheets, slopes, z, gap, fit, y, x):
+    """Sort sources of two layers that are of neither sheet yet by the planes through the target; whether all are."""
+    kind = slopes.dtype.type
+    gx, gy = slopes[0] - slopes[2], slopes[1] - slopes[3]
+    square = gx * gx + gy * gy
+    if not square > 0:
+        return False
+    for n in range(9):
+        if sheets[n] != NEITHER:
+            continue
+        u, v = 1 - n % 3, 1 - n // 3
+        if not _two(gap, y + v, x + u):
+            return False
+        near, far = z[0, y + v, x + u], z[1, y + v, x + u]
+        a = z[0, y, x] + slopes[0] * kind(u) + slopes[1] * kind(v)
+        b = z[1, y, x] + slopes[2] * kind(u) + slopes[3] * kind(v)
+        straight, crossed = abs(a - near) + abs(b - far), abs(a - far) + abs(b - near)
+        reach = np.sqrt(square) * kind(np.sqrt(u * u + v * v))
+        if not min(straight, crossed) < fit * reach:
+            return False
+        sheets[n] = SHEET_A if straight <= crossed else SHEET_B
+    return True
+
+
+@compiled
+def _weigh(d, found, slopes, positions, rgba, row, y, x, scale, peak, gamma):
+    """Fill what the derivative of a target is made of."""
+    kind = positions.dtype.type
+    zero, one, slope = kind(0), kind(1), kind(2) * scale * gamma
+    weights, colors, sheets = found.weights[d], found.colors[d], found.sheets[d]
+    colors[:] = zero
+    wa, wb, ax, ay, bx, by = zero, zero, zero, zero, zero, zero
+    for n in range(9):
+        v, u = n // 3 - 1, n % 3 - 1
+        i = row[0, y - v, x - u]
+        w, dx, dy = splat(positions, i, y - v, x - u, u, v, scale, peak, gamma)
+        weights[n, 0], weights[n, 1], weights[n, 2] = w, slope * w * dx, slope * w * dy
+        for c in range(4):
+            colors[sheets[n], c] += w * rgba[i, c]
+        if sheets[n] == SHEET_A:
+            wa, ax, ay = wa + w, ax + weights[n, 1], ay + weights[n, 2]
+        else:
+            wb, bx, by = wb + w, bx + weights[n, 1], by + weights[n, 2]
+    if not (wa > zero and wb > zero):
+        return
+    found.columns[d] = x
+    over = one / (wa + wb)
+    for n in range(9):
+        for j in range(3):
+            weights[n, j] *= over
+    for c in range(4):
+        colors[SHEET_A, c] /= wa
+        colors[SHEET_B, c] /= wb
+    share = wb * over
+    gx, gy = slopes[0] - slopes[2], slopes[1] - slopes[3]
+    along = ((one - share) * bx - share * ax) * over * gx + ((one - share) * by - share * ay) * over * gy
+    found.slopes[d, 0] = -along / (gx * gx + gy * gy)
+    found.slopes[d, 1:] = slopes
+
+
+@compiled
+def rate(slopes, t_positions, i, j):
+    """ġ along a tangent of positions, at a target with the samples i and j."""
+    a = t_positions[i, 2] - slopes[1] * t_positions[i, 0] - slopes[2] * t_positions[i, 1]
+    return a - (t_positions[j, 2] - slopes[3] * t_positions[j, 0] - slopes[4] * t_positions[j, 1])
+
+
+@compiled
+def change_of(pixel, d, found, rgba, row, y, t_positions, t_rgba):
+    """The derivative (4,) of a listed target along tangents (N, 3) and (N, 4), or of no rows: zeros."""
+    x, moved, tinted = found.columns[d], len(t_positions) > 0, len(t_rgba) > 0
+    colors, moves = found.colors[d], pixel.dtype.type(0)
+    if moved:
+        moves = found.slopes[d, 0] * rate(found.slopes[d], t_positions, row[0, y, x], row[1, y, x])
+    for c in range(4):
+        pixel[c] = moves * (colors[SHEET_B, c] - colors[SHEET_A, c])
+    for n in range(9):
+        i, weights, own = row[0, y + 1 - n // 3, x + 1 - n % 3], found.weights[d, n], colors[found.sheets[d, n]]
+        if moved:
+            change = weights[1] * t_positions[i, 0] + weights[2] * t_positions[i, 1]
+            for c in range(4):
+                pixel[c] += change * (rgba[i, c] - own[c])
+        if tinted:
+            for c in range(4):
+                pixel[c] += weights[0] * t_rgba[i, c]
+
+
+@kernel
+def push(start, stop, rgba, row, found, t_positions, t_rgba, border, out):
+    """Put the derivatives of listed targets into rows [start, stop) of the tangents (T, H, W, 4)."""
+    for y in range(start + border, stop + border):
+        for d in range(found.offsets[y], found.offsets[y + 1]):
+            x = found.columns[d] - border
+            if 0 <= x < out.shape[2]:
+                for t in range(len(out)):
+                    change_of(out[t, y - border, x], d, found, rgba, row, y, t_positions[t], t_rgba[t])
+
+
+@kernel
+def hide(found, border, g):
+    """Set the image's gradient (H, W, 4) to zero at listed targets."""
+    for y in range(border, len(g) + border):
+        for d in range(found.offsets[y], found.offsets[y + 1]):
+            x = found.columns[d] - border
+            if 0 <= x < g.shape[1]:
+                g[y - border, x] = g.dtype.type(0)
+
+
+@kernel
+def pull(rgba, row, found, border, g, g_positions, g_rgba):
+    """Add to the gradients of positions (N, 3) and rgba (N, 4), or of no rows, what listed targets give."""
+    zero = g.dtype.type(0)
+    for y in range(border, len(g) + border):
+        for d in range(found.offsets[y], found.offsets[y + 1]):
+            x = found.columns[d]
+            if not 0 <= x - border < g.shape[1]:
+                continue
+            h, colors, moves = g[y - border, x - border], found.colors[d], zero
+            for c in range(4):
+                moves += h[c] * (colors[SHEET_B, c] - colors[SHEET_A, c])
+            moves *= found.slopes[d, 0]
+            if len(g_positions) > 0:
+                for k, sign in ((0, moves), (1, -moves)):
+                    i = row[k, y, x]
+                    g_positions[i, 0] -= sign * found.slopes[d, 1 + 2 * k]
+                    g_positions[i, 1] -= sign * found.slopes[d, 2 + 2 * k]
+                    g_positions[i, 2] += sign
+            for n in range(9):
+                i, weights, own = row[0, y + 1 - n // 3, x + 1 - n % 3], found.weights[d, n], colors[found.sheets[d, n]]
+                if len(g_positions) > 0:
+                    change = zero
+                    for c in range(4):
+                        change += h[c] * (rgba[i, c] - own[c])
+                    g_positions[i, 0] += weights[1] * change
+                    g_positions[i, 1] += weights[2] * change
+                if len(g_rgba) > 0:
+                    for c in range(4):
+                        g_rgba[i, c] += weights[0] * h[c]
