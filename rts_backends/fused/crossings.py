@@ -50,7 +50,7 @@ class Crossings(NamedTuple):
 
     Attributes:
         offsets: (H + 1,) int64, where the cells of each row begin in the lists below.
-        columns: (M,) int32, their columns; negative where a cell's derivative is not that of a line.
+        columns: (M,) int32, their columns; −1 where the derivative is none of a line after all.
         sheets: (M, 9) uint8, of which sheet each source is; source 3 (v + 1) + (u + 1) lies at −(u, v).
         weights: (M, 9, 3), of the sources' fronts in that of all: the weight, and its slopes with their position.
         colors: (M, 2, 4), the sheets' mean colours.
@@ -97,10 +97,10 @@ def listed(arrays: tuple, choices: tuple, extent: np.floating) -> Crossings:
     if not some.any():
         return nothing(height, kind)
     around, counts = np.zeros((height, width), np.uint16), np.zeros(height, np.int64)
-    parallel(_list, height, bits, some, choices.states, around, counts, work=row[0].size)
+    seen = row, choices.mixed, choices.offsets, choices.columns, choices.ranges, z, gap
+    parallel(_list, height, bits, some, choices.states, *seen, rules, around, counts, work=row[0].size)
     found = _empty(np.concatenate([[0], np.cumsum(counts)]), kind)
-    listed = choices.mixed, choices.offsets, choices.columns, choices.ranges
-    parallel(_fill, height, *arrays, *listed, z, gap, around, rules, found, work=1000 * len(found.columns))
+    parallel(_fill, height, *arrays, *seen[1:], rules, around, found, work=1000 * len(found.columns))
     return found
 
 
@@ -249,27 +249,46 @@ def _keep_around(kept, covered, x, reach):
 
 
 @kernel
-def _list(start, stop, bits, some, states, around, counts):
-    """The steps from each cell to the others of its pairs, as bits 3 (v + 1) + (u + 1); and how many cells have any.
+def _list(start, stop, bits, some, states, row, mixed, firsts, columns, ranges, z, gap, rules, around, counts):
+    """Find targets of rows [start, stop): their pairs, as bits 3 (v + 1) + (u + 1) of steps; and how many there are.
 
     A target amid one colour keeps the derivative it has, which is that of a line.
     """
     height, width = bits.shape
+    sheets, slopes = np.empty(9, np.uint8), np.empty(4, z.dtype)
     for y in range(start, stop):
         if not (some[max(y - 1, 0)] or some[y] or some[min(y + 1, height - 1)]):
             continue
+        m = firsts[y]
         for x in range(width):
-            if states[y, x] == FLAT:
+            found = 0 if states[y, x] == FLAT else _steps(bits, y, x)
+            if not found:
                 continue
-            found = 0
-            for i in range(4):
-                u, v = STEPS[i]
-                if bits[y, x] >> i & 1:
-                    found |= 1 << (3 * (v + 1) + u + 1)
-                if 0 <= y - v < height and 0 <= x - u and bits[y - v, x - u] >> i & 1:
-                    found |= 1 << (3 * (1 - v) + 1 - u)
-            around[y, x] = found
-            counts[y] += found != 0
+            m = _place(columns, m, mixed, y, x)
+            if _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, found, y, x):
+                around[y, x] = found
+                counts[y] += 1
+
+
+@compiled
+def _steps(bits, y, x):
+    """The steps from a cell to the others of its pairs."""
+    height, found = len(bits), 0
+    for i in range(4):
+        u, v = STEPS[i]
+        if bits[y, x] >> i & 1:
+            found |= 1 << (3 * (v + 1) + u + 1)
+        if 0 <= y - v < height and 0 <= x - u and bits[y - v, x - u] >> i & 1:
+            found |= 1 << (3 * (1 - v) + 1 - u)
+    return found
+
+
+@compiled
+def _place(columns, m, mixed, y, x):
+    """Where in the list of mixed targets one stands that does not come before m, if it is mixed."""
+    while mixed[y, x] and columns[m] < x:
+        m += 1
+    return m
 
 
 @kernel
@@ -288,34 +307,31 @@ def _fill(
     ranges,
     z,
     gap,
-    around,
     rules,
+    around,
     found,
 ):
-    """Decide of which sheet the sources of the cells of pairs in rows [start, stop) are, and fill the lists."""
-    slopes, plain = np.empty(4, positions.dtype), np.zeros((9, 3, 2), ranges.dtype)
-    plain[:, 1, 1] = 1
+    """Fill the lists of the targets of rows [start, stop)."""
+    slopes = np.empty(4, positions.dtype)
     for y in range(start, stop):
         d, m = found.offsets[y], firsts[y]
         for x in range(row.shape[2] if found.offsets[y + 1] > d else 0):
-            if not around[y, x]:
-                continue
-            choice = plain
-            if mixed[y, x]:
-                while columns[m] < x:
-                    m += 1
-                choice = ranges[m]
-            found.columns[d] = -1
-            _sort(found.sheets[d], choice, row, around[y, x], y, x)
-            if _incline(slopes, found.sheets[d], z, gap, y, x) and _complete(
-                found.sheets[d], slopes, z, gap, rules.fit, y, x
-            ):
+            if around[y, x]:
+                m = _place(columns, m, mixed, y, x)
+                _decide(found.sheets[d], slopes, row, mixed, ranges, m, z, gap, rules, around[y, x], y, x)
                 _weigh(d, found, slopes, positions, rgba, row, y, x, scale, peak, gamma)
-            d += 1
+                d += 1
 
 
 @compiled
-def _sort(sheets, choice, row, around, y, x):
+def _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, around, y, x):
+    """Find of which sheet the sources of a cell of a pair are, and the sheets' slopes; whether that is possible."""
+    _sort(sheets, row, mixed[y, x], ranges, m, around, y, x)
+    return _incline(slopes, sheets, z, gap, y, x) and _complete(sheets, slopes, z, gap, rules.fit, y, x)
+
+
+@compiled
+def _sort(sheets, row, mixed, ranges, m, around, y, x):
     """Of which sheet sources are by pairs, and by layers paired front to front."""
     _, height, width = row.shape
     for n in range(9):
@@ -324,7 +340,7 @@ def _sort(sheets, choice, row, around, y, x):
         if around >> (8 - n) & 1:
             sheets[n] = SHEET_B
         elif 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0:
-            if choice[n, 1, 0] == 0 and choice[n, 1, 1] == 1:
+            if not mixed or (ranges[m, n, 1, 0] == 0 and ranges[m, n, 1, 1] == 1):
                 sheets[n] = SHEET_A
 
 
@@ -394,9 +410,10 @@ def _weigh(d, found, slopes, positions, rgba, row, y, x, scale, peak, gamma):
             wa, ax, ay = wa + w, ax + weights[n, 1], ay + weights[n, 2]
         else:
             wb, bx, by = wb + w, bx + weights[n, 1], by + weights[n, 2]
-    if not (wa > zero and wb > zero):
+    # Weights may vanish, of samples that are not where they were cast.
+    found.columns[d] = x if wa > zero and wb > zero else -1
+    if found.columns[d] < 0:
         return
-    found.columns[d] = x
     over = one / (wa + wb)
     for n in range(9):
         for j in range(3):
