@@ -30,8 +30,10 @@ SIZE, STEPS = (128, 128), {"lm": 60, "adam": 300}
 SPHERE, CARD_AT, CARD_STARTS = 0.8, 0.45, (0.2, 0.3, 0.55, 0.65)
 """The sphere's radius; the card's place along the view, and those that fits start from."""
 FINGERS, JOINTS = 5, 3
-HAND_SIZE, HAND_AT = 1.3, np.array([0.2, -0.3, 0.1, 0.05, -0.08, 0.12])
-"""The hand's extent, and its pose: rotation vector, then place."""
+HAND_SIZE, HAND_AT = 1.3, np.array([0.05, -0.04, 0.2, 0.05, -0.08, 0.0])
+"""The hand's extent, and its pose beside that of the box: rotation vector, then place."""
+PRESSED, TILT = 0.5, (-0.35, 0.1)
+"""How far below the box's upper side centres of spheres are, in terms of their radii; and the box's turns, radians."""
 TURN, SHIFT, RUNS = 6.0, 0.08, 10
 """How far off a start is: degrees, and share of the hand's size; and how many are tried."""
 COLORS = np.array([[0.85, 0.6, 0.45], [0.25, 0.45, 0.7]])
@@ -61,25 +63,25 @@ def cut_sphere(depth: Any) -> list[rts.Part]:
 
 
 def hand() -> rts.Part:
-    """Spheres: a palm, and joints of fingers that bend towards the box."""
+    """Spheres in the box's upper side: a palm, and joints of fingers. All that is seen of them is caps."""
     vertices, faces = icosphere(3)
-    spheres = [(0.0, -0.25, 0.0, 0.34)]
+    spheres = [(0.0, -0.25, 0.34)]
     for i in range(FINGERS):
         angle = np.radians(np.linspace(-60, 60, FINGERS)[i])
         for j in range(JOINTS):
             reach, radius = 0.42 + 0.17 * j, 0.13 - 0.02 * j
-            spheres.append((reach * np.sin(angle), -0.25 + reach * np.cos(angle), 0.02 - 0.05 * j**1.5, radius))
+            spheres.append((reach * np.sin(angle), -0.25 + reach * np.cos(angle), radius))
     count = len(vertices)
-    points = np.concatenate([np.array(s[:3]) + s[3] * vertices for s in spheres])
+    points = np.concatenate([np.array([x, y, -PRESSED * r]) + r * vertices for x, y, r in spheres])
     triangles = np.concatenate([faces + i * count for i in range(len(spheres))])
     shades = np.repeat(np.linspace(0.8, 1.15, len(spheres)), count)[:, None]
-    return unlit(points, triangles, (COLORS[0] * shades).clip(0, 1), "back")
+    return unlit(points @ rotation_xy(*TILT).T, triangles, (COLORS[0] * shades).clip(0, 1), "back")
 
 
 def pressed_hand(pose: Any) -> list[rts.Part]:
     """The hand at a pose (6,), and the box, whose upper side is seen slantwise."""
-    vertices, faces = box((-1.0, -0.9, -0.7), (1.0, 0.9, 0.02))
-    board = unlit(vertices @ rotation_xy(-0.35, 0.1).T, faces, COLORS[1], "back")
+    vertices, faces = box((-1.0, -0.9, -0.7), (1.0, 0.9, 0.0))
+    board = unlit(vertices @ rotation_xy(*TILT).T, faces, COLORS[1], "back")
     return [hand().replace(transform=rts.rigid(pose)), board]
 
 
