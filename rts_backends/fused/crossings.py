@@ -19,7 +19,8 @@ from rts_backends.fused.mixed import splat
 from rts_backends.fused.survey import FLAT
 
 BORDER = 3
-"""Of the array of gaps: so far from a cell are those that decide whether it is in a pair with a neighbour."""
+"""Rows around those of arrays of depths (2, ·, W), and rows and columns around those of their gaps (·, ·): so far from
+a cell are those that decide whether it is in a pair with a neighbour. Rows y below count from the first of all."""
 STEPS = ((1, 0), (0, 1), (1, 1), (1, -1))
 """Steps (x, y) from one cell of each pair to the other, which bits 0 to 3 stand for."""
 NEITHER, SHEET_A, SHEET_B = 2, 0, 1
@@ -90,12 +91,13 @@ def listed(arrays: tuple, choices: tuple, extent: np.floating) -> Crossings:
     kind = positions.dtype
     if len(row) < 2 or not (row[1] >= 0).any():
         return nothing(height, kind)
-    z, gap = np.empty((2, height, width), kind), _gaps(height, width, kind)
-    parallel(_gather, height, positions, row, z, gap, work=row[0].size)
-    rules = Rules.of(extent)
-    bits, some = _pairs(z, gap, rules)
+    rules, bits, some = Rules.of(extent), *_none(height, width)
+    parallel(_find_in_cells, height, positions, row, rules, bits, some, work=2 * row[0].size)
     if not some.any():
         return nothing(height, kind)
+    rows = height + 2 * BORDER
+    z, gap = np.empty((2, rows, width), kind), np.full((rows, width + 2 * BORDER), np.inf, kind)
+    parallel(_gather, height, positions, row, z, gap, work=row[0].size)
     around, counts = np.zeros((height, width), np.uint16), np.zeros(height, np.int64)
     seen = row, choices.mixed, choices.offsets, choices.columns, choices.ranges, z, gap
     parallel(_list, height, bits, some, choices.states, *seen, rules, around, counts, work=row[0].size)
@@ -107,79 +109,127 @@ def listed(arrays: tuple, choices: tuple, extent: np.floating) -> Crossings:
 def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np.ndarray) -> None:
     """Mark in `kept` (K, H, W) what `rts.splatting.crossings.sheets` keeps."""
     _, height, width = covered.shape
-    gap = _gaps(height, width, depth.dtype)
-    parallel(_subtract, height, covered, depth, gap, work=covered[0].size // 2)
-    bits, some = _pairs(depth, gap, Rules.of(extent))
+    bits, some = _none(height, width)
+    parallel(_find_in_depths, height, covered, depth, Rules.of(extent), bits, some, work=4 * covered[0].size)
     if some.any():
         parallel(_keep, height, covered, bits, some, specification.KEPT, kept, work=covered[0].size)
 
 
-def _gaps(height: int, width: int, kind: np.dtype) -> np.ndarray:
-    return np.full((height + 2 * BORDER, width + 2 * BORDER), np.inf, kind)
-
-
-def _pairs(z: np.ndarray, gap: np.ndarray, rules: Rules) -> tuple[np.ndarray, np.ndarray]:
-    """Bits (H, W) of the steps from each cell to the other of a pair, and whether there are any in each row."""
-    height, width = z.shape[1:]
-    bits, some = np.zeros((height, width), np.uint8), np.zeros(height, np.bool_)
-    parallel(_find, height, z, gap, rules, bits, some, work=4 * bits.size)
-    return bits, some
+def _none(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """No pairs: bits (H, W) of the steps from each cell to the other of a pair, and whether there are any in a row."""
+    return np.zeros((height, width), np.uint8), np.zeros(height, np.bool_)
 
 
 @kernel
 def _gather(start, stop, positions, row, z, gap):
-    """Depths of the first two layers, where there are both, and the gaps between them."""
+    """Depths of the first two layers of rows [start, stop), where there are both, and the gaps between them."""
     for y in range(start, stop):
-        for x in range(row.shape[2]):
-            i, j = row[0, y, x], row[1, y, x]
-            if i >= 0 and j >= 0:
-                z[0, y, x], z[1, y, x] = positions[i, 2], positions[j, 2]
-                gap[y + BORDER, x + BORDER] = positions[j, 2] - positions[i, 2]
+        _load_cells(z[:, y + BORDER], gap[y + BORDER], positions, row, y)
 
 
 @kernel
-def _subtract(start, stop, covered, depth, gap):
-    """The gaps between the first two layers."""
-    infinity = gap.dtype.type(np.inf)
-    for y in range(start, stop):
-        _subtract_row(gap[y + BORDER, BORDER:-BORDER], covered[0, y], covered[1, y], depth[0, y], depth[1, y], infinity)
+def _find_in_cells(start, stop, positions, row, rules, bits, some):
+    """Find pairs whose first cell lies in rows [start, stop)."""
+    z, gap, known = _window(start, stop, row.shape[2], positions.dtype)
+    for y in range(max(start - BORDER, 0), min(stop + BORDER, row.shape[1])):
+        at = y - start + BORDER
+        known[at] = _load_cells(z[:, at], gap[at], positions, row, y)
+    _find(start, stop, z, gap, known, rules, bits, some)
+
+
+@kernel
+def _find_in_depths(start, stop, covered, depth, rules, bits, some):
+    """Find pairs whose first cell lies in rows [start, stop)."""
+    z, gap, known = _window(start, stop, covered.shape[2], depth.dtype)
+    for y in range(max(start - BORDER, 0), min(stop + BORDER, covered.shape[1])):
+        at = y - start + BORDER
+        known[at] = _any(covered[1, y])
+        if known[at]:
+            z[0, at], z[1, at] = depth[0, y], depth[1, y]
+            _subtract(gap[at, BORDER:-BORDER], covered[0, y], covered[1, y], depth[0, y], depth[1, y])
+    _find(start, stop, z, gap, known, rules, bits, some)
 
 
 @compiled
-def _subtract_row(gap, covered0, covered1, depth0, depth1, infinity):
+def _window(start, stop, width, kind):
+    """Arrays of depths and gaps for some rows and those around them, and which of these have two layers somewhere."""
+    rows = stop - start + 2 * BORDER
+    gap = np.full((rows, width + 2 * BORDER), np.inf, kind)
+    return np.empty((2, rows, width), kind), gap, np.zeros(rows, np.bool_)
+
+
+@compiled
+def _load_cells(z, gap, positions, row, y):
+    """Depths (2, W) of a row and the gaps between them, infinity where there are not both; whether there are any."""
+    if not _some(row[1, y]):
+        return False
+    for x in range(row.shape[2]):
+        i, j = row[0, y, x], row[1, y, x]
+        if i >= 0 and j >= 0:
+            z[0, x], z[1, x] = positions[i, 2], positions[j, 2]
+            gap[x + BORDER] = positions[j, 2] - positions[i, 2]
+    return True
+
+
+@compiled
+def _subtract(gap, covered0, covered1, depth0, depth1):
+    infinity = gap.dtype.type(np.inf)
     for x in range(len(gap)):
         gap[x] = depth1[x] - depth0[x] if covered0[x] & covered1[x] else infinity
 
 
-@kernel
-def _find(start, stop, z, gap, rules, bits, some):
-    """Find pairs whose first cell lies in rows [start, stop)."""
-    _, _, width = z.shape
-    marks = np.empty((4, width), np.bool_)
-    for y in range(start, stop):
+# Loops that the compiler makes vector instructions of, as it does not of methods of arrays.
+
+
+@compiled
+def _any(flags):
+    most = np.uint8(0)
+    for flag in flags:
+        most = max(most, np.uint8(flag))
+    return most > 0
+
+
+@compiled
+def _some(cells):
+    most = cells.dtype.type(-1)
+    for i in cells:
+        most = max(most, i)
+    return most >= 0
+
+
+@compiled
+def _find(start, stop, z, gap, known, rules, bits, some):
+    """Find pairs in a window of rows, of those that are known to have two layers somewhere."""
+    width = z.shape[2]
+    marks = np.empty(width, np.uint8)
+    for y in range(BORDER, stop - start + BORDER):
+        if not known[y]:
+            continue
         for i in range(4):
             u, v = STEPS[i]
-            before, here = gap[y + BORDER - v, BORDER - u :], gap[y + BORDER, BORDER:]
-            there, after = gap[y + BORDER + v, BORDER + u :], gap[y + BORDER + 2 * v, BORDER + 2 * u :]
-            _suspect(marks[i], before, here, there, after)
-        for x in range(width):
-            if not (marks[0, x] | marks[1, x] | marks[2, x] | marks[3, x]):
+            before, here = gap[y - v, BORDER - u :], gap[y, BORDER:]
+            _suspect(marks, before, here, gap[y + v, BORDER + u :], gap[y + 2 * v, BORDER + 2 * u :])
+            if not _any(marks):
                 continue
-            for i in range(4):
-                if marks[i, x] and _crosses(z, gap, rules, y, x, STEPS[i][1], STEPS[i][0]):
-                    bits[y, x] |= np.uint8(1 << i)
-                    some[y] = True
+            for x in range(width):
+                if marks[x] and _crosses(z, gap, rules, y, x, v, u):
+                    bits[start + y - BORDER, x] |= np.uint8(1 << i)
+                    some[start + y - BORDER] = True
 
 
 @compiled
 def _suspect(marks, before, here, there, after):
-    """Mark cells where the gap grows on both sides of a pair, or one side is not known: infinity.
+    """Mark cells where the gap grows on both sides of a pair; where it is not known it is infinity.
 
-    R is at least what the gaps alone change by, |before − 2 here − there| + |after − 2 there − here|.
+    R is at least what the gaps alone change by, |before − 2 here − there| + |after − 2 there − here|, and at most half
+    of here + there: 3 / 2, 1 / 2 and 5 / 2 less what rounding may do.
     """
-    least = here.dtype.type(2.49)
+    kind = here.dtype.type
+    own, other, both = kind(1.49), kind(0.49), kind(2.49)
     for x in range(len(marks)):
-        marks[x] = before[x] + after[x] > least * (here[x] + there[x])
+        h, t, b, a = here[x], there[x], before[x], after[x]
+        grows = (b > own * h + other * t) & (a > own * t + other * h) & (b + a > both * (h + t))
+        marks[x] = np.uint8(grows)
 
 
 @compiled
@@ -194,7 +244,7 @@ def _crosses(z, gap, rules, y, x, v, u):
 @compiled
 def _two(gap, y, x):
     """Whether a cell has two layers."""
-    return gap[y + BORDER, x + BORDER] < np.inf
+    return gap[y, x + BORDER] < np.inf
 
 
 @compiled
@@ -204,7 +254,7 @@ def _ratio(z, gap, rules, y, x, v, u):
     if not (_two(gap, y, x) and _two(gap, y + v, x + u)):
         return infinity
     before, after = _two(gap, y - v, x - u), _two(gap, y + 2 * v, x + 2 * u)
-    total = gap[y + BORDER, x + BORDER] + gap[y + v + BORDER, x + u + BORDER]
+    total = gap[y, x + BORDER] + gap[y + v, x + u + BORDER]
     if not (before or after) or not total > rules.least:
         return infinity
     q0, q1, p0, p1 = z[0, y, x], z[1, y, x], z[0, y + v, x + u], z[1, y + v, x + u]
@@ -327,7 +377,8 @@ def _fill(
 def _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, around, y, x):
     """Find of which sheet the sources of a cell of a pair are, and the sheets' slopes; whether that is possible."""
     _sort(sheets, row, mixed[y, x], ranges, m, around, y, x)
-    return _incline(slopes, sheets, z, gap, y, x) and _complete(sheets, slopes, z, gap, rules.fit, y, x)
+    at = y + BORDER, x
+    return _incline(slopes, sheets, z, gap, *at) and _complete(sheets, slopes, z, gap, rules.fit, *at)
 
 
 @compiled
