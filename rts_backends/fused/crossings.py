@@ -23,6 +23,8 @@ BORDER = 3
 a cell are those that decide whether it is in a pair with a neighbour. Rows y below count from the first of all."""
 STEPS = ((1, 0), (0, 1), (1, 1), (1, -1))
 """Steps (x, y) from one cell of each pair to the other, which bits 0 to 3 stand for."""
+CHUNK, FEW = 16, 8
+"""Cells that are passed over at once; and the share of a row's cells, 1 / FEW, that are looked at one by one."""
 NEITHER, SHEET_A, SHEET_B = 2, 0, 1
 """Of which sheet a source is."""
 
@@ -92,7 +94,7 @@ def listed(arrays: tuple, choices: tuple, extent: np.floating) -> Crossings:
     if len(row) < 2 or not (row[1] >= 0).any():
         return nothing(height, kind)
     rules, bits, some = Rules.of(extent), *_none(height, width)
-    parallel(_find_in_cells, height, positions, row, rules, bits, some, work=2 * row[0].size)
+    parallel(_find_in_cells, height, positions, row, rules, bits, some, work=row[0].size)
     if not some.any():
         return nothing(height, kind)
     rows = height + 2 * BORDER
@@ -123,52 +125,59 @@ def _none(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 @kernel
 def _gather(start, stop, positions, row, z, gap):
     """Depths of the first two layers of rows [start, stop), where there are both, and the gaps between them."""
+    columns = np.empty(row.shape[2], np.int32)
     for y in range(start, stop):
-        _load_cells(z[:, y + BORDER], gap[y + BORDER], positions, row, y)
+        _load_cells(z[:, y + BORDER], gap[y + BORDER], columns, positions, row, y)
 
 
 @kernel
 def _find_in_cells(start, stop, positions, row, rules, bits, some):
     """Find pairs whose first cell lies in rows [start, stop)."""
-    z, gap, known = _window(start, stop, row.shape[2], positions.dtype)
+    z, gap, counts = _window(start, stop, row.shape[2], positions.dtype)
+    columns = np.empty((len(gap), row.shape[2]), np.int32)
     for y in range(max(start - BORDER, 0), min(stop + BORDER, row.shape[1])):
         at = y - start + BORDER
-        known[at] = _load_cells(z[:, at], gap[at], positions, row, y)
-    _find(start, stop, z, gap, known, rules, bits, some)
+        counts[at] = _load_cells(z[:, at], gap[at], columns[at], positions, row, y)
+    _find(start, stop, z, gap, counts, columns, rules, bits, some)
 
 
 @kernel
 def _find_in_depths(start, stop, covered, depth, rules, bits, some):
     """Find pairs whose first cell lies in rows [start, stop)."""
-    z, gap, known = _window(start, stop, covered.shape[2], depth.dtype)
+    z, gap, counts = _window(start, stop, covered.shape[2], depth.dtype)
     for y in range(max(start - BORDER, 0), min(stop + BORDER, covered.shape[1])):
         at = y - start + BORDER
-        known[at] = _any(covered[1, y])
-        if known[at]:
+        if _any(covered[1, y]):
+            counts[at] = covered.shape[2]
             z[0, at], z[1, at] = depth[0, y], depth[1, y]
             _subtract(gap[at, BORDER:-BORDER], covered[0, y], covered[1, y], depth[0, y], depth[1, y])
-    _find(start, stop, z, gap, known, rules, bits, some)
+    _find(start, stop, z, gap, counts, np.empty((len(gap), 0), np.int32), rules, bits, some)
 
 
 @compiled
 def _window(start, stop, width, kind):
-    """Arrays of depths and gaps for some rows and those around them, and which of these have two layers somewhere."""
+    """Arrays of depths and gaps for some rows and those around them, and how many cells of each have two layers."""
     rows = stop - start + 2 * BORDER
     gap = np.full((rows, width + 2 * BORDER), np.inf, kind)
-    return np.empty((2, rows, width), kind), gap, np.zeros(rows, np.bool_)
+    return np.empty((2, rows, width), kind), gap, np.zeros(rows, np.int64)
 
 
 @compiled
-def _load_cells(z, gap, positions, row, y):
-    """Depths (2, W) of a row and the gaps between them, infinity where there are not both; whether there are any."""
-    if not _some(row[1, y]):
-        return False
-    for x in range(row.shape[2]):
-        i, j = row[0, y, x], row[1, y, x]
-        if i >= 0 and j >= 0:
-            z[0, x], z[1, x] = positions[i, 2], positions[j, 2]
-            gap[x + BORDER] = positions[j, 2] - positions[i, 2]
-    return True
+def _load_cells(z, gap, columns, positions, row, y):
+    """Fill depths (2, W) of a row, gaps and columns of its cells of two layers; returns how many there are."""
+    width, count = row.shape[2], 0
+    for left in range(0, width, CHUNK):
+        right = min(left + CHUNK, width)
+        if not _some(row[1, y, left:right]):
+            continue
+        for x in range(left, right):
+            i, j = row[0, y, x], row[1, y, x]
+            if j >= 0 and i >= 0:
+                z[0, x], z[1, x] = positions[i, 2], positions[j, 2]
+                gap[x + BORDER] = positions[j, 2] - positions[i, 2]
+                columns[count] = x
+                count += 1
+    return count
 
 
 @compiled
@@ -198,17 +207,25 @@ def _some(cells):
 
 
 @compiled
-def _find(start, stop, z, gap, known, rules, bits, some):
-    """Find pairs in a window of rows, of those that are known to have two layers somewhere."""
+def _find(start, stop, z, gap, counts, columns, rules, bits, some):
+    """Find pairs in a window of rows, of which each has so many cells of two layers; the columns of these, if few."""
     width = z.shape[2]
     marks = np.empty(width, np.uint8)
     for y in range(BORDER, stop - start + BORDER):
-        if not known[y]:
+        if counts[y] == 0:
             continue
         for i in range(4):
             u, v = STEPS[i]
             before, here = gap[y - v, BORDER - u :], gap[y, BORDER:]
-            _suspect(marks, before, here, gap[y + v, BORDER + u :], gap[y + 2 * v, BORDER + 2 * u :])
+            there, after = gap[y + v, BORDER + u :], gap[y + 2 * v, BORDER + 2 * u :]
+            if FEW * counts[y] < width:
+                for n in range(counts[y]):
+                    x = columns[y, n]
+                    if _grows(before[x], here[x], there[x], after[x]) and _crosses(z, gap, rules, y, x, v, u):
+                        bits[start + y - BORDER, x] |= np.uint8(1 << i)
+                        some[start + y - BORDER] = True
+                continue
+            _suspect(marks, before, here, there, after)
             if not _any(marks):
                 continue
             for x in range(width):
@@ -219,17 +236,20 @@ def _find(start, stop, z, gap, known, rules, bits, some):
 
 @compiled
 def _suspect(marks, before, here, there, after):
-    """Mark cells where the gap grows on both sides of a pair; where it is not known it is infinity.
-
-    R is at least what the gaps alone change by, |before − 2 here − there| + |after − 2 there − here|, and at most half
-    of here + there: 3 / 2, 1 / 2 and 5 / 2 less what rounding may do.
-    """
-    kind = here.dtype.type
-    own, other, both = kind(1.49), kind(0.49), kind(2.49)
+    """Mark cells where the gap grows on both sides of a pair."""
     for x in range(len(marks)):
-        h, t, b, a = here[x], there[x], before[x], after[x]
-        grows = (b > own * h + other * t) & (a > own * t + other * h) & (b + a > both * (h + t))
-        marks[x] = np.uint8(grows)
+        marks[x] = np.uint8(_grows(before[x], here[x], there[x], after[x]))
+
+
+@compiled
+def _grows(b, h, t, a):
+    """Whether the gap grows from a pair's two cells on either side; where it is not known it is infinity.
+
+    R is at least what the gaps alone change by, |b − 2 h − t| + |a − 2 t − h|, and at most half of h + t: 3 / 2, 1 / 2
+    and 5 / 2 less what rounding may do.
+    """
+    own, other, both = np.float32(1.49), np.float32(0.49), np.float32(2.49)
+    return (b > own * h + other * t) & (a > own * t + other * h) & (b + a > both * (h + t))
 
 
 @compiled
