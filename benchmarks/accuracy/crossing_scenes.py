@@ -85,7 +85,7 @@ def bar_through_card(size: int) -> Scene:
 
 def plate(size: int, cull: str = "none") -> Scene:
     """A thin closed plate: beside the line its back lies between the two sheets."""
-    vertices, faces = box((-0.7, -0.7, -0.005), (0.7, 0.7, 0.005))
+    vertices, faces = box((-0.7, -0.7, -0.001), (0.7, 0.7, 0.001))
     part = unlit(vertices @ rotation_xy(0.15, 0.35).T, faces, PLANE_COLORS[1], cull)
     return Scene(
         "thin plate" if cull == "none" else "thin plate, culled",
@@ -93,8 +93,25 @@ def plate(size: int, cull: str = "none") -> Scene:
         (part, plane(0.3, 0.15, 0.02, PLANE_COLORS[0])),
         (nearer(0.5 * pixel(DISTANCE, size)), None),
         (2, 4),
-        f"a closed plate of a hundredth of its width through a plane comes nearer; cull {cull}",
+        f"a closed plate, 700 times as wide as it is thick, through a plane comes nearer; cull {cull}",
     )
+
+
+def nearly_one(size: int) -> Scene:
+    """Over a pixel the depths of the planes differ by less than rounding may."""
+    slopes = (0.3, 0.1), (0.27, 0.08)
+    parts = [plane(*s, h, c) for s, h, c in zip(slopes, (0.002, 0.0), PLANE_COLORS, strict=True)]
+    rise = float(np.linalg.norm(np.subtract(*slopes))) * pixel(DISTANCE, size)
+    note = "two planes that cross at two degrees; one comes nearer"
+    return Scene("planes at two degrees", (size, size), tuple(parts), (nearer(rise), None), (2, 4), note)
+
+
+def three_planes(size: int) -> Scene:
+    angles, colors = np.radians([20, 145, 260]), (*PLANE_COLORS, (0.3, 0.8, 0.4))
+    parts = [plane(0.4 * np.cos(a), 0.4 * np.sin(a), 0.01, c) for a, c in zip(angles, colors, strict=True)]
+    moves = nearer(0.7 * pixel(DISTANCE, size)), None, None
+    note = "three planes that meet in a point; one comes nearer"
+    return Scene("three planes", (size, size), tuple(parts), moves, (2, 4), note)
 
 
 CROSSING = {
@@ -106,4 +123,6 @@ CROSSING = {
     "bar through card": bar_through_card,
     "thin plate": plate,
     "thin plate, culled": lambda size: plate(size, "back"),
+    "planes at two degrees": nearly_one,
+    "three planes": three_planes,
 }

@@ -17,10 +17,15 @@ import torch
 import rts
 from benchmarks.accuracy import methods, scenes
 from benchmarks.accuracy.crossing_scenes import CROSSING
+from benchmarks.accuracy.figures import CONTRAST_LOW, show, signed
 from benchmarks.accuracy.scores import scores
 from benchmarks.accuracy.truth import truth
 from benchmarks.report import table
+from rts.diagnostics.comparison.scores import low_pass
 
+FAILURES = "thin plate", "planes at two degrees", "three planes", "bar through card"
+SHOWN = slice(40, 216)
+"""Rows and columns of pictures."""
 VISIBLE = rts.plugin("rts.splatters", "visible")
 SETTINGS = ((2, 1), (4, 1), (2, 2), (4, 2))
 """K, and s for s² samples a pixel."""
@@ -75,6 +80,24 @@ def crossing_lines(names: list[str], folder: Path, spp: int) -> list[list[str]]:
     return lines
 
 
+def pictures(folder: Path, path: Path) -> None:
+    """What is left where lines of crossing fail, with one sample a pixel."""
+    from matplotlib.figure import Figure
+
+    titles = "image", "derivative, truth", "as samples", "as depths", f"low-passed difference × {CONTRAST_LOW:g}"
+    figure = Figure(figsize=(2.9 * 5, 2.9 * len(FAILURES) + 0.4), layout="constrained")
+    for n, (line, name) in enumerate(zip(figure.subplots(len(FAILURES), 5), FAILURES, strict=True)):
+        chosen = scene(name)
+        against = truth(chosen, folder, chosen.step)
+        before, found = (derivative(chosen, chosen.layers[0], 1, on) for on in (False, True))
+        difference = signed(low_pass(found - against.derivative), CONTRAST_LOW)
+        seen = against.image.clip(0, 1), *(signed(x) for x in (against.derivative, before, found)), difference
+        for axes, picture, title in zip(line, seen, titles, strict=True):
+            show(axes, picture[SHOWN, SHOWN], "" if n else title)
+        line[0].set_ylabel(name, fontsize=13)
+    figure.savefig(path, dpi=100)
+
+
 def unchanged(name: str) -> list[str]:
     """By how much derivatives differ, in terms of the largest."""
     chosen, cells = scene(name), []
@@ -91,10 +114,13 @@ def main() -> None:
     parser.add_argument("--truth", type=Path, default=Path("out/truth"), help="where truths are kept")
     parser.add_argument("--scenes", nargs="+", default=["spheres", *CROSSING], choices=["spheres", *CROSSING])
     parser.add_argument("--spp", type=int, default=0, help="samples a pixel of Mitsuba, 0 for without other renderers")
+    parser.add_argument("--pictures", type=Path, help="a PNG of failures, to be written")
     parser.add_argument("--others", action="store_true", help="the scenes where no surfaces cross, too")
     args = parser.parse_args()
     lines = crossing_lines(args.scenes, args.truth, args.spp)
     print(table(["scene", "method", "as samples", "as depths", "noise"], lines))
+    if args.pictures:
+        pictures(args.truth, args.pictures)
     if args.others:
         print(table(["scene", *(methods.name_of("visible", *s) for s in SETTINGS)], map(unchanged, OTHERS)))
 
