@@ -253,7 +253,7 @@ def turning(mended):
 
 
 def crossing(mended):
-    """Two cards that pass through one another; one moves in depth."""
+    """Two cards that pass through one another; one moves in depth, and the splatter does not tell the line."""
     vertices, faces = quad(-13.2, 13.3, -9.4, 9.1)
     tilted = vertices.copy()
     tilted[:, 2] = 0.7 * tilted[:, 0] - (40 if mended else 0)
@@ -264,7 +264,8 @@ def crossing(mended):
         part = flat(tilted, faces, RED)
         return [level, moved(part, rts.namespace(p).stack([0 * p, 0 * p, p]))], camera
 
-    return scene, np.array(0.3), {}
+    splatter = rts.plugin("rts.splatters", "visible")(crossings=False)
+    return scene, np.array(0.3), {"splatter": splatter}
 
 
 SCENES = {

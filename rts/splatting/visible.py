@@ -8,7 +8,7 @@ import numpy as np
 
 from rts.engines import engine_of
 from rts.records import Splats
-from rts.splatting import rims
+from rts.splatting import crossings, rims
 from rts.splatting.kernel import Kernel
 from rts.splatting.layers import NEIGHBOURS, Depths, Layers, all_of, nearest, normalised, over
 from rts.trees import Array
@@ -35,12 +35,15 @@ class Visible(Kernel):
     Attributes:
         rims: whether coverage moves as outlines do, extrapolated from the samples inside of them (`rims.py`); otherwise
             it moves as the samples, which on a smooth rim that turns move faster. The image is the same.
+        crossings: whether lines where two surfaces pass through one another move as their depths say (`crossings.py`);
+            otherwise as the samples beside them, which hardly do. The image is the same.
     """
 
     epsilon: float = 1e-3
     calibration: float | None = None
     rims: bool = True
-    reach = 3  # Depths three cells away may decide how an outline moves.
+    crossings: bool = True
+    reach = 3  # Depths three cells away may decide how an outline or a line of crossing moves.
 
     def accumulate(self, splats: Splats) -> Array:
         """See `Kernel`."""
@@ -66,16 +69,20 @@ class Visible(Kernel):
                 surface = surface + xp.where((s == k)[..., None], given, 0.0)
                 behind = behind + xp.where((hidden == k)[..., None], given, 0.0)
         colors = [normalised(b, xp) for b in (front, surface, behind)]
-        if self.rims and engine_of(splats.positions).differentiates:
+        differentiates = engine_of(splats.positions).differentiates
+        if self.rims and differentiates:
             gains = rims.gains(self, layers, shift, splats.part)
             for i, (total, gain) in enumerate(zip((front, surface), gains, strict=True)):
                 colors[i] = colors[i] + rims.spread(total, gain)
-        return over(colors[0], over(*colors[1:]))
+        image = over(colors[0], over(*colors[1:]))
+        lines = self.crossings and none > 1 and differentiates
+        return crossings.with_lines(self, layers, shift, image) if lines else image
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """See `rts.Splatter`: those of `Kernel`, and second layers beside outlines, which may be chords' other ends."""
+        """See `rts.Splatter`: those of `Kernel`, what may be chords' other ends, both layers near lines of crossing."""
         kept = super().needed(covered, depth)
-        return kept | rims.chords(covered) if self.rims else kept
+        kept = kept | rims.chords(covered) if self.rims else kept
+        return kept | crossings.sheets(covered, depth) if self.crossings else kept
 
     def plain(self, depths: Depths, margin: float) -> Array:
         """See `Kernel`: where no source has a hidden layer in play."""

@@ -20,7 +20,8 @@ from rts.splatting.layers import OFFSETS, check_rows
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only
 from rts_backends.fused import choices as listing
-from rts_backends.fused import mixed, outlines, stencil
+from rts_backends.fused import crossings, mixed, outlines, stencil
+from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
 from rts_backends.fused.survey import BLOCK, survey
 
@@ -35,6 +36,7 @@ class Settings(NamedTuple):
         gamma: the calibration.
         border: rows and columns at each side of the cells that are no part of the image.
         rims: whether coverage moves as outlines do, in `visible`.
+        crossings: whether lines where surfaces cross move as their depths say, in `visible`.
     """
 
     kind: str
@@ -43,6 +45,7 @@ class Settings(NamedTuple):
     gamma: float
     border: int = 0
     rims: bool = False
+    crossings: bool = False
 
 
 class Choices(NamedTuple):
@@ -104,6 +107,7 @@ class Cells:
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
         self.visible, self.border = settings.kind == "visible", settings.border
         self.rims = self.visible and settings.rims
+        self.crosses = self.visible and settings.crossings
         self._numbers = tuple(map(positions.dtype.type, _scale_and_peak(settings) + (settings.gamma,)))
         self._reach = positions.dtype.type(_reach(settings))
         if choices is not None:
@@ -193,6 +197,14 @@ class Cells:
             parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=200 * len(found.columns))
         return found
 
+    @cached_property
+    def crossings(self) -> Crossings:
+        """The targets whose derivative is that of a line where surfaces cross."""
+        if not self.crosses:
+            return crossings.nothing(self.row.shape[1], self.positions.dtype)
+        arrays = self.positions, self.rgba, self.row, *self._numbers
+        return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent))
+
     def image(self, out: np.ndarray) -> None:
         """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""
         if out.size:
@@ -214,6 +226,10 @@ class Cells:
             np.empty((0, 3), kind) if g_positions is None else g_positions,
             np.empty((0, 4), kind) if g_rgba is None else g_rgba,
         )
+        given, crossed = g, len(self.crossings.columns) > 0
+        if crossed:
+            g = given.copy()
+            crossings.hide(self.crossings, self.border, g)
         g = read_only(g)
         plain = *self.plain_arguments, self.choices.states, self.border
         parallel(stencil.pull, height, *plain, g, *found, work=self._plain_work)
@@ -223,6 +239,8 @@ class Cells:
             parallel(mixed.pull, height, *self.mixed_arguments, adjoints, *found, work=self._mixed_work)
         if self.rims and g_positions is not None:
             outlines.pull(self.row, self.outlines, self.border, g, g_positions)
+        if crossed:
+            crossings.pull(self.rgba, self.row, self.crossings, self.border, read_only(given), *found)
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
         """Fill tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4), or None."""
@@ -239,6 +257,9 @@ class Cells:
         if self.rims and t_positions is not None:
             given = self.row, self.outlines, tangents[0], self.border
             parallel(outlines.push, out.shape[1], *given, out, work=80 * len(self.outlines.columns) * len(out))
+        if count := len(self.crossings.columns):
+            given = self.rgba, self.row, self.crossings, *tangents, self.border
+            parallel(crossings.push, out.shape[1], *given, out, work=80 * count * len(out))
 
     def _vjp_of_repeated(self, g: np.ndarray, *results: np.ndarray | None) -> None:
         """`vjp` with a copy of the sample for each cell, whose gradients are then added in the order of the cells."""
@@ -249,6 +270,7 @@ class Cells:
         copy = object.__new__(Cells)
         copy.__dict__.update(self.__dict__, choices=self.choices._replace(repeated=False), row=read_only(own))
         copy.__dict__.pop("outlines", None)  # They name samples.
+        copy.__dict__.pop("crossings", None)
         copy.positions, copy.rgba = read_only(self.positions[index]), read_only(self.rgba[index])
         found = [None if x is None else np.zeros((len(index), x.shape[1]), x.dtype) for x in results]
         copy.vjp(g, *found)

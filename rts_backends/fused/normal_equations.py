@@ -20,6 +20,7 @@ from rts.records import ArraySpec
 from rts.threads import parallel, read_only
 from rts.trees import Array
 from rts_backends.fused.cells import Cells, Settings
+from rts_backends.fused.crossings import change_of
 from rts_backends.fused.mixed import changes_of
 from rts_backends.fused.outlines import gain
 from rts_backends.fused.rows import (
@@ -93,7 +94,7 @@ def normal_equations(
 
     Args:
         cells: the samples, s · H times s · W without their border; a pixel of the image is the mean of s² of them.
-        t_positions: (T, N, 2), or more columns, tangents of their positions along T directions.
+        t_positions: (T, N, 3), tangents of their positions along T directions.
         t_rgba: (T, N, 4) of their colours; None for zeros.
         target: (H, W, C), of alpha (C = 1), colours (3) or both (4).
         weights: (H, W, 1) or (H, W, C), or None.
@@ -106,7 +107,7 @@ def normal_equations(
     fields = (read_only(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
     bands, fine = -(-len(target) // BAND), _cells_a_pixel(cells.row.shape, cells.border, target.shape)
     sums = np.zeros((bands, count + 1, count + 1))
-    drawn = cells.plain_arguments, cells.row, cells.choices, cells.outlines
+    drawn = cells.plain_arguments, cells.row, cells.choices, cells.outlines, cells.crossings
     given = *drawn, tangents, tuple(fields), cells.border, fine
     parallel(_accumulate, bands, ALPHA if target.shape[2] == 1 else COLORS, *given, sums)
     total = sums.sum(axis=0) / max(target.size, 1)
@@ -125,7 +126,7 @@ def _any(tangents: np.ndarray) -> bool:
 
 
 @kernel
-def _accumulate(start, stop, planes, plain, row, choices, outlines, tangents, fields, border, fine, sums):
+def _accumulate(start, stop, planes, plain, row, choices, outlines, crossings, tangents, fields, border, fine, sums):
     """Products (B, T + 1, T + 1) of tangents and, last, residuals in bands [start, stop); the lower triangles.
 
     Of rows of pixels that are means of `fine` rows and columns of cells.
@@ -179,6 +180,7 @@ def _accumulate(start, stop, planes, plain, row, choices, outlines, tangents, fi
                     composite(value, layers, count)
                     _mix(change, value, plain, row, choices, tangents, border, y, left, count, changes)
                     _move_outlines(change, row, outlines, t_positions, border, y, left, count)
+                    _move_lines(change, rgba, row, crossings, tangents, border, y, left, count)
                 else:
                     fill(value, rgba, row[0, y + border, border:], choices.states[y + border, border:], left, count)
                 if fine > 1:
@@ -239,6 +241,21 @@ def _move_outlines(change, row, outlines, t_positions, border, y, left, count):
             front, surface = gain(d, t_positions[n], row, outlines, y + border)
             for c in range(4):
                 change[n, c * PITCH + j] += front * outlines.changes[d, 0, c] + surface * outlines.changes[d, 1, c]
+
+
+@compiled
+def _move_lines(change, rgba, row, crossings, tangents, border, y, left, count):
+    """The derivatives of targets beside lines of crossing in a row of a tile, in place of all others."""
+    t_positions, t_rgba = tangents
+    pixel = np.empty(4, change.dtype)
+    for d in range(crossings.offsets[y + border], crossings.offsets[y + border + 1]):
+        j = crossings.columns[d] - border - left
+        if not 0 <= j < count:
+            continue
+        for n in range(len(change)):
+            change_of(pixel, d, crossings, rgba, row, y + border, t_positions[n], t_rgba[n])
+            for c in range(4):
+                change[n, c * PITCH + j] = pixel[c]
 
 
 @compiled

@@ -8,6 +8,8 @@ import numpy as np
 from rts.splatting.kernel import LEAST_EPSILON, TIE
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel
+from rts_backends.fused import crossings
+from rts_backends.fused.cells import Settings
 
 HALO = 3
 """Rows that the decision for a row looks at on either side: its marks, their neighbours, and those one farther on."""
@@ -19,10 +21,11 @@ compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
 
 
-def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, rims: bool, epsilon: float) -> np.ndarray:
-    """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W); for `Visible`, with or without rims, or `Multi`."""
+def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.ndarray:
+    """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W); for `Visible` or `Multi`."""
     layers, height, _ = covered.shape
-    if layers == 1 or not (visible or epsilon >= LEAST_EPSILON):
+    visible, rims = settings.kind == "visible", settings.rims
+    if layers == 1 or not (visible or settings.epsilon >= LEAST_EPSILON):
         return covered
     covered, depth = np.ascontiguousarray(covered), np.ascontiguousarray(depth)
     extent, kept = np.zeros((2, height), depth.dtype), np.empty_like(covered)
@@ -30,6 +33,8 @@ def needed(covered: np.ndarray, depth: np.ndarray, visible: bool, rims: bool, ep
     least, largest, kind = extent[0].min(initial=0), extent[1].max(initial=0), depth.dtype.type
     numbers = kind(2 * (largest - least)), kind(TIE * max(largest, -least)), kind(CONTINUED)
     parallel(_keep, height, covered, depth, visible, rims, *numbers, kept, work=2 * covered.size)
+    if settings.crossings:
+        crossings.sheets(covered, depth, kind(largest - least), kept)
     return kept
 
 

@@ -69,7 +69,7 @@ class _Fused(splatting.Kernel):
             return super().needed(covered, depth)
         from rts_backends.fused import pruning
 
-        return pruning.needed(covered, depth, self.kind == "visible", self._settings(0).rims, self.epsilon)
+        return pruning.needed(covered, depth, self._settings(0))
 
 
 class Single(_Fused, splatting.Single):
@@ -90,7 +90,7 @@ class Visible(_Fused, splatting.Visible):
     kind = "visible"
 
     def _settings(self, border: int) -> Settings:
-        return super()._settings(border)._replace(rims=self.rims)
+        return super()._settings(border)._replace(rims=self.rims, crossings=self.crossings)
 
 
 # ---------------------------------------------------------------------------------------------------- the operation
@@ -100,7 +100,7 @@ _SPECIFICATIONS = {"single": splatting.Single, "multi": splatting.Multi, "visibl
 
 def _specification(positions: Array, rgba: Array, row: Array, part: Array, *, settings: Settings) -> Array:
     given = settings.sigma, settings.epsilon, settings.gamma
-    options = {"rims": settings.rims} if settings.kind == "visible" else {}
+    options = {"rims": settings.rims, "crossings": settings.crossings} if settings.kind == "visible" else {}
     splats = Splats(positions, rgba, row, part if part.shape[0] else None)
     return without_border(_SPECIFICATIONS[settings.kind](*given, **options).accumulate(splats), settings.border)
 

@@ -225,7 +225,7 @@ def _crossing(case: _Case, touched: Touched) -> None:
         mask[apron:-apron, apron:-apron],
         "crossing",
         "parts pass through one another there, and their line of crossing moves otherwise than either",
-        "Part them, or model the line as an edge of both.",
+        'Take the splatter "visible", whose lines of crossing move, with more layers or samples; or part them.',
     )
 
 
