@@ -21,9 +21,10 @@ from rts.camera import Camera
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel
+from rts_backends import raster_cells
 from rts_backends.triangles import facing, owns, pixel_matrix, to_corner
 
-BAND_ROWS = 16
+BAND_ROWS = raster_cells.SIDE
 CHUNK = 1 << 11
 BLOCK = 64
 LONG_BLOCK = 256
@@ -58,6 +59,24 @@ class Raster(TriangleSampler):
 
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
+        return self._drawn(prepared, camera, size, layers, cull, None)
+
+    def rasterize_cells(
+        self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
+    ) -> Fragments:
+        """See `TriangleSampler.rasterize_cells`: triangles that touch no block of these cells are passed over."""
+        return self._drawn(prepared, camera, size, layers, cull, cells)
+
+    def _drawn(
+        self,
+        prepared: Proxy,
+        camera: Camera,
+        size: tuple[int, int],
+        layers: int,
+        cull: str,
+        cells: np.ndarray | None,
+    ) -> Fragments:
+        """Fragments of all cells, or of some."""
         height, width = size
         # With unsigned indices compiled code need not look for negative ones, which count from the end.
         vertices, faces = prepared.vertices, np.asarray(prepared.faces, np.int32).view(np.uint32)
@@ -77,16 +96,26 @@ class Raster(TriangleSampler):
         spans, counts = np.empty((chunks, 2), np.int64), np.zeros((bands, chunks), np.int64)
         given = vertices, faces, screen, matrix, height, width, step, keep
         parallel(_select, chunks, *given, listed, spans, counts, work=10 * len(faces))
+        blocks = None if cells is None else raster_cells.Blocks.of(cells, size)
+        if blocks is not None:
+            parallel(raster_cells.narrow, chunks, listed, blocks.table, spans, counts, work=5 * int(counts.sum()))
         offsets = np.append(0, np.cumsum(counts.sum(axis=1)))
         places = offsets[:-1, None] + np.cumsum(counts, axis=1) - counts
         items = np.empty(offsets[-1], np.uint32)
         parallel(_sort, chunks, listed, spans, places, items, work=8 * len(items))
-        fragments = Fragments(
-            np.empty((layers, height, width), np.int32),
-            np.empty((layers, height, width, 2), np.float32),
-            np.empty((layers, height, width), np.float32),
-        )
-        parallel(_draw, bands, offsets, items, listed, vertices, matrix, -camera.view[2], keep, *fragments)
+        given = offsets, items, listed, vertices, matrix, -camera.view[2], keep
+        if blocks is None or cells is None:
+            fragments = Fragments(
+                np.empty((layers, height, width), np.int32),
+                np.empty((layers, height, width, 2), np.float32),
+                np.empty((layers, height, width), np.float32),
+            )
+            parallel(_draw, bands, *given, *fragments)
+        else:
+            fragments = blocks.nothing(cells, layers)
+            flat = [x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments]
+            nearest = np.full((layers, cells.size), np.inf)
+            parallel(_draw_cells, bands, *given, blocks.table, blocks.numbers, nearest, *flat)
         self._scratch = {key: (screen, listed)}
         return fragments
 
@@ -264,6 +293,92 @@ def _draw(first, last, offsets, items, listed, vertices, matrix, view_depth, kee
                     depths[k, j, i] = z if z < np.inf else 0.0
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _draw_cells(
+    first,
+    last,
+    offsets,
+    items,
+    listed,
+    vertices,
+    matrix,
+    view_depth,
+    keep,
+    table,
+    members,
+    nearest,
+    triangle_ids,
+    barycentrics,
+    depths,
+):  # fmt: skip
+    """As `_draw`, of some cells: arrays (K, M) are of their list, in which `table` and `members` of `Blocks` look up."""
+    entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
+    numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
+    most = 4 * BLOCK
+    hits = np.empty((most + table.shape[1] * BAND_ROWS, 2), np.int32)
+    for band in range(first, last):
+        top = band * BAND_ROWS
+        for start in range(offsets[band], offsets[band + 1], BLOCK):
+            block = items[start : min(offsets[band + 1], start + BLOCK)]
+            _gather(block, listed, vertices, entries, points)
+            _set_up(len(block), points, matrix, view_depth, keep, top, top + BAND_ROWS - 1, entries, numbers, clips)
+            _cover(len(block), entries, numbers, covers)
+            found = 0
+            for b in range(len(block)):
+                i0, i1, j0, j1 = entries[4, b], entries[5, b], entries[6, b], entries[7, b]
+                place = b * BAND_ROWS + j0 - top
+                if (i1 - i0 < 2) & (j1 - j0 < 2):
+                    for n in range(4):
+                        hits[found, 0], hits[found, 1] = place + (n >> 1), i0 + (n & 1)
+                        found += (covers[b] >> n) & 1
+                    continue
+                for j in range(j0, j1 + 1):
+                    y = j + 0.5
+                    ra, rb = numbers[1, b] * y + numbers[2, b], numbers[4, b] * y + numbers[5, b]
+                    rc = numbers[7, b] * y + numbers[8, b]
+                    for column in range(i0 // BAND_ROWS, i1 // BAND_ROWS + 1):
+                        if table[band, column] < 0:
+                            continue
+                        left, right = max(i0, column * BAND_ROWS), min(i1, column * BAND_ROWS + BAND_ROWS - 1)
+                        for i in range(left, right + 1):
+                            x = i + 0.5
+                            ea, eb, ec = numbers[0, b] * x + ra, numbers[3, b] * x + rb, numbers[6, b] * x + rc
+                            hits[found, 0], hits[found, 1] = place, i
+                            found += (ea >= 0) & (eb >= 0) & (ec >= 0)
+                    place += 1
+                    if found > most - 4:
+                        given = entries, numbers, clips, table[band], members, nearest, triangle_ids, barycentrics
+                        _insert_cells(hits[:found], top, *given)
+                        found = 0
+            given = entries, numbers, clips, table[band], members, nearest, triangle_ids, barycentrics
+            _insert_cells(hits[:found], top, *given)
+        for column in table[band]:
+            if column < 0:
+                continue
+            for m in members[column].flat:
+                if m >= 0:
+                    for k in range(len(nearest)):
+                        z = nearest[k, m]
+                        depths[k, m] = z if z < np.inf else 0.0
+
+
+@numba.njit(error_model="numpy")
+def _insert_cells(hits, top, entries, numbers, clips, columns, members, nearest, triangle_ids, barycentrics):
+    """As `_insert`, into the layers of those cells that are listed."""
+    for h in range(len(hits)):
+        place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
+        b, row = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS)
+        block = columns[i // np.uint32(BAND_ROWS)]
+        if block < 0:
+            continue
+        m = members[block, row, i % np.uint32(BAND_ROWS)]
+        if m < 0:
+            continue
+        found, z, p, q = _met(b, i + 0.5, row + np.uint32(top) + 0.5, numbers, clips)
+        if found:
+            _put(z, entries[0, b], p, q, nearest[:, m], triangle_ids[:, m], barycentrics[:, m])
+
+
 # numba itself must inline these, so that lengths of rows are known: only then do their loops become vector code.
 
 
@@ -338,34 +453,45 @@ def _cover(count, entries, numbers, covers):
 @numba.njit(error_model="numpy")
 def _insert(hits, top, entries, numbers, clips, nearest, triangle_ids, barycentrics):
     """Insert the block's triangles into the layers of pixels; hits (n, 2) are triangle and row of the band, column."""
-    layers = len(triangle_ids)
     for h in range(len(hits)):
         place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
         b, row = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS)
         j = row + np.uint32(top)
-        x, y = i + 0.5, j + 0.5
-        xa, ya, wa = numbers[0, b], numbers[1, b], numbers[2, b]
-        xb, yb, wb = numbers[3, b], numbers[4, b], numbers[5, b]
-        xc, yc, wc = numbers[6, b], numbers[7, b], numbers[8, b]
-        ea, eb, ec = xa * x + (ya * y + wa), xb * x + (yb * y + wb), xc * x + (yc * y + wc)
-        # Top and left edges own the pixels exactly on them (y points down).
-        if min(ea, eb, ec) == 0:
-            if (ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc)):
-                continue
-        total = ea + eb + ec
-        if not total > 0 or (clips[b] and _outside(numbers, b, ea, eb, ec)):
-            continue
-        z, scale = (ea * numbers[9, b] + eb * numbers[10, b] + ec * numbers[11, b]) / total, 1 / total
-        # Behind what is as near, before what is farther; a branch would be foreseen every other time.
-        moved, t, p, q = z, entries[0, b], np.float32(ea * scale), np.float32(eb * scale)
-        for k in range(layers):
-            old, old_t = nearest[k, row, i], triangle_ids[k, j, i]
-            old_p, old_q = barycentrics[k, j, i, 0], barycentrics[k, j, i, 1]
-            before = z < old
-            nearest[k, row, i], triangle_ids[k, j, i] = moved if before else old, t if before else old_t
-            barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = p if before else old_p, q if before else old_q
-            moved, t = old if before else moved, old_t if before else t
-            p, q = old_p if before else p, old_q if before else q
+        found, z, p, q = _met(b, i + 0.5, j + 0.5, numbers, clips)
+        if found:
+            _put(z, entries[0, b], p, q, nearest[:, row, i], triangle_ids[:, j, i], barycentrics[:, j, i])
+
+
+@numba.njit(inline="always", error_model="numpy")
+def _met(b, x, y, numbers, clips):
+    """Whether triangle b of a block covers a point; and its depth and first two barycentrics there."""
+    xa, ya, wa = numbers[0, b], numbers[1, b], numbers[2, b]
+    xb, yb, wb = numbers[3, b], numbers[4, b], numbers[5, b]
+    xc, yc, wc = numbers[6, b], numbers[7, b], numbers[8, b]
+    ea, eb, ec = xa * x + (ya * y + wa), xb * x + (yb * y + wb), xc * x + (yc * y + wc)
+    found = True
+    # Top and left edges own the pixels exactly on them (y points down).
+    if min(ea, eb, ec) == 0:
+        found = not (
+            (ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc))
+        )
+    total = ea + eb + ec
+    found = found and total > 0 and not (clips[b] and _outside(numbers, b, ea, eb, ec))
+    z, scale = (ea * numbers[9, b] + eb * numbers[10, b] + ec * numbers[11, b]) / total, 1 / total
+    return found, z, np.float32(ea * scale), np.float32(eb * scale)
+
+
+@numba.njit(inline="always")
+def _put(z, t, p, q, nearest, triangle_ids, barycentrics):
+    """Put a hit into the layers (K,) of a cell: behind what is as near, before what is farther."""
+    moved = z  # A branch would be foreseen every other time.
+    for k in range(len(nearest)):
+        old, old_t, old_p, old_q = nearest[k], triangle_ids[k], barycentrics[k, 0], barycentrics[k, 1]
+        before = z < old
+        nearest[k], triangle_ids[k] = moved if before else old, t if before else old_t
+        barycentrics[k, 0], barycentrics[k, 1] = p if before else old_p, q if before else old_q
+        moved, t = old if before else moved, old_t if before else t
+        p, q = old_p if before else p, old_q if before else q
 
 
 @numba.njit
