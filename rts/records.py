@@ -136,7 +136,7 @@ class Fine:
         shift: (M, 3) float32, from pixel positions in the grid of fine cells to those in the layout.
         row: (K, h, w) int32, the splat in each place of the layout, or −1.
         part: (K, h, w) int32, the part seen there, or −1.
-        kinds: (h, w) uint8, bit 0 where a cell of an active pixel is.
+        kinds: (h, w) uint8, bit 0 at the cells of active pixels, bit 1 within two cells of them.
         pixel: (H, W) int32, for each pixel of the image which pixel of the layout it is, counted along its lines
             without the apron; −1 where it is not active.
         overflow: () int32, pixels that there was no room for, which stay coarse, and samples that were dropped.
@@ -208,7 +208,8 @@ class Splats:
         settled: (H, W) bool, cells amid one colour, where nothing that moves changes the image; or None.
         sentinel: () float, the depth that stands for empty layers, beyond all samples; None for one of the scene's
             scale.
-        wanted: (H, W) bool, the targets that are looked at; others may have any finite colour. None for all.
+        wanted: (H, W) bool, the targets that are looked at and those within two cells of them; others may have any
+            finite colour. None for all.
         border: cells at each side that splat into the image but are no part of it.
     """
 

@@ -80,6 +80,7 @@ class Cells:
         row: (K, H, W) signed integers, the sample of each cell, or −1.
         choices: the choices for the same samples, if they are known.
         part: (K, H, W) integers, the part of each sample; None, or no layers, where that is not known.
+        wanted: (H, W) bool, the targets to fill, others may be anything; None, or no rows, for all.
 
     Raises:
         InputError: shapes that do not fit, or `row` refers to a sample that is not there.
@@ -93,6 +94,7 @@ class Cells:
         row: np.ndarray,
         choices: Choices | None = None,
         part: np.ndarray | None = None,
+        wanted: np.ndarray | None = None,
     ):
         if positions.shape[1:] != (3,) or rgba.shape != (len(positions), 4):
             given = f"{positions.shape} and {rgba.shape}"
@@ -102,6 +104,7 @@ class Cells:
             check_rows(row, len(positions))
         self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
+        self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
         self.visible, self.border = settings.kind == "visible", settings.border
         self.rims = self.visible and settings.rims
         self._numbers = tuple(map(positions.dtype.type, _scale_and_peak(settings) + (settings.gamma,)))
@@ -148,6 +151,8 @@ class Cells:
         parallel(survey, height, *given, *noted, work=2 * self.row.size)
         repeated = int(np.count_nonzero(seen)) != int(counts.sum())
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
+        if self._wanted is not None:
+            states *= self._wanted
         least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
         # See `rts.splatting.layers`: nothing is nearer to what is beyond everything than to a front.
         extent = largest - least
@@ -155,6 +160,7 @@ class Cells:
         if layers > 1:
             given = self.row, self.visible, beyond, hidden, states
             parallel(listing.find, height, self.positions, *given, marks, counts, work=self.row.size)
+            counts = self._of_wanted(marks, counts)
         offsets = np.concatenate([[0], np.cumsum(counts)])
         columns = np.empty(offsets[-1], np.int32)
         ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
@@ -176,6 +182,7 @@ class Cells:
             listed = choices.mixed, choices.offsets, choices.columns, choices.ranges
             given = self.positions, self.row, self._reach, choices.states, *listed, ends, marks, counts
             parallel(outlines.find, height, *given, work=self.row[0].size)
+            counts = self._of_wanted(marks, counts)
         offsets = np.concatenate([[0], np.cumsum(counts)])
         found = Outlines(
             np.empty((height, width), kind),
@@ -192,6 +199,13 @@ class Cells:
             listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
             parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=200 * len(found.columns))
         return found
+
+    def _of_wanted(self, marks: np.ndarray, counts: np.ndarray) -> np.ndarray:
+        """Clear marks (H, W) of targets that are not wanted; how many are left in each row, `counts` if all are."""
+        if self._wanted is None:
+            return counts
+        marks *= self._wanted
+        return marks.sum(axis=1, dtype=np.int64)
 
     def image(self, out: np.ndarray) -> None:
         """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""
