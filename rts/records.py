@@ -208,8 +208,7 @@ class Splats:
         settled: (H, W) bool, cells amid one colour, where nothing that moves changes the image; or None.
         sentinel: () float, the depth that stands for empty layers, beyond all samples; None for one of the scene's
             scale.
-        wanted: (H, W) bool, the targets that are looked at and those within two cells of them; others may have any
-            finite colour. None for all.
+        wanted: (H, W) bool, the targets that are looked at; others may have any finite colour. None for all.
         border: cells at each side that splat into the image but are no part of it.
     """
 

@@ -510,7 +510,7 @@ def to_fine_splats(
     index, shift, row, part, kinds = constants(arrays, *suiting(positions, rgba))
     xp = namespace(positions)
     moved = take(positions, index) + xp.astype(shift, positions.dtype)
-    return Splats(moved, take(rgba, index), row, part, wanted=kinds > 1, border=fine.apron)
+    return Splats(moved, take(rgba, index), row, part, wanted=(kinds & 1) > 0, border=fine.apron)
 
 
 def to_splats(

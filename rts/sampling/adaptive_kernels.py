@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numba
+import numpy as np
 
 compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
@@ -23,36 +24,51 @@ def mark(start, stop, row, depth, firsts, beyond, continued, marks):
         marks: (H, W) uint8, to be filled.
     """
     layers, height, width = row.shape
-    for y in range(start, stop):
+    # Of three rows of cells, repeated at the ends: the part seen, −1 for none, and whether there is a hidden layer.
+    parts, hidden = np.empty((3, width + 2), np.int32), np.empty((3, width + 2), np.uint8)
+    for y in range(start - 1, stop + 1):
+        at = min(max(y, 0), height - 1)
+        seen, behind = parts[(y + 3) % 3], hidden[(y + 3) % 3]
         for x in range(width):
-            marks[y, x] = 0
-            i = row[0, y, x]
-            for n in range(9):
-                v, u = n // 3 - 1, n % 3 - 1
-                py, px = y - v, x - u
-                if n == 4 or not (0 <= py < height and 0 <= px < width):
-                    continue
-                j = row[0, py, px]
-                if (i < 0) != (j < 0):
-                    marks[y, x] = 1
-                    break
-                if i < 0:
-                    continue
-                if _part(firsts, i) != _part(firsts, j):
-                    marks[y, x] = 1
-                    break
-                if layers > 1 and (row[1, y, x] >= 0 or row[1, py, px] >= 0):
-                    if _parted(row, depth, y, x, v, u, beyond, continued):
-                        marks[y, x] = 1
-                        break
+            i = row[0, at, x]
+            part = np.int32(-1 if i < 0 else 0)
+            for first in firsts:
+                part += i >= first
+            seen[x + 1], behind[x + 1] = part, layers > 1 and row[min(1, layers - 1), at, x] >= 0
+        seen[0], seen[width + 1], behind[0], behind[width + 1] = seen[1], seen[width], behind[1], behind[width]
+        if y <= start:
+            continue
+        above, level, below = (y + 1) % 3, (y + 2) % 3, y % 3
+        _differ(marks[y - 1], parts[above], parts[level], parts[below])
+        if layers > 1:
+            for x in range(width):
+                near = hidden[above, x] | hidden[above, x + 1] | hidden[above, x + 2] | hidden[level, x]
+                near |= hidden[level, x + 1] | hidden[level, x + 2] | hidden[below, x]
+                near |= hidden[below, x + 1] | hidden[below, x + 2]
+                if near and not marks[y - 1, x] and row[0, y - 1, x] >= 0:
+                    marks[y - 1, x] = _ends(row, depth, y - 1, x, beyond, continued)
 
 
 @compiled
-def _part(firsts, i):
-    part = 0
-    for first in firsts:
-        part += i >= first
-    return part
+def _differ(marks, above, level, below):
+    """Mark the cells of a row beside which another part is seen, or nothing."""
+    for x in range(len(marks)):
+        own = level[x + 1]
+        found = (above[x] != own) | (above[x + 1] != own) | (above[x + 2] != own) | (level[x] != own)
+        found |= (level[x + 2] != own) | (below[x] != own) | (below[x + 1] != own) | (below[x + 2] != own)
+        marks[x] = found
+
+
+@compiled
+def _ends(row, depth, y, x, beyond, continued):
+    """Whether the front of a cell, whose neighbours are covered, too, ends towards one of them."""
+    _, height, width = row.shape
+    for n in range(9):
+        v, u = n // 3 - 1, n % 3 - 1
+        py, px = y - v, x - u
+        if n != 4 and 0 <= py < height and 0 <= px < width and _parted(row, depth, y, x, v, u, beyond, continued):
+            return True
+    return False
 
 
 @compiled

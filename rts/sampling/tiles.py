@@ -20,9 +20,9 @@ from rts.records import ArraySpec, Fine, Sampled, Samples
 from rts.threads import parallel, read_only
 from rts.trees import Array
 
-TILE = 16
-"""Fine cells along each side of a tile, about, without its apron: with fewer there are more of aprons, with more, more
-of empty cells."""
+TILE = 32
+"""Fine cells along each side of a tile with its apron, about: with fewer there are more of aprons, with more, more of
+empty cells. Compiled splatters take as many columns at a time."""
 
 LINE = 256
 """Fine cells that are sampled, in a line of their list."""
@@ -54,7 +54,7 @@ class Grid(NamedTuple):
     @property
     def tile(self) -> int:
         """Pixels along each side of a tile."""
-        return max(-(-self.apron // self.side), round(TILE / self.side), 1)
+        return max(-(-self.apron // self.side), (TILE - 2 * self.apron) // self.side, 1)
 
     @property
     def tiles(self) -> tuple[int, int]:

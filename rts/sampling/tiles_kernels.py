@@ -16,7 +16,7 @@ def fill(active, corners, side, tile, apron, across, pitch, most, numbers, cells
     """Lay out the cells that active pixels need, tile by tile; the number of tiles that fit, and of their cells.
 
     Args:
-        active: (H, W) bool; pixels of tiles that do not fit become False.
+        active: (H, W) bool.
         corners: (T, 2), row and column of each tile among tiles.
         side: s, cells along each side of a pixel.
         tile: pixels along each side of a tile.
@@ -45,21 +45,23 @@ def fill(active, corners, side, tile, apron, across, pitch, most, numbers, cells
         before = count
         down, over = t // across * pitch, t % across * pitch
         for v in range(reach):
-            fy = top * side + v - apron
-            ty = (fy + inner) // inner
+            # Places in the maps of this tile and of those around it: 0 for that before, 1 for this, 2 for that after.
+            ty = (v >= apron) + (v >= apron + inner)
+            rows = numbers[corners[t, 0] + ty, :, v - apron - (ty - 1) * inner]
+            first = (top * side + v) * line + left * side
             for u in range(reach):
                 if local[v, u] == 0:
                     continue
-                fx = left * side + u - apron
-                tx = (fx + inner) // inner
-                m = numbers[ty, tx, fy + inner - ty * inner, fx + inner - tx * inner]
+                tx = (u >= apron) + (u >= apron + inner)
+                own = rows[corners[t, 1] + tx]
+                m = own[u - apron - (tx - 1) * inner]
                 if m == 0:
                     count += 1
                     if count > most:
                         break
                     m = count
-                    cells[m - 1] = (fy + apron) * line + fx + apron
-                    numbers[ty, tx, fy + inner - ty * inner, fx + inner - tx * inner] = m
+                    cells[m - 1] = first + u
+                    own[u - apron - (tx - 1) * inner] = m
                 place[down + v, over + u] = m - 1
                 kinds[down + v, over + u] = local[v, u] & 3
             if count > most:
@@ -80,13 +82,10 @@ def fill(active, corners, side, tile, apron, across, pitch, most, numbers, cells
 @numba.njit(nogil=True)
 def _spread(local, top, left, side, apron):
     """Mark the cells around a pixel, of which the first is (top, left) without the apron."""
-    for v in range(side + 2 * apron):
-        near_y = apron - 2 <= v < apron + side + 2
-        inside_y = apron <= v < apron + side
-        for u in range(side + 2 * apron):
-            near = near_y and apron - 2 <= u < apron + side + 2
-            inside = inside_y and apron <= u < apron + side
-            local[top + v, left + u] |= 4 | (2 if near else 0) | (1 if inside else 0)
+    local[top : top + side + 2 * apron, left : left + side + 2 * apron] |= np.uint8(4)
+    top, left = top + apron, left + apron
+    local[top - 2 : top + side + 2, left - 2 : left + side + 2] |= np.uint8(NEAR)
+    local[top : top + side, left : left + side] |= np.uint8(WANTED)
 
 
 @kernel

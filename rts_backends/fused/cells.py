@@ -160,7 +160,8 @@ class Cells:
         if layers > 1:
             given = self.row, self.visible, beyond, hidden, states
             parallel(listing.find, height, self.positions, *given, marks, counts, work=self.row.size)
-            counts = self._of_wanted(marks, counts)
+            # How an outline moves is decided by pairs up to two cells away.
+            counts = self._of_wanted(marks, counts, 2)
         offsets = np.concatenate([[0], np.cumsum(counts)])
         columns = np.empty(offsets[-1], np.int32)
         ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
@@ -182,7 +183,7 @@ class Cells:
             listed = choices.mixed, choices.offsets, choices.columns, choices.ranges
             given = self.positions, self.row, self._reach, choices.states, *listed, ends, marks, counts
             parallel(outlines.find, height, *given, work=self.row[0].size)
-            counts = self._of_wanted(marks, counts)
+            counts = self._of_wanted(marks, counts, 1)
         offsets = np.concatenate([[0], np.cumsum(counts)])
         found = Outlines(
             np.empty((height, width), kind),
@@ -200,11 +201,18 @@ class Cells:
             parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=200 * len(found.columns))
         return found
 
-    def _of_wanted(self, marks: np.ndarray, counts: np.ndarray) -> np.ndarray:
-        """Clear marks (H, W) of targets that are not wanted; how many are left in each row, `counts` if all are."""
+    def _of_wanted(self, marks: np.ndarray, counts: np.ndarray, reach: int) -> np.ndarray:
+        """Clear marks (H, W) that are farther than so many cells from wanted targets; how many each row has then."""
         if self._wanted is None:
             return counts
-        marks *= self._wanted
+        near = self._wanted
+        for _ in range(reach):
+            near = near.copy()
+            near[1:] |= near[:-1].copy()
+            near[:-1] |= near[1:].copy()
+            near[:, 1:] |= near[:, :-1].copy()
+            near[:, :-1] |= near[:, 1:].copy()
+        marks *= near
         return marks.sum(axis=1, dtype=np.int64)
 
     def image(self, out: np.ndarray) -> None:
