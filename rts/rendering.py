@@ -90,8 +90,8 @@ def render(
             for the worst case, layers × cells. If a third of the cells are covered, pass a third of that. What does not
             fit is dropped, deepest layers first, and counted: `overflow` of `rts.sample` is above 0, then. Where the
             image is rendered in bands, it is the capacity of each band. With `rts.Adaptive` the fine samples have as
-            many rows again: layers × fine cells, of active pixels and their aprons, for a quarter of all such cells by
-            default; pixels beyond stay coarse, and are counted.
+            many rows again, `layers` for each fine cell of active pixels and their aprons; pixels that find no room stay
+            coarse, and are counted.
         engine: name of the engine to compute with, "torch" or "jax", where the scene alone does not tell: its arrays
             are all NumPy, but a shader holds a network. None for the engine of the arrays.
 
@@ -326,6 +326,7 @@ def _fine(
     row, depth = engine_of(coarse).known(coarse.row), engine_of(coarse).known(coarse.depth)
     needed = None
     if row is None or depth is None or row.ndim != 3:
+        check_memory(1, room.cells, _planned(layers), capacity, gradient=engine.differentiates)
         given = engine_of(coarse).call_host(laid_out, Layout.specs(grid, room), coarse.row, coarse.depth)
         layout, allotted = Layout(*given), _planned(layers) * room.cells
     else:

@@ -48,12 +48,15 @@ class Method(NamedTuple):
     seeds: int = 1
 
 
-def name_of(splatter: str, layers: int, supersample: int = 1) -> str:
+def name_of(splatter: str, layers: int, supersample: int | rts.Adaptive = 1) -> str:
     """The name of a method of ours."""
+    if isinstance(supersample, rts.Adaptive):
+        side, where = supersample.samples, "around outlines" if supersample.dilated else "at outlines"
+        return f"{splatter}, K = {layers}, {side} × {side} {where}"
     return f"{splatter}, K = {layers}" + (f", {supersample} × {supersample}" if supersample > 1 else "")
 
 
-def ours(scene: scenes.Scene, splatter: str, layers: int, supersample: int = 1) -> Method:
+def ours(scene: scenes.Scene, splatter: str, layers: int, supersample: int | rts.Adaptive = 1) -> Method:
     """A splatter of this library, or one with other settings.
 
     `multi, calibrated` has the constants of `visible`; outlines of `visible, by samples` move as the samples inside of

@@ -27,9 +27,8 @@ empty cells. Compiled splatters take as many columns at a time."""
 LINE = 256
 """Fine cells that are sampled, in a line of their list."""
 
-SHARE, FILLED = 1 / 4, 1 / 3
-"""Where shapes have to be known beforehand: share of all fine cells that there is room for, and of a tile's that are
-needed where they are, about."""
+FILLED = 1 / 3
+"""Share of a tile's cells that are needed, about, where shapes have to be known beforehand."""
 
 
 class Grid(NamedTuple):
@@ -69,9 +68,10 @@ class Grid(NamedTuple):
     def room(self, capacity: int | None, layers: int) -> Room:
         """Room for the worst case, or for so many rows."""
         cells, (down, across) = self.fine[0] * self.fine[1], self.tiles
-        cells = math.ceil(SHARE * cells) if capacity is None else min(cells, max(1, capacity // layers))
+        if capacity is None:
+            return Room(down * across, cells)
         each = FILLED * (self.tile * self.side) ** 2
-        return Room(min(down * across, math.ceil(cells / each)), cells)
+        return Room(min(down * across, math.ceil(capacity / layers / each)), min(cells, max(1, capacity // layers)))
 
 
 class Room(NamedTuple):
