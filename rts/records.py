@@ -155,6 +155,11 @@ class Fine:
     supersample: int
     apron: int
 
+    @property
+    def wanted(self) -> Array:
+        """(h, w) bool, the cells of active pixels."""
+        return (self.kinds & 1) > 0
+
 
 @record(static=("supersample", "apron"))
 class Sampled:

@@ -185,9 +185,11 @@ class Cells:
             parallel(outlines.find, height, *given, work=self.row[0].size)
             counts = self._of_wanted(marks, counts, 1)
         offsets = np.concatenate([[0], np.cumsum(counts)])
+        # Targets that are listed but not wanted may look at cells for which nothing is decided.
+        make = np.empty if self._wanted is None else np.zeros
         found = Outlines(
-            np.empty((height, width), kind),
-            np.empty((height, width), np.int32),
+            make((height, width), kind),
+            make((height, width), np.int32),
             offsets,
             np.empty(offsets[-1], np.int32),
             np.empty((offsets[-1], 9), np.uint8),

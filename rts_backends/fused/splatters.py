@@ -61,7 +61,8 @@ class _Fused(splatting.Kernel):
             return None
         from rts_backends.fused import normal_equations
 
-        given = splats.positions, splats.rgba, splats.row, splats.part, t_positions, t_rgba, target, weights, background
+        own = splats.positions, splats.rgba, splats.row, splats.part, splats.wanted
+        given = *own, t_positions, t_rgba, target, weights, background
         return normal_equations.equations(self._settings(splats.border), engine_of(given), *given)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
