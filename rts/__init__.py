@@ -22,6 +22,7 @@ from rts.errors import (
     RtsWarning,
     ToleranceWarning,
 )
+from rts.explaining import explain
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
 from rts.files.views import View, load_views
@@ -51,7 +52,6 @@ from rts.records import ArraySpec, Fine, Fragments, Proxy, RayHits, Rays, Sample
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples, sample
 from rts.sampling.adaptive import Adaptive
-from rts.sampling.auto import explain
 from rts.sampling.prepared import prepare
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.splatting import exact_calibration

@@ -90,8 +90,8 @@ def render(
             for the worst case, layers × cells. If a third of the cells are covered, pass a third of that. What does not
             fit is dropped, deepest layers first, and counted: `overflow` of `rts.sample` is above 0, then. Where the
             image is rendered in bands, it is the capacity of each band. With `rts.Adaptive` the fine samples have as
-            many rows again, `layers` for each fine cell of active pixels and their aprons; pixels that find no room stay
-            coarse, and are counted.
+            many rows again, `layers` for each fine cell of active pixels and their aprons; pixels that find no room
+            stay coarse, and are counted.
         engine: name of the engine to compute with, "torch" or "jax", where the scene alone does not tell: its arrays
             are all NumPy, but a shader holds a network. None for the engine of the arrays.
 
@@ -377,12 +377,10 @@ def _of_contrast(
     colors = value_of(splats.rgba)
     if colors is None or colors.ndim != 2 or value_of(coarse.row) is None:
         raise InputError(
-            f"contrast of Adaptive is {supersample.contrast}, and colours are traced; give None: what is sampled cannot "
-            f"depend on values that are not known yet"
+            f"contrast of Adaptive is {supersample.contrast}, and colours are traced; give None: what is sampled "
+            f"cannot depend on values that are not known yet"
         )
-    fine = _fine(
-        scene, scene.camera, size, coarse, adaptive=supersample, splatter=splatter, colors=colors, **options
-    )
+    fine = _fine(scene, scene.camera, size, coarse, adaptive=supersample, splatter=splatter, colors=colors, **options)
     return _splatted(replace(coarse, fine=fine), scene, scene.camera, suited, splatter, splats)
 
 

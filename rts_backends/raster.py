@@ -310,8 +310,8 @@ def _draw_cells(
     triangle_ids,
     barycentrics,
     depths,
-):  # fmt: skip
-    """As `_draw`, of some cells: arrays (K, M) are of their list, in which `table` and `members` of `Blocks` look up."""
+):
+    """As `_draw`, of some cells: arrays (K, M) are of their list; `table` and `members` are those of `Blocks`."""
     entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
     numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
     most = 4 * BLOCK
@@ -472,9 +472,7 @@ def _met(b, x, y, numbers, clips):
     found = True
     # Top and left edges own the pixels exactly on them (y points down).
     if min(ea, eb, ec) == 0:
-        found = not (
-            (ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc))
-        )
+        found = not ((ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc)))
     total = ea + eb + ec
     found = found and total > 0 and not (clips[b] and _outside(numbers, b, ea, eb, ec))
     z, scale = (ea * numbers[9, b] + eb * numbers[10, b] + ec * numbers[11, b]) / total, 1 / total

@@ -212,7 +212,8 @@ class ImageResiduals(Residuals):
 
         def swept(shown: Callable[..., Splats], fields: _Fields, **known: Any) -> tuple[Array, Array, Array] | None:
             """The normal equations of splats: what makes them of parts, cameras, engine and exemplar; and what is known
-            of them."""
+            of them.
+            """
 
             def splats(v: Array) -> tuple[Array, Array]:
                 parts, camera = _checked(*self.scene(unflatten(v)))

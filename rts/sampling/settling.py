@@ -103,9 +103,7 @@ def refined(
     return checked_refined(surface.refine(inputs, replace(lifted, row=lifted.row.copy()), rays), lifted, surface), rays
 
 
-def _rays_of(
-    samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None
-) -> Rays:
+def _rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None) -> Rays:
     """The ray of each packed sample (N, 3); where no cell has any, the first row gets the first pixel's."""
     from rts.sampling import settling_kernels
 

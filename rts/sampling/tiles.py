@@ -129,7 +129,9 @@ def needed_room(active: np.ndarray, grid: Grid) -> Room:
     """Room for all of some pixels (H, W) bool; of cells it is a bound."""
     tiles = int(_in_tiles(active, grid).sum())
     each = (grid.side + 2 * grid.apron) ** 2
-    return Room(max(1, tiles), max(1, min(int(active.sum()) * each, tiles * (grid.tile * grid.side + 2 * grid.apron) ** 2)))
+    return Room(
+        max(1, tiles), max(1, min(int(active.sum()) * each, tiles * (grid.tile * grid.side + 2 * grid.apron) ** 2))
+    )
 
 
 def _in_tiles(active: np.ndarray, grid: Grid) -> np.ndarray:

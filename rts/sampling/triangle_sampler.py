@@ -97,9 +97,7 @@ class TriangleSampler(Sampler):
         check_fragments(whole, (layers, *size), np.iinfo(np.int32).max, self)
         at = np.where(there, cells, 0)
         ids = np.where(there, whole.triangle_ids.reshape(layers, -1)[:, at], -1)
-        return Fragments(
-            ids, whole.barycentrics.reshape(layers, -1, 2)[:, at], whole.depth.reshape(layers, -1)[:, at]
-        )
+        return Fragments(ids, whole.barycentrics.reshape(layers, -1, 2)[:, at], whole.depth.reshape(layers, -1)[:, at])
 
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
         """See `Sampler`: the proxy of a part, and what is prepared of it."""
