@@ -139,6 +139,7 @@ class Fine:
         kinds: (h, w) uint8, bit 0 at the cells of active pixels, bit 1 within two cells of them.
         pixel: (H, W) int32, for each pixel of the image which pixel of the layout it is, counted along its lines
             without the apron; −1 where it is not active.
+        coarse: (h', w') bool, the cells of the coarse grid, with its apron, whose pixels are not active.
         overflow: () int32, pixels that there was no room for, which stay coarse, and samples that were dropped.
         supersample: s; each active pixel has s² cells.
         apron: cells around active pixels, and around the layout.
@@ -151,6 +152,7 @@ class Fine:
     part: Array
     kinds: Array
     pixel: Array
+    coarse: Array
     overflow: Array
     supersample: int
     apron: int

@@ -471,9 +471,10 @@ def _splatted(
     """
     if splats is None:
         splats = to_splats(sampled, scene.parts, scene.camera, window, *suited)
-    image = _averaged(splatter, splats, sampled.supersample)
     if sampled.fine is None:
-        return image
+        return _averaged(splatter, splats, sampled.supersample)
+    coarse = constants(sampled.fine.coarse, *suiting(splats.rgba))
+    image = _averaged(splatter, splats.replace(wanted=coarse), 1)
     splats = to_fine_splats(sampled.fine, scene.parts, scene.camera, *suited)
     finer = _averaged(splatter, splats, sampled.fine.supersample)
     engine, xp = engine_of(image), namespace(image)

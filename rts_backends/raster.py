@@ -98,7 +98,8 @@ class Raster(TriangleSampler):
         parallel(_select, chunks, *given, listed, spans, counts, work=10 * len(faces))
         blocks = None if cells is None else raster_cells.Blocks.of(cells, size)
         if blocks is not None:
-            parallel(raster_cells.narrow, chunks, listed, blocks.table, spans, counts, work=5 * int(counts.sum()))
+            narrowed = listed, blocks.table, blocks.numbers, spans, counts
+            parallel(raster_cells.narrow, chunks, *narrowed, work=5 * int(counts.sum()))
         offsets = np.append(0, np.cumsum(counts.sum(axis=1)))
         places = offsets[:-1, None] + np.cumsum(counts, axis=1) - counts
         items = np.empty(offsets[-1], np.uint32)

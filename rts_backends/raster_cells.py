@@ -12,6 +12,9 @@ from rts.records import Fragments
 SIDE = 16
 """Cells along each side of a block, which are as many as rows of a band of the rasterizer."""
 
+SMALL = 6
+"""Boxes of fewer pixels along each side are looked at pixel by pixel."""
+
 BOX = 4
 """Where the box of a listed triangle begins in what is listed of it: first and last column and row."""
 
@@ -67,14 +70,15 @@ def _fill(cells, width, table, numbers):
 
 
 @numba.njit(cache=True, nogil=True)
-def narrow(first, last, listed, table, spans, counts):
-    """Leave out listed triangles whose box of pixels touches no numbered block.
+def narrow(first, last, listed, table, members, spans, counts):
+    """Leave out listed triangles whose box of pixels holds none of the cells, as far as that is seen at once.
 
     Args:
         first: first chunk.
         last: past the last chunk.
         listed: see `rts_backends.raster`.
         table: of `Blocks`.
+        members: the `numbers` of `Blocks`.
         spans: (chunks, 2), where each chunk begins and ends in the list; ends are changed.
         counts: (bands, chunks), to be counted anew.
     """
@@ -82,14 +86,20 @@ def narrow(first, last, listed, table, spans, counts):
         counts[:, chunk] = 0
         found = spans[chunk, 0]
         for n in range(spans[chunk, 0], spans[chunk, 1]):
-            i0, i1 = listed[n, BOX] // SIDE, listed[n, BOX + 1] // SIDE
-            j0, j1 = listed[n, BOX + 2] // SIDE, listed[n, BOX + 3] // SIDE
+            left, right, top, bottom = listed[n, BOX], listed[n, BOX + 1], listed[n, BOX + 2], listed[n, BOX + 3]
+            i0, i1, j0, j1 = left // SIDE, right // SIDE, top // SIDE, bottom // SIDE
             touches = False
             for j in range(j0, j1 + 1):
                 for i in range(i0, i1 + 1):
                     touches |= table[j, i] >= 0
                 if touches:
                     break
+            if touches and right - left < SMALL and bottom - top < SMALL:
+                touches = False
+                for y in range(top, bottom + 1):
+                    for x in range(left, right + 1):
+                        block = table[y // SIDE, x // SIDE]
+                        touches |= block >= 0 and members[block, y % SIDE, x % SIDE] >= 0
             if touches:
                 listed[found] = listed[n]
                 found += 1

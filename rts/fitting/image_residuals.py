@@ -211,9 +211,7 @@ class ImageResiduals(Residuals):
         fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
 
         def swept(shown: Callable[..., Splats], fields: _Fields, **known: Any) -> tuple[Array, Array, Array] | None:
-            """The normal equations of splats: what makes them of parts, cameras, engine and exemplar; and what is known
-            of them.
-            """
+            """The normal equations of what `shown` makes of parts, cameras, engine and exemplar; `known` is constant."""
 
             def splats(v: Array) -> tuple[Array, Array]:
                 parts, camera = _checked(*self.scene(unflatten(v)))
@@ -239,7 +237,7 @@ class ImageResiduals(Residuals):
         coarse, finer = _split(fields, constants(fine.pixel, engine, vector), fine)
         placed = {"row": fine.row, "part": fine.part, "wanted": fine.wanted}
         found = (
-            swept(partial(to_splats, sampled), coarse, **known),
+            swept(partial(to_splats, sampled), coarse, **known, wanted=fine.coarse),
             swept(lambda parts, camera, _, *suited: to_fine_splats(fine, parts, camera, *suited), finer, **placed),
         )
         if found[0] is None or found[1] is None:

@@ -6,6 +6,7 @@ Cells that no active pixel needs are empty. A cell that two tiles show is sample
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -97,6 +98,7 @@ class Layout(NamedTuple):
         place: (h, w) int32, which of these each place of the layout shows, or −1.
         kinds: (h, w) uint8, bits of `tiles_kernels`.
         pixel: (H, W) int32, where in the layout, in pixels, an active pixel is; −1 for pixels that are not active.
+        coarse: (H', W') bool, with the apron, the pixels of the image that are not active.
         dropped: () int32, pixels that there was no room for.
     """
 
@@ -104,6 +106,7 @@ class Layout(NamedTuple):
     place: Array
     kinds: Array
     pixel: Array
+    coarse: Array
     dropped: Array
 
     @staticmethod
@@ -111,8 +114,10 @@ class Layout(NamedTuple):
         """Shapes and dtypes of the arrays."""
         place = _shape(grid, room)
         lines = -(-room.cells // LINE), LINE
-        shapes = (lines, np.int32), (place, np.int32), (place, np.uint8), (grid.size, np.int32), ((), np.int32)
-        return tuple(ArraySpec(shape, dtype) for shape, dtype in shapes)
+        coarse = tuple(n + 2 * grid.apron for n in grid.size)
+        kinds = np.int32, np.int32, np.uint8, np.int32, np.bool_, np.int32
+        shapes = lines, place, place, grid.size, coarse, ()
+        return tuple(itertools.starmap(ArraySpec, zip(shapes, kinds, strict=True)))
 
 
 def _shape(grid: Grid, room: Room) -> tuple[int, int]:
@@ -153,7 +158,7 @@ def lay_out(active: np.ndarray, grid: Grid, room: Room, lines_of: Callable[[int]
     """
     from rts.sampling import tiles_kernels
 
-    (lines, _, _, _, _), shape = Layout.specs(grid, room), _shape(grid, room)
+    (lines, *_), shape = Layout.specs(grid, room), _shape(grid, room)
     cells = np.full(lines.shape, -1, np.int32)
     place, kinds = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8)
     pixel = np.full(grid.size, -1, np.int32)
@@ -164,7 +169,8 @@ def lay_out(active: np.ndarray, grid: Grid, room: Room, lines_of: Callable[[int]
     _, count = tiles_kernels.fill(active, corners, *sizes, numbers, cells.reshape(-1), place, kinds, pixel)
     if lines_of is not None:
         cells = cells[: lines_of(max(1, -(-count // LINE)))]
-    return Layout(cells, place, kinds, pixel, np.asarray(active.sum() - (pixel >= 0).sum(), np.int32))
+    coarse, left = np.pad(pixel < 0, grid.apron), active.sum() - (pixel >= 0).sum()
+    return Layout(cells, place, kinds, pixel, coarse, np.asarray(left, np.int32))
 
 
 class InTiles(Needed):
@@ -220,6 +226,7 @@ def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
         part,
         layout.kinds,
         layout.pixel,
+        layout.coarse,
         sampled.overflow + layout.dropped,
         supersample=grid.side,
         apron=grid.apron,
