@@ -528,7 +528,7 @@ def test_eager_jax_compiles_only_at_the_first_pose_of_each_bucket(jax, compilati
         pose = arrays("jax", rigid((0, 1, 0), 7 * i, (0, 0, 0.02 * i)))
         moving = part.replace(transform=pose)
         before = len(compilations)
-        sampled = rts.sample(moving, camera, SIZE)
+        sampled = rts.sample(moving, camera, (3 * SIZE[0], 3 * SIZE[1]))
         jax.grad(lambda t, s=sampled: rts.render_samples(s, part.replace(transform=t), camera).sum())(pose)
         rows = sampled.samples[0].ids.shape[0]
         assert len(compilations) == before or rows not in buckets, f"pose {i} compiled again for {rows} rows"
@@ -543,7 +543,7 @@ def test_rows_are_exact_or_padded_to_a_bucket(target):
     sampled = rts.sample(part, camera, SIZE)
     rows, covered = sampled.samples[0].ids.shape[0], int((sampled.row >= 0).sum())
     if target == "jax":
-        powers = {2**n for n in range(6, 16)} | {3 * 2**n for n in range(5, 15)}
+        powers = {2**n for n in range(10, 16)} | {3 * 2**n for n in range(9, 15)}
         assert rows == min(p for p in powers if p >= covered)
     else:
         assert rows == covered

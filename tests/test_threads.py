@@ -233,17 +233,14 @@ def resident():
     return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-@pytest.mark.parametrize(
-    "name, moving",
-    [*((name, False) for name in SAMPLERS), ("raster", True), ("embree", True), ("opengl", True)],
-)
-def test_a_thousand_renders_leave_no_memory_behind(name, moving):
+@pytest.mark.parametrize("name", SAMPLERS)
+def test_a_thousand_renders_leave_no_memory_behind(name):
     sampler, part = made(name), scene(name, 0)
     original = {key: value.copy() for key, value in part.theta.items()}
     angles = np.linspace(0, 3, 1000).astype(np.float32)
 
     def render(angle):
-        if moving:
+        if angle > angles[500]:  # The surface changes, too.
             for key in original:
                 part.theta[key][:] = original[key] * (1 + 0.1 * angle)
         rts.render(part.replace(transform=rts.rigid((0, float(angle), 0, 0, 0, 0))), CAMERA, (16, 16), sampler=sampler)

@@ -29,8 +29,8 @@ _REAL_KINDS = ("f", "i", "u", "b", "V")
 
 
 def bucket(rows: int) -> int:
-    """The next number of the form 2ⁿ or 3·2ⁿ, at least 64: few sizes, so that eager operations stay compiled."""
-    size = 64
+    """The next number of the form 2ⁿ or 3·2ⁿ, at least 1024: few sizes, so that eager operations stay compiled."""
+    size = 1024
     while size < rows:
         size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
     return size
