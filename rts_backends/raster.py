@@ -39,7 +39,7 @@ Positions on screen take 16 bits, so that those of a million triangles stay in c
 BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 """In place of a position: before the near plane (or NaN), beyond the far plane."""
 
-LISTED = 8
+LISTED = raster_cells.LISTED
 """What is listed of a triangle: its index, its three corners, and its first and last column and row of pixels."""
 
 NUMBERS = 18
@@ -98,8 +98,7 @@ class Raster(TriangleSampler):
         parallel(_select, chunks, *given, listed, spans, counts, work=10 * len(faces))
         blocks = None if cells is None else raster_cells.Blocks.of(cells, size)
         if blocks is not None:
-            narrowed = listed, blocks.table, blocks.numbers, spans, counts
-            parallel(raster_cells.narrow, chunks, *narrowed, work=5 * int(counts.sum()))
+            parallel(raster_cells.narrow, chunks, listed, blocks.bits, spans, counts, work=5 * int(counts.sum()))
         offsets = np.append(0, np.cumsum(counts.sum(axis=1)))
         places = offsets[:-1, None] + np.cumsum(counts, axis=1) - counts
         items = np.empty(offsets[-1], np.uint32)

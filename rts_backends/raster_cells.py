@@ -12,11 +12,11 @@ from rts.records import Fragments
 SIDE = 16
 """Cells along each side of a block, which are as many as rows of a band of the rasterizer."""
 
-SMALL = 6
-"""Boxes of fewer pixels along each side are looked at pixel by pixel."""
+BOX, LISTED = 4, 8
+"""Where the box of a listed triangle begins in what is listed of it, first and last column and row; and where it ends.
+"""
 
-BOX = 4
-"""Where the box of a listed triangle begins in what is listed of it: first and last column and row."""
+ALL = np.uint32(2**SIDE - 1)
 
 
 class Blocks(NamedTuple):
@@ -25,10 +25,12 @@ class Blocks(NamedTuple):
     Attributes:
         table: (Y, X) int32, the number of each block that holds any, or −1.
         numbers: (B, SIDE, SIDE) int32, where in the list each cell of such a block is, or −1.
+        bits: (H, X) uint16, the cells of each line of the grid that are asked for, a number for SIDE of them.
     """
 
     table: np.ndarray
     numbers: np.ndarray
+    bits: np.ndarray
 
     @classmethod
     def of(cls, cells: np.ndarray, size: tuple[int, int]) -> Blocks:
@@ -37,8 +39,9 @@ class Blocks(NamedTuple):
         table = np.full((-(-height // SIDE), -(-width // SIDE)), -1, np.int32)
         cells = np.ascontiguousarray(cells, np.int32).reshape(-1)
         numbers = np.full((_number(cells, width, table), SIDE, SIDE), -1, np.int32)
-        _fill(cells, width, table, numbers)
-        return cls(table, numbers)
+        bits = np.zeros((height, table.shape[1]), np.uint16)
+        _fill(cells, width, table, numbers, bits)
+        return cls(table, numbers, bits)
 
     @staticmethod
     def nothing(cells: np.ndarray, layers: int) -> Fragments:
@@ -62,23 +65,23 @@ def _number(cells, width, table):
 
 
 @numba.njit(cache=True, nogil=True)
-def _fill(cells, width, table, numbers):
+def _fill(cells, width, table, numbers, bits):
     for m in range(len(cells)):
         if cells[m] >= 0:
             y, x = cells[m] // width, cells[m] % width
             numbers[table[y // SIDE, x // SIDE], y % SIDE, x % SIDE] = m
+            bits[y, x // SIDE] |= np.uint16(1 << x % SIDE)
 
 
 @numba.njit(cache=True, nogil=True)
-def narrow(first, last, listed, table, members, spans, counts):
-    """Leave out listed triangles whose box of pixels holds none of the cells, as far as that is seen at once.
+def narrow(first, last, listed, bits, spans, counts):
+    """Leave out listed triangles whose box of pixels holds none of the cells.
 
     Args:
         first: first chunk.
         last: past the last chunk.
         listed: see `rts_backends.raster`.
-        table: of `Blocks`.
-        members: the `numbers` of `Blocks`.
+        bits: of `Blocks`.
         spans: (chunks, 2), where each chunk begins and ends in the list; ends are changed.
         counts: (bands, chunks), to be counted anew.
     """
@@ -86,23 +89,21 @@ def narrow(first, last, listed, table, members, spans, counts):
         counts[:, chunk] = 0
         found = spans[chunk, 0]
         for n in range(spans[chunk, 0], spans[chunk, 1]):
-            left, right, top, bottom = listed[n, BOX], listed[n, BOX + 1], listed[n, BOX + 2], listed[n, BOX + 3]
-            i0, i1, j0, j1 = left // SIDE, right // SIDE, top // SIDE, bottom // SIDE
+            left, right = np.uint32(listed[n, BOX]), np.uint32(listed[n, BOX + 1])
+            top, bottom = np.uint32(listed[n, BOX + 2]), np.uint32(listed[n, BOX + 3])
+            i0, i1 = left // np.uint32(SIDE), right // np.uint32(SIDE)
+            begin, end = ALL << left % np.uint32(SIDE) & ALL, ALL >> (np.uint32(SIDE - 1) - right % np.uint32(SIDE))
             touches = False
-            for j in range(j0, j1 + 1):
+            for y in range(top, bottom + 1):
                 for i in range(i0, i1 + 1):
-                    touches |= table[j, i] >= 0
+                    mask = (begin if i == i0 else ALL) & (end if i == i1 else ALL)
+                    touches |= (bits[y, i] & mask) != 0
                 if touches:
                     break
-            if touches and right - left < SMALL and bottom - top < SMALL:
-                touches = False
-                for y in range(top, bottom + 1):
-                    for x in range(left, right + 1):
-                        block = table[y // SIDE, x // SIDE]
-                        touches |= block >= 0 and members[block, y % SIDE, x % SIDE] >= 0
             if touches:
-                listed[found] = listed[n]
+                for r in range(LISTED):
+                    listed[found, r] = listed[n, r]
                 found += 1
-                for j in range(j0, j1 + 1):
+                for j in range(top // np.uint32(SIDE), bottom // np.uint32(SIDE) + 1):
                     counts[j, chunk] += 1
         spans[chunk, 1] = found
