@@ -32,6 +32,10 @@ CLOSED = {
 """Scene → its parts that are closed, whose back faces are hidden whether they are culled or not."""
 
 
+ADAPTIVE = (rts.Adaptive(4, dilated=False), rts.Adaptive(4, dilated=True), rts.Adaptive(8, dilated=False))
+"""Samples where outlines are, and around them, that are scored and timed on the cases."""
+
+
 class Method(NamedTuple):
     """A renderer of one scene.
 
@@ -93,7 +97,7 @@ def splatters(scene: scenes.Scene) -> list[Method]:
     found.append(ours(scene, "multi, calibrated", most))
     found += [ours(scene, "visible, by samples", most, s) for s in (1, 2)]
     if scene.name in CASES:
-        found += [ours(scene, "none", 1), ours(scene, "visible", most, 4)]
+        found += [ours(scene, "none", 1), *(ours(scene, "visible", most, s) for s in (4, *ADAPTIVE))]
     return found
 
 
