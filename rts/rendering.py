@@ -44,12 +44,13 @@ from rts.interfaces import AnyNeeded, CheckedPart, Part, Splatter
 from rts.operations.linear import affine_map
 from rts.operations.take import take
 from rts.records import Fine, Sampled, Samples, Splats
-from rts.sampling.adaptive import Adaptive, contrasts, dilated, finest, outlines
+from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.emptiness import why_empty
+from rts.sampling.fine import Where, fine_samples
 from rts.sampling.merging import merge
 from rts.sampling.prepared import PreparedParts
-from rts.sampling.pruning import Everything, as_needed, needed_by, prune
-from rts.sampling.tiles import Grid, InTiles, Layout, Room, arranged, at_cells, lay_out, needed_room, of_engine, rounded
+from rts.sampling.pruning import Everything, as_needed, needed_by, planned, prune
+from rts.sampling.tiles import Grid, at_cells
 from rts.splatting.visible import Visible
 from rts.trees import Array, Tree
 
@@ -232,13 +233,13 @@ def _sampled(
     capacity: int | None,
 ) -> Sampled:
     """The samples of a window of the image, through the camera of this window."""
-    options = dict(splatter=splatter, layers=layers, capacity=capacity)
+    options: dict[str, Any] = dict(splatter=splatter, layers=layers, capacity=capacity)
     if isinstance(supersample, Adaptive):
         coarse = _sampled(scene, camera, size, supersample=1, **options)
         return replace(coarse, fine=_fine(scene, camera, size, coarse, adaptive=supersample, **options))
     side = int(supersample)
     height, width = side * size[0], side * size[1]
-    check_memory(height, width, _planned(layers), capacity, gradient=scene.suited[0].differentiates)
+    check_memory(height, width, planned(layers), capacity, gradient=scene.suited[0].differentiates)
     apron = apron_of(splatter)
     needed = None if splatter is None else needed_by(splatter, scene.parts)
     taken = partial(_taken, scene, _wide(scene, camera, (height, width), apron), capacity=capacity)
@@ -301,65 +302,12 @@ def _fine(
     capacity: int | None,
     colors: np.ndarray | None = None,
 ) -> Fine:
-    """Fine samples where outlines are.
-
-    Args:
-        scene: checked.
-        camera: that of the image.
-        size: (height, width) of the image.
-        coarse: its samples, one a pixel.
-        adaptive: where to look, and how closely.
-        splatter: see `sample`.
-        layers: see `sample`.
-        capacity: see `sample`.
-        colors: (N, 4) of the coarse samples, to look for contrast; or None.
-    """
-    engine, like = scene.suited
-    apron, side = apron_of(splatter), adaptive.samples
-    grid = Grid(size, side, apron)
-    spread, sizes = adaptive.dilates(scene.parts), [s.ids.shape[-2] for s in coarse.samples]
-    room = grid.room(capacity, _planned(layers))
-
-    def laid_out(row: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, ...]:
-        return tuple(lay_out(_active(row, depth, sizes, coarse.apron, spread, adaptive, colors), grid, room))
-
-    row, depth = engine_of(coarse).known(coarse.row), engine_of(coarse).known(coarse.depth)
-    needed = None
-    if row is None or depth is None or row.ndim != 3:
-        check_memory(1, room.cells, _planned(layers), capacity, gradient=engine.differentiates)
-        given = engine_of(coarse).call_host(laid_out, Layout.specs(grid, room), coarse.row, coarse.depth)
-        layout, allotted = Layout(*given), _planned(layers) * room.cells
-    else:
-        active = _active(row, depth, sizes, coarse.apron, spread, adaptive, colors)
-        few = engine_of(coarse).padded(coarse.row)
-        room = needed_room(active, grid) if capacity is None else room
-        room = Room(rounded(room.tiles), room.cells) if few else room
-        host = lay_out(active, grid, room, rounded if few else int)
-        check_memory(1, host.cells.size, _planned(layers), capacity, gradient=engine.differentiates)
-        layout, allotted = of_engine(host, engine_of(coarse), coarse.depth), None
-        needed = None if splatter is None else needed_by(splatter, scene.parts)
-        needed = None if needed is None else InTiles(needed, host)
-    wide = _wide(scene, camera, (side * size[0], side * size[1]), apron)
-    taken = partial(_taken, scene, wide, capacity=allotted, cells=layout.cells)
-    sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)
-    return arranged(sampled, layout, grid)
-
-
-def _active(
-    row: np.ndarray,
-    depth: np.ndarray,
-    sizes: Sequence[int],
-    apron: int,
-    spread: bool,
-    adaptive: Adaptive,
-    colors: np.ndarray | None,
-) -> np.ndarray:
-    """Active pixels (H, W) bool, of samples one a pixel (K, ·, ·) with an apron."""
-    found = outlines(row, depth, sizes)
-    if colors is not None and adaptive.contrast is not None:
-        found |= contrasts(row[0], colors, adaptive.contrast)
-    found = dilated(found) if spread else found
-    return np.ascontiguousarray(found[apron:-apron, apron:-apron])
+    """Fine samples where outlines are; `colors` (N, 4) of the coarse ones are to look for contrast."""
+    grid = Grid(size, adaptive.samples, apron_of(splatter))
+    wide = _wide(scene, camera, (grid.side * size[0], grid.side * size[1]), grid.apron)
+    needed = None if splatter is None else needed_by(splatter, scene.parts)
+    where = Where(adaptive, adaptive.dilates(scene.parts), colors)
+    return fine_samples(coarse, grid, where, partial(_taken, scene, wide), needed, layers, capacity)
 
 
 def _of_contrast(
@@ -448,7 +396,9 @@ def _narrowed(sampled: Sampled, cells: int) -> Sampled:
         return sampled
     rows, columns = (slice(cells, n - cells) for n in sampled.row.shape[1:])
     row, depth = (x[:, rows, columns] for x in (sampled.row, sampled.depth))
-    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells)
+    fine = sampled.fine  # Its own apron may be wider than is needed.
+    fine = None if fine is None else replace(fine, coarse=fine.coarse[rows, columns])
+    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, fine=fine)
 
 
 def _splatted(
@@ -597,18 +547,13 @@ def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, came
         raise
 
 
-def _planned(layers: int | Literal["auto"]) -> int:
-    """Layers to count with before they are known."""
-    return 4 if layers == "auto" else int(layers)
-
-
 def _bands(
     height: int, width: int, layers: int | Literal["auto"], supersample: int | Adaptive
 ) -> list[tuple[int, int]]:
     """(first row, number of rows) of the bands in which a supersampled image is rendered."""
     if isinstance(supersample, Adaptive) or supersample == 1:
         return [(0, height)]
-    rows = max(1, BAND // (_planned(layers) * int(supersample) ** 2 * width))
+    rows = max(1, BAND // (planned(layers) * int(supersample) ** 2 * width))
     count = math.ceil(height / rows)
     edges = [height * i // count for i in range(count + 1)]
     return [(top, end - top) for top, end in itertools.pairwise(edges)]

@@ -52,9 +52,9 @@ class Rays(Sampler):
         origins = xp.reshape(rays.origins, (-1, 3))
         listed = True
         if cells is not None:
-            cells, size = constants(cells, engine, like), tuple(cells.shape)
-            listed = xp.reshape(cells >= 0, (1, -1))
-            index = xp.reshape(xp.where(cells >= 0, cells, 0), (-1,))
+            index: Array = xp.reshape(constants(cells, engine, like), (-1,))
+            size, listed = tuple(cells.shape), index[None] >= 0
+            index = xp.where(index >= 0, index, 0)
             directions, origins = xp.take(directions, index, axis=0), xp.take(origins, index, axis=0)
         origins = origins + near * directions
         hits = _checked_hits(surface.intersect(theta, origins, directions, layers), surface, layers, size)

@@ -8,10 +8,10 @@ from helpers import DIFFERENTIABLE, TORCH, arrays, derivative, gradient, icosphe
 from loops import STEPS, Pairing
 
 import rts
-from rts import Adaptive, rendering
+from rts import Adaptive
 from rts.fitting.least_squares import normal_equations
 from rts.interfaces import Sampler
-from rts.sampling import tiles
+from rts.sampling import fine, tiles
 from rts.sampling.adaptive import dilated, outlines
 from rts.splatting import Multi
 
@@ -38,7 +38,7 @@ def render(parts, supersample, **options):
 
 def activate(monkeypatch, mask):
     """Make a mask of pixels (H, W) the active ones."""
-    monkeypatch.setattr(rendering, "_active", lambda *_: np.ascontiguousarray(mask))
+    monkeypatch.setattr(fine, "active", lambda *_: np.ascontiguousarray(mask))
 
 
 def random_mask(seed=0, share=0.3):
@@ -48,8 +48,8 @@ def random_mask(seed=0, share=0.3):
 def apart(parts, mask, s, atol=1e-6, **options):
     """Compare an adaptive image with the finer one at active pixels, and with the plain one at the others."""
     found = to_numpy(render(parts, Adaptive(s), **options))
-    fine, plain = (to_numpy(render(parts, n, **options)) for n in (s, 1))
-    np.testing.assert_allclose(found[mask], fine[mask], rtol=0, atol=atol)
+    finer, plain = (to_numpy(render(parts, n, **options)) for n in (s, 1))
+    np.testing.assert_allclose(found[mask], finer[mask], rtol=0, atol=atol)
     np.testing.assert_allclose(found[~mask], plain[~mask], rtol=0, atol=atol)
 
 

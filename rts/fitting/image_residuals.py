@@ -211,7 +211,7 @@ class ImageResiduals(Residuals):
         fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
 
         def swept(shown: Callable[..., Splats], fields: _Fields, **known: Any) -> tuple[Array, Array, Array] | None:
-            """The normal equations of what `shown` makes of parts, cameras, engine and exemplar; `known` is constant."""
+            """The normal equations of what `shown` makes of parts, cameras and an exemplar; `known` is constant."""
 
             def splats(v: Array) -> tuple[Array, Array]:
                 parts, camera = _checked(*self.scene(unflatten(v)))

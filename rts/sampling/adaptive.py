@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -54,7 +55,7 @@ class Adaptive:
         return self.dilated
 
 
-def finest(supersample: int | Adaptive) -> int:
+def finest(supersample: Any) -> Any:
     """Samples along each side of a pixel, where there are most; what is neither is returned as it is."""
     return supersample.samples if isinstance(supersample, Adaptive) else supersample
 

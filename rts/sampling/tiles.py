@@ -144,7 +144,7 @@ def _in_tiles(active: np.ndarray, grid: Grid) -> np.ndarray:
     down, across = grid.tiles
     wide = np.zeros((down * grid.tile, across * grid.tile), bool)
     wide[: grid.size[0], : grid.size[1]] = active
-    return wide.reshape(down, grid.tile, across, grid.tile).any(axis=(1, 3))
+    return np.asarray(wide.reshape(down, grid.tile, across, grid.tile).any(axis=(1, 3)))
 
 
 def lay_out(active: np.ndarray, grid: Grid, room: Room, lines_of: Callable[[int], int] | None = None) -> Layout:

@@ -6,6 +6,8 @@ the public interface of the package embreex serves, slower and to the same end.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from rts.camera import Camera
@@ -81,7 +83,8 @@ def _cast(
     prepared: Structure, camera: Camera, size: tuple[int, int], cull: str, cells: np.ndarray, shape: tuple[int, ...]
 ) -> Fragments:
     """Fragments (K, ·, ·) of some cells, or of all where none are named."""
-    scene, (height, width), count = prepared.scene, size, shape[1] * shape[2]
+    scene: Any = prepared.scene
+    (height, width), count = size, shape[1] * shape[2]
     tiles = -(-len(cells) // TILE**2) if len(cells) else -(-height // TILE) * -(-width // TILE)
     flat = np.empty((shape[0], count), np.int32), np.empty((shape[0], count, 2), np.float32)
     found = *flat, np.empty((shape[0], count), np.float32)
