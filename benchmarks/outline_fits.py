@@ -34,7 +34,8 @@ TILT = (0.45, 0.3)
 """Turns of the vase about x and y, radians."""
 SIZE, STEPS, RATE = (128, 128), 250, 0.01
 WEIGHTS = (0.003, 0.03)
-"""Of the Laplacian energy, a mean over vertices in squares of the sphere's edges, beside the mean square of pixels."""
+"""Weights of the Laplacian energy, a mean over vertices in squares of the sphere's edges, beside the mean
+square of pixels."""
 COLOR = (0.85, 0.75, 0.6)
 
 

@@ -319,7 +319,7 @@ def test_a_step_at_512_needs_little_memory():
     tracemalloc.stop()
     mixed = splats.choices.mixed.mean()
     print(f"{100 * mixed:.0f} % mixed: peak {peak / 2**20:.1f} MiB, of which results {results / 2**20:.1f} MiB")
-    assert mixed > 0.9 and peak < 80 * 2**20  # The worst case: random depths.
+    assert mixed > 0.9 and peak < 100 * 2**20  # The worst case: random depths.
 
 
 # ------------------------------------------------------------------------------------------------------ torch

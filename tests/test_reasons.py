@@ -129,11 +129,11 @@ def reach(mended):
 
 def bounded(mended):
     """Values on a lattice, some of whose crossed edges have hardly any slope: those across its right outline."""
-    axes = np.meshgrid(*[np.linspace(-1, 1, 13)] * 3, indexing="ij")
+    axes = np.meshgrid(*[np.linspace(-1, 1, 7)] * 3, indexing="ij")
     values = (np.linalg.norm(np.stack(axes), axis=0) - 0.73).astype(np.float32)
     if not mended:
-        x, y, z = np.argwhere((values[6:-1] < 0) & (values[7:] > 0)).T
-        values[x + 6, y, z], values[x + 7, y, z] = -1e-5, 1e-5
+        x, y, z = np.argwhere((values[3:-1] < 0) & (values[4:] > 0)).T
+        values[x + 3, y, z], values[x + 4, y, z] = -1e-5, 1e-5
     surface = rts.plugin("rts.surfaces", "isosurface")(((-1, -1, -1), (1, 1, 1)), motion="edge")
 
     def scene(p):
@@ -239,18 +239,17 @@ def depth(mended):
 
 
 def turning(mended):
-    """A smooth, round thing that turns about itself, or moves."""
+    """A smooth, round thing that turns about itself; its outline moves with samples inside of it, or as outlines do."""
     vertices, faces = icosphere(3, radius=10.0)
     vertices = vertices * np.array([1.0, 0.8, 0.7], np.float32)
+    splatter = rts.plugin("splatters", "visible")(rims=mended)
 
     def scene(p):
         zero = 0 * p
-        pose = rts.namespace(p).stack(
-            [zero, zero, zero, p, zero, zero] if mended else [zero, p, zero, zero, zero, zero]
-        )
+        pose = rts.namespace(p).stack([zero, p, zero, zero, zero, zero])
         return flat(vertices, faces, RED, transform=rts.rigid(pose)), CAMERA
 
-    return scene, np.array(0.1), {"loss": lambda image: image[:, :16, 3].sum()}
+    return scene, np.array(0.1), {"loss": lambda image: image[:, :16, 3].sum(), "splatter": splatter}
 
 
 def crossing(mended):

@@ -16,7 +16,7 @@ from rts_backends.fused import splatters as fused
 pytestmark = pytest.mark.splatting
 
 DISTANCE, RADIUS = 3.2, 0.7
-"""Of the camera from the sphere's centre, and the sphere's."""
+"""Distance of the camera from the sphere's centre, and the sphere's radius."""
 
 
 def pushed(splatter, splats, tangent, target="torch-cpu"):
@@ -153,7 +153,7 @@ def double():
 
 
 RULES = (1, "root"), (2, "chord"), (3, "line")
-CASES = [*[(target, *rule) for target in TORCH for rule in RULES], ("jax", 2, "chord")]
+CASES = [*[(target, *rule) for target in TORCH for rule in RULES], ("jax", 1, "root")]
 
 
 @pytest.mark.parametrize("target, layers, name", CASES)
