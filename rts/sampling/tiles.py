@@ -83,8 +83,8 @@ class Room(NamedTuple):
 
 
 def rounded(count: int) -> int:
-    """The next number of the form 2ⁿ or 3·2ⁿ: few, so that what engines compile for a shape serves again."""
-    size = 4
+    """The next number of the form 2ⁿ or 3·2ⁿ, at least 16: few, so that what is compiled for a shape serves again."""
+    size = 16
     while size < count:
         size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
     return size
