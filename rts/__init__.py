@@ -22,6 +22,7 @@ from rts.errors import (
     RtsWarning,
     ToleranceWarning,
 )
+from rts.explaining import explain
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
 from rts.files.views import View, load_views
@@ -47,10 +48,10 @@ from rts.operations.gradient import gradient
 from rts.operations.operation import Operation
 from rts.operations.rigid import rigid
 from rts.radiance_fields import load_radiance_field, volume_render
-from rts.records import ArraySpec, Fragments, Proxy, RayHits, Rays, Sampled, Samples, Splats
+from rts.records import ArraySpec, Fine, Fragments, Proxy, RayHits, Rays, Sampled, Samples, Splats
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples, sample
-from rts.sampling.auto import explain
+from rts.sampling.adaptive import Adaptive
 from rts.sampling.prepared import prepare
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.splatting import exact_calibration
@@ -58,6 +59,7 @@ from rts.splatting import exact_calibration
 __version__ = "0.1.0"
 
 __all__ = [
+    "Adaptive",
     "ArraySpec",
     "AspectWarning",
     "Camera",
@@ -66,6 +68,7 @@ __all__ = [
     "EngineError",
     "Evaluator",
     "FileWarning",
+    "Fine",
     "Fit",
     "Fragments",
     "GBuffer",

@@ -137,7 +137,7 @@ def check_size(size: Any, layers: Any, capacity: Any, supersample: Any) -> tuple
     if capacity is not None and not is_count(capacity):
         raise InputError(f"capacity is {quoted(capacity)}; expected an integer of at least 1, or None")
     if not is_count(supersample):
-        raise InputError(f"supersample is {quoted(supersample)}; expected an integer of at least 1")
+        raise InputError(f"supersample is {quoted(supersample)}; expected an integer of at least 1, or an rts.Adaptive")
     return height, width
 
 

@@ -291,9 +291,13 @@ class Sampler(Plugin):
     Attributes:
         prunes: whether `sample` also takes the keyword `needed`, which says which samples to keep: a `Needed`, a
             function of its signature, or None for all.
+        takes_cells: whether `sample` also takes the keyword `cells`, (L, C) int32: the only cells of the grid to
+            sample, as flat indices, or −1 for none; an array of the part's engine, perhaps traced. `row` and `depth` of
+            the samples are then (K, L, C). Without it all cells are sampled, and those that are not listed left out.
     """
 
     prunes: bool = False
+    takes_cells: bool = False
 
     @abc.abstractmethod
     def sample(
@@ -337,10 +341,12 @@ class Shader(Plugin):
 
     Attributes:
         opaque: a promise that alpha is 1.
+        uniform: a promise that all samples of a part have one colour.
         reads: the entries of the G-buffer that it needs besides position; None for all.
     """
 
     opaque: bool = False
+    uniform: bool = False
     reads: tuple[str, ...] | None = None
 
     @abc.abstractmethod

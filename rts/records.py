@@ -124,6 +124,46 @@ class Samples:
 
 
 @record(static=("supersample", "apron"))
+class Fine:
+    """The fine samples of an adaptively sampled scene: cells of active pixels and an apron around them, in tiles.
+
+    Tiles lie side by side in one layout of h × w cells, which splatters take as they take any picture. What lies
+    outside of active pixels there is no part of the image.
+
+    Attributes:
+        samples: one `Samples` for each part; `row` and `depth` are of a list of cells.
+        index: (M,) int32, the sample that each splat shows, counted over all parts in order.
+        shift: (M, 3) float32, from pixel positions in the grid of fine cells to those in the layout.
+        row: (K, h, w) int32, the splat in each place of the layout, or −1.
+        part: (K, h, w) int32, the part seen there, or −1.
+        kinds: (h, w) uint8, bit 0 at the cells of active pixels, bit 1 within two cells of them.
+        pixel: (H, W) int32, for each pixel of the image which pixel of the layout it is, counted along its lines
+            without the apron; −1 where it is not active.
+        coarse: (h', w') bool, the cells of the coarse grid, with its apron, whose pixels are not active.
+        overflow: () int32, pixels that there was no room for, which stay coarse, and samples that were dropped.
+        supersample: s; each active pixel has s² cells.
+        apron: cells around active pixels, and around the layout.
+    """
+
+    samples: tuple[Samples, ...]
+    index: Array
+    shift: Array
+    row: Array
+    part: Array
+    kinds: Array
+    pixel: Array
+    coarse: Array
+    overflow: Array
+    supersample: int
+    apron: int
+
+    @property
+    def wanted(self) -> Array:
+        """(h, w) bool, the cells of active pixels."""
+        return (self.kinds & 1) > 0
+
+
+@record(static=("supersample", "apron"))
 class Sampled:
     """A whole scene, sampled: what `rts.sample` returns and `rts.render_samples` takes.
 
@@ -137,6 +177,7 @@ class Sampled:
         overflow: () int32, samples dropped for want of capacity, or beyond the limit of `layers="auto"`. Should be 0.
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
+        fine: further samples where outlines are (`rts.Adaptive`), or None.
     """
 
     samples: tuple[Samples, ...]
@@ -145,6 +186,7 @@ class Sampled:
     overflow: Array
     supersample: int = 1
     apron: int = 2
+    fine: Fine | None = None
 
     @property
     def part(self) -> Array:
@@ -173,6 +215,7 @@ class Splats:
         settled: (H, W) bool, cells amid one colour, where nothing that moves changes the image; or None.
         sentinel: () float, the depth that stands for empty layers, beyond all samples; None for one of the scene's
             scale.
+        wanted: (H, W) bool, the targets that are looked at; others may have any finite colour. None for all.
         border: cells at each side that splat into the image but are no part of it.
     """
 
@@ -183,6 +226,7 @@ class Splats:
     facing: Array | None = None
     settled: Array | None = None
     sentinel: Array | None = None
+    wanted: Array | None = None
     border: int = 0
 
     def replace(self, **changes: Any) -> Splats:

@@ -9,6 +9,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple
 
+import numpy as np
+
 from rts.arguments import quoted
 from rts.arrays import described, shape_of
 from rts.camera import Camera
@@ -40,11 +42,15 @@ from rts.errors import EmptyImageWarning, InputError, warn
 from rts.gbuffer import GBuffer
 from rts.interfaces import AnyNeeded, CheckedPart, Part, Splatter
 from rts.operations.linear import affine_map
-from rts.records import Sampled, Samples, Splats
+from rts.operations.take import take
+from rts.records import Fine, Sampled, Samples, Splats
+from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.emptiness import why_empty
+from rts.sampling.fine import Where, fine_samples
 from rts.sampling.merging import merge
 from rts.sampling.prepared import PreparedParts
-from rts.sampling.pruning import Everything, as_needed, needed_by, prune
+from rts.sampling.pruning import Everything, as_needed, needed_by, planned, prune
+from rts.sampling.tiles import Grid, at_cells
 from rts.splatting.visible import Visible
 from rts.trees import Array, Tree
 
@@ -61,7 +67,7 @@ def render(
     sampler: Any = "auto",
     splatter: Any = "auto",
     layers: int | Literal["auto"] = 2,
-    supersample: int = 1,
+    supersample: int | Adaptive = 1,
     background: Any = None,
     capacity: int | None = None,
     engine: str | None = None,
@@ -77,13 +83,16 @@ def render(
         layers: K, the number of surface layers kept at each pixel; or "auto", as many as count where surfaces hide one
             another, up to 8 (a warning says if there are more).
         supersample: s, for s² samples a pixel, splatted on the finer grid and averaged. Large images are rendered in
-            bands of rows, so that memory stays bounded; in a gradient each band is then made once more.
+            bands of rows, so that memory stays bounded; in a gradient each band is then made once more. Or an
+            `rts.Adaptive`, for as many only where outlines are; there are no bands then.
         background: colour (3,) or (4,), or image (H, W, 3 or 4), premultiplied, to composite onto; None for
             transparent.
         capacity: number of rows to allot for the samples of a part inside `jax.jit`, where shapes must be known. None
             for the worst case, layers × cells. If a third of the cells are covered, pass a third of that. What does not
             fit is dropped, deepest layers first, and counted: `overflow` of `rts.sample` is above 0, then. Where the
-            image is rendered in bands, it is the capacity of each band.
+            image is rendered in bands, it is the capacity of each band. With `rts.Adaptive` the fine samples have as
+            many rows again, `layers` for each fine cell of active pixels and their aprons; pixels that find no room
+            stay coarse, and are counted.
         engine: name of the engine to compute with, "torch" or "jax", where the scene alone does not tell: its arrays
             are all NumPy, but a shader holds a network. None for the engine of the arrays.
 
@@ -101,13 +110,16 @@ def render(
         AspectWarning: the camera is for images of another ratio of width to height.
     """
     scene = _Scene.of(parts, camera, sampler, engine)
-    size = check_size(size, layers, capacity, supersample)
+    size = check_size(size, layers, capacity, finest(supersample))
     scene = scene.at(size)
     background = check_background(background, size)
     splatter = check_splatter(splatter)
-    options = dict(splatter=splatter, layers=layers, supersample=int(supersample), capacity=capacity)
+    options = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
     bands = _bands(*size, layers, supersample)
     suited = scene.suited if is_constant(background) else scene.suiting(background)
+    if isinstance(supersample, Adaptive) and supersample.contrast is not None:
+        image = _of_contrast(scene, size, suited, **options)
+        return _over_background(_seen(image, scene), background)
     if len(bands) == 1:
         sampled = _sampled(scene, scene.camera, size, **options)
         image = _splatted(sampled, scene, scene.camera, suited, splatter)
@@ -129,7 +141,7 @@ def sample(
     sampler: Any = "auto",
     splatter: Any = None,
     layers: int | Literal["auto"] = 2,
-    supersample: int = 1,
+    supersample: int | Adaptive = 1,
     capacity: int | None = None,
     engine: str | None = None,
 ) -> Sampled:
@@ -155,10 +167,15 @@ def sample(
         EngineError: torch and jax arrays in one scene.
     """
     scene = _Scene.of(parts, camera, sampler, engine)
-    size = check_size(size, layers, capacity, supersample)
+    size = check_size(size, layers, capacity, finest(supersample))
     scene = scene.at(size)
     splatter = None if splatter is None else check_splatter(splatter)
-    options = dict(splatter=splatter, layers=layers, supersample=int(supersample), capacity=capacity)
+    if isinstance(supersample, Adaptive) and supersample.contrast is not None:
+        raise InputError(
+            f"contrast of Adaptive is {supersample.contrast}; expected None, since rts.sample knows no colours; render "
+            f"with it, or leave it out"
+        )
+    options = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
     return _sampled(scene, scene.camera, size, **options)
 
 
@@ -212,36 +229,107 @@ def _sampled(
     *,
     splatter: Splatter | None,
     layers: int | Literal["auto"],
-    supersample: int,
+    supersample: int | Adaptive,
     capacity: int | None,
 ) -> Sampled:
     """The samples of a window of the image, through the camera of this window."""
-    parts, _, samplers, entries, suited = scene
-    height, width = supersample * size[0], supersample * size[1]
-    check_memory(height, width, _planned(layers), capacity, gradient=suited[0].differentiates)
+    options: dict[str, Any] = dict(splatter=splatter, layers=layers, capacity=capacity)
+    if isinstance(supersample, Adaptive):
+        coarse = _sampled(scene, camera, size, supersample=1, **options)
+        return replace(coarse, fine=_fine(scene, camera, size, coarse, adaptive=supersample, **options))
+    side = int(supersample)
+    height, width = side * size[0], side * size[1]
+    check_memory(height, width, planned(layers), capacity, gradient=scene.suited[0].differentiates)
     apron = apron_of(splatter)
-    grid = height + 2 * apron, width + 2 * apron
-    # Every part is sampled by the one engine, and by the very views that samples are projected with.
-    wide = camera.with_apron((height, width), apron)
-    if suited[0].differentiates:
-        wide = constants(wide, *suited)
-
-    def taken(count: int, needed: AnyNeeded | None) -> Sampled:
-        samples, pruned = [], False
-        for part, chosen, entry in zip(parts, samplers, entries, strict=True):
-            known: dict[str, Any] = {} if entry is None else {"entry": entry}
-            if needed is not None and chosen.prunes:
-                pruned = len(parts) == 1
-                known["needed"] = needed if pruned else Everything(needed)
-            samples.append(chosen.sample(part, wide.within(part.transform), grid, count, capacity=capacity, **known))
-        sampled = merge(samples, count)
-        # Traced arrays have the shape of the worst case, pruned or not.
-        return sampled if needed is None or pruned or is_traced(sampled.row) else prune(sampled, needed)
-
-    samplers = [suited_sampler(chosen, part, camera) for part, chosen in zip(parts, samplers, strict=True)]
-    needed = None if splatter is None else needed_by(splatter, parts)
+    needed = None if splatter is None else needed_by(splatter, scene.parts)
+    taken = partial(_taken, scene, _wide(scene, camera, (height, width), apron), capacity=capacity)
     sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)
-    return replace(sampled, supersample=supersample, apron=apron)
+    return replace(sampled, supersample=side, apron=apron)
+
+
+class _Wide(NamedTuple):
+    """A grid of cells: its camera, constant, and its height and width."""
+
+    camera: Camera
+    grid: tuple[int, int]
+
+
+def _wide(scene: _Scene, camera: Camera, size: tuple[int, int], apron: int) -> _Wide:
+    """The grid of an image of cells (height, width) with an apron."""
+    # Every part is sampled by the one engine, and by the very views that samples are projected with.
+    wide = camera.with_apron(size, apron)
+    if scene.suited[0].differentiates:
+        wide = constants(wide, *scene.suited)
+    return _Wide(wide, (size[0] + 2 * apron, size[1] + 2 * apron))
+
+
+def _taken(
+    scene: _Scene,
+    wide: _Wide,
+    count: int,
+    needed: AnyNeeded | None,
+    *,
+    capacity: int | None,
+    cells: Array | None = None,
+) -> Sampled:
+    """The samples of a grid of cells, or of those that are listed; less what is not needed."""
+    samples, pruned, listed = [], False, {} if cells is None else {"cells": cells}
+    for part, chosen, entry in zip(scene.parts, scene.samplers, scene.entries, strict=True):
+        chosen = suited_sampler(chosen, part, scene.camera)
+        known: dict[str, Any] = {} if entry is None else {"entry": entry}
+        seen = wide.camera.within(part.transform)
+        if cells is not None and not chosen.takes_cells:
+            samples.append(at_cells(chosen.sample(part, seen, wide.grid, count, **known), cells, capacity))
+            continue
+        if needed is not None and chosen.prunes:
+            pruned = len(scene.parts) == 1
+            known["needed"] = needed if pruned else Everything(needed)
+        samples.append(chosen.sample(part, seen, wide.grid, count, capacity=capacity, **known, **listed))
+    sampled = merge(samples, count)
+    # Traced arrays have the shape of the worst case, pruned or not.
+    return sampled if needed is None or pruned or is_traced(sampled.row) else prune(sampled, needed)
+
+
+def _fine(
+    scene: _Scene,
+    camera: Camera,
+    size: tuple[int, int],
+    coarse: Sampled,
+    *,
+    adaptive: Adaptive,
+    splatter: Splatter | None,
+    layers: int | Literal["auto"],
+    capacity: int | None,
+    colors: np.ndarray | None = None,
+) -> Fine:
+    """Fine samples where outlines are; `colors` (N, 4) of the coarse ones are to look for contrast."""
+    grid = Grid(size, adaptive.samples, apron_of(splatter))
+    wide = _wide(scene, camera, (grid.side * size[0], grid.side * size[1]), grid.apron)
+    needed = None if splatter is None else needed_by(splatter, scene.parts)
+    where = Where(adaptive, adaptive.dilates(scene.parts), colors)
+    return fine_samples(coarse, grid, where, partial(_taken, scene, wide), needed, layers, capacity)
+
+
+def _of_contrast(
+    scene: _Scene,
+    size: tuple[int, int],
+    suited: tuple,
+    *,
+    splatter: Splatter,
+    supersample: Adaptive,
+    **options: Any,
+) -> Array:
+    """The image with fine samples also where colours change, which are those of the coarse samples."""
+    coarse = _sampled(scene, scene.camera, size, splatter=splatter, supersample=1, **options)
+    splats = to_splats(coarse, scene.parts, scene.camera, scene.camera, *suited)
+    colors = value_of(splats.rgba)
+    if colors is None or colors.ndim != 2 or value_of(coarse.row) is None:
+        raise InputError(
+            f"contrast of Adaptive is {supersample.contrast}, and colours are traced; give None: what is sampled "
+            f"cannot depend on values that are not known yet"
+        )
+    fine = _fine(scene, scene.camera, size, coarse, adaptive=supersample, splatter=splatter, colors=colors, **options)
+    return _splatted(replace(coarse, fine=fine), scene, scene.camera, suited, splatter, splats)
 
 
 @uncompiled
@@ -308,10 +396,19 @@ def _narrowed(sampled: Sampled, cells: int) -> Sampled:
         return sampled
     rows, columns = (slice(cells, n - cells) for n in sampled.row.shape[1:])
     row, depth = (x[:, rows, columns] for x in (sampled.row, sampled.depth))
-    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells)
+    fine = sampled.fine  # Its own apron may be wider than is needed.
+    fine = None if fine is None else replace(fine, coarse=fine.coarse[rows, columns])
+    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, fine=fine)
 
 
-def _splatted(sampled: Sampled, scene: _Scene, window: Camera, suited: tuple, splatter: Splatter) -> Array:
+def _splatted(
+    sampled: Sampled,
+    scene: _Scene,
+    window: Camera,
+    suited: tuple,
+    splatter: Splatter,
+    splats: Splats | None = None,
+) -> Array:
     """The image (H, W, 4) of what was sampled through a window of the camera's image.
 
     Args:
@@ -320,22 +417,56 @@ def _splatted(sampled: Sampled, scene: _Scene, window: Camera, suited: tuple, sp
         window: the camera of the samples.
         suited: the engine to compute with, and an array that sets dtype and device of its constants, or None.
         splatter: a splatter.
+        splats: of the samples, but for the fine ones, if they are known.
     """
-    fine = sampled.supersample
-    image = splatter.cropped(to_splats(sampled, scene.parts, scene.camera, window, *suited))
-    expected = *(n - 2 * sampled.apron for n in sampled.row.shape[1:]), 4
+    if splats is None:
+        splats = to_splats(sampled, scene.parts, scene.camera, window, *suited)
+    if sampled.fine is None:
+        return _averaged(splatter, splats, sampled.supersample)
+    coarse = constants(sampled.fine.coarse, *suiting(splats.rgba))
+    image = _averaged(splatter, splats.replace(wanted=coarse), 1)
+    splats = to_fine_splats(sampled.fine, scene.parts, scene.camera, *suited)
+    finer = _averaged(splatter, splats, sampled.fine.supersample)
+    engine, xp = engine_of(image), namespace(image)
+    pixel = constants(sampled.fine.pixel, engine, image)
+    rows = take(xp.reshape(finer, (-1, 4)), xp.reshape(xp.where(pixel >= 0, pixel, 0), (-1,)))
+    return xp.where((pixel >= 0)[..., None], xp.reshape(rows, image.shape), image)
+
+
+def _averaged(splatter: Splatter, splats: Splats, side: int) -> Array:
+    """The image (h, w, 4) of splats without their border, each pixel the mean of `side`² cells."""
+    image = splatter.cropped(splats)
+    expected = *(n - 2 * splats.border for n in splats.row.shape[1:]), 4
     if shape_of(image) != expected:
         raise InputError(f"the image of {splatter!r} {described(image)}; expected {expected} without the border")
-    if fine > 1:
-        xp, size = namespace(image), image.shape[:2]
-        image = xp.mean(xp.reshape(image, (size[0] // fine, fine, size[1] // fine, fine, 4)), axis=(1, 3))
-    return image
+    if side == 1:
+        return image
+    # One axis after the other: over both at once, torch takes three times as long.
+    xp, (height, width) = namespace(image), (n // side for n in image.shape[:2])
+    rows = xp.mean(xp.reshape(image, (height, side, width * side * 4)), axis=1)
+    return xp.mean(xp.reshape(rows, (height, width, side, 4)), axis=2)
+
+
+def to_fine_splats(
+    fine: Fine, parts: Sequence[CheckedPart], camera: Camera, engine: Engine, like: Array | None
+) -> Splats:
+    """Evaluate, shade and project fine samples: splats in the places of their layout. Arguments as in `to_splats`."""
+    size = tuple(n * fine.supersample for n in fine.pixel.shape)
+    wide = _Wide(camera.with_apron(size, fine.apron), tuple(n + 2 * fine.apron for n in size))
+    if not engine.owns(fine.row):
+        fine = constants(fine, engine, like if engine.differentiates else None)
+    positions, rgba = _shown(fine.samples, fine.index, parts, camera, wide, engine, like)
+    arrays = fine.index, fine.shift, fine.row, fine.part, fine.wanted
+    index, shift, row, part, wanted = constants(arrays, *suiting(positions, rgba))
+    xp = namespace(positions)
+    moved = take(positions, index) + xp.astype(shift, positions.dtype)
+    return Splats(moved, take(rgba, index), row, part, wanted=wanted, border=fine.apron)
 
 
 def to_splats(
     sampled: Sampled, parts: Sequence[CheckedPart], camera: Camera, window: Camera, engine: Engine, like: Array | None
 ) -> Splats:
-    """Evaluate, shade and project samples: what splatters take, with the apron as border.
+    """Evaluate, shade and project samples: what splatters take, with the apron as border. Fine ones are left out.
 
     Args:
         sampled: the samples.
@@ -345,18 +476,44 @@ def to_splats(
         engine: the engine to compute with.
         like: an array that sets dtype and device of its constants and of the splats.
     """
+    grid, apron = tuple(sampled.row.shape[1:]), sampled.apron
+    wide = _Wide(window.with_apron((grid[0] - 2 * apron, grid[1] - 2 * apron), apron), grid)
+    if not engine.owns(sampled.row):
+        sampled = constants(sampled, engine, like if engine.differentiates else None)
+    positions, rgba = _shown(sampled.samples, sampled.row, parts, camera, wide, engine, like)
+    row, part = sampled.row, sampled.part
+    if not engine.owns(rgba):
+        row, part = constants((row, part), *suiting(positions, rgba))
+    return Splats(positions, rgba, row, part, border=apron)
+
+
+def _shown(
+    sampled: Sequence[Samples],
+    row: Array,
+    parts: Sequence[CheckedPart],
+    camera: Camera,
+    wide: _Wide,
+    engine: Engine,
+    like: Array | None,
+) -> tuple[Array, Array]:
+    """Positions (N, 3) in a grid and colours (N, 4) of the samples of all parts, in order.
+
+    Args:
+        sampled: the samples of each part.
+        row: integers, those of them that are seen.
+        parts: checked parts.
+        camera: the camera of the whole image, which shaders see.
+        wide: the grid, and its camera.
+        engine: the engine to compute with.
+        like: an array that sets dtype and device of its constants and of what is returned.
+    """
     dtype = like
     if not engine.differentiates:
         like = None  # All is constant, and computed in the dtypes that are given.
-    grid, apron = tuple(sampled.row.shape[1:]), sampled.apron
-    wide = window.with_apron((grid[0] - 2 * apron, grid[1] - 2 * apron), apron)
-    wide = wide.replace(view=constants(wide.view, engine, like))
+    seen = wide.camera.replace(view=constants(wide.camera.view, engine, like))
     camera = constants(camera, engine, like)
-    if not engine.owns(sampled.row):
-        sampled = constants(sampled, engine, like)
-
     positions, colors, first = [], [], 0
-    for index, (part, samples) in enumerate(zip(parts, sampled.samples, strict=True)):
+    for index, (part, samples) in enumerate(zip(parts, sampled, strict=True)):
         transform = constants(part.transform, engine, like)
         reads = part.surface.reads(part.theta)
         local = _evaluate(part, reads, samples, engine, like)
@@ -364,18 +521,17 @@ def to_splats(
         world = _to_world(_readable(local, samples, engine), transform)
         rgba = _shaded(part, theta, world, camera)
         check_shaded(rgba, local["position"].shape[0], part.shader)
-        positions.append(constants(wide.within(transform).project(local["position"], grid), engine, dtype))
-        check_splats(index, part, world, positions[-1], rgba, sampled.row, first)
+        positions.append(constants(seen.within(transform).project(local["position"], wide.grid), engine, dtype))
+        check_splats(index, part, world, positions[-1], rgba, row, first)
         colors.append(constants(rgba, engine, dtype))
         first += samples.ids.shape[-2]
-    row, part = sampled.row, sampled.part
     if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
         # A shader may close over arrays of an engine that the scene has none of.
-        positions, colors, row, part = constants((positions, colors, row, part), *suiting(positions, colors))
+        positions, colors = constants((positions, colors), *suiting(positions, colors))
     if len(parts) == 1:
-        return Splats(positions[0], colors[0], row, part, border=apron)
-    xp = namespace(row)
-    return Splats(xp.concat(positions), xp.concat(colors), row, part, border=apron)
+        return positions[0], colors[0]
+    xp = namespace(positions[0])
+    return xp.concat(positions), xp.concat(colors)
 
 
 def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
@@ -391,16 +547,13 @@ def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, came
         raise
 
 
-def _planned(layers: int | Literal["auto"]) -> int:
-    """Layers to count with before they are known."""
-    return 4 if layers == "auto" else int(layers)
-
-
-def _bands(height: int, width: int, layers: int | Literal["auto"], supersample: int) -> list[tuple[int, int]]:
+def _bands(
+    height: int, width: int, layers: int | Literal["auto"], supersample: int | Adaptive
+) -> list[tuple[int, int]]:
     """(first row, number of rows) of the bands in which a supersampled image is rendered."""
-    if supersample == 1:
+    if isinstance(supersample, Adaptive) or supersample == 1:
         return [(0, height)]
-    rows = max(1, BAND // (_planned(layers) * int(supersample) ** 2 * width))
+    rows = max(1, BAND // (planned(layers) * int(supersample) ** 2 * width))
     count = math.ceil(height / rows)
     edges = [height * i // count for i in range(count + 1)]
     return [(top, end - top) for top, end in itertools.pairwise(edges)]

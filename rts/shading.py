@@ -41,6 +41,7 @@ class Silhouette(Shader):
     """White where there is a surface."""
 
     opaque = True
+    uniform = True
     reads = ()
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:

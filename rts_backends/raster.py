@@ -21,11 +21,11 @@ from rts.camera import Camera
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel
-from rts_backends.triangles import facing, owns, pixel_matrix, to_corner
+from rts_backends import raster_cells
+from rts_backends.raster_drawing import BAND_ROWS, LISTED, draw, draw_cells
+from rts_backends.triangles import facing, pixel_matrix, to_corner
 
-BAND_ROWS = 16
 CHUNK = 1 << 11
-BLOCK = 64
 LONG_BLOCK = 256
 """The block for loops that keep little of each triangle or vertex."""
 
@@ -37,12 +37,6 @@ Positions on screen take 16 bits, so that those of a million triangles stay in c
 
 BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 """In place of a position: before the near plane (or NaN), beyond the far plane."""
-
-LISTED = 8
-"""What is listed of a triangle: its index, its three corners, and its first and last column and row of pixels."""
-
-NUMBERS = 18
-"""Three edge functions (x, y, 1) turned inward; of the corners the depths, and w + z and w − z of clip space."""
 
 
 class Raster(TriangleSampler):
@@ -58,6 +52,24 @@ class Raster(TriangleSampler):
 
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
+        return self._drawn(prepared, camera, size, layers, cull, None)
+
+    def rasterize_cells(
+        self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
+    ) -> Fragments:
+        """See `TriangleSampler.rasterize_cells`: triangles that touch no block of these cells are passed over."""
+        return self._drawn(prepared, camera, size, layers, cull, cells)
+
+    def _drawn(
+        self,
+        prepared: Proxy,
+        camera: Camera,
+        size: tuple[int, int],
+        layers: int,
+        cull: str,
+        cells: np.ndarray | None,
+    ) -> Fragments:
+        """Fragments of all cells, or of some."""
         height, width = size
         # With unsigned indices compiled code need not look for negative ones, which count from the end.
         vertices, faces = prepared.vertices, np.asarray(prepared.faces, np.int32).view(np.uint32)
@@ -77,16 +89,26 @@ class Raster(TriangleSampler):
         spans, counts = np.empty((chunks, 2), np.int64), np.zeros((bands, chunks), np.int64)
         given = vertices, faces, screen, matrix, height, width, step, keep
         parallel(_select, chunks, *given, listed, spans, counts, work=10 * len(faces))
+        blocks = None if cells is None else raster_cells.Blocks.of(cells, size)
+        if blocks is not None:
+            parallel(raster_cells.narrow, chunks, listed, blocks.bits, spans, counts, work=5 * int(counts.sum()))
         offsets = np.append(0, np.cumsum(counts.sum(axis=1)))
         places = offsets[:-1, None] + np.cumsum(counts, axis=1) - counts
         items = np.empty(offsets[-1], np.uint32)
         parallel(_sort, chunks, listed, spans, places, items, work=8 * len(items))
-        fragments = Fragments(
-            np.empty((layers, height, width), np.int32),
-            np.empty((layers, height, width, 2), np.float32),
-            np.empty((layers, height, width), np.float32),
-        )
-        parallel(_draw, bands, offsets, items, listed, vertices, matrix, -camera.view[2], keep, *fragments)
+        given = offsets, items, listed, vertices, matrix, -camera.view[2], keep
+        if blocks is None or cells is None:
+            fragments = Fragments(
+                np.empty((layers, height, width), np.int32),
+                np.empty((layers, height, width, 2), np.float32),
+                np.empty((layers, height, width), np.float32),
+            )
+            parallel(draw, bands, *given, *fragments)
+        else:
+            fragments = blocks.nothing(cells, layers)
+            flat = [x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments]
+            nearest = np.full((layers, cells.size), np.inf)
+            parallel(draw_cells, bands, *given, blocks.table, blocks.numbers, nearest, *flat)
         self._scratch = {key: (screen, listed)}
         return fragments
 
@@ -214,163 +236,3 @@ def _sort(first, last, listed, spans, places, items):
             for band in range(listed[n, 6] // BAND_ROWS, listed[n, 7] // BAND_ROWS + 1):
                 items[places[band, chunk]] = n
                 places[band, chunk] += 1
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _draw(first, last, offsets, items, listed, vertices, matrix, view_depth, keep, triangle_ids, barycentrics, depths):
-    """Fill the three fragment arrays, band by band."""
-    layers, height, width = triangle_ids.shape
-    nearest = np.empty((layers, BAND_ROWS, width))
-    entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
-    numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
-    most = 4 * BLOCK
-    hits = np.empty((most + width, 2), np.int32)
-    for band in range(first, last):
-        top, bottom = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS) - 1
-        rows = slice(top, bottom + 1)
-        nearest[:], triangle_ids[:, rows], barycentrics[:, rows] = np.inf, -1, 0
-        for start in range(offsets[band], offsets[band + 1], BLOCK):
-            block = items[start : min(offsets[band + 1], start + BLOCK)]
-            _gather(block, listed, vertices, entries, points)
-            _set_up(len(block), points, matrix, view_depth, keep, top, bottom, entries, numbers, clips)
-            _cover(len(block), entries, numbers, covers)
-            found = 0
-            for b in range(len(block)):
-                i0, i1, j0, j1 = entries[4, b], entries[5, b], entries[6, b], entries[7, b]
-                place = b * BAND_ROWS + j0 - top
-                if (i1 - i0 < 2) & (j1 - j0 < 2):
-                    for n in range(4):
-                        hits[found, 0], hits[found, 1] = place + (n >> 1), i0 + (n & 1)
-                        found += (covers[b] >> n) & 1
-                    continue
-                for j in range(j0, j1 + 1):
-                    y = j + 0.5
-                    ra, rb = numbers[1, b] * y + numbers[2, b], numbers[4, b] * y + numbers[5, b]
-                    rc = numbers[7, b] * y + numbers[8, b]
-                    for i in range(i0, i1 + 1):
-                        x = i + 0.5
-                        ea, eb, ec = numbers[0, b] * x + ra, numbers[3, b] * x + rb, numbers[6, b] * x + rc
-                        hits[found, 0], hits[found, 1] = place, i
-                        found += (ea >= 0) & (eb >= 0) & (ec >= 0)
-                    place += 1
-                    if found > most - 4:
-                        _insert(hits[:found], top, entries, numbers, clips, nearest, triangle_ids, barycentrics)
-                        found = 0
-            _insert(hits[:found], top, entries, numbers, clips, nearest, triangle_ids, barycentrics)
-        for k in range(layers):
-            for j in range(top, bottom + 1):
-                for i in range(width):
-                    z = nearest[k, j - top, i]
-                    depths[k, j, i] = z if z < np.inf else 0.0
-
-
-# numba itself must inline these, so that lengths of rows are known: only then do their loops become vector code.
-
-
-@numba.njit(inline="always")
-def _gather(block, listed, vertices, entries, points):
-    """What is listed of the triangles (LISTED, BLOCK), and their corners (3, 3, BLOCK).
-
-    The loops are so short that the processor overlaps their waits for memory.
-    """
-    for b in range(len(block)):
-        for r in range(LISTED):
-            entries[r, b] = listed[block[b], r]
-    for b in range(len(block)):
-        for c in range(3):
-            v = np.uint32(entries[1 + c, b])
-            for r in range(3):
-                points[c, r, b] = vertices[v, r]
-
-
-@numba.njit(inline="always")
-def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, clips):
-    """Work out the numbers (NUMBERS, BLOCK) of triangles, and which may need clipping.
-
-    Rows are cut to the band; none are left of a triangle of no area, or facing away.
-    """
-    corners, signs = np.empty((3, 4, BLOCK)), np.empty(BLOCK)
-    for c in range(3):
-        for b in range(count):
-            px, py, pz = points[c, 0, b], points[c, 1, b], points[c, 2, b]
-            numbers[9 + c, b] = view_depth[0] * px + view_depth[1] * py + view_depth[2] * pz + view_depth[3]
-            x, y, z = np.float64(px), np.float64(py), np.float64(pz)
-            for r in range(4):
-                corners[c, r, b] = m[r, 0] * x + m[r, 1] * y + m[r, 2] * z + m[r, 3]
-            numbers[12 + c, b] = corners[c, 3, b] + corners[c, 2, b]
-            numbers[15 + c, b] = corners[c, 3, b] - corners[c, 2, b]
-    for b in range(count):
-        ax, ay, aw = corners[0, 0, b], corners[0, 1, b], corners[0, 3, b]
-        bx, by, bw = corners[1, 0, b], corners[1, 1, b], corners[1, 3, b]
-        cx, cy, cw = corners[2, 0, b], corners[2, 1, b], corners[2, 3, b]
-        area = ax * (by * cw - bw * cy) - ay * (bx * cw - bw * cx) + aw * (bx * cy - by * cx)
-        signs[b] = 1.0 if area > 0 else -1.0
-        drawn = (area * keep > 0) | ((keep == 0) & (area != 0))
-        entries[6, b], entries[7, b] = max(entries[6, b], top), min(entries[7, b], bottom) if drawn else -1
-        near = min(numbers[12, b], numbers[13, b], numbers[14, b])
-        far = min(numbers[15, b], numbers[16, b], numbers[17, b])
-        clips[b] = (near < 0) | (far < 0)
-    for c in range(3):
-        i, j = (c + 1) % 3, (c + 2) % 3
-        for b in range(count):
-            ax, ay, aw = corners[i, 0, b], corners[i, 1, b], corners[i, 3, b]
-            bx, by, bw = corners[j, 0, b], corners[j, 1, b], corners[j, 3, b]
-            numbers[3 * c, b] = signs[b] * (ay * bw - aw * by)
-            numbers[3 * c + 1, b] = signs[b] * (aw * bx - ax * bw)
-            numbers[3 * c + 2, b] = signs[b] * (ax * by - ay * bx)
-
-
-@numba.njit(inline="always")
-def _cover(count, entries, numbers, covers):
-    """Which of the first 2 × 2 pixels of its box each triangle may cover, as bits."""
-    for b in range(count):
-        bits = 0
-        for n in range(4):
-            i, j = entries[4, b] + (n & 1), entries[6, b] + (n >> 1)
-            x, y = i + 0.5, j + 0.5
-            ea = numbers[0, b] * x + (numbers[1, b] * y + numbers[2, b])
-            eb = numbers[3, b] * x + (numbers[4, b] * y + numbers[5, b])
-            ec = numbers[6, b] * x + (numbers[7, b] * y + numbers[8, b])
-            bits |= ((i <= entries[5, b]) & (j <= entries[7, b]) & (ea >= 0) & (eb >= 0) & (ec >= 0)) << n
-        covers[b] = bits
-
-
-@numba.njit(error_model="numpy")
-def _insert(hits, top, entries, numbers, clips, nearest, triangle_ids, barycentrics):
-    """Insert the block's triangles into the layers of pixels; hits (n, 2) are triangle and row of the band, column."""
-    layers = len(triangle_ids)
-    for h in range(len(hits)):
-        place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
-        b, row = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS)
-        j = row + np.uint32(top)
-        x, y = i + 0.5, j + 0.5
-        xa, ya, wa = numbers[0, b], numbers[1, b], numbers[2, b]
-        xb, yb, wb = numbers[3, b], numbers[4, b], numbers[5, b]
-        xc, yc, wc = numbers[6, b], numbers[7, b], numbers[8, b]
-        ea, eb, ec = xa * x + (ya * y + wa), xb * x + (yb * y + wb), xc * x + (yc * y + wc)
-        # Top and left edges own the pixels exactly on them (y points down).
-        if min(ea, eb, ec) == 0:
-            if (ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc)):
-                continue
-        total = ea + eb + ec
-        if not total > 0 or (clips[b] and _outside(numbers, b, ea, eb, ec)):
-            continue
-        z, scale = (ea * numbers[9, b] + eb * numbers[10, b] + ec * numbers[11, b]) / total, 1 / total
-        # Behind what is as near, before what is farther; a branch would be foreseen every other time.
-        moved, t, p, q = z, entries[0, b], np.float32(ea * scale), np.float32(eb * scale)
-        for k in range(layers):
-            old, old_t = nearest[k, row, i], triangle_ids[k, j, i]
-            old_p, old_q = barycentrics[k, j, i, 0], barycentrics[k, j, i, 1]
-            before = z < old
-            nearest[k, row, i], triangle_ids[k, j, i] = moved if before else old, t if before else old_t
-            barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = p if before else old_p, q if before else old_q
-            moved, t = old if before else moved, old_t if before else t
-            p, q = old_p if before else p, old_q if before else q
-
-
-@numba.njit
-def _outside(numbers, b, ea, eb, ec):
-    """Whether the point with barycentrics in the ratio ea : eb : ec lies outside the near or the far plane."""
-    near = ea * numbers[12, b] + eb * numbers[13, b] + ec * numbers[14, b]
-    far = ea * numbers[15, b] + eb * numbers[16, b] + ec * numbers[17, b]
-    return near < 0 or far < 0

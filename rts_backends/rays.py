@@ -13,14 +13,23 @@ from rts.errors import InputError
 from rts.interfaces import Part, RaySurface, Sampler, as_surface
 from rts.records import ArraySpec, RayHits, Samples
 from rts.sampling.validation import check_camera
-from rts.trees import map_leaves
+from rts.trees import Array, map_leaves
 
 
 class Rays(Sampler):
     """Casts a ray through every pixel's centre, on the device, so that a traced function may hold the surface."""
 
+    takes_cells = True
+
     def sample(
-        self, part: Part, camera: Camera, size: tuple[int, int], layers: int, *, capacity: int | None = None
+        self,
+        part: Part,
+        camera: Camera,
+        size: tuple[int, int],
+        layers: int,
+        *,
+        capacity: int | None = None,
+        cells: Array | None = None,
     ) -> Samples:
         """See `rts.Sampler`."""
         surface = as_surface(part.surface)
@@ -40,17 +49,24 @@ class Rays(Sampler):
         near, far = camera.depth_range()
         rays = camera.rays(size)
         directions = xp.reshape(rays.directions, (-1, 3))
-        origins = xp.reshape(rays.origins, (-1, 3)) + near * directions
+        origins = xp.reshape(rays.origins, (-1, 3))
+        listed = True
+        if cells is not None:
+            index: Array = xp.reshape(constants(cells, engine, like), (-1,))
+            size, listed = tuple(cells.shape), index[None] >= 0
+            index = xp.where(index >= 0, index, 0)
+            directions, origins = xp.take(directions, index, axis=0), xp.take(origins, index, axis=0)
+        origins = origins + near * directions
         hits = _checked_hits(surface.intersect(theta, origins, directions, layers), surface, layers, size)
         depth = near + hits.distance
-        hit = xp.reshape(hits.hit & (hits.distance >= 0) & (depth <= far), (layers, *size))
+        hit = xp.reshape(hits.hit & (hits.distance >= 0) & (depth <= far) & listed, (layers, *size))
 
-        cells = layers * size[0] * size[1]
-        rows = cells if capacity is None else capacity
+        every = layers * size[0] * size[1]
+        rows = every if capacity is None else capacity
 
         def pack(hit: np.ndarray) -> tuple[np.ndarray, ...]:
             found = np.flatnonzero(hit)
-            row = np.full(cells, -1, np.int32)
+            row = np.full(every, -1, np.int32)
             row[found[:rows]] = np.arange(min(rows, len(found)), dtype=np.int32)
             index = np.zeros(max(1, len(found)) if capacity is None else rows, np.int32)
             index[: len(found)] = found[: len(index)]
@@ -60,11 +76,11 @@ class Rays(Sampler):
         specs = packed, ArraySpec((layers, *size), np.int32), ArraySpec((), np.int32)
         index, row, overflow = engine.call_host(pack, specs, hit)
         width_i, width_p = surface.hit_widths or surface.sample_widths
-        params = xp.take(xp.reshape(hits.params, (cells, width_p)), index, axis=0)
+        params = xp.take(xp.reshape(hits.params, (every, width_p)), index, axis=0)
         if hits.ids is None:
             ids = xp.zeros_like(params[:, :0], dtype=xp.int32)
         else:
-            ids = xp.take(xp.reshape(hits.ids, (cells, width_i)), index, axis=0)
+            ids = xp.take(xp.reshape(hits.ids, (every, width_i)), index, axis=0)
         depth = xp.where(row >= 0, xp.reshape(depth, (layers, *size)), 0.0)
         return Samples(ids, params, row, depth, overflow)
 

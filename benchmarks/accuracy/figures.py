@@ -76,12 +76,22 @@ def error_vs_time(results: dict, path: Path) -> None:
         return
     figure = Figure(figsize=(4.6 * len(scenes), 5.2), layout="constrained")
     for axes, scene in zip(figure.subplots(1, len(scenes), sharey=True, squeeze=False)[0], scenes, strict=True):
-        for start, label, style in (
-            ("visible", "visible, K = 2, s × s samples a pixel", {"color": "#c2410c", "marker": "o"}),
-            ("Mitsuba", "Mitsuba 3, direct_projective", {"color": "#1d4ed8", "marker": "s"}),
-            ("DEODR", "DEODR", {"color": "#15803d", "marker": "^"}),
+        for start, end, label, style in (
+            ("visible", ("2", "4"), "visible, K = 2, s × s samples a pixel", {"color": "#c2410c", "marker": "o"}),
+            (
+                "visible",
+                ("outlines",),
+                "the same, at or around outlines only",
+                {"color": "#c026d3", "marker": "D", "linestyle": "none"},
+            ),
+            ("Mitsuba", ("",), "Mitsuba 3, direct_projective", {"color": "#1d4ed8", "marker": "s"}),
+            ("DEODR", ("",), "DEODR", {"color": "#15803d", "marker": "^"}),
         ):
-            rows = [r for r in results["times"] if r["scene"] == scene and r["method"].startswith(start)]
+            rows = [
+                r
+                for r in results["times"]
+                if r["scene"] == scene and r["method"].startswith(start) and r["method"].endswith(end)
+            ]
             points = [(r["seconds"], errors[scene, r["method"]]) for r in rows]
             axes.loglog(*np.array(points).reshape(-1, 2).T, label=label, **style)
             place = {"xytext": (-6, -11), "ha": "right"} if start == "visible" else {"xytext": (6, 4)}

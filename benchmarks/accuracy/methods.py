@@ -32,6 +32,10 @@ CLOSED = {
 """Scene → its parts that are closed, whose back faces are hidden whether they are culled or not."""
 
 
+ADAPTIVE = (rts.Adaptive(4, dilated=False), rts.Adaptive(4, dilated=True), rts.Adaptive(8, dilated=False))
+"""Samples where outlines are, and around them, that are scored and timed on the cases."""
+
+
 class Method(NamedTuple):
     """A renderer of one scene.
 
@@ -48,12 +52,15 @@ class Method(NamedTuple):
     seeds: int = 1
 
 
-def name_of(splatter: str, layers: int, supersample: int = 1) -> str:
+def name_of(splatter: str, layers: int, supersample: int | rts.Adaptive = 1) -> str:
     """The name of a method of ours."""
+    if isinstance(supersample, rts.Adaptive):
+        side, where = supersample.samples, "around outlines" if supersample.dilated else "at outlines"
+        return f"{splatter}, K = {layers}, {side} × {side} {where}"
     return f"{splatter}, K = {layers}" + (f", {supersample} × {supersample}" if supersample > 1 else "")
 
 
-def ours(scene: scenes.Scene, splatter: str, layers: int, supersample: int = 1) -> Method:
+def ours(scene: scenes.Scene, splatter: str, layers: int, supersample: int | rts.Adaptive = 1) -> Method:
     """A splatter of this library, or one with other settings.
 
     `multi, calibrated` has the constants of `visible`; outlines of `visible, by samples` move as the samples inside of
@@ -90,7 +97,7 @@ def splatters(scene: scenes.Scene) -> list[Method]:
     found.append(ours(scene, "multi, calibrated", most))
     found += [ours(scene, "visible, by samples", most, s) for s in (1, 2)]
     if scene.name in CASES:
-        found += [ours(scene, "none", 1), ours(scene, "visible", most, 4)]
+        found += [ours(scene, "none", 1), *(ours(scene, "visible", most, s) for s in (4, *ADAPTIVE))]
     return found
 
 

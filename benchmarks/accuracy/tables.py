@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.accuracy.methods import CASES, CLOSED, name_of
+from benchmarks.accuracy.methods import ADAPTIVE, CASES, CLOSED, name_of
 from benchmarks.accuracy.scores import scores
 from benchmarks.report import table
 
@@ -58,6 +58,7 @@ CASE_METHODS = (
     "visible, K = 2",
     "visible, K = 2, 2 × 2",
     "visible, K = 2, 4 × 4",
+    *(name_of("visible", 2, adaptive) for adaptive in ADAPTIVE),
 )
 
 

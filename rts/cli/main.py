@@ -131,6 +131,16 @@ def _size(text: str) -> tuple[int, int]:
     return int(parts[0]), int(parts[-1])
 
 
+def _supersample(text: str) -> Any:
+    """The samples a pixel of "4", or of "adaptive:4"."""
+    import rts
+
+    kind, _, number = text.rpartition(":")
+    if kind.strip().lower() not in ("", "adaptive") or not number.strip().isdecimal():
+        raise typer.BadParameter(f"{text!r} is no supersample; expected a number such as 4, or adaptive:4")
+    return rts.Adaptive(int(number)) if kind else int(number)
+
+
 def _view(text: str) -> tuple[float, ...]:
     """Azimuth, elevation and perhaps distance."""
     try:
@@ -222,7 +232,9 @@ def render(
     layers: Annotated[int, typer.Option(help="Surface layers kept at each pixel.")] = 2,
     shader: Annotated[str, typer.Option(help="Name of a shader; auto is the model's own.")] = "auto",
     splatter: Annotated[str, typer.Option(help="Name of a splatter: visible, multi, single or none.")] = "auto",
-    supersample: Annotated[int, typer.Option(help="Samples along each side of a pixel.")] = 1,
+    supersample: Annotated[
+        str, typer.Option(help="Samples along each side of a pixel: 4; or adaptive:4, where outlines are.")
+    ] = "1",
     background: Annotated[str, typer.Option(help="A colour's name, #rrggbb, or none: transparent.")] = "none",
     cull: Annotated[str, typer.Option(help="none, or back to leave out triangles seen from behind.")] = "none",
 ) -> None:
@@ -256,7 +268,7 @@ def render(
         sampler=sampler,
         splatter=splatter,
         layers=layers,
-        supersample=supersample,
+        supersample=_supersample(supersample),
         background=color,
     )
     seconds = time.perf_counter() - start

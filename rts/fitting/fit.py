@@ -22,6 +22,7 @@ from rts.fitting.names import listed, named_leaves, one_line
 from rts.fitting.run import LONGEST_REASON, NO_GRADIENT, Astray, Report, Run, progress_bar, require
 from rts.fitting.schedule import Stage, checked_schedule
 from rts.interfaces import Residuals
+from rts.sampling.adaptive import finest
 from rts.trees import Array, Tree, leaves, map_leaves
 
 STEPS = {"adam": 200, "sgd": 200, "lm": 50}
@@ -133,7 +134,7 @@ def fit(
                 checked = _checked(stage, engine, run)
                 if method == "lm":
                     own = stage.normal_equations if stage.sums_products else None
-                    supersample = getattr(stage, "supersample", None)
+                    supersample = finest(getattr(stage, "supersample", None))
                     levenberg_marquardt(checked, parameters, engine, run, jit, own, supersample)
                 else:
                     _descend(checked, _scalar(loss, engine), parameters, engine, method, rate, run, jit)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
-from typing import Any, Literal
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
 
 from rts.arguments import quoted
 from rts.arrays import described, from_numbers, is_finite, kind_of, shape_of
@@ -24,9 +27,10 @@ from rts.fitting.least_squares import flatten, normal_equations
 from rts.fitting.names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.interfaces import CheckedPart, Part, Residuals, Splatter
-from rts.records import Splats
+from rts.records import ArraySpec, Fine, Splats
 from rts.rendering import _bands as bands_of
-from rts.rendering import render, sample, to_splats
+from rts.rendering import render, sample, to_fine_splats, to_splats
+from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.prepared import PreparedParts
 from rts.trees import Array, Tree
 
@@ -60,7 +64,7 @@ class ImageResiduals(Residuals):
 
     Attributes:
         size: (height, width).
-        supersample: samples a pixel along each axis.
+        supersample: samples a pixel along each axis, or an `rts.Adaptive`.
 
     Raises:
         InputError: an argument of the wrong kind, shapes that do not fit, integers as target, or a target, weights or
@@ -79,19 +83,19 @@ class ImageResiduals(Residuals):
         sampler: Any = "auto",
         splatter: Any = "auto",
         layers: int | Literal["auto"] = 2,
-        supersample: int = 1,
+        supersample: int | Adaptive = 1,
         capacity: int | None = None,
     ):
         if not callable(scene):
             raise InputError(f"scene is {quoted(scene)}; expected a function: parameters → parts, or (parts, camera)")
         if camera is not None and not isinstance(camera, Camera):
             raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera, or None where scene gives one")
-        self.size = check_size(size, layers, capacity, supersample)
+        self.size = check_size(size, layers, capacity, finest(supersample))
         self._scene, self._camera, self._splatter = scene, camera, check_splatter(splatter)
         self._target, self._channels = _checked_target(target, self.size)
         self._weights = _checked_weights(weights, self._target.shape, self.size)
         self._background = check_background(background, self.size)
-        self.supersample = int(supersample)
+        self.supersample = supersample if isinstance(supersample, Adaptive) else int(supersample)
         self._sampling: dict[str, Any] = {"sampler": check_sampler(sampler), "layers": layers, "capacity": capacity}
         self._full, self._sigma = self.size, 0.0
 
@@ -170,6 +174,7 @@ class ImageResiduals(Residuals):
             and splatter.sums_products
             and engine.differentiates
             and (self.supersample == 1 or splatter.averages)
+            and not (isinstance(self.supersample, Adaptive) and self.supersample.contrast is not None)
         ):
             found = self._swept(splatter, parameters, engine)
         return normal_equations(self, parameters, engine) if found is None else found
@@ -202,27 +207,44 @@ class ImageResiduals(Residuals):
 
         sampled = sample(parts, window(camera), size, splatter=splatter, supersample=self.supersample, **self._sampling)
         colored = self._channels > 1 or not _all_opaque(parts, camera)
-
-        def splats(v: Array) -> tuple[Array, Array]:
-            parts, camera = _checked(*self.scene(unflatten(v)))
-            seen = camera.for_size(self.size), window(camera)
-            moved = to_splats(sampled, parts, *seen, *suiting(parts, camera, sampled, v))
-            positions, rgba = constants((moved.positions, moved.rgba), engine, v)
-            # What is opaque has an alpha of one, whatever its colours.
-            return positions, rgba if colored else engine.stop_gradient(rgba)
-
-        (positions, rgba), (t_positions, t_rgba) = engine.jacobian(splats)(vector)
         band = slice(top, top + rows)
-        target, weights, background = (None if x is None else x[band] for x in self._constants(vector))
-        row, part = constants((sampled.row, sampled.part), engine, vector)
-        return splatter.normal_equations(
-            Splats(positions, rgba, row, part, border=sampled.apron),
-            t_positions,
-            t_rgba if colored else None,
-            target,
-            weights=weights,
-            background=background,
+        fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
+
+        def swept(shown: Callable[..., Splats], fields: _Fields, **known: Any) -> tuple[Array, Array, Array] | None:
+            """The normal equations of what `shown` makes of parts, cameras and an exemplar; `known` is constant."""
+
+            def splats(v: Array) -> tuple[Array, Array]:
+                parts, camera = _checked(*self.scene(unflatten(v)))
+                seen = camera.for_size(self.size), window(camera)
+                moved = shown(parts, *seen, *suiting(parts, camera, sampled, v))
+                positions, rgba = constants((moved.positions, moved.rgba), engine, v)
+                # What is opaque has an alpha of one, whatever its colours.
+                return positions, rgba if colored else engine.stop_gradient(rgba)
+
+            (positions, rgba), (t_positions, t_rgba) = engine.jacobian(splats)(vector)
+            return splatter.normal_equations(
+                Splats(positions, rgba, **constants(known, engine, vector), border=sampled.apron),
+                t_positions,
+                t_rgba if colored else None,
+                **fields._asdict(),
+            )
+
+        known = {"row": sampled.row, "part": sampled.part}
+        if sampled.fine is None:
+            return swept(partial(to_splats, sampled), fields, **known)
+        # A pixel counts on one of the grids alone.
+        fine = sampled.fine
+        coarse, finer = _split(fields, constants(fine.pixel, engine, vector), fine)
+        placed = {"row": fine.row, "part": fine.part, "wanted": fine.wanted}
+        found = (
+            swept(partial(to_splats, sampled), coarse, **known, wanted=fine.coarse),
+            swept(lambda parts, camera, _, *suited: to_fine_splats(fine, parts, camera, *suited), finer, **placed),
         )
+        if found[0] is None or found[1] is None:
+            return None
+        share = finer.target.shape[0] * finer.target.shape[1] / (rows * self.size[1])
+        value, matrix, gradient = (a + share * b for a, b in zip(found[0], found[1], strict=True))
+        return value, matrix, gradient
 
     def _constants(self, like: Array) -> tuple[Array, Array | None, Array | None]:
         """Target (H, W, C), weights (H, W, 1 or C) and background (H, W, 4) in the engine of an array."""
@@ -239,6 +261,38 @@ class ImageResiduals(Residuals):
                 background = xp.concat([background, xp.ones_like(background[..., :1])], axis=-1)
             background = xp.broadcast_to(background, (*self.size, 4))
         return target, weights, background
+
+
+class _Fields(NamedTuple):
+    """What an image of h × w pixels is compared with: target (h, w, C), weights and background, arrays or None."""
+
+    target: Array
+    weights: Array | None
+    background: Array | None
+
+
+def _split(fields: _Fields, pixel: Array, fine: Fine) -> tuple[_Fields, _Fields]:
+    """The fields with weights of zero at active pixels, and those for the layout of `fine`, zero at all others."""
+    xp, engine = namespace(pixel), engine_of(pixel)
+    height, width = ((n - 2 * fine.apron) // fine.supersample for n in fine.row.shape[1:])
+
+    def host(pixel: np.ndarray) -> tuple[np.ndarray]:
+        found = np.full(height * width, -1, np.int32)
+        active = np.flatnonzero(pixel >= 0)
+        found[pixel.reshape(-1)[active]] = active
+        return (found,)
+
+    (origin,) = engine.call_host(host, (ArraySpec((height * width,), np.int32),), pixel)
+    there = (origin >= 0)[:, None]
+
+    def laid_out(x: Array) -> Array:
+        rows = xp.take(xp.reshape(x, (-1, x.shape[-1])), xp.where(origin >= 0, origin, 0), axis=0)
+        return xp.reshape(xp.where(there, rows, 0.0), (height, width, x.shape[-1]))
+
+    weights = xp.ones_like(fields.target[..., :1]) if fields.weights is None else fields.weights
+    background = None if fields.background is None else laid_out(fields.background)
+    coarse = fields._replace(weights=xp.where((pixel >= 0)[..., None], 0.0, weights))
+    return coarse, _Fields(laid_out(fields.target), laid_out(weights), background)
 
 
 def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tuple[Array, Array | None]:

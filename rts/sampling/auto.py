@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from rts import registry
 from rts.camera import Camera
-from rts.checks import check_sampler, check_scene
+from rts.checks import check_sampler
 from rts.engines import engine_of, is_constant
 from rts.errors import PluginError
 from rts.interfaces import Part, Sampler, TriangleSurface
 from rts.records import Samples
-from rts.sampling.prepared import PreparedParts
 
 STATIC_FACES = 4_000_000
 """From so many triangles on, rays at a kept structure are faster than drawing all (benchmarks/speed/samplers.py)."""
@@ -22,10 +20,21 @@ _log = logging.getLogger("rts")
 
 
 class Choice(NamedTuple):
-    """A sampler, by name, and the reason for it."""
+    """What is done for a part.
+
+    Attributes:
+        sampler: the sampler that `sampler="auto"` takes, by name.
+        reason: why.
+        samples: how many samples are taken, at a size that is given; None where that is not known.
+        fine: how many of them are fine ones, of `rts.Adaptive`; None without.
+        active: how many pixels of the image take fine samples, for all parts together; None without.
+    """
 
     sampler: str
     reason: str
+    samples: int | None = None
+    fine: int | None = None
+    active: int | None = None
 
 
 def choose(part: Part, *, static: bool) -> Choice:
@@ -52,20 +61,6 @@ def is_static(part: Part, camera: Camera) -> bool:
     """Whether something is differentiated, but not what the surface reads: so calls repeat, and triangles stay."""
     constant = is_constant([part.theta[name] for name in part.surface.reads(part.theta)])
     return constant and engine_of(part, camera).differentiates
-
-
-def explain(parts: Part | Sequence[Part] | PreparedParts, camera: Camera) -> list[Choice]:
-    """What `sampler="auto"` takes for each part of a scene, and why.
-
-    Args:
-        parts: as in `rts.render`.
-        camera: as in `rts.render`.
-
-    Returns:
-        For each part the name of the `sampler`, and the `reason`.
-    """
-    parts, camera = check_scene(parts.parts if isinstance(parts, PreparedParts) else parts, camera)
-    return [choose(part, static=is_static(part, camera)) for part in parts]
 
 
 class Auto(Sampler):

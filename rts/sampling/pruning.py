@@ -6,7 +6,7 @@ import itertools
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,6 +21,11 @@ from rts.trees import leaves
 
 LAYER_LIMIT = 8
 """The largest number of layers that `layers="auto"` takes."""
+
+
+def planned(layers: int | Literal["auto"]) -> int:
+    """Layers to count with before they are known."""
+    return 4 if layers == "auto" else int(layers)
 
 
 def needed_by(splatter: Splatter, parts: Sequence[CheckedPart]) -> AnyNeeded | None:

@@ -30,6 +30,8 @@ def on_surface(
     camera: Camera,
     layers: int,
     tables: Mapping[str, ArraySpec],
+    size: tuple[int, int],
+    cells: np.ndarray | None = None,
 ) -> Samples:
     """Samples on a surface where rays meet its nearest triangles: refined, and in order.
 
@@ -44,24 +46,27 @@ def on_surface(
         camera: host matrices.
         layers: K.
         tables: what the surface's `table_specs` allots.
+        size: (height, width) of the grid of cells.
+        cells: (L, C), the cells that the samples are of, as flat indices in the grid; None for all.
     """
     first = Fragments(*(x[:layers] for x in fragments))
-    moved, rays = refined(surface, inputs, lift(first, proxy), camera, tables)
+    moved, rays = refined(surface, inputs, lift(first, proxy), camera, tables, size, cells)
     settled = settle(moved, camera, rays.spread)
     if len(fragments.depth) == layers:
         return settled
-    cells = np.nonzero((settled.row[-1] < 0) & (fragments.triangle_ids[layers] >= 0))
-    if not len(cells[0]):
+    places = np.nonzero((settled.row[-1] < 0) & (fragments.triangle_ids[layers] >= 0))
+    if not len(places[0]):
         return settled
+    indices = np.ravel_multi_index(places, size) if cells is None else cells[places]
     # The cells where some are missing, as the only line of an image.
-    behind = Fragments(*(np.ascontiguousarray(x[layers:, *cells])[:, None] for x in fragments))
-    more, _ = refined(surface, inputs, lift(behind, proxy), camera, tables, size=settled.row.shape[1:], cells=cells)
+    behind = Fragments(*(np.ascontiguousarray(x[layers:, *places])[:, None] for x in fragments))
+    more, _ = refined(surface, inputs, lift(behind, proxy), camera, tables, size, indices[None])
     added = np.where(more.row >= 0, more.row + np.int32(len(settled.ids)), -1)
     pairs = (settled.row, added), (settled.depth, more.depth)
-    row, depth = (np.concatenate([a[:, *cells], b[:, 0]])[:, None] for a, b in pairs)
+    row, depth = (np.concatenate([a[:, *places], b[:, 0]])[:, None] for a, b in pairs)
     both = settle(replace(settled, row=row, depth=depth), camera, rays.spread)
     row, depth = settled.row, settled.depth
-    row[:, *cells], depth[:, *cells] = both.row[:layers, 0], both.depth[:layers, 0]
+    row[:, *places], depth[:, *places] = both.row[:layers, 0], both.depth[:layers, 0]
     ids, params = (np.concatenate(x) for x in ((settled.ids, more.ids), (settled.params, more.params)))
     overflow = np.asarray(settled.overflow + more.overflow, np.int32)
     return replace(settled, ids=ids, params=params, row=row, depth=depth, overflow=overflow)
@@ -74,7 +79,7 @@ def refined(
     camera: Camera,
     tables: Mapping[str, ArraySpec],
     size: tuple[int, ...] | None = None,
-    cells: tuple[np.ndarray, ...] | None = None,
+    cells: np.ndarray | None = None,
 ) -> tuple[Samples, Rays]:
     """What `refine` of a surface makes of samples on its triangles, checked; and their rays.
 
@@ -84,8 +89,8 @@ def refined(
         lifted: the samples, a row for each covered cell.
         camera: host matrices.
         tables: what the surface's `table_specs` allots.
-        size: (height, width) of the image; None for that of the samples.
-        cells: lines and columns (M,) in it of the samples, which are (K, 1, M); None for all cells.
+        size: (height, width) of the grid of cells; None for that of the samples.
+        cells: (L, C), the cells that the samples are of, as flat indices in the grid; None for all.
     """
     by_sample = tuple(name for name, spec in tables.items() if spec.by_sample)
     allotted = {
@@ -98,9 +103,7 @@ def refined(
     return checked_refined(surface.refine(inputs, replace(lifted, row=lifted.row.copy()), rays), lifted, surface), rays
 
 
-def _rays_of(
-    samples: Samples, camera: Camera, size: tuple[int, ...], cells: tuple[np.ndarray, ...] | None = None
-) -> Rays:
+def _rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None) -> Rays:
     """The ray of each packed sample (N, 3); where no cell has any, the first row gets the first pixel's."""
     from rts.sampling import settling_kernels
 
@@ -112,7 +115,8 @@ def _rays_of(
         none = np.zeros(1, np.int64)
         settling_kernels.rays_of_cells(np.zeros((1, 1), np.int32), none, none, *given)
     if cells is not None:
-        settling_kernels.rays_of_cells(samples.row[:, 0], cells[0], cells[1], *given)
+        lines, columns = np.divmod(cells.reshape(-1), width)
+        settling_kernels.rays_of_cells(samples.row.reshape(len(samples.row), -1), lines, columns, *given)
     else:
         lines = read_only(samples.row, np.int32).reshape(-1, width)
         parallel(settling_kernels.rays_of, len(lines), lines, *given, work=20 * len(samples.ids))

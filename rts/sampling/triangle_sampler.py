@@ -40,6 +40,7 @@ class TriangleSampler(Sampler):
     builds: bool = False
     follows: bool = False
     prunes = True
+    takes_cells = True
     _keeper: Keeper
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
@@ -75,6 +76,28 @@ class TriangleSampler(Sampler):
         Returns:
             Fragments, front to back in each pixel; no layer follows an empty one.
         """
+
+    def rasterize_cells(
+        self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
+    ) -> Fragments:
+        """As `rasterize`, of some cells alone. The default draws all, and takes those.
+
+        Args:
+            prepared: see `rasterize`.
+            camera: see `rasterize`.
+            size: see `rasterize`.
+            layers: see `rasterize`.
+            cull: see `rasterize`.
+            cells: (L, C) int32, flat indices of cells in the grid, or −1 for none.
+
+        Returns:
+            Fragments, (K, L, C).
+        """
+        whole, there = self.rasterize(prepared, camera, size, layers, cull), cells >= 0
+        check_fragments(whole, (layers, *size), np.iinfo(np.int32).max, self)
+        at = np.where(there, cells, 0)
+        ids = np.where(there, whole.triangle_ids.reshape(layers, -1)[:, at], -1)
+        return Fragments(ids, whole.barycentrics.reshape(layers, -1, 2)[:, at], whole.depth.reshape(layers, -1)[:, at])
 
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
         """See `Sampler`: the proxy of a part, and what is prepared of it."""
@@ -126,6 +149,7 @@ class TriangleSampler(Sampler):
         capacity: int | None = None,
         needed: AnyNeeded | None = None,
         entry: Entry | None = None,
+        cells: Array | None = None,
     ) -> Samples:
         """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
 
@@ -137,13 +161,15 @@ class TriangleSampler(Sampler):
             capacity: as in `rts.Sampler`.
             needed: says which samples to keep; None for all.
             entry: what `hold` gave, to be used without a look at the surface's inputs.
+            cells: as in `rts.Sampler`.
 
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
         """
         surface, theta, camera = _of_triangles(part.surface), part.theta, camera.for_size(size)
         engine, like = suiting(theta, camera)
-        shape = _Shape(layers, size, capacity)
+        shape = _Shape(layers, size if cells is None else tuple(cells.shape), capacity, size)
+        listed = [] if cells is None else [cells]
         inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
         reads = {name: theta[name] for name in surface.reads(theta)}
         host_theta = reads if engine.differentiates and is_constant(reads) else None
@@ -155,11 +181,12 @@ class TriangleSampler(Sampler):
         transform = [] if part.transform is None else [part.transform]
 
         def host(view: np.ndarray, projection: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
-            it = iter(rest[len(transform) :])
+            it = iter(rest[len(transform) + len(listed) :])
+            host_cells = np.asarray(rest[len(transform)], np.int32) if listed else None
             host_inputs = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
             host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
             host_camera = check_camera(host_camera, *rest[: len(transform)])
-            found = self._found(surface, part.cull, host_inputs, host_camera, shape, tables, needed, entry)
+            found = self._found(surface, part.cull, host_inputs, host_camera, shape, tables, needed, entry, host_cells)
             gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
             return (
                 found.ids,
@@ -172,7 +199,7 @@ class TriangleSampler(Sampler):
             )
 
         specs = *shape.specs(surface.sample_widths), *tables.values(), *attributes.values()
-        results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *leaves(inputs))
+        results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *listed, *leaves(inputs))
         rest = 5 + len(tables)
         return Samples(
             *results[:5],
@@ -193,15 +220,17 @@ class TriangleSampler(Sampler):
         tables: Mapping[str, ArraySpec],
         needed: AnyNeeded | None,
         entry: Entry | None,
+        cells: np.ndarray | None,
     ) -> Samples:
         """The samples that are to be kept, on the host."""
         # Of tables there is but one set, so that no samples can be added later.
         more = surface.refines and surface.refine_moves and not tables
         grid = max(shape.layers + 1, LEAST_LAYERS) if more else shape.layers, *shape.size
         with self._keeper.lock:
-            found = entry or self._entry(surface, inputs, camera, shape.size)
+            found = entry or self._entry(surface, inputs, camera, shape.view)
             if len(found.proxy.faces):
-                fragments = self.rasterize(found.prepared, camera, shape.size, grid[0], cull)
+                given = found.prepared, camera, shape.view, grid[0], cull
+                fragments = self.rasterize(*given) if cells is None else self.rasterize_cells(*given, cells)
                 check_fragments(fragments, grid, len(found.proxy.faces), self)
             else:
                 fragments = _no_fragments(grid)
@@ -210,9 +239,11 @@ class TriangleSampler(Sampler):
             kept = covered if needed is None else needed(covered, fragments.depth)
             if not surface.refines:
                 return lift(fragments, found.proxy, shape.capacity, kept)
-            samples, _ = refined(surface, inputs, lift(fragments, found.proxy, None, kept), camera, tables)
+            lifted = lift(fragments, found.proxy, None, kept)
+            samples, _ = refined(surface, inputs, lifted, camera, tables, shape.view, cells)
             return repack(samples, samples.row >= 0, shape.capacity)
-        settled = on_surface(surface, inputs, fragments, found.proxy, camera, shape.layers, tables)
+        given = surface, inputs, fragments, found.proxy, camera, shape.layers, tables, shape.view, cells
+        settled = on_surface(*given)
         # `needed` is asked only now, since it goes by the final depths.
         left = kept = settled.row >= 0
         if needed is not None:
@@ -226,13 +257,15 @@ class _Shape(NamedTuple):
 
     Attributes:
         layers: K.
-        size: (height, width).
+        size: lines and columns of the samples: of the grid, or of the list of its cells.
         capacity: rows to allot, or None for as many as there are.
+        view: (height, width) of the grid.
     """
 
     layers: int
     size: tuple[int, int]
     capacity: int | None
+    view: tuple[int, int]
 
     @property
     def rows(self) -> int:

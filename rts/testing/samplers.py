@@ -183,6 +183,27 @@ class SamplerConformance(Conformance):
         kept = (np.asarray(found.row)[0] >= 0) == (np.asarray(whole.row)[0] >= 0)
         claim(kept.all(), "samples that are needed are left out")
 
+    def test_listed_cells_are_those_of_the_whole_grid(self, sampler: Any, parts: list[Part]) -> None:
+        """A sampler that takes `cells` finds there what it finds in these cells of the grid, and nothing for −1."""
+        chosen, (height, width) = check_sampler(sampler), scenes.SIZE
+        if not chosen.takes_cells:
+            pytest.skip("the sampler takes no cells")
+        cells = np.random.default_rng(0).permutation(height * width)[: height * width // 2 // 8 * 8].astype(np.int32)
+        cells[::7] = -1
+        listed: dict[str, Any] = {"cells": cells.reshape(-1, 8)}
+        for index, part in enumerate(map(scenes.checked, parts)):
+            whole, found = (
+                chosen.sample(part, scenes.CAMERA.within(part.transform), scenes.SIZE, 3, **known)
+                for known in ({}, listed)
+            )
+            row, depth = (np.asarray(x).reshape(len(x), -1)[:, cells] for x in (whole.row, whole.depth))
+            claim(found.row.shape == (len(row), len(cells) // 8, 8), f"part {index}: row has shape {found.row.shape}")
+            covered = (row >= 0) & (cells >= 0)
+            seen = np.asarray(found.row).reshape(row.shape)
+            claim(((seen >= 0) == covered).all(), f"part {index}: other cells are covered than in the whole grid")
+            near = np.abs(np.asarray(found.depth).reshape(row.shape) - depth) <= 1e-5 * np.abs(depth)
+            claim((near | ~covered).all(), f"part {index}: depths are not those of the cells in the whole grid")
+
     def test_what_it_cannot_sample_is_refused_in_one_line(self, sampler: Any) -> None:
         """A surface with neither triangles nor an intersection is an `rts.InputError` that says what to do."""
         part = Part(Elsewhere(), {"center": np.zeros(3, np.float32)})

@@ -177,13 +177,13 @@ def keep_nearest_address() -> int:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def cast(
     first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep, vertices, faces,
-    owners, margins, triangle_ids, barycentrics, depths_out,
+    owners, margins, width, height, cells, triangle_ids, barycentrics, depths_out,
 ):  # fmt: skip
-    """Fill the fragment arrays for tiles of pixels.
+    """Fill the fragment arrays for tiles of pixels, or for pieces of a list of them.
 
     Args:
-        first: first tile.
-        last: past the last tile.
+        first: first tile or piece, of TILE² pixels.
+        last: past the last.
         intersect: address of rtcIntersect1.
         filter_address: address of the intersection filter.
         scene: Embree's handle.
@@ -197,11 +197,15 @@ def cast(
         faces: (T, 3).
         owners: (M,) of `Covers`.
         margins: (T,) of `Covers`.
-        triangle_ids: (K, H, W) to fill.
-        barycentrics: (K, H, W, 2) to fill.
-        depths_out: (K, H, W) to fill.
+        width: of the image.
+        height: of the image.
+        cells: (M,) int32, flat indices of the pixels to cast rays through, −1 for none; of no length for all H · W.
+        triangle_ids: (K, M or H · W) to fill.
+        barycentrics: (K, M or H · W, 2) to fill.
+        depths_out: (K, M or H · W) to fill.
     """
-    layers, height, width = triangle_ids.shape
+    layers = len(triangle_ids)
+    at, columns, lines = np.empty((3, TILE * TILE), np.int64)
     across = (width + TILE - 1) // TILE
     state, depths = np.empty(HEADER), np.empty(layers)
     ids, sure = np.empty(layers, np.int32), np.empty(layers, np.bool_)
@@ -229,29 +233,28 @@ def cast(
     state[KEEP], state[DEPTH_SLACK], state[REACH_SLACK] = keep, slack, REACH_SLACK_SHARE * radius
     state[NEAREST], state[FARTHEST] = planes[2] + slack, planes[3] - slack
     for tile in range(first, last):
-        top, left = tile // across * TILE, tile % across * TILE
-        for j in range(top, min(height, top + TILE)):
-            for i in range(left, min(width, left + TILE)):
-                state[COUNT], state[PIXEL_X], state[PIXEL_Y] = 0, i + 0.5, j + 0.5
-                x, y = (i + 0.5) * 2 / width - 1, 1 - (j + 0.5) * 2 / height
-                if _aim(ray_space, object_sphere, planes, x, y, ray, state):
-                    ray_bits[9], ray_bits[10], ray_bits[11] = -1, 0, 0
-                    ray_bits[17], ray_bits[18], ray_bits[19] = -1, -1, -1
-                    _call(intersect, scene, ray.ctypes.data, options.ctypes.data)
-                count = int(state[COUNT])
-                for k in range(layers):
-                    triangle_ids[k, j, i] = ids[k] if k < count else -1
+        pixels = _pixels(tile, across, width, height, cells, at, columns, lines)
+        for p in range(pixels):
+            i, j = columns[p], lines[p]
+            state[COUNT], state[PIXEL_X], state[PIXEL_Y] = 0, i + 0.5, j + 0.5
+            x, y = (i + 0.5) * 2 / width - 1, 1 - (j + 0.5) * 2 / height
+            if i >= 0 and _aim(ray_space, object_sphere, planes, x, y, ray, state):
+                ray_bits[9], ray_bits[10], ray_bits[11] = -1, 0, 0
+                ray_bits[17], ray_bits[18], ray_bits[19] = -1, -1, -1
+                _call(intersect, scene, ray.ctypes.data, options.ctypes.data)
+            count = int(state[COUNT])
+            for k in range(layers):
+                triangle_ids[k, at[p]] = ids[k] if k < count else -1
         # Corners are gathered by loops of their own, so short that the processor overlaps their waits for memory.
         count = 0
         for k in range(layers):
-            for j in range(top, min(height, top + TILE)):
-                for i in range(left, min(width, left + TILE)):
-                    if triangle_ids[k, j, i] >= 0:
-                        t = triangle_ids[k, j, i]
-                        near_faces[count, 0] = faces[t, 0]
-                        near_faces[count, 1] = faces[t, 1]
-                        near_faces[count, 2] = faces[t, 2]
-                        count += 1
+            for p in range(pixels):
+                if triangle_ids[k, at[p]] >= 0:
+                    t = triangle_ids[k, at[p]]
+                    near_faces[count, 0] = faces[t, 0]
+                    near_faces[count, 1] = faces[t, 1]
+                    near_faces[count, 2] = faces[t, 2]
+                    count += 1
         for n in range(count):
             for c in range(3):
                 v = near_faces[n, c]
@@ -260,23 +263,42 @@ def cast(
                 near_vertices[3 * n + c, 2] = vertices[v, 2]
         n = 0
         for k in range(layers):
-            for j in range(top, min(height, top + TILE)):
-                for i in range(left, min(width, left + TILE)):
-                    if triangle_ids[k, j, i] < 0:
-                        barycentrics[k, j, i, 0] = barycentrics[k, j, i, 1] = depths_out[k, j, i] = 0
-                        continue
-                    to_corner(matrix, near_vertices, 3 * n, corners, 0)
-                    to_corner(matrix, near_vertices, 3 * n + 1, corners, 1)
-                    to_corner(matrix, near_vertices, 3 * n + 2, corners, 2)
-                    ea, eb, ec, _ = edge_values(corners, 0, 1, 2, i + 0.5, j + 0.5)
-                    a, b, c = ea / (ea + eb + ec), eb / (ea + eb + ec), ec / (ea + eb + ec)
-                    barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = a, b
-                    depths_out[k, j, i] = (
-                        a * depth_of(row, near_vertices, 3 * n)
-                        + b * depth_of(row, near_vertices, 3 * n + 1)
-                        + c * depth_of(row, near_vertices, 3 * n + 2)
-                    )
-                    n += 1
+            for p in range(pixels):
+                to, i, j = at[p], columns[p], lines[p]
+                if triangle_ids[k, to] < 0:
+                    barycentrics[k, to, 0] = barycentrics[k, to, 1] = depths_out[k, to] = 0
+                    continue
+                to_corner(matrix, near_vertices, 3 * n, corners, 0)
+                to_corner(matrix, near_vertices, 3 * n + 1, corners, 1)
+                to_corner(matrix, near_vertices, 3 * n + 2, corners, 2)
+                ea, eb, ec, _ = edge_values(corners, 0, 1, 2, i + 0.5, j + 0.5)
+                a, b, c = ea / (ea + eb + ec), eb / (ea + eb + ec), ec / (ea + eb + ec)
+                barycentrics[k, to, 0], barycentrics[k, to, 1] = a, b
+                depths_out[k, to] = (
+                    a * depth_of(row, near_vertices, 3 * n)
+                    + b * depth_of(row, near_vertices, 3 * n + 1)
+                    + c * depth_of(row, near_vertices, 3 * n + 2)
+                )
+                n += 1
+
+
+@numba.njit
+def _pixels(tile, across, width, height, cells, at, columns, lines):
+    """Places, columns (−1 for none) and lines of the pixels of a tile, or of a piece of a list; how many there are."""
+    count = 0
+    if len(cells) > 0:
+        for m in range(tile * TILE * TILE, min(len(cells), (tile + 1) * TILE * TILE)):
+            at[count], columns[count], lines[count] = m, -1, 0
+            if cells[m] >= 0:
+                columns[count], lines[count] = cells[m] % width, cells[m] // width
+            count += 1
+        return count
+    top, left = tile // across * TILE, tile % across * TILE
+    for j in range(top, min(height, top + TILE)):
+        for i in range(left, min(width, left + TILE)):
+            at[count], columns[count], lines[count] = j * width + i, i, j
+            count += 1
+    return count
 
 
 @numba.njit(error_model="numpy")

@@ -6,6 +6,8 @@ the public interface of the package embreex serves, slower and to the same end.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from rts.camera import Camera
@@ -61,36 +63,54 @@ class Embree(TriangleSampler):
         self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str
     ) -> Fragments:
         """See `TriangleSampler.rasterize`."""
-        scene, planes = prepared.scene, _planes(camera.projection)
+        scene = prepared.scene
         if isinstance(scene, embreex_fallback.Scene):
-            return scene.cast(
-                prepared.proxy, prepared.covers.owners, prepared.sphere, planes, camera, size, layers, cull
-            )
-        height, width = size
-        fragments = Fragments(
-            np.empty((layers, height, width), np.int32),
-            np.empty((layers, height, width, 2), np.float32),
-            np.empty((layers, height, width), np.float32),
-        )
-        parallel(
-            cast,
-            -(-height // TILE) * -(-width // TILE),
-            scene.intersect,
-            keep_nearest_address(),
-            scene.handle,
-            pixel_matrix(camera, size),
-            -camera.view[2],
-            np.concatenate([camera.projection, np.linalg.inv(camera.view)]),
-            prepared.sphere,
-            planes,
-            facing(camera, cull),
-            prepared.proxy.vertices,
-            prepared.proxy.faces,
-            prepared.covers.owners,
-            prepared.covers.margins,
-            *fragments,
-        )
-        return fragments
+            given = prepared.proxy, prepared.covers.owners, prepared.sphere, _planes(camera.projection)
+            return scene.cast(*given, camera, size, layers, cull)
+        return _cast(prepared, camera, size, cull, np.empty(0, np.int32), (layers, *size))
+
+    def rasterize_cells(
+        self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
+    ) -> Fragments:
+        """See `TriangleSampler.rasterize_cells`: a ray for each of these cells."""
+        if isinstance(prepared.scene, embreex_fallback.Scene):
+            return super().rasterize_cells(prepared, camera, size, layers, cull, cells)
+        flat = np.ascontiguousarray(cells, np.int32).reshape(-1)
+        return _cast(prepared, camera, size, cull, flat, (layers, *cells.shape))
+
+
+def _cast(
+    prepared: Structure, camera: Camera, size: tuple[int, int], cull: str, cells: np.ndarray, shape: tuple[int, ...]
+) -> Fragments:
+    """Fragments (K, ·, ·) of some cells, or of all where none are named."""
+    scene: Any = prepared.scene
+    (height, width), count = size, shape[1] * shape[2]
+    tiles = -(-len(cells) // TILE**2) if len(cells) else -(-height // TILE) * -(-width // TILE)
+    flat = np.empty((shape[0], count), np.int32), np.empty((shape[0], count, 2), np.float32)
+    found = *flat, np.empty((shape[0], count), np.float32)
+    parallel(
+        cast,
+        tiles,
+        scene.intersect,
+        keep_nearest_address(),
+        scene.handle,
+        pixel_matrix(camera, size),
+        -camera.view[2],
+        np.concatenate([camera.projection, np.linalg.inv(camera.view)]),
+        prepared.sphere,
+        _planes(camera.projection),
+        facing(camera, cull),
+        prepared.proxy.vertices,
+        prepared.proxy.faces,
+        prepared.covers.owners,
+        prepared.covers.margins,
+        width,
+        height,
+        cells,
+        *found,
+    )
+    ids, barycentrics, depth = found
+    return Fragments(ids.reshape(shape), barycentrics.reshape(*shape, 2), depth.reshape(shape))
 
 
 def _packed(proxy: Proxy) -> Proxy:

@@ -83,6 +83,7 @@ class Cells:
         row: (K, H, W) signed integers, the sample of each cell, or −1.
         choices: the choices for the same samples, if they are known.
         part: (K, H, W) integers, the part of each sample; None, or no layers, where that is not known.
+        wanted: (H, W) bool, the targets to fill, others may be anything; None, or no rows, for all.
 
     Raises:
         InputError: shapes that do not fit, or `row` refers to a sample that is not there.
@@ -96,6 +97,7 @@ class Cells:
         row: np.ndarray,
         choices: Choices | None = None,
         part: np.ndarray | None = None,
+        wanted: np.ndarray | None = None,
     ):
         if positions.shape[1:] != (3,) or rgba.shape != (len(positions), 4):
             given = f"{positions.shape} and {rgba.shape}"
@@ -105,6 +107,7 @@ class Cells:
             check_rows(row, len(positions))
         self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
+        self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
         self.visible, self.border = settings.kind == "visible", settings.border
         self.rims = self.visible and settings.rims
         self.crosses = self.visible and settings.crossings
@@ -152,6 +155,8 @@ class Cells:
         parallel(survey, height, *given, *noted, work=2 * self.row.size)
         repeated = int(np.count_nonzero(seen)) != int(counts.sum())
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
+        if self._wanted is not None:
+            states *= self._wanted
         least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
         # See `rts.splatting.layers`: nothing is nearer to what is beyond everything than to a front.
         extent = largest - least
@@ -159,6 +164,8 @@ class Cells:
         if layers > 1:
             given = self.row, self.visible, beyond, hidden, states
             parallel(listing.find, height, self.positions, *given, marks, counts, work=self.row.size)
+            # How an outline moves is decided by pairs up to two cells away.
+            counts = self._of_wanted(marks, counts, 2)
         offsets = np.concatenate([[0], np.cumsum(counts)])
         columns = np.empty(offsets[-1], np.int32)
         ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
@@ -180,10 +187,13 @@ class Cells:
             listed = choices.mixed, choices.offsets, choices.columns, choices.ranges
             given = self.positions, self.row, self._reach, choices.states, *listed, ends, marks, counts
             parallel(outlines.find, height, *given, work=self.row[0].size)
+            counts = self._of_wanted(marks, counts, 1)
         offsets = np.concatenate([[0], np.cumsum(counts)])
+        # Targets that are listed but not wanted may look at cells for which nothing is decided.
+        make = np.empty if self._wanted is None else np.zeros
         found = Outlines(
-            np.empty((height, width), kind),
-            np.empty((height, width), np.int32),
+            make((height, width), kind),
+            make((height, width), np.int32),
             offsets,
             np.empty(offsets[-1], np.int32),
             np.empty((offsets[-1], 9), np.uint8),
@@ -204,6 +214,20 @@ class Cells:
             return crossings.nothing(self.row.shape[1], self.positions.dtype)
         arrays = self.positions, self.rgba, self.row, *self._numbers
         return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent))
+
+    def _of_wanted(self, marks: np.ndarray, counts: np.ndarray, reach: int) -> np.ndarray:
+        """Clear marks (H, W) that are farther than so many cells from wanted targets; how many each row has then."""
+        if self._wanted is None:
+            return counts
+        near = self._wanted
+        for _ in range(reach):
+            near = near.copy()
+            near[1:] |= near[:-1].copy()
+            near[:-1] |= near[1:].copy()
+            near[:, 1:] |= near[:, :-1].copy()
+            near[:, :-1] |= near[:, 1:].copy()
+        marks *= near
+        return marks.sum(axis=1, dtype=np.int64)
 
     def image(self, out: np.ndarray) -> None:
         """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""

@@ -257,6 +257,7 @@ def fill(
         d, m = found.offsets[y], firsts[y]
         for x in range(marks.shape[1]):
             if not marks[y, x]:
+                m += mixed[y, x]
                 continue
             if row[0, y, x] >= 0:
                 found.beta[y, x] = positions.dtype.type(0)

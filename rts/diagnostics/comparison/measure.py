@@ -22,11 +22,11 @@ from rts.diagnostics.comparison.turns import LONGEST, Calls, Turns
 from rts.diagnostics.steps import pixel_step
 from rts.engines import Engine, is_constant, namespace
 from rts.errors import InputError, RtsWarning
+from rts.explaining import explain
 from rts.fitting.names import one_line
 from rts.interfaces import Part, as_surface
 from rts.registry import instance
 from rts.rendering import render, sample
-from rts.sampling.auto import explain
 from rts.trees import Array, Tree, collected, leaves, map_leaves
 
 PATIENCE = 8.0

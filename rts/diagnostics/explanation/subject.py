@@ -21,6 +21,7 @@ from rts.fitting.names import named_leaves
 from rts.interfaces import CheckedPart, Part
 from rts.records import Sampled
 from rts.rendering import render, sample
+from rts.sampling.adaptive import finest
 from rts.sampling.prepared import PreparedParts
 from rts.trees import Array, Tree, leaves, map_leaves
 
@@ -303,8 +304,8 @@ class Subject:
 
     @cached_property
     def supersample(self) -> int:
-        """Samples along each axis of a pixel."""
-        return self.options.get("supersample", 1)
+        """Samples along each axis of a pixel, where there are most."""
+        return finest(self.options.get("supersample", 1))
 
     @cached_property
     def fineness(self) -> Fineness:

@@ -1,0 +1,63 @@
+"""What rendering a scene would do: which sampler each part gets, and how many samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.checks import check_scene
+from rts.engines import engine_of
+from rts.interfaces import Part
+from rts.records import Samples
+from rts.rendering import sample
+from rts.sampling.adaptive import Adaptive
+from rts.sampling.auto import Choice, choose, is_static
+from rts.sampling.prepared import PreparedParts
+
+
+def explain(
+    parts: Part | Sequence[Part] | PreparedParts,
+    camera: Camera,
+    size: tuple[int, int] | None = None,
+    *,
+    splatter: Any = "auto",
+    layers: int | Literal["auto"] = 2,
+    supersample: int | Adaptive = 1,
+) -> list[Choice]:
+    """What `sampler="auto"` takes for each part of a scene, and why; and, at a size, how many samples there are.
+
+    Args:
+        parts: as in `rts.render`.
+        camera: as in `rts.render`.
+        size: (height, width) in pixels; None to count nothing.
+        splatter: as in `rts.render`.
+        layers: as in `rts.render`.
+        supersample: as in `rts.render`.
+
+    Returns:
+        For each part the name of the `sampler`, and the `reason`; with a size also the number of `samples`, apron
+        included, and with `rts.Adaptive` how many of them are `fine`, and how many pixels are `active`.
+
+    Raises:
+        InputError: what was given cannot be sampled.
+    """
+    checked, seen = check_scene(parts.parts if isinstance(parts, PreparedParts) else parts, camera)
+    choices = [choose(part, static=is_static(part, seen)) for part in checked]
+    if size is None:
+        return choices
+    found = sample(parts, camera, size, splatter=splatter, layers=layers, supersample=supersample)
+    coarse = map(_count, found.samples)
+    if found.fine is None:
+        return [choice._replace(samples=n) for choice, n in zip(choices, coarse, strict=True)]
+    pixel = engine_of(found).to_numpy(found.fine.pixel)
+    finer, active = map(_count, found.fine.samples), int(np.count_nonzero(pixel >= 0))
+    counts = zip(choices, coarse, finer, strict=True)
+    return [choice._replace(samples=n + m, fine=m, active=active) for choice, n, m in counts]
+
+
+def _count(samples: Samples) -> int:
+    """How many samples cells refer to."""
+    return int(np.count_nonzero(engine_of(samples).to_numpy(samples.row) >= 0))

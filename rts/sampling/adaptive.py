@@ -1,0 +1,110 @@
+"""Samples where outlines are: which pixels take many, decided by one sample a pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from rts.arguments import quoted
+from rts.checks import is_count, is_real
+from rts.errors import InputError
+from rts.interfaces import CheckedPart
+from rts.threads import parallel, read_only
+
+
+@dataclass(frozen=True)
+class Adaptive:
+    """In place of a number of `supersample`: s² samples where outlines are, one in every other pixel.
+
+    A pixel is active if, of one sample a pixel, its front ends towards a neighbour (nothing is there, or another
+    surface), or a neighbour's towards it. Active pixels are those of `supersample=samples`, the others those of 1.
+
+    Attributes:
+        samples: s, along each side of an active pixel; at least 2.
+        dilated: whether the eight neighbours of active pixels are active too. Colours that change near outlines need
+            that; None for where some shader gives a part more than one colour (`Shader.uniform`).
+        contrast: pixels are also active whose colour, in any channel, has a second difference above this along any of
+            four directions: edges of colour on surfaces. Needs colours, which `rts.sample` does not have, nor do
+            compiled programs and derivatives of several directions at once. None for not to look; 0.2 suits.
+    """
+
+    samples: int
+    dilated: bool | None = None
+    contrast: float | None = None
+
+    def __post_init__(self):
+        if not is_count(self.samples) or self.samples < 2:
+            raise InputError(
+                f"samples of Adaptive is {quoted(self.samples)}; expected an integer of at least 2, such as 4"
+            )
+        if self.dilated is not None and not isinstance(self.dilated, bool):
+            raise InputError(f"dilated of Adaptive is {quoted(self.dilated)}; expected True, False or None")
+        if self.contrast is not None and not (is_real(self.contrast) and 0 < self.contrast):
+            raise InputError(
+                f"contrast of Adaptive is {quoted(self.contrast)}; expected a positive number, such as 0.2, or None"
+            )
+        object.__setattr__(self, "samples", int(self.samples))
+
+    def dilates(self, parts: Sequence[CheckedPart]) -> bool:
+        """Whether active pixels of a scene are dilated."""
+        if self.dilated is None:
+            return self.contrast is not None or not all(part.shader.uniform for part in parts)
+        return self.dilated
+
+
+def finest(supersample: Any) -> Any:
+    """Samples along each side of a pixel, where there are most; what is neither is returned as it is."""
+    return supersample.samples if isinstance(supersample, Adaptive) else supersample
+
+
+def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int]) -> np.ndarray:
+    """Cells (H, W) bool whose fronts end towards a neighbour, or a neighbour's towards them.
+
+    Args:
+        row: (K, H, W) int32 of one sample a pixel.
+        depth: (K, H, W).
+        sizes: the number of rows of each part.
+    """
+    from rts.sampling import adaptive_kernels
+    from rts.splatting.visible import CONTINUED
+
+    depth, kind = read_only(depth), depth.dtype.type
+    extent = max(depth.max(initial=0), 0) - min(depth.min(initial=0), 0)
+    marks = np.empty(row.shape[1:], np.uint8)
+    given = read_only(row, np.int32), depth, np.cumsum(sizes)[:-1], kind(2 * extent if extent > 0 else 1)
+    parallel(adaptive_kernels.mark, len(marks), *given, kind(CONTINUED), marks, work=4 * row.size)
+    return marks.astype(bool)
+
+
+def contrasts(row: np.ndarray, rgba: np.ndarray, least: float) -> np.ndarray:
+    """Cells (H, W) bool whose front's colour differs by more than `least` from the mean line of two opposite ones.
+
+    Args:
+        row: (H, W), the front of each cell.
+        rgba: (N, 4).
+        least: the second difference, of any channel.
+    """
+    covered = np.pad(row >= 0, 1)
+    color = np.pad(rgba[np.maximum(row, 0)], ((1, 1), (1, 1), (0, 0)))
+    height, width = row.shape
+
+    def at(x: np.ndarray, v: int, u: int) -> np.ndarray:
+        return x[1 + v : 1 + v + height, 1 + u : 1 + u + width]
+
+    found = np.zeros(row.shape, bool)
+    for v, u in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        second = np.abs(at(color, v, u) - 2 * at(color, 0, 0) + at(color, -v, -u)).max(axis=-1)
+        found |= (second > least) & at(covered, v, u) & at(covered, -v, -u) & at(covered, 0, 0)
+    return found
+
+
+def dilated(cells: np.ndarray) -> np.ndarray:
+    """Cells (H, W) and those beside them."""
+    for axis in (0, 1):
+        before, after = np.delete(cells, -1, axis), np.delete(cells, 0, axis)
+        wide = [(1, 0) if i == axis else (0, 0) for i in (0, 1)]
+        cells = cells | np.pad(before, wide) | np.pad(after, [w[::-1] for w in wide])
+    return cells

@@ -1,0 +1,95 @@
+"""Cells beside outlines, by depths alone: the pairing of `rts.splatting.Visible`, compiled."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+compiled = numba.njit(nogil=True)
+kernel = numba.njit(nogil=True, cache=True)
+
+
+@kernel
+def mark(start, stop, row, depth, firsts, beyond, continued, marks):
+    """Mark the cells of rows [start, stop) whose front ends towards a neighbour, or a neighbour's towards them.
+
+    Args:
+        start: first row.
+        stop: end of the rows.
+        row: (K, H, W) int32.
+        depth: (K, H, W).
+        firsts: (P − 1,) the first row of each part but the first.
+        beyond: depth of layers that are not covered; no two layers are farther apart than each is from it.
+        continued: share of the error of plain pairing below which a front continues another.
+        marks: (H, W) uint8, to be filled.
+    """
+    layers, height, width = row.shape
+    # Of three rows of cells, repeated at the ends: the part seen, −1 for none, and whether there is a hidden layer.
+    parts, hidden = np.empty((3, width + 2), np.int32), np.empty((3, width + 2), np.uint8)
+    for y in range(start - 1, stop + 1):
+        at = min(max(y, 0), height - 1)
+        seen, behind = parts[(y + 3) % 3], hidden[(y + 3) % 3]
+        for x in range(width):
+            i = row[0, at, x]
+            part = np.int32(-1 if i < 0 else 0)
+            for first in firsts:
+                part += i >= first
+            seen[x + 1], behind[x + 1] = part, layers > 1 and row[min(1, layers - 1), at, x] >= 0
+        seen[0], seen[width + 1], behind[0], behind[width + 1] = seen[1], seen[width], behind[1], behind[width]
+        if y <= start:
+            continue
+        above, level, below = (y + 1) % 3, (y + 2) % 3, y % 3
+        _differ(marks[y - 1], parts[above], parts[level], parts[below])
+        if layers > 1:
+            for x in range(width):
+                near = hidden[above, x] | hidden[above, x + 1] | hidden[above, x + 2] | hidden[level, x]
+                near |= hidden[level, x + 1] | hidden[level, x + 2] | hidden[below, x]
+                near |= hidden[below, x + 1] | hidden[below, x + 2]
+                if near and not marks[y - 1, x] and row[0, y - 1, x] >= 0:
+                    marks[y - 1, x] = _ends(row, depth, y - 1, x, beyond, continued)
+
+
+@compiled
+def _differ(marks, above, level, below):
+    """Mark the cells of a row beside which another part is seen, or nothing."""
+    for x in range(len(marks)):
+        own = level[x + 1]
+        found = (above[x] != own) | (above[x + 1] != own) | (above[x + 2] != own) | (level[x] != own)
+        found |= (level[x + 2] != own) | (below[x] != own) | (below[x + 1] != own) | (below[x + 2] != own)
+        marks[x] = found
+
+
+@compiled
+def _ends(row, depth, y, x, beyond, continued):
+    """Whether the front of a cell, whose neighbours are covered, too, ends towards one of them."""
+    _, height, width = row.shape
+    for n in range(9):
+        v, u = n // 3 - 1, n % 3 - 1
+        py, px = y - v, x - u
+        if n != 4 and 0 <= py < height and 0 <= px < width and _parted(row, depth, y, x, v, u, beyond, continued):
+            return True
+    return False
+
+
+@compiled
+def _parted(row, depth, y, x, v, u, beyond, continued):
+    """Whether the front of a covered target (y, x) and that of the source from which (u, v) leads to it do not pair."""
+    layers, height, width = row.shape
+    py, px = y - v, x - u
+    source, target = depth[0, py, px], depth[0, y, x]
+    plain = abs(source - target)
+    best = plain
+    for k in range(1, layers):
+        p = depth[k, py, px] if row[k, py, px] >= 0 else beyond
+        q = depth[k, y, x] if row[k, y, x] >= 0 else beyond
+        best = min(best, abs(p - target), abs(q - source))
+    if not best < plain:
+        return False
+    limit = continued * best
+    for steps in (-1, 2):
+        end, start = (source, target) if steps < 0 else (target, source)
+        by, bx = y - steps * v, x - steps * u
+        if 0 <= by < height and 0 <= bx < width and row[0, by, bx] >= 0:
+            if abs(end - (start + start - depth[0, by, bx])) < limit:
+                return False
+    return True

@@ -1,0 +1,84 @@
+"""Fine samples of the pixels that the coarse samples say are active."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from rts.checks import check_memory
+from rts.engines import engine_of
+from rts.interfaces import AnyNeeded
+from rts.records import Fine, Sampled
+from rts.sampling.adaptive import Adaptive, contrasts, dilated, outlines
+from rts.sampling.pruning import as_needed, planned
+from rts.sampling.tiles import Grid, InTiles, Layout, Room, arranged, lay_out, needed_room, of_engine, rounded
+
+
+class Where(NamedTuple):
+    """Which pixels are active.
+
+    Attributes:
+        adaptive: what the user asked for.
+        dilates: whether the neighbours of such pixels are active, too.
+        colors: (N, 4) of the coarse samples, to look for contrast; or None.
+    """
+
+    adaptive: Adaptive
+    dilates: bool
+    colors: np.ndarray | None = None
+
+
+def active(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], apron: int, where: Where) -> np.ndarray:
+    """Active pixels (H, W) bool of coarse samples (K, ·, ·) with an apron; see `outlines`."""
+    found = outlines(row, depth, sizes)
+    if where.colors is not None and where.adaptive.contrast is not None:
+        found |= contrasts(row[0], where.colors, where.adaptive.contrast)
+    found = dilated(found) if where.dilates else found
+    return np.ascontiguousarray(found[apron:-apron, apron:-apron])
+
+
+def fine_samples(
+    coarse: Sampled,
+    grid: Grid,
+    where: Where,
+    take: Callable[..., Sampled],
+    needed: AnyNeeded | None,
+    layers: int | Literal["auto"],
+    capacity: int | None,
+) -> Fine:
+    """Fine samples of active pixels and their apron, in tiles.
+
+    Args:
+        coarse: one sample a pixel.
+        grid: the sizes.
+        where: which pixels are active.
+        take: samples the fine grid: a number of layers, what is needed, `cells` and `capacity` → `Sampled`.
+        needed: says which samples of an image the splatter needs; None for all.
+        layers: K, or "auto".
+        capacity: rows to allot, or None for as many as there are, or could be.
+    """
+    sizes, engine = [s.ids.shape[-2] for s in coarse.samples], engine_of(coarse)
+    room, most = grid.room(capacity, planned(layers)), planned(layers)
+    row, depth = engine.known(coarse.row), engine.known(coarse.depth)
+    if row is None or depth is None or row.ndim != 3:
+        check_memory(1, room.cells, most, capacity, gradient=engine.differentiates)
+
+        def laid_out(row: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, ...]:
+            return tuple(lay_out(active(row, depth, sizes, coarse.apron, where), grid, room))
+
+        layout = Layout(*engine.call_host(laid_out, Layout.specs(grid, room), coarse.row, coarse.depth))
+        known, allotted = None, most * room.cells
+    else:
+        pixels, few = active(row, depth, sizes, coarse.apron, where), engine.padded(coarse.row)
+        room = needed_room(pixels, grid) if capacity is None else room
+        room = Room(rounded(room.tiles), room.cells) if few else room
+        host = lay_out(pixels, grid, room, rounded if few else int)
+        check_memory(1, host.cells.size, most, capacity, gradient=engine.differentiates)
+        layout, allotted = of_engine(host, engine, coarse.depth), None
+        known = None if needed is None else InTiles(needed, host)
+    taken = partial(take, capacity=allotted, cells=layout.cells)
+    sampled = taken(layers, known) if layers != "auto" else as_needed(taken, known)
+    return arranged(sampled, layout, grid)

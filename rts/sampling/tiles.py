@@ -1,0 +1,302 @@
+"""Tiles: the fine cells that active pixels need, laid out side by side as one picture that any splatter can take.
+
+A tile holds a square of pixels and an apron of fine cells around it, so that no splat crosses from one tile to another.
+Cells that no active pixel needs are empty. A cell that two tiles show is sampled, evaluated and shaded once.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.adapting import adapted
+from rts.engines import Engine, constants, engine_of, namespace
+from rts.interfaces import AnyNeeded, Needed
+from rts.records import ArraySpec, Fine, Sampled, Samples
+from rts.threads import parallel, read_only
+from rts.trees import Array
+
+TILE = 32
+"""Fine cells along each side of a tile with its apron, about: with fewer there are more of aprons, with more, more of
+empty cells. Compiled splatters take as many columns at a time."""
+
+LINE = 256
+"""Fine cells that are sampled, in a line of their list."""
+
+FILLED = 1 / 3
+"""Share of a tile's cells that are needed, about, where shapes have to be known beforehand."""
+
+
+class Grid(NamedTuple):
+    """The sizes of an adaptively sampled image.
+
+    Attributes:
+        size: (height, width) in pixels.
+        side: s, fine cells along each side of a pixel.
+        apron: fine cells around active pixels, and around the image.
+    """
+
+    size: tuple[int, int]
+    side: int
+    apron: int
+
+    @property
+    def fine(self) -> tuple[int, int]:
+        """Height and width of the grid of fine cells, with its apron."""
+        height, width = self.size
+        return height * self.side + 2 * self.apron, width * self.side + 2 * self.apron
+
+    @property
+    def tile(self) -> int:
+        """Pixels along each side of a tile."""
+        return max(-(-self.apron // self.side), (TILE - 2 * self.apron) // self.side, 1)
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Lines and columns of tiles that make the image."""
+        return -(-self.size[0] // self.tile), -(-self.size[1] // self.tile)
+
+    @property
+    def pitch(self) -> int:
+        """Fine cells from one tile of a layout to the next: whole pixels."""
+        return -(-(self.tile * self.side + 2 * self.apron) // self.side) * self.side
+
+    def room(self, capacity: int | None, layers: int) -> Room:
+        """Room for the worst case, or for so many rows."""
+        cells, (down, across) = self.fine[0] * self.fine[1], self.tiles
+        if capacity is None:
+            return Room(down * across, cells)
+        each = FILLED * (self.tile * self.side) ** 2
+        return Room(min(down * across, math.ceil(capacity / layers / each)), min(cells, max(1, capacity // layers)))
+
+
+class Room(NamedTuple):
+    """How many tiles, and fine cells to sample, there is room for."""
+
+    tiles: int
+    cells: int
+
+
+def rounded(count: int) -> int:
+    """The next number of the form 2ⁿ or 3·2ⁿ, at least 16: few, so that what is compiled for a shape serves again."""
+    size = 16
+    while size < count:
+        size = size * 3 // 2 if size & (size - 1) == 0 else size * 4 // 3
+    return size
+
+
+class Layout(NamedTuple):
+    """Fine cells in tiles.
+
+    Attributes:
+        cells: (L, LINE) int32, the cells to sample, as flat indices in the grid with its apron; −1 for none.
+        place: (h, w) int32, which of these each place of the layout shows, or −1.
+        kinds: (h, w) uint8, bits of `tiles_kernels`.
+        pixel: (H, W) int32, where in the layout, in pixels, an active pixel is; −1 for pixels that are not active.
+        coarse: (H', W') bool, with the apron, the pixels of the image that are not active.
+        dropped: () int32, pixels that there was no room for.
+    """
+
+    cells: Array
+    place: Array
+    kinds: Array
+    pixel: Array
+    coarse: Array
+    dropped: Array
+
+    @staticmethod
+    def specs(grid: Grid, room: Room) -> tuple[ArraySpec, ...]:
+        """Shapes and dtypes of the arrays."""
+        place = _shape(grid, room)
+        lines = -(-room.cells // LINE), LINE
+        coarse = tuple(n + 2 * grid.apron for n in grid.size)
+        kinds = np.int32, np.int32, np.uint8, np.int32, np.bool_, np.int32
+        shapes = lines, place, place, grid.size, coarse, ()
+        return tuple(itertools.starmap(ArraySpec, zip(shapes, kinds, strict=True)))
+
+
+def _shape(grid: Grid, room: Room) -> tuple[int, int]:
+    """Height and width of a layout."""
+    across = _across(room)
+    return -(-room.tiles // across) * grid.pitch + 2 * grid.apron, across * grid.pitch + 2 * grid.apron
+
+
+def _across(room: Room) -> int:
+    return max(1, math.isqrt(room.tiles))
+
+
+def needed_room(active: np.ndarray, grid: Grid) -> Room:
+    """Room for all of some pixels (H, W) bool; of cells it is a bound."""
+    tiles = int(_in_tiles(active, grid).sum())
+    each = (grid.side + 2 * grid.apron) ** 2
+    return Room(
+        max(1, tiles), max(1, min(int(active.sum()) * each, tiles * (grid.tile * grid.side + 2 * grid.apron) ** 2))
+    )
+
+
+def _in_tiles(active: np.ndarray, grid: Grid) -> np.ndarray:
+    """Which tiles hold any of some pixels."""
+    down, across = grid.tiles
+    wide = np.zeros((down * grid.tile, across * grid.tile), bool)
+    wide[: grid.size[0], : grid.size[1]] = active
+    return np.asarray(wide.reshape(down, grid.tile, across, grid.tile).any(axis=(1, 3)))
+
+
+def lay_out(active: np.ndarray, grid: Grid, room: Room, lines_of: Callable[[int], int] | None = None) -> Layout:
+    """The fine cells that active pixels (H, W) bool need, in tiles, as far as there is room.
+
+    Args:
+        active: the pixels.
+        grid: the sizes.
+        room: for how much; it decides the shapes.
+        lines_of: how many lines the list of cells is to have if so many are needed; None for those of `room`.
+    """
+    from rts.sampling import tiles_kernels
+
+    (lines, *_), shape = Layout.specs(grid, room), _shape(grid, room)
+    cells = np.full(lines.shape, -1, np.int32)
+    place, kinds = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8)
+    pixel = np.full(grid.size, -1, np.int32)
+    corners = np.argwhere(_in_tiles(active, grid))[: room.tiles]
+    (down, across), inner = grid.tiles, grid.tile * grid.side
+    numbers = np.zeros((down + 2, across + 2, inner, inner), np.int32)
+    sizes = grid.side, grid.tile, grid.apron, _across(room), grid.pitch, room.cells
+    _, count = tiles_kernels.fill(active, corners, *sizes, numbers, cells.reshape(-1), place, kinds, pixel)
+    if lines_of is not None:
+        cells = cells[: lines_of(max(1, -(-count // LINE)))]
+    coarse, left = np.pad(pixel < 0, grid.apron), active.sum() - (pixel >= 0).sum()
+    return Layout(cells, place, kinds, pixel, coarse, np.asarray(left, np.int32))
+
+
+class InTiles(Needed):
+    """Says which samples of listed cells can reach active pixels: asks what decides for images, of the layout."""
+
+    def __init__(self, needed: AnyNeeded, layout: Layout):
+        """`layout` is on the host."""
+        self._needed, self._layout = needed, layout
+
+    def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """See `Needed`; (K, L, LINE)."""
+        from rts.sampling import tiles_kernels
+
+        layers, place = len(covered), self._layout.place
+        lists = [read_only(x).reshape(layers, -1) for x in (covered, depth)]
+        laid, deep = np.empty((layers, *place.shape), bool), np.empty((layers, *place.shape), depth.dtype)
+        parallel(tiles_kernels.gather, layers * len(place), *lists, place, laid, deep, work=2 * laid.size)
+        kept, found = self._needed(laid, deep), np.zeros((layers, covered[0].size), bool)
+        if kept is laid:
+            return covered
+        tiles_kernels.scatter(kept, self._layout.kinds, place, found)
+        found = found.reshape(covered.shape) & covered
+        found[0] = covered[0]
+        return found
+
+    def ran_out(self, cells: int) -> None:
+        """See `Needed`."""
+        adapted(self._needed, Needed).ran_out(cells)
+
+
+def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
+    """Samples of listed cells, (K, L, LINE), put into the places that show these cells."""
+    sizes = [s.ids.shape[-2] for s in sampled.samples]
+    engine, layers = engine_of(sampled), sampled.row.shape[0]
+    laid = layers, *layout.place.shape
+    splats = layers * laid[1] * laid[2]
+    specs = (
+        ArraySpec((splats,), np.int32, packed=True),
+        ArraySpec((splats, 3), np.float32, packed=True),
+        ArraySpec(laid, np.int32),
+        ArraySpec(laid, np.int32),
+    )
+
+    def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, ...]:
+        return _arranged(row, place, cells, sizes, grid.fine[1])
+
+    index, shift, row, part = engine.call_host(host, specs, sampled.row, layout.place, layout.cells)
+    return Fine(
+        sampled.samples,
+        index,
+        shift,
+        row,
+        part,
+        layout.kinds,
+        layout.pixel,
+        layout.coarse,
+        sampled.overflow + layout.dropped,
+        supersample=grid.side,
+        apron=grid.apron,
+    )
+
+
+def _arranged(
+    row: np.ndarray, place: np.ndarray, cells: np.ndarray, sizes: Sequence[int], width: int
+) -> tuple[np.ndarray, ...]:
+    """What `tiles_kernels.arrange` fills; there is always at least one splat."""
+    from rts.sampling import tiles_kernels
+
+    row, place, cells = (read_only(x, np.int32) for x in (row, place, cells))
+    row, cells, lines = row.reshape(len(row), -1), cells.reshape(-1), len(row) * len(place)
+    counts = np.empty(lines, np.int64)
+    parallel(tiles_kernels.count, lines, row, place, counts, work=len(row) * place.size)
+    offsets, total = np.cumsum(counts) - counts, int(counts.sum())
+    index, shift = np.zeros(max(1, total), np.int32), np.zeros((max(1, total), 3), np.float32)
+    laid, part = (np.empty((len(row), *place.shape), np.int32) for _ in range(2))
+    given = row, place, cells, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part
+    parallel(tiles_kernels.arrange, lines, *given, work=2 * laid.size)
+    return index, shift, laid, part
+
+
+def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
+    """Samples of all cells, less those that are not listed: what is done for samplers that know no lists.
+
+    Args:
+        whole: of the whole grid.
+        cells: (L, LINE) int32, flat indices in the grid, or −1.
+        capacity: rows to allot, or None for as many as there are.
+    """
+    layers, count = whole.row.shape[0], whole.ids.shape[0]
+    rows = count if capacity is None else capacity
+    grid = layers, *cells.shape
+
+    def host(row: np.ndarray, depth: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, ...]:
+        there = cells >= 0
+        at = np.where(there, cells, 0)
+        row, depth = (x.reshape(layers, -1)[:, at] for x in (row, depth))
+        covered = (row >= 0) & there
+        index = row[covered]
+        number = np.full(grid, -1, np.int32)
+        number[covered] = np.where(np.arange(len(index)) < rows, np.arange(len(index)), -1)
+        kept = np.zeros(max(1, len(index)) if capacity is None else rows, np.int32)
+        kept[: len(index)] = index[: len(kept)]
+        return kept, number, np.where(number >= 0, depth, 0), np.asarray(max(0, len(index) - rows), np.int32)
+
+    kind = np.float64 if namespace(whole.depth).finfo(whole.depth.dtype).bits == 64 else np.float32
+    specs = (
+        ArraySpec((rows,), np.int32, packed=capacity is None),
+        ArraySpec(grid, np.int32),
+        ArraySpec(grid, kind),
+        ArraySpec((), np.int32),
+    )
+    index, row, depth, overflow = engine_of(whole).call_host(host, specs, whole.row, whole.depth, cells)
+    xp, gbuffer = namespace(index), whole.gbuffer
+    tables = whole.tables.items()
+    return replace(
+        whole,
+        ids=xp.take(whole.ids, index, axis=0),
+        params=xp.take(whole.params, index, axis=0),
+        row=row,
+        depth=depth,
+        overflow=whole.overflow + overflow,
+        tables={k: xp.take(v, index, axis=0) if k in whole.by_sample else v for k, v in tables},
+        gbuffer=None if gbuffer is None else {k: xp.take(v, index, axis=0) for k, v in gbuffer.items()},
+    )
+
+
+def of_engine(layout: Layout, engine: Engine, like: Array) -> Layout:
+    """The layout in arrays of an engine, on the device of `like`."""
+    return Layout(*(constants(x, engine, like) for x in layout))

@@ -1,0 +1,277 @@
+"""The second pass of the rasterizer: listed triangles drawn into the layers of pixels, a band of rows at a time.
+
+Loops run over arrays of one short block (a row for each number, a column for each triangle) and have no branches, so
+that they compile to vector instructions and no jump is mispredicted; what is rare is sorted out last.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from rts_backends import raster_cells
+from rts_backends.triangles import owns
+
+BAND_ROWS = raster_cells.SIDE
+BLOCK = 64
+
+LISTED = raster_cells.LISTED
+"""What is listed of a triangle: its index, its three corners, and its first and last column and row of pixels."""
+
+NUMBERS = 18
+"""Three edge functions (x, y, 1) turned inward; of the corners the depths, and w + z and w − z of clip space."""
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def draw(first, last, offsets, items, listed, vertices, matrix, view_depth, keep, triangle_ids, barycentrics, depths):
+    """Fill the three fragment arrays, band by band."""
+    layers, height, width = triangle_ids.shape
+    nearest = np.empty((layers, BAND_ROWS, width))
+    entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
+    numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
+    most = 4 * BLOCK
+    hits = np.empty((most + width, 2), np.int32)
+    for band in range(first, last):
+        top, bottom = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS) - 1
+        rows = slice(top, bottom + 1)
+        nearest[:], triangle_ids[:, rows], barycentrics[:, rows] = np.inf, -1, 0
+        for start in range(offsets[band], offsets[band + 1], BLOCK):
+            block = items[start : min(offsets[band + 1], start + BLOCK)]
+            _gather(block, listed, vertices, entries, points)
+            _set_up(len(block), points, matrix, view_depth, keep, top, bottom, entries, numbers, clips)
+            _cover(len(block), entries, numbers, covers)
+            found = 0
+            for b in range(len(block)):
+                i0, i1, j0, j1 = entries[4, b], entries[5, b], entries[6, b], entries[7, b]
+                place = b * BAND_ROWS + j0 - top
+                if (i1 - i0 < 2) & (j1 - j0 < 2):
+                    for n in range(4):
+                        hits[found, 0], hits[found, 1] = place + (n >> 1), i0 + (n & 1)
+                        found += (covers[b] >> n) & 1
+                    continue
+                for j in range(j0, j1 + 1):
+                    y = j + 0.5
+                    ra, rb = numbers[1, b] * y + numbers[2, b], numbers[4, b] * y + numbers[5, b]
+                    rc = numbers[7, b] * y + numbers[8, b]
+                    for i in range(i0, i1 + 1):
+                        x = i + 0.5
+                        ea, eb, ec = numbers[0, b] * x + ra, numbers[3, b] * x + rb, numbers[6, b] * x + rc
+                        hits[found, 0], hits[found, 1] = place, i
+                        found += (ea >= 0) & (eb >= 0) & (ec >= 0)
+                    place += 1
+                    if found > most - 4:
+                        _insert(hits[:found], top, entries, numbers, clips, nearest, triangle_ids, barycentrics)
+                        found = 0
+            _insert(hits[:found], top, entries, numbers, clips, nearest, triangle_ids, barycentrics)
+        for k in range(layers):
+            for j in range(top, bottom + 1):
+                for i in range(width):
+                    z = nearest[k, j - top, i]
+                    depths[k, j, i] = z if z < np.inf else 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def draw_cells(
+    first,
+    last,
+    offsets,
+    items,
+    listed,
+    vertices,
+    matrix,
+    view_depth,
+    keep,
+    table,
+    members,
+    nearest,
+    triangle_ids,
+    barycentrics,
+    depths,
+):
+    """As `draw`, of some cells: arrays (K, M) are of their list; `table` and `members` are those of `Blocks`."""
+    entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
+    numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
+    most = 4 * BLOCK
+    hits = np.empty((most + table.shape[1] * BAND_ROWS, 2), np.int32)
+    for band in range(first, last):
+        top = band * BAND_ROWS
+        for start in range(offsets[band], offsets[band + 1], BLOCK):
+            block = items[start : min(offsets[band + 1], start + BLOCK)]
+            _gather(block, listed, vertices, entries, points)
+            _set_up(len(block), points, matrix, view_depth, keep, top, top + BAND_ROWS - 1, entries, numbers, clips)
+            _cover(len(block), entries, numbers, covers)
+            found = 0
+            for b in range(len(block)):
+                i0, i1, j0, j1 = entries[4, b], entries[5, b], entries[6, b], entries[7, b]
+                place = b * BAND_ROWS + j0 - top
+                if (i1 - i0 < 2) & (j1 - j0 < 2):
+                    for n in range(4):
+                        hits[found, 0], hits[found, 1] = place + (n >> 1), i0 + (n & 1)
+                        found += (covers[b] >> n) & 1
+                    continue
+                for j in range(j0, j1 + 1):
+                    y = j + 0.5
+                    ra, rb = numbers[1, b] * y + numbers[2, b], numbers[4, b] * y + numbers[5, b]
+                    rc = numbers[7, b] * y + numbers[8, b]
+                    for column in range(i0 // BAND_ROWS, i1 // BAND_ROWS + 1):
+                        if table[band, column] < 0:
+                            continue
+                        left, right = max(i0, column * BAND_ROWS), min(i1, column * BAND_ROWS + BAND_ROWS - 1)
+                        for i in range(left, right + 1):
+                            x = i + 0.5
+                            ea, eb, ec = numbers[0, b] * x + ra, numbers[3, b] * x + rb, numbers[6, b] * x + rc
+                            hits[found, 0], hits[found, 1] = place, i
+                            found += (ea >= 0) & (eb >= 0) & (ec >= 0)
+                    place += 1
+                    if found > most - 4:
+                        given = entries, numbers, clips, table[band], members, nearest, triangle_ids, barycentrics
+                        _insert_cells(hits[:found], top, *given)
+                        found = 0
+            given = entries, numbers, clips, table[band], members, nearest, triangle_ids, barycentrics
+            _insert_cells(hits[:found], top, *given)
+        for column in table[band]:
+            if column < 0:
+                continue
+            for m in members[column].flat:
+                if m >= 0:
+                    for k in range(len(nearest)):
+                        z = nearest[k, m]
+                        depths[k, m] = z if z < np.inf else 0.0
+
+
+@numba.njit(error_model="numpy")
+def _insert_cells(hits, top, entries, numbers, clips, columns, members, nearest, triangle_ids, barycentrics):
+    """As `_insert`, into the layers of those cells that are listed."""
+    for h in range(len(hits)):
+        place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
+        b, row = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS)
+        block = columns[i // np.uint32(BAND_ROWS)]
+        if block < 0:
+            continue
+        m = members[block, row, i % np.uint32(BAND_ROWS)]
+        if m < 0:
+            continue
+        found, z, p, q = _met(b, i + 0.5, row + np.uint32(top) + 0.5, numbers, clips)
+        if found:
+            _put(z, entries[0, b], p, q, nearest[:, m], triangle_ids[:, m], barycentrics[:, m])
+
+
+# numba itself must inline these, so that lengths of rows are known: only then do their loops become vector code.
+
+
+@numba.njit(inline="always")
+def _gather(block, listed, vertices, entries, points):
+    """What is listed of the triangles (LISTED, BLOCK), and their corners (3, 3, BLOCK).
+
+    The loops are so short that the processor overlaps their waits for memory.
+    """
+    for b in range(len(block)):
+        for r in range(LISTED):
+            entries[r, b] = listed[block[b], r]
+    for b in range(len(block)):
+        for c in range(3):
+            v = np.uint32(entries[1 + c, b])
+            for r in range(3):
+                points[c, r, b] = vertices[v, r]
+
+
+@numba.njit(inline="always")
+def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, clips):
+    """Work out the numbers (NUMBERS, BLOCK) of triangles, and which may need clipping.
+
+    Rows are cut to the band; none are left of a triangle of no area, or facing away.
+    """
+    corners, signs = np.empty((3, 4, BLOCK)), np.empty(BLOCK)
+    for c in range(3):
+        for b in range(count):
+            px, py, pz = points[c, 0, b], points[c, 1, b], points[c, 2, b]
+            numbers[9 + c, b] = view_depth[0] * px + view_depth[1] * py + view_depth[2] * pz + view_depth[3]
+            x, y, z = np.float64(px), np.float64(py), np.float64(pz)
+            for r in range(4):
+                corners[c, r, b] = m[r, 0] * x + m[r, 1] * y + m[r, 2] * z + m[r, 3]
+            numbers[12 + c, b] = corners[c, 3, b] + corners[c, 2, b]
+            numbers[15 + c, b] = corners[c, 3, b] - corners[c, 2, b]
+    for b in range(count):
+        ax, ay, aw = corners[0, 0, b], corners[0, 1, b], corners[0, 3, b]
+        bx, by, bw = corners[1, 0, b], corners[1, 1, b], corners[1, 3, b]
+        cx, cy, cw = corners[2, 0, b], corners[2, 1, b], corners[2, 3, b]
+        area = ax * (by * cw - bw * cy) - ay * (bx * cw - bw * cx) + aw * (bx * cy - by * cx)
+        signs[b] = 1.0 if area > 0 else -1.0
+        drawn = (area * keep > 0) | ((keep == 0) & (area != 0))
+        entries[6, b], entries[7, b] = max(entries[6, b], top), min(entries[7, b], bottom) if drawn else -1
+        near = min(numbers[12, b], numbers[13, b], numbers[14, b])
+        far = min(numbers[15, b], numbers[16, b], numbers[17, b])
+        clips[b] = (near < 0) | (far < 0)
+    for c in range(3):
+        i, j = (c + 1) % 3, (c + 2) % 3
+        for b in range(count):
+            ax, ay, aw = corners[i, 0, b], corners[i, 1, b], corners[i, 3, b]
+            bx, by, bw = corners[j, 0, b], corners[j, 1, b], corners[j, 3, b]
+            numbers[3 * c, b] = signs[b] * (ay * bw - aw * by)
+            numbers[3 * c + 1, b] = signs[b] * (aw * bx - ax * bw)
+            numbers[3 * c + 2, b] = signs[b] * (ax * by - ay * bx)
+
+
+@numba.njit(inline="always")
+def _cover(count, entries, numbers, covers):
+    """Which of the first 2 × 2 pixels of its box each triangle may cover, as bits."""
+    for b in range(count):
+        bits = 0
+        for n in range(4):
+            i, j = entries[4, b] + (n & 1), entries[6, b] + (n >> 1)
+            x, y = i + 0.5, j + 0.5
+            ea = numbers[0, b] * x + (numbers[1, b] * y + numbers[2, b])
+            eb = numbers[3, b] * x + (numbers[4, b] * y + numbers[5, b])
+            ec = numbers[6, b] * x + (numbers[7, b] * y + numbers[8, b])
+            bits |= ((i <= entries[5, b]) & (j <= entries[7, b]) & (ea >= 0) & (eb >= 0) & (ec >= 0)) << n
+        covers[b] = bits
+
+
+@numba.njit(error_model="numpy")
+def _insert(hits, top, entries, numbers, clips, nearest, triangle_ids, barycentrics):
+    """Insert the block's triangles into the layers of pixels; hits (n, 2) are triangle and row of the band, column."""
+    for h in range(len(hits)):
+        place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
+        b, row = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS)
+        j = row + np.uint32(top)
+        found, z, p, q = _met(b, i + 0.5, j + 0.5, numbers, clips)
+        if found:
+            _put(z, entries[0, b], p, q, nearest[:, row, i], triangle_ids[:, j, i], barycentrics[:, j, i])
+
+
+@numba.njit(inline="always", error_model="numpy")
+def _met(b, x, y, numbers, clips):
+    """Whether triangle b of a block covers a point; and its depth and first two barycentrics there."""
+    xa, ya, wa = numbers[0, b], numbers[1, b], numbers[2, b]
+    xb, yb, wb = numbers[3, b], numbers[4, b], numbers[5, b]
+    xc, yc, wc = numbers[6, b], numbers[7, b], numbers[8, b]
+    ea, eb, ec = xa * x + (ya * y + wa), xb * x + (yb * y + wb), xc * x + (yc * y + wc)
+    found = True
+    # Top and left edges own the pixels exactly on them (y points down).
+    if min(ea, eb, ec) == 0:
+        found = not ((ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc)))
+    total = ea + eb + ec
+    found = found and total > 0 and not (clips[b] and _outside(numbers, b, ea, eb, ec))
+    z, scale = (ea * numbers[9, b] + eb * numbers[10, b] + ec * numbers[11, b]) / total, 1 / total
+    return found, z, np.float32(ea * scale), np.float32(eb * scale)
+
+
+@numba.njit(inline="always")
+def _put(z, t, p, q, nearest, triangle_ids, barycentrics):
+    """Put a hit into the layers (K,) of a cell: behind what is as near, before what is farther."""
+    moved = z  # A branch would be foreseen every other time.
+    for k in range(len(nearest)):
+        old, old_t, old_p, old_q = nearest[k], triangle_ids[k], barycentrics[k, 0], barycentrics[k, 1]
+        before = z < old
+        nearest[k], triangle_ids[k] = moved if before else old, t if before else old_t
+        barycentrics[k, 0], barycentrics[k, 1] = p if before else old_p, q if before else old_q
+        moved, t = old if before else moved, old_t if before else t
+        p, q = old_p if before else p, old_q if before else q
+
+
+@numba.njit
+def _outside(numbers, b, ea, eb, ec):
+    """Whether the point with barycentrics in the ratio ea : eb : ec lies outside the near or the far plane."""
+    near = ea * numbers[12, b] + eb * numbers[13, b] + ec * numbers[14, b]
+    far = ea * numbers[15, b] + eb * numbers[16, b] + ec * numbers[17, b]
+    return near < 0 or far < 0
