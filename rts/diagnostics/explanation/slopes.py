@@ -25,7 +25,7 @@ class Slope(NamedTuple):
         name: where the number is, such as "pose[2]".
         autodiff: the derivative through the splatter.
         difference: the central finite difference of area-sampled hard renders.
-        error: how far the difference may be off: what two sampling grids and two steps disagree on.
+        error: how far the difference may be off: what two sampling grids and two steps disagree on, and rounding.
         step: the step of the difference, in units of the number.
     """
 
@@ -70,13 +70,16 @@ def measured(subject: Subject, name: str, direction: Tree, slope: float | None, 
     step = subject.step(direction) or _step_of_hidden(subject, direction) or STEP_UNSEEN
     to_numpy = subject.engine.to_numpy
 
+    rounding: list[float] = []
+
     def hard(length: float, count: int) -> tuple[float, np.ndarray]:
         after, before = (subject.hard(direction, sign * length / 2, count) for sign in (1, -1))
-        difference = float(to_numpy(subject.loss(after))) - float(to_numpy(subject.loss(before)))
-        return difference / length, to_numpy(after).astype(np.float64) - to_numpy(before)
+        losses = [to_numpy(subject.loss(x)) for x in (after, before)]
+        rounding.append(max(float(abs(x) * np.finfo(x.dtype).eps) for x in losses) / length)
+        return (float(losses[0]) - float(losses[1])) / length, to_numpy(after).astype(np.float64) - to_numpy(before)
 
     (coarse, image), (fine, other), (wide, _) = hard(step, samples), hard(step, samples + 1), hard(2 * step, samples)
-    error = abs(coarse - fine) / 2 + abs(wide - coarse) / 3
+    error = abs(coarse - fine) / 2 + abs(wide - coarse) / 3 + max(rounding)
     try:
         pushed, forward = subject.push(direction) * step, True
     except (RuntimeError, TypeError):  # Of torch and of jax, for a user's own operation.
