@@ -6,7 +6,7 @@ between two layers grows.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -38,8 +38,8 @@ class Rules(NamedTuple):
     fit: float
 
     @classmethod
-    def of(cls, extent: np.floating) -> Rules:
-        """For depths of an extent, the camera's included."""
+    def of(cls, extent: Any) -> Rules:
+        """For depths of an extent, the camera's included, in their dtype."""
         kind = type(extent)
         numbers = specification.LARGEST, specification.DIRECT, specification.FIT
         return cls(kind(TIE) * extent, *map(kind, numbers))

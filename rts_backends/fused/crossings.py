@@ -6,7 +6,7 @@ up in their order, on one thread.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -17,7 +17,7 @@ from rts_backends.fused.mixed import splat
 from rts_backends.fused.survey import FLAT
 
 NEITHER, SHEET_A, SHEET_B = 2, 0, 1
-"""Of which sheet a source is."""
+"""What a source is: of neither sheet, or of one."""
 
 compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
@@ -55,7 +55,7 @@ def _empty(offsets: np.ndarray, kind: np.dtype) -> Crossings:
     return Crossings(offsets, np.empty(count, np.int32), np.empty((count, 9), np.uint8), *arrays)
 
 
-def listed(arrays: tuple, choices: tuple, extent: np.floating) -> Crossings:
+def listed(arrays: tuple, choices: Any, extent: np.floating) -> Crossings:
     """The targets beside lines.
 
     Args:
@@ -168,7 +168,7 @@ def _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, around, y, x):
 
 @compiled
 def _sort(sheets, row, mixed, ranges, m, around, y, x):
-    """Of which sheet sources are by pairs, and by layers paired front to front."""
+    """Tell sources of either sheet by pairs, and by layers paired front to front."""
     _, height, width = row.shape
     for n in range(9):
         py, px = y + 1 - n // 3, x + 1 - n % 3
