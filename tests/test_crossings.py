@@ -43,7 +43,8 @@ class Sheets:
 
     def pairs(self):
         two = self.covered[0] & self.covered[1]
-        return crossings.pairs(*np.where(two, self.depth[:2], 0), two, self.depth.dtype.type(np.abs(self.depth).max()))
+        first, second = np.where(two, self.depth[:2], 0)
+        return crossings.pairs(first, second, two, self.depth.dtype.type(np.abs(self.depth).max()))
 
 
 def plane(slope_x, slope_y, depth):

@@ -29,6 +29,7 @@ from __future__ import annotations
 import functools
 import math
 import operator
+from typing import Any
 
 import numpy as np
 
@@ -71,7 +72,8 @@ def with_lines(kernel: Kernel, layers: Layers, shift: dict[Steps, Array], image:
     line = -((rates[0] - rates[1]) / square)[..., None] * xp.where(target[..., None], gradient, 0.0)
     still = stopped(xp.stack(kernel.offsets(layers.position[0]), axis=-1))
 
-    sums, coverage = [0.0, 0.0], [0.0, 0.0]
+    sums: list[Any] = [0.0, 0.0]
+    coverage: list[Any] = [0.0, 0.0]
     for n in shift:
         given, moving = layers.splats(*n)[0], kernel.weight(layers.at(still, *n) + kernel.gamma * line, *n)
         other = swapped[n] if n in swapped else target & False
@@ -100,7 +102,7 @@ def targets(layers: Layers, shift: dict[Steps, Array]) -> tuple[Array, dict[Step
     xp = layers.xp
     two = layers.at(layers.covered[1], 0, 0)
     z = [stopped(xp.where(two, layers.target[k], 0.0)) for k in (0, 1)]
-    crosses = pairs(*z, two, stopped(layers.extent))
+    crosses = pairs(z[0], z[1], two, stopped(layers.extent))
     # By the step from the target to the source.
     swapped = dict(crosses)
     same = {m: ~crosses[m] & (shift[_reversed(m)] == 0) & layers.covers(*_reversed(m)) for m in AROUND}

@@ -1,51 +1,26 @@
 """Lines where surfaces pass through one another, as `rts.splatting.crossings` says, for the compiled `Visible`.
 
-Pairs are found by a test that vector instructions do and that few other cells pass: on either side of a line the gap
-between two layers grows. Targets beside a line have their derivative from here, in place of all that others add. They
-are few: the gradient adds up in their order, on one thread.
+Targets beside a line have their derivative from here, in place of all that others add. They are few: the gradient adds
+up in their order, on one thread.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
-from rts.splatting import crossings as specification
-from rts.splatting.kernel import TIE
 from rts.threads import parallel
+from rts_backends.fused.crossing_pairs import BORDER, STEPS, Rules, find_in_cells, gather, has_two, no_pairs
 from rts_backends.fused.mixed import splat
 from rts_backends.fused.survey import FLAT
 
-BORDER = 3
-"""Rows around those of arrays of depths (2, ·, W), and rows and columns around those of their gaps (·, ·): so far from
-a cell are those that decide whether it is in a pair with a neighbour. Rows y below count from the first of all."""
-STEPS = ((1, 0), (0, 1), (1, 1), (1, -1))
-"""Steps (x, y) from one cell of each pair to the other, which bits 0 to 3 stand for."""
-CHUNK, FEW = 16, 8
-"""Cells that are passed over at once; and the share of a row's cells, 1 / FEW, that are looked at one by one."""
 NEITHER, SHEET_A, SHEET_B = 2, 0, 1
-"""Of which sheet a source is."""
+"""What a source is: of neither sheet, or of one."""
 
 compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
-
-
-class Rules(NamedTuple):
-    """Numbers of `rts.splatting.crossings`, in the dtype of the depths."""
-
-    least: float
-    largest: float
-    direct: float
-    fit: float
-
-    @classmethod
-    def of(cls, extent: np.floating) -> Rules:
-        """For depths of an extent, the camera's included."""
-        kind = type(extent)
-        numbers = specification.LARGEST, specification.DIRECT, specification.FIT
-        return cls(kind(TIE) * extent, *map(kind, numbers))
 
 
 class Crossings(NamedTuple):
@@ -80,7 +55,7 @@ def _empty(offsets: np.ndarray, kind: np.dtype) -> Crossings:
     return Crossings(offsets, np.empty(count, np.int32), np.empty((count, 9), np.uint8), *arrays)
 
 
-def listed(arrays: tuple, choices: tuple, extent: np.floating) -> Crossings:
+def listed(arrays: tuple, choices: Any, extent: np.floating) -> Crossings:
     """The targets beside lines.
 
     Args:
@@ -93,229 +68,19 @@ def listed(arrays: tuple, choices: tuple, extent: np.floating) -> Crossings:
     kind = positions.dtype
     if len(row) < 2 or not (row[1] >= 0).any():
         return nothing(height, kind)
-    rules, bits, some = Rules.of(extent), *_none(height, width)
-    parallel(_find_in_cells, height, positions, row, rules, bits, some, work=row[0].size)
+    rules, bits, some = Rules.of(extent), *no_pairs(height, width)
+    parallel(find_in_cells, height, positions, row, rules, bits, some, work=row[0].size)
     if not some.any():
         return nothing(height, kind)
     rows = height + 2 * BORDER
     z, gap = np.empty((2, rows, width), kind), np.full((rows, width + 2 * BORDER), np.inf, kind)
-    parallel(_gather, height, positions, row, z, gap, work=row[0].size)
+    parallel(gather, height, positions, row, z, gap, work=row[0].size)
     around, counts = np.zeros((height, width), np.uint16), np.zeros(height, np.int64)
     seen = row, choices.mixed, choices.offsets, choices.columns, choices.ranges, z, gap
     parallel(_list, height, bits, some, choices.states, *seen, rules, around, counts, work=row[0].size)
     found = _empty(np.concatenate([[0], np.cumsum(counts)]), kind)
     parallel(_fill, height, *arrays, *seen[1:], rules, around, found, work=1000 * len(found.columns))
     return found
-
-
-def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np.ndarray) -> None:
-    """Mark in `kept` (K, H, W) what `rts.splatting.crossings.sheets` keeps."""
-    _, height, width = covered.shape
-    bits, some = _none(height, width)
-    parallel(_find_in_depths, height, covered, depth, Rules.of(extent), bits, some, work=4 * covered[0].size)
-    if some.any():
-        parallel(_keep, height, covered, bits, some, specification.KEPT, kept, work=covered[0].size)
-
-
-def _none(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """No pairs: bits (H, W) of the steps from each cell to the other of a pair, and whether there are any in a row."""
-    return np.zeros((height, width), np.uint8), np.zeros(height, np.bool_)
-
-
-@kernel
-def _gather(start, stop, positions, row, z, gap):
-    """Depths of the first two layers of rows [start, stop), where there are both, and the gaps between them."""
-    columns = np.empty(row.shape[2], np.int32)
-    for y in range(start, stop):
-        _load_cells(z[:, y + BORDER], gap[y + BORDER], columns, positions, row, y)
-
-
-@kernel
-def _find_in_cells(start, stop, positions, row, rules, bits, some):
-    """Find pairs whose first cell lies in rows [start, stop)."""
-    z, gap, counts = _window(start, stop, row.shape[2], positions.dtype)
-    columns = np.empty((len(gap), row.shape[2]), np.int32)
-    for y in range(max(start - BORDER, 0), min(stop + BORDER, row.shape[1])):
-        at = y - start + BORDER
-        counts[at] = _load_cells(z[:, at], gap[at], columns[at], positions, row, y)
-    _find(start, stop, z, gap, counts, columns, rules, bits, some)
-
-
-@kernel
-def _find_in_depths(start, stop, covered, depth, rules, bits, some):
-    """Find pairs whose first cell lies in rows [start, stop)."""
-    z, gap, counts = _window(start, stop, covered.shape[2], depth.dtype)
-    for y in range(max(start - BORDER, 0), min(stop + BORDER, covered.shape[1])):
-        at = y - start + BORDER
-        if _any(covered[1, y]):
-            counts[at] = covered.shape[2]
-            z[0, at], z[1, at] = depth[0, y], depth[1, y]
-            _subtract(gap[at, BORDER:-BORDER], covered[0, y], covered[1, y], depth[0, y], depth[1, y])
-    _find(start, stop, z, gap, counts, np.empty((len(gap), 0), np.int32), rules, bits, some)
-
-
-@compiled
-def _window(start, stop, width, kind):
-    """Arrays of depths and gaps for some rows and those around them, and how many cells of each have two layers."""
-    rows = stop - start + 2 * BORDER
-    gap = np.full((rows, width + 2 * BORDER), np.inf, kind)
-    return np.empty((2, rows, width), kind), gap, np.zeros(rows, np.int64)
-
-
-@compiled
-def _load_cells(z, gap, columns, positions, row, y):
-    """Fill depths (2, W) of a row, gaps and columns of its cells of two layers; returns how many there are."""
-    width, count = row.shape[2], 0
-    for left in range(0, width, CHUNK):
-        right = min(left + CHUNK, width)
-        if not _some(row[1, y, left:right]):
-            continue
-        for x in range(left, right):
-            i, j = row[0, y, x], row[1, y, x]
-            if j >= 0 and i >= 0:
-                z[0, x], z[1, x] = positions[i, 2], positions[j, 2]
-                gap[x + BORDER] = positions[j, 2] - positions[i, 2]
-                columns[count] = x
-                count += 1
-    return count
-
-
-@compiled
-def _subtract(gap, covered0, covered1, depth0, depth1):
-    infinity = gap.dtype.type(np.inf)
-    for x in range(len(gap)):
-        gap[x] = depth1[x] - depth0[x] if covered0[x] & covered1[x] else infinity
-
-
-# Loops that the compiler makes vector instructions of, as it does not of methods of arrays.
-
-
-@compiled
-def _any(flags):
-    most = np.uint8(0)
-    for flag in flags:
-        most = max(most, np.uint8(flag))
-    return most > 0
-
-
-@compiled
-def _some(cells):
-    most = cells.dtype.type(-1)
-    for i in cells:
-        most = max(most, i)
-    return most >= 0
-
-
-@compiled
-def _find(start, stop, z, gap, counts, columns, rules, bits, some):
-    """Find pairs in a window of rows, of which each has so many cells of two layers; the columns of these, if few."""
-    width = z.shape[2]
-    marks = np.empty(width, np.uint8)
-    for y in range(BORDER, stop - start + BORDER):
-        if counts[y] == 0:
-            continue
-        for i in range(4):
-            u, v = STEPS[i]
-            before, here = gap[y - v, BORDER - u :], gap[y, BORDER:]
-            there, after = gap[y + v, BORDER + u :], gap[y + 2 * v, BORDER + 2 * u :]
-            if FEW * counts[y] < width:
-                for n in range(counts[y]):
-                    x = columns[y, n]
-                    if _grows(before[x], here[x], there[x], after[x]) and _crosses(z, gap, rules, y, x, v, u):
-                        bits[start + y - BORDER, x] |= np.uint8(1 << i)
-                        some[start + y - BORDER] = True
-                continue
-            _suspect(marks, before, here, there, after)
-            if not _any(marks):
-                continue
-            for x in range(width):
-                if marks[x] and _crosses(z, gap, rules, y, x, v, u):
-                    bits[start + y - BORDER, x] |= np.uint8(1 << i)
-                    some[start + y - BORDER] = True
-
-
-@compiled
-def _suspect(marks, before, here, there, after):
-    """Mark cells where the gap grows on both sides of a pair."""
-    for x in range(len(marks)):
-        marks[x] = np.uint8(_grows(before[x], here[x], there[x], after[x]))
-
-
-@compiled
-def _grows(b, h, t, a):
-    """Whether the gap grows from a pair's two cells on either side; where it is not known it is infinity.
-
-    R is at least what the gaps alone change by, |b − 2 h − t| + |a − 2 t − h|, and at most half of h + t: 3 / 2, 1 / 2
-    and 5 / 2 less what rounding may do.
-    """
-    own, other, both = np.float32(1.49), np.float32(0.49), np.float32(2.49)
-    return (b > own * h + other * t) & (a > own * t + other * h) & (b + a > both * (h + t))
-
-
-@compiled
-def _crosses(z, gap, rules, y, x, v, u):
-    """Whether a line runs between a cell and the one a step (u, v) farther on."""
-    ratio = _ratio(z, gap, rules, y, x, v, u)
-    if not ratio < rules.largest:
-        return False
-    return ratio < _ratio(z, gap, rules, y - v, x - u, v, u) and ratio <= _ratio(z, gap, rules, y + v, x + u, v, u)
-
-
-@compiled
-def _two(gap, y, x):
-    """Whether a cell has two layers."""
-    return gap[y, x + BORDER] < np.inf
-
-
-@compiled
-def _ratio(z, gap, rules, y, x, v, u):
-    """R / (h(q) + h(p)) of a cell q and the one p a step (u, v) farther on; infinity where they are no pair."""
-    infinity, two = gap.dtype.type(np.inf), gap.dtype.type(2)
-    if not (_two(gap, y, x) and _two(gap, y + v, x + u)):
-        return infinity
-    before, after = _two(gap, y - v, x - u), _two(gap, y + 2 * v, x + 2 * u)
-    total = gap[y, x + BORDER] + gap[y + v, x + u + BORDER]
-    if not (before or after) or not total > rules.least:
-        return infinity
-    q0, q1, p0, p1 = z[0, y, x], z[1, y, x], z[0, y + v, x + u], z[1, y + v, x + u]
-    change0, change1, direct0, direct1 = infinity, infinity, infinity, infinity
-    if before:
-        b0, b1 = z[0, y - v, x - u], z[1, y - v, x - u]
-        change0 = abs(b0 - two * q0 + p1) + abs(b1 - two * q1 + p0)
-        direct0 = abs(b0 - two * q0 + p0) + abs(b1 - two * q1 + p1)
-    if after:
-        f0, f1 = z[0, y + 2 * v, x + 2 * u], z[1, y + 2 * v, x + 2 * u]
-        change1 = abs(f0 - two * p0 + q1) + abs(f1 - two * p1 + q0)
-        direct1 = abs(f0 - two * p0 + q0) + abs(f1 - two * p1 + q1)
-    change = change0 + change1 if before and after else two * min(change0, change1)
-    direct = direct0 + direct1 if before and after else two * min(direct0, direct1)
-    return change / total if change < rules.direct * direct else infinity
-
-
-@kernel
-def _keep(start, stop, covered, bits, some, reach, kept):
-    """Keep the first two layers of rows [start, stop) near pairs."""
-    _, height, width = covered.shape
-    for y in range(start, stop):
-        for py in range(max(y - reach - 1, 0), min(y + reach + 2, height)):
-            if not some[py]:
-                continue
-            for x in range(width):
-                if not bits[py, x]:
-                    continue
-                for i in range(4):
-                    if bits[py, x] >> i & 1:
-                        for step in range(2):
-                            qx, qy = x + step * STEPS[i][0], py + step * STEPS[i][1]
-                            if abs(qy - y) <= reach:
-                                _keep_around(kept[0, y], covered[0, y], qx, reach)
-                                _keep_around(kept[1, y], covered[1, y], qx, reach)
-
-
-@compiled
-def _keep_around(kept, covered, x, reach):
-    for i in range(max(x - reach, 0), min(x + reach + 1, len(kept))):
-        kept[i] |= covered[i]
 
 
 @kernel
@@ -403,7 +168,7 @@ def _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, around, y, x):
 
 @compiled
 def _sort(sheets, row, mixed, ranges, m, around, y, x):
-    """Of which sheet sources are by pairs, and by layers paired front to front."""
+    """Tell sources of either sheet by pairs, and by layers paired front to front."""
     _, height, width = row.shape
     for n in range(9):
         py, px = y + 1 - n // 3, x + 1 - n % 3
@@ -423,7 +188,7 @@ def _incline(slopes, sheets, z, gap, y, x):
         ahead, behind = (3, 5) if axis == 0 else (1, 7)
         u, v = 1 - axis, axis
         first, second = sheets[ahead] != NEITHER, sheets[behind] != NEITHER
-        first, second = first and _two(gap, y + v, x + u), second and _two(gap, y - v, x - u)
+        first, second = first and has_two(gap, y + v, x + u), second and has_two(gap, y - v, x - u)
         if not (first or second):
             return False
         for k in range(2):
@@ -449,7 +214,7 @@ def _complete(sheets, slopes, z, gap, fit, y, x):
         if sheets[n] != NEITHER:
             continue
         u, v = 1 - n % 3, 1 - n // 3
-        if not _two(gap, y + v, x + u):
+        if not has_two(gap, y + v, x + u):
             return False
         near, far = z[0, y + v, x + u], z[1, y + v, x + u]
         a = z[0, y, x] + slopes[0] * kind(u) + slopes[1] * kind(v)

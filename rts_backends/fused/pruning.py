@@ -8,7 +8,7 @@ import numpy as np
 from rts.splatting.kernel import LEAST_EPSILON, TIE
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel
-from rts_backends.fused import crossings
+from rts_backends.fused import crossing_pairs
 from rts_backends.fused.cells import Settings
 
 HALO = 3
@@ -34,7 +34,7 @@ def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.nda
     numbers = kind(2 * (largest - least)), kind(TIE * max(largest, -least)), kind(CONTINUED)
     parallel(_keep, height, covered, depth, visible, rims, *numbers, kept, work=2 * covered.size)
     if settings.crossings:
-        crossings.sheets(covered, depth, kind(largest - least), kept)
+        crossing_pairs.sheets(covered, depth, kind(largest - least), kept)
     return kept
 
 
