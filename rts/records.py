@@ -174,7 +174,8 @@ class Sampled:
         samples: one `Samples` for each part.
         row: (K, H, W) int32, the sample in each cell, counted over all parts in order, or −1.
         depth: (K, H, W) float32, linear camera depth; 0 where empty.
-        overflow: () int32, samples dropped for want of capacity, or beyond the limit of `layers="auto"`. Should be 0.
+        overflow: () int32, samples dropped for want of capacity, or beyond the limit of `layers="auto"`; with those of
+            `fine`. Should be 0.
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
         fine: further samples where outlines are (`rts.Adaptive`), or None.

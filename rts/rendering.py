@@ -236,7 +236,8 @@ def _sampled(
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, capacity=capacity)
     if isinstance(supersample, Adaptive):
         coarse = _sampled(scene, camera, size, supersample=1, **options)
-        return replace(coarse, fine=_fine(scene, camera, size, coarse, adaptive=supersample, **options))
+        fine = _fine(scene, camera, size, coarse, adaptive=supersample, **options)
+        return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)
     side = int(supersample)
     height, width = side * size[0], side * size[1]
     check_memory(height, width, planned(layers), capacity, gradient=scene.suited[0].differentiates)
