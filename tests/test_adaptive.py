@@ -328,7 +328,7 @@ def test_the_outline_of_a_sphere_that_turns_stands_still():
 
 
 def test_derivatives_are_differences_at_fixed_samples():
-    """Of the splatter whose derivative is that of its image."""
+    """For a splatter whose derivative is that of its image."""
     vertices, along = arrays(TORCH[0], (BALL, np.random.default_rng(9).normal(size=BALL.shape)), np.float64)
     sampled = rts.sample(scene(vertices), CAMERA, SIZE, supersample=Adaptive(3), layers=3, splatter=Multi())
 
