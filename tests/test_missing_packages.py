@@ -13,6 +13,7 @@ from test_samplers import interior
 
 import rts
 from rts import Camera, InputError, Part, PluginError, Proxy
+from rts.testing.compatibility import APRON
 
 pytestmark = pytest.mark.core
 
@@ -262,7 +263,10 @@ def test_an_image_beyond_the_device_is_refused_and_the_next_render_works(tall):
         with pytest.raises(InputError) as error:
             rts.render(part, CAMERAS["perspective"], size, sampler=sampler)
         message = str(error.value)
-        assert f"{size[0] + 4} × {size[1] + 4} pixels" in message and f"at most {limit} × {limit}" in message
+        assert (
+            f"{size[0] + 2 * APRON} × {size[1] + 2 * APRON} pixels" in message
+            and f"at most {limit} × {limit}" in message
+        )
         assert "'raster'" in message and "\n" not in message
         np.testing.assert_array_equal(render(sampler), expected)
     assert sampler._worker.context is context
