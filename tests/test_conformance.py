@@ -448,6 +448,14 @@ def covering(samples, part):
     return replace(samples, row=samples.row * 0, depth=samples.depth * 0 + 1)
 
 
+class Misplaced(type(rts.plugin("samplers", "raster")())):
+    """Samples other cells than those that are listed."""
+
+    def sample(self, *args, cells=None, **options):
+        listed = {} if cells is None else {"cells": np.where(cells >= 0, cells ^ 1, cells)}
+        return super().sample(*args, **listed, **options)
+
+
 SAMPLERS = {
     "samples_lie_on_the_centres_of_their_pixels": {
         "rows upside down": OddRaster(lambda f, _: Fragments(*(x[:, ::-1] for x in f))),
@@ -459,6 +467,7 @@ SAMPLERS = {
         "depth of another scale": OddRaster(lambda f, _: f._replace(depth=f.depth * np.float32(1.1))),
     },
     "it_leaves_out_what_is_not_needed": {"keeps everything": Hoarder()},
+    "listed_cells_are_those_of_the_whole_grid": {"those beside them": Misplaced()},
     "it_agrees_with_the_reference": {
         "nothing culled": OddRaster(cull="none"),
         "edges lost": OddRaster(eroded),

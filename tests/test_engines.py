@@ -120,14 +120,18 @@ def test_the_derivative_of_render_is_that_at_frozen_samples(target):
     assert_trees_close(found, plain_gradient(target), 1e-6)
 
 
+# Frozen samples have the derivative of the image that is made of them, where lines move as they do.
+STILL = rts.plugin("splatters", "visible")(rims=False, crossings=False)
+
+
 @pytest.mark.parametrize("target", TORCH)
 def test_in_double_precision_the_gradient_at_frozen_samples_is_the_finite_difference(target):
     scene = arrays(target, SCENE, np.float64)
-    sampled = rts.sample(part_of(scene), camera_at(scene["eye"]), SIZE)
+    sampled = rts.sample(part_of(scene), camera_at(scene["eye"]), SIZE, splatter=STILL)
     weights = arrays(target, WEIGHTS, np.float64)
 
     def f(s):
-        image = rts.render_samples(sampled, part_of(s), camera_at(s["eye"]))
+        image = rts.render_samples(sampled, part_of(s), camera_at(s["eye"]), splatter=STILL)
         assert str(image.dtype) == "torch.float64"
         return (image * weights).sum()
 
@@ -150,12 +154,12 @@ def test_gradcheck_passes_in_all_arguments_at_frozen_samples(target):
     def parts(tree):
         return Part(mesh, tree["theta"], "blinn_phong", tree["transform"])
 
-    sampled = rts.sample(parts(given), camera_at(given["eye"]), size)
+    sampled = rts.sample(parts(given), camera_at(given["eye"]), size, splatter=STILL)
 
     def f(*flat):
         it = iter(flat)
         tree = map_leaves(lambda _: next(it), given)
-        return rts.render_samples(sampled, parts(tree), camera_at(tree["eye"]))
+        return rts.render_samples(sampled, parts(tree), camera_at(tree["eye"]), splatter=STILL)
 
     inputs = [x.requires_grad_(True) for x in leaves(given)]
     assert torch.autograd.gradcheck(f, inputs, atol=1e-5, check_forward_ad=True)
@@ -267,12 +271,11 @@ def test_torch_jacfwd_and_jacrev_are_a_loop_of_jvps(on_torch):
 
 def test_torch_hessian_is_the_finite_difference_of_the_gradient_at_frozen_samples(on_torch):
     torch, target = on_torch
-    scene, loss = arrays(target, SCENE, np.float64), loss_of(target, np.float64)
-    weights = arrays(target, WEIGHTS, np.float64)
-    sampled = rts.sample(part_of(scene), camera_at(scene["eye"]), SIZE)
+    scene, weights = arrays(target, SCENE, np.float64), arrays(target, WEIGHTS, np.float64)
+    sampled = rts.sample(part_of(scene), camera_at(scene["eye"]), SIZE, splatter=STILL)
 
     def frozen(eye):
-        return (rts.render_samples(sampled, part_of(scene), camera_at(eye)) * weights).sum()
+        return (rts.render_samples(sampled, part_of(scene), camera_at(eye), splatter=STILL) * weights).sum()
 
     step = 1e-5
     columns = []
@@ -280,7 +283,7 @@ def test_torch_hessian_is_the_finite_difference_of_the_gradient_at_frozen_sample
         above, below = (torch.func.grad(frozen)(scene["eye"] + d) for d in (e, -e))
         columns.append((above - below) / (2 * step))
     expected = to_numpy(torch.stack(columns))
-    found = to_numpy(torch.func.hessian(lambda eye: loss(with_eye(scene, eye)))(scene["eye"]))
+    found = to_numpy(torch.func.hessian(frozen)(scene["eye"]))
     assert relative_error(found, expected) < 1e-5
     np.testing.assert_allclose(found, found.T, rtol=1e-6, atol=1e-6 * np.abs(found).max())
 
