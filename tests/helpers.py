@@ -196,3 +196,12 @@ def mesh_part(mesh, **options):
 def show(parts, camera=CAMERA, size=SIZE, **options):
     """The image, on the host."""
     return to_numpy(rts.render(parts, camera, size, **options))
+
+
+def low_passed(image):
+    """The image (H, W) or (H, W, C) after a Gaussian of 2 pixels."""
+    t = np.arange(-6, 7)
+    g = np.exp(-(t**2) / 8) / np.exp(-(t**2) / 8).sum()
+    for axis in (0, 1):
+        image = np.apply_along_axis(np.convolve, axis, image, g, mode="same")
+    return image

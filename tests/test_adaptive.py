@@ -12,8 +12,9 @@ from rts import Adaptive
 from rts.fitting.least_squares import normal_equations
 from rts.interfaces import Sampler
 from rts.sampling import fine, tiles
-from rts.sampling.adaptive import dilated, outlines
+from rts.sampling.adaptive import outlines
 from rts.splatting import Multi
+from rts.splatting.layers import dilated
 
 pytestmark = pytest.mark.splatting
 

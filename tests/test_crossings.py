@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, derivative, gradient, icosphere, mesh_part, quad
+from helpers import DIFFERENTIABLE, arrays, derivative, gradient, icosphere, low_passed, mesh_part, quad
 
 import rts
 from rts import rendering
@@ -96,15 +96,6 @@ def lengths(size, normal, offset):
         ends = np.sort(np.stack([(low - origin) / step, (low + 1 - origin) / step]), axis=0)
         first, last = np.maximum(first, ends[0]), np.minimum(last, ends[1])
     return np.clip(last - first, 0, None)
-
-
-def low_passed(image):
-    """The image (H, W, C) after a Gaussian of 2 pixels."""
-    t = np.arange(-6, 7)
-    g = np.exp(-(t**2) / 8) / np.exp(-(t**2) / 8).sum()
-    for axis in (0, 1):
-        image = np.apply_along_axis(np.convolve, axis, image, g, mode="same")
-    return image
 
 
 SLANTED = (0.5, 0.2, 20.0), (-0.3, -0.3, 61.37)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import TORCH, arrays, derivative, gradient, icosphere, mesh_part, quad, to_numpy
+from helpers import TORCH, arrays, derivative, gradient, icosphere, low_passed, mesh_part, quad, to_numpy
 from loops import STEPS, Pairing
 
 import rts
@@ -367,15 +367,6 @@ def turning(pixels):
 def moving(pixels):
     """A motion along +x."""
     return lambda p: np.broadcast_to([pixels, 0.0, 0.0], p.shape)
-
-
-def low_passed(image):
-    """The image after a Gaussian of 2 pixels."""
-    t = np.arange(-6, 7)
-    g = np.exp(-(t**2) / 8) / np.exp(-(t**2) / 8).sum()
-    for axis in (0, 1):
-        image = np.apply_along_axis(np.convolve, axis, image, g, mode="same")
-    return image
 
 
 @pytest.mark.parametrize("fine, layers, least, most", [(1, 1, 0.1, 0.02), (2, 1, 0.07, 0.01), (1, 2, 0.1, 0.008)])

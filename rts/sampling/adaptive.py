@@ -99,12 +99,3 @@ def contrasts(row: np.ndarray, rgba: np.ndarray, least: float) -> np.ndarray:
         second = np.abs(at(color, v, u) - 2 * at(color, 0, 0) + at(color, -v, -u)).max(axis=-1)
         found |= (second > least) & at(covered, v, u) & at(covered, -v, -u) & at(covered, 0, 0)
     return found
-
-
-def dilated(cells: np.ndarray) -> np.ndarray:
-    """Cells (H, W) and those beside them."""
-    for axis in (0, 1):
-        before, after = np.delete(cells, -1, axis), np.delete(cells, 0, axis)
-        wide = [(1, 0) if i == axis else (0, 0) for i in (0, 1)]
-        cells = cells | np.pad(before, wide) | np.pad(after, [w[::-1] for w in wide])
-    return cells

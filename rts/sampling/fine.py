@@ -12,9 +12,10 @@ from rts.checks import check_memory
 from rts.engines import engine_of
 from rts.interfaces import AnyNeeded
 from rts.records import Fine, Sampled
-from rts.sampling.adaptive import Adaptive, contrasts, dilated, outlines
+from rts.sampling.adaptive import Adaptive, contrasts, outlines
 from rts.sampling.pruning import as_needed, planned
 from rts.sampling.tiles import Grid, InTiles, Layout, Room, arranged, lay_out, needed_room, of_engine, rounded
+from rts.splatting.layers import dilated
 
 
 class Where(NamedTuple):

@@ -35,8 +35,7 @@ import numpy as np
 
 from rts.engines import namespace, stopped
 from rts.splatting.kernel import TIE, Kernel
-from rts.splatting.layers import Layers
-from rts.splatting.rims import AROUND, Steps, _reversed
+from rts.splatting.layers import AROUND, Layers, Steps, opposite
 from rts.trees import Array
 
 LARGEST = 0.5
@@ -105,7 +104,7 @@ def targets(layers: Layers, shift: dict[Steps, Array]) -> tuple[Array, dict[Step
     crosses = pairs(z[0], z[1], two, stopped(layers.extent))
     # By the step from the target to the source.
     swapped = dict(crosses)
-    same = {m: ~crosses[m] & (shift[_reversed(m)] == 0) & layers.covers(*_reversed(m)) for m in AROUND}
+    same = {m: ~crosses[m] & (shift[opposite(m)] == 0) & layers.covers(*opposite(m)) for m in AROUND}
     slopes, known = [], two & functools.reduce(operator.or_, crosses.values())
     for first, second in (z, reversed(z)):
         found = [_slope(first, second, m, two, same, swapped) for m in ((1, 0), (0, 1))]
@@ -123,7 +122,7 @@ def targets(layers: Layers, shift: dict[Steps, Array]) -> tuple[Array, dict[Step
         same[m] = same[m] | (free & (straight <= crossed))
         swapped[m] = swapped[m] | (free & (crossed < straight))
         target = target & (same[m] | swapped[m])
-    return target, {_reversed(m): b for m, b in swapped.items()}, slopes
+    return target, {opposite(m): b for m, b in swapped.items()}, slopes
 
 
 def pairs(z0: Array, z1: Array, two: Array, extent: Array | float) -> dict[Steps, Array]:
@@ -138,7 +137,7 @@ def pairs(z0: Array, z1: Array, two: Array, extent: Array | float) -> dict[Steps
     xp, found = namespace(two, z0), {}
     ratios = {m: _ratio(z0, z1, two, TIE * extent, m) for m in HALF}
     for m, ratio in ratios.items():
-        back = _reversed(m)
+        back = opposite(m)
         least = (ratio < ahead(ratio, back, xp.inf)) & (ratio <= ahead(ratio, m, xp.inf))
         found[m] = least & (ratio < LARGEST)
         found[back] = ahead(found[m], back, False)
@@ -175,7 +174,7 @@ def ahead(cells: Array, steps: Steps, value: float) -> Array:
 
 def _ratio(z0: Array, z1: Array, two: Array, least: Array | float, m: Steps) -> Array:
     """R / (h(q) + h(p)) of cells and those a step m farther on; infinity where they are no pair."""
-    xp, back, twice = namespace(two, z0), _reversed(m), (2 * m[0], 2 * m[1])
+    xp, back, twice = namespace(two, z0), opposite(m), (2 * m[0], 2 * m[1])
     (b0, b1), (p0, p1), (f0, f1) = ((ahead(z0, n, 0.0), ahead(z1, n, 0.0)) for n in (back, m, twice))
     before, after = ahead(two, back, False), ahead(two, twice, False)
 

@@ -17,6 +17,10 @@ from rts.trees import Array
 
 OFFSETS = (-1, 0, 1)
 NEIGHBOURS = [(u, v) for v in OFFSETS for u in OFFSETS]
+AROUND = [n for n in NEIGHBOURS if n != (0, 0)]
+
+Steps = tuple[int, int]
+"""Cells along x and y."""
 
 
 def check_rows(row: Array, count: int) -> None:
@@ -163,6 +167,18 @@ def _beyond(depth: list[Array], covered: Array) -> tuple[list[Array], Array]:
     extent = xp.clip(xp.max(every), 0.0, None) - xp.clip(xp.min(every), None, 0.0)
     beyond = xp.where(extent > 0, 2 * extent, 1.0)
     return [xp.where(covered[k], z, beyond) for k, z in enumerate(depth)], extent
+
+
+def opposite(n: Steps) -> Steps:
+    """The steps that lead back."""
+    return -n[0], -n[1]
+
+
+def dilated(cells: np.ndarray) -> np.ndarray:
+    """Cells (H, W), bool or uint8, and those beside them."""
+    wide = np.pad(cells, ((1, 1), (0, 0)))
+    wide = np.pad(wide[:-2] | wide[1:-1] | wide[2:], ((0, 0), (1, 1)))
+    return wide[:, :-2] | wide[:, 1:-1] | wide[:, 2:]
 
 
 def all_of(conditions: list[Array]) -> Array:

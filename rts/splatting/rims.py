@@ -27,7 +27,7 @@ import numpy as np
 
 from rts.engines import namespace, stopped
 from rts.splatting.kernel import Kernel
-from rts.splatting.layers import NEIGHBOURS, Layers, bordered
+from rts.splatting.layers import AROUND, Layers, Steps, bordered, dilated, opposite
 from rts.trees import Array
 
 LEAST, LARGEST = 1.23, 2.5
@@ -38,10 +38,6 @@ CONVERGING = 1.5
 """Ratio of the squares of two gaps, a pixel apart, from which a surface closes within two pixels."""
 HALF = 0.5
 """β of the line, and −β of the chord."""
-
-AROUND = [n for n in NEIGHBOURS if n != (0, 0)]
-
-Steps = tuple[int, int]
 
 
 def gains(kernel: Kernel, layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tuple[Array, Array]:
@@ -111,7 +107,7 @@ def rules(layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tupl
     xp, (z, _) = layers.xp, layers.front(0, 0)
     z = stopped(z)
     off = _off(layers, shift)
-    usable = {n: off[n] & layers.covers(*n) & ~off[_reversed(n)] for n in AROUND}
+    usable = {n: off[n] & layers.covers(*n) & ~off[opposite(n)] for n in AROUND}
     outward = tuple(sum(xp.where(o, n[i], 0) for n, o in off.items()) for i in (0, 1))
     best, inward = (xp.full_like(shift[0, 0], x) for x in (-1000, -1))
     deep, beta = inward > 0, xp.zeros_like(z)
@@ -130,15 +126,8 @@ def rules(layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tupl
 
 def chords(covered: np.ndarray) -> np.ndarray:
     """The second layers (K, H, W) that lie beside the outlines of fronts before nothing."""
-    ring = covered[0] & _spread(~covered[0])
-    return covered & _spread(ring) & (np.arange(len(covered)) == 1)[:, None, None]
-
-
-def _spread(cells: np.ndarray) -> np.ndarray:
-    """Cells (H, W) and those beside them."""
-    height, width = cells.shape
-    wide = np.pad(cells, 1)
-    return np.logical_or.reduce([wide[v : v + height, u : u + width] for v in range(3) for u in range(3)])
+    ring = covered[0] & dilated(~covered[0])
+    return covered & dilated(ring) & (np.arange(len(covered)) == 1)[:, None, None]
 
 
 def _motions(layers: Layers) -> list[Array]:
@@ -157,14 +146,14 @@ def _off(layers: Layers, shift: dict[Steps, Array]) -> dict[Steps, Array]:
     found = {}
     for n in AROUND:
         # Pairing is symmetric: what matters is whether p + n, as a source of p, is paired front to front.
-        back = _reversed(n)
+        back = opposite(n)
         found[n] = there & layers.at(inside, *back) & (~layers.covers(*back) | (shift[back] != 0))
     return found
 
 
 def _ratio(layers: Layers, z: Array, n: Steps, off: dict[Steps, Array]) -> Array:
     """The ratio r along a direction; 0 where p₂ does not continue the surface, or does not fall off."""
-    xp, back = layers.xp, _reversed(n)
+    xp, back = layers.xp, opposite(n)
     (z1, _), (z2, there) = layers.front(*n), layers.front(2 * n[0], 2 * n[1])
     z1, z2 = stopped(z1), stopped(z2)
     ends = layers.at(bordered(xp.where(off[back], 1, 0)[None])[0], *n) == 1
@@ -188,7 +177,3 @@ def _chord(layers: Layers, usable: dict[Steps, Array], part: Array | None) -> Ar
         inner = layers.at(gap, *n)
         closes = closes | (usable[n] & layers.at(both, *n) & (CONVERGING * own * own <= inner * inner))
     return closes & layers.at(both, 0, 0) & (part[0] == part[1])
-
-
-def _reversed(n: Steps) -> Steps:
-    return -n[0], -n[1]

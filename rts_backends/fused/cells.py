@@ -16,7 +16,7 @@ import numpy as np
 from rts.errors import InputError
 from rts.splatting import rims
 from rts.splatting.kernel import LEAST_EPSILON
-from rts.splatting.layers import OFFSETS, check_rows
+from rts.splatting.layers import OFFSETS, check_rows, dilated
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only
 from rts_backends.fused import choices as listing
@@ -221,11 +221,7 @@ class Cells:
             return counts
         near = self._wanted
         for _ in range(reach):
-            near = near.copy()
-            near[1:] |= near[:-1].copy()
-            near[:-1] |= near[1:].copy()
-            near[:, 1:] |= near[:, :-1].copy()
-            near[:, :-1] |= near[:, 1:].copy()
+            near = dilated(near)
         marks *= near
         return marks.sum(axis=1, dtype=np.int64)
 
