@@ -243,7 +243,8 @@ def _sampled(
     check_memory(height, width, planned(layers), capacity, gradient=scene.suited[0].differentiates)
     apron = apron_of(splatter)
     needed = None if splatter is None else needed_by(splatter, scene.parts)
-    taken = partial(_taken, scene, _wide(scene, camera, (height, width), apron), capacity=capacity)
+    wide = _wide(scene, camera, (height, width), apron)
+    taken = partial(_taken, scene, wide, capacity=capacity, facing=_reads_facing(splatter))
     sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)
     return replace(sampled, supersample=side, apron=apron)
 
@@ -272,6 +273,7 @@ def _taken(
     *,
     capacity: int | None,
     cells: Array | None = None,
+    facing: bool = False,
 ) -> Sampled:
     """The samples of a grid of cells, or of those that are listed; less what is not needed."""
     samples, pruned, listed = [], False, {} if cells is None else {"cells": cells}
@@ -282,6 +284,8 @@ def _taken(
         if cells is not None and not chosen.takes_cells:
             samples.append(at_cells(chosen.sample(part, seen, wide.grid, count, **known), cells, capacity))
             continue
+        if facing and chosen.tells_facing:
+            known["facing"] = True
         if needed is not None and chosen.prunes:
             pruned = len(scene.parts) == 1
             known["needed"] = needed if pruned else Everything(needed)
@@ -308,7 +312,8 @@ def _fine(
     wide = _wide(scene, camera, (grid.side * size[0], grid.side * size[1]), grid.apron)
     needed = None if splatter is None else needed_by(splatter, scene.parts)
     where = Where(adaptive, adaptive.dilates(scene.parts), colors)
-    return fine_samples(coarse, grid, where, partial(_taken, scene, wide), needed, layers, capacity)
+    take = partial(_taken, scene, wide, facing=_reads_facing(splatter))
+    return fine_samples(coarse, grid, where, take, needed, layers, capacity)
 
 
 def _of_contrast(
@@ -391,6 +396,11 @@ def apron_of(splatter: Splatter | None) -> int:
     return (Visible if splatter is None else splatter).reach + 1
 
 
+def _reads_facing(splatter: Splatter | None) -> bool:
+    """Whether to tell what faces the viewer; None stands for `Visible`."""
+    return (Visible if splatter is None else splatter).reads_facing
+
+
 def _narrowed(sampled: Sampled, cells: int) -> Sampled:
     """Samples with an apron that is narrower by some cells."""
     if cells == 0:
@@ -399,7 +409,8 @@ def _narrowed(sampled: Sampled, cells: int) -> Sampled:
     row, depth = (x[:, rows, columns] for x in (sampled.row, sampled.depth))
     fine = sampled.fine  # Its own apron may be wider than is needed.
     fine = None if fine is None else replace(fine, coarse=fine.coarse[rows, columns])
-    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, fine=fine)
+    facing = None if sampled.facing is None else sampled.facing[:, rows, columns]
+    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, fine=fine, facing=facing)
 
 
 def _splatted(
@@ -457,11 +468,11 @@ def to_fine_splats(
     if not engine.owns(fine.row):
         fine = constants(fine, engine, like if engine.differentiates else None)
     positions, rgba = _shown(fine.samples, fine.index, parts, camera, wide, engine, like)
-    arrays = fine.index, fine.shift, fine.row, fine.part, fine.wanted
-    index, shift, row, part, wanted = constants(arrays, *suiting(positions, rgba))
+    arrays = fine.index, fine.shift, fine.row, fine.part, fine.facing, fine.wanted
+    index, shift, row, part, facing, wanted = constants(arrays, *suiting(positions, rgba))
     xp = namespace(positions)
     moved = take(positions, index) + xp.astype(shift, positions.dtype)
-    return Splats(moved, take(rgba, index), row, part, wanted=wanted, border=fine.apron)
+    return Splats(moved, take(rgba, index), row, part, facing, wanted=wanted, border=fine.apron)
 
 
 def to_splats(
@@ -482,10 +493,10 @@ def to_splats(
     if not engine.owns(sampled.row):
         sampled = constants(sampled, engine, like if engine.differentiates else None)
     positions, rgba = _shown(sampled.samples, sampled.row, parts, camera, wide, engine, like)
-    row, part = sampled.row, sampled.part
+    cells = sampled.row, sampled.part, sampled.facing
     if not engine.owns(rgba):
-        row, part = constants((row, part), *suiting(positions, rgba))
-    return Splats(positions, rgba, row, part, border=apron)
+        cells = constants(cells, *suiting(positions, rgba))
+    return Splats(positions, rgba, *cells, border=apron)
 
 
 def _shown(

@@ -229,13 +229,13 @@ class ImageResiduals(Residuals):
                 **fields._asdict(),
             )
 
-        known = {"row": sampled.row, "part": sampled.part}
+        known = {"row": sampled.row, "part": sampled.part, "facing": sampled.facing}
         if sampled.fine is None:
             return swept(partial(to_splats, sampled), fields, **known)
         # A pixel counts on one of the grids alone.
         fine = sampled.fine
         coarse, finer = _split(fields, constants(fine.pixel, engine, vector), fine)
-        placed = {"row": fine.row, "part": fine.part, "wanted": fine.wanted}
+        placed = {"row": fine.row, "part": fine.part, "facing": fine.facing, "wanted": fine.wanted}
         found = (
             swept(partial(to_splats, sampled), coarse, **known, wanted=fine.coarse),
             swept(lambda parts, camera, _, *suited: to_fine_splats(fine, parts, camera, *suited), finer, **placed),

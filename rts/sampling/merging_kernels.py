@@ -8,28 +8,42 @@ import numpy as np
 from rts.threads import parallel
 
 
-def interleave(rows: tuple[np.ndarray, ...], depths: tuple[np.ndarray, ...], layers: int) -> tuple[np.ndarray, ...]:
+def interleave(
+    rows: tuple[np.ndarray, ...],
+    depths: tuple[np.ndarray, ...],
+    facing: tuple[np.ndarray, ...],
+    layers: int,
+    most: int,
+) -> tuple[np.ndarray, ...]:
     """The nearest layers of several parts: part and row within it, −1 where empty, and depth, (K, H, W) each.
+
+    With them, where it is told, which piece faces the viewer in each cell; 0 in cells full of layers.
 
     Args:
         rows: `row` of each part, (L, H, W) int32, front to back.
         depths: depths of each part, (L, H, W).
+        facing: `facing` of each part, (L, H, W) int16; or none.
         layers: K.
+        most: the largest number of a piece.
     """
     count, (_, height, width) = len(rows), rows[0].shape
     deepest = max(r.shape[0] for r in rows)
     row = np.full((count, deepest, height, width), -1, np.int32)
     depth = np.zeros(row.shape, np.result_type(*depths))
+    told = np.zeros(row.shape if facing else (0, deepest, height, width), np.int16)
     for i, (r, d) in enumerate(zip(rows, depths, strict=True)):
         row[i, : len(r)], depth[i, : len(d)] = r, d
+    for i, f in enumerate(facing):
+        told[i, : len(f)] = f
     shape = (min(layers, sum(r.shape[0] for r in rows)), height, width)
     found = np.empty(shape, np.int32), np.empty(shape, np.int32), np.empty(shape, depth.dtype)
-    parallel(_interleave, height, row, depth, *found)
-    return found
+    merged = np.zeros(shape if facing else (0, height, width), np.int16)
+    parallel(_interleave, height, row, depth, told, most, *found, merged)
+    return (*found, merged) if facing else found
 
 
 @numba.njit(cache=True, nogil=True)
-def _interleave(start, stop, row, depth, part, merged, merged_depth):
+def _interleave(start, stop, row, depth, facing, most, part, merged, merged_depth, merged_facing):
     count, deepest, _, width = row.shape
     at = np.empty(count, np.int64)
     for y in range(start, stop):
@@ -47,4 +61,16 @@ def _interleave(start, stop, row, depth, part, merged, merged_depth):
                 else:
                     part[k, y, x], merged[k, y, x] = nearest, row[nearest, at[nearest], y, x]
                     merged_depth[k, y, x] = best
+                    if len(facing) > 0:
+                        merged_facing[k, y, x] = _of_part(facing[nearest, at[nearest], y, x], nearest, count, most)
                     at[nearest] += 1
+            if len(facing) > 0 and part[len(part) - 1, y, x] >= 0:
+                merged_facing[:, y, x] = 0
+
+
+@numba.njit(nogil=True)
+def _of_part(facing, part, count, most):
+    """The number of a part's piece among those of all parts; 0 where it would be too large."""
+    if facing == 0 or abs(facing) > (most - part) // count:
+        return 0
+    return facing * count + (part if facing > 0 else -part)

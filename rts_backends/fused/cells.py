@@ -83,6 +83,7 @@ class Cells:
         row: (K, H, W) signed integers, the sample of each cell, or −1.
         choices: the choices for the same samples, if they are known.
         part: (K, H, W) integers, the part of each sample; None, or no layers, where that is not known.
+        facing: (K, H, W) integers, which piece shows which side; None, or no layers, where that is not told.
         wanted: (H, W) bool, the targets to fill, others may be anything; None, or no rows, for all.
 
     Raises:
@@ -97,6 +98,7 @@ class Cells:
         row: np.ndarray,
         choices: Choices | None = None,
         part: np.ndarray | None = None,
+        facing: np.ndarray | None = None,
         wanted: np.ndarray | None = None,
     ):
         if positions.shape[1:] != (3,) or rgba.shape != (len(positions), 4):
@@ -107,6 +109,7 @@ class Cells:
             check_rows(row, len(positions))
         self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
+        self.facing = read_only(self.row[:0] if facing is None else facing, np.int16)
         self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
         self.visible, self.border = settings.kind == "visible", settings.border
         self.rims = self.visible and settings.rims
@@ -172,7 +175,7 @@ class Cells:
         sums = np.empty((offsets[-1], 3, 5), kind)
         if len(columns):
             continued = kind.type(CONTINUED)  # An argument, since compiled code that is cached would keep its value.
-            given = self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states
+            given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states
             arrays = self.positions, self.rgba, self.row, *self._numbers
             parallel(listing.choose, height, *arrays, *given, work=500 * len(columns))
         return Choices(marks, offsets, columns, ranges, sums, states, repeated, extent)
