@@ -310,9 +310,8 @@ class Sampler(Plugin):
         takes_cells: whether `sample` also takes the keyword `cells`, (L, C) int32: the only cells of the grid to
             sample, as flat indices, or −1 for none; an array of the part's engine, perhaps traced. `row` and `depth` of
             the samples are then (K, L, C). Without it all cells are sampled, and those that are not listed left out.
-        tells_facing: whether `sample` also takes the keyword `facing`: whether to find `Samples.facing`. It is of
-            interest in cells with hidden samples and beside them, and is 0 where all K layers are found, since there
-            may be more behind.
+        tells_facing: whether `sample` also takes the keyword `facing`: whether to find `Samples.facing`, which is of
+            interest in cells with hidden samples, and beside them.
     """
 
     prunes: bool = False

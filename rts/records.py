@@ -16,6 +16,10 @@ from rts.engines import namespace
 from rts.trees import Array, record
 
 
+MORE = 1 << 14
+"""Added to the number of a piece (`Samples.facing`) in the last of K layers, behind which there may be more."""
+
+
 class ArraySpec(NamedTuple):
     """The shape and dtype of one array that a host function returns.
 
@@ -111,7 +115,8 @@ class Samples:
         by_sample: the names of the tables that have a row for each sample; other tables are shared by all.
         facing: (K, H, W) int16, the number of the piece of surface that is seen in each cell, from 1 on, negative where
             it is seen from behind; 0 where that is not known or not of interest. Pieces are consistently oriented: what
-            is seen from opposite sides in two neighbouring cells is not one sheet. None where nothing is told.
+            is seen from opposite sides in two neighbouring cells is not one sheet. Numbers are larger by `MORE` where
+            all K layers are covered, in the last of them. None where nothing is told.
     """
 
     ids: Array

@@ -13,6 +13,7 @@ from rts.arguments import quoted
 from rts.arrays import shape_of
 from rts.engines import value_of
 from rts.errors import EngineError, InputError
+from rts.records import MORE
 from rts.trees import leaves
 
 
@@ -80,7 +81,7 @@ def pieces(faces: np.ndarray) -> np.ndarray:
     Args:
         faces: (T, 3) integers.
     """
-    count, largest = len(faces), np.iinfo(np.int16).max
+    count = len(faces)
     start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1).astype(np.int64)
     low, high = np.minimum(start, end), np.maximum(start, end)
     key = low * (int(high.max(initial=0)) + 1) + high
@@ -94,7 +95,7 @@ def pieces(faces: np.ndarray) -> np.ndarray:
     sizes = np.bincount(labels)
     number = np.empty(len(sizes), np.int64)
     number[np.argsort(-sizes, kind="stable")] = np.arange(1, len(sizes) + 1)
-    number[number > largest] = 0
+    number[number >= MORE] = 0
     twisted = labels[pairs[0]][~alike & (labels[pairs[0]] == labels[pairs[1]])]
     number[twisted] = 0
     return fixed(number[labels].astype(np.int16))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.camera import Camera
-from rts.records import Fragments, Proxy
+from rts.records import MORE, Fragments, Proxy
 from rts.threads import parallel, read_only
 
 
@@ -14,8 +14,8 @@ def facing(
 ) -> np.ndarray:
     """Which piece is seen, and from which side: (K, H, W) int16, see `rts.records.Samples`.
 
-    It is found where splatters may compare it: in cells that have hidden layers, and beside them. It is 0 elsewhere, and
-    in cells full of layers, behind which there may be more.
+    It is found where splatters may compare it: in cells that have hidden layers, and beside them. It is 0 elsewhere.
+    The last layer of fragments is marked by `MORE`.
 
     Args:
         fragments: what was sampled.
@@ -31,9 +31,8 @@ def facing(
     behind = np.count_nonzero(kept[1:])
     if behind:
         given = (np.ascontiguousarray(x) for x in (kept, fragments.triangle_ids))
-        full = np.ascontiguousarray(fragments.triangle_ids[-1])
         triangles = read_only(proxy.vertices), read_only(proxy.faces, np.int32), read_only(pieces, np.int16)
-        arrays = *given, full, *triangles, eye(camera), listed
+        arrays = *given, *triangles, eye(camera), listed, MORE
         parallel(facing_kernels.fill, kept.shape[1], *arrays, found, work=kept[0].size + 100 * behind)
     return found
 

@@ -7,7 +7,7 @@ import numpy as np
 
 
 @numba.njit(cache=True, nogil=True)
-def fill(start, stop, kept, triangle_ids, last, vertices, faces, pieces, eye, listed, found):
+def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eye, listed, more, found):
     """Fill lines [start, stop) of `found` (K, H, W) int16, zeros; see `rts.sampling.facing`."""
     layers, height, width = kept.shape
     hidden, near = np.zeros((3, width + 2), np.uint8), np.empty(width, np.uint8)
@@ -21,11 +21,13 @@ def fill(start, stop, kept, triangle_ids, last, vertices, faces, pieces, eye, li
             continue
         _spread(near, hidden[(y + 1) % 3], hidden[(y + 2) % 3], level)
         for x in range(width):
-            if last[y - 1, x] < 0 and (listed or near[x]):
+            if listed or near[x]:
                 for k in range(layers):
                     if kept[k, y - 1, x]:
                         t = triangle_ids[k, y - 1, x]
                         piece = pieces[t] if len(pieces) > 1 else pieces[0]
+                        if piece > 0 and k == layers - 1:
+                            piece += more
                         found[k, y - 1, x] = piece if _front(vertices, faces, t, eye) else -piece
 
 

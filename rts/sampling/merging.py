@@ -9,12 +9,8 @@ import numpy as np
 
 from rts.engines import engine_of, namespace
 from rts.errors import InputError
-from rts.records import ArraySpec, Sampled, Samples
+from rts.records import MORE, ArraySpec, Sampled, Samples
 from rts.trees import Array
-
-
-LARGEST = np.iinfo(np.int16).max
-"""The largest number of a piece."""
 
 
 def merge(samples: Sequence[Samples], layers: int) -> Sampled:
@@ -57,14 +53,20 @@ def _interleaved(layers: int, sizes: Sequence[int], *given: Array) -> tuple[Arra
     if not facing:
         return part, row, depth
     told = xp.take_along_axis(xp.concat([_of_part(f, i, count) for i, f in enumerate(facing)]), order, axis=0)
-    return part, row, depth, xp.where((row < 0) | (row[-1:, ...] >= 0), xp.zeros_like(told), told)
+    last = told[-1:, ...]
+    marked = xp.where((last != 0) & (xp.abs(last) < MORE), last + xp.where(last > 0, MORE, -MORE), last)
+    return part, row, depth, xp.concat([told[:-1, ...], xp.astype(marked, told.dtype)])
 
 
 def _of_part(facing: Array, part: int, count: int) -> Array:
     """The numbers of a part's pieces among those of all parts; 0 where they would be too large."""
     xp = namespace(facing)
-    fits = (xp.abs(facing) <= (LARGEST - part) // count) & (facing != 0)
-    return xp.where(fits, facing * count + xp.where(facing > 0, part, -part), 0 * facing)
+    size = xp.abs(facing)
+    more = xp.where(size >= MORE, MORE, 0)
+    number = size - more
+    fits = (number > 0) & (number <= (MORE - 1 - part) // count)
+    number = xp.where(fits, number * count + part + more, 0)
+    return xp.astype(xp.where(facing > 0, number, -number), facing.dtype)
 
 
 def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *given: Array) -> tuple[Array, ...]:
@@ -81,7 +83,7 @@ def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *given: Array) -
             if row.max(initial=-1) >= size:
                 raise InputError(f"row of part {i} refers to sample {row.max()} of {size}; sample this scene anew")
         return merging_kernels.interleave(
-            arrays[:count], arrays[count : 2 * count], arrays[2 * count :], layers, LARGEST
+            arrays[:count], arrays[count : 2 * count], arrays[2 * count :], layers, MORE
         )
 
     specs = ArraySpec(shape, np.int32), ArraySpec(shape, np.int32), ArraySpec(shape, dtype)

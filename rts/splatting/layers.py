@@ -12,7 +12,7 @@ import numpy as np
 from rts.engines import namespace
 from rts.errors import InputError
 from rts.operations.operation import known_value
-from rts.records import Splats
+from rts.records import MORE, Splats
 from rts.trees import Array
 
 OFFSETS = (-1, 0, 1)
@@ -72,7 +72,8 @@ class Depths:
     def pairing(self, u: int, v: int) -> tuple[Array, Array]:
         """The number s of `Multi`, and the distance of the depths that it pairs, (H, W) both.
 
-        A hidden layer does not pair with a front that is the other side of its piece.
+        A hidden layer does not pair with a front that is the other side of its piece. The last of K layers may stand
+        for what is not known behind it, but only towards fronts that lie behind it.
         """
         source, xp = self.source(u, v), self.xp
         ahead, below = [xp.abs(z - self.target[0]) for z in source], [xp.abs(z - source[0]) for z in self.target]
@@ -80,8 +81,8 @@ class Depths:
             cells = [(self.at(f, u, v), self.at(f, 0, 0)) for f in self._facing]
             (front, target), *hidden = cells
             for k, (p, q) in enumerate(hidden, start=1):
-                ahead[k] = xp.where((target != 0) & (p == -target), xp.inf, ahead[k])
-                below[k] = xp.where((front != 0) & (q == -front), xp.inf, below[k])
+                ahead[k] = xp.where(_opposite(p, target, self.target[0] > source[k]), xp.inf, ahead[k])
+                below[k] = xp.where(_opposite(q, front, source[0] > self.target[k]), xp.inf, below[k])
         a, best_a = _first_minimum(ahead, xp)
         b, best_b = _first_minimum(below, xp)
         return xp.where(best_b < best_a, -b, a), xp.minimum(best_a, best_b)
@@ -203,6 +204,13 @@ def all_of(conditions: list[Array]) -> Array:
 def fronts(covered: np.ndarray) -> np.ndarray:
     """(K, H, W) bool: the covered cells of the first layer."""
     return covered & (np.arange(len(covered)) == 0)[:, None, None]
+
+
+def _opposite(hidden: Array, front: Array, behind: Array) -> Array:
+    """Whether a hidden layer shows the other side of a front's piece, and does not stand for what may be behind it."""
+    xp = namespace(front)
+    other = (front != 0) & (hidden == -front)
+    return other | ((front != 0) & ~behind & (hidden == -front - xp.where(front > 0, MORE, -MORE)))
 
 
 def _first_minimum(values: list[Array], xp: Any) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from rts.records import MORE
 from rts_backends.fused.mixed import sums_of
 from rts_backends.fused.survey import BLOCK, BUSY, EMPTY
 
@@ -137,8 +138,7 @@ def choose(
 ):
     """List each row's mixed targets: the arrays of `rts_backends.fused.cells.Choices` from `columns` to `sums`.
 
-    Where layers may pair with the other side of a sheet only because `facing` (K, H, W) is not told, with no layers,
-    targets are listed here too that are not mixed: their fronts pair.
+    Marks go by depths alone. Where `facing` (K, H, W) is told, which else has no layers, more fronts may pair.
     """
     layers, height, width = row.shape
     z, target = np.empty((layers, 9), positions.dtype), np.empty(layers, positions.dtype)
@@ -195,12 +195,20 @@ def _pairing(z, n, target, sides):
     best_a, best_b = abs(front - target[0]), abs(target[0] - front)
     for k in range(1, len(target)):
         distance = abs(z[k, n] - target[0])
-        if distance < best_a and (sides[0, 4] == 0 or sides[k, n] != -sides[0, 4]):
+        if distance < best_a and not _opposite(sides[k, n], sides[0, 4], target[0] > z[k, n]):
             best_a, a = distance, k
         distance = abs(target[k] - front)
-        if distance < best_b and (sides[0, n] == 0 or sides[k, 4] != -sides[0, n]):
+        if distance < best_b and not _opposite(sides[k, 4], sides[0, n], front > target[k]):
             best_b, b = distance, k
     return (-b, best_b) if best_b < best_a else (a, best_a)
+
+
+@compiled
+def _opposite(hidden, front, behind):
+    """Whether a hidden layer shows the other side of a front's piece, and does not stand for what may be behind it."""
+    if front == 0 or (hidden > 0) == (front > 0):
+        return False
+    return hidden == -front or (not behind and abs(hidden) == abs(front) + MORE)
 
 
 @compiled
