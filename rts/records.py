@@ -15,7 +15,6 @@ import numpy as np
 from rts.engines import namespace
 from rts.trees import Array, record
 
-
 MORE = 1 << 14
 """Added to the number of a piece (`Samples.facing`) in the last of K layers, behind which there may be more."""
 

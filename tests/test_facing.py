@@ -96,7 +96,10 @@ def test_by_depth_alone_a_back_may_pair_with_a_front():
 def test_sheets_of_their_own_may_be_wound_in_any_way():
     # Two sheets, the hidden one the other way round, and triangles that hang together in nothing.
     (vertices, faces), (behind, other) = leaf(), leaf()
-    sheets = np.concatenate([vertices, behind - np.float32([0, 0, 0.05])]), np.concatenate([faces, other[:, ::-1] + 642])
+    sheets = (
+        np.concatenate([vertices, behind - np.float32([0, 0, 0.05])]),
+        np.concatenate([faces, other[:, ::-1] + 642]),
+    )
     alone = soup(30)
     for mesh, same in ((alone, True), (sheets, False)):
         images = [rts.render(part_of(mesh), CAMERA, SIZE, splatter=s, layers=4) for s in ("visible", BY_DEPTH)]
@@ -108,7 +111,11 @@ def test_sheets_of_their_own_may_be_wound_in_any_way():
 
 def scene():
     vertices, faces = leaf()
-    return [part_of(icosphere(2, 0.8, (0.4, 0, 0))), part_of((vertices - np.float32([0.8, 0.3, 0]), faces)), part_of(icosphere(1, 0.7), cull="back")]
+    return [
+        part_of(icosphere(2, 0.8, (0.4, 0, 0))),
+        part_of((vertices - np.float32([0.8, 0.3, 0]), faces)),
+        part_of(icosphere(1, 0.7), cull="back"),
+    ]
 
 
 def test_order_of_parts_and_what_is_pruned_change_nothing():
@@ -136,9 +143,7 @@ def test_engines_agree(target):
         moved = [p.replace(theta={**p.theta, "vertices": v}) for p, v in zip(parts, vertices, strict=True)]
         return rts.render(moved, CAMERA, SIZE, layers=4)
 
-    if target == "jax":
-        jitted = pytest.importorskip("jax").jit(render)(vertices)
-        np.testing.assert_allclose(to_numpy(jitted), image, rtol=0, atol=1e-5)
+    render = pytest.importorskip("jax").jit(render) if target == "jax" else render
     np.testing.assert_allclose(to_numpy(render(vertices)), image, rtol=0, atol=1e-5)
 
 

@@ -82,9 +82,7 @@ def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *given: Array) -
         for i, (row, size) in enumerate(zip(arrays, sizes, strict=False)):
             if row.max(initial=-1) >= size:
                 raise InputError(f"row of part {i} refers to sample {row.max()} of {size}; sample this scene anew")
-        return merging_kernels.interleave(
-            arrays[:count], arrays[count : 2 * count], arrays[2 * count :], layers, MORE
-        )
+        return merging_kernels.interleave(arrays[:count], arrays[count : 2 * count], arrays[2 * count :], layers, MORE)
 
     specs = ArraySpec(shape, np.int32), ArraySpec(shape, np.int32), ArraySpec(shape, dtype)
     specs = specs if len(given) == 2 * count else (*specs, ArraySpec(shape, np.int16))
