@@ -178,7 +178,7 @@ class TriangleSurface(Surface):
         return size, *(m.tobytes() for m in camera)
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
-        """Which triangles are wound alike, so that what is seen from its front cannot go on in what is seen from behind.
+        """Which triangles are wound alike, so that what shows its front does not go on in what shows its back.
 
         Not asked where `refine` moves samples. `rts.topology.pieces` finds them by the edges that triangles share.
 

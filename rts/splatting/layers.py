@@ -118,7 +118,7 @@ class Layers(Depths):
     """`Depths` with weights and colours."""
 
     def __init__(self, weights: Callable[[Array], Any], splats: Splats, facing: Array | None = None):
-        """Layers of packed samples; `weights` is that of `rts.splatting.Kernel`, `facing` that of the splats or None."""
+        """Layers of packed samples; `weights` is that of `rts.splatting.Kernel`, `facing` of the splats or None."""
         check_rows(splats.row, splats.positions.shape[0])
         cells = bordered(splats.row)
         every = [cells[k] for k in range(splats.row.shape[0])]

@@ -58,8 +58,8 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
     Args:
         settings: the splatter, as numbers.
         engine: the engine of the arrays.
-        *given: positions, rgba, row, part, facing, wanted and the arguments of `normal_equations` from `t_positions`, arrays or
-            None.
+        *given: positions, rgba, row, part, facing, wanted and the arguments of `normal_equations` from `t_positions`,
+            arrays or None.
     """
     positions, rgba, row, _, _, _, t_positions, _, target = given[:9]
     kind = {32: np.float32, 64: np.float64}.get(engine.namespace.finfo(positions.dtype).bits)
