@@ -74,7 +74,7 @@ def test_what_is_seen_from_its_front_is_what_culling_leaves(kind):
 
 
 def leaf():
-    """A closed flat ellipsoid that stands askew: near its rim the back is nearer to a neighbour's front than the front."""
+    """A closed flat ellipsoid that stands askew: near its rim backs are nearer to a neighbour's front than fronts."""
     vertices, faces = icosphere(3)
     return (vertices * (0.8, 0.5, 0.08) @ rotation((1, 2, 0), 60)).astype(np.float32), faces
 
@@ -95,17 +95,15 @@ def test_by_depth_alone_a_back_may_pair_with_a_front():
 
 def test_sheets_of_their_own_may_be_wound_in_any_way():
     # Two sheets, the hidden one the other way round, and triangles that hang together in nothing.
-    (vertices, faces), (behind, other) = leaf(), leaf()
-    sheets = (
-        np.concatenate([vertices, behind - np.float32([0, 0, 0.05])]),
-        np.concatenate([faces, other[:, ::-1] + 642]),
-    )
+    vertices, faces = leaf()
+    wound = faces, faces[:, ::-1] + len(vertices)
+    sheets = np.concatenate([vertices, vertices - np.float32([0, 0, 0.05])]), np.concatenate(wound)
     alone = soup(30)
     for mesh, same in ((alone, True), (sheets, False)):
         images = [rts.render(part_of(mesh), CAMERA, SIZE, splatter=s, layers=4) for s in ("visible", BY_DEPTH)]
         assert np.array_equal(*images) == same
     whole = rts.render(part_of(sheets), CAMERA, SIZE, layers=6)
-    turned = rts.render(part_of((sheets[0], np.concatenate([faces[:, ::-1], other + 642]))), CAMERA, SIZE, layers=6)
+    turned = rts.render(part_of((sheets[0], sheets[1][:, ::-1])), CAMERA, SIZE, layers=6)
     np.testing.assert_allclose(whole, turned, rtol=0, atol=1e-5)
 
 
