@@ -9,7 +9,6 @@ from helpers import DIFFERENTIABLE, arrays, box, icosphere, rotation, soup, to_n
 import rts
 from rts import splatting
 from rts.records import MORE
-from rts.rendering import sample
 from rts.sampling.facing import eye
 from rts.topology import pieces
 from rts_backends.fused.splatters import Visible
@@ -63,7 +62,7 @@ def test_what_is_seen_from_its_front_is_what_culling_leaves(kind):
     if kind == "mirrored":
         camera = camera.replace(view=np.diag([-1.0, 1, 1, 1]) @ camera.view)
     part = part_of(icosphere(1))
-    told, culled = (sample(part.replace(cull=c), camera, SIZE, layers=3) for c in ("none", "back"))
+    told, culled = (rts.sample(part.replace(cull=c), camera, SIZE, layers=3) for c in ("none", "back"))
     assert culled.facing is None
     ids = told.samples[0].ids[told.row]
     front = (told.row >= 0) & (told.facing > 0)
@@ -121,7 +120,7 @@ def test_order_of_parts_and_what_is_pruned_change_nothing():
     image = rts.render(parts, CAMERA, SIZE, layers=6)
     np.testing.assert_allclose(rts.render(parts[::-1], CAMERA, SIZE, layers=6), image, rtol=0, atol=1e-6)
     np.testing.assert_allclose(rts.render(parts, CAMERA, SIZE, layers="auto"), image, rtol=0, atol=1e-6)
-    whole = sample(parts, CAMERA, SIZE, layers=6)
+    whole = rts.sample(parts, CAMERA, SIZE, layers=6)
     np.testing.assert_allclose(rts.render_samples(whole, parts, CAMERA), image, rtol=0, atol=1e-6)
     copy = pickle.loads(pickle.dumps(whole))
     np.testing.assert_array_equal(copy.facing, whole.facing)
