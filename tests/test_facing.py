@@ -56,6 +56,16 @@ def test_pieces_hang_together_and_are_wound_alike():
     assert len(set(pieces(np.array([[0, 1, 2], [1, 0, 3], [0, 1, 4]])))) == 3
 
 
+def test_pieces_of_a_plugin_are_checked():
+    class Numbered(MESH):
+        def pieces(self, proxy):
+            return np.ones(5, np.int16)
+
+    part = part_of(icosphere(1))
+    with pytest.raises(rts.InputError, match=r"pieces of .* \(5,\); expected int16 of \(80,\)"):
+        rts.sample(part.replace(surface=Numbered(part.surface.faces)), CAMERA, SIZE)
+
+
 @pytest.mark.parametrize("kind", ["perspective", "orthographic", "mirrored"])
 def test_what_is_seen_from_its_front_is_what_culling_leaves(kind):
     camera = CAMERA if kind != "orthographic" else rts.Camera.orthographic((1, 2, 4), (0, 0, 0), height=4)

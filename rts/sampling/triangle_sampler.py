@@ -19,7 +19,7 @@ from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.facing import facing as facing_of
 from rts.sampling.packing import lift, repack
 from rts.sampling.settling import on_surface, refined
-from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_proxy
+from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
 
 LEAST_LAYERS = 3
@@ -252,7 +252,7 @@ class TriangleSampler(Sampler):
             kept = covered if needed is None else needed(covered, fragments.depth)
             sides = None
             if tells:
-                pieces = surface.pieces(found.proxy)
+                pieces = checked_pieces(surface, found.proxy)
                 sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
             if not surface.refines:
                 return replace(lift(fragments, found.proxy, shape.capacity, kept), facing=sides)
