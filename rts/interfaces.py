@@ -289,6 +289,8 @@ class Sampler(Plugin):
     """Finds where rays meet one part: the step without derivative.
 
     Attributes:
+        culls: whether it leaves out what is seen from behind where a part has `cull="back"`; it refuses such parts
+            otherwise.
         prunes: whether `sample` also takes the keyword `needed`, which says which samples to keep: a `Needed`, a
             function of its signature, or None for all.
         takes_cells: whether `sample` also takes the keyword `cells`, (L, C) int32: the only cells of the grid to
@@ -296,6 +298,7 @@ class Sampler(Plugin):
             the samples are then (K, L, C). Without it all cells are sampled, and those that are not listed left out.
     """
 
+    culls: bool = False
     prunes: bool = False
     takes_cells: bool = False
 
@@ -375,6 +378,7 @@ class Splatter(Plugin):
     """Turns shaded samples into an image that has derivatives at occlusion boundaries.
 
     Attributes:
+        layers: how many layers it looks at, from the front; None for all that there are.
         reach: how many cells away from its own, along either axis, a sample may have an effect.
         prunes: whether it says which samples it needs; True in a class with its own `needed`.
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
@@ -384,6 +388,7 @@ class Splatter(Plugin):
     FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}
     STAND_INS = {"image": ("splat", _image_of_arrays)}
 
+    layers: int | None = None
     reach: int = 1
     prunes: bool = False
     sums_products: bool = False

@@ -39,6 +39,7 @@ class TriangleSampler(Sampler):
     FLAGS = {"prepare": "builds", "update": "follows"}
     builds: bool = False
     follows: bool = False
+    culls = True
     prunes = True
     takes_cells = True
     _keeper: Keeper
