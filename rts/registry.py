@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 from typing import Any, Literal, NamedTuple, overload
 
@@ -151,6 +151,36 @@ def plugin(group: str, name: str) -> Any:
         raise PluginError(
             f"the {kind} {name!r} of {_distribution(entry)} fails to import: {type(error).__name__}: {error}"
         ) from error
+
+
+def built_in_surfaces() -> dict[str, str]:
+    """Class → name of the surfaces that the library's own distribution registers, such as "Mesh" → "mesh"."""
+    own = _entries("rts.engines")["numpy"][0].dist
+    return {
+        entry.attr: name
+        for name, entries in _entries("rts.surfaces").items()
+        for entry in entries
+        if own is not None and entry.dist is not None and entry.dist.name == own.name
+    }
+
+
+def attribute(name: str, known: Iterable[str]) -> Any:
+    """What `rts.Mesh` and its like are: a built-in surface by the name of its class, loaded now.
+
+    Args:
+        name: of the attribute.
+        known: names that there are besides, for a hint.
+
+    Raises:
+        AttributeError: there is no such surface, or it cannot be imported.
+    """
+    surfaces = built_in_surfaces() if name[:1].isupper() else {}  # Only classes are worth a look at entry points.
+    if name not in surfaces:
+        raise AttributeError(f"module 'rts' has no attribute {name!r}{_suggest(name, [*known, *surfaces])}")
+    try:
+        return plugin("rts.surfaces", surfaces[name])
+    except PluginError as error:
+        raise AttributeError(f"rts.{name} cannot be loaded: {error}") from error
 
 
 def instance(group: str, chosen: Any) -> Any:

@@ -1,8 +1,11 @@
 """Plugins by name: what is found, what is loaded, and what the errors say."""
 
+import ast
 import json
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -173,6 +176,45 @@ def test_details_say_which_extra_is_missing(install, tmp_path):
     assert found["odd"].ready and found["odd"].missing == ("qqq-there.is-none",) and found["odd"].install == "mine[odd]"
     assert found["odd"].capabilities["reach"] == 1 and not found["odd"].capabilities["prunes"]
     assert not found["even"].ready and found["even"].install is None and found["even"].capabilities == {}
+
+
+# ---------------------------------------------------------------------------------- surfaces as attributes
+
+
+def test_the_surfaces_of_the_library_are_attributes_of_it():
+    root = Path(__file__).resolve().parent.parent
+    entries = tomllib.loads((root / "pyproject.toml").read_text())["project"]["entry-points"]["rts.surfaces"]
+    assert registry.built_in_surfaces() == {path.partition(":")[2]: name for name, path in entries.items()}
+    assert set(registry.built_in_surfaces()) <= set(dir(rts)) and "render" in dir(rts)
+    assert rts.Mesh is rts.plugin("surfaces", "mesh") and rts.Sdf is rts.plugin("surfaces", "sdf")
+    # Type checkers see where each is from.
+    [block] = [n for n in ast.parse((root / "rts/__init__.py").read_text()).body if isinstance(n, ast.If)]
+    told = {f"{n.module}:{n.names[0].asname}" for n in block.body}
+    assert ast.unparse(block.test) == "TYPE_CHECKING" and told == set(entries.values())
+
+
+def test_an_attribute_that_is_not_there_is_an_attribute_error_with_a_hint(install):
+    for name, hint in {"Mash": "did you mean 'Mesh'", "rendr": "did you mean 'render'", "Heightfield": ""}.items():
+        with pytest.raises(AttributeError, match=f"^module 'rts' has no attribute '{name}'.*{hint}"):
+            getattr(rts, name)
+    assert not hasattr(rts, "qqq") and not hasattr(rts, "Toy")
+
+
+def test_a_surface_that_cannot_be_loaded_is_an_attribute_error_too(monkeypatch):
+    def broken(*_):
+        raise rts.PluginError("no compiler")
+
+    monkeypatch.delitem(vars(rts), "Bezier", raising=False)
+    monkeypatch.setattr(registry, "plugin", broken)
+    with pytest.raises(AttributeError, match="^rts.Bezier cannot be loaded: no compiler"):
+        rts.Bezier  # noqa: B018
+
+
+def test_surfaces_and_entry_points_are_left_alone_until_an_attribute_asks_for_them():
+    loaded = modules_after("import rts\nassert not rts.registry._found\nassert not hasattr(rts, 'regulrizers')")
+    assert not {m for m in loaded if m.startswith("rts_surfaces")}
+    loaded = modules_after("import rts\nassert rts.registry._found == {}\nrts.Mesh")
+    assert {m for m in loaded if m.startswith("rts_surfaces.")} == {"rts_surfaces.entries", "rts_surfaces.mesh"}
 
 
 # ------------------------------------------------------------------------------------------ what is loaded
