@@ -1,4 +1,4 @@
-"""The command line: `rts plugins`, `render`, `fit-pose`, `export`, `compare`, `tune`, `demo`."""
+"""The command line: `rts plugins`, `render`, `fit-pose`, `export`, `compare`, `tune`, `new`, `demo`."""
 
 from __future__ import annotations
 
@@ -472,6 +472,22 @@ def _interrupted(what: str) -> Iterator[None]:
     except KeyboardInterrupt:
         typer.echo(f"rts: interrupted; {what}", err=True)
         raise typer.Exit(130) from None
+
+
+@app.command(epilog="Example: rts new surface blob && pip install -e 'rts-blob[test]' && pytest rts-blob")
+def new(
+    kind: Annotated[str, typer.Argument(help="surface", show_default=False)],
+    name: Annotated[str, typer.Argument(help="The plugin's name.", show_default=False)],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder to make; rts-NAME by default.", show_default=False)
+    ] = None,
+) -> None:
+    """Write a distribution that adds a plugin: its entry point, its class, and a test that passes as it is."""
+    from rts.cli.new_plugin import write_plugin
+
+    files = write_plugin(kind, name, output)
+    _say("wrote")
+    _say_written(files)
 
 
 @app.command(epilog="Example: rts demo -o out && open out/summary.md")
