@@ -305,6 +305,8 @@ class Sampler(Plugin):
     """Finds where rays meet one part: the step without derivative.
 
     Attributes:
+        culls: whether it leaves out what is seen from behind where a part has `cull="back"`; it refuses such parts
+            otherwise.
         prunes: whether `sample` also takes the keyword `needed`, which says which samples to keep: a `Needed`, a
             function of its signature, or None for all.
         takes_cells: whether `sample` also takes the keyword `cells`, (L, C) int32: the only cells of the grid to
@@ -314,6 +316,7 @@ class Sampler(Plugin):
             interest in cells with hidden samples, and beside them.
     """
 
+    culls: bool = False
     prunes: bool = False
     takes_cells: bool = False
     tells_facing: bool = False
@@ -394,6 +397,7 @@ class Splatter(Plugin):
     """Turns shaded samples into an image that has derivatives at occlusion boundaries.
 
     Attributes:
+        layers: how many layers it looks at, from the front; None for all that there are.
         reach: how many cells away from its own, along either axis, a sample may have an effect.
         reads_facing: whether it reads `Splats.facing`, which is found only then.
         prunes: whether it says which samples it needs; True in a class with its own `needed`.
@@ -404,6 +408,7 @@ class Splatter(Plugin):
     FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}
     STAND_INS = {"image": ("splat", _image_of_arrays)}
 
+    layers: int | None = None
     reach: int = 1
     reads_facing: bool = False
     prunes: bool = False

@@ -41,6 +41,7 @@ class TriangleSampler(Sampler):
     FLAGS = {"prepare": "builds", "update": "follows"}
     builds: bool = False
     follows: bool = False
+    culls = True
     prunes = True
     takes_cells = True
     tells_facing = True

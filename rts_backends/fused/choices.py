@@ -116,6 +116,32 @@ def _mark(marks, front, hidden, target_front, target_hidden):
 
 
 @kernel
+def narrow(start, stop, mixed, wanted, kept, counts):
+    """Leave out mixed targets of rows [start, stop) that decide nothing for wanted ones.
+
+    How an outline moves is decided by pairs up to two cells away.
+
+    Args:
+        start: first row.
+        stop: end of the rows.
+        mixed: (H, W) of `find`.
+        wanted: (H, W) uint8.
+        kept: (H, W) uint8, to be filled.
+        counts: (H,), to be filled.
+    """
+    height, width = mixed.shape
+    for y in range(start, stop):
+        counts[y] = 0
+        for x in range(width):
+            kept[y, x] = 0
+            if mixed[y, x]:
+                for v in range(max(y - 2, 0), min(y + 3, height)):
+                    for u in range(max(x - 2, 0), min(x + 3, width)):
+                        kept[y, x] |= wanted[v, u]
+                counts[y] += kept[y, x]
+
+
+@kernel
 def choose(
     start,
     stop,
