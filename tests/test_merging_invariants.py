@@ -202,5 +202,5 @@ def test_the_unit_of_depth_does_not_matter(given, exponent):
 
 def test_in_array_code_the_unit_of_depth_does_not_matter():
     rows, depths = (x.reshape(2, 1, 1, 1) for x in (np.array([-1, 0]), np.array([0, 2**24], np.float32)))
-    part, row, depth = (x.item() for x in merging._interleaved(1, *rows, *depths))
+    part, row, depth = (x.item() for x in merging._interleaved(1, [1, 1], *rows, *depths))
     assert (part, row, depth) == (1, 0, 2**24)
