@@ -178,6 +178,10 @@ def test_the_compiled_splatter_is_the_specification(layers):
     images = [s.image(splats) for s in (Visible(), splatting.Visible(), Visible(reads_facing=False))]
     np.testing.assert_allclose(images[0], images[1], rtol=0, atol=1e-12)
     assert np.abs(images[0] - images[2]).max() > 0.05
+    target, tangents = rng.random(images[0].shape), rng.normal(size=(1, *positions.shape))
+    found = Visible().normal_equations(splats, tangents, None, target)
+    assert found is not None
+    np.testing.assert_allclose(found[0], ((images[0] - target) ** 2).mean(), rtol=1e-12)
     torch = pytest.importorskip("torch")
     along, constant = torch.tensor(rng.normal(size=images[0].shape)), [torch.tensor(t) for t in (rgba, row, facing)]
     found = []
