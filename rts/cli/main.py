@@ -133,12 +133,9 @@ def _size(text: str) -> tuple[int, int]:
 
 def _supersample(text: str) -> Any:
     """The samples a pixel of "4", or of "adaptive:4"."""
-    import rts
+    from rts.sampling.adaptive import of_text
 
-    kind, _, number = text.rpartition(":")
-    if kind.strip().lower() not in ("", "adaptive") or not number.strip().isdecimal():
-        raise typer.BadParameter(f"{text!r} is no supersample; expected a number such as 4, or adaptive:4")
-    return rts.Adaptive(int(number)) if kind else int(number)
+    return of_text(text)
 
 
 def _view(text: str) -> tuple[float, ...]:
@@ -411,6 +408,9 @@ def compare(
     samplers: Annotated[list[str] | None, typer.Option("--sampler", help="May be repeated. All by default.")] = None,
     splatters: Annotated[list[str] | None, typer.Option("--splatter", help="May be repeated. All by default.")] = None,
     engines: Annotated[list[str] | None, typer.Option("--engine", help="May be repeated. All by default.")] = None,
+    supersample: Annotated[
+        list[str] | None, typer.Option(help="As in rts render. May be repeated. 1, 2, 4 and adaptive:4 by default.")
+    ] = None,
     peers: Annotated[bool, typer.Option(help="DEODR and Mitsuba, where they are installed.")] = True,
     fresh: Annotated[bool, typer.Option("--fresh", help="Forget what earlier runs have measured.")] = False,
 ) -> None:
@@ -426,6 +426,7 @@ def compare(
         return
     wanted: dict[str, Any] = dict(modes=modes, samplers=samplers, splatters=splatters, engines=engines)
     options: dict[str, Any] = {name: value or None for name, value in wanted.items()}
+    options["supersample"] = [_supersample(text) for text in supersample or []] or None
     shape = None if size is None else _size(size)
     with _interrupted("what was measured is kept: the same command goes on from there"):
         found = measured(

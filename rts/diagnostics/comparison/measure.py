@@ -26,7 +26,8 @@ from rts.explaining import explain
 from rts.fitting.names import one_line
 from rts.interfaces import Part, as_surface
 from rts.registry import instance
-from rts.rendering import render, sample
+from rts.rendering import render
+from rts.sampling.scenes import sample
 from rts.trees import Array, Tree, collected, leaves, map_leaves
 
 PATIENCE = 8.0
@@ -270,7 +271,7 @@ class Measurements:
         group: str,
         splatters: Iterable[str],
         layers: Iterable[int | str],
-        samples: Iterable[int],
+        samples: Iterable[int | str],
         kinds: Iterable[str] = ("",),
         rates: bool = True,
     ) -> list[Setting]:
@@ -280,7 +281,7 @@ class Measurements:
             group: of modes.
             splatters: names.
             layers: numbers, or "auto".
-            samples: along each side of a pixel.
+            samples: as `Setting.supersample`.
             kinds: samplers that have errors of their own, and "" for all others.
             rates: whether the rates that surfaces offer are among them.
         """
@@ -373,7 +374,7 @@ class Measurements:
         layers = self.counting(group, setting) or 0
         return (
             layers + (0.5 if setting.layers == "auto" else 0.0),
-            setting.supersample,
+            setting.side,
             self.forms(group)[setting.rate].work,
         )
 
