@@ -204,7 +204,7 @@ class Cells:
             rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
             arrays = self.positions, self.rgba, self.row, *self._numbers, self.part, kind.type(choices.extent), rules
             listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
-            parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=150 * len(found.columns))
+            parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=50 * len(found.columns))
         return found
 
     @cached_property

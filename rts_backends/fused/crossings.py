@@ -73,8 +73,8 @@ def listed(arrays: tuple, choices: Any, extent: np.floating) -> Crossings:
     if not some.any():
         return nothing(height, kind)
     rows = height + 2 * BORDER
-    z, gap = np.empty((2, rows, width), kind), np.full((rows, width + 2 * BORDER), np.inf, kind)
-    parallel(gather, height, positions, row, z, gap, work=row[0].size)
+    z, gap = np.empty((2, rows, width), kind), np.empty((rows, width + 2 * BORDER), kind)
+    parallel(gather, rows, positions, row, some, z, gap, work=row[0].size)
     around, counts = np.zeros((height, width), np.uint16), np.zeros(height, np.int64)
     seen = row, choices.mixed, choices.offsets, choices.columns, choices.ranges, z, gap
     parallel(_list, height, bits, some, choices.states, *seen, rules, around, counts, work=row[0].size)
@@ -110,7 +110,7 @@ def _steps(bits, y, x):
     """The steps from a cell to the others of its pairs."""
     height, found = len(bits), 0
     for i in range(4):
-        u, v = STEPS[i]
+        u, v = STEPS[i, 0], STEPS[i, 1]
         if bits[y, x] >> i & 1:
             found |= 1 << (3 * (v + 1) + u + 1)
         if 0 <= y - v < height and 0 <= x - u and bits[y - v, x - u] >> i & 1:
