@@ -50,9 +50,10 @@ from rts.operations.rigid import rigid
 from rts.radiance_fields import load_radiance_field, volume_render
 from rts.records import ArraySpec, Fine, Fragments, Proxy, RayHits, Rays, Sampled, Samples, Splats
 from rts.registry import plugin, plugins
-from rts.rendering import render, render_samples, sample
+from rts.rendering import render, render_samples
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.prepared import prepare
+from rts.sampling.scenes import sample
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.splatting import exact_calibration
 

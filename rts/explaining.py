@@ -12,10 +12,10 @@ from rts.checks import check_scene
 from rts.engines import engine_of
 from rts.interfaces import Part
 from rts.records import Samples
-from rts.rendering import sample
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.auto import Choice, choose, is_static
 from rts.sampling.prepared import PreparedParts
+from rts.sampling.scenes import sample
 
 
 def explain(

@@ -14,9 +14,9 @@ from rts.operations.linear import AFFINE
 from rts.operations.projection import PROJECTION
 from rts.operations.rigid import RIGID
 from rts.operations.take import take
-from rts.rendering import sample
 from rts.sampling.merging import merge
 from rts.sampling.packing import lift
+from rts.sampling.scenes import sample
 from rts_backends.fused import splatters as fused
 from rts_backends.fused.cells import Settings
 

@@ -10,8 +10,8 @@ from helpers import ALL, DIFFERENTIABLE, arrays, box, derivative, gradient, icos
 import rts
 from rts import splatting
 from rts.records import ArraySpec
-from rts.rendering import sample
 from rts.sampling import pruning
+from rts.sampling.scenes import sample
 from rts.trees import map_leaves
 
 pytestmark = pytest.mark.sampling

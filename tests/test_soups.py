@@ -13,7 +13,7 @@ from soups import differences, hits_of, soup_of
 
 import rts
 from rts import splatting
-from rts.rendering import sample
+from rts.sampling.scenes import sample
 
 pytestmark = pytest.mark.sampling
 

@@ -23,15 +23,17 @@ from rts.checks import (
 )
 from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting
 from rts.errors import InputError
+from rts.evaluating import to_fine_splats, to_splats
 from rts.fitting.least_squares import flatten, normal_equations
 from rts.fitting.names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.interfaces import CheckedPart, Part, Residuals, Splatter
 from rts.records import ArraySpec, Fine, Splats
 from rts.rendering import _bands as bands_of
-from rts.rendering import render, sample, to_fine_splats, to_splats
+from rts.rendering import render
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.prepared import PreparedParts
+from rts.sampling.scenes import sample
 from rts.trees import Array, Tree
 
 Parts = Part | Sequence[Part] | PreparedParts

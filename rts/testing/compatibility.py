@@ -14,7 +14,8 @@ from rts.checks import check_sampler, check_scene
 from rts.engines import Engine, constants, engine_named, is_constant
 from rts.errors import EmptyImageWarning, RtsError
 from rts.interfaces import Part, RaySurface, TriangleSurface
-from rts.rendering import apron_of, render
+from rts.rendering import render
+from rts.sampling.scenes import apron_of
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.trees import leaves, map_leaves
 

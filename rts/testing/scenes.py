@@ -11,7 +11,8 @@ from rts.camera import Camera
 from rts.checks import check_scene
 from rts.interfaces import Part
 from rts.records import Sampled
-from rts.rendering import render, render_samples, sample
+from rts.rendering import render, render_samples
+from rts.sampling.scenes import sample
 from rts.testing import compatibility
 from rts.testing.claims import claim
 from rts.testing.compatibility import APRON, CAPACITY, LAYERS, SIZE

@@ -15,9 +15,10 @@ from rts.camera import Camera
 from rts.checks import check_scene
 from rts.engines import engine_of
 from rts.interfaces import Part
-from rts.rendering import render, sample
+from rts.rendering import render
 from rts.sampling.cache import fingerprint
 from rts.sampling.pruning import LAYER_LIMIT
+from rts.sampling.scenes import sample
 from rts.trees import leaves
 
 PACKAGES = ("rts", "rts_backends", "rts_surfaces")

@@ -26,7 +26,8 @@ from rts.explaining import explain
 from rts.fitting.names import one_line
 from rts.interfaces import Part, as_surface
 from rts.registry import instance
-from rts.rendering import render, sample
+from rts.rendering import render
+from rts.sampling.scenes import sample
 from rts.trees import Array, Tree, collected, leaves, map_leaves
 
 PATIENCE = 8.0

@@ -20,9 +20,10 @@ from rts.errors import InputError
 from rts.fitting.names import named_leaves
 from rts.interfaces import CheckedPart, Part
 from rts.records import Sampled
-from rts.rendering import render, sample
+from rts.rendering import render
 from rts.sampling.adaptive import finest
 from rts.sampling.prepared import PreparedParts
+from rts.sampling.scenes import sample
 from rts.trees import Array, Tree, leaves, map_leaves
 
 Scene = Callable[[Tree], tuple[Part | Sequence[Part] | PreparedParts, Camera]]

@@ -1,0 +1,168 @@
+"""Samples evaluated, shaded and projected: what splatters take, differentiably."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from rts.arrays import described, shape_of
+from rts.camera import Camera
+from rts.checks import check_shaded, check_splats
+from rts.engines import Engine, constants, engine_of, is_constant, namespace, suiting
+from rts.errors import InputError
+from rts.gbuffer import GBuffer
+from rts.interfaces import CheckedPart
+from rts.operations.linear import affine_map
+from rts.operations.take import take
+from rts.records import Fine, Sampled, Samples, Splats
+from rts.sampling.scenes import Wide
+from rts.trees import Array, Tree
+
+
+def to_splats(
+    sampled: Sampled, parts: Sequence[CheckedPart], camera: Camera, window: Camera, engine: Engine, like: Array | None
+) -> Splats:
+    """Evaluate, shade and project samples: what splatters take, with the apron as border. Fine ones are left out.
+
+    Args:
+        sampled: the samples.
+        parts: checked parts.
+        camera: the camera of the whole image, which shaders see.
+        window: the camera of the samples.
+        engine: the engine to compute with.
+        like: an array that sets dtype and device of its constants and of the splats.
+    """
+    grid, apron = tuple(sampled.row.shape[1:]), sampled.apron
+    wide = Wide(window.with_apron((grid[0] - 2 * apron, grid[1] - 2 * apron), apron), grid)
+    if not engine.owns(sampled.row):
+        sampled = constants(sampled, engine, like if engine.differentiates else None)
+    positions, rgba = _shown(sampled.samples, sampled.row, parts, camera, wide, engine, like)
+    row, part = sampled.row, sampled.part
+    if not engine.owns(rgba):
+        row, part = constants((row, part), *suiting(positions, rgba))
+    return Splats(positions, rgba, row, part, border=apron)
+
+
+def to_fine_splats(
+    fine: Fine, parts: Sequence[CheckedPart], camera: Camera, engine: Engine, like: Array | None
+) -> Splats:
+    """Evaluate, shade and project fine samples: splats in the places of their layout. Arguments as in `to_splats`."""
+    size = tuple(n * fine.supersample for n in fine.pixel.shape)
+    wide = Wide(camera.with_apron(size, fine.apron), tuple(n + 2 * fine.apron for n in size))
+    if not engine.owns(fine.row):
+        fine = constants(fine, engine, like if engine.differentiates else None)
+    positions, rgba = _shown(fine.samples, fine.index, parts, camera, wide, engine, like)
+    arrays = fine.index, fine.shift, fine.row, fine.part, fine.wanted
+    index, shift, row, part, wanted = constants(arrays, *suiting(positions, rgba))
+    xp = namespace(positions)
+    moved = take(positions, index) + xp.astype(shift, positions.dtype)
+    return Splats(moved, take(rgba, index), row, part, wanted=wanted, border=fine.apron)
+
+
+def _shown(
+    sampled: Sequence[Samples],
+    row: Array,
+    parts: Sequence[CheckedPart],
+    camera: Camera,
+    wide: Wide,
+    engine: Engine,
+    like: Array | None,
+) -> tuple[Array, Array]:
+    """Positions (N, 3) in a grid and colours (N, 4) of the samples of all parts, in order.
+
+    Args:
+        sampled: the samples of each part.
+        row: integers, those of them that are seen.
+        parts: checked parts.
+        camera: the camera of the whole image, which shaders see.
+        wide: the grid, and its camera.
+        engine: the engine to compute with.
+        like: an array that sets dtype and device of its constants and of what is returned.
+    """
+    dtype = like
+    if not engine.differentiates:
+        like = None  # All is constant, and computed in the dtypes that are given.
+    seen = wide.camera.replace(view=constants(wide.camera.view, engine, like))
+    camera = constants(camera, engine, like)
+    positions, colors, first = [], [], 0
+    for index, (part, samples) in enumerate(zip(parts, sampled, strict=True)):
+        transform = constants(part.transform, engine, like)
+        reads = part.surface.reads(part.theta)
+        local = _evaluate(part, reads, samples, engine, like)
+        theta = {k: v if k in reads else constants(v, engine, like) for k, v in part.theta.items()}
+        world = _to_world(_readable(local, samples, engine), transform)
+        rgba = _shaded(part, theta, world, camera)
+        check_shaded(rgba, local["position"].shape[0], part.shader)
+        positions.append(constants(seen.within(transform).project(local["position"], wide.grid), engine, dtype))
+        check_splats(index, part, world, positions[-1], rgba, row, first)
+        colors.append(constants(rgba, engine, dtype))
+        first += samples.ids.shape[-2]
+    if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
+        # A shader may close over arrays of an engine that the scene has none of.
+        positions, colors = constants((positions, colors), *suiting(positions, colors))
+    if len(parts) == 1:
+        return positions[0], colors[0]
+    xp = namespace(positions[0])
+    return xp.concat(positions), xp.concat(colors)
+
+
+def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+    """What the shader of a part returns."""
+    try:
+        return part.shader(theta, gbuffer, camera)
+    except TypeError as error:
+        if is_constant(gbuffer.like):
+            error.add_note(
+                "All arrays of this scene are NumPy's. If its shader holds a network, call rts.render(…, "
+                "engine='torch'), or 'jax'."
+            )
+        raise
+
+
+def _evaluate(part: CheckedPart, reads: Sequence[str], samples: Samples, engine: Engine, like: Array | None) -> GBuffer:
+    """The part's G-buffer in local space, of the entries of θ that its surface reads."""
+    theta = {name: part.theta[name] for name in reads}
+    if samples.gbuffer is not None and is_constant(theta):
+        wanted = part.shader.reads
+        if samples.asked is None or (wanted is not None and set(wanted) <= set(samples.asked)):
+            return GBuffer(samples.gbuffer)
+    gbuffer = part.surface.evaluate(constants(theta, engine, like), samples)
+    gbuffer = gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer)
+    if shape_of(gbuffer["position"]) != (samples.ids.shape[0], 3):
+        position = described(gbuffer["position"])
+        raise InputError(f"'position' of {part.surface!r} {position}; expected ({samples.ids.shape[0]}, 3)")
+    return gbuffer
+
+
+def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
+    """The G-buffer for shaders: rows that no cell refers to hold values at which derivatives are finite, too."""
+    if not engine.padded(samples.row):
+        return gbuffer
+    found = GBuffer()
+    found.like = gbuffer["position"]
+    for name in gbuffer:
+        found.defer(name, lambda name=name: engine.fill_unused(gbuffer[name], samples.row))
+    return found
+
+
+def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
+    """Positions and normals moved by the part's transform."""
+    if transform is None:
+        return gbuffer
+    world = GBuffer()
+    world.like = gbuffer.like
+    for name in gbuffer:
+        world.defer(name, lambda name=name: gbuffer[name])
+    world.defer("position", lambda: affine_map(transform[:3, :], gbuffer["position"]))
+    if "normal" in gbuffer:
+        world.defer("normal", lambda: _move_normals(transform, gbuffer["normal"]))
+    return world
+
+
+def _move_normals(transform: Array, normals: Array) -> Array:
+    """Normals under an affine map: times the cofactor matrix, turned so that a mirror image keeps its outside."""
+    xp = namespace(transform)
+    a, b, c = (transform[:3, i] for i in range(3))
+    cofactors = [xp.linalg.cross(b, c), xp.linalg.cross(c, a), xp.linalg.cross(a, b)]
+    volume = xp.sum(a * cofactors[0])
+    outside = xp.where(volume < 0, -xp.ones_like(volume), xp.ones_like(volume))
+    return sum(normals[:, i : i + 1] * (cofactors[i] * outside) for i in range(3))

@@ -1,0 +1,213 @@
+"""Scenes sampled: all parts on one grid, without derivative, the half of `rts.render` that knows no colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.checks import check_memory, check_ratio, check_sampler, check_scene, check_size, check_splatter, suited_sampler
+from rts.engines import Engine, constants, is_traced, suiting_scene, uncompiled
+from rts.errors import InputError
+from rts.interfaces import AnyNeeded, CheckedPart, Part, Splatter
+from rts.records import Fine, Sampled
+from rts.sampling.adaptive import Adaptive, finest
+from rts.sampling.fine import Where, fine_samples
+from rts.sampling.merging import merge
+from rts.sampling.prepared import PreparedParts
+from rts.sampling.pruning import Everything, as_needed, needed_by, planned, prune
+from rts.sampling.tiles import Grid, at_cells
+from rts.splatting.visible import Visible
+from rts.trees import Array, Tree
+
+
+@uncompiled
+def sample(
+    parts: Part | Sequence[Part] | PreparedParts,
+    camera: Camera,
+    size: tuple[int, int],
+    *,
+    sampler: Any = "auto",
+    splatter: Any = None,
+    layers: int | Literal["auto"] = 2,
+    supersample: int | Adaptive = 1,
+    capacity: int | None = None,
+    engine: str | None = None,
+) -> Sampled:
+    """Find where the rays through cells' centres meet the surfaces: the half of `render` without derivative.
+
+    Args:
+        parts: as in `render`.
+        camera: as in `render`.
+        size: as in `render`.
+        sampler: as in `render`.
+        splatter: the splatter that the samples are for: the apron suits its reach, and hidden samples that it does not
+            need are dropped. None keeps all, with an apron that suits every built-in splatter.
+        layers: as in `render`.
+        supersample: as in `render`.
+        capacity: as in `render`.
+        engine: as in `render`.
+
+    Returns:
+        Samples for `render_samples`, which may be handed to a function under `jax.jit`.
+
+    Raises:
+        InputError: what was given cannot be sampled.
+        EngineError: torch and jax arrays in one scene.
+    """
+    scene = Scene.of(parts, camera, sampler, engine)
+    size = check_size(size, layers, capacity, finest(supersample))
+    scene = scene.at(size)
+    splatter = None if splatter is None else check_splatter(splatter)
+    if isinstance(supersample, Adaptive) and supersample.contrast is not None:
+        raise InputError(
+            f"contrast of Adaptive is {supersample.contrast}; expected None, since rts.sample knows no colours; render "
+            f"with it, or leave it out"
+        )
+    options = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
+    return sampled_scene(scene, scene.camera, size, **options)
+
+
+class Scene(NamedTuple):
+    """A scene that is checked, once for sampling and shading.
+
+    Attributes:
+        parts: checked parts.
+        camera: the camera of the whole image.
+        samplers: the sampler of each part.
+        entries: what each sampler has built for its part, or None.
+        suited: the engine of parts and camera, and an array that sets dtype and device of its constants, or None.
+    """
+
+    parts: list[CheckedPart]
+    camera: Camera
+    samplers: Sequence[Any]
+    entries: Sequence[Any]
+    suited: tuple[Engine, Array | None]
+
+    @classmethod
+    def of(
+        cls,
+        parts: Part | Sequence[Part] | PreparedParts,
+        camera: Camera,
+        sampler: Any,
+        engine: str | None,
+    ) -> Scene:
+        """The scene of what the user gave."""
+        prepared = isinstance(parts, PreparedParts)
+        checked, camera = check_scene(parts.parts if prepared else parts, camera)
+        chosen = parts.samplers if prepared else [check_sampler(sampler)] * len(checked)
+        entries = parts.entries if prepared else [None] * len(checked)
+        return cls(checked, camera, chosen, entries, suiting_scene(checked, camera, engine=engine))
+
+    def at(self, size: tuple[int, int]) -> Scene:
+        """The scene for images of a size."""
+        check_ratio(self.camera, size)
+        return self._replace(camera=self.camera.for_size(size))
+
+    def suiting(self, *others: Tree) -> tuple[Engine, Array | None]:
+        """As `suited`, with further arrays in the scene."""
+        engine, like = suiting_scene(self.parts, self.camera, *others)
+        return (engine, like) if engine.differentiates else self.suited
+
+
+def sampled_scene(
+    scene: Scene,
+    camera: Camera,
+    size: tuple[int, int],
+    *,
+    splatter: Splatter | None,
+    layers: int | Literal["auto"],
+    supersample: int | Adaptive,
+    capacity: int | None,
+) -> Sampled:
+    """The samples of a window of the image, through the camera of this window."""
+    options: dict[str, Any] = dict(splatter=splatter, layers=layers, capacity=capacity)
+    if isinstance(supersample, Adaptive):
+        coarse = sampled_scene(scene, camera, size, supersample=1, **options)
+        fine = fine_scene(scene, camera, size, coarse, adaptive=supersample, **options)
+        return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)
+    side = int(supersample)
+    height, width = side * size[0], side * size[1]
+    check_memory(height, width, planned(layers), capacity, gradient=scene.suited[0].differentiates)
+    apron = apron_of(splatter)
+    needed = None if splatter is None else needed_by(splatter, scene.parts)
+    taken = partial(_taken, scene, _widened(scene, camera, (height, width), apron), capacity=capacity)
+    sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)
+    return replace(sampled, supersample=side, apron=apron)
+
+
+class Wide(NamedTuple):
+    """A grid of cells: its camera, constant, and its height and width."""
+
+    camera: Camera
+    grid: tuple[int, int]
+
+
+def _widened(scene: Scene, camera: Camera, size: tuple[int, int], apron: int) -> Wide:
+    """The grid of an image of cells (height, width) with an apron."""
+    # Every part is sampled by the one engine, and by the very views that samples are projected with.
+    wide = camera.with_apron(size, apron)
+    if scene.suited[0].differentiates:
+        wide = constants(wide, *scene.suited)
+    return Wide(wide, (size[0] + 2 * apron, size[1] + 2 * apron))
+
+
+def _taken(
+    scene: Scene,
+    wide: Wide,
+    count: int,
+    needed: AnyNeeded | None,
+    *,
+    capacity: int | None,
+    cells: Array | None = None,
+) -> Sampled:
+    """The samples of a grid of cells, or of those that are listed; less what is not needed."""
+    samples, pruned, listed = [], False, {} if cells is None else {"cells": cells}
+    for part, chosen, entry in zip(scene.parts, scene.samplers, scene.entries, strict=True):
+        chosen = suited_sampler(chosen, part, scene.camera)
+        known: dict[str, Any] = {} if entry is None else {"entry": entry}
+        seen = wide.camera.within(part.transform)
+        if cells is not None and not chosen.takes_cells:
+            samples.append(at_cells(chosen.sample(part, seen, wide.grid, count, **known), cells, capacity))
+            continue
+        if needed is not None and chosen.prunes:
+            pruned = len(scene.parts) == 1
+            known["needed"] = needed if pruned else Everything(needed)
+        samples.append(chosen.sample(part, seen, wide.grid, count, capacity=capacity, **known, **listed))
+    sampled = merge(samples, count)
+    # Traced arrays have the shape of the worst case, pruned or not.
+    return sampled if needed is None or pruned or is_traced(sampled.row) else prune(sampled, needed)
+
+
+def fine_scene(
+    scene: Scene,
+    camera: Camera,
+    size: tuple[int, int],
+    coarse: Sampled,
+    *,
+    adaptive: Adaptive,
+    splatter: Splatter | None,
+    layers: int | Literal["auto"],
+    capacity: int | None,
+    colors: np.ndarray | None = None,
+) -> Fine:
+    """Fine samples where outlines are; `colors` (N, 4) of the coarse ones are to look for contrast."""
+    grid = Grid(size, adaptive.samples, apron_of(splatter))
+    wide = _widened(scene, camera, (grid.side * size[0], grid.side * size[1]), grid.apron)
+    needed = None if splatter is None else needed_by(splatter, scene.parts)
+    where = Where(adaptive, adaptive.dilates(scene.parts), colors)
+    return fine_samples(coarse, grid, where, partial(_taken, scene, wide), needed, layers, capacity)
+
+
+def apron_of(splatter: Splatter | None) -> int:
+    """How many cells to sample on each side beyond the image: as many as the splatter reaches, and one more.
+
+    Samples within reach have an effect on the image, and pairing looks at one cell beside theirs. None stands for
+    `Visible`, which reaches farthest of the built-in ones.
+    """
+    return (Visible if splatter is None else splatter).reach + 1
