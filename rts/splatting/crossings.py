@@ -68,7 +68,7 @@ class Lines(NamedTuple):
     slopes: list[tuple[Array, Array]]
 
     def sums(self, values: Callable[[int, int], Array]) -> list[Array]:
-        """Of values (H, W, ·) of sources, by the offset from them, the sum over each sheet."""
+        """The sum over each sheet of values (H, W, ·) of sources, which are given by the offset from them."""
         found: list[Any] = [0.0, 0.0]
         for n in NEIGHBOURS:
             given, other = values(*n), self.other[n] if n in self.other else self.target & False

@@ -66,7 +66,7 @@ class Visible(Kernel):
         for n, s in shift.items():
             hidden = xp.where(s < 0, 0, nearest(layers.source(*n), revealed, s, xp))
             hidden = xp.where(m < none, hidden, none)
-            for k, given in enumerate(layers.splats(*n, still)):
+            for k, given in enumerate(layers.splats(*n, still=still)):
                 if k == 0:
                     front = front + xp.where((s > 0)[..., None], given, 0.0)
                 surface = surface + xp.where((s == k)[..., None], given, 0.0)

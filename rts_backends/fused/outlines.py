@@ -100,7 +100,7 @@ _BITS = (np.arange(512)[:, None] >> np.arange(9) & 1).astype(np.int8)
 SUMS = (_BITS @ [(n % 3 - 1, n // 3 - 1) for n in range(9)]).astype(np.int64)
 OPPOSITE = (_BITS[:, ::-1].astype(np.int64) << np.arange(9)).sum(axis=1)
 LOWEST = _BITS.argmax(axis=1)
-"""Of nine directions as bits: the sum of those that are set, the bits of those opposite, and the place of the first."""
+"""What nine directions as bits sum up to, the bits of those opposite, and the place of the first that is set."""
 
 EMPTY, COVERED, LOOSE = np.uint8(1), np.uint8(2), np.uint8(4)
 """Bits of a cell: in the array without a sample, with one, and not sure to fill its share of what is around it."""
