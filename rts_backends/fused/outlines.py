@@ -97,7 +97,7 @@ def find(start, stop, positions, row, reach, states, mixed, offsets, columns, ra
 
 
 _BITS = (np.arange(512)[:, None] >> np.arange(9) & 1).astype(np.int8)
-SUMS = (_BITS @ [(n % 3 - 1, n // 3 - 1) for n in range(9)]).astype(np.int64)
+ALONG = (_BITS @ [(n % 3 - 1, n // 3 - 1) for n in range(9)]).astype(np.int64)
 OPPOSITE = (_BITS[:, ::-1].astype(np.int64) << np.arange(9)).sum(axis=1)
 LOWEST = _BITS.argmax(axis=1)
 """What nine directions as bits sum up to, the bits of those opposite, and the place of the first that is set."""
@@ -156,7 +156,7 @@ def _rule(positions, row, part, ends, y, x, extent, rules):
     """β and the partner's sample of a cell whose front ends somewhere."""
     one, two, bits = positions.dtype.type(1), positions.dtype.type(2), np.int64(ends[y, x])
     beta, partner, best, deep, steepest = positions.dtype.type(0), -1, -1000, False, two
-    along_x, along_y, left = SUMS[bits, 0], SUMS[bits, 1], bits & ~OPPOSITE[bits]
+    along_x, along_y, left = ALONG[bits, 0], ALONG[bits, 1], bits & ~OPPOSITE[bits]
     paired = len(part) > 1 and part[0, y, x] == part[1, y, x]
     own = _gap(positions, row, y, x) if paired else beta
     while left:
