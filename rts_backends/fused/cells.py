@@ -209,7 +209,7 @@ class Cells:
             rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
             arrays = self.positions, self.rgba, self.row, *self._numbers, self.part, kind.type(choices.extent), rules
             listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
-            parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=200 * len(found.columns))
+            parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=50 * len(found.columns))
         return found
 
     @cached_property
@@ -241,21 +241,31 @@ class Cells:
             np.empty((0, 3), kind) if g_positions is None else g_positions,
             np.empty((0, 4), kind) if g_rgba is None else g_rgba,
         )
-        given, crossed = g, len(self.crossings.columns) > 0
+        crossed = len(self.crossings.columns) > 0
+        g = own = read_only(g)
         if crossed:
-            g = given.copy()
-            crossings.hide(self.crossings, self.border, g)
-        g = read_only(g)
+            own = g.copy()
+            crossings.hide(self.crossings, self.border, own)
+            own = read_only(own)
         plain = *self.plain_arguments, self.choices.states, self.border
-        parallel(stencil.pull, height, *plain, g, *found, work=self._plain_work)
-        if count := len(self.choices.columns):
+        parallel(stencil.pull, height, *plain, own, *found, work=self._plain_work)
+        if crossed:
+            self._pull_mixed(own, found[0], found[1][:0])
+            self._pull_mixed(g, found[0][:0], found[1])
+            crossings.pull(self.rgba, self.row, self.crossings, self.border, g, *found)
+        else:
+            self._pull_mixed(g, *found)
+        if self.rims and g_positions is not None:
+            outlines.pull(self.row, self.outlines, self.border, own, g_positions)
+
+    def _pull_mixed(self, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray) -> None:
+        """Add to the gradients what mixed targets give; to those of no rows, nothing."""
+        count, height = len(self.choices.columns), self.row.shape[1]
+        if count and (len(g_positions) or len(g_rgba)):
             adjoints = np.empty((count, 3, 5), g.dtype)
             parallel(mixed.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=self._mixed_work // 5)
-            parallel(mixed.pull, height, *self.mixed_arguments, adjoints, *found, work=self._mixed_work)
-        if self.rims and g_positions is not None:
-            outlines.pull(self.row, self.outlines, self.border, g, g_positions)
-        if crossed:
-            crossings.pull(self.rgba, self.row, self.crossings, self.border, read_only(given), *found)
+            given = *self.mixed_arguments, adjoints, g_positions, g_rgba
+            parallel(mixed.pull, height, *given, work=self._mixed_work)
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
         """Fill tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4), or None."""
@@ -273,7 +283,8 @@ class Cells:
             given = self.row, self.outlines, tangents[0], self.border
             parallel(outlines.push, out.shape[1], *given, out, work=80 * len(self.outlines.columns) * len(out))
         if count := len(self.crossings.columns):
-            given = self.rgba, self.row, self.crossings, *tangents, self.border
+            arrays = self.positions, self.rgba, self.row, *self._numbers
+            given = *arrays, self.choices.ranges, self.choices.sums, self.crossings, *tangents, self.border
             parallel(crossings.push, out.shape[1], *given, out, work=80 * count * len(out))
 
     def _vjp_of_repeated(self, g: np.ndarray, *results: np.ndarray | None) -> None:

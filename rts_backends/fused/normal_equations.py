@@ -21,7 +21,7 @@ from rts.threads import parallel, read_only
 from rts.trees import Array
 from rts_backends.fused.cells import Cells, Settings
 from rts_backends.fused.crossings import change_of
-from rts_backends.fused.mixed import changes_of
+from rts_backends.fused.mixed import changes_of, composited
 from rts_backends.fused.outlines import gain
 from rts_backends.fused.rows import (
     PITCH,
@@ -181,7 +181,7 @@ def _accumulate(start, stop, planes, plain, row, choices, outlines, crossings, t
                     composite(value, layers, count)
                     _mix(change, value, plain, row, choices, tangents, border, y, left, count, changes)
                     _move_outlines(change, row, outlines, t_positions, border, y, left, count)
-                    _move_lines(change, rgba, row, crossings, tangents, border, y, left, count)
+                    _move_lines(change, plain, row, choices, crossings, tangents, border, y, left, count)
                 else:
                     fill(value, rgba, row[0, y + border, border:], choices.states[y + border, border:], left, count)
                 if fine > 1:
@@ -226,9 +226,7 @@ def _mix(change, value, plain, row, choices, tangents, border, y, left, count, c
             back = total[1, c] + (one - total[1, 3]) * total[2, c]
             value[c * PITCH + j] = total[0, c] + (one - total[0, 3]) * back
             for n in range(len(change)):
-                own = changes[n]
-                d_back = own[1, c] - own[1, 3] * total[2, c] + (one - total[1, 3]) * own[2, c]
-                change[n, c * PITCH + j] = own[0, c] - own[0, 3] * back + (one - total[0, 3]) * d_back
+                change[n, c * PITCH + j] = composited(total, changes[n], c)
 
 
 @compiled
@@ -245,16 +243,18 @@ def _move_outlines(change, row, outlines, t_positions, border, y, left, count):
 
 
 @compiled
-def _move_lines(change, rgba, row, crossings, tangents, border, y, left, count):
+def _move_lines(change, plain, row, choices, crossings, tangents, border, y, left, count):
     """The derivatives of targets beside lines of crossing in a row of a tile, in place of all others."""
+    positions, rgba, _, scale, peak, gamma = plain
     t_positions, t_rgba = tangents
+    given = positions, rgba, row, scale, peak, gamma, choices.ranges, choices.sums
     pixel = np.empty(4, change.dtype)
     for d in range(crossings.offsets[y + border], crossings.offsets[y + border + 1]):
         j = crossings.columns[d] - border - left
         if not 0 <= j < count:
             continue
         for n in range(len(change)):
-            change_of(pixel, d, crossings, rgba, row, y + border, t_positions[n], t_rgba[n])
+            change_of(pixel, d, crossings, *given, y + border, t_positions[n], t_rgba[n])
             for c in range(4):
                 change[n, c * PITCH + j] = pixel[c]
 
