@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import kernel
 from rts.threads import parallel
 
 
@@ -28,7 +28,7 @@ def interleave(rows: tuple[np.ndarray, ...], depths: tuple[np.ndarray, ...], lay
     return found
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _interleave(start, stop, row, depth, part, merged, merged_depth):
     count, deepest, _, width = row.shape
     at = np.empty(count, np.int64)

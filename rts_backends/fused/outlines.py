@@ -9,19 +9,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
 from rts_backends.fused.mixed import splat
 from rts_backends.fused.survey import FLAT
 
 NOTHING, FRONT, JOINED, SURFACE = 0, 1, 2, 3
 """What a source gives to a target: nothing, or coverage of the buffer in front as its outline moves; of that at the
 surface as the target's outline moves; of that at the surface, over nothing, as its own does."""
-
-
-compiled = numba.njit(nogil=True)
-kernel = numba.njit(nogil=True, cache=True)
 
 
 class Rules(NamedTuple):
