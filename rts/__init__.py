@@ -56,6 +56,7 @@ from rts.sampling.prepared import prepare
 from rts.sampling.scenes import sample
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.splatting import exact_calibration
+from rts.warming import warmup
 
 __version__ = "0.1.0"
 
@@ -128,4 +129,5 @@ __all__ = [
     "tune",
     "unwrapped",
     "volume_render",
+    "warmup",
 ]

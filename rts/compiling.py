@@ -60,3 +60,6 @@ class _Progress(event.Listener):
 def _is_ours(dispatcher: Any) -> bool:
     module = getattr(getattr(dispatcher, "py_func", None), "__module__", None) or ""
     return module.partition(".")[0] in PACKAGES
+
+
+event.register("numba:compile", _Progress())
