@@ -20,7 +20,7 @@ from rts.camera import Camera
 from rts.compiling import compiled, kernel
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
-from rts.threads import parallel
+from rts.threads import parallel, read_only
 from rts_backends import raster_cells
 from rts_backends.raster_drawing import BAND_ROWS, LISTED, draw, draw_cells
 from rts_backends.triangles import facing, pixel_matrix, to_corner
@@ -72,7 +72,7 @@ class Raster(TriangleSampler):
         """Fragments of all cells, or of some."""
         height, width = size
         # With unsigned indices compiled code need not look for negative ones, which count from the end.
-        vertices, faces = prepared.vertices, np.asarray(prepared.faces, np.int32).view(np.uint32)
+        vertices, faces = read_only(prepared.vertices), read_only(prepared.faces, np.int32).view(np.uint32)
         matrix, keep = pixel_matrix(camera, size), facing(camera, cull)
         # Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
         # room for every vertex and triangle, but only what is used is ever touched.

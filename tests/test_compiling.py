@@ -24,7 +24,8 @@ def specialisations():
     ours = ("rts", "rts_backends", "rts_surfaces")
     modules = [m for name, m in sys.modules.items() if name.partition(".")[0] in ours]
     found = {id(x): x for m in modules for x in vars(m).values() if isinstance(x, Dispatcher)}
-    return {f"{x.__module__}.{x.__name__}": len(x.overloads) for x in found.values() if x.overloads}
+    kept = [x for x in found.values() if x.overloads and hasattr(x._cache, "cache_path")]
+    return {f"{x.__module__}.{x.__name__}": len(x.overloads) for x in kept}
 
 vertices = np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0.5), (-1, 0, -1)], np.float32)
 part = rts.Part(rts.plugin("surfaces", "mesh")([(0, 1, 2), (1, 3, 2)]), {"vertices": vertices})
