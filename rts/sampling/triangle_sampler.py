@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -15,9 +16,10 @@ from rts.errors import InputError
 from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSurface, as_surface
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
+from rts.sampling.facing import facing as facing_of
 from rts.sampling.packing import lift, repack
 from rts.sampling.settling import on_surface, refined
-from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_proxy
+from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
 
 LEAST_LAYERS = 3
@@ -39,8 +41,10 @@ class TriangleSampler(Sampler):
     FLAGS = {"prepare": "builds", "update": "follows"}
     builds: bool = False
     follows: bool = False
+    culls = True
     prunes = True
     takes_cells = True
+    tells_facing = True
     _keeper: Keeper
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
@@ -150,6 +154,7 @@ class TriangleSampler(Sampler):
         needed: AnyNeeded | None = None,
         entry: Entry | None = None,
         cells: Array | None = None,
+        facing: bool = False,
     ) -> Samples:
         """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
 
@@ -162,6 +167,7 @@ class TriangleSampler(Sampler):
             needed: says which samples to keep; None for all.
             entry: what `hold` gave, to be used without a look at the surface's inputs.
             cells: as in `rts.Sampler`.
+            facing: as in `rts.Sampler`; surfaces that move samples off their triangles tell nothing.
 
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
@@ -169,6 +175,8 @@ class TriangleSampler(Sampler):
         surface, theta, camera = _of_triangles(part.surface), part.theta, camera.for_size(size)
         engine, like = suiting(theta, camera)
         shape = _Shape(layers, size if cells is None else tuple(cells.shape), capacity, size)
+        tells = facing and layers > 1 and part.cull == "none" and surface.tells_pieces
+        tells = tells and not (surface.refines and surface.refine_moves)
         listed = [] if cells is None else [cells]
         inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
         reads = {name: theta[name] for name in surface.reads(theta)}
@@ -186,7 +194,8 @@ class TriangleSampler(Sampler):
             host_inputs = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
             host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
             host_camera = check_camera(host_camera, *rest[: len(transform)])
-            found = self._found(surface, part.cull, host_inputs, host_camera, shape, tables, needed, entry, host_cells)
+            given = shape, tables, needed, entry, host_cells, tells
+            found = self._found(surface, part.cull, host_inputs, host_camera, *given)
             gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
             return (
                 found.ids,
@@ -194,20 +203,24 @@ class TriangleSampler(Sampler):
                 found.row,
                 found.depth,
                 found.overflow,
+                *([found.facing] if tells else []),
                 *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
                 *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
             )
 
-        specs = *shape.specs(surface.sample_widths), *tables.values(), *attributes.values()
+        sides = [ArraySpec((layers, *shape.size), np.int16)] if tells else []
+        specs = *shape.specs(surface.sample_widths), *sides, *tables.values(), *attributes.values()
         results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *listed, *leaves(inputs))
-        rest = 5 + len(tables)
+        first = 5 + len(sides)
+        rest = first + len(tables)
         return Samples(
             *results[:5],
-            tables=dict(zip(tables, results[5:rest], strict=True)),
+            tables=dict(zip(tables, results[first:rest], strict=True)),
             gbuffer=dict(zip(attributes, results[rest:], strict=True)) if host_theta is not None else None,
             asked=asked,
             centered=surface.centered,
             by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
+            facing=results[5] if tells else None,
         )
 
     def _found(
@@ -221,8 +234,9 @@ class TriangleSampler(Sampler):
         needed: AnyNeeded | None,
         entry: Entry | None,
         cells: np.ndarray | None,
+        tells: bool,
     ) -> Samples:
-        """The samples that are to be kept, on the host."""
+        """The samples that are to be kept, on the host; if it `tells`, with what faces the viewer."""
         # Of tables there is but one set, so that no samples can be added later.
         more = surface.refines and surface.refine_moves and not tables
         grid = max(shape.layers + 1, LEAST_LAYERS) if more else shape.layers, *shape.size
@@ -237,11 +251,15 @@ class TriangleSampler(Sampler):
         covered = fragments.triangle_ids >= 0
         if not (surface.refines and surface.refine_moves):
             kept = covered if needed is None else needed(covered, fragments.depth)
+            sides = None
+            if tells:
+                pieces = checked_pieces(surface, found.proxy)
+                sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
             if not surface.refines:
-                return lift(fragments, found.proxy, shape.capacity, kept)
+                return replace(lift(fragments, found.proxy, shape.capacity, kept), facing=sides)
             lifted = lift(fragments, found.proxy, None, kept)
             samples, _ = refined(surface, inputs, lifted, camera, tables, shape.view, cells)
-            return repack(samples, samples.row >= 0, shape.capacity)
+            return replace(repack(samples, samples.row >= 0, shape.capacity), facing=sides)
         given = surface, inputs, fragments, found.proxy, camera, shape.layers, tables, shape.view, cells
         settled = on_surface(*given)
         # `needed` is asked only now, since it goes by the final depths.
