@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from typing import Any, Self
 
-import numba
 import numpy as np
 
 from rts.camera import Camera
+from rts.compiling import compiled, kernel
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
-from rts.threads import parallel
+from rts.threads import parallel, read_only
 from rts_backends import raster_cells
 from rts_backends.raster_drawing import BAND_ROWS, LISTED, draw, draw_cells
 from rts_backends.triangles import facing, pixel_matrix, to_corner
@@ -72,7 +72,7 @@ class Raster(TriangleSampler):
         """Fragments of all cells, or of some."""
         height, width = size
         # With unsigned indices compiled code need not look for negative ones, which count from the end.
-        vertices, faces = prepared.vertices, np.asarray(prepared.faces, np.int32).view(np.uint32)
+        vertices, faces = read_only(prepared.vertices), read_only(prepared.faces, np.int32).view(np.uint32)
         matrix, keep = pixel_matrix(camera, size), facing(camera, cull)
         # Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
         # room for every vertex and triangle, but only what is used is ever touched.
@@ -113,7 +113,7 @@ class Raster(TriangleSampler):
         return fragments
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _project(start, stop, vertices, m, screen):
     """Positions (V, 2) on screen, in steps from the middle of the image."""
     points, pixels = np.empty((3, LONG_BLOCK), np.float32), np.empty((2, LONG_BLOCK), np.int16)
@@ -137,7 +137,7 @@ def _project(start, stop, vertices, m, screen):
             written[v, 0], written[v, 1] = pixels[0, v], pixels[1, v]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, listed, spans, counts):
     """List the triangles that may cover a pixel's centre, and count them.
 
@@ -199,7 +199,7 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
         spans[chunk, 1] = found
 
 
-@numba.njit
+@compiled
 def _centres(x0, x1, y0, y1, height, width, step):
     """First and last column and row, in float32, whose pixels have their centres in a box, known to half a step."""
     slack, half, zero = np.float32(0.75) * step, np.float32(0.5), np.float32(0)
@@ -208,7 +208,7 @@ def _centres(x0, x1, y0, y1, height, width, step):
     return i0, i1, j0, j1
 
 
-@numba.njit
+@compiled
 def _clipped_box(corners, width, height):
     """The pixel box (x0, x1, y0, y1) of the part of a triangle before the near plane."""
     x0, x1, y0, y1 = np.inf, -np.inf, np.inf, -np.inf
@@ -228,7 +228,7 @@ def _clipped_box(corners, width, height):
     return np.float32(x0), np.float32(x1), np.float32(y0), np.float32(y1)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _sort(first, last, listed, spans, places, items):
     """Sort the list by bands: write where each band's triangles are, in order, from `places` (bands, chunks) on."""
     for chunk in range(first, last):

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
 from rts.splatting import crossings as specification
 from rts.splatting.kernel import TIE
 from rts.threads import parallel
@@ -24,9 +24,6 @@ CHUNK = 32
 """Cells that are passed over at once."""
 ROWS = 32
 """That are looked at together, so that they stay near the processor."""
-
-compiled = numba.njit(nogil=True)
-kernel = numba.njit(nogil=True, cache=True)
 
 
 class Rules(NamedTuple):

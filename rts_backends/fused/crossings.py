@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
 from rts.threads import parallel
 from rts_backends.fused.crossing_pairs import BORDER, STEPS, Rules, find_in_cells, gather, has_two, no_pairs
 from rts_backends.fused.mixed import splat, tint_of
@@ -18,9 +18,6 @@ from rts_backends.fused.survey import FLAT
 
 NEITHER, SHEET_A, SHEET_B = 2, 0, 1
 """What a source is: of neither sheet, or of one."""
-
-compiled = numba.njit(nogil=True)
-kernel = numba.njit(nogil=True, cache=True)
 
 
 class Crossings(NamedTuple):

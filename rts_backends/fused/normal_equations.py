@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
 from rts.engines import Engine
@@ -289,7 +288,7 @@ def _multiply(sums, products, change, value, fields, y, left, count, changing):
             sums[a, b] += _dot(products[a], products[b], channels * count)
 
 
-@numba.njit(nogil=True, fastmath={"contract", "reassoc"})
+@compiled(fastmath={"contract", "reassoc"})
 def _dot(a, b, count):
     """The sum of products, in an order that suits vector instructions."""
     total = a.dtype.type(0)

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
 from rts_backends.fused.mixed import splat
 from rts_backends.fused.survey import FLAT
 
@@ -21,9 +21,6 @@ surface as the target's outline moves; of that at the surface, over nothing, as 
 
 LISTED, BESIDE = 1, 2
 """Marks of targets that are listed, and of those whose outline matters to listed ones beside them."""
-
-compiled = numba.njit(nogil=True)
-kernel = numba.njit(nogil=True, cache=True)
 
 
 class Rules(NamedTuple):

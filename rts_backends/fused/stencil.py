@@ -76,7 +76,8 @@ def _copy(image, rgba, cells, states):
             i = cells[x]
             image[x, 0], image[x, 1], image[x, 2], image[x, 3] = rgba[i, 0], rgba[i, 1], rgba[i, 2], rgba[i, 3]
         else:
-            image[x] = image.dtype.type(0)
+            for c in range(4):
+                image[x, c] = image.dtype.type(0)
 
 
 @compiled

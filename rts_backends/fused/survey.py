@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from rts.compiling import compiled, kernel
 
 BLOCK = 32
 """Columns that share a note of whether hidden layers are near."""
 
 EMPTY, FLAT, BUSY = 0, 1, 2
 """Targets that no splat reaches, that are amid splats of one colour, and all others."""
-
-compiled = numba.njit(nogil=True)
-kernel = numba.njit(nogil=True, cache=True)
 
 
 @kernel
