@@ -36,10 +36,11 @@ def to_splats(
     if not engine.owns(sampled.row):
         sampled = constants(sampled, engine, like if engine.differentiates else None)
     positions, rgba = _shown(sampled.samples, sampled.row, parts, camera, wide, engine, like)
-    row, part = sampled.row, sampled.part
+    known = sampled.row, sampled.part, sampled.settled
     if not engine.owns(rgba):
-        row, part = constants((row, part), *suiting(positions, rgba))
-    return Splats(positions, rgba, row, part, border=apron)
+        known = constants(known, *suiting(positions, rgba))
+    row, part, settled = known
+    return Splats(positions, rgba, row, part, settled=settled, border=apron)
 
 
 def to_fine_splats(

@@ -109,6 +109,7 @@ class Samples:
         asked: the names of the entries that were wanted when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their cells.
         by_sample: the names of the tables that have a row for each sample; other tables are shared by all.
+        settled: (H, W) bool, see `Splats`; None where no samples were left out for it.
     """
 
     ids: Array
@@ -121,6 +122,7 @@ class Samples:
     asked: tuple[str, ...] | None = None
     centered: bool = True
     by_sample: tuple[str, ...] = ()
+    settled: Array | None = None
 
 
 @record(static=("supersample", "apron"))
@@ -179,6 +181,7 @@ class Sampled:
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
         fine: further samples where outlines are (`rts.Adaptive`), or None.
+        settled: (H, W) bool, see `Splats`; None where no samples were left out for it.
     """
 
     samples: tuple[Samples, ...]
@@ -188,11 +191,14 @@ class Sampled:
     supersample: int = 1
     apron: int = 2
     fine: Fine | None = None
+    settled: Array | None = None
 
     @property
     def part(self) -> Array:
         """(K, H, W) int32, the part seen in each cell, or −1."""
         xp, first = namespace(self.row), 0
+        if len(self.samples) == 1:
+            return xp.clip(self.row, None, 0)
         part = xp.astype(self.row >= 0, self.row.dtype) - 1
         for samples in self.samples[:-1]:
             first += samples.ids.shape[-2]
@@ -213,7 +219,8 @@ class Splats:
         row: (K, H, W) int32, the sample of each cell front to back, or −1; an array of the positions' engine.
         part: (K, H, W) int32, the part of each sample, or −1; None if that is not known.
         facing: (N,) float, the cosine between a sample's normal and the direction to the viewer; or None.
-        settled: (H, W) bool, cells amid one colour, where nothing that moves changes the image; or None.
+        settled: (H, W) bool, cells that show the one colour of all samples, whatever moves; or None. They may have
+            no sample, as cells around them that affect no others.
         sentinel: () float, the depth that stands for empty layers, beyond all samples; None for one of the scene's
             scale.
         wanted: (H, W) bool, the targets that are looked at; others may have any finite colour. None for all.

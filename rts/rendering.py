@@ -93,13 +93,13 @@ def render(
         image = _of_contrast(scene, size, suited, **options)
         return _over_background(_seen(image, scene), background)
     if len(bands) == 1:
-        sampled = sampled_scene(scene, scene.camera, size, **options)
+        sampled = sampled_scene(scene, scene.camera, size, settles=True, **options)
         image = _splatted(sampled, scene, scene.camera, suited, splatter)
         return _over_background(_seen(image, scene), background)
     images = []
     for top, rows in bands:
         window = scene.camera.window(size, (top, 0), (rows, size[1]))
-        take = partial(sampled_scene, scene, window, (rows, size[1]), **options)
+        take = partial(sampled_scene, scene, window, (rows, size[1]), settles=True, **options)
         images.append(suited[0].checkpoint(take, lambda s, w=window: _splatted(s, scene, w, suited, splatter)))
     return _over_background(_seen(namespace(*images).concat(images), scene), background)
 
@@ -182,9 +182,10 @@ def _narrowed(sampled: Sampled, cells: int) -> Sampled:
         return sampled
     rows, columns = (slice(cells, n - cells) for n in sampled.row.shape[1:])
     row, depth = (x[:, rows, columns] for x in (sampled.row, sampled.depth))
+    settled = None if sampled.settled is None else sampled.settled[rows, columns]
     fine = sampled.fine  # Its own apron may be wider than is needed.
     fine = None if fine is None else replace(fine, coarse=fine.coarse[rows, columns])
-    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, fine=fine)
+    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, fine=fine, settled=settled)
 
 
 def _splatted(

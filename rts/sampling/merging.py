@@ -20,7 +20,7 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         overflow = overflow + s.overflow
     if len(samples) == 1:
         only = samples[0]
-        return Sampled(tuple(samples), only.row, only.depth, overflow)
+        return Sampled(tuple(samples), only.row, only.depth, overflow, settled=only.settled)
     given = *(s.row for s in samples), *(s.depth for s in samples)
     sizes = tuple(s.ids.shape[0] for s in samples)
     on_host, elsewhere = partial(_interleaved_on_the_host, layers, sizes=sizes), partial(_interleaved, layers)

@@ -16,6 +16,7 @@ from rts.errors import InputError
 from rts.interfaces import AnyNeeded, CheckedPart, Part, Splatter
 from rts.records import Fine, Sampled
 from rts.sampling.adaptive import Adaptive, finest
+from rts.sampling.cache import Entry
 from rts.sampling.fine import Where, fine_samples
 from rts.sampling.merging import merge
 from rts.sampling.prepared import PreparedParts
@@ -124,8 +125,12 @@ def sampled_scene(
     layers: int | Literal["auto"],
     supersample: int | Adaptive,
     capacity: int | None,
+    settles: bool = False,
 ) -> Sampled:
-    """The samples of a window of the image, through the camera of this window."""
+    """The samples of a window of the image, through the camera of this window.
+
+    See `sample`; where `settles`, samples that only cells of one colour need may be left out.
+    """
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, capacity=capacity)
     if isinstance(supersample, Adaptive):
         coarse = sampled_scene(scene, camera, size, supersample=1, **options)
@@ -135,7 +140,8 @@ def sampled_scene(
     height, width = side * size[0], side * size[1]
     check_memory(height, width, planned(layers), capacity, gradient=scene.suited[0].differentiates)
     apron = apron_of(splatter)
-    needed = None if splatter is None else needed_by(splatter, scene.parts)
+    sizes = [entry.size if isinstance(entry, Entry) else None for entry in scene.entries]
+    needed = None if splatter is None else needed_by(splatter, scene.parts, sizes, settles)
     taken = partial(_taken, scene, _widened(scene, camera, (height, width), apron), capacity=capacity)
     sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)
     return replace(sampled, supersample=side, apron=apron)

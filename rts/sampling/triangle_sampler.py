@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -15,7 +16,7 @@ from rts.errors import InputError
 from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSurface, as_surface
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
-from rts.sampling.packing import lift, repack
+from rts.sampling.packing import largest, lift, repack
 from rts.sampling.settling import on_surface, refined
 from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
@@ -110,6 +111,8 @@ class TriangleSampler(Sampler):
             camera = camera if size is None else camera.for_size(size)
             camera = camera.within(part.transform).map(lambda m: engine_of(m).to_numpy(m))
         built = self._built(surface, inputs, camera, size)
+        read = [engine_of(x).to_numpy(x) for x in leaves(stopped({k: part.theta[k] for k in surface.reads(part.theta)}))]
+        built = built._replace(size=max([built.size, *(largest(x) for x in read if x.dtype.kind == "f")]))
         return built._replace(inputs=map_leaves(np.copy, inputs)) if surface.refines else built
 
     def _built(self, surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Entry:
@@ -117,13 +120,13 @@ class TriangleSampler(Sampler):
         proxy = checked_proxy(surface, inputs, camera, size)
         # A copy, since the arrays given may be changed in place, or lent for the length of one call only.
         proxy = proxy._replace(vertices=proxy.vertices.copy())
-        return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None)
+        return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None, largest(proxy.vertices))
 
     def _entry(self, surface: TriangleSurface, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
         """What `_built` gives, kept from call to call where that pays."""
         if surface.proxy_is_cheap and not self.builds:
             proxy = checked_proxy(surface, inputs, camera, size)
-            return Entry(proxy, self.prepare(proxy))
+            return Entry(proxy, self.prepare(proxy), largest(proxy.vertices))
         beside = surface.proxy_key(inputs, camera, size) if surface.depends_on_view else None
 
         def follow(old: Entry) -> Entry | None:
@@ -134,7 +137,7 @@ class TriangleSampler(Sampler):
                 return None
             proxy = proxy._replace(vertices=proxy.vertices.copy())
             updated = self.update(old.prepared, proxy)
-            return None if updated is None else Entry(proxy, updated)
+            return None if updated is None else Entry(proxy, updated, largest(proxy.vertices))
 
         key = (fingerprint(inputs), beside)
         return self._keeper.get(unwrapped(surface), key, lambda: self._built(surface, inputs, camera, size), follow)
@@ -176,6 +179,9 @@ class TriangleSampler(Sampler):
         tables = shape.tables(surface) if surface.refines else {}
         shader = adapted(part.shader, Shader)
         asked = None if shader is None else shader.reads
+        needed = None if needed is None else adapted(needed, Needed)
+        settles = needed is not None and needed.settles and cells is None and not surface.refines
+        known = [ArraySpec(size, np.bool_)] if settles else []
         attributes = _attribute_specs(surface, asked, host_theta, shape, like)
 
         transform = [] if part.transform is None else [part.transform]
@@ -194,20 +200,23 @@ class TriangleSampler(Sampler):
                 found.row,
                 found.depth,
                 found.overflow,
+                *([found.settled] if settles else []),
                 *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
                 *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
             )
 
-        specs = *shape.specs(surface.sample_widths), *tables.values(), *attributes.values()
+        specs = *shape.specs(surface.sample_widths), *known, *tables.values(), *attributes.values()
         results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *listed, *leaves(inputs))
-        rest = 5 + len(tables)
+        first = 5 + len(known)
+        rest = first + len(tables)
         return Samples(
             *results[:5],
-            tables=dict(zip(tables, results[5:rest], strict=True)),
+            tables=dict(zip(tables, results[first:rest], strict=True)),
             gbuffer=dict(zip(attributes, results[rest:], strict=True)) if host_theta is not None else None,
             asked=asked,
             centered=surface.centered,
             by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
+            settled=results[5] if settles else None,
         )
 
     def _found(
@@ -218,7 +227,7 @@ class TriangleSampler(Sampler):
         camera: Camera,
         shape: _Shape,
         tables: Mapping[str, ArraySpec],
-        needed: AnyNeeded | None,
+        needed: Needed | None,
         entry: Entry | None,
         cells: np.ndarray | None,
     ) -> Samples:
@@ -238,7 +247,10 @@ class TriangleSampler(Sampler):
         if not (surface.refines and surface.refine_moves):
             kept = covered if needed is None else needed(covered, fragments.depth)
             if not surface.refines:
-                return lift(fragments, found.proxy, shape.capacity, kept)
+                settled = None
+                if needed is not None and needed.settles and cells is None:
+                    settled = needed.settled(covered, fragments.depth, kept, found.size)
+                return replace(lift(fragments, found.proxy, shape.capacity, kept, found.size), settled=settled)
             lifted = lift(fragments, found.proxy, None, kept)
             samples, _ = refined(surface, inputs, lifted, camera, tables, shape.view, cells)
             return repack(samples, samples.row >= 0, shape.capacity)
@@ -247,7 +259,7 @@ class TriangleSampler(Sampler):
         # `needed` is asked only now, since it goes by the final depths.
         left = kept = settled.row >= 0
         if needed is not None:
-            adapted(needed, Needed).ran_out(int((covered[-1] & ~left[-1]).sum()))
+            needed.ran_out(int((covered[-1] & ~left[-1]).sum()))
             kept = needed(left, settled.depth)
         return repack(settled, kept, shape.capacity)
 

@@ -1,0 +1,142 @@
+"""Cells that show one colour whatever moves: they need no samples, nor do those that affect only such cells."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from rts.threads import parallel
+
+LONG = 2
+"""Nanoseconds that a cell of a layer takes."""
+
+compiled = numba.njit(nogil=True)
+kernel = numba.njit(nogil=True, cache=True)
+
+
+def settle(covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, reach: int) -> np.ndarray:
+    """Cells (H, W) bool amid nine fronts and no hidden sample that is kept; other samples are left out.
+
+    Those stay that are within reach of a cell that is not settled. So do the nearest and the farthest, since the depth
+    of what is empty goes by them.
+
+    Args:
+        covered: (K, H, W) bool.
+        depth: (K, H, W) float, of one dtype.
+        kept: (K, H, W) bool, samples that are needed where colours differ; changed in place.
+        reach: cells.
+    """
+    layers, height, width = covered.shape
+    covered, depth = np.ascontiguousarray(covered), np.ascontiguousarray(depth)
+    found, near = np.empty((height, width), np.bool_), np.empty((height, width), np.bool_)
+    extremes = np.zeros((2, height), depth.dtype)
+    parallel(_settle, height, covered, depth, kept, reach, found, near, extremes, work=LONG * covered.size)
+    least, largest = extremes[0].min(initial=0), extremes[1].max(initial=0)
+    farthest = [_place(extremes[i], x, depth, kept) for i, x in enumerate((least, largest)) if x]
+    parallel(_drop, height, near, kept, work=covered.size // 8)
+    for k, y, x in farthest:
+        kept[: k + 1, y, x] = covered[: k + 1, y, x]
+    return found
+
+
+def _place(extremes: np.ndarray, depth: np.floating, depths: np.ndarray, kept: np.ndarray) -> tuple[int, int, int]:
+    """Layer, row and column of the first sample of a depth that is one of the extremes (H,) of the rows."""
+    y = int((extremes == depth).argmax())
+    k, x = np.argwhere(kept[:, y] & (depths[:, y] == depth))[0]
+    return int(k), y, int(x)
+
+
+@kernel
+def _settle(start, stop, covered, depth, kept, reach, found, near, extremes):
+    """Fill rows [start, stop) of what is found, of cells near any that are not, and of extremes of the depths."""
+    layers, height, width = covered.shape
+    around = reach + 1
+    rows = stop - start + 2 * around
+    # A border of cells that are not amid fronts, as nothing is known there.
+    loose, beside = np.ones((rows, width + 2 * around), np.uint8), np.ones((rows, width), np.uint8)
+    wide = np.ones((rows, width), np.uint8)
+    low, high = np.empty(width, depth.dtype), np.empty(width, depth.dtype)
+    for r in range(rows):
+        y = start - around + r
+        if 0 <= y < height:
+            middle = loose[r, around : around + width]
+            _load(middle, covered[0, y])
+            for k in range(1, layers):
+                _add(middle, kept[k, y])
+            _spread(beside[r], loose[r, around - 1 :], 3)
+            _spread(wide[r], loose[r], 2 * around + 1)
+    for y in range(start, stop):
+        r = y - start
+        _amid(found[y], beside[r + around - 1], beside[r + around], beside[r + around + 1])
+        own = wide[r]
+        for v in range(1, 2 * around + 1):
+            _join(own, wide[r + v])
+        _copy(near[y], own)
+        low[:] = high[:] = depth.dtype.type(0)
+        for k in range(layers):
+            _enlarge(low, high, depth[k, y], kept[k, y])
+        extremes[0, y], extremes[1, y] = low.min(), high.max()
+
+
+@kernel
+def _drop(start, stop, near, kept):
+    """Leave out what is not near."""
+    for k in range(len(kept)):
+        for y in range(start, stop):
+            _mask(kept[k, y], near[y])
+
+
+# Rows are handed over one by one, which the compiler needs to see that they do not overlap.
+
+
+@compiled
+def _load(loose, covered):
+    for x in range(len(loose)):
+        loose[x] = np.uint8(1) - np.uint8(covered[x])
+
+
+@compiled
+def _add(loose, kept):
+    for x in range(len(loose)):
+        loose[x] |= np.uint8(kept[x])
+
+
+@compiled
+def _spread(to, cells, count):
+    """The union of so many cells from each on."""
+    to[:] = 0
+    for i in range(count):
+        _join(to, cells[i:])
+
+
+@compiled
+def _join(to, cells):
+    for x in range(len(to)):
+        to[x] |= cells[x]
+
+
+@compiled
+def _amid(found, above, level, below):
+    for x in range(len(found)):
+        found[x] = (above[x] | level[x] | below[x]) == 0
+
+
+@compiled
+def _copy(near, wide):
+    for x in range(len(near)):
+        near[x] = wide[x] != 0
+
+
+@compiled
+def _mask(kept, near):
+    for x in range(len(kept)):
+        kept[x] &= near[x]
+
+
+@compiled
+def _enlarge(low, high, depth, kept):
+    zero = depth.dtype.type(0)
+    for x in range(len(low)):
+        z = depth[x] if kept[x] else zero
+        low[x] = z if z < low[x] else low[x]
+        high[x] = z if z > high[x] else high[x]
