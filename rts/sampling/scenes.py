@@ -38,6 +38,7 @@ def sample(
     supersample: int | Adaptive = 1,
     capacity: int | None = None,
     engine: str | None = None,
+    settles: bool = False,
 ) -> Sampled:
     """Find where the rays through cells' centres meet the surfaces: the half of `render` without derivative.
 
@@ -52,6 +53,9 @@ def sample(
         supersample: as in `render`.
         capacity: as in `render`.
         engine: as in `render`.
+        settles: leave out samples of one part of one colour that only cells amid them need, which show this colour
+            whatever moves. What renders them must be given the values of θ, transform and camera that are given here.
+            `render` does so.
 
     Returns:
         Samples for `render_samples`, which may be handed to a function under `jax.jit`.
@@ -69,7 +73,7 @@ def sample(
             f"contrast of Adaptive is {supersample.contrast}; expected None, since rts.sample knows no colours; render "
             f"with it, or leave it out"
         )
-    options = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
+    options = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity, settles=settles)
     return sampled_scene(scene, scene.camera, size, **options)
 
 
