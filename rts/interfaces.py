@@ -275,10 +275,12 @@ class Needed(Plugin):
 
     Attributes:
         settles: whether it also says which cells are `settled`; True in a class with its own method.
+        size: of the largest number that surfaces read, if it is known.
     """
 
     FLAGS = {"settled": "settles"}
     settles: bool = False
+    size: float | None = None
 
     @abc.abstractmethod
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:

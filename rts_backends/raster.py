@@ -117,7 +117,7 @@ class Raster(TriangleSampler):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _project(start, stop, vertices, m, screen):
-    """Positions (V,) on screen, in steps from the middle of the image: the column in the lower 16 bits, then the row."""
+    """Positions (V,) on screen, in steps from the middle of the image: columns in the lower 16 bits, rows in the others."""
     points, pixels = np.empty((3, LONG_BLOCK), np.float32), np.empty((2, LONG_BLOCK), np.int32)
     for first in range(start, stop, LONG_BLOCK):
         block = slice(first, min(stop, first + LONG_BLOCK))
@@ -173,8 +173,8 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
                 x, y = (i0 + half - middle) / step, (j0 + half - center) / step
                 ax, ay, bx, by, cx, cy = xa - x, ya - y, xb - x, yb - y, xc - x, yc - y
                 ea, eb, ec = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
-                # Rounding changes coordinates by half a step at most, so these by the sum of the box's sides and 2.5, and
-                # their sum by twice that. The rest is for the centre, which is rounded to a hundredth.
+                # Rounding changes coordinates by half a step at most, so these by the sum of the box's sides and 2.5,
+                # and their sum by twice that. The rest is for the centre, which is rounded to a hundredth.
                 bound = more * (x1 - x0 + y1 - y0 + four)
                 away = (ea + eb + ec) * sign < -(bound + bound)
                 missed = ((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound)) | away

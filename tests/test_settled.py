@@ -29,7 +29,7 @@ def joined(*meshes):
 SCENES = {
     "sphere": icosphere(3, 0.9),
     "box before a card": joined(box(0.5), quad(-1.0, 1.0, -1.0, 1.0, -0.8)),
-    "spheres that cross": joined(icosphere(2, 0.8), (icosphere(2, 0.8)[0] + np.float32((0.5, 0, 0)), icosphere(2, 1)[1])),
+    "spheres that cross": joined(icosphere(2, 0.8), (icosphere(2, 0.8)[0] + np.float32((0.5, 0, 0)), icosphere(2)[1])),
     "cut by the frame": icosphere(3, 1.6),
 }
 
@@ -55,8 +55,8 @@ def sampled_image(part, settles, splatter="visible", **options):
     return rts.render_samples(sampled, part, CAMERA, splatter=splatter), sampled
 
 
-@pytest.mark.parametrize("layers", [1, 3])
-def test_settled_cells_are_amid_fronts_and_what_is_left_out_is_far_from_all_others(layers):
+@pytest.mark.parametrize(("layers", "reach"), [(1, 3), (3, 3), (2, 1), (2, 2), (2, 4)])
+def test_settled_cells_are_amid_fronts_and_what_is_left_out_is_far_from_all_others(layers, reach):
     rng = np.random.default_rng(layers)
     for shape in ((30, 41), (1, 9), (70, 3)):
         front = ~dilated(rng.random(shape) < 0.01)
@@ -65,13 +65,13 @@ def test_settled_cells_are_amid_fronts_and_what_is_left_out_is_far_from_all_othe
         depth = np.sort(rng.random(covered.shape).astype(np.float32), axis=0)
         loose = np.pad(~front | kept[1:].any(axis=0), 9, constant_values=True)
         expected = ~dilated(loose)[9:-9, 9:-9]
-        for _ in range(4):
+        for _ in range(reach + 1):
             loose = dilated(loose)
         left = kept & loose[9:-9, 9:-9]
         if kept.any():  # The farthest stays, whose depth sets the scale of what is empty.
             k, y, x = np.unravel_index(np.where(kept, depth, -1).argmax(), kept.shape)
             left[: k + 1, y, x] = covered[: k + 1, y, x]
-        found = settle(covered, depth, kept, 3)
+        found = settle(covered, depth, kept, reach)
         np.testing.assert_array_equal(found, expected)
         np.testing.assert_array_equal(kept, left)
 
@@ -189,3 +189,31 @@ def test_samples_are_left_out_only_where_nothing_can_depend_on_them():
         )
     ]
     assert settled == [True, True, False, False, False, False, False]
+
+
+@pytest.mark.parametrize("kind", ["single", "multi", "visible"])
+def test_what_has_no_cotangent_is_not_pulled_and_what_has_no_weight_not_swept(kind):
+    import torch
+
+    vertices = torch.tensor(SCENES["sphere"][0], requires_grad=True)
+    image = sampled_image(part_of(vertices, "sphere"), True, kind)[0]
+    weights = torch.zeros((*SIZE, 4))
+    weights[20:33, 5:20] = torch.from_numpy(np.random.default_rng(4).normal(size=(13, 15, 4)).astype(np.float32))
+    (whole,) = torch.autograd.grad((image * (weights + 0)).sum(), vertices, retain_graph=True)
+    # A gradient that is tiny instead of zero elsewhere is pulled there.
+    tiny = torch.where(weights == 0, 1e-30, weights)
+    (pulled,) = torch.autograd.grad((image * tiny).sum(), vertices)
+    assert whole.abs().max() > 0
+    np.testing.assert_allclose(whole, pulled, rtol=0, atol=1e-6 * float(whole.abs().max()))
+
+    def scene(p):
+        return part_of(SCENES["sphere"][0], "sphere", transform=rts.rigid(p["pose"]))
+
+    parameters = {"pose": torch.tensor([0.1, 0.2, 0.0, 0.02, 0.0, 0.0], dtype=torch.float64)}
+    target, mask = np.random.default_rng(3).random((*SIZE, 1)), weights[..., 3:].numpy().astype(float)
+    found = [
+        rts.ImageResiduals(scene, CAMERA, SIZE, target, weights=w, splatter=kind).normal_equations(parameters)
+        for w in (mask, np.where(mask == 0, 1e-30, mask))
+    ]
+    for masked, every in zip(*found, strict=True):
+        np.testing.assert_allclose(masked, every, rtol=1e-9, atol=1e-15)

@@ -28,13 +28,13 @@ class Entry(NamedTuple):
     Attributes:
         proxy: the triangles.
         prepared: what the sampler built.
-        size: the largest number of those that they were made of, or larger.
+        size: the largest number of those that they were made of, or larger; None where nobody has looked.
         inputs: what the proxy was made of, where samples are refined later.
     """
 
     proxy: Proxy
     prepared: Any
-    size: float
+    size: float | None = None
     inputs: Tree = None
 
 

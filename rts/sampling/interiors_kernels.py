@@ -53,29 +53,33 @@ def _settle(start, stop, covered, depth, kept, reach, found, near, extremes):
     around = reach + 1
     rows = stop - start + 2 * around
     # A border of cells that are not amid fronts, as nothing is known there.
-    loose, beside = np.ones((rows, width + 2 * around), np.uint8), np.ones((rows, width), np.uint8)
-    wide = np.ones((rows, width), np.uint8)
-    low, high = np.empty(width, depth.dtype), np.empty(width, depth.dtype)
+    loose, middle = np.ones((rows, width + 2 * around), np.uint8), slice(around, around + width)
+    wide, far = np.ones((rows, width), np.uint8), 2 * around - 2
+    column, nine = np.empty(width + 2 * around, np.uint8), np.empty(width + 2 * around - 2, np.uint8)
     for r in range(rows):
         y = start - around + r
         if 0 <= y < height:
-            middle = loose[r, around : around + width]
-            _load(middle, covered[0, y])
+            _load(loose[r, middle], covered[0, y])
             for k in range(1, layers):
-                _add(middle, kept[k, y])
-            _spread(beside[r], loose[r, around - 1 :], 3)
-            _spread(wide[r], loose[r], 2 * around + 1)
+                _add(loose[r, middle], kept[k, y])
+    for r in range(rows - 2):
+        _unite(column, loose[r], loose[r + 1], loose[r + 2])
+        _unite(nine, column, column[1:], column[2:])
+        y = start - around + r + 1
+        if start <= y < stop:
+            _reverse(found[y], nine[around - 1 :])
+        # What is wider is united of threes.
+        _unite(wide[r], nine, nine[min(3, far) :], nine[far:])
+        for v in range(6, far, 3):
+            _join(wide[r], nine[v:])
     for y in range(start, stop):
         r = y - start
-        _amid(found[y], beside[r + around - 1], beside[r + around], beside[r + around + 1])
-        own = wide[r]
-        for v in range(1, 2 * around + 1):
-            _join(own, wide[r + v])
-        _copy(near[y], own)
-        low[:] = high[:] = depth.dtype.type(0)
+        _near(near[y], wide[r], wide[r + min(3, far)], wide[r + far])
+        for v in range(6, far, 3):
+            _join(near[y], wide[r + v])
         for k in range(layers):
-            _enlarge(low, high, depth[k, y], kept[k, y])
-        extremes[0, y], extremes[1, y] = low.min(), high.max()
+            low, high = bounds(depth[k, y], kept[k, y])
+            extremes[0, y], extremes[1, y] = min(low, extremes[0, y]), max(high, extremes[1, y])
 
 
 @kernel
@@ -102,29 +106,27 @@ def _add(loose, kept):
 
 
 @compiled
-def _spread(to, cells, count):
-    """The union of so many cells from each on."""
-    to[:] = 0
-    for i in range(count):
-        _join(to, cells[i:])
-
-
-@compiled
 def _join(to, cells):
     for x in range(len(to)):
         to[x] |= cells[x]
 
 
 @compiled
-def _amid(found, above, level, below):
-    for x in range(len(found)):
-        found[x] = (above[x] | level[x] | below[x]) == 0
+def _reverse(to, cells):
+    for x in range(len(to)):
+        to[x] = cells[x] == 0
 
 
 @compiled
-def _copy(near, wide):
-    for x in range(len(near)):
-        near[x] = wide[x] != 0
+def _unite(to, a, b, c):
+    for x in range(len(to)):
+        to[x] = a[x] | b[x] | c[x]
+
+
+@compiled
+def _near(to, a, b, c):
+    for x in range(len(to)):
+        to[x] = (a[x] | b[x] | c[x]) != 0
 
 
 @compiled
@@ -133,10 +135,11 @@ def _mask(kept, near):
         kept[x] &= near[x]
 
 
-@compiled
-def _enlarge(low, high, depth, kept):
-    zero = depth.dtype.type(0)
-    for x in range(len(low)):
-        z = depth[x] if kept[x] else zero
-        low[x] = z if z < low[x] else low[x]
-        high[x] = z if z > high[x] else high[x]
+@numba.njit(nogil=True, fastmath={"nnan", "nsz", "reassoc"})
+def bounds(depth, covered):
+    """The least and the largest depth of those that are covered, and zero."""
+    low = high = depth.dtype.type(0)
+    for x in range(len(depth)):
+        z = depth[x] if covered[x] else depth.dtype.type(0)
+        low, high = min(low, z), max(high, z)
+    return low, high

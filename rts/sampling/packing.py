@@ -35,8 +35,8 @@ def lift(
 
     Samples are numbered layer by layer, each in rows and columns of the image. There is always at least one row, so
     that what follows stays connected to θ; a row that no cell refers to has no effect. `kept` (K, H, W) bool says which
-    of the covered cells to take, None for all; all are taken, too, where depths are too rough to tell (`too_far`). `size`
-    is that of the largest coordinate, if it is known.
+    of the covered cells to take, None for all; all are taken, too, where depths are too rough to tell (`too_far`).
+    `size` is that of the largest coordinate, if it is known.
     """
     from rts.sampling import packing_kernels
 

@@ -82,11 +82,11 @@ class _BySplatter(Needed):
     """
 
     def __init__(self, splatter: Splatter, size: float | None, settles: bool):
-        self._splatter, self._size, self.settles = splatter, size, settles
+        self._splatter, self.size, self.settles = splatter, size, settles
 
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `Needed`."""
-        if len(covered) == 1 or (self._size is not None and too_far(self._size, depth)):
+        if len(covered) == 1 or (self.size is not None and too_far(self.size, depth)):
             return covered
         kept = self._splatter.needed(covered, depth)
         if not (isinstance(kept, np.ndarray) and kept.shape == covered.shape and kept.dtype == bool):
@@ -98,7 +98,7 @@ class _BySplatter(Needed):
 
     def settled(self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float) -> np.ndarray:
         """See `Needed`."""
-        if too_far(max(size, self._size or 0.0), depth):
+        if too_far(max(size, self.size or 0.0), depth):
             return np.zeros(covered.shape[1:], bool)
         from rts.sampling import interiors_kernels
 
@@ -117,6 +117,7 @@ class Inspection(Needed):
     def __init__(self, needed: AnyNeeded | None):
         self._needed, self._lock = None if needed is None else adapted(needed, Needed), threading.Lock()
         self.settles = self._needed is not None and self._needed.settles
+        self.size = None if self._needed is None else self._needed.size
         self.short = 0
         self.most: int | None = None
         self.beyond = np.zeros(0, np.int64)
@@ -149,6 +150,7 @@ class Everything(Needed):
 
     def __init__(self, needed: AnyNeeded):
         self._needed: Needed = adapted(needed, Needed)
+        self.size = self._needed.size
 
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `Needed`."""

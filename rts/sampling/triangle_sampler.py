@@ -111,8 +111,9 @@ class TriangleSampler(Sampler):
             camera = camera if size is None else camera.for_size(size)
             camera = camera.within(part.transform).map(lambda m: engine_of(m).to_numpy(m))
         built = self._built(surface, inputs, camera, size)
-        read = [engine_of(x).to_numpy(x) for x in leaves(stopped({k: part.theta[k] for k in surface.reads(part.theta)}))]
-        built = built._replace(size=max([built.size, *(largest(x) for x in read if x.dtype.kind == "f")]))
+        arrays = leaves(stopped({name: part.theta[name] for name in surface.reads(part.theta)}))
+        read = [engine_of(x).to_numpy(x) for x in arrays]
+        built = built._replace(size=max([built.size or 0.0, *(largest(x) for x in read if x.dtype.kind == "f")]))
         return built._replace(inputs=map_leaves(np.copy, inputs)) if surface.refines else built
 
     def _built(self, surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Entry:
@@ -126,7 +127,7 @@ class TriangleSampler(Sampler):
         """What `_built` gives, kept from call to call where that pays."""
         if surface.proxy_is_cheap and not self.builds:
             proxy = checked_proxy(surface, inputs, camera, size)
-            return Entry(proxy, self.prepare(proxy), largest(proxy.vertices))
+            return Entry(proxy, self.prepare(proxy))
         beside = surface.proxy_key(inputs, camera, size) if surface.depends_on_view else None
 
         def follow(old: Entry) -> Entry | None:
@@ -247,10 +248,14 @@ class TriangleSampler(Sampler):
         if not (surface.refines and surface.refine_moves):
             kept = covered if needed is None else needed(covered, fragments.depth)
             if not surface.refines:
-                settled = None
-                if needed is not None and needed.settles and cells is None:
-                    settled = needed.settled(covered, fragments.depth, kept, found.size)
-                return replace(lift(fragments, found.proxy, shape.capacity, kept, found.size), settled=settled)
+                settled, size = None, found.size
+                if size is None and needed is not None:
+                    # Vertices that were looked at as a part of θ need not be looked at again.
+                    read = any(np.may_share_memory(x, found.proxy.vertices) for x in leaves(inputs))
+                    size = needed.size if read and needed.size is not None else largest(found.proxy.vertices)
+                if needed is not None and needed.settles and cells is None and size is not None:
+                    settled = needed.settled(covered, fragments.depth, kept, size)
+                return replace(lift(fragments, found.proxy, shape.capacity, kept, size), settled=settled)
             lifted = lift(fragments, found.proxy, None, kept)
             samples, _ = refined(surface, inputs, lifted, camera, tables, shape.view, cells)
             return repack(samples, samples.row >= 0, shape.capacity)

@@ -159,6 +159,8 @@ def _accumulate(
             loaded[:] = -9
             changing = False
             for y in range(top * fine, bottom * fine):
+                if len(fields[1]) > 0 and not _counts(fields[1][y // fine, own : own + pixels]):
+                    continue
                 at = y + border, left + border
                 moving_row = busy(choices.states, *at, count, least) or busy(choices.mixed, *at, count, 1)
                 if moving_row:
@@ -263,6 +265,16 @@ def _move_lines(change, rgba, row, crossings, tangents, border, y, left, count):
             change_of(pixel, d, crossings, rgba, row, y + border, t_positions[n], t_rgba[n])
             for c in range(4):
                 change[n, c * PITCH + j] = pixel[c]
+
+
+@compiled
+def _counts(weights):
+    """Whether any weight (·, C) is not zero."""
+    some = False
+    for j in range(len(weights)):
+        for c in range(weights.shape[1]):
+            some |= weights[j, c] != 0
+    return some
 
 
 @compiled
