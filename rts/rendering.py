@@ -17,7 +17,7 @@ from rts.engines import constants, engine_of, is_constant, namespace, suiting, s
 from rts.errors import EmptyImageWarning, InputError, warn
 from rts.evaluating import to_fine_splats, to_splats
 from rts.interfaces import Part, Splatter
-from rts.operations.take import take
+from rts.operations.inset import averaged, with_inset
 from rts.records import Sampled, Splats
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.emptiness import why_empty
@@ -247,7 +247,9 @@ def _narrowed(sampled: Sampled, cells: int) -> Sampled:
     settled = None if sampled.settled is None else sampled.settled[rows, columns]
     fine = sampled.fine  # Its own apron may be wider than is needed.
     fine = None if fine is None else replace(fine, coarse=fine.coarse[rows, columns])
-    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, fine=fine, settled=settled)
+    facing = None if sampled.facing is None else sampled.facing[:, rows, columns]
+    known = {"fine": fine, "facing": facing, "settled": settled}
+    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, **known)
 
 
 def _splatted(
@@ -271,29 +273,21 @@ def _splatted(
     if splats is None:
         splats = to_splats(sampled, scene.parts, scene.camera, window, *suited)
     if sampled.fine is None:
-        return _averaged(splatter, splats, sampled.supersample)
+        image = _cropped(splatter, splats)
+        return image if sampled.supersample == 1 else averaged(image, sampled.supersample)
     coarse = constants(sampled.fine.coarse, *suiting(splats.rgba))
-    image = _averaged(splatter, splats.replace(wanted=coarse), 1)
-    splats = to_fine_splats(sampled.fine, scene.parts, scene.camera, *suited)
-    finer = _averaged(splatter, splats, sampled.fine.supersample)
-    engine, xp = engine_of(image), namespace(image)
-    pixel = constants(sampled.fine.pixel, engine, image)
-    rows = take(xp.reshape(finer, (-1, 4)), xp.reshape(xp.where(pixel >= 0, pixel, 0), (-1,)))
-    return xp.where((pixel >= 0)[..., None], xp.reshape(rows, image.shape), image)
+    image = _cropped(splatter, splats.replace(wanted=coarse))
+    finer = _cropped(splatter, to_fine_splats(sampled.fine, scene.parts, scene.camera, *suited))
+    return with_inset(image, finer, constants(sampled.fine.pixel, engine_of(image), image), sampled.fine.supersample)
 
 
-def _averaged(splatter: Splatter, splats: Splats, side: int) -> Array:
-    """The image (h, w, 4) of splats without their border, each pixel the mean of `side`² cells."""
+def _cropped(splatter: Splatter, splats: Splats) -> Array:
+    """The image (h, w, 4) of splats without their border."""
     image = splatter.cropped(splats)
     expected = *(n - 2 * splats.border for n in splats.row.shape[1:]), 4
     if shape_of(image) != expected:
         raise InputError(f"the image of {splatter!r} {described(image)}; expected {expected} without the border")
-    if side == 1:
-        return image
-    # One axis after the other: over both at once, torch takes three times as long.
-    xp, (height, width) = namespace(image), (n // side for n in image.shape[:2])
-    rows = xp.mean(xp.reshape(image, (height, side, width * side * 4)), axis=1)
-    return xp.mean(xp.reshape(rows, (height, width, side, 4)), axis=2)
+    return image
 
 
 def _bands(

@@ -4,54 +4,29 @@ import itertools
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, TORCH, arrays, derivative, gradient, icosphere, quad, to_numpy
-from loops import STEPS, Pairing
+from adaptive_scenes import (
+    BALL,
+    CAMERA,
+    CARD,
+    FACES,
+    FAR_FACES,
+    MESH,
+    SIZE,
+    activate,
+    apart,
+    random_mask,
+    render,
+    scene,
+)
+from helpers import TORCH, arrays, derivative, gradient, icosphere, quad, to_numpy
 
 import rts
 from rts import Adaptive
 from rts.fitting.least_squares import normal_equations
 from rts.interfaces import Sampler
-from rts.sampling import fine, tiles
-from rts.sampling.adaptive import outlines
 from rts.splatting import Multi
-from rts.splatting.layers import dilated
 
 pytestmark = pytest.mark.splatting
-
-MESH = rts.plugin("rts.surfaces", "mesh")
-CAMERA = rts.Camera.look_at((0.4, 0.5, 3.2), (0, 0, 0))
-SIZE = (21, 26)
-BALL, FACES = icosphere(2, 0.8)
-CARD, CARD_FACES = quad(-0.9, 0.7, -0.2, 1.1, -0.4)
-FAR, FAR_FACES = quad(-40.0, 40.0, -30.0, -9.0, -60.0)
-
-
-def scene(vertices=BALL, shader="unlit"):
-    """A ball before a card before a far card; colours vary."""
-    part = rts.Part(MESH(FACES), {"vertices": vertices, "colors": (BALL + 1) / 2}, shader)
-    cards = [(CARD, CARD_FACES, (0.2, 0.9, 0.4)), (FAR, FAR_FACES, (0.9, 0.3, 0.1))]
-    return [part, *(rts.Part(MESH(f), {"vertices": v, "color": np.array(c)}, shader) for v, f, c in cards)]
-
-
-def render(parts, supersample, **options):
-    return rts.render(parts, CAMERA, SIZE, supersample=supersample, **{"layers": 3, **options})
-
-
-def activate(monkeypatch, mask):
-    """Make a mask of pixels (H, W) the active ones."""
-    monkeypatch.setattr(fine, "active", lambda *_: np.ascontiguousarray(mask))
-
-
-def random_mask(seed=0, share=0.3):
-    return np.random.default_rng(seed).random(SIZE) < share
-
-
-def apart(parts, mask, s, atol=1e-6, **options):
-    """Compare an adaptive image with the finer one at active pixels, and with the plain one at the others."""
-    found = to_numpy(render(parts, Adaptive(s), **options))
-    finer, plain = (to_numpy(render(parts, n, **options)) for n in (s, 1))
-    np.testing.assert_allclose(found[mask], finer[mask], rtol=0, atol=atol)
-    np.testing.assert_allclose(found[~mask], plain[~mask], rtol=0, atol=atol)
 
 
 # ------------------------------------------------------------------------------------------ two images, put together
@@ -85,14 +60,16 @@ def test_gradients_are_those_of_either_image(target, splatter, monkeypatch):
             np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3 * max(1, np.abs(expected).max()))
 
 
-def test_engines_agree():
-    weights = np.random.default_rng(1).normal(size=(*SIZE, 4))
+@pytest.mark.parametrize("count, compiled", [(1, False), (2, True)])
+def test_engines_agree(count, compiled):
+    jax, weights = pytest.importorskip("jax"), np.random.default_rng(1).normal(size=(*SIZE, 4))
 
     def loss(target):
         weigh = arrays(target, weights)
-        return lambda v: (render(scene(v)[:2], Adaptive(3)) * weigh).sum()
+        return lambda v: (render(scene(v)[:count], Adaptive(3)) * weigh).sum()
 
-    found, expected = (gradient(t, loss(t), arrays(t, BALL)) for t in ("jax", TORCH[0]))
+    found = (jax.jit if compiled else lambda f: f)(jax.grad(loss("jax")))(arrays("jax", BALL))
+    expected = gradient(TORCH[0], loss(TORCH[0]), arrays(TORCH[0], BALL))
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3 * np.abs(expected).max())
 
 
@@ -140,7 +117,7 @@ def test_samplers_that_know_no_lists_serve_too(monkeypatch):
     apart(scene(), mask, 3, sampler=Whole())
 
 
-@pytest.mark.parametrize("name", [n for n in rts.plugins("rts.surfaces") if n != "radiance_field"])
+@pytest.mark.parametrize("name", rts.plugins("rts.surfaces"))
 def test_every_surface_is_that_of_the_finer_image(name, monkeypatch):
     target = TORCH[0]
     part = rts.plugin("rts.surfaces", name).example()
@@ -166,93 +143,6 @@ def test_every_surface_is_that_of_the_finer_image(name, monkeypatch):
         for n in (Adaptive(2), 2)
     ]
     np.testing.assert_allclose(found[0], found[1], rtol=0, atol=2e-3 * np.abs(found[1]).max())
-
-
-# ---------------------------------------------------------------------------------------------- which pixels are active
-
-
-def two_sheets(seed):
-    """Rows and depths (K, H, W) of rough sheets with holes, in two layers."""
-    rng = np.random.default_rng(seed)
-    height, width = 9, 11
-    y, x = np.indices((height, width))
-    sheets = np.stack([3 + 0.2 * x + 0 * y, 3.9 + 0.1 * y, 5 - 0.15 * x])
-    sheets = np.where(rng.random(sheets.shape) < 0.4, np.inf, sheets)
-    depth = np.sort(sheets, axis=0)[:2]
-    covered = np.isfinite(depth)
-    row = np.where(covered, np.cumsum(covered).reshape(covered.shape) - 1, -1).astype(np.int32)
-    return row, np.where(covered, depth, 0)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_active_are_cells_at_either_side_of_where_fronts_end(seed):
-    row, depth = two_sheets(seed)
-    positions = np.zeros((row.max() + 1, 3))
-    positions[row[row >= 0], 2] = depth[row >= 0]
-    pairing = Pairing(positions, row, visible=True)
-    expected = np.zeros(row.shape[1:], bool)
-    for (y, x), (u, v) in itertools.product(pairing.cells, STEPS):
-        if (u, v) != (0, 0) and pairing.ends((y, x), (u, v)):
-            expected[y, x] = expected[y + v, x + u] = True
-    found = outlines(row, depth, [positions.shape[0]])
-    np.testing.assert_array_equal(found, expected)
-    assert 0.2 < found.mean() < 1
-
-
-def test_where_another_part_is_seen_both_sides_are_active():
-    row = np.arange(30, dtype=np.int32).reshape(1, 5, 6)
-    found = outlines(row, np.ones(row.shape), [15, 15])
-    np.testing.assert_array_equal(np.flatnonzero(found), np.arange(8, 22))  # It changes amid the third row.
-    assert not outlines(row, np.ones(row.shape), [30]).any()
-
-
-def test_dilation_reaches_the_eight_neighbours():
-    cells = np.zeros((5, 6), bool)
-    cells[2, 1] = True
-    expected = np.zeros((5, 6), bool)
-    expected[1:4, :3] = True
-    np.testing.assert_array_equal(dilated(cells), expected)
-
-
-def test_masks_are_dilated_for_shaders_of_more_than_one_colour_a_part():
-    def active(shader, adaptive):
-        sampled = rts.sample(scene(shader=shader), CAMERA, SIZE, supersample=adaptive, layers=3)
-        return sampled.fine.pixel >= 0
-
-    bare = active("silhouette", Adaptive(4))
-    np.testing.assert_array_equal(active("unlit", Adaptive(4)), active("silhouette", Adaptive(4, dilated=True)))
-    np.testing.assert_array_equal(active("unlit", Adaptive(4, dilated=False)), bare)
-    inner = dilated(bare)[1:-1, 1:-1]
-    np.testing.assert_array_equal(active("unlit", Adaptive(4))[1:-1, 1:-1], inner)
-
-
-def steps_of_colour():
-    """A card whose left half is dark and whose right half is bright, over all of the image."""
-    vertices, faces = quad(-9, 9, -9, 9)
-
-    def shader(theta, gbuffer, camera):
-        xp = rts.namespace(gbuffer["position"])
-        grey = xp.where(gbuffer["position"][:, :1] < 0.13, 0.1, 0.9)
-        return xp.concat([grey, grey, grey, xp.ones_like(grey)], axis=1)
-
-    return rts.Part(MESH(faces), {"vertices": vertices}, shader)
-
-
-def test_contrast_finds_edges_of_colour():
-    part = steps_of_colour()
-    images = [render(part, n) for n in (1, 4, Adaptive(4), Adaptive(4, contrast=0.2))]
-    plain, fine, by_outlines, by_contrast = images
-    np.testing.assert_array_equal(by_outlines, plain)
-    changed = np.abs(by_contrast - plain).max(axis=-1) > 0
-    assert changed.any() and np.abs(by_contrast - fine).max() < np.abs(plain - fine).max() / 3
-
-
-def test_contrast_is_refused_where_colours_are_not_known():
-    with pytest.raises(rts.InputError, match="rts.sample knows no colours"):
-        rts.sample(scene(), CAMERA, SIZE, supersample=Adaptive(4, contrast=0.2))
-    jax = pytest.importorskip("jax")
-    with pytest.raises(rts.InputError, match="colours are traced"):
-        jax.jit(lambda v: render(scene(v), Adaptive(4, contrast=0.2)))(arrays("jax", BALL))
 
 
 # --------------------------------------------------------------------------------------------------- derivatives
@@ -358,116 +248,6 @@ def test_depths_beyond_active_pixels_make_no_difference():
     assert 0.1 < mask.mean() < 0.9 and deepest[0] > 1.2 * deepest[1]
 
 
-# ------------------------------------------------------------------------------------------------ what is sampled
-
-
-@pytest.mark.parametrize("s", [2, 4, 8])
-def test_fine_samples_are_those_of_active_pixels_and_their_apron(s, monkeypatch):
-    mask = random_mask(10, 0.05)
-    activate(monkeypatch, mask)
-    part = scene()[0]
-    sampled = rts.sample(part, CAMERA, SIZE, supersample=Adaptive(s), layers=1, splatter="visible")
-    dense = rts.sample(part, CAMERA, SIZE, supersample=s, layers=1, splatter="visible")
-    apron, needed = dense.apron, np.zeros(dense.row.shape[1:], bool)
-    for y, x in np.argwhere(mask):
-        needed[y * s : (y + 1) * s + 2 * apron, x * s : (x + 1) * s + 2 * apron] = True
-    hits = int((dense.row[0] >= 0)[needed].sum())
-    (samples,) = sampled.fine.samples
-    assert len(samples.ids) == hits == (samples.row >= 0).sum() and int(sampled.fine.overflow) == 0
-    assert sampled.fine.index.max() == hits - 1 and (sampled.fine.pixel >= 0).sum() == mask.sum()
-
-
-def test_hidden_samples_that_cannot_be_seen_are_left_out():
-    sampled = rts.sample(scene(), CAMERA, SIZE, supersample=Adaptive(4), layers=3, splatter="visible")
-    whole = rts.sample(scene(), CAMERA, SIZE, supersample=Adaptive(4), layers=3)
-    count, most = (sum((s.row >= 0).sum() for s in x.fine.samples) for x in (sampled, whole))
-    assert count < 0.9 * most
-
-
-def test_pixels_without_room_stay_coarse_and_are_counted():
-    jax = pytest.importorskip("jax")
-
-    def scene(v):
-        return rts.Part(MESH(FACES), {"vertices": v})
-
-    parts = scene(BALL)
-    plain = render(parts, 1)
-    most = (rts.sample(parts, CAMERA, SIZE, supersample=Adaptive(4), layers=3).fine.pixel >= 0).sum()
-
-    def find(v, capacity):
-        return rts.sample(scene(v), CAMERA, SIZE, supersample=Adaptive(4), layers=3, capacity=capacity)
-
-    kept = []
-    for capacity in (1500, 8000, 60000):
-        traced = jax.jit(find, static_argnums=1)(arrays("jax", BALL), capacity)
-        for sampled in (find(BALL, capacity), traced):
-            active = np.asarray(sampled.fine.pixel) >= 0
-            assert active.sum() + int(sampled.fine.overflow) == most and sampled.overflow >= sampled.fine.overflow
-            image = np.asarray(rts.render_samples(sampled, parts, CAMERA))
-            np.testing.assert_allclose(image[~active], plain[~active], atol=1e-5)
-        kept.append(active.sum())
-    assert kept[0] < kept[1] < kept[2] == most
-
-
-@pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_batches_give_the_same(target):
-    stretched = np.stack([BALL, 0.7 * BALL])
-
-    def scene(v):
-        return rts.Part(MESH(FACES), {"vertices": v})
-
-    expected = [render(scene(v), Adaptive(2)) for v in stretched]
-    if target == "jax":
-        jax = pytest.importorskip("jax")
-        batched = jax.vmap(lambda v: render(scene(v), Adaptive(2)))(arrays("jax", stretched))
-    else:
-        torch = pytest.importorskip("torch")
-        batched = torch.vmap(lambda v: render(scene(v), Adaptive(2)))(arrays(target, stretched))
-    np.testing.assert_allclose(to_numpy(batched), np.stack(expected), atol=2e-5)
-
-
-def test_as_many_layers_as_count():
-    found, expected = (render(scene(), Adaptive(3), layers=k) for k in ("auto", 6))
-    np.testing.assert_allclose(found, expected, atol=1e-6)
-
-
-def test_prepared_parts_and_backgrounds():
-    background = np.random.default_rng(11).random((*SIZE, 3))
-    found, expected = (render(parts, Adaptive(3), background=background) for parts in (rts.prepare(scene()), scene()))
-    np.testing.assert_array_equal(found, expected)
-    bare = render(scene(), Adaptive(3))
-    np.testing.assert_allclose(expected[..., :3], bare[..., :3] + (1 - bare[..., 3:]) * background, atol=1e-6)
-
-
-def test_what_is_sampled_is_rendered():
-    sampled = rts.sample(scene(), CAMERA, SIZE, supersample=Adaptive(3), layers=3)
-    assert sampled.supersample == 1 and sampled.fine.supersample == 3
-    for splatter in ("visible", "single"):  # One that reaches as far, and one that does not.
-        found = rts.render_samples(sampled, scene(), CAMERA, splatter=splatter)
-        np.testing.assert_allclose(found, render(scene(), Adaptive(3), splatter=splatter), atol=1e-6)
-
-
-def test_an_empty_view_has_a_gradient_of_zero():
-    part = rts.Part(MESH(FACES), {"vertices": arrays(TORCH[0], BALL + [0, 0, 90])})
-    with pytest.warns(rts.EmptyImageWarning):
-        found = gradient(
-            TORCH[0],
-            lambda v: render(rts.Part(MESH(FACES), {"vertices": v}), Adaptive(3)).sum(),
-            part.theta["vertices"],
-        )
-    assert not found.any()
-
-
-def test_memory_is_that_of_the_outlines():
-    """At 8 × 8 the finer image has fifty times as many samples."""
-    vertices, faces = icosphere(3)
-    part = rts.Part(MESH(faces), {"vertices": vertices})
-    sampled = rts.sample(part, CAMERA, (128, 128), supersample=Adaptive(8), splatter="visible")
-    grid = tiles.Grid((128, 128), 8, sampled.fine.apron).fine
-    assert sampled.fine.row[0].size < 0.25 * grid[0] * grid[1]
-    assert sum(len(s.ids) for s in sampled.fine.samples) < 0.1 * grid[0] * grid[1]
-
-
 # ------------------------------------------------------------------------------------------------- where it is used
 
 
@@ -527,21 +307,3 @@ def test_explain_counts_pixels_and_samples():
     assert choice.samples == choice.fine + len(sampled.samples[0].ids)
     (plain,) = rts.explain(part, CAMERA, SIZE)
     assert plain.samples == len(sampled.samples[0].ids) and plain.active is plain.fine is None
-
-
-@pytest.mark.parametrize(
-    "wrong, told",
-    [
-        ({"samples": 1}, "samples of Adaptive is 1; expected an integer of at least 2"),
-        ({"samples": 2.5}, "samples of Adaptive is 2.5"),
-        ({"samples": 4, "dilated": 1}, "dilated of Adaptive is 1; expected True, False or None"),
-        ({"samples": 4, "contrast": 0}, "contrast of Adaptive is 0; expected a positive number"),
-    ],
-)
-def test_what_cannot_be_is_refused(wrong, told):
-    with pytest.raises(rts.InputError, match=told):
-        Adaptive(**wrong)
-
-
-def test_it_is_a_static_value():
-    assert Adaptive(4) == Adaptive(np.int64(4)) != Adaptive(4, dilated=True) and len({Adaptive(4), Adaptive(4)}) == 1

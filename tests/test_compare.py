@@ -24,6 +24,7 @@ from rts.diagnostics.tune import tune
 from rts.engines import engine_named
 from rts.errors import InputError, PluginError, ToleranceWarning
 from rts.registry import plugin
+from rts.sampling.adaptive import as_text, finest
 
 pytestmark = pytest.mark.rendering
 pytest.importorskip("torch")
@@ -49,6 +50,7 @@ def scene(*modes):
 
 
 TRUTH = dict(truth_samples=6, progress=False)
+EVERY = [1, 2, 3, 4, rts.Adaptive(4)]
 SMALL = dict(**TRUTH, engines=["torch"], samplers=["raster"], supersample=[1, 2], layers=[1, 2], peers=False)
 
 
@@ -327,6 +329,14 @@ class TestCompare:
         (row,) = comparison.rows
         assert row["error"] < 0.5 and row["ms"]["median"] > 0
 
+    def test_samples_at_outlines(self, kept):
+        options = {**SMALL, "layers": [2], "splatters": ["visible"]}
+        samples = [1, 4, rts.Adaptive(4), rts.Adaptive(4, dilated=False)]
+        comparison = compare(scene("translation"), truths=kept, **{**options, "supersample": samples})
+        errors = {row["settings"]["supersample"]: row["error"] for row in comparison.rows}
+        assert list(errors) == [1, 4, "adaptive:4", "adaptive:4:dilated=False"]
+        assert errors["adaptive:4"] == pytest.approx(errors[4], rel=0.2) and errors["adaptive:4"] < 0.6 * errors[1]
+
     def test_auto_layers(self, kept):
         options = {**SMALL, "supersample": [1], "layers": ["auto", 4, 1], "splatters": ["visible"]}
         comparison = compare(scene("translation"), truths=kept, **options)
@@ -457,7 +467,7 @@ def modelled(monkeypatch):
     samplers = {"raster": 1.0, "embree": 2.0, "opengl": 3.0, "reference": 5.0, "toy": 50.0}
 
     def cost(setting):
-        return costs[setting.splatter] * setting.layers**0.3 * setting.supersample**2 * samplers[setting.sampler]
+        return costs[setting.splatter] * setting.layers**0.3 * setting.side**2 * samplers[setting.sampler]
 
     def timed(self, name):
         assert callable(self.calls[name]())
@@ -475,7 +485,7 @@ class TestTune:
         tuned = tune(scene(*modes), tolerance=tolerance, **TRUTH, **options)
         whole = compare(
             scene(*modes),
-            **{**SMALL, "layers": [1, 2, 4], "supersample": [1, 2, 3, 4], "splatters": options["splatters"]},
+            **{**SMALL, "layers": [1, 2, 4], "supersample": EVERY, "splatters": options["splatters"]},
             truths=kept,
         )
         worst = {}
@@ -484,7 +494,9 @@ class TestTune:
             worst[key] = max(worst.get(key, 0), row["error"])
         within = [Setting(*key, "raster", "torch") for key, error in worst.items() if error <= tolerance]
         best = min(modelled(s) for s in within)
-        chosen = Setting(**{**tuned.settings, "engine": "torch"})
+        samples = tuned.settings["supersample"]
+        samples = as_text(samples) if isinstance(samples, rts.Adaptive) else samples
+        chosen = Setting(**{**tuned.settings, "supersample": samples, "engine": "torch"})
         assert modelled(chosen) == pytest.approx(best)
         assert tuned.error == pytest.approx(max(worst[tuple(chosen)[:4]], 0), rel=1e-6)
         assert tuned.seconds == pytest.approx(best / 1e3)
@@ -493,7 +505,7 @@ class TestTune:
     def test_nothing_is_within(self, modelled, kept):
         with pytest.warns(ToleranceWarning, match="nothing is within 0.0001 %: the least error that was found"):
             tuned = tune(scene("translation"), tolerance=1e-6, samplers=["raster"], truths=kept, **TRUTH)
-        assert tuned.settings["splatter"] == "visible" and tuned.settings["supersample"] >= 3
+        assert tuned.settings["splatter"] == "visible" and finest(tuned.settings["supersample"]) >= 3
         assert tuned.error > 1e-6
 
     def test_bounds_are_no_errors(self, monkeypatch, modelled, kept):
@@ -543,7 +555,7 @@ class TestTune:
             engine = SimpleNamespace(name="torch")
 
             def work(self, group, setting):
-                return min(setting.layers, 3), setting.supersample, 1.0
+                return min(setting.layers, 3), setting.side, 1.0
 
             def scores(self, mode, setting):
                 return {"error": 0.05 if setting.supersample == 4 else 1.0}
@@ -681,13 +693,15 @@ def model(tmp_path, monkeypatch, kept):
 
 class TestCommandLine:
     def test_compare(self, model, tmp_path):
-        code, told = run("compare", model, "--quick", "--size", SIDE, "-o", tmp_path / "out")
+        samples = ["--supersample", "1", "--supersample", "adaptive:2"]
+        code, told = run("compare", model, "--quick", "--size", SIDE, *samples, "-o", tmp_path / "out")
         assert code == 0, told
         assert "fastest settings by the error of derivatives" in told and "translation" in told
         assert [p.suffix for p in sorted((tmp_path / "out").glob("model.*"))] == [".html", ".json", ".png"]
         rows = json.loads((tmp_path / "out" / "model.json").read_text())["rows"]
         assert {r["mode"] for r in rows} == {"translation"} and len(rows) <= 40
         assert {r["settings"]["engine"] for r in rows if r["ms"]} == {"torch"}
+        assert {r["settings"]["supersample"] for r in rows} == {1, "adaptive:2"}
 
     def test_list(self):
         code, told = run("compare", "list")

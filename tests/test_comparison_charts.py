@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import PROPERTIES
 
+import rts
 from rts import InputError, PluginError
 from rts.diagnostics.comparison import style
 from rts.diagnostics.comparison.chart import draw
@@ -138,6 +139,9 @@ def test_settings_are_named_in_short_and_as_arguments():
     text = style.arguments(ours)
     assert text == 'sampler="raster", splatter="visible", layers="auto", supersample=2  # torch, tolerance=0.4'
     assert eval(f"dict({text}\n)") == {"sampler": "raster", "splatter": "visible", "layers": "auto", "supersample": 2}
+    adaptive = row("a", 1, 1.0, supersample="adaptive:8:dilated=False")
+    assert style.label(adaptive) == "visible K=2 adaptive 8×8 dilated=False raster torch"
+    assert eval(f"dict({style.arguments(adaptive)}\n)")["supersample"] == rts.Adaptive(8, dilated=False)
     peer = row("a", 1, 1.0, peer="Mitsuba", spp=16)
     assert (style.label(peer), style.arguments(peer)) == ("Mitsuba spp=16", "# Mitsuba, spp=16")
 

@@ -6,6 +6,7 @@ from helpers import ALL, DIFFERENTIABLE, arrays, derivative, finite_difference, 
 
 import rts
 from rts.operations.combine import COMBINE, combine, interpolate
+from rts.operations.inset import with_inset
 from rts.operations.linear import affine_map, matmul
 from rts.operations.projection import projective_map
 from rts.operations.take import take
@@ -101,6 +102,31 @@ def test_combine_refuses_what_does_not_fit_in_one_line():
     for target in ALL:
         with pytest.raises(rts.InputError, match="refer to row 9 of 4 rows; sample this surface anew"):
             to_numpy(combine(*arrays(target, (rows, ids + 9, weights))))
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_an_inset_is_the_mean_of_cells_where_there_is_one(target):
+    image, fine = RNG.normal(size=(3, 4, 2)), RNG.normal(size=(4, 6, 2))
+    pixel = np.array([[-1, 5, 0, -1], [-1, -1, 1, -1], [4, -1, -1, -1]], np.int32)
+
+    def expected(image, fine):
+        means = fine.reshape(2, 2, 3, 2, 2).mean(axis=(1, 3)).reshape(6, 2)
+        return np.where((pixel >= 0)[..., None], means[np.maximum(pixel, 0)], image)
+
+    places = arrays(target, pixel)
+    put = lambda x: with_inset(x[0], x[1], places, 2)  # noqa: E731
+    given = list(arrays(target, (image, fine)))
+    np.testing.assert_allclose(to_numpy(put(given)), expected(image, fine), atol=1e-6)
+    if target == "numpy":
+        return
+    moves, factors = [RNG.normal(size=x.shape) for x in (image, fine)], RNG.normal(size=image.shape)
+    along = derivative(target, put, given, list(arrays(target, moves)))[1]
+    np.testing.assert_allclose(along, expected(*moves), atol=1e-6)
+    pulled = gradient(target, lambda x: (put(x) * arrays(target, factors)).sum(), given)
+    np.testing.assert_allclose(
+        sum((a * b).sum() for a, b in zip(pulled, moves, strict=True)), (factors * along).sum(), rtol=1e-4
+    )
+    assert (np.abs(pulled[1]).max(axis=2) > 0).sum() == 4 * 4
 
 
 @pytest.mark.parametrize("target", ALL)

@@ -105,6 +105,18 @@ def test_weighted_targets_keep_the_sum_of_squares_but_for_a_constant(target):
     assert coarse(one) - coarse(other) == pytest.approx(fine(one) - fine(other), rel=1e-4)
 
 
+def test_stages_may_take_samples_where_outlines_are():
+    whole = turned((57, 43))
+    fine, plain, adaptive = (whole.at_stage(rts.Stage(0.2, supersample=s)) for s in (4, 1, rts.Adaptive(4)))
+    assert adaptive.supersample == rts.Adaptive(4) and whole.at_stage(rts.Stage(0.2)).supersample == whole.supersample
+    np.testing.assert_allclose(adaptive(POSE), fine(POSE), atol=2e-6)
+    assert np.abs(plain(POSE) - fine(POSE)).max() > 0.05
+    torch = pytest.importorskip("torch")
+    schedule = [rts.Stage(0.25, supersample=rts.Adaptive(4)), rts.Stage(supersample=rts.Adaptive(2))]
+    fit = rts.fit(whole, torch.zeros(6), method="lm", schedule=schedule, steps=9)
+    assert fit.loss < 0.1 * float((whole(np.zeros(6)) ** 2).mean())
+
+
 @pytest.mark.parametrize("channels", [1, 3, 4])
 @pytest.mark.parametrize("aspect", [None, 43 / 57])
 def test_a_stage_sees_what_the_whole_image_sees(channels, aspect):
@@ -264,6 +276,7 @@ def test_residuals_of_ones_own_have_stages(method):
         ({"scale": float("nan")}, r"scale is nan; expected a share"),
         ({"supersample": 0}, r"supersample is 0; expected an integer"),
         ({"supersample": 1.5}, r"supersample is 1.5; expected an integer"),
+        ({"supersample": "adaptive"}, r"supersample is 'adaptive'; expected an integer of at least 1, an rts.Adaptive"),
         ({"sigma": -1}, r"sigma is -1; expected a number of pixels"),
         ({"sigma": float("inf")}, r"sigma is inf; expected a number of pixels"),
         ({"sigma": "wide"}, r"sigma is 'wide'; expected a number of pixels"),

@@ -97,7 +97,7 @@ class ImageResiduals(Residuals):
         self._target, self._channels = _checked_target(target, self.size)
         self._weights = _checked_weights(weights, self._target.shape, self.size)
         self._background = check_background(background, self.size)
-        self.supersample = supersample if isinstance(supersample, Adaptive) else int(supersample)
+        self.supersample = _checked_supersample(supersample)
         self._sampling: dict[str, Any] = {"sampler": check_sampler(sampler), "layers": layers, "capacity": capacity}
         self._full, self._sigma = self.size, 0.0
 
@@ -134,7 +134,7 @@ class ImageResiduals(Residuals):
         """
         made = copy(self)
         made._sigma = float(stage.sigma)
-        made.supersample = self.supersample if stage.supersample is None else int(stage.supersample)
+        made.supersample = self.supersample if stage.supersample is None else _checked_supersample(stage.supersample)
         made.size = stage.size(self.size)
         if made.size != self.size:
             made._target, made._weights = _shrunk(self._target, self._weights, made.size)
@@ -232,13 +232,13 @@ class ImageResiduals(Residuals):
                 **fields._asdict(),
             )
 
-        known = {"row": sampled.row, "part": sampled.part, "settled": sampled.settled}
+        known = {"row": sampled.row, "part": sampled.part, "facing": sampled.facing, "settled": sampled.settled}
         if sampled.fine is None:
             return swept(partial(to_splats, sampled), fields, **known)
         # A pixel counts on one of the grids alone.
         fine = sampled.fine
         coarse, finer = _split(fields, constants(fine.pixel, engine, vector), fine)
-        placed = {"row": fine.row, "part": fine.part, "wanted": fine.wanted}
+        placed = {"row": fine.row, "part": fine.part, "facing": fine.facing, "wanted": fine.wanted}
         found = (
             swept(partial(to_splats, sampled), coarse, **known, wanted=fine.coarse),
             swept(lambda parts, camera, _, *suited: to_fine_splats(fine, parts, camera, *suited), finer, **placed),
@@ -296,6 +296,10 @@ def _split(fields: _Fields, pixel: Array, fine: Fine) -> tuple[_Fields, _Fields]
     background = None if fields.background is None else laid_out(fields.background)
     coarse = fields._replace(weights=xp.where((pixel >= 0)[..., None], 0.0, weights))
     return coarse, _Fields(laid_out(fields.target), laid_out(weights), background)
+
+
+def _checked_supersample(given: Any) -> int | Adaptive:
+    return given if isinstance(given, Adaptive) else int(given)
 
 
 def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tuple[Array, Array | None]:

@@ -188,9 +188,8 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: AnyNeeded | None)
             f'layers="auto"; give a larger number if their derivative matters',
             LayersWarning,
         )
-    return replace(
-        sampled, row=sampled.row[:kept, ...], depth=sampled.depth[:kept, ...], overflow=sampled.overflow + missing
-    )
+    row, depth, facing = (None if x is None else x[:kept, ...] for x in (sampled.row, sampled.depth, sampled.facing))
+    return replace(sampled, row=row, depth=depth, facing=facing, overflow=sampled.overflow + missing)
 
 
 def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:

@@ -146,7 +146,8 @@ def sampled_scene(
     apron = apron_of(splatter)
     sizes = [entry.size if isinstance(entry, Entry) else None for entry in scene.entries]
     needed = None if splatter is None else needed_by(splatter, scene.parts, sizes, settles)
-    taken = partial(_taken, scene, _widened(scene, camera, (height, width), apron), capacity=capacity)
+    wide = _widened(scene, camera, (height, width), apron)
+    taken = partial(_taken, scene, wide, capacity=capacity, facing=_reads_facing(splatter))
     sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)
     return replace(sampled, supersample=side, apron=apron)
 
@@ -175,6 +176,7 @@ def _taken(
     *,
     capacity: int | None,
     cells: Array | None = None,
+    facing: bool = False,
 ) -> Sampled:
     """The samples of a grid of cells, or of those that are listed; less what is not needed."""
     samples, pruned, listed = [], False, {} if cells is None else {"cells": cells}
@@ -185,6 +187,8 @@ def _taken(
         if cells is not None and not chosen.takes_cells:
             samples.append(at_cells(chosen.sample(part, seen, wide.grid, count, **known), cells, capacity))
             continue
+        if facing and chosen.tells_facing:
+            known["facing"] = True
         if needed is not None and chosen.prunes:
             pruned = len(scene.parts) == 1
             known["needed"] = needed if pruned else Everything(needed)
@@ -211,7 +215,8 @@ def fine_scene(
     wide = _widened(scene, camera, (grid.side * size[0], grid.side * size[1]), grid.apron)
     needed = None if splatter is None else needed_by(splatter, scene.parts)
     where = Where(adaptive, adaptive.dilates(scene.parts), colors)
-    return fine_samples(coarse, grid, where, partial(_taken, scene, wide), needed, layers, capacity)
+    take = partial(_taken, scene, wide, facing=_reads_facing(splatter))
+    return fine_samples(coarse, grid, where, take, needed, layers, capacity)
 
 
 def apron_of(splatter: Splatter | None) -> int:
@@ -221,3 +226,8 @@ def apron_of(splatter: Splatter | None) -> int:
     `Visible`, which reaches farthest of the built-in ones.
     """
     return (Visible if splatter is None else splatter).reach + 1
+
+
+def _reads_facing(splatter: Splatter | None) -> bool:
+    """Whether to tell which sides of surfaces are seen; None stands for `Visible`."""
+    return (Visible if splatter is None else splatter).reads_facing

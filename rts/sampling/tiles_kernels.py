@@ -82,10 +82,17 @@ def fill(active, corners, side, tile, apron, across, pitch, most, numbers, cells
 @numba.njit(nogil=True)
 def _spread(local, top, left, side, apron):
     """Mark the cells around a pixel, of which the first is (top, left) without the apron."""
-    local[top : top + side + 2 * apron, left : left + side + 2 * apron] |= np.uint8(4)
-    top, left = top + apron, left + apron
-    local[top - 2 : top + side + 2, left - 2 : left + side + 2] |= np.uint8(NEAR)
-    local[top : top + side, left : left + side] |= np.uint8(WANTED)
+    reach = side + 2 * apron
+    for v in range(reach):
+        row, inside = local[top + v], apron <= v < apron + side
+        near = np.uint8(4 | NEAR) if apron - 2 <= v < apron + side + 2 else np.uint8(4)
+        for u in range(left, left + reach):
+            row[u] |= np.uint8(4)
+        for u in range(left + apron - 2, left + apron + side + 2):
+            row[u] |= near
+        if inside:
+            for u in range(left + apron, left + apron + side):
+                row[u] |= np.uint8(WANTED)
 
 
 @kernel

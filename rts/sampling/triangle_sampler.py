@@ -16,9 +16,10 @@ from rts.errors import InputError
 from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSurface, as_surface
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
+from rts.sampling.facing import facing as facing_of
 from rts.sampling.packing import largest, lift, repack
 from rts.sampling.settling import on_surface, refined
-from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_proxy
+from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
 
 LEAST_LAYERS = 3
@@ -40,8 +41,10 @@ class TriangleSampler(Sampler):
     FLAGS = {"prepare": "builds", "update": "follows"}
     builds: bool = False
     follows: bool = False
+    culls = True
     prunes = True
     takes_cells = True
+    tells_facing = True
     _keeper: Keeper
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
@@ -154,6 +157,7 @@ class TriangleSampler(Sampler):
         needed: AnyNeeded | None = None,
         entry: Entry | None = None,
         cells: Array | None = None,
+        facing: bool = False,
     ) -> Samples:
         """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
 
@@ -166,6 +170,7 @@ class TriangleSampler(Sampler):
             needed: says which samples to keep; None for all.
             entry: what `hold` gave, to be used without a look at the surface's inputs.
             cells: as in `rts.Sampler`.
+            facing: as in `rts.Sampler`; surfaces that move samples off their triangles tell nothing.
 
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
@@ -173,6 +178,8 @@ class TriangleSampler(Sampler):
         surface, theta, camera = _of_triangles(part.surface), part.theta, camera.for_size(size)
         engine, like = suiting(theta, camera)
         shape = _Shape(layers, size if cells is None else tuple(cells.shape), capacity, size)
+        tells = facing and layers > 1 and part.cull == "none" and surface.tells_pieces
+        tells = tells and not (surface.refines and surface.refine_moves)
         listed = [] if cells is None else [cells]
         inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
         reads = {name: theta[name] for name in surface.reads(theta)}
@@ -182,7 +189,6 @@ class TriangleSampler(Sampler):
         asked = None if shader is None else shader.reads
         needed = None if needed is None else adapted(needed, Needed)
         settles = needed is not None and needed.settles and cells is None and not surface.refines
-        known = [ArraySpec(size, np.bool_)] if settles else []
         attributes = _attribute_specs(surface, asked, host_theta, shape, like)
 
         transform = [] if part.transform is None else [part.transform]
@@ -193,7 +199,8 @@ class TriangleSampler(Sampler):
             host_inputs = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
             host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
             host_camera = check_camera(host_camera, *rest[: len(transform)])
-            found = self._found(surface, part.cull, host_inputs, host_camera, shape, tables, needed, entry, host_cells)
+            given = shape, tables, needed, entry, host_cells, tells
+            found = self._found(surface, part.cull, host_inputs, host_camera, *given)
             gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
             return (
                 found.ids,
@@ -201,14 +208,17 @@ class TriangleSampler(Sampler):
                 found.row,
                 found.depth,
                 found.overflow,
+                *([found.facing] if tells else []),
                 *([found.settled] if settles else []),
                 *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
                 *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
             )
 
-        specs = *shape.specs(surface.sample_widths), *known, *tables.values(), *attributes.values()
+        sides = [ArraySpec((layers, *shape.size), np.int16)] if tells else []
+        amid = [ArraySpec(size, np.bool_)] if settles else []
+        specs = *shape.specs(surface.sample_widths), *sides, *amid, *tables.values(), *attributes.values()
         results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *listed, *leaves(inputs))
-        first = 5 + len(known)
+        first = 5 + len(sides) + len(amid)
         rest = first + len(tables)
         return Samples(
             *results[:5],
@@ -217,7 +227,8 @@ class TriangleSampler(Sampler):
             asked=asked,
             centered=surface.centered,
             by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
-            settled=results[5] if settles else None,
+            facing=results[5] if tells else None,
+            settled=results[first - 1] if settles else None,
         )
 
     def _found(
@@ -231,8 +242,9 @@ class TriangleSampler(Sampler):
         needed: Needed | None,
         entry: Entry | None,
         cells: np.ndarray | None,
+        tells: bool,
     ) -> Samples:
-        """The samples that are to be kept, on the host."""
+        """The samples that are to be kept, on the host; if it `tells`, with what faces the viewer."""
         # Of tables there is but one set, so that no samples can be added later.
         more = surface.refines and surface.refine_moves and not tables
         grid = max(shape.layers + 1, LEAST_LAYERS) if more else shape.layers, *shape.size
@@ -247,18 +259,24 @@ class TriangleSampler(Sampler):
         covered = fragments.triangle_ids >= 0
         if not (surface.refines and surface.refine_moves):
             kept = covered if needed is None else needed(covered, fragments.depth)
-            if not surface.refines:
-                settled, size = None, found.size
-                if size is None and needed is not None:
+            settled, size = None, found.size
+            if needed is not None and not surface.refines:
+                if size is None:
                     # Vertices that were looked at as a part of θ need not be looked at again.
                     read = any(np.may_share_memory(x, found.proxy.vertices) for x in leaves(inputs))
                     size = needed.size if read and needed.size is not None else largest(found.proxy.vertices)
-                if needed is not None and needed.settles and cells is None and size is not None:
+                if needed.settles and cells is None:
                     settled = needed.settled(covered, fragments.depth, kept, size)
-                return replace(lift(fragments, found.proxy, shape.capacity, kept, size), settled=settled)
+            sides = None
+            if tells:
+                pieces = checked_pieces(surface, found.proxy)
+                sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
+            if not surface.refines:
+                lifted = lift(fragments, found.proxy, shape.capacity, kept, size)
+                return replace(lifted, facing=sides, settled=settled)
             lifted = lift(fragments, found.proxy, None, kept)
             samples, _ = refined(surface, inputs, lifted, camera, tables, shape.view, cells)
-            return repack(samples, samples.row >= 0, shape.capacity)
+            return replace(repack(samples, samples.row >= 0, shape.capacity), facing=sides)
         given = surface, inputs, fragments, found.proxy, camera, shape.layers, tables, shape.view, cells
         settled = on_surface(*given)
         # `needed` is asked only now, since it goes by the final depths.

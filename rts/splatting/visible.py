@@ -23,7 +23,8 @@ class Visible(Kernel):
 
     Pairing is that of `Multi`, but front layers also pair (s = 0) where one lies on the line through the other and its
     next cell, or off it by less than 0.8 of the smallest of A and B: depth that changes fast, as on the sides of a box
-    near its outline, is nearer to a back face than to itself.
+    near its outline, is nearer to a back face than to itself. Where it is told which side of a surface layers show, a
+    hidden layer does not pair with a front that is the other side of the same sheet.
 
     Each buffer gets at most one layer of a source. An empty target takes the source's front layer, at the surface. A
     covered target takes the source's front layer in front where s > 0, and layer s at the surface where s ≥ 0. Behind
@@ -37,17 +38,21 @@ class Visible(Kernel):
             it moves as the samples, which on a smooth rim that turns move faster. The image is the same.
         crossings: whether lines where two surfaces pass through one another move as their depths say (`crossings.py`);
             otherwise as the samples beside them, which hardly do. The image is the same.
+        reads_facing: whether layers that show opposite sides of one sheet are kept from pairing, where samplers tell
+            sides (`Splats.facing`); otherwise depths alone decide.
     """
 
     epsilon: float = 1e-3
     calibration: float | None = None
     rims: bool = True
     crossings: bool = True
+    reads_facing: bool = True
     reach = 3  # Depths three cells away may decide how an outline or a line of crossing moves.
 
     def accumulate(self, splats: Splats) -> Array:
         """See `Kernel`."""
-        layers, row = Layers(self.weights, splats), splats.row
+        row = splats.row
+        layers = Layers(self.weights, splats, splats.facing if self.reads_facing else None)
         xp, shift = layers.xp, {}
         for n in NEIGHBOURS:
             s, off = layers.pairing(*n)

@@ -16,7 +16,7 @@ import numpy as np
 from rts.errors import InputError
 from rts.splatting import rims
 from rts.splatting.kernel import LEAST_EPSILON
-from rts.splatting.layers import OFFSETS, check_rows, dilated
+from rts.splatting.layers import OFFSETS, check_rows
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only
 from rts_backends.fused import choices as listing
@@ -83,6 +83,7 @@ class Cells:
         row: (K, H, W) signed integers, the sample of each cell, or −1.
         choices: the choices for the same samples, if they are known.
         part: (K, H, W) integers, the part of each sample; None, or no layers, where that is not known.
+        facing: (K, H, W) integers, which piece shows which side; None, or no layers, where that is not told.
         wanted: (H, W) bool, the targets to fill, others may be anything; None, or no rows, for all.
         settled: (H, W) bool, targets that show the colour of all samples, whatever moves; None, or no rows, for none.
 
@@ -98,6 +99,7 @@ class Cells:
         row: np.ndarray,
         choices: Choices | None = None,
         part: np.ndarray | None = None,
+        facing: np.ndarray | None = None,
         wanted: np.ndarray | None = None,
         settled: np.ndarray | None = None,
     ):
@@ -109,6 +111,7 @@ class Cells:
             check_rows(row, len(positions))
         self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
+        self.facing = read_only(self.row[:0] if facing is None else facing, np.int16)
         self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
         self.settled = read_only(np.empty((0, row.shape[2])) if settled is None else settled, np.bool_)
         self.visible, self.border = settings.kind == "visible", settings.border
@@ -170,7 +173,9 @@ class Cells:
             given = self.row, self.visible, beyond, hidden, states
             parallel(listing.find, height, self.positions, *given, marks, counts, work=self.row.size)
             # How an outline moves is decided by pairs up to two cells away.
-            counts = self._of_wanted(marks, counts, 2)
+            if self._wanted is not None:
+                found, marks = marks, np.empty_like(marks)
+                parallel(listing.narrow, height, found, self._wanted, marks, counts, work=self.row[0].size)
             if len(self.settled) and not self.visible:
                 marks &= ~self.settled
                 counts = marks.sum(axis=1, dtype=np.int64)
@@ -180,7 +185,7 @@ class Cells:
         sums = np.empty((offsets[-1], 3, 5), kind)
         if len(columns):
             continued = kind.type(CONTINUED)  # An argument, since compiled code that is cached would keep its value.
-            given = self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states
+            given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states
             arrays = self.positions, self.rgba, self.row, *self._numbers
             parallel(listing.choose, height, *arrays, *given, work=500 * len(columns))
         return Choices(marks, offsets, columns, ranges, sums, states, repeated, extent)
@@ -195,13 +200,13 @@ class Cells:
             listed = choices.mixed, choices.offsets, choices.columns, choices.ranges
             given = self.positions, self.row, self._reach, choices.states, *listed, ends, marks, counts
             parallel(outlines.find, height, *given, work=self.row[0].size)
-            counts = self._of_wanted(marks, counts, 1)
+            if self._wanted is not None:
+                found, marks = marks, np.empty_like(marks)
+                parallel(outlines.narrow, height, found, self._wanted, marks, counts, work=self.row[0].size)
         offsets = np.concatenate([[0], np.cumsum(counts)])
-        # Targets that are listed but not wanted may look at cells for which nothing is decided.
-        make = np.empty if self._wanted is None else np.zeros
         found = Outlines(
-            make((height, width), kind),
-            make((height, width), np.int32),
+            np.empty((height, width), kind),
+            np.empty((height, width), np.int32),
             offsets,
             np.empty(offsets[-1], np.int32),
             np.empty((offsets[-1], 9), np.uint8),
@@ -222,16 +227,6 @@ class Cells:
             return crossings.nothing(self.row.shape[1], self.positions.dtype)
         arrays = self.positions, self.rgba, self.row, *self._numbers
         return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent))
-
-    def _of_wanted(self, marks: np.ndarray, counts: np.ndarray, reach: int) -> np.ndarray:
-        """Clear marks (H, W) that are farther than so many cells from wanted targets; how many each row has then."""
-        if self._wanted is None:
-            return counts
-        near = self._wanted
-        for _ in range(reach):
-            near = dilated(near)
-        marks *= near
-        return marks.sum(axis=1, dtype=np.int64)
 
     @cached_property
     def drawn(self) -> np.ndarray:

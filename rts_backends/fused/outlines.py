@@ -19,6 +19,8 @@ NOTHING, FRONT, JOINED, SURFACE = 0, 1, 2, 3
 """What a source gives to a target: nothing, or coverage of the buffer in front as its outline moves; of that at the
 surface as the target's outline moves; of that at the surface, over nothing, as its own does."""
 
+LISTED, BESIDE = 1, 2
+"""Marks of targets that are listed, and of those whose outline matters to listed ones beside them."""
 
 compiled = numba.njit(nogil=True)
 kernel = numba.njit(nogil=True, cache=True)
@@ -94,6 +96,31 @@ def find(start, stop, positions, row, reach, states, mixed, offsets, columns, ra
                 ends[y, x] = _ends_before_nothing(above, level, below, x) if level[x + 1] & COVERED else 0
         for d in range(offsets[y], offsets[y + 1]):
             ends[y, columns[d]] |= _ends_before_others(ranges[d], row, y, columns[d])
+
+
+@kernel
+def narrow(start, stop, marks, wanted, kept, counts):
+    """Leave out marks of rows [start, stop) that are neither wanted nor beside wanted ones.
+
+    Args:
+        start: first row.
+        stop: end of the rows.
+        marks: (H, W) of `find`.
+        wanted: (H, W) uint8.
+        kept: (H, W) uint8, to be filled with marks.
+        counts: (H,), to be filled with the number of those that are listed.
+    """
+    height, width = marks.shape
+    for y in range(start, stop):
+        counts[y] = 0
+        for x in range(width):
+            kept[y, x] = marks[y, x] & wanted[y, x]
+            counts[y] += kept[y, x]
+            if marks[y, x] and not kept[y, x]:
+                for n in range(9):
+                    v, u = y + n // 3 - 1, x + n % 3 - 1
+                    if 0 <= v < height and 0 <= u < width and marks[v, u] & wanted[v, u]:
+                        kept[y, x] = BESIDE
 
 
 EMPTY, COVERED, LOOSE = np.uint8(1), np.uint8(2), np.uint8(4)
@@ -247,7 +274,7 @@ def fill(
         sums: (M, 3, 5).
         firsts: (H + 1,), where the mixed targets of each row begin.
         ends: (H, W) of `find`.
-        marks: (H, W) of `find`.
+        marks: (H, W) of `find` or `narrow`.
         found: `Outlines`, to be filled but for its offsets.
     """
     own, plain = np.zeros((3, 5), positions.dtype), np.zeros((9, 3, 2), ranges.dtype)
@@ -263,6 +290,9 @@ def fill(
                 found.beta[y, x] = positions.dtype.type(0)
                 if ends[y, x]:
                     found.beta[y, x], found.partner[y, x] = _rule(positions, row, part, ends, y, x, extent, rules)
+            if marks[y, x] == BESIDE:
+                m += mixed[y, x]
+                continue
             found.columns[d] = x
             _weigh(own[1], found.slopes[d], positions, rgba, row, y, x, scale, peak, gamma, slope)
             if mixed[y, x]:

@@ -10,9 +10,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rts.diagnostics.comparison.front import Row, milliseconds
-from rts.diagnostics.comparison.style import PEER_SYMBOL, Looks, drawn, environment_line, label, side_length
+from rts.diagnostics.comparison.settings import samples_of
+from rts.diagnostics.comparison.style import (
+    PEER_SYMBOL,
+    Looks,
+    drawn,
+    environment_line,
+    label,
+    samples_label,
+    side_length,
+)
 from rts.errors import PluginError
 from rts.files.paths import writing
+from rts.sampling.adaptive import finest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -108,9 +118,10 @@ def _panel(axes: Axes, rows: Sequence[Row], truth_error: float, looks: Looks) ->
     axes.set_yscale("log")
     axes.axhline(truth_error, color=PALE, linestyle="--", linewidth=1, zorder=1)
     axes.plot(*_places(_front(rows)), drawstyle="steps-post", color=INK, linewidth=1.1, zorder=5)
-    for (color, symbol, side, on), same in _alike([row for row in rows if "peer" not in row], looks).items():
-        for mark in _marks(symbol, color, side):
-            axes.plot(*_places(same), **mark, alpha=1.0 if on else 0.45, zorder=6 if on else 4 - 0.01 * side)
+    for (color, symbol, samples, on), same in _alike([row for row in rows if "peer" not in row], looks).items():
+        behind = 0.01 * side_length(samples)  # Small ones are before large ones.
+        for mark in _marks(symbol, color, samples):
+            axes.plot(*_places(same), **mark, alpha=1.0 if on else 0.45, zorder=6 if on else 4 - behind)
     for peer, color in looks.peers.items():
         places = _places(sorted((row for row in rows if row.get("peer") == peer), key=milliseconds))
         axes.plot(*places, color=color, linewidth=1.2, zorder=4)
@@ -137,9 +148,9 @@ def _ticks(axes: Axes) -> None:
         axis.set_minor_formatter(NullFormatter())
 
 
-def _alike(rows: Sequence[Row], looks: Looks) -> dict[tuple[str, str, int, bool], list[Row]]:
+def _alike(rows: Sequence[Row], looks: Looks) -> dict[tuple[str, str, int | str, bool], list[Row]]:
     """Rows by colour, symbol, samples along a pixel's side, and whether they are on the front."""
-    found: dict[tuple[str, str, int, bool], list[Row]] = {}
+    found: dict[tuple[str, str, int | str, bool], list[Row]] = {}
     for row in rows:
         settings = row["settings"]
         symbol = looks.samplers[settings["sampler"]] + looks.engines[settings["engine"]]
@@ -152,8 +163,8 @@ def _places(rows: Sequence[Row]) -> tuple[list[float], list[float]]:
     return [milliseconds(row) for row in rows], [row["error"] for row in rows]
 
 
-def _marks(symbol: str, color: str, supersample: int = 1) -> list[dict[str, Any]]:
-    """The lines of matplotlib that together are a symbol: itself, and the dot in it if there is one."""
+def _marks(symbol: str, color: str, supersample: int | str = 1) -> list[dict[str, Any]]:
+    """The lines of matplotlib that together are a symbol: itself, the dot in it, and the bar of adaptive samples."""
     shape, hollow, dot = symbol.removesuffix("-dot").removesuffix("-open"), "-open" in symbol, symbol.endswith("-dot")
     size = 0.72 * side_length(supersample)  # Points of 1/72 inch.
     mark = {"marker": MARKERS[shape], "markersize": size, "linestyle": "none", "markeredgewidth": 0.9}
@@ -161,7 +172,14 @@ def _marks(symbol: str, color: str, supersample: int = 1) -> list[dict[str, Any]
     if dot:
         inner = color if hollow else "white"
         marks.append({**mark, "marker": ".", "markersize": 0.6 * size, "color": inner, "markeredgewidth": 0})
+    if isinstance(supersample, str):
+        marks.append({**mark, "marker": "_", "markersize": 1.8 * size, "markeredgecolor": color})
     return marks
+
+
+def _order(supersample: int | str) -> tuple[bool, int, str]:
+    """Where samples a pixel stand in the legend."""
+    return isinstance(supersample, str), finest(samples_of(supersample)), str(supersample)
 
 
 DIRECTIONS = ((-0.7, -0.7), (-1.0, -0.2), (-0.2, -1.0))
@@ -217,12 +235,12 @@ def _legend(figure: Figure, rows: Sequence[Row], looks: Looks) -> None:
     from matplotlib.legend_handler import HandlerTuple
     from matplotlib.lines import Line2D
 
-    sides = sorted({row["settings"]["supersample"] for row in rows if "peer" not in row})
+    sides = sorted({row["settings"]["supersample"] for row in rows if "peer" not in row}, key=_order)
     sections = {
         "splatter": {name: _marks("circle", color) for name, color in looks.splatters.items()},
         "sampler": {name: _marks(symbol, PALE) for name, symbol in looks.samplers.items()},
         "engine": {name: _marks(f"circle{fill}", PALE, 2) for name, fill in looks.engines.items()},
-        "samples a pixel": {f"{s} × {s}": _marks("circle", PALE, s) for s in sides},
+        "samples a pixel": {samples_label(s).replace("×", " × "): _marks("circle", PALE, s) for s in sides},
         "other renderers": {
             name: [{"color": color, "linewidth": 1.2}, *_marks(PEER_SYMBOL, color)]
             for name, color in looks.peers.items()

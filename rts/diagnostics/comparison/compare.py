@@ -29,10 +29,11 @@ from rts.engines import Engine
 from rts.errors import InputError, PluginError
 from rts.files.paths import output_folder, writing
 from rts.fitting.names import one_line
+from rts.sampling.adaptive import Adaptive, as_text, finest
 from rts.trees import Tree
 
 LAYERS = (1, 2, 4, "auto")
-SUPERSAMPLE = (1, 2, 4)
+SUPERSAMPLE = (1, 2, 4, Adaptive(4))
 QUICK_CELLS = 40
 """The most settings that are looked at with `quick`."""
 PEER_ROUNDS = 2
@@ -112,7 +113,7 @@ class Plan(NamedTuple):
             "" for the usual one.
         engines: the one that errors are measured with first.
         layers: K or "auto".
-        supersample: samples along each side of a pixel.
+        supersample: as `Setting.supersample`.
         rates: whether the rates that surfaces offer are tried.
         most: how many settings are looked at, at most; None for all.
         peers: other renderers.
@@ -122,7 +123,7 @@ class Plan(NamedTuple):
     samplers: Mapping[str, str]
     engines: Sequence[Engine]
     layers: Sequence[int | str]
-    supersample: Sequence[int]
+    supersample: Sequence[int | str]
     rates: bool
     most: int | None
     peers: Sequence[Peer]
@@ -139,7 +140,7 @@ def compare(
     splatters: Sequence[str] | None = None,
     engines: Sequence[str] | None = None,
     layers: Sequence[int | str] | None = None,
-    supersample: Sequence[int] | None = None,
+    supersample: Sequence[int | Adaptive] | None = None,
     peers: bool = True,
     quick: bool = False,
     surface: str = "mesh",
@@ -169,7 +170,7 @@ def compare(
         splatters: names; None for all.
         engines: names; None for all. Errors are measured with the first.
         layers: numbers of layers, or "auto"; None for 1, 2, 4 and "auto".
-        supersample: samples along each side of a pixel; None for 1, 2 and 4.
+        supersample: samples along each side of a pixel, or `rts.Adaptive`; None for 1, 2, 4 and `rts.Adaptive(4)`.
         peers: whether other renderers take part.
         quick: one mode, engine and sampler unless others are named, at most 40 settings, no peers.
         surface: the kind of surface that reads a model.
@@ -188,7 +189,7 @@ def compare(
     kept = None if truths is None else output_folder(truths)
     found = some_modes(found, list(found.directions)[:1] if quick and modes is None else modes)
     layers = _counts("layers", layers, LAYERS[:2] if quick else LAYERS, ("auto",))
-    supersample = _counts("supersample", supersample, SUPERSAMPLE)
+    samples_a_pixel = _samples(supersample)
     (samples,) = _counts("truth_samples", truth_samples, ())
     names, without = usable("rts.splatters", splatters)
     possible, missing = usable("rts.samplers", samplers)
@@ -205,7 +206,7 @@ def compare(
     measured.left_out += unsuited
     most = QUICK_CELLS if quick else None
     kinds = measured.kinds(suited[:1] if quick and samplers is None else suited)
-    plan = Plan(names, kinds, used, layers, supersample, rates=not quick, most=most, peers=others)
+    plan = Plan(names, kinds, used, layers, samples_a_pixel, rates=not quick, most=most, peers=others)
     with phases(progress) as phase:
         comparison = _compared(measured, plan, phase)
     if folder is not None:
@@ -219,6 +220,14 @@ def _counts(name: str, given: Any, usual: Sequence, others: tuple[str, ...] = ()
         expected = " or ".join(["integers of at least 1", *map(repr, others)])
         raise InputError(f"{name} is {quoted(given)}; expected {expected}")
     return [n if n in others else int(n) for n in found]
+
+
+def _samples(given: Any) -> list[int | str]:
+    """What `Setting.supersample` holds, of what a user gave."""
+    wanted = list(SUPERSAMPLE) if given is None else list(given) if isinstance(given, (list, tuple)) else [given]
+    if not wanted or not all(is_count(finest(s)) for s in wanted):
+        raise InputError(f"supersample is {quoted(given)}; expected integers of at least 1 or rts.Adaptive")
+    return [as_text(s) if isinstance(s, Adaptive) else int(s) for s in wanted]
 
 
 def _unthinned() -> list[str]:

@@ -271,7 +271,7 @@ class Measurements:
         group: str,
         splatters: Iterable[str],
         layers: Iterable[int | str],
-        samples: Iterable[int],
+        samples: Iterable[int | str],
         kinds: Iterable[str] = ("",),
         rates: bool = True,
     ) -> list[Setting]:
@@ -281,7 +281,7 @@ class Measurements:
             group: of modes.
             splatters: names.
             layers: numbers, or "auto".
-            samples: along each side of a pixel.
+            samples: as `Setting.supersample`.
             kinds: samplers that have errors of their own, and "" for all others.
             rates: whether the rates that surfaces offer are among them.
         """
@@ -374,7 +374,7 @@ class Measurements:
         layers = self.counting(group, setting) or 0
         return (
             layers + (0.5 if setting.layers == "auto" else 0.0),
-            setting.supersample,
+            setting.side,
             self.forms(group)[setting.rate].work,
         )
 

@@ -22,6 +22,7 @@ from rts.diagnostics.comparison.style import (
     drawn,
     environment_line,
     label,
+    samples_label,
     side_length,
 )
 from rts.errors import InputError, PluginError
@@ -81,12 +82,11 @@ def _settings(row: Row) -> dict[str, Any]:
     shown = {"text": arguments(row), "label": label(row), "size": side_length(given.get("supersample", 1))}
     if "peer" in row:
         return {**shown, "peer": row["peer"]}
-    side = given["supersample"]
     return {
         **shown,
         **{name: given[name] for name in ("splatter", "sampler", "engine")},
         "layers": f"K={given['layers']}",
-        "samples": f"{side} × {side}",
+        "samples": samples_label(given["supersample"]).replace("×", " × "),
         "rate": given["rate"] or "as given",
     }
 

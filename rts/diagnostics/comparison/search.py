@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 from rts.diagnostics.comparison.measure import TOGETHER, Measurements
 from rts.diagnostics.comparison.progress import Phase
-from rts.diagnostics.comparison.settings import Setting
+from rts.diagnostics.comparison.settings import Setting, in_python
 from rts.diagnostics.comparison.turns import Calls
 from rts.errors import InputError, ToleranceWarning, warn
 
 LAYERS = (1, 2, 4, 8)
-SUPERSAMPLE = (1, 2, 3, 4)
+SUPERSAMPLE = (1, 2, "adaptive:4", 3, 4)
 HOPELESS = 2.0
 """How many times the error of the best splatter another one may have, to be looked at further."""
 ALIKE = 0.9
@@ -112,7 +112,7 @@ class Search:
         splatters: Sequence[str],
         kind: str,
         layers: Sequence[int] = LAYERS,
-        supersample: Sequence[int] = SUPERSAMPLE,
+        supersample: Sequence[int | str] = SUPERSAMPLE,
         rates: bool = True,
     ) -> list[Setting]:
         """All settings of a kind of sampler that may differ in their error, the cheapest first."""
@@ -185,8 +185,11 @@ class Search:
 
     def _far(self, setting: Setting) -> bool:
         """Whether the errors with fewer samples, as a power of their number, tell of one that is much too large."""
-        fewer = [setting._replace(supersample=n) for n in SUPERSAMPLE if n < setting.supersample]
-        known = [(s.supersample, self.bounds[self._cell(s)]) for s in fewer if self._cell(s) in self.bounds]
+        if isinstance(setting.supersample, str):
+            return False  # Of outlines it has the error of as many samples everywhere.
+        numbers = [n for n in SUPERSAMPLE if not isinstance(n, str) and n < setting.supersample]
+        fewer = {n: self._cell(setting._replace(supersample=n)) for n in numbers}
+        known = [(n, self.bounds[cell]) for n, cell in fewer.items() if cell in self.bounds]
         if len(known) < 2:
             return False
         (coarse, larger), (fine, smaller) = known[-2:]
@@ -321,7 +324,7 @@ def _value(setting: Setting, name: str) -> str:
     value = getattr(setting, name)
     if name == "rate":
         return value or "the surfaces as they are given"
-    return f"{name}={value!r}"
+    return f"{name}={in_python(value) if name == 'supersample' else repr(value)}"
 
 
 def _percent(error: float) -> str:

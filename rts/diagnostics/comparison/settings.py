@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,10 +14,14 @@ from rts.arguments import quoted
 from rts.diagnostics.comparison.front import LEVELS
 from rts.engines import Engine, engine_named
 from rts.errors import InputError, PluginError
+from rts.sampling.adaptive import Adaptive, of_text
 
 FIRST = "torch"
 """The engine that errors are measured with where it is installed, since all agree on them and it compiles nothing."""
 
+
+SHARE = 1.5
+"""Fine samples for each sample of the plain image and each along a pixel's side, about, where they are at outlines."""
 
 ALIKE = 1.1
 """A setting that costs more has to have an error smaller than by this factor, or smaller than one of `LEVELS`."""
@@ -28,7 +33,7 @@ class Setting(NamedTuple):
     Attributes:
         splatter: its name.
         layers: K, or "auto".
-        supersample: samples along each side of a pixel.
+        supersample: samples along each side of a pixel; or, where outlines are, such as "adaptive:4" (`rts.Adaptive`).
         rate: what differs of the surfaces, such as "tolerance=0.4"; "" for nothing.
         sampler: its name; "" where only the error is meant.
         engine: its name; "" likewise.
@@ -36,7 +41,7 @@ class Setting(NamedTuple):
 
     splatter: str
     layers: int | str
-    supersample: int
+    supersample: int | str
     rate: str = ""
     sampler: str = ""
     engine: str = ""
@@ -44,8 +49,27 @@ class Setting(NamedTuple):
     @property
     def options(self) -> dict[str, Any]:
         """Keyword arguments of `rts.render`."""
-        found = {"splatter": self.splatter, "layers": self.layers, "supersample": self.supersample}
+        found = {"splatter": self.splatter, "layers": self.layers, "supersample": samples_of(self.supersample)}
         return {"sampler": self.sampler, **found} if self.sampler else found
+
+    @property
+    def side(self) -> float:
+        """The square root of the samples a pixel; of those at outlines alone, about what they cost."""
+        found = samples_of(self.supersample)
+        return math.sqrt(SHARE * found.samples) if isinstance(found, Adaptive) else found
+
+
+def samples_of(supersample: int | str) -> int | Adaptive:
+    """What `rts.render` takes, of what settings hold: a number, or a text."""
+    return of_text(supersample) if isinstance(supersample, str) else int(supersample)
+
+
+def in_python(supersample: int | str) -> str:
+    """Samples a pixel as a user writes them."""
+    if not isinstance(supersample, str):
+        return str(supersample)
+    _, side, *options = supersample.split(":")
+    return f"rts.Adaptive({', '.join([side, *options])})"
 
 
 def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], list[str]]:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from rts.diagnostics.comparison.front import Row, milliseconds, timed
+from rts.diagnostics.comparison.settings import in_python, samples_of
+from rts.sampling.adaptive import finest
 
 SPLATTER_COLORS = {
     "visible": "#D55E00",
@@ -89,9 +91,17 @@ def drawn(row: Row) -> bool:
     return timed(row) and milliseconds(row) > 0 and row["error"] > 0
 
 
-def side_length(supersample: int) -> float:
+def side_length(supersample: int | str) -> float:
     """How large a row is drawn, by how many samples it takes along the side of a pixel; in pixels of a screen."""
-    return 5.0 + 2.5 * min(supersample, 6)
+    return 5.0 + 2.5 * min(finest(samples_of(supersample)), 6)
+
+
+def samples_label(supersample: int | str) -> str:
+    """Samples a pixel in few words: "4×4", or "adaptive 4×4" where they are at outlines alone."""
+    side = finest(samples_of(supersample))
+    if not isinstance(supersample, str):
+        return f"{side}×{side}"
+    return " ".join([f"adaptive {side}×{side}", *supersample.split(":")[2:]])
 
 
 def label(row: Row) -> str:
@@ -99,8 +109,8 @@ def label(row: Row) -> str:
     settings = row["settings"]
     if "peer" in row:
         return " ".join([row["peer"], *(f"{name}={value}" for name, value in settings.items())])
-    side = settings["supersample"]
-    words = [settings["splatter"], f"K={settings['layers']}", f"{side}×{side}" if side != 1 else ""]
+    samples = settings["supersample"]
+    words = [settings["splatter"], f"K={settings['layers']}", samples_label(samples) if samples != 1 else ""]
     return " ".join(filter(None, [*words, settings["sampler"], settings["engine"], settings["rate"]]))
 
 
@@ -109,8 +119,9 @@ def arguments(row: Row) -> str:
     settings = row["settings"]
     if "peer" in row:
         return "# " + ", ".join([row["peer"], *(f"{name}={value}" for name, value in settings.items())])
-    names = ("sampler", "splatter", "layers", "supersample")
+    names = ("sampler", "splatter", "layers")
     given = ", ".join(f"{name}={json.dumps(settings[name], ensure_ascii=False)}" for name in names)
+    given += f", supersample={in_python(settings['supersample'])}"
     return f"{given}  # " + ", ".join(filter(None, [settings["engine"], settings["rate"]]))
 
 

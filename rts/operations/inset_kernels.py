@@ -1,0 +1,49 @@
+"""Means of a finer image put into an image, compiled."""
+
+from __future__ import annotations
+
+import numba
+
+kernel = numba.njit(nogil=True, cache=True)
+
+
+@kernel
+def put(image, fine, pixel, side, out):
+    """Fill out (H, W, C); see `rts.operations.inset.with_inset`."""
+    height, width, channels = out.shape
+    across, share = fine.shape[1] // side, out.dtype.type(1) / out.dtype.type(side)
+    for y in range(height):
+        for x in range(width):
+            if pixel[y, x] < 0:
+                for c in range(channels):
+                    out[y, x, c] = image[y, x, c]
+                continue
+            top, left = pixel[y, x] // across * side, pixel[y, x] % across * side
+            for c in range(channels):
+                # Rows first, as in the specification, whose rounding this has.
+                total = out.dtype.type(0)
+                for u in range(left, left + side):
+                    column = out.dtype.type(0)
+                    for v in range(top, top + side):
+                        column += fine[v, u, c]
+                    total += column * share
+                out[y, x, c] = total * share
+
+
+@kernel
+def pull(g, pixel, side, image, fine):
+    """Gradients of both images, zeros to be filled, from that of the result; nothing of one without rows."""
+    height, width, channels = g.shape
+    across, share = fine.shape[1] // side, g.dtype.type(1) / g.dtype.type(side * side)
+    for y in range(height):
+        for x in range(width):
+            if pixel[y, x] < 0:
+                if len(image):
+                    for c in range(channels):
+                        image[y, x, c] = g[y, x, c]
+            elif len(fine):
+                top, left = pixel[y, x] // across * side, pixel[y, x] % across * side
+                for v in range(top, top + side):
+                    for u in range(left, left + side):
+                        for c in range(channels):
+                            fine[v, u, c] = g[y, x, c] * share

@@ -1,0 +1,120 @@
+"""What is sampled where outlines are: which cells, how many layers, and what finds no room."""
+
+import numpy as np
+import pytest
+from adaptive_scenes import BALL, CAMERA, FACES, MESH, SIZE, activate, random_mask, render, scene
+from helpers import DIFFERENTIABLE, TORCH, arrays, gradient, icosphere, to_numpy
+
+import rts
+from rts import Adaptive
+from rts.sampling import tiles
+
+pytestmark = pytest.mark.sampling
+
+
+@pytest.mark.parametrize("s", [2, 4, 8])
+def test_fine_samples_are_those_of_active_pixels_and_their_apron(s, monkeypatch):
+    mask = random_mask(10, 0.05)
+    activate(monkeypatch, mask)
+    part = scene()[0]
+    sampled = rts.sample(part, CAMERA, SIZE, supersample=Adaptive(s), layers=1, splatter="visible")
+    dense = rts.sample(part, CAMERA, SIZE, supersample=s, layers=1, splatter="visible")
+    apron, needed = dense.apron, np.zeros(dense.row.shape[1:], bool)
+    for y, x in np.argwhere(mask):
+        needed[y * s : (y + 1) * s + 2 * apron, x * s : (x + 1) * s + 2 * apron] = True
+    hits = int((dense.row[0] >= 0)[needed].sum())
+    (samples,) = sampled.fine.samples
+    assert len(samples.ids) == hits == (samples.row >= 0).sum() and int(sampled.fine.overflow) == 0
+    assert sampled.fine.index.max() == hits - 1 and (sampled.fine.pixel >= 0).sum() == mask.sum()
+
+
+def test_hidden_samples_that_cannot_be_seen_are_left_out():
+    sampled = rts.sample(scene(), CAMERA, SIZE, supersample=Adaptive(4), layers=3, splatter="visible")
+    whole = rts.sample(scene(), CAMERA, SIZE, supersample=Adaptive(4), layers=3)
+    count, most = (sum((s.row >= 0).sum() for s in x.fine.samples) for x in (sampled, whole))
+    assert count < 0.9 * most
+
+
+def test_pixels_without_room_stay_coarse_and_are_counted():
+    jax = pytest.importorskip("jax")
+
+    def scene(v):
+        return rts.Part(MESH(FACES), {"vertices": v})
+
+    parts = scene(BALL)
+    plain = render(parts, 1)
+    most = (rts.sample(parts, CAMERA, SIZE, supersample=Adaptive(4), layers=3).fine.pixel >= 0).sum()
+
+    def find(v, capacity):
+        return rts.sample(scene(v), CAMERA, SIZE, supersample=Adaptive(4), layers=3, capacity=capacity)
+
+    kept = []
+    for capacity in (1500, 8000, 60000):
+        # One that holds a part of the pixels is compiled, too.
+        traced = [jax.jit(find, static_argnums=1)(arrays("jax", BALL), capacity)] if capacity == 8000 else []
+        for sampled in (find(BALL, capacity), *traced):
+            active = np.asarray(sampled.fine.pixel) >= 0
+            assert active.sum() + int(sampled.fine.overflow) == most and sampled.overflow >= sampled.fine.overflow
+            image = np.asarray(rts.render_samples(sampled, parts, CAMERA))
+            np.testing.assert_allclose(image[~active], plain[~active], atol=1e-5)
+        kept.append(active.sum())
+    assert kept[0] < kept[1] < kept[2] == most
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_batches_give_the_same(target):
+    stretched = np.stack([BALL, 0.7 * BALL])
+
+    def scene(v):
+        return rts.Part(MESH(FACES), {"vertices": v})
+
+    expected = [render(scene(v), Adaptive(2)) for v in stretched]
+    if target == "jax":
+        jax = pytest.importorskip("jax")
+        batched = jax.vmap(lambda v: render(scene(v), Adaptive(2)))(arrays("jax", stretched))
+    else:
+        torch = pytest.importorskip("torch")
+        batched = torch.vmap(lambda v: render(scene(v), Adaptive(2)))(arrays(target, stretched))
+    np.testing.assert_allclose(to_numpy(batched), np.stack(expected), atol=2e-5)
+
+
+def test_as_many_layers_as_count():
+    found, expected = (render(scene(), Adaptive(3), layers=k) for k in ("auto", 6))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_prepared_parts_and_backgrounds():
+    background = np.random.default_rng(11).random((*SIZE, 3))
+    found, expected = (render(parts, Adaptive(3), background=background) for parts in (rts.prepare(scene()), scene()))
+    np.testing.assert_array_equal(found, expected)
+    bare = render(scene(), Adaptive(3))
+    np.testing.assert_allclose(expected[..., :3], bare[..., :3] + (1 - bare[..., 3:]) * background, atol=1e-6)
+
+
+def test_what_is_sampled_is_rendered():
+    sampled = rts.sample(scene(), CAMERA, SIZE, supersample=Adaptive(3), layers=3)
+    assert sampled.supersample == 1 and sampled.fine.supersample == 3
+    for splatter in ("visible", "single"):  # One that reaches as far, and one that does not.
+        found = rts.render_samples(sampled, scene(), CAMERA, splatter=splatter)
+        np.testing.assert_allclose(found, render(scene(), Adaptive(3), splatter=splatter), atol=1e-6)
+
+
+def test_an_empty_view_has_a_gradient_of_zero():
+    part = rts.Part(MESH(FACES), {"vertices": arrays(TORCH[0], BALL + [0, 0, 90])})
+    with pytest.warns(rts.EmptyImageWarning):
+        found = gradient(
+            TORCH[0],
+            lambda v: render(rts.Part(MESH(FACES), {"vertices": v}), Adaptive(3)).sum(),
+            part.theta["vertices"],
+        )
+    assert not found.any()
+
+
+def test_memory_is_that_of_the_outlines():
+    """At 8 × 8 the finer image has fifty times as many samples."""
+    vertices, faces = icosphere(3)
+    part = rts.Part(MESH(faces), {"vertices": vertices})
+    sampled = rts.sample(part, CAMERA, (128, 128), supersample=Adaptive(8), splatter="visible")
+    grid = tiles.Grid((128, 128), 8, sampled.fine.apron).fine
+    assert sampled.fine.row[0].size < 0.25 * grid[0] * grid[1]
+    assert sum(len(s.ids) for s in sampled.fine.samples) < 0.1 * grid[0] * grid[1]
