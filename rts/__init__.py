@@ -61,6 +61,7 @@ from rts.sampling.prepared import prepare
 from rts.sampling.scenes import sample
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.splatting import exact_calibration
+from rts.warming import warmup
 
 if TYPE_CHECKING:
     from rts_surfaces.bezier import Bezier as Bezier
@@ -153,4 +154,5 @@ __all__ = [
     "tune",
     "unwrapped",
     "volume_render",
+    "warmup",
 ]

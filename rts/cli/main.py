@@ -1,4 +1,4 @@
-"""The command line: `rts plugins`, `render`, `fit-pose`, `export`, `compare`, `tune`, `new`, `demo`."""
+"""The command line: `rts plugins`, `render`, `fit-pose`, `export`, `compare`, `tune`, `new`, `demo`, `warmup`."""
 
 from __future__ import annotations
 
@@ -505,6 +505,16 @@ def demo(
     _say(f"pose found in {len(found.history)} steps, {found.seconds:.1f} s; wrote")
     _say_written(files)
     _say_skipped_plot(files)
+
+
+@app.command(epilog="Example: rts warmup --processes 4")
+def warmup(
+    processes: Annotated[int, typer.Option(min=0, help="Processes at once; 0 is as many as there are cores.")] = 0,
+) -> None:
+    """Compile ahead what ordinary renders and fits use, in several processes; else it is compiled when first used."""
+    import rts
+
+    _say(f"compiled and kept on disk, {rts.warmup(processes or None):.0f} s")
 
 
 def _sum(counts: list[int]) -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
 
-@numba.njit(cache=True, nogil=True)
+
+@kernel
 def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eye, listed, more, found):
     """Fill lines [start, stop) of `found` (K, H, W) int16, zeros; see `rts.sampling.facing`."""
     layers, height, width = kept.shape
@@ -34,20 +35,20 @@ def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eye, listed, 
 # Rows are handed over one by one, which the compiler needs to see that they do not overlap.
 
 
-@numba.njit(nogil=True)
+@compiled
 def _add(level, kept):
     for x in range(len(kept)):
         level[x] |= np.uint8(kept[x])
 
 
-@numba.njit(nogil=True)
+@compiled
 def _spread(near, above, level, below):
     for x in range(len(near)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
         near[x] = around | below[x] | below[x + 1] | below[x + 2]
 
 
-@numba.njit(nogil=True)
+@compiled
 def _front(vertices, faces, t, eye):
     """Whether a triangle is seen from the side from which its corners go round counter-clockwise."""
     a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]

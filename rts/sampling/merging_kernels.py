@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
 from rts.threads import parallel
 
 
@@ -42,7 +42,7 @@ def interleave(
     return (*found, merged) if facing else found
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _interleave(start, stop, row, depth, facing, more, part, merged, merged_depth, merged_facing):
     count, deepest, _, width = row.shape
     at = np.empty(count, np.int64)
@@ -69,7 +69,7 @@ def _interleave(start, stop, row, depth, facing, more, part, merged, merged_dept
                 merged_facing[last, y, x] += more if merged_facing[last, y, x] > 0 else -more
 
 
-@numba.njit(nogil=True)
+@compiled
 def _of_part(facing, part, count, more):
     """The number of a part's piece among those of all parts; 0 where it would be too large."""
     size = abs(np.int64(facing))

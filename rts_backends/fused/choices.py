@@ -8,15 +8,12 @@ Depths are compared in the dtype of the positions and in the order of `rts.splat
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
 from rts.records import MORE
 from rts_backends.fused.mixed import sums_of
 from rts_backends.fused.survey import BLOCK, BUSY, EMPTY
-
-compiled = numba.njit(nogil=True)
-kernel = numba.njit(nogil=True, cache=True)
 
 
 @compiled
