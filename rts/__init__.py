@@ -2,9 +2,14 @@
 
 Find where camera rays meet a surface with any ordinary renderer; evaluate the surface there, shade it and splat it;
 differentiate only that.
+
+The surfaces that come with it are attributes, too, loaded when they are first used: `rts.Mesh`, `rts.Bezier`,
+`rts.BSpline`, `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`.
 """
 
-from rts import regularizers
+from typing import TYPE_CHECKING
+
+from rts import registry, regularizers
 from rts.adapting import unwrapped
 from rts.camera import Camera
 from rts.diagnostics.gradients import check_gradient, gradient_image
@@ -56,6 +61,27 @@ from rts.sampling.prepared import prepare
 from rts.sampling.scenes import sample
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.splatting import exact_calibration
+from rts.warming import warmup
+
+if TYPE_CHECKING:
+    from rts_surfaces.bezier import Bezier as Bezier
+    from rts_surfaces.bspline import BSpline as BSpline
+    from rts_surfaces.bspline import Revolution as Revolution
+    from rts_surfaces.implicit.isosurface import Isosurface as Isosurface
+    from rts_surfaces.implicit.sdf import Sdf as Sdf
+    from rts_surfaces.mesh import Mesh as Mesh
+    from rts_surfaces.subdivision.surface import Subdivision as Subdivision
+else:
+
+    def __getattr__(name: str):
+        """The built-in surfaces, found through entry points when they are first asked for."""
+        found = globals()[name] = registry.attribute(name, __all__)
+        return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *registry.built_in_surfaces()})
+
 
 __version__ = "0.1.0"
 
@@ -128,4 +154,5 @@ __all__ = [
     "tune",
     "unwrapped",
     "volume_render",
+    "warmup",
 ]

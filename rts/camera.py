@@ -128,6 +128,39 @@ class Camera:
         return cls(*_alike(view, projection), _known_ratio(aspect))
 
     @classmethod
+    def perspective(
+        cls,
+        fov_y: Any = 45.0,
+        *,
+        view: Any = None,
+        aspect: Any = None,
+        near: Any = 0.01,
+        far: Any = 1000.0,
+        principal_point: Any = (0.0, 0.0),
+    ) -> Camera:
+        """A perspective camera whose pose is a matrix; without one it is at the origin and looks along −z, +y up.
+
+        That is for objects whose pose is relative to the camera: they lie at negative z.
+
+        Args:
+            fov_y: vertical field of view, degrees.
+            view: (4, 4) camera-from-world, affine; None for the identity.
+            aspect: width over height of the image; None for that of the size it is rendered at.
+            near: near plane.
+            far: far plane.
+            principal_point: (2,) where the axis meets the image, NDC.
+
+        Raises:
+            InputError: a field of view, ratio or view that makes no image, or planes are out of order.
+        """
+        known = None if view is None else check_numbers("view", view, (4, 4))
+        if known is not None and not (_is_affine(known) and is_invertible(known[:3, :3])):
+            raise InputError("view is singular, or its last row is not (0, 0, 0, 1); expected a camera-from-world map")
+        _, (view,) = promote(np.eye(4) if view is None else view)
+        projection = perspective(fov_y, 1.0 if aspect is None else aspect, near, far, principal_point)
+        return cls(*_alike(view, projection), _known_ratio(aspect))
+
+    @classmethod
     def orthographic(
         cls,
         eye: Any,

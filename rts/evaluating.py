@@ -36,10 +36,10 @@ def to_splats(
     if not engine.owns(sampled.row):
         sampled = constants(sampled, engine, like if engine.differentiates else None)
     positions, rgba = _shown(sampled.samples, sampled.row, parts, camera, wide, engine, like)
-    row, part = sampled.row, sampled.part
+    cells = sampled.row, sampled.part, sampled.facing, sampled.settled
     if not engine.owns(rgba):
-        row, part = constants((row, part), *suiting(positions, rgba))
-    return Splats(positions, rgba, row, part, border=apron)
+        cells = constants(cells, *suiting(positions, rgba))
+    return Splats(positions, rgba, *cells, border=apron)
 
 
 def to_fine_splats(
@@ -51,11 +51,11 @@ def to_fine_splats(
     if not engine.owns(fine.row):
         fine = constants(fine, engine, like if engine.differentiates else None)
     positions, rgba = _shown(fine.samples, fine.index, parts, camera, wide, engine, like)
-    arrays = fine.index, fine.shift, fine.row, fine.part, fine.wanted
-    index, shift, row, part, wanted = constants(arrays, *suiting(positions, rgba))
+    arrays = fine.index, fine.shift, fine.row, fine.part, fine.facing, fine.wanted
+    index, shift, row, part, facing, wanted = constants(arrays, *suiting(positions, rgba))
     xp = namespace(positions)
     moved = take(positions, index) + xp.astype(shift, positions.dtype)
-    return Splats(moved, take(rgba, index), row, part, wanted=wanted, border=fine.apron)
+    return Splats(moved, take(rgba, index), row, part, facing, wanted=wanted, border=fine.apron)
 
 
 def _shown(

@@ -135,16 +135,18 @@ class TriangleSurface(Surface):
         refines: whether samples on the triangles go through `refine`; True in a class with its own `refine`.
         refine_moves: whether `refine` moves samples or drops them. Where it only adds to what they carry, hidden ones
             are left out before.
+        tells_pieces: whether its triangles are known to be oriented alike; True in a class with its own `pieces`.
         face_count: how many triangles there are, or None if that is not known beforehand; the sampler "auto" goes by
             it.
     """
 
-    FLAGS = {"refine": "refines", "proxy_key": "depends_on_view"}
+    FLAGS = {"refine": "refines", "proxy_key": "depends_on_view", "pieces": "tells_pieces"}
 
     proxy_is_cheap: bool = False
     depends_on_view: bool = False
     refines: bool = False
     refine_moves: bool = True
+    tells_pieces: bool = False
     face_count: int | None = None
 
     @abc.abstractmethod
@@ -174,6 +176,20 @@ class TriangleSurface(Surface):
         Only called if `depends_on_view` is True. The default is the view itself: triangles are rebuilt for each.
         """
         return size, *(m.tobytes() for m in camera)
+
+    def pieces(self, proxy: Proxy) -> np.ndarray:
+        """Which triangles are wound alike, so that what shows its front does not go on in what shows its back.
+
+        Not asked where `refine` moves samples. `rts.topology.pieces` finds them by the edges that triangles share.
+
+        Args:
+            proxy: what `proxy` gave.
+
+        Returns:
+            (T,) int16, for each triangle the number of its piece, from 1 on, or 0 where it may be wound in any way; or
+            (1,), the number of all.
+        """
+        return np.zeros(1, np.int16)
 
     def refine(self, inputs: Tree, samples: Samples, rays: Rays) -> Samples:
         """Move samples from the triangles onto the surface, along their rays, or drop them; on the host.
@@ -271,11 +287,31 @@ def as_surface(given: Any) -> Any:
 
 
 class Needed(Plugin):
-    """Says which samples can reach the image; on the host. Any function with the signature of `__call__` will do."""
+    """Says which samples can reach the image; on the host. Any function with the signature of `__call__` will do.
+
+    Attributes:
+        settles: whether it also says which cells are `settled`; True in a class with its own method.
+        size: of the largest number that surfaces read, if it is known.
+    """
+
+    FLAGS = {"settled": "settles"}
+    settles: bool = False
+    size: float | None = None
 
     @abc.abstractmethod
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Which samples to keep, (K, H, W) bool, where covered (K, H, W) bool lie at depth (K, H, W)."""
+
+    def settled(self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float) -> np.ndarray:
+        """Cells (H, W) bool whose colour is known without samples; those that only such cells need leave `kept`.
+
+        Args:
+            covered: (K, H, W) bool.
+            depth: (K, H, W) float.
+            kept: (K, H, W) bool, what `__call__` gave; changed in place.
+            size: of the largest coordinate.
+        """
+        raise NotImplementedError
 
     def ran_out(self, cells: int) -> None:
         """Take note of how many cells had all layers of triangles that were looked for, and too few after `refine`."""
@@ -289,15 +325,21 @@ class Sampler(Plugin):
     """Finds where rays meet one part: the step without derivative.
 
     Attributes:
+        culls: whether it leaves out what is seen from behind where a part has `cull="back"`; it refuses such parts
+            otherwise.
         prunes: whether `sample` also takes the keyword `needed`, which says which samples to keep: a `Needed`, a
             function of its signature, or None for all.
         takes_cells: whether `sample` also takes the keyword `cells`, (L, C) int32: the only cells of the grid to
             sample, as flat indices, or −1 for none; an array of the part's engine, perhaps traced. `row` and `depth` of
             the samples are then (K, L, C). Without it all cells are sampled, and those that are not listed left out.
+        tells_facing: whether `sample` also takes the keyword `facing`: whether to find `Samples.facing`, which is of
+            interest in cells with hidden samples, and beside them.
     """
 
+    culls: bool = False
     prunes: bool = False
     takes_cells: bool = False
+    tells_facing: bool = False
 
     @abc.abstractmethod
     def sample(
@@ -375,19 +417,27 @@ class Splatter(Plugin):
     """Turns shaded samples into an image that has derivatives at occlusion boundaries.
 
     Attributes:
+        layers: how many layers it looks at, from the front; None for all that there are.
         reach: how many cells away from its own, along either axis, a sample may have an effect.
+        reads_facing: whether it reads `Splats.facing`, which is found only then.
         prunes: whether it says which samples it needs; True in a class with its own `needed`.
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
         averages: whether its normal equations may be asked for with a target of fewer pixels than there are cells.
+        settles: whether it reads `Splats.settled`: where all nine samples around a cell are fronts of one opaque
+            colour, on cells' centres, and no hidden one beside them is `needed`, the cell has that colour, whatever
+            moves by little; and samples farther than `reach` from all other cells need not be there.
     """
 
     FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}
     STAND_INS = {"image": ("splat", _image_of_arrays)}
 
+    layers: int | None = None
     reach: int = 1
+    reads_facing: bool = False
     prunes: bool = False
     sums_products: bool = False
     averages: bool = False
+    settles: bool = False
 
     @abc.abstractmethod
     def image(self, splats: Splats) -> Array:

@@ -15,6 +15,9 @@ import numpy as np
 from rts.engines import namespace
 from rts.trees import Array, record
 
+MORE = 1 << 14
+"""Added to the number of a piece (`Samples.facing`) in the last of K layers, behind which there may be more."""
+
 
 class ArraySpec(NamedTuple):
     """The shape and dtype of one array that a host function returns.
@@ -109,6 +112,11 @@ class Samples:
         asked: the names of the entries that were wanted when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their cells.
         by_sample: the names of the tables that have a row for each sample; other tables are shared by all.
+        settled: (H, W) bool, see `Splats`; None where no samples were left out for it.
+        facing: (K, H, W) int16, the number of the piece of surface that is seen in each cell, from 1 on, negative where
+            it is seen from behind; 0 where that is not known or not of interest. Pieces are consistently oriented: what
+            is seen from opposite sides in two neighbouring cells is not one sheet. Numbers are larger by `MORE` where
+            all K layers are covered, in the last of them. None where nothing is told.
     """
 
     ids: Array
@@ -121,6 +129,8 @@ class Samples:
     asked: tuple[str, ...] | None = None
     centered: bool = True
     by_sample: tuple[str, ...] = ()
+    settled: Array | None = None
+    facing: Array | None = None
 
 
 @record(static=("supersample", "apron"))
@@ -143,6 +153,7 @@ class Fine:
         overflow: () int32, pixels that there was no room for, which stay coarse, and samples that were dropped.
         supersample: s; each active pixel has s² cells.
         apron: cells around active pixels, and around the layout.
+        facing: (K, h, w) int16, as in `Sampled`, or None.
     """
 
     samples: tuple[Samples, ...]
@@ -156,6 +167,7 @@ class Fine:
     overflow: Array
     supersample: int
     apron: int
+    facing: Array | None = None
 
     @property
     def wanted(self) -> Array:
@@ -179,6 +191,9 @@ class Sampled:
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
         fine: further samples where outlines are (`rts.Adaptive`), or None.
+        settled: (H, W) bool, see `Splats`; None where no samples were left out for it.
+        facing: (K, H, W) int16, as in `Samples`; pieces of different parts have different numbers. None where nothing
+            is told.
     """
 
     samples: tuple[Samples, ...]
@@ -188,11 +203,15 @@ class Sampled:
     supersample: int = 1
     apron: int = 2
     fine: Fine | None = None
+    settled: Array | None = None
+    facing: Array | None = None
 
     @property
     def part(self) -> Array:
         """(K, H, W) int32, the part seen in each cell, or −1."""
         xp, first = namespace(self.row), 0
+        if len(self.samples) == 1:
+            return xp.clip(self.row, None, 0)
         part = xp.astype(self.row >= 0, self.row.dtype) - 1
         for samples in self.samples[:-1]:
             first += samples.ids.shape[-2]
@@ -212,8 +231,10 @@ class Splats:
         rgba: (N, 4) premultiplied, of the engine of the positions; differentiable.
         row: (K, H, W) int32, the sample of each cell front to back, or −1; an array of the positions' engine.
         part: (K, H, W) int32, the part of each sample, or −1; None if that is not known.
-        facing: (N,) float, the cosine between a sample's normal and the direction to the viewer; or None.
-        settled: (H, W) bool, cells amid one colour, where nothing that moves changes the image; or None.
+        facing: (K, H, W) integers, the number of the piece of surface in each cell, negative where it is seen from
+            behind, 0 where that is not told; or None. See `Samples`.
+        settled: (H, W) bool, cells that show the one colour of all samples, whatever moves; or None. They may have
+            no sample, as cells around them that affect no others.
         sentinel: () float, the depth that stands for empty layers, beyond all samples; None for one of the scene's
             scale.
         wanted: (H, W) bool, the targets that are looked at; others may have any finite colour. None for all.

@@ -7,28 +7,44 @@ registered in its `pyproject.toml` in the same way as anyone's. Only the plugin 
 from __future__ import annotations
 
 import difflib
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any, NamedTuple
+import re
+from collections.abc import Iterable, Mapping
+from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
+from typing import Any, Literal, NamedTuple, overload
 
+from rts.capabilities import capabilities
 from rts.errors import InputError, PluginError
 
 GROUPS = ("rts.surfaces", "rts.samplers", "rts.shaders", "rts.splatters", "rts.engines")
 
 
 class PluginInfo(NamedTuple):
-    """One line of `rts plugins`.
+    """One plugin: a line of `rts plugins`, and an item of `rts.plugins(group, details=True)`.
 
     Attributes:
         group: the entry-point group.
         name: the plugin's name.
         distribution: name and version of the distribution that brings it.
         error: why it does not load, or None.
+        missing: packages of the extra with the plugin's name that are not installed; a plugin may be ready without
+            them, for part of what it does.
+        install: what to install for what is missing, such as "rasterize-then-splat[torch]"; None where nothing is, or
+            no extra brings it.
+        capabilities: what it can do, by name; of its class, see `rts.capabilities`. Empty where it does not load.
     """
 
     group: str
     name: str
     distribution: str
     error: str | None
+    missing: tuple[str, ...] = ()
+    install: str | None = None
+    capabilities: Mapping[str, Any] = {}
+
+    @property
+    def ready(self) -> bool:
+        """Whether it loads."""
+        return self.error is None
 
 
 _found: dict[str, dict[str, list[EntryPoint]]] = {}
@@ -62,13 +78,27 @@ def _distribution(entry: EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown distribution"
 
 
-def plugins(group: str) -> list[str]:
-    """The names registered in a group, such as "rts.samplers" (or "samplers"), sorted.
+@overload
+def plugins(group: str, *, details: Literal[False] = ...) -> list[str]: ...
+
+
+@overload
+def plugins(group: str, *, details: Literal[True]) -> list[PluginInfo]: ...
+
+
+def plugins(group: str, *, details: bool = False) -> list[str] | list[PluginInfo]:
+    """The plugins registered in a group, such as "rts.samplers" (or "samplers"), sorted by name.
+
+    Args:
+        group: the group.
+        details: whether to say more of each than its name: its distribution, whether it is ready or what is missing,
+            and what it can do. Every plugin is imported for that.
 
     Raises:
         InputError: no such group.
     """
-    return sorted(_entries(_group(group)))
+    group = _group(group)
+    return [_details(group, name) for name in sorted(_entries(group))] if details else sorted(_entries(group))
 
 
 def _entry(group: str, name: str) -> EntryPoint:
@@ -123,6 +153,36 @@ def plugin(group: str, name: str) -> Any:
         ) from error
 
 
+def built_in_surfaces() -> dict[str, str]:
+    """Class → name of the surfaces that the library's own distribution registers, such as "Mesh" → "mesh"."""
+    own = _entries("rts.engines")["numpy"][0].dist
+    return {
+        entry.attr: name
+        for name, entries in _entries("rts.surfaces").items()
+        for entry in entries
+        if own is not None and entry.dist is not None and entry.dist.name == own.name
+    }
+
+
+def attribute(name: str, known: Iterable[str]) -> Any:
+    """What `rts.Mesh` and its like are: a built-in surface by the name of its class, loaded now.
+
+    Args:
+        name: of the attribute.
+        known: names that there are besides, for a hint.
+
+    Raises:
+        AttributeError: there is no such surface, or it cannot be imported.
+    """
+    surfaces = built_in_surfaces() if name[:1].isupper() else {}  # Only classes are worth a look at entry points.
+    if name not in surfaces:
+        raise AttributeError(f"module 'rts' has no attribute {name!r}{_suggest(name, [*known, *surfaces])}")
+    try:
+        return plugin("rts.surfaces", surfaces[name])
+    except PluginError as error:
+        raise AttributeError(f"rts.{name} cannot be loaded: {error}") from error
+
+
 def instance(group: str, chosen: Any) -> Any:
     """A usable plugin from a name, a class or a ready object.
 
@@ -138,13 +198,29 @@ def instance(group: str, chosen: Any) -> Any:
 
 def survey() -> list[PluginInfo]:
     """Every registered plugin, each tried, in order of group and name."""
+    return [info for group in GROUPS for info in plugins(group, details=True)]
+
+
+def _details(group: str, name: str) -> PluginInfo:
+    entries, able, error = _entries(group)[name], {}, None
+    try:
+        able = capabilities(group, plugin(group, name))
+    except PluginError as problem:
+        error = str(problem)
+    missing = _missing(entries[0])
+    install = f"{entries[0].dist.name}[{name}]" if missing and entries[0].dist else None
+    return PluginInfo(group, name, " and ".join(map(_distribution, entries)), error, missing, install, able)
+
+
+def _missing(entry: EntryPoint) -> tuple[str, ...]:
+    """The packages that the extra of the plugin's name asks for, and that are not installed."""
     found = []
-    for group in GROUPS:
-        for name, entries in sorted(_entries(group).items()):
+    for requirement in (entry.dist.requires if entry.dist else None) or ():
+        wanted, _, marker = requirement.partition(";")
+        if re.search(rf"""extra\s*==\s*["']{re.escape(entry.name)}["']""", marker):
+            package = re.split(r"[^\w.-]", wanted.strip(), maxsplit=1)[0]
             try:
-                plugin(group, name)
-                error = None
-            except PluginError as problem:
-                error = str(problem)
-            found.append(PluginInfo(group, name, " and ".join(map(_distribution, entries)), error))
-    return found
+                distribution(package)
+            except PackageNotFoundError:
+                found.append(package)
+    return tuple(found)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
 
 WALK = 16
 """Steps from triangle to triangle at most."""
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def corner_lists(faces, count):
     """For each of `count` vertices the triangles around it: offsets (V + 1,) into members (3 T,)."""
     offsets = np.zeros(count + 1, np.int32)
@@ -29,7 +29,7 @@ def corner_lists(faces, count):
     return offsets, members
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def places(vertices, faces):
     """(T, 3) faces in which corners at one place have one number, though they may be different vertices."""
     size = 4
@@ -58,7 +58,7 @@ def places(vertices, faces):
     return found
 
 
-@numba.njit
+@compiled
 def look(t, x, y, matrix, row, keep, vertices, faces, corners):
     """Whether a triangle covers a pixel exactly, its least barycentric there, its depth, two barycentrics."""
     ia, ib, ic = faces[t, 0], faces[t, 1], faces[t, 2]
@@ -77,7 +77,7 @@ def look(t, x, y, matrix, row, keep, vertices, faces, corners):
     return inside, min(ea, eb, ec) / total, z, ea / total, eb / total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def settle(
     first, last, matrix, row, keep, vertices, faces, around, offsets, members, triangle_ids, barycentrics, depths
 ):  # fmt: skip

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from rts.compiling import kernel
 from rts.records import Fragments
 
 SIDE = 16
@@ -51,7 +51,7 @@ class Blocks(NamedTuple):
         return Fragments(ids, barycentrics, np.zeros(shape, np.float32))
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _number(cells, width, table):
     """Number the blocks that hold any cells; how many there are."""
     count = 0
@@ -64,7 +64,7 @@ def _number(cells, width, table):
     return count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _fill(cells, width, table, numbers, bits):
     for m in range(len(cells)):
         if cells[m] >= 0:
@@ -73,7 +73,7 @@ def _fill(cells, width, table, numbers, bits):
             bits[y, x // SIDE] |= np.uint16(1 << x % SIDE)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def narrow(first, last, listed, bits, spans, counts):
     """Leave out listed triangles whose box of pixels holds none of the cells.
 

@@ -6,9 +6,9 @@ that they compile to vector instructions and no jump is mispredicted; what is ra
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
 from rts_backends import raster_cells
 from rts_backends.triangles import owns
 
@@ -22,7 +22,7 @@ NUMBERS = 18
 """Three edge functions (x, y, 1) turned inward; of the corners the depths, and w + z and w − z of clip space."""
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def draw(first, last, offsets, items, listed, vertices, matrix, view_depth, keep, triangle_ids, barycentrics, depths):
     """Fill the three fragment arrays, band by band."""
     layers, height, width = triangle_ids.shape
@@ -70,7 +70,7 @@ def draw(first, last, offsets, items, listed, vertices, matrix, view_depth, keep
                     depths[k, j, i] = z if z < np.inf else 0.0
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def draw_cells(
     first,
     last,
@@ -139,7 +139,7 @@ def draw_cells(
                         depths[k, m] = z if z < np.inf else 0.0
 
 
-@numba.njit(error_model="numpy")
+@compiled(error_model="numpy")
 def _insert_cells(hits, top, entries, numbers, clips, columns, members, nearest, triangle_ids, barycentrics):
     """As `_insert`, into the layers of those cells that are listed."""
     for h in range(len(hits)):
@@ -159,7 +159,7 @@ def _insert_cells(hits, top, entries, numbers, clips, columns, members, nearest,
 # numba itself must inline these, so that lengths of rows are known: only then do their loops become vector code.
 
 
-@numba.njit(inline="always")
+@compiled(inline="always")
 def _gather(block, listed, vertices, entries, points):
     """What is listed of the triangles (LISTED, BLOCK), and their corners (3, 3, BLOCK).
 
@@ -175,7 +175,7 @@ def _gather(block, listed, vertices, entries, points):
                 points[c, r, b] = vertices[v, r]
 
 
-@numba.njit(inline="always")
+@compiled(inline="always")
 def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, clips):
     """Work out the numbers (NUMBERS, BLOCK) of triangles, and which may need clipping.
 
@@ -212,7 +212,7 @@ def _set_up(count, points, m, view_depth, keep, top, bottom, entries, numbers, c
             numbers[3 * c + 2, b] = signs[b] * (ax * by - ay * bx)
 
 
-@numba.njit(inline="always")
+@compiled(inline="always")
 def _cover(count, entries, numbers, covers):
     """Which of the first 2 × 2 pixels of its box each triangle may cover, as bits."""
     for b in range(count):
@@ -227,7 +227,7 @@ def _cover(count, entries, numbers, covers):
         covers[b] = bits
 
 
-@numba.njit(error_model="numpy")
+@compiled(error_model="numpy")
 def _insert(hits, top, entries, numbers, clips, nearest, triangle_ids, barycentrics):
     """Insert the block's triangles into the layers of pixels; hits (n, 2) are triangle and row of the band, column."""
     for h in range(len(hits)):
@@ -239,7 +239,7 @@ def _insert(hits, top, entries, numbers, clips, nearest, triangle_ids, barycentr
             _put(z, entries[0, b], p, q, nearest[:, row, i], triangle_ids[:, j, i], barycentrics[:, j, i])
 
 
-@numba.njit(inline="always", error_model="numpy")
+@compiled(inline="always", error_model="numpy")
 def _met(b, x, y, numbers, clips):
     """Whether triangle b of a block covers a point; and its depth and first two barycentrics there."""
     xa, ya, wa = numbers[0, b], numbers[1, b], numbers[2, b]
@@ -256,7 +256,7 @@ def _met(b, x, y, numbers, clips):
     return found, z, np.float32(ea * scale), np.float32(eb * scale)
 
 
-@numba.njit(inline="always")
+@compiled(inline="always")
 def _put(z, t, p, q, nearest, triangle_ids, barycentrics):
     """Put a hit into the layers (K,) of a cell: behind what is as near, before what is farther."""
     moved = z  # A branch would be foreseen every other time.
@@ -269,7 +269,7 @@ def _put(z, t, p, q, nearest, triangle_ids, barycentrics):
         p, q = old_p if before else p, old_q if before else q
 
 
-@numba.njit
+@compiled
 def _outside(numbers, b, ea, eb, ec):
     """Whether the point with barycentrics in the ratio ea : eb : ec lies outside the near or the far plane."""
     near = ea * numbers[12, b] + eb * numbers[13, b] + ec * numbers[14, b]

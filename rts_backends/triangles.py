@@ -11,10 +11,10 @@ own dates.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
 from rts.camera import Camera
+from rts.compiling import compiled, kernel
 
 
 def pixel_matrix(camera: Camera, size: tuple[int, int]) -> np.ndarray:
@@ -34,7 +34,7 @@ def facing(camera: Camera, cull: str) -> float:
     return -float(winding) if cull == "back" else 0.0
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def bounding_sphere(vertices, faces):
     """(4,) centre and radius of a sphere around the vertices that triangles refer to, by their bounding box."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -50,7 +50,7 @@ def bounding_sphere(vertices, faces):
     return sphere
 
 
-@numba.njit
+@compiled
 def to_corner(matrix, vertices, v, corners, i):
     """Transform vertex `v` into row `i` of `corners`."""
     x, y, z = np.float64(vertices[v, 0]), np.float64(vertices[v, 1]), np.float64(vertices[v, 2])
@@ -58,13 +58,13 @@ def to_corner(matrix, vertices, v, corners, i):
         corners[i, r] = matrix[r, 0] * x + matrix[r, 1] * y + matrix[r, 2] * z + matrix[r, 3]
 
 
-@numba.njit
+@compiled
 def depth_of(row, vertices, v):
     """Linear depth of vertex `v`; `row` is minus the third row of the view."""
     return row[0] * vertices[v, 0] + row[1] * vertices[v, 1] + row[2] * vertices[v, 2] + row[3]
 
 
-@numba.njit
+@compiled
 def determinant(corners, ia, ib, ic):
     """The determinant of three corners (X, Y, w): twice the signed area on screen, times the three w."""
     ax, ay, aw = corners[ia, 0], corners[ia, 1], corners[ia, 3]
@@ -73,7 +73,7 @@ def determinant(corners, ia, ib, ic):
     return ax * (by * cw - bw * cy) - ay * (bx * cw - bw * cx) + aw * (bx * cy - by * cx)
 
 
-@numba.njit
+@compiled
 def edge(corners, i, j):
     """Coefficients (x, y, 1) of the edge function of two corners; swapping them negates it exactly."""
     ax, ay, aw = corners[i, 0], corners[i, 1], corners[i, 3]
@@ -81,13 +81,13 @@ def edge(corners, i, j):
     return ay * bw - aw * by, aw * bx - ax * bw, ax * by - ay * bx
 
 
-@numba.njit
+@compiled
 def owns(x, y):
     """Whether an edge with these coefficients, turned inward, owns the pixels exactly on it: top and left edges do."""
     return x > 0 or (x == 0 and y > 0)
 
 
-@numba.njit
+@compiled
 def edge_values(corners, ia, ib, ic, x, y):
     """Edge functions at a pixel position, positive inside, and whether the position belongs to the triangle."""
     xa, ya, wa = edge(corners, ib, ic)
@@ -104,7 +104,7 @@ def edge_values(corners, ia, ib, ic, x, y):
     return ea, eb, ec, inside
 
 
-@numba.njit
+@compiled
 def clipped(corners, ia, ib, ic, ea, eb, ec):
     """Whether the point with barycentrics in the ratio ea : eb : ec lies outside the near or the far plane."""
     near = ea * (corners[ia, 2] + corners[ia, 3]) + eb * (corners[ib, 2] + corners[ib, 3])

@@ -8,12 +8,14 @@ are differentiated. It imports numba.
 from __future__ import annotations
 
 import math
+from functools import partial
 
-import numba
 import numpy as np
 
-compiled = numba.njit(nogil=True, fastmath={"contract"})
-kernel = numba.njit(nogil=True, cache=True, fastmath={"contract"})
+from rts import compiling
+
+compiled = partial(compiling.compiled, fastmath={"contract"})
+kernel = partial(compiling.kernel, fastmath={"contract"})
 
 BEZIER = np.array([[1.0, 0, 0, 0], [-3, 3, 0, 0], [3, -6, 3, 0], [-1, 3, -3, 1]])
 """Coefficients of 1, t, t², t³ (rows) from Bézier control points (columns)."""

@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 
-compiled = numba.njit(nogil=True)
-kernel = numba.njit(nogil=True, cache=True)
+from rts.compiling import compiled, kernel
 
 COLLAPSED = 1e-6
 """Derivatives that are parallel but for this share have no normal."""

@@ -19,7 +19,7 @@ from rts.operations.combine import interpolate
 from rts.operations.take import take
 from rts.records import Proxy, Samples
 from rts.sampling.cache import fingerprint
-from rts.topology import fixed, index_table
+from rts.topology import fixed, index_table, pieces
 from rts.trees import Array, Tree
 from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows
 
@@ -65,6 +65,7 @@ class Mesh(TriangleSurface):
         self._extents = [int(t.max()) + 1 for t in self._tables]
         self.sample_widths = (self._ids.shape[1], 2)
         self._normals: tuple[tuple, np.ndarray] | None = None
+        self._pieces: np.ndarray | None = None
         self._reads: dict[tuple, tuple[str, ...]] = {}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -133,6 +134,12 @@ class Mesh(TriangleSurface):
     def proxy(self, inputs: np.ndarray, camera: Any, size: tuple[int, int]) -> Proxy:
         """The mesh itself."""
         return Proxy(np.ascontiguousarray(inputs, dtype=np.float32), self.faces, self._ids)
+
+    def pieces(self, proxy: Proxy) -> np.ndarray:
+        """Those of its faces, found once."""
+        if self._pieces is None:
+            self._pieces = pieces(self.faces)
+        return self._pieces
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Interpolated positions and attributes; see the class for their names."""

@@ -5,11 +5,7 @@ Tiles, their tables and their local coordinates are those of `rts_surfaces.tiles
 
 from __future__ import annotations
 
-import numba
-
-compiled = numba.njit(nogil=True)
-kernel = numba.njit(nogil=True, cache=True)
-
+from rts.compiling import compiled, kernel
 
 # ------------------------------------------------------------------------------------------ points and counts
 

@@ -6,6 +6,9 @@ import pytest
 # Idle threads of OpenMP otherwise spin, which on a busy machine makes small renders many times slower.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
+# Most programs that tests have jax compile run once: to have LLVM improve them takes longer than it saves.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
+
 ROOT = Path(__file__).resolve().parent.parent
 
 

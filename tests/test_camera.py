@@ -43,6 +43,26 @@ def test_perspective_pixel_of_a_point_is_the_written_out_number():
     np.testing.assert_allclose(pixel(camera, (1, 2, 0)), (30 + 4, 20 - 8, 5), atol=1e-12)
 
 
+def test_a_camera_without_a_pose_is_at_the_origin_and_looks_along_minus_z():
+    camera = Camera.perspective(90)
+    np.testing.assert_array_equal(camera.view, np.eye(4))
+    # At depth 5 an image of 200 rows shows ±5: 20 pixels a unit, from the middle (150, 100).
+    np.testing.assert_allclose(camera.project(np.array([[1.0, 2, -5]]), (200, 300)), [[170, 60, 5]], atol=1e-9)
+    looking = Camera.look_at((1, 2, 5), (0, 0, 0), fov_y=30, near=0.1, far=9)
+    assert Camera.perspective(30, view=looking.view, near=0.1, far=9) == looking
+    assert Camera.perspective(30, aspect=1.5).aspect == 1.5
+    for wrong, said in ({"view": np.zeros((4, 4))}, "singular"), ({"view": np.eye(3)}, "shape"), ({"near": 0}, "near"):
+        with pytest.raises(InputError, match=said):
+            Camera.perspective(40, **wrong)
+
+
+def test_a_camera_of_a_matrix_is_differentiable_in_it():
+    torch = pytest.importorskip("torch")
+    view = torch.eye(4, dtype=torch.float64, requires_grad=True)
+    Camera.perspective(90, view=view).project(torch.tensor([[1.0, 2, -5]]).double(), (200, 300))[0, 0].backward()
+    assert view.grad[0, 3] == pytest.approx(20)  # Pixels a unit.
+
+
 def test_orthographic_pixel_of_a_point_is_the_written_out_number():
     # 8 units high, 40 pixels high: 5 pixels a unit at any depth.
     camera = Camera.orthographic((0, 0, 5), (0, 0, 0), height=8, aspect=1.5)

@@ -175,7 +175,12 @@ def test_plugins_lists_each_plugin_and_why_one_does_not_load(monkeypatch):
         assert f"│ {name} │" in output
     broken = [rts.registry.PluginInfo("rts.samplers", "odd", "odd 1.0", "needs [odd]: pip install odd")]
     monkeypatch.setattr(rts.registry, "survey", lambda: broken)
-    assert "│ samplers │ odd │ odd 1.0 │ needs [odd]: pip install odd │" in succeed("plugins")
+    assert "│ samplers │ odd │ odd 1.0 │ needs [odd]: pip install odd │ │" in succeed("plugins")
+    able = {"triangles": True, "rays": False, "layers": 1, "reads": ("uv", "normal"), "reach": None}
+    partly = [rts.registry.PluginInfo("rts.samplers", "odd", "odd 1.0", None, ("dd",), "odd[odd]", able)]
+    monkeypatch.setattr(rts.registry, "survey", lambda: partly)
+    ready = "ready, but without dd: pip install 'odd[odd]'"
+    assert f"│ {ready} │ triangles, layers 1, reads uv normal │" in succeed("plugins")
 
 
 # -------------------------------------------------------------------------------------------------- render

@@ -1,8 +1,11 @@
 """Plugins by name: what is found, what is loaded, and what the errors say."""
 
+import ast
 import json
 import subprocess
 import sys
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -132,6 +135,86 @@ def test_a_survey_names_the_distribution_and_why_a_plugin_does_not_load(install)
     assert lines["good"].error is None and lines["good"].distribution == "mixed 3.4"
     assert "no display" in lines["bad"].error
     assert lines["multi"].error is None and lines["multi"].distribution.startswith("rasterize-then-splat ")
+
+
+def test_details_say_what_each_plugin_can_do():
+    found = {(i.group, i.name): i for g in registry.GROUPS for i in rts.plugins(g, details=True)}
+    assert [i.name for i in rts.plugins("samplers", details=True)] == rts.plugins("samplers")
+
+    def able(group, name):
+        return found[f"rts.{group}", name].capabilities
+
+    assert able("surfaces", "mesh")["triangles"] and not able("surfaces", "mesh")["rays"]
+    assert able("surfaces", "sdf")["rays"] and not able("surfaces", "sdf")["triangles"]
+    assert able("samplers", "raster")["culls"] and not able("samplers", "rays")["culls"]
+    assert able("splatters", "single")["layers"] == 1 and able("splatters", "visible")["layers"] is None
+    assert able("engines", "numpy") == {"differentiates": False}
+    assert able("shaders", "silhouette")["uniform"] and able("shaders", "textured")["reads"] is not None
+    assert found["rts.surfaces", "mesh"].ready and found["rts.surfaces", "mesh"].missing == ()
+
+
+def test_a_splatter_looks_at_no_more_layers_than_it_says():
+    rng = np.random.default_rng(2)
+    row = np.arange(2 * 5 * 6, dtype=np.int32).reshape(2, 5, 6)
+    y, x = np.indices((5, 6)) + 0.5
+    depth = np.cumsum(rng.uniform(1, 3, (2, 5, 6)), axis=0)
+    positions = np.stack([*np.broadcast_arrays(x, y, depth)], axis=-1).reshape(-1, 3)
+    rgba = rng.uniform(0.1, 0.5, (60, 4))
+    for info in rts.plugins("splatters", details=True):
+        splatter = rts.plugin("splatters", info.name)()
+        one, two = splatter.splat(positions[:30], rgba[:30], row[:1]), splatter.splat(positions, rgba, row)
+        assert np.array_equal(one, two) == (info.capabilities["layers"] == 1), info.name
+
+
+def test_details_say_which_extra_is_missing(install, tmp_path):
+    source = "class Odd:\n    def splat(self, positions, rgba, row): ...\n"
+    install("mine", {"rts.splatters": {"odd": "mine_odd:Odd", "even": "mine_gone:Even"}}, {"mine_odd": source}, ["odd"])
+    metadata = next((tmp_path / "mine").glob("*.dist-info")) / "METADATA"
+    needs = "Requires-Dist: numpy; extra == 'odd'\nRequires-Dist: qqq-there.is-none>=3; extra == \"odd\"\n"
+    metadata.write_text(metadata.read_text() + needs)
+    found = {info.name: info for info in rts.plugins("splatters", details=True)}
+    assert found["odd"].ready and found["odd"].missing == ("qqq-there.is-none",) and found["odd"].install == "mine[odd]"
+    assert found["odd"].capabilities["reach"] == 1 and not found["odd"].capabilities["prunes"]
+    assert not found["even"].ready and found["even"].install is None and found["even"].capabilities == {}
+
+
+# ---------------------------------------------------------------------------------- surfaces as attributes
+
+
+def test_the_surfaces_of_the_library_are_attributes_of_it():
+    root = Path(__file__).resolve().parent.parent
+    entries = tomllib.loads((root / "pyproject.toml").read_text())["project"]["entry-points"]["rts.surfaces"]
+    assert registry.built_in_surfaces() == {path.partition(":")[2]: name for name, path in entries.items()}
+    assert set(registry.built_in_surfaces()) <= set(dir(rts)) and "render" in dir(rts)
+    assert rts.Mesh is rts.plugin("surfaces", "mesh") and rts.Sdf is rts.plugin("surfaces", "sdf")
+    # Type checkers see where each is from.
+    [block] = [n for n in ast.parse((root / "rts/__init__.py").read_text()).body if isinstance(n, ast.If)]
+    told = {f"{n.module}:{n.names[0].asname}" for n in block.body}
+    assert ast.unparse(block.test) == "TYPE_CHECKING" and told == set(entries.values())
+
+
+def test_an_attribute_that_is_not_there_is_an_attribute_error_with_a_hint(install):
+    for name, hint in {"Mash": "did you mean 'Mesh'", "rendr": "did you mean 'render'", "Heightfield": ""}.items():
+        with pytest.raises(AttributeError, match=f"^module 'rts' has no attribute '{name}'.*{hint}"):
+            getattr(rts, name)
+    assert not hasattr(rts, "qqq") and not hasattr(rts, "Toy")
+
+
+def test_a_surface_that_cannot_be_loaded_is_an_attribute_error_too(monkeypatch):
+    def broken(*_):
+        raise rts.PluginError("no compiler")
+
+    monkeypatch.delitem(vars(rts), "Bezier", raising=False)
+    monkeypatch.setattr(registry, "plugin", broken)
+    with pytest.raises(AttributeError, match="^rts.Bezier cannot be loaded: no compiler"):
+        rts.Bezier  # noqa: B018
+
+
+def test_surfaces_and_entry_points_are_left_alone_until_an_attribute_asks_for_them():
+    loaded = modules_after("import rts\nassert not rts.registry._found\nassert not hasattr(rts, 'regulrizers')")
+    assert not {m for m in loaded if m.startswith("rts_surfaces")}
+    loaded = modules_after("import rts\nassert rts.registry._found == {}\nrts.Mesh")
+    assert {m for m in loaded if m.startswith("rts_surfaces.")} == {"rts_surfaces.entries", "rts_surfaces.mesh"}
 
 
 # ------------------------------------------------------------------------------------------ what is loaded

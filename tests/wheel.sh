@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Whether the wheel works by itself: installed into an empty environment, away from the sources, the demo runs, settings
-# are compared on a model, and the tests of the example plugin pass.
+# are compared on a model, and the tests of the example plugin and of a newly written one pass.
 #
 #     tests/wheel.sh <folder of the wheel> <folder of the example plugin> <constraints>
 set -euo pipefail
@@ -31,3 +31,7 @@ test -s out/compare/model.json && test -s out/compare/model.png && test -s out/c
 venv/bin/rts tune model.obj --tolerance 0.1 --mode translation
 cd plugin
 ../venv/bin/python -m pytest -q -p no:cacheprovider tests
+cd ..
+venv/bin/rts new surface blob
+venv/bin/python -m pip install --quiet ./rts-blob
+venv/bin/python -m pytest -q -p no:cacheprovider rts-blob

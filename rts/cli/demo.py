@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from rts import registry
-from rts.cli.pose_fit import PoseFit, fit_pose, posed, shrunk, silhouette_of
+from rts.cli.pose_file import posed
+from rts.cli.pose_fit import PoseFit, fit_pose, shrunk, silhouette_of
 from rts.cli.pose_report import write_report
+from rts.cli.pose_verdict import judged
 from rts.cli.views import bounds_of, orbit
 from rts.files.paths import writing
 from rts.interfaces import Part
@@ -64,9 +66,10 @@ def run(folder: Path, engine: str | None = None, progress: bool | None = None) -
     # One layer, splatted as the fit does: two would widen the outline, as the knot's back faces are not culled.
     target = silhouette_of(render(posed(model, true, "silhouette"), camera, SIZE, splatter="single", layers=1))
     found = fit_pose(model, target, camera, bounds, engine=engine, progress=progress)
-    files = write_report(folder, found, model, camera, target, scenery=[floor])
+    verdict = judged(found.pose, model, target)
+    files = write_report(folder, found, verdict, model, target, scenery=[floor])
     errors = {
-        "rotation_error_degrees": {"start": _degrees(np.eye(4), true), "end": _degrees(found.matrix, true)},
+        "rotation_error_degrees": {"start": _degrees(np.eye(4), true), "end": _degrees(found.pose.matrix, true)},
         "translation_error_over_radius": {
             "start": float(np.linalg.norm(TRUE_TRANSLATION) / bounds.radius),
             "end": float(np.linalg.norm(found.translation - TRUE_TRANSLATION) / bounds.radius),
@@ -75,6 +78,7 @@ def run(folder: Path, engine: str | None = None, progress: bool | None = None) -
     summary: dict[str, Any] = {
         **errors,
         "loss": {"start": found.first_loss, "end": found.loss},
+        "iou": {"start": judged(found.start, model, target).iou, "end": verdict.iou},
         "steps": len(found.history),
         "seconds": found.seconds,
         "triangles": len(model[0].surface.faces),
@@ -91,6 +95,7 @@ def _markdown(summary: dict[str, Any], files: list[Path]) -> str:
         ("rotation error, degrees", summary["rotation_error_degrees"]),
         ("translation error, object radii", summary["translation_error_over_radius"]),
         ("mean square difference of silhouettes", summary["loss"]),
+        ("intersection over union of silhouettes", summary["iou"]),
     ]
     table = "\n".join(f"| {name} | {v['start']:.3g} | {v['end']:.3g} |" for name, v in rows)
     pictures = "\n\n".join(f"![{f.stem}]({f.name})" for f in files if f.suffix in (".png", ".gif"))

@@ -1,4 +1,4 @@
-"""The command line: `rts plugins`, `render`, `fit-pose`, `export`, `compare`, `tune`, `demo`."""
+"""The command line: `rts plugins`, `render`, `fit-pose`, `export`, `compare`, `tune`, `new`, `demo`, `warmup`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import os
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -163,6 +163,18 @@ def _background(text: str) -> tuple[float, ...] | None:
         raise typer.BadParameter(f"{text!r} is no colour; expected a name, #rrggbb, or none") from None
 
 
+def _given(context: typer.Context, option: str) -> bool:
+    """Whether an option was given, and is not its default."""
+    source = context.get_parameter_source(option)
+    return source is not None and source.name != "DEFAULT"
+
+
+def _refuse_beside(option: str, context: typer.Context, others: Sequence[str]) -> None:
+    for other in others:
+        if _given(context, other):
+            raise typer.BadParameter(f"--{other} beside {option}, which says it already; leave one of them out")
+
+
 Surface = Annotated[
     str, typer.Option(help="Name of the surface that reads the model: mesh, or such as bezier for patches.")
 ]
@@ -217,6 +229,7 @@ def plugins(
 
 @app.command(epilog="Example: rts render bunny.obj -o bunny.png --size 480x640 --camera 30,20 --cull back")
 def render(
+    context: typer.Context,
     model: Annotated[Path, typer.Argument(help="OBJ, PLY, STL, GLB, glTF, OFF, …", show_default=False)],
     output: Annotated[Path, typer.Option("--output", "-o", help="The PNG to write.")] = Path("out.png"),
     surface: Surface = "mesh",
@@ -234,18 +247,29 @@ def render(
     ] = "1",
     background: Annotated[str, typer.Option(help="A colour's name, #rrggbb, or none: transparent.")] = "none",
     cull: Annotated[str, typer.Option(help="none, or back to leave out triangles seen from behind.")] = "none",
+    pose: Annotated[
+        Path | None,
+        typer.Option(help="The pose.json of `rts fit-pose`: pose, camera and size are exactly those in it."),
+    ] = None,
 ) -> None:
     """Render a model to a picture."""
     import rts
+    from rts.cli.pose_file import posed, read_pose
     from rts.cli.views import bounds_of, orbit
     from rts.files.paths import output_file
 
     shape, view, color = _size(size), _view(camera), _background(background)
     output_file(output, "picture", (".png",))
     chosen = registry.plugin("rts.engines", engine)()
-    parts = rts.load(model, surface=surface)
+    if pose is None:
+        parts = rts.load(model, surface=surface)
+        seen = orbit(bounds_of(parts), shape, *view, fov=fov, up=up)
+    else:
+        _refuse_beside("--pose", context, ("camera", "fov", "up"))
+        matrix, seen, own = read_pose(pose)
+        shape = shape if _given(context, "size") else own
+        parts = posed(rts.load(model, surface=surface), matrix)
     bounds = bounds_of(parts)
-    seen = orbit(bounds, shape, *view, fov=fov, up=up)
     distance = float(np.linalg.norm(np.linalg.inv(seen.view)[:3, 3] - bounds.center))
     extent = np.array([max(distance - bounds.radius, 0), distance + bounds.radius], np.float32)
 
@@ -293,34 +317,43 @@ def fit_pose(
     camera: Camera_ = "30,20",
     fov: Fov = 40.0,
     up: Up = "y",
+    fit_fov: Annotated[bool, typer.Option("--fit-fov", help="Fit the field of view, too; --fov is the start.")] = False,
 ) -> None:
     """Find the turn and shift of a model that make its silhouette match a picture's: coarse, blurred pixels first.
 
-    Writes pose.json (axis-angle, translation, 4x4 matrix, loss, iterations, seconds), before.png, after.png,
-    target.png, animation.gif and convergence.png.
+    Writes pose.json (axis-angle, translation, 4x4 matrix; camera, size, field of view; loss, iterations, seconds;
+    intersection over union and verdict), before.png, after.png, target.png, animation.gif and convergence.png.
+    `rts render MODEL --pose pose.json` draws the model so.
     """
     import rts
     from rts.cli.pose_fit import fit_pose as fit
     from rts.cli.pose_fit import silhouette_of
     from rts.cli.pose_report import write_report
+    from rts.cli.pose_verdict import judged
     from rts.cli.views import bounds_of, orbit
     from rts.files.paths import output_folder
 
     view = _view(camera)
     output_folder(output)
     parts = rts.load(model, surface=surface)
-    mask = silhouette_of(rts.load_image(target))
+    picture = rts.load_image(target)
+    mask = silhouette_of(picture)
     bounds = bounds_of(parts)
     seen = orbit(bounds, mask.shape, *view, fov=fov, up=up)
     chosen = None if engine == "auto" else engine
-    found = fit(parts, mask, seen, bounds, engine=chosen, method=method, steps=steps)
-    files = write_report(output, found, parts, seen, mask)
+    found = fit(parts, mask, seen, bounds, engine=chosen, method=method, steps=steps, fit_fov=fit_fov)
+    verdict = judged(found.pose, parts, mask, picture)
+    files = write_report(output, found, verdict, parts, mask)
     _say(
         f"loss {found.first_loss:.3g} → {found.loss:.3g} in {len(found.history)} steps, {_sum(found.levels)} from "
         f"coarse and blurred pixels to fine, {found.seconds:.1f} s (at the finest, {found.reason}); wrote"
     )
     _say_written(files)
     _say_skipped_plot(files)
+    seen_by = f", field of view {found.pose.fov_y:.1f} degrees" if fit_fov else ""
+    _say(f"{verdict.word}: IoU {verdict.iou:.3f}{seen_by}")
+    for note in verdict.notes:
+        _say(escape(f"  {note}"))
 
 
 @app.command(epilog="Example: rts export teapot.txt --surface bezier -o teapot.obj --tolerance 0.0005")
@@ -442,6 +475,22 @@ def _interrupted(what: str) -> Iterator[None]:
         raise typer.Exit(130) from None
 
 
+@app.command(epilog="Example: rts new surface blob && pip install -e 'rts-blob[test]' && pytest rts-blob")
+def new(
+    kind: Annotated[str, typer.Argument(help="surface", show_default=False)],
+    name: Annotated[str, typer.Argument(help="The plugin's name.", show_default=False)],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder to make; rts-NAME by default.", show_default=False)
+    ] = None,
+) -> None:
+    """Write a distribution that adds a plugin: its entry point, its class, and a test that passes as it is."""
+    from rts.cli.new_plugin import write_plugin
+
+    files = write_plugin(kind, name, output)
+    _say("wrote")
+    _say_written(files)
+
+
 @app.command(epilog="Example: rts demo -o out && open out/summary.md")
 def demo(
     output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("out"),
@@ -456,6 +505,16 @@ def demo(
     _say(f"pose found in {len(found.history)} steps, {found.seconds:.1f} s; wrote")
     _say_written(files)
     _say_skipped_plot(files)
+
+
+@app.command(epilog="Example: rts warmup --processes 4")
+def warmup(
+    processes: Annotated[int, typer.Option(min=0, help="Processes at once; 0 is as many as there are cores.")] = 0,
+) -> None:
+    """Compile ahead what ordinary renders and fits use, in several processes; else it is compiled when first used."""
+    import rts
+
+    _say(f"compiled and kept on disk, {rts.warmup(processes or None):.0f} s")
 
 
 def _sum(counts: list[int]) -> str:

@@ -6,6 +6,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from rts import registry
+from rts.capabilities import in_words
 from rts.testing.compatibility import DIFFERING, SHARE, pairs
 
 OK = (
@@ -17,12 +18,22 @@ OK = (
 
 
 def plugin_table() -> Table:
-    """Every plugin, and whether it loads."""
-    table = Table("group", "name", "from", Column("state", overflow="fold"))
-    for group, name, distribution, error in registry.survey():
-        state = "[green]ready[/]" if error is None else f"[red]{escape(error)}[/]"
-        table.add_row(group.removeprefix("rts."), name, distribution, state)
+    """Every plugin, whether it loads, and what it can do."""
+    columns = (Column(name, no_wrap=True) for name in ("group", "name"))
+    table = Table(*columns, "from", Column("state", overflow="fold"), Column("can", overflow="fold"))
+    for info in registry.survey():
+        able = escape(in_words(info.capabilities))
+        table.add_row(info.group.removeprefix("rts."), info.name, info.distribution, _state(info), able)
     return table
+
+
+def _state(info: registry.PluginInfo) -> str:
+    if info.error is not None:
+        return f"[red]{escape(info.error)}[/]"
+    if info.install is not None:
+        text = f"ready, but without {', '.join(info.missing)}: pip install '{info.install}'"
+        return f"[yellow]{escape(text)}[/]"
+    return "[green]ready[/]"
 
 
 def matrix_table() -> Table:

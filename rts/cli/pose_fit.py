@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from rts import registry
 from rts.camera import Camera
+from rts.cli.pose_file import Pose, posed
 from rts.cli.views import Bounds
-from rts.engines import Engine, engine_named
+from rts.engines import Engine, engine_named, engine_of, namespace
 from rts.errors import InputError, PluginError
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.least_squares import mean_square
 from rts.fitting.schedule import Stage, box_filtered, pyramid
 from rts.interfaces import Part
-from rts.operations.linear import matmul
 from rts.operations.rigid import rigid
 from rts.trees import Array
 
@@ -33,11 +33,11 @@ class PoseFit(NamedTuple):
         rotation: (3,) axis times angle, radians, about `center`.
         translation: (3,) world units.
         center: (3,) world.
-        matrix: (4, 4), world from the model as loaded.
-        trail: the best matrix so far, at each step.
+        trail: the best pose so far, at each step; the last is the pose found.
         history: the loss at each step: mean square of the difference of silhouettes, at that step's resolution and
             blur.
         levels: how many steps were made at each stage, from coarse to fine.
+        start: the model as loaded, seen by the camera given.
         first_loss: the loss of the start at full resolution.
         loss: the lowest loss at full resolution.
         reason: why it stopped there.
@@ -47,14 +47,19 @@ class PoseFit(NamedTuple):
     rotation: np.ndarray
     translation: np.ndarray
     center: np.ndarray
-    matrix: np.ndarray
-    trail: list[np.ndarray]
+    trail: list[Pose]
     history: list[float]
     levels: list[int]
+    start: Pose
     first_loss: float
     loss: float
     reason: str
     seconds: float
+
+    @property
+    def pose(self) -> Pose:
+        """The pose found, and its camera."""
+        return self.trail[-1]
 
 
 def available_engine() -> str:
@@ -98,29 +103,34 @@ def fit_pose(
     engine: str | None = None,
     method: str = "lm",
     steps: int | None = None,
+    fit_fov: bool = False,
     progress: bool | None = None,
 ) -> PoseFit:
     """Turn and move a model until its silhouette is the target's, from coarse pixels to fine ones.
 
+    The field of view is fitted as the logarithm of the focal length over that of `camera`.
+
     Args:
         parts: the model, NumPy arrays; its pose as loaded is the start.
         target: (H, W) silhouette.
-        camera: the camera of the target.
+        camera: the camera of the target, float64 NumPy and perspective, with its ratio of width to height.
         bounds: those of the model; translations are fitted in units of its radius, so that they weigh like radians.
         engine: "torch" or "jax"; default whichever is installed.
         method: as in `rts.fit`.
         steps: at most so many at each resolution; default that of `rts.fit`.
+        fit_fov: whether the camera's field of view is fitted, too.
         progress: see `rts.fit`.
     """
     chosen = _engine(engine or available_engine())
-    weights = np.repeat([1.0, bounds.radius], 3)
+    weights = np.concatenate([np.repeat([1.0, bounds.radius], 3), np.ones(int(fit_fov))])
     met: list[np.ndarray] = []
 
-    def note(step: int, pose: Array, loss: float) -> None:
-        met.append(chosen.to_numpy(pose).astype(np.float64) * weights)
+    def note(step: int, unknowns: Array, loss: float) -> None:
+        met.append(chosen.to_numpy(unknowns).astype(np.float64) * weights)
 
     residuals = _residuals(parts, camera, target, bounds, weights, chosen)
-    start, schedule = chosen.constant(np.zeros(6, np.float32)), pyramid(target.shape, largest=LARGEST_SIDE)
+    start = chosen.constant(np.zeros(len(weights), np.float32))
+    schedule = pyramid(target.shape, largest=LARGEST_SIDE)
     result = fit(
         residuals,
         start,
@@ -131,16 +141,15 @@ def fit_pose(
         progress=progress,
     )
     found = chosen.to_numpy(result.parameters).astype(np.float64) * weights
-    trail = [_matrix(pose, bounds) for pose in (*_best_so_far(met, result), found)]
-    levels = list(result.stages)
+    trail = [_pose(unknowns, bounds, camera, target.shape) for unknowns in (*_best_so_far(met, result), found)]
     return PoseFit(
         found[:3],
-        found[3:],
+        found[3:6],
         bounds.center,
-        trail[-1],
         trail,
         result.history,
-        levels,
+        list(result.stages),
+        Pose(np.eye(4), camera, target.shape),
         float(mean_square(residuals.at_stage(schedule[-1])(start))),
         result.loss,
         result.reason,
@@ -171,23 +180,22 @@ def _engine(name: str) -> Engine:
 def _residuals(
     parts: Sequence[Part], camera: Camera, target: np.ndarray, bounds: Bounds, weights: np.ndarray, engine: Engine
 ) -> ImageResiduals:
-    def silhouettes(pose: Array) -> list[Part]:
-        transform = rigid(pose * engine.constant(weights, pose), bounds.center)
-        return posed(parts, transform, "silhouette")
+    def silhouettes(unknowns: Array) -> tuple[list[Part], Camera]:
+        unknowns = unknowns * engine.constant(weights, unknowns)
+        return posed(parts, rigid(unknowns[:6], bounds.center), "silhouette"), _zoomed(camera, unknowns[6:])
 
-    return ImageResiduals(silhouettes, camera, target.shape, target, layers=1, splatter="single")
-
-
-def _matrix(pose: np.ndarray, bounds: Bounds) -> np.ndarray:
-    return np.asarray(rigid(np.asarray(pose, np.float64), bounds.center))
+    return ImageResiduals(silhouettes, None, target.shape, target, layers=1, splatter="single")
 
 
-def posed(parts: Sequence[Part], transform: Array, shader: Any = None) -> list[Part]:
-    """The parts moved by a transform of the world, perhaps with another shader."""
-    return [
-        part.replace(
-            transform=transform if part.transform is None else matmul(transform, part.transform),
-            shader=shader or part.shader,
-        )
-        for part in parts
-    ]
+def _pose(unknowns: np.ndarray, bounds: Bounds, camera: Camera, size: tuple[int, int]) -> Pose:
+    return Pose(np.asarray(rigid(unknowns[:6], bounds.center)), _zoomed(camera, unknowns[6:]), size)
+
+
+def _zoomed(camera: Camera, focal: Array) -> Camera:
+    """The camera with another focal length; (1,) the logarithm of how many times its own, or (0,) to leave it."""
+    if not len(focal):
+        return camera
+    xp = namespace(focal)
+    factor, one = xp.exp(focal), xp.ones_like(focal)
+    projection = engine_of(focal).constant(camera.projection, focal)
+    return camera.replace(projection=projection * xp.concat([factor, factor, one, one]))

@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from rts.camera import Camera
-from rts.cli.pose_fit import LARGEST_SIDE, PoseFit, posed, shrunk
+from rts.cli.pose_file import Pose, posed
+from rts.cli.pose_fit import LARGEST_SIDE, PoseFit, shrunk
+from rts.cli.pose_verdict import Verdict
 from rts.files.images import save_animation, save_image
 from rts.files.paths import writing
 from rts.interfaces import Part
@@ -23,8 +25,8 @@ PAPER, MARKED = (0.86, 0.87, 0.9), (0.95, 0.32, 0.05)
 def write_report(
     folder: Path,
     found: PoseFit,
+    verdict: Verdict,
     parts: Sequence[Part],
-    camera: Camera,
     target: np.ndarray,
     scenery: Sequence[Part] = (),
 ) -> list[Path]:
@@ -35,8 +37,8 @@ def write_report(
     Args:
         folder: where to; made if need be.
         found: what `fit_pose` gave.
+        verdict: what to think of it.
         parts: the model.
-        camera: the camera of the target.
         target: (H, W) silhouette.
         scenery: parts that stand still, for the pictures.
 
@@ -48,20 +50,18 @@ def write_report(
     """
     with writing(folder / "pose.json"):
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "pose.json").write_text(json.dumps(_numbers(found), indent=2) + "\n")
+        (folder / "pose.json").write_text(json.dumps(_numbers(found) | verdict.numbers(), indent=2) + "\n")
     large, small = shrunk(target, PICTURE_SIDE), shrunk(target, LARGEST_SIDE)
 
-    def picture(matrix: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        return _outlined(posed(parts, matrix), scenery, camera, mask)
+    def picture(pose: Pose, mask: np.ndarray) -> np.ndarray:
+        return _outlined([*posed(parts, pose.matrix), *scenery], pose.camera, mask)
 
-    save_image(folder / "before.png", picture(np.eye(4), large))
-    save_image(folder / "after.png", picture(found.matrix, large))
+    save_image(folder / "before.png", picture(found.start, large))
+    save_image(folder / "after.png", picture(found.pose, large))
     save_image(folder / "target.png", large)
-    moved = [found.trail[0]] + [
-        b for a, b in zip(found.trail, found.trail[1:], strict=False) if np.abs(b - a).max() > 1e-4
-    ]
+    moved = [found.trail[0]] + [b for a, b in zip(found.trail, found.trail[1:], strict=False) if _moved(a, b)]
     chosen = moved[:: -(-len(moved) // FRAMES)]
-    frames = [picture(m, small) for m in [chosen[0]] * 4 + chosen + [found.matrix] * 10]
+    frames = [picture(p, small) for p in [chosen[0]] * 4 + chosen + [found.pose] * 10]
     save_animation(folder / "animation.gif", frames, fps=8)
     names = ["pose.json", "before.png", "after.png", "target.png", "animation.gif"]
     return [folder / name for name in names] + _plot(folder / "convergence.png", found.history)
@@ -72,7 +72,7 @@ def _numbers(found: PoseFit) -> dict[str, Any]:
         "axis_angle": found.rotation.tolist(),
         "translation": found.translation.tolist(),
         "center": found.center.tolist(),
-        "matrix": found.matrix.tolist(),
+        **found.pose.numbers(),
         "loss": found.loss,
         "iterations": len(found.history),
         "seconds": found.seconds,
@@ -80,12 +80,18 @@ def _numbers(found: PoseFit) -> dict[str, Any]:
     }
 
 
-def _outlined(parts: Sequence[Part], scenery: Sequence[Part], camera: Camera, mask: np.ndarray) -> np.ndarray:
+def _moved(before: Pose, after: Pose) -> bool:
+    """Whether a step can be seen."""
+    changes = after.matrix - before.matrix, after.camera.projection - before.camera.projection
+    return max(float(np.abs(c).max()) for c in changes) > 1e-4
+
+
+def _outlined(parts: Sequence[Part], camera: Camera, mask: np.ndarray) -> np.ndarray:
     """The model in the scene, the outline of the target drawn over it."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
     paper = np.asarray(PAPER) + 0.6 * mask[..., None] * (np.asarray(MARKED) - PAPER)
-    image = render([*parts, *scenery], camera, mask.shape, background=paper)[..., :3]
+    image = render(parts, camera, mask.shape, background=paper)[..., :3]
     inside = (mask > 0.5).astype(np.float64)
     edge = (maximum_filter(inside, 3) - minimum_filter(inside, 3))[..., None]
     return image + 0.85 * edge * (np.asarray(MARKED) - image)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numba
-
-kernel = numba.njit(nogil=True, cache=True)
+from rts.compiling import kernel
 
 
 @kernel

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import kernel
 from rts.operations.projection_kernels import CHUNK
 from rts.threads import parallel, read_only
 
@@ -39,7 +39,7 @@ def affine_pull(
         parallel(_pull_points, len(points), rows, g, g_points, work=g.size)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _affine(start, stop, rows, points, out):
     for n in range(start, stop):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
@@ -47,7 +47,7 @@ def _affine(start, stop, rows, points, out):
             out[n, r] = x * rows[r, 0] + y * rows[r, 1] + z * rows[r, 2] + rows[r, 3]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _add_moved(start, stop, rows, move, out):
     for n in range(start, stop):
         x, y, z = move[n, 0], move[n, 1], move[n, 2]
@@ -55,7 +55,7 @@ def _add_moved(start, stop, rows, move, out):
             out[n, r] += x * rows[r, 0] + y * rows[r, 1] + z * rows[r, 2]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _pull_rows(start, stop, points, g, sums):
     for chunk in range(start, stop):
         total = sums[chunk]
@@ -67,7 +67,7 @@ def _pull_rows(start, stop, points, g, sums):
                 total[r, 3] += h
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _pull_points(start, stop, rows, g, g_points):
     for n in range(start, stop):
         for i in range(3):

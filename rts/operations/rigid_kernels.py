@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from rts.compiling import kernel
 
 SMALL = 1e-2
 """Squared angles below which series are used, which are right to 3e-14 there."""
@@ -18,7 +19,7 @@ def rigid(pose: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return matrix, jacobian
 
 
-@numba.njit(cache=True)
+@kernel
 def _rigid(pose, center, matrix, jacobian):
     r = pose[:3]
     s = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba
+from rts.compiling import kernel
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def add(values, index, total):
     """Add the rows of (M, C) to those of (V, C) that (M,) integers name, in their order; indices of no row are left."""
     for m in range(len(index)):

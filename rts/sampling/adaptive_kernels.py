@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-compiled = numba.njit(nogil=True)
-kernel = numba.njit(nogil=True, cache=True)
+from rts.compiling import compiled, kernel
 
 
 @kernel

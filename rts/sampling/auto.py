@@ -66,6 +66,8 @@ def is_static(part: Part, camera: Camera) -> bool:
 class Auto(Sampler):
     """The sampler that suits each part."""
 
+    culls = True
+
     def suited(self, part: Part, camera: Camera | None) -> Sampler:
         """See `rts.Sampler`."""
         choice = choose(part, static=camera is None or is_static(part, camera))

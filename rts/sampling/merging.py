@@ -9,7 +9,7 @@ import numpy as np
 
 from rts.engines import engine_of, namespace
 from rts.errors import InputError
-from rts.records import ArraySpec, Sampled, Samples
+from rts.records import MORE, ArraySpec, Sampled, Samples
 from rts.trees import Array
 
 
@@ -20,31 +20,59 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         overflow = overflow + s.overflow
     if len(samples) == 1:
         only = samples[0]
-        return Sampled(tuple(samples), only.row, only.depth, overflow)
-    given = *(s.row for s in samples), *(s.depth for s in samples)
+        return Sampled(tuple(samples), only.row, only.depth, overflow, facing=only.facing, settled=only.settled)
+    given = [*(s.row for s in samples), *(s.depth for s in samples)]
+    if any(s.facing is not None for s in samples):
+        given += [_nothing_told(s.row) if s.facing is None else s.facing for s in samples]
     sizes = tuple(s.ids.shape[0] for s in samples)
-    on_host, elsewhere = partial(_interleaved_on_the_host, layers, sizes=sizes), partial(_interleaved, layers)
-    part, row, depth = engine_of(given).by_host(on_host, elsewhere, *given)
+    on_host, elsewhere = (partial(f, layers, sizes) for f in (_interleaved_on_the_host, _interleaved))
+    part, row, depth, *facing = engine_of(given).by_host(on_host, elsewhere, *given)
     xp, start = namespace(row), 0
     for i, s in enumerate(samples):
         row = xp.where(part == i, row + start, row) if start else row
         start += s.ids.shape[0]
-    return Sampled(tuple(samples), row, depth, overflow)
+    return Sampled(tuple(samples), row, depth, overflow, facing=facing[0] if facing else None)
 
 
-def _interleaved(layers: int, *given: Array) -> tuple[Array, ...]:
-    """Part, row within it and depth, (K, H, W) each, from the rows of each part and the depths of each."""
-    xp, rows = namespace(given[0]), given[: len(given) // 2]
-    row, depth = xp.concat(rows), xp.concat(given[len(rows) :])
+def _nothing_told(row: Array) -> Array:
+    xp = namespace(row)
+    return xp.zeros_like(row, dtype=xp.int16)
+
+
+def _interleaved(layers: int, sizes: Sequence[int], *given: Array) -> tuple[Array, ...]:
+    """Part, row within it, depth and what faces the viewer, (K, H, W) each, from those three of each part.
+
+    The last are missing where they are not given.
+    """
+    xp, count = namespace(given[0]), len(sizes)
+    rows, facing = given[:count], given[2 * count :]
+    row, depth = xp.concat(rows), xp.concat(given[count : 2 * count])
     part = xp.concat([xp.where(r >= 0, i, r) for i, r in enumerate(rows)])
     order = xp.argsort(xp.where(row >= 0, depth, xp.inf), axis=0, stable=True)[:layers]
     part, row, depth = (xp.take_along_axis(x, order, axis=0) for x in (part, row, depth))
-    return part, row, depth
+    if not facing:
+        return part, row, depth
+    told = xp.take_along_axis(xp.concat([_of_part(f, i, count) for i, f in enumerate(facing)]), order, axis=0)
+    last = told[-1:, ...]
+    marked = xp.where((last != 0) & (xp.abs(last) < MORE), last + xp.where(last > 0, MORE, -MORE), last)
+    return part, row, depth, xp.concat([told[:-1, ...], xp.astype(marked, told.dtype)])
 
 
-def _interleaved_on_the_host(layers: int, *given: Array, sizes: Sequence[int] = ()) -> tuple[Array, ...]:
+def _of_part(facing: Array, part: int, count: int) -> Array:
+    """The numbers of a part's pieces among those of all parts; 0 where they would be too large."""
+    xp = namespace(facing)
+    size = xp.abs(facing)
+    more = xp.where(size >= MORE, MORE, 0)
+    number = size - more
+    fits = (number > 0) & (number <= (MORE - 1 - part) // count)
+    number = xp.where(fits, number * count + part + more, 0)
+    return xp.astype(xp.where(facing > 0, number, -number), facing.dtype)
+
+
+def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *given: Array) -> tuple[Array, ...]:
     """`_interleaved`, compiled: sorting many short columns takes array code far longer."""
-    rows, depths = given[: len(given) // 2], given[len(given) // 2 :]
+    count = len(sizes)
+    rows, depths = given[:count], given[count : 2 * count]
     shape = (min(layers, sum(r.shape[0] for r in rows)), *rows[0].shape[1:])
     dtype = np.float64 if any(namespace(d).finfo(d.dtype).bits == 64 for d in depths) else np.float32
 
@@ -54,7 +82,8 @@ def _interleaved_on_the_host(layers: int, *given: Array, sizes: Sequence[int] = 
         for i, (row, size) in enumerate(zip(arrays, sizes, strict=False)):
             if row.max(initial=-1) >= size:
                 raise InputError(f"row of part {i} refers to sample {row.max()} of {size}; sample this scene anew")
-        return merging_kernels.interleave(arrays[: len(rows)], arrays[len(rows) :], layers)
+        return merging_kernels.interleave(arrays[:count], arrays[count : 2 * count], arrays[2 * count :], layers, MORE)
 
     specs = ArraySpec(shape, np.int32), ArraySpec(shape, np.int32), ArraySpec(shape, dtype)
+    specs = specs if len(given) == 2 * count else (*specs, ArraySpec(shape, np.int16))
     return engine_of(given).call_host(host, specs, *given)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import kernel
 from rts.records import Fragments
 from rts.threads import parallel
 
@@ -44,7 +44,7 @@ def pack(
     return ids, params, row.reshape(shape), depth.reshape(shape), total
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _count(start, stop, kept, counts):
     for y in range(start, stop):
         count = 0
@@ -53,7 +53,7 @@ def _count(start, stop, kept, counts):
         counts[y] = count
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _pack(start, stop, kept, triangle_ids, barycentrics, depths, table, corners, offsets, ids, params, row, depth):
     for y in range(start, stop):
         n = offsets[y]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import numba
+from rts.compiling import compiled, kernel
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def settle_lines(start, stop, row, depth, limits, out_row, out_depth):
     """See `rts.sampling.settling.settle`; for lines `start` to `stop` of the image.
 
@@ -44,7 +44,7 @@ def settle_lines(start, stop, row, depth, limits, out_row, out_depth):
                 out_depth[k, y, x], out_row[k, y, x] = 0, -1
 
 
-@numba.njit(nogil=True)
+@compiled
 def _ray(x, y, p, inverse, origin, direction):
     """The ray through a point of the image, in NDC. See `rts.Camera.rays`."""
     a, b, across, lean = p[0, 0] - x * p[3, 0], p[0, 1] - x * p[3, 1], x * p[3, 3] - p[0, 3], p[0, 2] - x * p[3, 2]
@@ -57,7 +57,7 @@ def _ray(x, y, p, inverse, origin, direction):
         direction[k] = inverse[k, 0] * toward_x + inverse[k, 1] * toward_y - inverse[k, 2]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def rays_of(start, stop, row, size, projection, inverse, origins, directions):
     """Fill the rays of samples as `rts.Camera.rays` gives them; for lines `start` to `stop` of all layers.
 
@@ -80,7 +80,7 @@ def rays_of(start, stop, row, size, projection, inverse, origins, directions):
                 _ray((i + 0.5) * 2 / width - 1, y, projection, inverse, origins[n], directions[n])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def rays_of_cells(row, lines, columns, size, projection, inverse, origins, directions):
     """Fill the rays of samples in some cells: row (K, M), in lines (M,) and columns (M,)."""
     height, width = size

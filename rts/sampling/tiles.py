@@ -207,17 +207,21 @@ def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
     engine, layers = engine_of(sampled), sampled.row.shape[0]
     laid = layers, *layout.place.shape
     splats = layers * laid[1] * laid[2]
-    specs = (
+    specs = [
         ArraySpec((splats,), np.int32, packed=True),
         ArraySpec((splats, 3), np.float32, packed=True),
         ArraySpec(laid, np.int32),
         ArraySpec(laid, np.int32),
-    )
+    ]
+    told = [] if sampled.facing is None else [sampled.facing]
+    specs += [ArraySpec(laid, np.int16) for _ in told]
 
-    def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, ...]:
-        return _arranged(row, place, cells, sizes, grid.fine[1])
+    def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray, *told: np.ndarray) -> tuple[np.ndarray, ...]:
+        found = (np.where(place >= 0, x.reshape(layers, -1)[:, place], 0).astype(np.int16) for x in told)
+        return *_arranged(row, place, cells, sizes, grid.fine[1]), *found
 
-    index, shift, row, part = engine.call_host(host, specs, sampled.row, layout.place, layout.cells)
+    given = sampled.row, layout.place, layout.cells, *told
+    index, shift, row, part, *facing = engine.call_host(host, tuple(specs), *given)
     return Fine(
         sampled.samples,
         index,
@@ -230,6 +234,7 @@ def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
         sampled.overflow + layout.dropped,
         supersample=grid.side,
         apron=grid.apron,
+        facing=facing[0] if facing else None,
     )
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-kernel = numba.njit(nogil=True, cache=True)
+from rts.compiling import compiled, kernel
 
 WANTED, NEAR = 1, 2
 """Bits of cells: inside of an active pixel, and within two cells of one."""
@@ -79,7 +78,7 @@ def fill(active, corners, side, tile, apron, across, pitch, most, numbers, cells
     return len(corners), count
 
 
-@numba.njit(nogil=True)
+@compiled
 def _spread(local, top, left, side, apron):
     """Mark the cells around a pixel, of which the first is (top, left) without the apron."""
     reach = side + 2 * apron

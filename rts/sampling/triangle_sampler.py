@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -15,9 +16,10 @@ from rts.errors import InputError
 from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSurface, as_surface
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
-from rts.sampling.packing import lift, repack
+from rts.sampling.facing import facing as facing_of
+from rts.sampling.packing import largest, lift, repack
 from rts.sampling.settling import on_surface, refined
-from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_proxy
+from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
 
 LEAST_LAYERS = 3
@@ -39,8 +41,10 @@ class TriangleSampler(Sampler):
     FLAGS = {"prepare": "builds", "update": "follows"}
     builds: bool = False
     follows: bool = False
+    culls = True
     prunes = True
     takes_cells = True
+    tells_facing = True
     _keeper: Keeper
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
@@ -110,6 +114,9 @@ class TriangleSampler(Sampler):
             camera = camera if size is None else camera.for_size(size)
             camera = camera.within(part.transform).map(lambda m: engine_of(m).to_numpy(m))
         built = self._built(surface, inputs, camera, size)
+        arrays = leaves(stopped({name: part.theta[name] for name in surface.reads(part.theta)}))
+        read = [engine_of(x).to_numpy(x) for x in arrays]
+        built = built._replace(size=max([built.size or 0.0, *(largest(x) for x in read if x.dtype.kind == "f")]))
         return built._replace(inputs=map_leaves(np.copy, inputs)) if surface.refines else built
 
     def _built(self, surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Entry:
@@ -117,7 +124,7 @@ class TriangleSampler(Sampler):
         proxy = checked_proxy(surface, inputs, camera, size)
         # A copy, since the arrays given may be changed in place, or lent for the length of one call only.
         proxy = proxy._replace(vertices=proxy.vertices.copy())
-        return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None)
+        return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None, largest(proxy.vertices))
 
     def _entry(self, surface: TriangleSurface, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
         """What `_built` gives, kept from call to call where that pays."""
@@ -134,7 +141,7 @@ class TriangleSampler(Sampler):
                 return None
             proxy = proxy._replace(vertices=proxy.vertices.copy())
             updated = self.update(old.prepared, proxy)
-            return None if updated is None else Entry(proxy, updated)
+            return None if updated is None else Entry(proxy, updated, largest(proxy.vertices))
 
         key = (fingerprint(inputs), beside)
         return self._keeper.get(unwrapped(surface), key, lambda: self._built(surface, inputs, camera, size), follow)
@@ -150,6 +157,7 @@ class TriangleSampler(Sampler):
         needed: AnyNeeded | None = None,
         entry: Entry | None = None,
         cells: Array | None = None,
+        facing: bool = False,
     ) -> Samples:
         """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
 
@@ -162,6 +170,7 @@ class TriangleSampler(Sampler):
             needed: says which samples to keep; None for all.
             entry: what `hold` gave, to be used without a look at the surface's inputs.
             cells: as in `rts.Sampler`.
+            facing: as in `rts.Sampler`; surfaces that move samples off their triangles tell nothing.
 
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
@@ -169,6 +178,8 @@ class TriangleSampler(Sampler):
         surface, theta, camera = _of_triangles(part.surface), part.theta, camera.for_size(size)
         engine, like = suiting(theta, camera)
         shape = _Shape(layers, size if cells is None else tuple(cells.shape), capacity, size)
+        tells = facing and layers > 1 and part.cull == "none" and surface.tells_pieces
+        tells = tells and not (surface.refines and surface.refine_moves)
         listed = [] if cells is None else [cells]
         inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
         reads = {name: theta[name] for name in surface.reads(theta)}
@@ -176,6 +187,8 @@ class TriangleSampler(Sampler):
         tables = shape.tables(surface) if surface.refines else {}
         shader = adapted(part.shader, Shader)
         asked = None if shader is None else shader.reads
+        needed = None if needed is None else adapted(needed, Needed)
+        settles = needed is not None and needed.settles and cells is None and not surface.refines
         attributes = _attribute_specs(surface, asked, host_theta, shape, like)
 
         transform = [] if part.transform is None else [part.transform]
@@ -186,7 +199,8 @@ class TriangleSampler(Sampler):
             host_inputs = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
             host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
             host_camera = check_camera(host_camera, *rest[: len(transform)])
-            found = self._found(surface, part.cull, host_inputs, host_camera, shape, tables, needed, entry, host_cells)
+            given = shape, tables, needed, entry, host_cells, tells
+            found = self._found(surface, part.cull, host_inputs, host_camera, *given)
             gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
             return (
                 found.ids,
@@ -194,20 +208,27 @@ class TriangleSampler(Sampler):
                 found.row,
                 found.depth,
                 found.overflow,
+                *([found.facing] if tells else []),
+                *([found.settled] if settles else []),
                 *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
                 *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
             )
 
-        specs = *shape.specs(surface.sample_widths), *tables.values(), *attributes.values()
+        sides = [ArraySpec((layers, *shape.size), np.int16)] if tells else []
+        amid = [ArraySpec(size, np.bool_)] if settles else []
+        specs = *shape.specs(surface.sample_widths), *sides, *amid, *tables.values(), *attributes.values()
         results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *listed, *leaves(inputs))
-        rest = 5 + len(tables)
+        first = 5 + len(sides) + len(amid)
+        rest = first + len(tables)
         return Samples(
             *results[:5],
-            tables=dict(zip(tables, results[5:rest], strict=True)),
+            tables=dict(zip(tables, results[first:rest], strict=True)),
             gbuffer=dict(zip(attributes, results[rest:], strict=True)) if host_theta is not None else None,
             asked=asked,
             centered=surface.centered,
             by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
+            facing=results[5] if tells else None,
+            settled=results[first - 1] if settles else None,
         )
 
     def _found(
@@ -218,11 +239,12 @@ class TriangleSampler(Sampler):
         camera: Camera,
         shape: _Shape,
         tables: Mapping[str, ArraySpec],
-        needed: AnyNeeded | None,
+        needed: Needed | None,
         entry: Entry | None,
         cells: np.ndarray | None,
+        tells: bool,
     ) -> Samples:
-        """The samples that are to be kept, on the host."""
+        """The samples that are to be kept, on the host; if it `tells`, with what faces the viewer."""
         # Of tables there is but one set, so that no samples can be added later.
         more = surface.refines and surface.refine_moves and not tables
         grid = max(shape.layers + 1, LEAST_LAYERS) if more else shape.layers, *shape.size
@@ -237,17 +259,30 @@ class TriangleSampler(Sampler):
         covered = fragments.triangle_ids >= 0
         if not (surface.refines and surface.refine_moves):
             kept = covered if needed is None else needed(covered, fragments.depth)
+            settled, size = None, found.size
+            if needed is not None and not surface.refines:
+                if size is None:
+                    # Vertices that were looked at as a part of θ need not be looked at again.
+                    read = any(np.may_share_memory(x, found.proxy.vertices) for x in leaves(inputs))
+                    size = needed.size if read and needed.size is not None else largest(found.proxy.vertices)
+                if needed.settles and cells is None:
+                    settled = needed.settled(covered, fragments.depth, kept, size)
+            sides = None
+            if tells:
+                pieces = checked_pieces(surface, found.proxy)
+                sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
             if not surface.refines:
-                return lift(fragments, found.proxy, shape.capacity, kept)
+                lifted = lift(fragments, found.proxy, shape.capacity, kept, size)
+                return replace(lifted, facing=sides, settled=settled)
             lifted = lift(fragments, found.proxy, None, kept)
             samples, _ = refined(surface, inputs, lifted, camera, tables, shape.view, cells)
-            return repack(samples, samples.row >= 0, shape.capacity)
+            return replace(repack(samples, samples.row >= 0, shape.capacity), facing=sides)
         given = surface, inputs, fragments, found.proxy, camera, shape.layers, tables, shape.view, cells
         settled = on_surface(*given)
         # `needed` is asked only now, since it goes by the final depths.
         left = kept = settled.row >= 0
         if needed is not None:
-            adapted(needed, Needed).ran_out(int((covered[-1] & ~left[-1]).sum()))
+            needed.ran_out(int((covered[-1] & ~left[-1]).sum()))
             kept = needed(left, settled.depth)
         return repack(settled, kept, shape.capacity)
 

@@ -75,6 +75,17 @@ def _table(surface: Any, name: str, table: Any, widths: tuple[int, ...], dtype: 
         return np.ascontiguousarray(array, dtype)
 
 
+def checked_pieces(surface: TriangleSurface, proxy: Proxy) -> np.ndarray:
+    """What `pieces` of a surface gives, refused where compiled code would read out of its bounds."""
+    pieces = np.asarray(surface.pieces(proxy))
+    if pieces.dtype != np.int16 or pieces.shape not in ((1,), (len(proxy.faces),)):
+        raise InputError(
+            f"pieces of {surface!r} gave {pieces.dtype} of {pieces.shape}; expected int16 of ({len(proxy.faces)},), or "
+            f"of (1,)"
+        )
+    return pieces
+
+
 def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sampler: Any) -> None:
     """Refuse what `rasterize` of a sampler should not have returned."""
     if isinstance(fragments, Fragments):

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.engines import namespace
+from rts.engines import namespace, stopped
 from rts.errors import InputError
 from rts.operations.operation import known_value
-from rts.records import Splats
+from rts.records import MORE, Splats
 from rts.trees import Array
 
 OFFSETS = (-1, 0, 1)
@@ -38,11 +38,14 @@ def check_rows(row: Array, count: int) -> None:
 class Depths:
     """Depths of an image with a border of one empty cell, as seen from targets; (u, v) leads from source to target."""
 
-    def __init__(self, depth: list[Array], covered: Array):
-        """Depths of each layer (h, w), finite, and where they are covered (K, h, w), both with the border."""
+    def __init__(self, depth: list[Array], covered: Array, facing: list[Array] | None = None):
+        """Depths of each layer (h, w), finite, where they are covered (K, h, w), and `Splats.facing`, with the border.
+
+        Without the last, any two layers may pair.
+        """
         self.xp = namespace(covered, depth[0])
         self.size = covered.shape[1] - 2, covered.shape[2] - 2
-        self.covered = covered
+        self.covered, self._facing = covered, facing
         self._depth, self.extent = _beyond(depth, covered)
         front = self._depth[0][None], self.xp.where(covered[0], 0, -1)[None]
         self._front = bordered(front[0])[0], bordered(front[1])[0] >= 0
@@ -67,11 +70,22 @@ class Depths:
         return self.at(self.covered[0], u, v)
 
     def pairing(self, u: int, v: int) -> tuple[Array, Array]:
-        """The number s of `Multi`, and the distance of the depths that it pairs, (H, W) both."""
-        source = self.source(u, v)
-        a, best_a = _first_minimum([self.xp.abs(z - self.target[0]) for z in source], self.xp)
-        b, best_b = _first_minimum([self.xp.abs(z - source[0]) for z in self.target], self.xp)
-        return self.xp.where(best_b < best_a, -b, a), self.xp.minimum(best_a, best_b)
+        """The number s of `Multi`, and the distance of the depths that it pairs, (H, W) both.
+
+        A hidden layer does not pair with a front that is the other side of its piece. The last of K layers may stand
+        for what is not known behind it, but only towards fronts that lie behind it.
+        """
+        source, xp = self.source(u, v), self.xp
+        ahead, below = [xp.abs(z - self.target[0]) for z in source], [xp.abs(z - source[0]) for z in self.target]
+        if self._facing is not None:
+            cells = [(self.at(f, u, v), self.at(f, 0, 0)) for f in self._facing]
+            (front, target), *hidden = cells
+            for k, (p, q) in enumerate(hidden, start=1):
+                ahead[k] = xp.where(_opposite(p, target, self.target[0] > source[k]), xp.inf, ahead[k])
+                below[k] = xp.where(_opposite(q, front, source[0] > self.target[k]), xp.inf, below[k])
+        a, best_a = _first_minimum(ahead, xp)
+        b, best_b = _first_minimum(below, xp)
+        return xp.where(best_b < best_a, -b, a), xp.minimum(best_a, best_b)
 
     def fronts_pair(self, u: int, v: int, margin: float) -> tuple[Array, Array]:
         """Whether the fronts are nearer, by a margin, than a front and a hidden layer; and the least such distance."""
@@ -103,22 +117,40 @@ class Depths:
 class Layers(Depths):
     """`Depths` with weights and colours."""
 
-    def __init__(self, weights: Callable[[Array], Any], splats: Splats):
-        """Layers of packed samples; `weights` is that of `rts.splatting.Kernel`."""
+    def __init__(self, weights: Callable[[Array], Any], splats: Splats, facing: Array | None = None):
+        """Layers of packed samples; `weights` is that of `rts.splatting.Kernel`, `facing` of the splats or None."""
         check_rows(splats.row, splats.positions.shape[0])
         cells = bordered(splats.row)
         every = [cells[k] for k in range(splats.row.shape[0])]
         self.position = [unpack(splats.positions, c) for c in every]
-        super().__init__([p[..., 2] for p in self.position], cells >= 0)
+        told = None if facing is None else list(bordered(facing, 0))
+        super().__init__([p[..., 2] for p in self.position], cells >= 0, told)
         self._color = [_weighted(unpack(splats.rgba, c), (c >= 0)[..., None]) for c in every]
         self._weights = [weights(p) for p in self.position]
 
-    def splats(self, u: int, v: int) -> list[Array]:
-        """What the sources' layers give, K times (H, W, 5): weighted colours and the weight."""
-        return [
-            self.at(color * (wx[u] * wy[v])[..., None], u, v)
-            for color, (wx, wy) in zip(self._color, self._weights, strict=True)
-        ]
+    def splats(self, u: int, v: int, still: Array | None = None) -> list[Array]:
+        """What the sources' layers give, K times (H, W, 5): weighted colours and the weight.
+
+        Args:
+            u: along x.
+            v: along y.
+            still: (H, W), targets at which no weight has a derivative; None for none.
+        """
+        found = []
+        for k in range(len(self._color)):
+            weight = self.weight(k, u, v)
+            weight = weight if still is None else self.xp.where(still, stopped(weight), weight)
+            found.append(self.color(k, u, v) * weight[..., None])
+        return found
+
+    def color(self, k: int, u: int, v: int) -> Array:
+        """Colours of the sources' layer k, and one (H, W, 5); zeros where it is not covered."""
+        return self.at(self._color[k], u, v)
+
+    def weight(self, k: int, u: int, v: int) -> Array:
+        """Weights of the sources' layer k (H, W); of any value where it is not covered."""
+        wx, wy = self._weights[k]
+        return self.at(wx[u] * wy[v], u, v)
 
 
 def nothing(rgba: Array, row: Array) -> Array:
@@ -189,6 +221,13 @@ def all_of(conditions: list[Array]) -> Array:
 def fronts(covered: np.ndarray) -> np.ndarray:
     """(K, H, W) bool: the covered cells of the first layer."""
     return covered & (np.arange(len(covered)) == 0)[:, None, None]
+
+
+def _opposite(hidden: Array, front: Array, behind: Array) -> Array:
+    """Whether a hidden layer shows the other side of a front's piece, and does not stand for what may be behind it."""
+    xp = namespace(front)
+    other = (front != 0) & (hidden == -front)
+    return other | ((front != 0) & ~behind & (hidden == -front - xp.where(front > 0, MORE, -MORE)))
 
 
 def _first_minimum(values: list[Array], xp: Any) -> tuple[Array, Array]:

@@ -51,6 +51,8 @@ class Plain(Splatter):
 class Single(Kernel):
     """One layer, occlusion ignored (paper eq. 1–3): only the front layer of `row` is splatted."""
 
+    layers = 1
+
     def accumulate(self, splats: Splats) -> Array:
         """See `Kernel`."""
         layers = Layers(self.weights, splats.replace(row=splats.row[:1]))

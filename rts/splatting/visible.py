@@ -23,7 +23,8 @@ class Visible(Kernel):
 
     Pairing is that of `Multi`, but front layers also pair (s = 0) where one lies on the line through the other and its
     next cell, or off it by less than 0.8 of the smallest of A and B: depth that changes fast, as on the sides of a box
-    near its outline, is nearer to a back face than to itself.
+    near its outline, is nearer to a back face than to itself. Where it is told which side of a surface layers show, a
+    hidden layer does not pair with a front that is the other side of the same sheet.
 
     Each buffer gets at most one layer of a source. An empty target takes the source's front layer, at the surface. A
     covered target takes the source's front layer in front where s > 0, and layer s at the surface where s ≥ 0. Behind
@@ -37,17 +38,21 @@ class Visible(Kernel):
             it moves as the samples, which on a smooth rim that turns move faster. The image is the same.
         crossings: whether lines where two surfaces pass through one another move as their depths say (`crossings.py`);
             otherwise as the samples beside them, which hardly do. The image is the same.
+        reads_facing: whether layers that show opposite sides of one sheet are kept from pairing, where samplers tell
+            sides (`Splats.facing`); otherwise depths alone decide.
     """
 
     epsilon: float = 1e-3
     calibration: float | None = None
     rims: bool = True
     crossings: bool = True
+    reads_facing: bool = True
     reach = 3  # Depths three cells away may decide how an outline or a line of crossing moves.
 
     def accumulate(self, splats: Splats) -> Array:
         """See `Kernel`."""
-        layers, row = Layers(self.weights, splats), splats.row
+        row = splats.row
+        layers = Layers(self.weights, splats, splats.facing if self.reads_facing else None)
         xp, shift = layers.xp, {}
         for n in NEIGHBOURS:
             s, off = layers.pairing(*n)
@@ -57,26 +62,27 @@ class Visible(Kernel):
         m = xp.full_like(row[0], none)
         for n, s in shift.items():
             m = xp.where(shown[n] & (-s < m), -s, m)
+        differentiates = engine_of(splats.positions).differentiates
+        lines = crossings.targets(layers, shift) if self.crossings and none > 1 and differentiates else None
+        still = None if lines is None else lines.target
         revealed = sum(xp.where(m == k, z, 0.0) for k, z in enumerate(layers.target))
 
         front, surface, behind = 0.0, 0.0, 0.0
         for n, s in shift.items():
             hidden = xp.where(s < 0, 0, nearest(layers.source(*n), revealed, s, xp))
             hidden = xp.where(m < none, hidden, none)
-            for k, given in enumerate(layers.splats(*n)):
+            for k, given in enumerate(layers.splats(*n, still=still)):
                 if k == 0:
                     front = front + xp.where((s > 0)[..., None], given, 0.0)
                 surface = surface + xp.where((s == k)[..., None], given, 0.0)
                 behind = behind + xp.where((hidden == k)[..., None], given, 0.0)
         colors = [normalised(b, xp) for b in (front, surface, behind)]
-        differentiates = engine_of(splats.positions).differentiates
         if self.rims and differentiates:
             gains = rims.gains(self, layers, shift, splats.part)
             for i, (total, gain) in enumerate(zip((front, surface), gains, strict=True)):
-                colors[i] = colors[i] + rims.spread(total, gain)
+                colors[i] = colors[i] + rims.spread(total, gain if still is None else xp.where(still, 0.0, gain))
         image = over(colors[0], over(*colors[1:]))
-        lines = self.crossings and none > 1 and differentiates
-        return crossings.with_lines(self, layers, shift, image) if lines else image
+        return image if lines is None else image + crossings.motion(self, layers, lines)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`: those of `Kernel`, what may be chords' other ends, both layers near lines of crossing."""

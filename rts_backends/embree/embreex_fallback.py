@@ -8,12 +8,12 @@ than `STEP` may get lost.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from rts.camera import Camera
+from rts.compiling import kernel
 from rts.records import Fragments, Proxy
 from rts.threads import parallel
 from rts_backends.neighbours import corner_lists, look, places
@@ -108,7 +108,7 @@ class Scene:
         )
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def _take(
     first, last, pixels, triangles, width, matrix, row, keep, vertices, faces, around, offsets, members, ids, found
 ):  # fmt: skip

@@ -17,6 +17,7 @@ from llvmlite import ir
 from numba import carray, types  # pyright: ignore[reportPrivateImportUsage]  # Documented, but not in __all__.
 from numba.extending import intrinsic
 
+from rts.compiling import compiled, kernel
 from rts_backends.embree.covers import NEVER
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
 
@@ -69,7 +70,7 @@ def _pointer(typing_context, address):
     return types.voidptr(types.intp), generate
 
 
-@numba.njit(error_model="numpy")
+@compiled(error_model="numpy")
 def _decide(t, state, work, vertices, faces):
     """Whether a triangle is hit, and at which depth; see `cast` for `work`."""
     matrix, row, corners = work[:4], work[4], work[5:]
@@ -88,7 +89,7 @@ def _decide(t, state, work, vertices, faces):
     return True, (ea * za + eb * zb + ec * zc) / total
 
 
-@numba.njit
+@compiled
 def _insert(t, z, exact, state, depths, ids, sure, work, vertices, faces):
     """Put a hit in its place among the nearest; True if it is one of them."""
     slack, count, i = state[DEPTH_SLACK], int(state[COUNT]), 0
@@ -174,7 +175,7 @@ def keep_nearest_address() -> int:
     return _keep_nearest.address  # pyright: ignore[reportReturnType]  # None before it is compiled, which it is.
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def cast(
     first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep, vertices, faces,
     owners, margins, width, height, cells, triangle_ids, barycentrics, depths_out,
@@ -282,7 +283,7 @@ def cast(
                 n += 1
 
 
-@numba.njit
+@compiled
 def _pixels(tile, across, width, height, cells, at, columns, lines):
     """Places, columns (−1 for none) and lines of the pixels of a tile, or of a piece of a list; how many there are."""
     count = 0
@@ -301,7 +302,7 @@ def _pixels(tile, across, width, height, cells, at, columns, lines):
     return count
 
 
-@numba.njit(error_model="numpy")
+@compiled(error_model="numpy")
 def _aim(space, sphere, planes, x, y, ray, state):
     """Write the ray through an NDC position, from where it meets the object's sphere; False if it misses.
 

@@ -8,14 +8,12 @@ Depths are compared in the dtype of the positions and in the order of `rts.splat
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
+from rts.records import MORE
 from rts_backends.fused.mixed import sums_of
 from rts_backends.fused.survey import BLOCK, BUSY, EMPTY
-
-compiled = numba.njit(nogil=True)
-kernel = numba.njit(nogil=True, cache=True)
 
 
 @compiled
@@ -150,6 +148,7 @@ def choose(
     scale,
     peak,
     gamma,
+    facing,
     visible,
     continued,
     beyond,
@@ -160,9 +159,13 @@ def choose(
     sums,
     states,
 ):
-    """List each row's mixed targets: the arrays of `rts_backends.fused.cells.Choices` from `columns` to `sums`."""
+    """List each row's mixed targets: the arrays of `rts_backends.fused.cells.Choices` from `columns` to `sums`.
+
+    Marks go by depths alone. Where `facing` (K, H, W) is told, which else has no layers, more fronts may pair.
+    """
     layers, height, width = row.shape
     z, target = np.empty((layers, 9), positions.dtype), np.empty(layers, positions.dtype)
+    sides = np.zeros((layers, 9), np.int64)
     shift = np.empty(9, np.int64)
     for y in range(start, stop):
         d = offsets[y]
@@ -175,8 +178,10 @@ def choose(
                 _depths(z, n, positions, row, y + 1 - n // 3, x + 1 - n % 3, beyond)
             for k in range(layers):
                 target[k] = z[k, 4] if z[k, 4] == z[k, 4] else beyond
+            if len(facing) > 0:
+                _sides(sides, facing, y, x)
             for n in range(9):
-                shift[n], off = _pairing(z, n, target)
+                shift[n], off = _pairing(z, n, target, sides)
                 if visible and shift[n] != 0 and _continues(positions, row, y, x, n, z[0], continued * off):
                     shift[n] = 0
             if visible:
@@ -192,19 +197,41 @@ def choose(
 
 
 @compiled
-def _pairing(z, n, target):
-    """The number s of `rts.splatting.Multi`, and what the depths that it pairs are off."""
+def _sides(sides, facing, y, x):
+    """Which sides the layers of a target and its sources show (K, 9); 0 beyond the image."""
+    layers, height, width = facing.shape
+    for n in range(9):
+        py, px = y + 1 - n // 3, x + 1 - n % 3
+        inside = 0 <= py < height and 0 <= px < width
+        for k in range(layers):
+            sides[k, n] = facing[k, py, px] if inside else 0
+
+
+@compiled
+def _pairing(z, n, target, sides):
+    """The number s of `rts.splatting.Visible` before `continues`, and what the depths that it pairs are off.
+
+    `sides` (K, 9) are those of the layers of all sources; 0 where it is not told, and everywhere in `Multi`.
+    """
     a, b = 0, 0
     front = z[0, n]
     best_a, best_b = abs(front - target[0]), abs(target[0] - front)
     for k in range(1, len(target)):
         distance = abs(z[k, n] - target[0])
-        if distance < best_a:
+        if distance < best_a and not _opposite(sides[k, n], sides[0, 4], target[0] > z[k, n]):
             best_a, a = distance, k
         distance = abs(target[k] - front)
-        if distance < best_b:
+        if distance < best_b and not _opposite(sides[k, 4], sides[0, n], front > target[k]):
             best_b, b = distance, k
     return (-b, best_b) if best_b < best_a else (a, best_a)
+
+
+@compiled
+def _opposite(hidden, front, behind):
+    """Whether a hidden layer shows the other side of a front's piece, and does not stand for what may be behind it."""
+    if front == 0 or (hidden > 0) == (front > 0):
+        return False
+    return hidden == -front or (not behind and abs(hidden) == abs(front) + MORE)
 
 
 @compiled

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
+from rts.sampling.interiors_kernels import bounds
 from rts.splatting.kernel import LEAST_EPSILON, TIE
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel
@@ -16,9 +17,6 @@ HALO = 3
 
 MIXED, RING = 1, 2
 """Marks of targets at which more than fronts may count, and of cells beside empty ones."""
-
-compiled = numba.njit(nogil=True)
-kernel = numba.njit(nogil=True, cache=True)
 
 
 def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.ndarray:
@@ -41,21 +39,10 @@ def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.nda
 @kernel
 def _extent(start, stop, covered, depth, extent):
     """The least and the largest depth in each row, and zero."""
-    low, high = np.empty(covered.shape[2], depth.dtype), np.empty(covered.shape[2], depth.dtype)
     for y in range(start, stop):
-        low[:] = high[:] = depth.dtype.type(0)
         for k in range(len(covered)):
-            _enlarge(low, high, covered[k, y], depth[k, y])
-        extent[0, y], extent[1, y] = low.min(), high.max()
-
-
-@compiled
-def _enlarge(low, high, covered, depth):
-    zero = depth.dtype.type(0)
-    for x in range(len(low)):
-        z = depth[x] if covered[x] else zero
-        low[x] = z if z < low[x] else low[x]
-        high[x] = z if z > high[x] else high[x]
+            low, high = bounds(depth[k, y], covered[k, y])
+            extent[0, y], extent[1, y] = min(low, extent[0, y]), max(high, extent[1, y])
 
 
 @kernel
@@ -72,7 +59,8 @@ def _keep(start, stop, covered, depth, visible, rims, beyond, margin, continued,
         if 0 <= y < height:
             for k in range(layers):
                 _load(z[k, r], covered[k, y], depth[k, y])
-            empty[r, 1:-1] = 1 - covered[0, y].astype(np.uint8)
+            for x in range(width):
+                empty[r, x + 1] = np.uint8(not covered[0, y, x])
         _bound(bounds[r, 0], bounds[r, 1], bounds[r, 2], z[0, r], z[1, r])
     for r in range(HALO - 1, rows - HALO + 1):
         _mark(marks[r, 1:], z, r, bounds, visible, beyond, margin, continued)
@@ -80,7 +68,8 @@ def _keep(start, stop, covered, depth, visible, rims, beyond, margin, continued,
             _mark_ring(marks[r, 1:-1], empty[r - 1], empty[r], empty[r + 1])
     for y in range(start, stop):
         r = y - start + HALO
-        kept[0, y] = covered[0, y]
+        for x in range(width):
+            kept[0, y, x] = covered[0, y, x]
         for k in range(1, layers):
             which = np.uint8(MIXED | RING if k == 1 else MIXED)
             _spread(kept[k, y], covered[k, y], which, marks[r - 1], marks[r], marks[r + 1])

@@ -15,12 +15,13 @@ touch the files of the kernels.
 from __future__ import annotations
 
 import math
+from functools import partial
 
-import numba
 import numpy as np
 from numba import types
 from numba.extending import overload
 
+from rts import compiling
 from rts_backends.fused.survey import FLAT
 
 TILE = 32
@@ -33,8 +34,8 @@ COLOR, ONE, WX, WY, RX, RY, SOURCE = (PITCH * p for p in (0, 4, 5, 8, 11, 12, 13
 SUM, SUMS = 5 * PITCH, 10 * PITCH
 """How many numbers a buffer's sums take, and those of two buffers: colours and the weight."""
 
-compiled = numba.njit(nogil=True, fastmath={"contract"})
-kernel = numba.njit(nogil=True, fastmath={"contract"}, cache=True)
+compiled = partial(compiling.compiled, fastmath={"contract"})
+kernel = partial(compiling.kernel, fastmath={"contract"})
 
 _F = [np.float32(1 / math.factorial(i)) for i in range(8)]
 _ONE, _F2, _F3, _F4, _F5, _F6, _F7 = _F[1:]

@@ -23,6 +23,7 @@ class _Fused(splatting.Kernel):
 
     kind: ClassVar[str]
     averages = True
+    _knows_settled = True
 
     def image(self, splats: Splats) -> Array:
         """See `rts.splatting.Kernel`."""
@@ -41,8 +42,15 @@ class _Fused(splatting.Kernel):
     def _of(self, splats: Splats, border: int) -> Array:
         """The image without a border."""
         part = splats.row[:0, :, :] if splats.part is None else splats.part
-        wanted = splats.row[0, :0, :] if splats.wanted is None else splats.wanted
-        return IMAGE(splats.positions, splats.rgba, splats.row, part, wanted, settings=self._settings(border))
+        facing = self._facing(splats)
+        facing = splats.row[:0, :, :] if facing is None else facing
+        none = splats.row[0, :0, :]
+        wanted, settled = (none if x is None else x for x in (splats.wanted, splats.settled))
+        given = splats.positions, splats.rgba, splats.row, part, facing, wanted, settled
+        return IMAGE(*given, settings=self._settings(border))
+
+    def _facing(self, splats: Splats) -> Array | None:
+        return splats.facing if self.reads_facing else None
 
     def _settings(self, border: int) -> Settings:
         return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border)
@@ -61,7 +69,8 @@ class _Fused(splatting.Kernel):
             return None
         from rts_backends.fused import normal_equations
 
-        own = splats.positions, splats.rgba, splats.row, splats.part, splats.wanted
+        own = splats.positions, splats.rgba, splats.row, splats.part, self._facing(splats)
+        own += splats.wanted, splats.settled
         given = *own, t_positions, t_rgba, target, weights, background
         return normal_equations.equations(self._settings(splats.border), engine_of(given), *given)
 
@@ -101,37 +110,51 @@ _SPECIFICATIONS = {"single": splatting.Single, "multi": splatting.Multi, "visibl
 
 
 def _specification(
-    positions: Array, rgba: Array, row: Array, part: Array, wanted: Array, *, settings: Settings
+    positions: Array,
+    rgba: Array,
+    row: Array,
+    part: Array,
+    facing: Array,
+    wanted: Array,
+    settled: Array,
+    *,
+    settings: Settings,
 ) -> Array:
     given = settings.sigma, settings.epsilon, settings.gamma
     options = {"rims": settings.rims, "crossings": settings.crossings} if settings.kind == "visible" else {}
-    splats = Splats(positions, rgba, row, part if part.shape[0] else None)
-    return without_border(_SPECIFICATIONS[settings.kind](*given, **options).accumulate(splats), settings.border)
+    part, facing, settled = (x if x.shape[0] else None for x in (part, facing, settled))
+    splats = Splats(positions, rgba, row, part, facing, settled)
+    return without_border(_SPECIFICATIONS[settings.kind](*given, **options).image(splats), settings.border)
 
 
 def _shape(
-    positions: tuple, rgba: tuple, row: tuple, part: tuple, wanted: tuple, *, settings: Settings
+    positions: tuple,
+    rgba: tuple,
+    row: tuple,
+    part: tuple,
+    facing: tuple,
+    wanted: tuple,
+    settled: tuple,
+    *,
+    settings: Settings,
 ) -> tuple[int, ...]:
     return *(max(0, n - 2 * settings.border) for n in row[1:]), 4
 
 
 def _forward(operands: Arrays, out: np.ndarray, *, settings: Settings) -> Choices | None:
-    positions, rgba, row, part, wanted = operands
-    cells = Cells(settings, positions, rgba, row, part=part, wanted=wanted)
+    cells = Cells(settings, *operands[:3], None, *operands[3:])
     cells.image(out)
     return cells.choices if out.size else None
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, settings: Settings, kept: Choices | None) -> None:
-    positions, rgba, row, part, wanted = operands
     t_positions, t_rgba = tangents
-    Cells(settings, positions, rgba, row, kept, part, wanted).jvp(t_positions, t_rgba, out)
+    Cells(settings, *operands[:3], kept, *operands[3:]).jvp(t_positions, t_rgba, out)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings, kept: Choices | None) -> None:
-    positions, rgba, row, part, wanted = operands
     g_positions, g_rgba = results
-    Cells(settings, positions, rgba, row, kept, part, wanted).vjp(g, g_positions, g_rgba)
+    Cells(settings, *operands[:3], kept, *operands[3:]).vjp(g, g_positions, g_rgba)
 
 
 def _used(operands: Arrays) -> int:
@@ -142,7 +165,7 @@ _OPTIONS: dict[str, Any] = {"differentiable": 2, "packed": (0, 1), "used": _used
 IMAGE = Operation(
     "rts.image",
     _specification,
-    (2, 2, 3, 3, 2),
+    (2, 2, 3, 3, 3, 2, 2),
     _shape,
     _forward,
     _push,
@@ -151,6 +174,6 @@ IMAGE = Operation(
     sweeps=True,
     **_OPTIONS,
 )
-"""The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part and wanted, without the settings' border.
+"""The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled, without a border.
 
-The last two are those of `rts.Splats`; (0, H, W) and (0, W) where they are not known."""
+The last three are those of `rts.Splats`; (0, H, W) and (0, W) where they are not known."""

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from rts.compiling import kernel
 
 FIRST, SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 """Factors of splitmix64, which spreads neighbouring numbers evenly."""
 
 
-@numba.njit(nogil=True, cache=True)
+@kernel
 def distinct(keys):
     """Find the different numbers among many, by open addressing.
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
 
-@numba.njit(nogil=True, inline="always")
+
+@compiled(inline="always")
 def _place(point, shape, low, step, lowest, near, slopes):
     """Fill the lowest corner of a point's cell, its shares (3, 2) of both ends along each axis, and their slopes (3,).
 
@@ -26,7 +27,7 @@ def _place(point, shape, low, step, lowest, near, slopes):
     return True
 
 
-@numba.njit(nogil=True, inline="always")
+@compiled(inline="always")
 def _difference(values, at, axis, step):
     """The central difference at the lattice point `at` (3,) along an axis, one-sided at the bounds."""
     x, y, z = at
@@ -37,7 +38,7 @@ def _difference(values, at, axis, step):
     return (above - below) / ((up + down) * step[axis])
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def value(start, stop, values, points, low, step, out):
     """Fill the differences (N, 3) at points `start` to `stop`."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
@@ -56,7 +57,7 @@ def value(start, stop, values, points, low, step, out):
                 out[n, axis] += share * _difference(values, at, axis, step)
 
 
-@numba.njit(nogil=True, inline="always")
+@compiled(inline="always")
 def _share_slopes(i, near, slopes, out):
     """Fill the derivatives (3,) of the share of corner i in the coordinates of the point."""
     for along in range(3):
@@ -67,7 +68,7 @@ def _share_slopes(i, near, slopes, out):
         out[along] = slope
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def push_points(start, stop, values, points, tangents, low, step, out):
     """Add the derivatives along tangents (N, 3) of the points."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
@@ -85,7 +86,7 @@ def push_points(start, stop, values, points, tangents, low, step, out):
                 out[n, axis] += change * _difference(values, at, axis, step)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def pull_points(start, stop, values, points, g, low, step, results):
     """Fill the gradients (N, 3) of the points, of those of the differences."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
@@ -105,7 +106,7 @@ def pull_points(start, stop, values, points, g, low, step, results):
                 results[n, axis] += along * own[axis]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def pull_values(points, g, low, step, results):
     """Add the gradients (X, Y, Z) of the values, of those of the differences."""
     shape = results.shape

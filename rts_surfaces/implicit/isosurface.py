@@ -234,6 +234,10 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         parallel(lattice_samples_kernels.hand_on, len(ids), faces, found.ends, cells, caps, ids, work=10 * len(ids))
         return Proxy(found.vertices, faces, ids)
 
+    def pieces(self, proxy: Proxy) -> np.ndarray:
+        """One: marching cubes wind all triangles by which side is inside."""
+        return np.ones(1, np.int16)
+
     def refine(self, inputs: Mapping[str, np.ndarray], samples: Samples, rays: Rays) -> Samples:
         """What samples carry: weights of the six values, their place, and how they move; and lattice points merged."""
         from rts_surfaces.implicit import lattice_samples_kernels

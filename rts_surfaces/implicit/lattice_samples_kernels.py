@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from rts.compiling import compiled, kernel
 
 LARGEST = 1e38
 """What is larger is no number of single precision: fields that are flat to the last digit move nothing."""
 
 
-@numba.njit(nogil=True, inline="always")
+@compiled(inline="always")
 def _place(number, shape, low, step, out):
     out[0] = low[0] + step[0] * (number // (shape[1] * shape[2]))
     out[1] = low[1] + step[1] * (number // shape[2] % shape[1])
     out[2] = low[2] + step[2] * (number % shape[2])
 
 
-@numba.njit(nogil=True, inline="always")
+@compiled(inline="always")
 def _slope(values, band, cell, base, at, shape, low, step, caps, out):
     """Fill the gradient (3,) of values interpolated within a cell; zero across sides that are capped."""
     x, y, z = base // (shape[1] * shape[2]), base // shape[2] % shape[1], base % shape[2]
@@ -42,7 +43,7 @@ def _slope(values, band, cell, base, at, shape, low, step, caps, out):
         out[i] = 0.0 if caps >> i & 1 else out[i] / step[i]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near, points, params, least):
     """Fill what samples `start` to `stop` carry.
 
@@ -100,7 +101,7 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
         params[n, 15] = level
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def hand_on(start, stop, faces, ends, cells, caps, ids):
     """Fill what triangles hand on to samples, (T, 8): the ends of three edges, the cell, and where it is capped."""
     for t in range(start, stop):

@@ -7,11 +7,12 @@ along each axis than fit between the points; where the surface is closed there i
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
 
-@numba.njit(nogil=True, inline="always")
+
+@compiled(inline="always")
 def _signs(values, isovalue, sign, closed, x, out):
     """Fill `out` with 1 for each point of plane x that is inside, with the cells' border around it."""
     shape_x, shape_y, shape_z = values.shape
@@ -35,7 +36,7 @@ def _signs(values, isovalue, sign, closed, x, out):
         out[shape_y] = out[shape_y - 1]
 
 
-@numba.njit(nogil=True, inline="always")
+@compiled(inline="always")
 def _codes(low, high, y, count, out):
     """Fill `out` with the cases of a row of cells between two planes of signs."""
     a, b, c, d = low[y], high[y], low[y + 1], high[y + 1]
@@ -45,13 +46,13 @@ def _codes(low, high, y, count, out):
         out[z] = below | above << 4
 
 
-@numba.njit(nogil=True, inline="always")
+@compiled(inline="always")
 def _is_real(x, y, z, shape, closed):
     """Whether a cell, counted with the border, has triangles."""
     return closed or (x < shape[0] - 1 and y < shape[1] - 1 and z < shape[2] - 1)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
     """Count mixed cells, vertices and triangles of layers `start` to `stop` into `tally` (layers, 3)."""
     shape = values.shape
@@ -84,7 +85,7 @@ def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
         tally[x, 0], tally[x, 1], tally[x, 2] = mixed, crossed, triangles
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def vertices(
     start, stop, values, isovalue, sign, closed, origin, step, offsets, cells, codes_of, first_of, ends, places, apart
 ):
@@ -158,12 +159,12 @@ def vertices(
                         vertex += 1
 
 
-@numba.njit(nogil=True, inline="always")
+@compiled(inline="always")
 def _bit_count(x):
     return (x & 1) + (x >> 1 & 1) + (x >> 2 & 1)
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def faces(
     start, stop, shape, closed, offsets, cells, codes_of, first_of, triangles_of, edges_of, edges, out, owners, caps
 ):
@@ -194,7 +195,7 @@ def faces(
                 t += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def edges_of_cells(corners, virtual, codes, triangles_of, edges_of, edges, keys, pairs):
     """Fill the edges that corners of triangles lie on, for mixed cells in any order.
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from rts.compiling import compiled, kernel
 
-@numba.njit(cache=True, nogil=True)
+
+@kernel
 def move(start, stop, values, params, rows, isovalue, sign, out):
     """Fill the places (N, 3) of samples `start` to `stop`."""
     for n in range(start, stop):
@@ -17,7 +18,7 @@ def move(start, stop, values, params, rows, isovalue, sign, out):
             out[n, i] = params[n, 9 + i] - sign * level * params[n, 12 + i]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def push(start, stop, tangents, params, rows, sign, out):
     """Fill the derivatives (N, 3) along tangents (M,) of the values."""
     for n in range(start, stop):
@@ -28,7 +29,7 @@ def push(start, stop, tangents, params, rows, sign, out):
             out[n, i] = -sign * level * params[n, 12 + i]
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def pull(g, params, rows, sign, results):
     """Add the gradients (M,) of the values, of those (N, 3) of the places."""
     for n in range(len(rows)):
@@ -38,7 +39,7 @@ def pull(g, params, rows, sign, results):
                 results[rows[n, i]] -= sign * along * params[n, 3 + i]
 
 
-@numba.njit(nogil=True, inline="always")
+@compiled(inline="always")
 def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
     """The axis along which edge k goes, its length, and how far along it the isovalue is crossed.
 
@@ -59,7 +60,7 @@ def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
     return axis, length, along, apart
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def cross(start, stop, values, params, rows, numbers, isovalue, shape, low, step, out):
     """Fill the places (N, 3) of samples `start` to `stop` whose corners slide along edges."""
     for n in range(start, stop):
@@ -73,7 +74,7 @@ def cross(start, stop, values, params, rows, numbers, isovalue, shape, low, step
         out[n, 0], out[n, 1], out[n, 2] = x, y, z
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def push_crossings(start, stop, values, tangents, params, rows, numbers, isovalue, shape, low, step, out):
     """Fill the derivatives (N, 3) along tangents (M,) of the values."""
     for n in range(start, stop):
@@ -85,7 +86,7 @@ def push_crossings(start, stop, values, tangents, params, rows, numbers, isovalu
                 out[n, axis] -= params[n, k] * length * change / apart
 
 
-@numba.njit(cache=True, nogil=True)
+@kernel
 def pull_crossings(values, g, params, rows, numbers, isovalue, shape, low, step, results):
     """Add the gradients (M,) of the values, of those (N, 3) of the places."""
     for n in range(len(rows)):

@@ -10,11 +10,9 @@ and `bricks` (B, 64) int32 the row of each corner, or −1. It imports numba.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
-compiled = numba.njit(nogil=True)
-kernel = numba.njit(nogil=True, cache=True)
+from rts.compiling import compiled, kernel
 
 SHIFT = 2
 MASK = (1 << SHIFT) - 1

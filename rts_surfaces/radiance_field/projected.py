@@ -97,6 +97,10 @@ class Projected(TriangleSurface):
         ids = np.concatenate([found.ids, depths.view(np.int32)], axis=1)
         return Proxy(world.astype(np.float32), faces[kept], np.ascontiguousarray(ids[kept]))
 
+    def pieces(self, proxy: Proxy) -> np.ndarray:
+        """One, as those of the surface itself, which refines samples without moving them: an isosurface."""
+        return np.ones(1, np.int16)
+
     def refine(self, inputs: Tree, samples: Samples, rays: Rays) -> Samples:
         """Barycentrics as they are in NDC; then what the surface itself does with samples there."""
         depths = np.ascontiguousarray(samples.ids[:, -3:]).view(np.float32).astype(np.float64)

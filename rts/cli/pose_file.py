@@ -1,0 +1,99 @@
+"""A pose with the camera that sees it, as `rts fit-pose` writes it and `rts render --pose` reads it."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.arguments import check_numbers, check_pixels, is_invertible
+from rts.camera import Camera
+from rts.errors import InputError
+from rts.files.paths import as_path
+from rts.interfaces import Part
+from rts.operations.linear import matmul
+from rts.trees import Array
+
+
+class Pose(NamedTuple):
+    """Where a model is, and how it is seen.
+
+    Attributes:
+        matrix: (4, 4) world from the model as loaded.
+        camera: the camera, whose ratio of width to height is known.
+        size: (height, width) of its image, pixels.
+    """
+
+    matrix: np.ndarray
+    camera: Camera
+    size: tuple[int, int]
+
+    @property
+    def fov_y(self) -> float:
+        """The camera's vertical field of view, degrees."""
+        return math.degrees(2 * math.atan(1 / self.camera.projection[1, 1]))
+
+    def numbers(self) -> dict[str, Any]:
+        """What a pose is in JSON."""
+        view, projection = self.camera
+        return {
+            "matrix": self.matrix.tolist(),
+            "size": list(self.size),
+            "fov_y": self.fov_y,
+            "camera": {"view": view.tolist(), "projection": projection.tolist(), "aspect": self.camera.aspect},
+        }
+
+
+def read_pose(path: Any) -> Pose:
+    """The pose in a file of JSON with a `matrix`, a `size`, and a `camera` of `view` and `projection`.
+
+    Raises:
+        InputError: there is no such file, it is not JSON, or an entry is missing or makes no pose.
+    """
+    path = as_path(path)
+    if not path.is_file():
+        raise InputError(f"no file {path}; expected the pose.json that `rts fit-pose` writes")
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{path} cannot be read as JSON ({' '.join(str(error).split())[:80]})") from error
+    try:
+        return _pose(found)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _pose(found: Any) -> Pose:
+    camera = _entry(found, "camera")
+    matrices = {"matrix": _entry(found, "matrix")}
+    matrices |= {name: _entry(camera, name) for name in ("view", "projection")}
+    for name, matrix in matrices.items():
+        known = check_numbers(name, matrix, (4, 4))
+        if known is None or not is_invertible(known):
+            raise InputError(f"{name} is singular; expected an invertible matrix")
+        matrices[name] = np.asarray(known, np.float64)
+    size = check_pixels(_entry(found, "size"))
+    aspect = camera.get("aspect")
+    if aspect is not None:
+        check_numbers("aspect", aspect, ())
+    return Pose(matrices["matrix"], Camera(matrices["view"], matrices["projection"], aspect), size)
+
+
+def _entry(found: Any, name: str) -> Any:
+    if not isinstance(found, dict) or name not in found:
+        raise InputError(f"there is no entry {name!r}; expected the pose.json that `rts fit-pose` writes")
+    return found[name]
+
+
+def posed(parts: Sequence[Part], transform: Array, shader: Any = None) -> list[Part]:
+    """The parts moved by a transform of the world, perhaps with another shader."""
+    return [
+        part.replace(
+            transform=transform if part.transform is None else matmul(transform, part.transform),
+            shader=shader or part.shader,
+        )
+        for part in parts
+    ]

@@ -1,0 +1,50 @@
+"""Which side of a surface is seen where hidden layers are: what keeps a front and a back from pairing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.records import MORE, Fragments, Proxy
+from rts.threads import parallel, read_only
+
+
+def facing(
+    fragments: Fragments, kept: np.ndarray, proxy: Proxy, pieces: np.ndarray, camera: Camera, listed: bool
+) -> np.ndarray:
+    """Which piece is seen, and from which side: (K, H, W) int16, see `rts.records.Samples`.
+
+    It is found where splatters may compare it: in cells that have hidden layers, and beside them. It is 0 elsewhere.
+    The last layer of fragments is marked by `MORE`.
+
+    Args:
+        fragments: what was sampled.
+        kept: (K, H, W) bool, which of them are samples.
+        proxy: the triangles.
+        pieces: (T,) int16, the number of each triangle's piece; or (1,), of all.
+        camera: host matrices.
+        listed: whether the cells are those of a list, so that what lies side by side in it may not do so in the image.
+    """
+    from rts.sampling import facing_kernels
+
+    found = np.zeros(kept.shape, np.int16)
+    behind = np.count_nonzero(kept[1:])
+    if behind:
+        given = (np.ascontiguousarray(x) for x in (kept, fragments.triangle_ids))
+        triangles = read_only(proxy.vertices), read_only(proxy.faces, np.int32), read_only(pieces, np.int16)
+        arrays = *given, *triangles, eye(camera), listed, MORE
+        parallel(facing_kernels.fill, kept.shape[1], *arrays, found, work=kept[0].size + 100 * behind)
+    return found
+
+
+def eye(camera: Camera) -> np.ndarray:
+    """(4,) the homogeneous point e that all rays come from, with the sign that makes n · (e − v) > 0 on front faces.
+
+    A triangle's normal n is that of counter-clockwise winding, v any point of it. Rays that are parallel come from
+    infinity: n · e > 0.
+    """
+    rows = camera.projection[[0, 1, 3]] @ camera.view
+    found = np.array([(-1) ** i * np.linalg.det(np.delete(rows, i, axis=1)) for i in range(4)])
+    p = camera.projection
+    winding = np.linalg.det(camera.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0])
+    return found if winding > 0 else -found

@@ -1,0 +1,59 @@
+"""Which side of their surface fragments show, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.compiling import compiled, kernel
+
+
+@kernel
+def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eye, listed, more, found):
+    """Fill lines [start, stop) of `found` (K, H, W) int16, zeros; see `rts.sampling.facing`."""
+    layers, height, width = kept.shape
+    hidden, near = np.zeros((3, width + 2), np.uint8), np.empty(width, np.uint8)
+    for y in range(start - 1, stop + 1):
+        level = hidden[(y + 3) % 3]
+        level[:] = 0
+        if 0 <= y < height:
+            for k in range(1, layers):
+                _add(level[1:-1], kept[k, y])
+        if y <= start:
+            continue
+        _spread(near, hidden[(y + 1) % 3], hidden[(y + 2) % 3], level)
+        for x in range(width):
+            if listed or near[x]:
+                for k in range(layers):
+                    if kept[k, y - 1, x]:
+                        t = triangle_ids[k, y - 1, x]
+                        piece = pieces[t] if len(pieces) > 1 else pieces[0]
+                        if piece > 0 and k == layers - 1:
+                            piece += more
+                        found[k, y - 1, x] = piece if _front(vertices, faces, t, eye) else -piece
+
+
+# Rows are handed over one by one, which the compiler needs to see that they do not overlap.
+
+
+@compiled
+def _add(level, kept):
+    for x in range(len(kept)):
+        level[x] |= np.uint8(kept[x])
+
+
+@compiled
+def _spread(near, above, level, below):
+    for x in range(len(near)):
+        around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
+        near[x] = around | below[x] | below[x + 1] | below[x + 2]
+
+
+@compiled
+def _front(vertices, faces, t, eye):
+    """Whether a triangle is seen from the side from which its corners go round counter-clockwise."""
+    a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
+    x, y, z = np.float64(vertices[a, 0]), np.float64(vertices[a, 1]), np.float64(vertices[a, 2])
+    bx, by, bz = vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z
+    cx, cy, cz = vertices[c, 0] - x, vertices[c, 1] - y, vertices[c, 2] - z
+    ex, ey, ez = eye[0] - eye[3] * x, eye[1] - eye[3] * y, eye[2] - eye[3] * z
+    return (by * cz - bz * cy) * ex + (bz * cx - bx * cz) * ey + (bx * cy - by * cx) * ez > 0

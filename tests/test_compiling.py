@@ -1,0 +1,99 @@
+"""What is compiled, and when: few kernels, each once; a line on terminals alone."""
+
+import io
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import rts
+
+pytest.importorskip("numba")
+from rts import compiling, warming
+
+pytestmark = pytest.mark.core
+
+FIRST_RENDER = """
+import sys
+import numpy as np
+import rts
+from numba.core.dispatcher import Dispatcher
+
+def specialisations():
+    ours = ("rts", "rts_backends", "rts_surfaces")
+    modules = [m for name, m in sys.modules.items() if name.partition(".")[0] in ours]
+    found = {id(x): x for m in modules for x in vars(m).values() if isinstance(x, Dispatcher)}
+    kept = [x for x in found.values() if x.overloads and hasattr(x._cache, "cache_path")]
+    return {f"{x.__module__}.{x.__name__}": len(x.overloads) for x in kept}
+
+vertices = np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0.5), (-1, 0, -1)], np.float32)
+part = rts.Part(rts.plugin("surfaces", "mesh")([(0, 1, 2), (1, 3, 2)]), {"vertices": vertices})
+camera = rts.Camera.look_at((0, 0, 3), (0, 0, 0))
+rts.render(part, camera, (40, 50))
+first = specialisations()
+vertices.flags.writeable = False
+moved = part.replace(theta={"vertices": np.asfortranarray(vertices)}, transform=rts.rigid([0, 0.1, 0, 0, 0, 0]))
+rts.render(moved, camera, (33, 40), sampler="raster")
+rts.render(part, camera, (40, 50), sampler="raster")
+again = specialisations()
+assert all(again[name] == count for name, count in first.items()), (first, again)
+print(len(first), max(first.values()), *sorted(first))
+"""
+
+
+def test_the_first_render_compiles_few_kernels_each_once():
+    done = subprocess.run([sys.executable, "-c", FIRST_RENDER], capture_output=True, text=True, check=True)
+    count, most, *_ = done.stdout.split()
+    assert 8 <= int(count) <= 16, done.stdout
+    assert int(most) == 1, done.stdout
+    assert not done.stderr  # It is no terminal.
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.mark.parametrize(("stream", "told"), [(Terminal(), True), (io.StringIO(), False)], ids=["terminal", "pipe"])
+def test_a_terminal_is_told_of_what_takes_long(stream, told, monkeypatch):
+    monkeypatch.setattr(sys, "stderr", stream)
+    progress = compiling._Progress()
+    ours, theirs = (type("", (), {"py_func": f}) for f in (rts.render, np.linalg.norm))
+
+    def compile_(dispatcher, seconds):
+        happened = type("", (), {"data": {"dispatcher": dispatcher}})
+        monkeypatch.setattr(compiling.time, "perf_counter", lambda: 0.0)
+        progress.on_start(happened)
+        progress.on_start(happened)  # Helpers are compiled within.
+        progress.on_end(happened)
+        monkeypatch.setattr(compiling.time, "perf_counter", lambda: seconds)
+        progress.on_end(happened)
+
+    compile_(ours, 0.5)
+    compile_(theirs, 9.0)
+    assert not stream.getvalue()
+    compile_(ours, 2.5)
+    assert ("rts: compiling kernels (once): 2 in 3 s" in stream.getvalue()) == told
+
+
+def test_warmup_does_every_task_in_a_process_and_says_what_failed(monkeypatch):
+    given = []
+
+    def run(command, **options):
+        given.append((command[2], options["env"]["RTS_NUM_THREADS"]))
+        failed = "fitting" in command[2]
+        return subprocess.CompletedProcess(
+            command, int(failed), "", "Traceback\nMemoryError: no more" if failed else ""
+        )
+
+    monkeypatch.setattr(warming.subprocess, "run", run)
+    with pytest.raises(rts.RtsError, match="could not compile what fitting needs: MemoryError: no more"):
+        rts.warmup(1)
+    assert [code.partition("[")[2] for code, _ in given] == [f"{name!r}]()" for name in warming.TASKS]
+
+
+@pytest.mark.parametrize("processes", [0, -1, 1.5, "two", True])
+def test_a_wrong_number_of_processes_is_refused(processes):
+    with pytest.raises(rts.InputError, match="processes is .*; expected a positive integer, or None"):
+        rts.warmup(processes)
