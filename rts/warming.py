@@ -80,7 +80,7 @@ def _parts() -> list[Part]:
     corners = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
     faces = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
     surface = registry.plugin("rts.surfaces", "mesh")(np.array(faces))
-    color = np.float32([0.2, 0.5, 0.8])
+    color = np.array([0.2, 0.5, 0.8], np.float32)
     theta = [{"vertices": corners * 0.9, "color": color}, {"vertices": corners[:, ::-1] * 0.7 + 0.3, "color": color}]
     return [Part(surface, each, shader) for each, shader in zip(theta, ("lambert", "silhouette"), strict=True)]
 
