@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from typing import Any
 
@@ -75,6 +75,28 @@ def _check_part(index: int, part: Part) -> CheckedPart:
     if isinstance(reads, str) or not set(reads) <= set(theta):
         raise InputError(f"reads of {surface!r} gave {reads!r}; expected names of entries of theta: {sorted(theta)}")
     return CheckedPart(surface, theta, shader, transform, part.cull)
+
+
+def check_changes(index: int, changes: Mapping[str, Any], count: int) -> None:
+    """Refuse changes of one of so many prepared parts that are not of fields which may change."""
+    if "surface" in changes:
+        raise InputError("a prepared part keeps its surface; call rts.prepare for another one")
+    unknown = set(changes) - {"theta", "shader", "transform", "cull"}
+    if unknown or not -count <= index < count:
+        raise InputError(
+            f"part {index} with {sorted(changes)} was asked for; expected theta, shader, transform or cull of "
+            f"one of {count} parts"
+        )
+
+
+def changed_part(index: int, part: CheckedPart, changes: Mapping[str, Any]) -> CheckedPart:
+    """A checked part with some fields changed, which are checked."""
+    if set(changes) - {"transform"}:
+        return _check_part(index, part.replace(**changes))
+    transform = changes["transform"]
+    if transform is not None:
+        transform = check_matrix(f"the transform of part {index}", transform)
+    return CheckedPart(part.surface, part.theta, part.shader, transform, part.cull)
 
 
 def check_sampler(chosen: Any) -> Sampler:

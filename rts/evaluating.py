@@ -36,7 +36,7 @@ def to_splats(
     if not engine.owns(sampled.row):
         sampled = constants(sampled, engine, like if engine.differentiates else None)
     positions, rgba = _shown(sampled.samples, sampled.row, parts, camera, wide, engine, like)
-    cells = sampled.row, sampled.part, sampled.facing
+    cells = sampled.row, sampled.part, sampled.facing, sampled.settled
     if not engine.owns(rgba):
         cells = constants(cells, *suiting(positions, rgba))
     return Splats(positions, rgba, *cells, border=apron)

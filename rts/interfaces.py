@@ -287,11 +287,31 @@ def as_surface(given: Any) -> Any:
 
 
 class Needed(Plugin):
-    """Says which samples can reach the image; on the host. Any function with the signature of `__call__` will do."""
+    """Says which samples can reach the image; on the host. Any function with the signature of `__call__` will do.
+
+    Attributes:
+        settles: whether it also says which cells are `settled`; True in a class with its own method.
+        size: of the largest number that surfaces read, if it is known.
+    """
+
+    FLAGS = {"settled": "settles"}
+    settles: bool = False
+    size: float | None = None
 
     @abc.abstractmethod
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Which samples to keep, (K, H, W) bool, where covered (K, H, W) bool lie at depth (K, H, W)."""
+
+    def settled(self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float) -> np.ndarray:
+        """Cells (H, W) bool whose colour is known without samples; those that only such cells need leave `kept`.
+
+        Args:
+            covered: (K, H, W) bool.
+            depth: (K, H, W) float.
+            kept: (K, H, W) bool, what `__call__` gave; changed in place.
+            size: of the largest coordinate.
+        """
+        raise NotImplementedError
 
     def ran_out(self, cells: int) -> None:
         """Take note of how many cells had all layers of triangles that were looked for, and too few after `refine`."""
@@ -403,6 +423,9 @@ class Splatter(Plugin):
         prunes: whether it says which samples it needs; True in a class with its own `needed`.
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
         averages: whether its normal equations may be asked for with a target of fewer pixels than there are cells.
+        settles: whether it reads `Splats.settled`: where all nine samples around a cell are fronts of one opaque
+            colour, on cells' centres, and no hidden one beside them is `needed`, the cell has that colour, whatever
+            moves by little; and samples farther than `reach` from all other cells need not be there.
     """
 
     FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}
@@ -414,6 +437,7 @@ class Splatter(Plugin):
     prunes: bool = False
     sums_products: bool = False
     averages: bool = False
+    settles: bool = False
 
     @abc.abstractmethod
     def image(self, splats: Splats) -> Array:

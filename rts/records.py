@@ -112,6 +112,7 @@ class Samples:
         asked: the names of the entries that were wanted when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their cells.
         by_sample: the names of the tables that have a row for each sample; other tables are shared by all.
+        settled: (H, W) bool, see `Splats`; None where no samples were left out for it.
         facing: (K, H, W) int16, the number of the piece of surface that is seen in each cell, from 1 on, negative where
             it is seen from behind; 0 where that is not known or not of interest. Pieces are consistently oriented: what
             is seen from opposite sides in two neighbouring cells is not one sheet. Numbers are larger by `MORE` where
@@ -128,6 +129,7 @@ class Samples:
     asked: tuple[str, ...] | None = None
     centered: bool = True
     by_sample: tuple[str, ...] = ()
+    settled: Array | None = None
     facing: Array | None = None
 
 
@@ -189,6 +191,7 @@ class Sampled:
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
         fine: further samples where outlines are (`rts.Adaptive`), or None.
+        settled: (H, W) bool, see `Splats`; None where no samples were left out for it.
         facing: (K, H, W) int16, as in `Samples`; pieces of different parts have different numbers. None where nothing
             is told.
     """
@@ -200,12 +203,15 @@ class Sampled:
     supersample: int = 1
     apron: int = 2
     fine: Fine | None = None
+    settled: Array | None = None
     facing: Array | None = None
 
     @property
     def part(self) -> Array:
         """(K, H, W) int32, the part seen in each cell, or −1."""
         xp, first = namespace(self.row), 0
+        if len(self.samples) == 1:
+            return xp.clip(self.row, None, 0)
         part = xp.astype(self.row >= 0, self.row.dtype) - 1
         for samples in self.samples[:-1]:
             first += samples.ids.shape[-2]
@@ -227,7 +233,8 @@ class Splats:
         part: (K, H, W) int32, the part of each sample, or −1; None if that is not known.
         facing: (K, H, W) integers, the number of the piece of surface in each cell, negative where it is seen from
             behind, 0 where that is not told; or None. See `Samples`.
-        settled: (H, W) bool, cells amid one colour, where nothing that moves changes the image; or None.
+        settled: (H, W) bool, cells that show the one colour of all samples, whatever moves; or None. They may have
+            no sample, as cells around them that affect no others.
         sentinel: () float, the depth that stands for empty layers, beyond all samples; None for one of the scene's
             scale.
         wanted: (H, W) bool, the targets that are looked at; others may have any finite colour. None for all.

@@ -12,8 +12,8 @@ from typing import Any, Literal
 from rts.arguments import quoted
 from rts.arrays import described, shape_of
 from rts.camera import Camera
-from rts.checks import check_background, check_size, check_splatter
-from rts.engines import constants, engine_of, is_constant, namespace, suiting, uncompiled, value_of
+from rts.checks import changed_part, check_background, check_changes, check_size, check_splatter
+from rts.engines import constants, engine_of, is_constant, namespace, suiting, suiting_scene, uncompiled, value_of
 from rts.errors import EmptyImageWarning, InputError, warn
 from rts.evaluating import to_fine_splats, to_splats
 from rts.interfaces import Part, Splatter
@@ -83,23 +83,85 @@ def render(
     """
     scene = Scene.of(parts, camera, sampler, engine)
     size = check_size(size, layers, capacity, finest(supersample))
-    scene = scene.at(size)
-    background = check_background(background, size)
-    splatter = check_splatter(splatter)
-    options = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
+    options = dict(splatter=check_splatter(splatter), layers=layers, supersample=supersample, capacity=capacity)
+    return _image(scene.at(size), size, check_background(background, size), **options)
+
+
+class Renderer:
+    """Renders prepared parts through one camera again and again; made by `PreparedParts.renderer`.
+
+    What stays is checked and looked up once, and what changes at each call.
+    """
+
+    def __init__(
+        self,
+        parts: PreparedParts,
+        camera: Camera,
+        size: tuple[int, int],
+        *,
+        splatter: Any = "auto",
+        layers: int | Literal["auto"] = 2,
+        supersample: int | Adaptive = 1,
+        background: Any = None,
+        capacity: int | None = None,
+        engine: str | None = None,
+    ):
+        scene, self._engine = Scene.of(parts, camera, "auto", engine), engine
+        self._size = check_size(size, layers, capacity, finest(supersample))
+        self._scene, self._background = scene.at(self._size), check_background(background, self._size)
+        self._options: dict[str, Any] = dict(
+            splatter=check_splatter(splatter), layers=layers, supersample=supersample, capacity=capacity
+        )
+
+    @uncompiled
+    def __call__(self, index: int = 0, **changes: Any) -> Array:
+        """The image, as `render` gives it, with some fields of one part changed.
+
+        Args:
+            index: the part.
+            **changes: its `transform`, `theta`, `shader` or `cull`; they hold for this call alone.
+
+        Returns:
+            (H, W, 4) premultiplied linear RGBA.
+
+        Raises:
+            InputError: there is no such part or field, or what is given does not suit.
+        """
+        scene = self._scene
+        if changes:
+            parts = list(scene.parts)
+            check_changes(index, changes, len(parts))
+            parts[index] = changed_part(index, parts[index], changes)
+            suited = suiting_scene(parts, scene.camera, engine=self._engine)
+            scene = scene._replace(parts=parts, suited=suited)
+        return _image(scene, self._size, self._background, **self._options)
+
+
+def _image(
+    scene: Scene,
+    size: tuple[int, int],
+    background: Array | None,
+    *,
+    splatter: Splatter,
+    layers: int | Literal["auto"],
+    supersample: int | Adaptive,
+    capacity: int | None,
+) -> Array:
+    """The image of a scene for images of a size; see `render`."""
+    options: dict[str, Any] = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
     bands = _bands(*size, layers, supersample)
     suited = scene.suited if is_constant(background) else scene.suiting(background)
     if isinstance(supersample, Adaptive) and supersample.contrast is not None:
         image = _of_contrast(scene, size, suited, **options)
         return _over_background(_seen(image, scene), background)
     if len(bands) == 1:
-        sampled = sampled_scene(scene, scene.camera, size, **options)
+        sampled = sampled_scene(scene, scene.camera, size, settles=True, **options)
         image = _splatted(sampled, scene, scene.camera, suited, splatter)
         return _over_background(_seen(image, scene), background)
     images = []
     for top, rows in bands:
         window = scene.camera.window(size, (top, 0), (rows, size[1]))
-        take = partial(sampled_scene, scene, window, (rows, size[1]), **options)
+        take = partial(sampled_scene, scene, window, (rows, size[1]), settles=True, **options)
         images.append(suited[0].checkpoint(take, lambda s, w=window: _splatted(s, scene, w, suited, splatter)))
     return _over_background(_seen(namespace(*images).concat(images), scene), background)
 
@@ -182,10 +244,12 @@ def _narrowed(sampled: Sampled, cells: int) -> Sampled:
         return sampled
     rows, columns = (slice(cells, n - cells) for n in sampled.row.shape[1:])
     row, depth = (x[:, rows, columns] for x in (sampled.row, sampled.depth))
+    settled = None if sampled.settled is None else sampled.settled[rows, columns]
     fine = sampled.fine  # Its own apron may be wider than is needed.
     fine = None if fine is None else replace(fine, coarse=fine.coarse[rows, columns])
     facing = None if sampled.facing is None else sampled.facing[:, rows, columns]
-    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, fine=fine, facing=facing)
+    known = {"fine": fine, "facing": facing, "settled": settled}
+    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, **known)
 
 
 def _splatted(

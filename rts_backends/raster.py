@@ -35,6 +35,8 @@ LIMIT = np.float32(2**15 - 2)
 Positions on screen take 16 bits, so that those of a million triangles stay in caches.
 """
 
+SIXTEEN, LOWER = np.int32(16), np.int32(2**16 - 1)
+
 BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 """In place of a position: before the near plane (or NaN), beyond the far plane."""
 
@@ -78,7 +80,7 @@ class Raster(TriangleSampler):
         # room for every vertex and triangle, but only what is used is ever touched.
         key = len(vertices), len(faces)
         screen, listed = self._scratch.pop(key, None) or (
-            np.empty((len(vertices), 2), np.int16),
+            np.empty(len(vertices), np.int32),
             np.empty((len(faces), LISTED), np.int32),
         )
         step = (max(size) / 2 + 2) / float(LIMIT)
@@ -115,8 +117,8 @@ class Raster(TriangleSampler):
 
 @kernel(error_model="numpy")
 def _project(start, stop, vertices, m, screen):
-    """Positions (V, 2) on screen, in steps from the middle of the image."""
-    points, pixels = np.empty((3, LONG_BLOCK), np.float32), np.empty((2, LONG_BLOCK), np.int16)
+    """Positions (V,) on screen, in steps from the image's middle: columns in the lower 16 bits, rows in the others."""
+    points, pixels = np.empty((3, LONG_BLOCK), np.float32), np.empty((2, LONG_BLOCK), np.int32)
     for first in range(start, stop, LONG_BLOCK):
         block = slice(first, min(stop, first + LONG_BLOCK))
         read, written = vertices[block], screen[block]
@@ -134,7 +136,7 @@ def _project(start, stop, vertices, m, screen):
             column, row = column if before_far else BEYOND, row if before_far else BEYOND
             pixels[0, v], pixels[1, v] = column if behind_near else BEFORE, row if behind_near else BEFORE
         for v in range(len(read)):
-            written[v, 0], written[v, 1] = pixels[0, v], pixels[1, v]
+            written[v] = (pixels[1, v] << SIXTEEN) | (pixels[0, v] & LOWER)
 
 
 @kernel(error_model="numpy")
@@ -144,11 +146,12 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
     Chunks of one call follow on each other in the list; `spans` (chunks, 2) says where each begins and ends, `counts`
     (bands, chunks) how many of its triangles touch a band of rows.
     """
-    xy, box = np.empty((3, LONG_BLOCK, 2), np.int16), np.empty((4, LONG_BLOCK), np.float32)
+    xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
     chosen, corners = np.empty(LONG_BLOCK, np.uint32), np.empty((3, 4))
     step, sign = np.float32(step), np.float32(keep)
-    middle, center, half, five = np.float32(width / 2), np.float32(height / 2), np.float32(0.5), np.float32(5)
+    more = np.float32(1.25)
+    middle, center, half, four = np.float32(width / 2), np.float32(height / 2), np.float32(0.5), np.float32(4)
     found = first * CHUNK
     for chunk in range(first, last):
         spans[chunk, 0] = found
@@ -156,12 +159,11 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
         for start in range(chunk * CHUNK, end, LONG_BLOCK):
             block = faces[start : min(end, start + LONG_BLOCK)]
             for b in range(len(block)):
-                for c in range(3):
-                    v = block[b, c]
-                    xy[c, b, 0], xy[c, b, 1] = screen[v, 0], screen[v, 1]
+                xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
             for b in range(len(block)):
-                xa, xb, xc = np.float32(xy[0, b, 0]), np.float32(xy[1, b, 0]), np.float32(xy[2, b, 0])
-                ya, yb, yc = np.float32(xy[0, b, 1]), np.float32(xy[1, b, 1]), np.float32(xy[2, b, 1])
+                xa, ya = np.float32(np.int16(xy[0, b])), np.float32(np.int16(xy[0, b] >> SIXTEEN))
+                xb, yb = np.float32(np.int16(xy[1, b])), np.float32(np.int16(xy[1, b] >> SIXTEEN))
+                xc, yc = np.float32(np.int16(xy[2, b])), np.float32(np.int16(xy[2, b] >> SIXTEEN))
                 x0, x1, y0, y1 = min(xa, xb, xc), max(xa, xb, xc), min(ya, yb, yc), max(ya, yb, yc)
                 i0, i1, j0, j1 = _centres(
                     x0 * step + middle, x1 * step + middle, y0 * step + center, y1 * step + center, height, width, step
@@ -171,8 +173,10 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
                 x, y = (i0 + half - middle) / step, (j0 + half - center) / step
                 ax, ay, bx, by, cx, cy = xa - x, ya - y, xb - x, yb - y, xc - x, yc - y
                 ea, eb, ec = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
-                bound = five * (x1 - x0 + y1 - y0 + five)  # Twice what rounding to whole steps may come to.
-                away = (ea + eb + ec) * sign < -bound
+                # Rounding changes coordinates by half a step at most, so these by the sum of the box's sides and 2.5,
+                # and their sum by twice that. The rest is for the centre, which is rounded to a hundredth.
+                bound = more * (x1 - x0 + y1 - y0 + four)
+                away = (ea + eb + ec) * sign < -(bound + bound)
                 missed = ((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound)) | away
                 placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
                 clips[b] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)

@@ -615,3 +615,38 @@ def test_fingerprints_of_many_small_changes_do_not_collide():
         data[rng.integers(300)] += np.float32(rng.choice([-1, 1]) * 2.0 ** rng.integers(-10, 3))
         seen.add(fingerprint(data))
     assert len(seen) > 4990
+
+
+@pytest.mark.parametrize("target", ["numpy", "torch-cpu"])
+def test_a_renderer_gives_the_images_of_render(target):
+    prepared = rts.prepare([part_of(*icosphere(1)), part_of(*icosphere(2), shader="normals")])
+    settings = {"layers": 3, "background": (0.1, 0.2, 0.3)}
+    draw = prepared.renderer(CAMERA, SIZE, **settings)
+    for pose in arrays(target, poses(3)):
+        moved = rts.rigid(pose)
+        np.testing.assert_array_equal(
+            to_numpy(draw(index=1, transform=moved)),
+            to_numpy(rts.render(prepared.replace(1, transform=moved), CAMERA, SIZE, **settings)),
+        )
+    np.testing.assert_array_equal(to_numpy(draw()), to_numpy(rts.render(prepared, CAMERA, SIZE, **settings)))
+    painted = {"shader": "depth", "cull": "back"}
+    np.testing.assert_array_equal(
+        to_numpy(draw(-1, **painted)), to_numpy(rts.render(prepared.replace(1, **painted), CAMERA, SIZE, **settings))
+    )
+
+
+def test_a_renderer_refuses_what_render_refuses():
+    prepared = rts.prepare(part_of(*icosphere(1)))
+    with pytest.raises(InputError, match="layers"):
+        prepared.renderer(CAMERA, SIZE, layers=0)
+    with pytest.raises(InputError, match="camera"):
+        prepared.renderer(None, SIZE)
+    draw = prepared.renderer(CAMERA, SIZE)
+    for changes, words in (
+        ({"transform": np.eye(3)}, r"transform of part 0 .*expected a \(4, 4\) array"),
+        ({"surface": Mesh(icosphere(1)[1])}, "keeps its surface"),
+        ({"index": 1, "transform": np.eye(4)}, "one of 1 parts"),
+        ({"colour": 1}, "colour"),
+    ):
+        with pytest.raises(InputError, match=words):
+            draw(**changes)

@@ -295,6 +295,21 @@ def test_compiled_derivatives_are_those_of_the_specification(layers, rims):
         assert np.abs(results[1][0] - results[2][0]).max() > 0.1
 
 
+@pytest.mark.parametrize("splatter", BOTH)
+def test_colors_keep_the_derivative_of_the_image(splatter):
+    for seed in range(2):
+        splats, rng = rough(seed, layers=2 + seed), np.random.default_rng(seed)
+        still, tint = np.zeros_like(splats.positions), rng.normal(size=splats.rgba.shape)
+        along = rng.normal(size=(*splats.row.shape[1:], 4))
+        results = []
+        for s in (splatter(), splatter(crossings=False)):
+            g_positions, g_rgba = pulled(s, splats, along)
+            results.append((pushed(s, splats, still, tint)[1], g_rgba, g_positions))
+        for found, expected in zip(results[0][:2], results[1][:2], strict=True):
+            np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+        assert np.abs(results[0][2] - results[1][2]).max() > 0.1
+
+
 def test_what_is_kept_near_lines_is_what_the_specification_says():
     kept = 0
     for seed in range(8):
@@ -337,22 +352,24 @@ def test_a_sample_in_several_cells_moves_all_of_their_lines():
 def test_normal_equations_are_products_of_tangents(fine):
     size, border, rng = (44, 52), 4, np.random.default_rng(5)
     splats = rough(5, size).replace(border=border)
-    tangents = rng.normal(size=(3, *splats.positions.shape))
+    tangents, tints = (rng.normal(size=(3, *x.shape)) for x in (splats.positions, splats.rgba))
     inside = slice(border, size[0] - border), slice(border, size[1] - border)
 
     def mean(image):
         height, width = (n - 2 * border for n in size)
         return image[inside].reshape(height // fine, fine, width // fine, fine, 4).mean(axis=(1, 3)).ravel()
 
-    changes = [pushed(fused.Visible(), splats, t) for t in tangents]
+    changes = [pushed(fused.Visible(), splats, *t) for t in zip(tangents, tints, strict=True)]
     image, columns = mean(changes[0][0]), np.stack([mean(change) for _, change in changes])
     shape = ((size[0] - 2 * border) // fine, (size[1] - 2 * border) // fine, 4)
-    given = arrays("torch-cpu", (splats.positions, splats.rgba, splats.row, tangents, np.zeros(shape)), np.float64)
+    given = arrays(
+        "torch-cpu", (splats.positions, splats.rgba, splats.row, tangents, tints, np.zeros(shape)), np.float64
+    )
     whole = rts.Splats(*given[:3], border=border)
-    found = fused.Visible().normal_equations(whole, given[3], None, given[4])
+    found = fused.Visible().normal_equations(whole, *given[3:])
     np.testing.assert_allclose(found[1], columns @ columns.T / image.size, rtol=1e-10)
     np.testing.assert_allclose(found[2], columns @ image / image.size, rtol=1e-10)
-    still = fused.Visible(crossings=False).normal_equations(whole, given[3], None, given[4])
+    still = fused.Visible(crossings=False).normal_equations(whole, *given[3:])
     assert np.abs(np.asarray(still[1]) - np.asarray(found[1])).max() > 0.01 * np.abs(np.asarray(found[1])).max()
 
 

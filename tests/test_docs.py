@@ -5,6 +5,7 @@ import re
 import shlex
 import subprocess
 import tomllib
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,8 @@ from rts.cli.main import app
 pytestmark = pytest.mark.docs
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = ["README.md", *(f"docs/{p.name}" for p in sorted((ROOT / "docs").glob("*.md"))), "CONTRIBUTING.md"]
+PAGES = ["README.md", *(str(p.relative_to(ROOT)) for p in sorted((ROOT / "docs").rglob("*.md"))), "CONTRIBUTING.md"]
+COMING_FROM = [page for page in PAGES if page.startswith("docs/coming-from/")]
 ELSEWHERE = {
     "rts demo": "make wheel",
     "rts plugins --matrix": "test_compatibility.py",
@@ -108,6 +110,46 @@ def test_the_python_of_the_guide_to_plugins_does_what_it_says():
         found["CLAMP"](*operands).detach(), found["CLAMP"].specification(*operands).detach(), atol=1e-12
     )
     assert issubclass(found["TestHeightfield"], rts.testing.SurfaceConformance)
+
+
+def shifted_loss(image, target, part, camera, pose, step):
+    """The loss of a pose shifted along x, area-sampled."""
+    shifted = part.replace(transform=np.asarray(rts.rigid(np.array([*pose[:3], pose[3] + step, *pose[4:]]))))
+    return float(((rts.render(shifted, camera, image.shape[:2], supersample=8)[..., 3] - target) ** 2).mean())
+
+
+def test_pages_for_users_of_others_show_one_task_and_its_gradient(model):
+    torch = pytest.importorskip("torch")
+    assert len(COMING_FROM) == 4
+    [_] = {tuple(blocks(page, "python")) for page in COMING_FROM}
+    found, _ = run(COMING_FROM[0])
+    target, pose = np.asarray(found["target"]), found["pose"].detach().numpy().astype(np.float64)
+    losses = [
+        shifted_loss(np.asarray(found["image"].detach()), target, found["part"], found["camera"], pose, step)
+        for step in (-0.05, 0.05)
+    ]
+    assert float(found["pose"].grad[3]) == pytest.approx((losses[1] - losses[0]) / 0.1, rel=0.05)
+    # The others that are installed agree, as far as their pages say.
+    ours, slope = float(found["loss"].detach()), float(found["pose"].grad[3])
+    pytest.importorskip("deodr")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        exec(*blocks("docs/coming-from/deodr.md", "py"), names := {})
+    assert float(((names["image"] - names["target"]) ** 2).mean()) == pytest.approx(ours, rel=0.07)
+    assert float(names["pose"].grad[3]) == pytest.approx(slope, rel=0.07)
+    assert torch.is_tensor(names["pose"])
+
+
+def test_the_task_in_mitsuba_runs_and_agrees(model):
+    from rts.diagnostics.comparison.mitsuba_peer import mitsuba
+
+    try:
+        mitsuba()
+    except ImportError as error:
+        pytest.skip(str(error))
+    exec(*blocks("docs/coming-from/mitsuba.md", "py"), names := {})
+    assert float(names["loss"].array[0]) == pytest.approx(0.091, rel=0.02)
+    assert float(names["dr"].grad(names["shift"])[0][0]) == pytest.approx(-0.272, rel=0.05)
 
 
 def test_the_entry_points_of_the_guide_are_those_of_the_example():

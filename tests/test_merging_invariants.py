@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from strategies import PROPERTIES, masks, rows_of, steps, told_apart
 
 from rts import threads
+from rts.records import MORE
 from rts.sampling import merging
 from rts.sampling.merging import merge
 
@@ -27,7 +28,10 @@ def parts(draw, least=1, most=4, reals=REALS):
         shape = draw(st.integers(1, 3)), *size
         row, total = draw(rows_of(draw(masks(shape))))
         depth = np.sort(draw(steps(shape, -2, 4, dtype=draw(reals))), axis=0)
-        found.append(replace(told_apart(row, total, depth), overflow=np.int32(draw(st.integers(0, 3)))))
+        facing = np.random.default_rng(draw(st.integers(0, 9))).integers(-3, 4, shape)
+        facing += np.where(facing > 2, MORE, np.where(facing < -2, -MORE, 0))
+        told = replace(told_apart(row, total, depth), facing=facing.astype(np.int16))
+        found.append(replace(told, overflow=np.int32(draw(st.integers(0, 3)))))
     return found, draw(st.integers(1, 6))
 
 
@@ -37,21 +41,25 @@ def offsets_of(samples):
 
 
 def by_hand(samples, layers):
-    """Part, row within it and depth, (K, H, W) each, of sorted cells."""
+    """Part, row within it, depth and facing, (K, H, W) each, of sorted cells."""
     shape = min(layers, sum(len(s.row) for s in samples)), *samples[0].row.shape[1:]
-    part, row, depth = np.full(shape, -1), np.full(shape, -1), np.zeros(shape)
+    part, row, depth, facing = np.full(shape, -1), np.full(shape, -1), np.zeros(shape), np.zeros(shape, int)
     for y, x in np.ndindex(shape[1:]):
         cell = [(s.depth[k, y, x], i, k, s.row[k, y, x]) for i, s in enumerate(samples) for k in range(len(s.row))]
-        for k, (z, i, _, own) in enumerate(sorted(c for c in cell if c[3] >= 0)[:layers]):
+        for k, (z, i, own_layer, own) in enumerate(sorted(c for c in cell if c[3] >= 0)[:layers]):
             part[k, y, x], row[k, y, x], depth[k, y, x] = i, own, z
-    return part, row, depth
+            told = int(samples[i].facing[own_layer, y, x])
+            number = (abs(told) % MORE) * len(samples) + i
+            more = abs(told) >= MORE or k == shape[0] - 1
+            facing[k, y, x] = np.sign(told) * (number + more * MORE)
+    return part, row, depth, facing
 
 
 def given_to(interleave, samples, layers, target="numpy"):
-    """Part, row and depth from one of the two ways to interleave."""
-    given = *(s.row for s in samples), *(s.depth for s in samples)
+    """Part, row, depth and facing from one of the two ways to interleave."""
+    given = *(s.row for s in samples), *(s.depth for s in samples), *(s.facing for s in samples)
     given = given if target == "numpy" else map(lambda x: arrays(target, x, x.dtype), given)
-    return to_numpy(interleave(layers, *given))
+    return to_numpy(interleave(layers, [len(s.ids) for s in samples], *given))
 
 
 # ------------------------------------------------------------------------------------------------- by hand
@@ -72,10 +80,12 @@ def test_compiled_it_is_what_one_does_by_hand(given):
 @given(given=parts())
 def test_in_array_code_it_is_what_one_does_by_hand(target, given):
     samples, layers = given
-    part, row, depth = given_to(merging._interleaved, samples, layers, target)
-    for values, expected in zip((part, row), by_hand(samples, layers), strict=False):
-        np.testing.assert_array_equal(values, expected)
-    np.testing.assert_array_equal(np.where(row >= 0, depth, 0), by_hand(samples, layers)[2])
+    part, row, *others = given_to(merging._interleaved, samples, layers, target)
+    expected = by_hand(samples, layers)
+    for values, own in zip((part, row), expected[:2], strict=True):
+        np.testing.assert_array_equal(values, own)
+    for values, own in zip(others, expected[2:], strict=True):
+        np.testing.assert_array_equal(np.where(row >= 0, values, 0), own)
 
 
 @PROPERTIES

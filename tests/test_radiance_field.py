@@ -340,7 +340,7 @@ def test_engines_agree_on_images_and_gradients():
 
 @pytest.mark.parametrize("name", ["weights", "values"])
 def test_samples_where_outlines_are_have_the_colours_and_gradients_of_many_everywhere(name):
-    """Of a network on a mesh, and of a lattice in NDC."""
+    """A network on a mesh, and a lattice in NDC."""
     part = surface(TORCH[0]) if name == "weights" else Projected.example()
     part = part.replace(theta=arrays(TORCH[0], part.theta))
     camera = CAMERA if name == "weights" else Camera.look_at((0.1, 0.2, 2.5), (0, 0, 0), fov_y=40)

@@ -34,6 +34,7 @@ class Task:
         shader: of the part.
         layers: K.
         splatter: by which it is rendered.
+        cull: of the part.
     """
 
     def __init__(
@@ -45,11 +46,12 @@ class Task:
         shader: str = "silhouette",
         layers: int = 2,
         splatter: Any = "auto",
+        cull: str = "none",
     ):
         self.name, self.vertices, self.faces, self.side = name, vertices, faces, side
         self.layers, self.splatter = layers, splatter
         self.size, self.view = (side, side), camera()
-        self.part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {"vertices": vertices}, shader)
+        self.part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {"vertices": vertices}, shader, cull=cull)
         self.channels = slice(3, 4) if shader == "silhouette" else slice(0, 4)
         self.target = self._target()
 

@@ -66,6 +66,7 @@ class TimedSplatter(rts.Splatter):
 
     def __init__(self, splatter: Any, clock: Clock):
         self._splatter, self._clock = splatter, clock
+        self.reach, self.settles = splatter.reach, splatter.settles
         self.needed = clock.timed("choose hidden layers", splatter.needed)
 
     def image(self, splats: rts.Splats) -> Any:
@@ -87,7 +88,8 @@ class TimedShader(rts.Shader):
     """A shader that is timed."""
 
     def __init__(self, shader: Any, clock: Clock):
-        self.opaque, self.reads, self._shader, self._clock = shader.opaque, shader.reads, shader, clock
+        self.opaque, self.uniform, self.reads = shader.opaque, shader.uniform, shader.reads
+        self._shader, self._clock = shader, clock
 
     def __call__(self, theta: Any, gbuffer: Any, camera: Any) -> Any:
         """See `rts.Shader`."""
@@ -124,9 +126,10 @@ def stages(task: Task, mode: str, sampler: str, rounds: int) -> dict[str, float]
         with clock.stage("pose matrix"):
             transform = rts.rigid(pose)
         posed = part.replace(transform=transform) if mode == "full" else prepared.replace(transform=transform)
-        options = {"sampler": timed} if mode == "full" else {}
+        options: dict[str, Any] = {"sampler": timed} if mode == "full" else {}
         with clock.stage("rest of sample"):
-            sampled = rts.sample(posed, task.view, task.size, splatter=splatter, layers=task.layers, **options)
+            options |= {"splatter": splatter, "layers": task.layers, "settles": True}
+            sampled = rts.sample(posed, task.view, task.size, **options)
         with clock.stage("evaluate, project"):
             image = rts.render_samples(sampled, posed, task.view, splatter=splatter)
         with clock.stage("loss"):

@@ -207,7 +207,8 @@ class ImageResiduals(Residuals):
             # A window is of no ratio of its own.
             return camera if size == self.size else camera.window(self.size, (top, 0), size).replace(aspect=None)
 
-        sampled = sample(parts, window(camera), size, splatter=splatter, supersample=self.supersample, **self._sampling)
+        options = dict(splatter=splatter, supersample=self.supersample, settles=True, **self._sampling)
+        sampled = sample(parts, window(camera), size, **options)
         colored = self._channels > 1 or not _all_opaque(parts, camera)
         band = slice(top, top + rows)
         fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
@@ -231,7 +232,7 @@ class ImageResiduals(Residuals):
                 **fields._asdict(),
             )
 
-        known = {"row": sampled.row, "part": sampled.part, "facing": sampled.facing}
+        known = {"row": sampled.row, "part": sampled.part, "facing": sampled.facing, "settled": sampled.settled}
         if sampled.fine is None:
             return swept(partial(to_splats, sampled), fields, **known)
         # A pixel counts on one of the grids alone.

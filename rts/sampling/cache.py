@@ -23,10 +23,18 @@ KEPT = 2
 
 
 class Entry(NamedTuple):
-    """A proxy, what a sampler built over it, and what the proxy was made of, where samples are refined later."""
+    """A proxy, and what a sampler built over it.
+
+    Attributes:
+        proxy: the triangles.
+        prepared: what the sampler built.
+        size: the largest number of those that they were made of, or larger; None where nobody has looked.
+        inputs: what the proxy was made of, where samples are refined later.
+    """
 
     proxy: Proxy
     prepared: Any
+    size: float | None = None
     inputs: Tree = None
 
 

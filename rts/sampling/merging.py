@@ -20,7 +20,7 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         overflow = overflow + s.overflow
     if len(samples) == 1:
         only = samples[0]
-        return Sampled(tuple(samples), only.row, only.depth, overflow, facing=only.facing)
+        return Sampled(tuple(samples), only.row, only.depth, overflow, facing=only.facing, settled=only.settled)
     given = [*(s.row for s in samples), *(s.depth for s in samples)]
     if any(s.facing is not None for s in samples):
         given += [_nothing_told(s.row) if s.facing is None else s.facing for s in samples]

@@ -24,18 +24,25 @@ def too_far(size: float, depth: np.ndarray) -> bool:
     return size > FAR * largest(depth)
 
 
-def lift(fragments: Fragments, proxy: Proxy, capacity: int | None = None, kept: np.ndarray | None = None) -> Samples:
+def lift(
+    fragments: Fragments,
+    proxy: Proxy,
+    capacity: int | None = None,
+    kept: np.ndarray | None = None,
+    size: float | None = None,
+) -> Samples:
     """Packed samples from fragments: the triangle's ids, and its corner parameters interpolated.
 
     Samples are numbered layer by layer, each in rows and columns of the image. There is always at least one row, so
     that what follows stays connected to θ; a row that no cell refers to has no effect. `kept` (K, H, W) bool says which
     of the covered cells to take, None for all; all are taken, too, where depths are too rough to tell (`too_far`).
+    `size` is that of the largest coordinate, if it is known.
     """
     from rts.sampling import packing_kernels
 
     if (least := fragments.triangle_ids.min(initial=-1)) < -1:
         raise InputError(f"the sampler gave triangle {least} to a cell; expected indices, or -1 where it is empty")
-    if kept is None or (len(kept) > 1 and too_far(largest(proxy.vertices), fragments.depth)):
+    if kept is None or (len(kept) > 1 and too_far(largest(proxy.vertices) if size is None else size, fragments.depth)):
         kept = fragments.triangle_ids >= 0
     table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)

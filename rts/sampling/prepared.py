@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rts.arguments import check_pixels
 from rts.camera import Camera
-from rts.checks import check_sampler, check_scene, suited_sampler
-from rts.errors import InputError
+from rts.checks import check_changes, check_sampler, check_scene, suited_sampler
 from rts.interfaces import Part
 from rts.sampling.cache import Entry
+
+if TYPE_CHECKING:
+    from rts.rendering import Renderer
 
 
 class PreparedParts:
@@ -40,17 +42,28 @@ class PreparedParts:
 
     def replace(self, index: int = 0, **changes: Any) -> PreparedParts:
         """A copy with some fields of one part changed, such as its `transform`; the triangles are not looked at."""
-        if "surface" in changes:
-            raise InputError("a prepared part keeps its surface; call rts.prepare for another one")
-        unknown = set(changes) - {"theta", "shader", "transform", "cull"}
-        if unknown or not -len(self.parts) <= index < len(self.parts):
-            raise InputError(
-                f"part {index} with {sorted(changes)} was asked for; expected theta, shader, transform or cull of "
-                f"one of {len(self.parts)} parts"
-            )
+        check_changes(index, changes, len(self.parts))
         parts = list(self.parts)
         parts[index] = parts[index].replace(**changes)
         return PreparedParts(parts, self.samplers, self.entries)
+
+    def renderer(self, camera: Camera, size: tuple[int, int], **settings: Any) -> Renderer:
+        """A function that renders these parts, for loops: `draw(transform=…)`, with what changes at each call.
+
+        Args:
+            camera: as in `render`.
+            size: as in `render`.
+            **settings: `splatter`, `layers`, `supersample`, `background`, `capacity` and `engine`, as in `render`.
+
+        Returns:
+            A function `(index=0, **changes)`, which gives the image of `render` with some fields of one part changed.
+
+        Raises:
+            InputError: what was given cannot be rendered.
+        """
+        from rts.rendering import Renderer
+
+        return Renderer(self, camera, size, **settings)
 
 
 def _built(sampler: Any, kept: Entry) -> Entry:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rts.adapting import adapted
-from rts.engines import engine_of, is_traced, namespace
+from rts.engines import engine_of, is_constant, is_traced, namespace
 from rts.errors import InputError, LayersWarning, warn
 from rts.interfaces import AnyNeeded, CheckedPart, Needed, Splatter, TriangleSurface
 from rts.operations.operation import known_value
@@ -28,42 +28,81 @@ def planned(layers: int | Literal["auto"]) -> int:
     return 4 if layers == "auto" else int(layers)
 
 
-def needed_by(splatter: Splatter, parts: Sequence[CheckedPart]) -> AnyNeeded | None:
-    """The function that says which samples of a scene the splatter needs; None to keep all.
+def needed_by(
+    splatter: Splatter,
+    parts: Sequence[CheckedPart],
+    sizes: Sequence[float | None] | None = None,
+    settles: bool = False,
+) -> Needed | None:
+    """What says which samples of a scene the splatter needs; None to keep all.
 
     Hidden samples are only without effect if all samples are opaque and lie on cells' centres; and only if numbers of
     the scene are not so large that rounding reorders depths. Where these are not known, since they are traced, `lift`
     looks at the triangles, unless samples are refined.
+
+    Args:
+        splatter: the splatter.
+        parts: checked parts.
+        sizes: of each part the largest number of those that its surface reads, or None where it is to be looked for.
+        settles: whether samples may be left out that only cells of one colour need. Where samples are to be evaluated
+            at other values of θ than they were found for, they may not.
     """
     if not splatter.prunes or not all(p.shader.opaque and p.surface.centered for p in parts):
         return None
-    size = _size(parts)
+    size = _size(parts, sizes or [None] * len(parts))
     if size is None and not all(isinstance(p.surface, TriangleSurface) and not p.surface.refines for p in parts):
         return None
-
-    def needed(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        if len(covered) == 1 or (size is not None and too_far(size, depth)):
-            return covered
-        kept = splatter.needed(covered, depth)
-        if not (isinstance(kept, np.ndarray) and kept.shape == covered.shape and kept.dtype == bool):
-            given = f"{kept.dtype} of {kept.shape}" if isinstance(kept, np.ndarray) else type(kept).__name__
-            raise InputError(f"needed of {splatter!r} gave {given}; expected a NumPy array, bool of {covered.shape}")
-        return kept & covered
-
-    return needed
+    return _BySplatter(splatter, size, settles and splatter.settles and len(parts) == 1 and parts[0].shader.uniform)
 
 
-def _size(parts: Sequence[CheckedPart]) -> float | None:
+def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float | None:
     """The largest number of those that surfaces read; None where one is traced."""
     size = 0.0
-    for part in parts:
-        for x in leaves({name: part.theta[name] for name in part.surface.reads(part.theta)}):
+    for part, known in zip(parts, sizes, strict=True):
+        read = {name: part.theta[name] for name in part.surface.reads(part.theta)}
+        if known is not None and is_constant(read):
+            size = max(size, known)
+            continue
+        for x in leaves(read):
             value = known_value(x)
             if value is None:
                 return None
             if value.dtype in (np.float32, np.float64):
                 size = max(size, largest(value))
     return size
+
+
+class _BySplatter(Needed):
+    """What a splatter needs of a scene.
+
+    Args:
+        splatter: the splatter.
+        size: of the largest number that surfaces read, if it is known.
+        settles: whether all samples are of one colour, and the splatter makes use of it.
+    """
+
+    def __init__(self, splatter: Splatter, size: float | None, settles: bool):
+        self._splatter, self.size, self.settles = splatter, size, settles
+
+    def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """See `Needed`."""
+        if len(covered) == 1 or (self.size is not None and too_far(self.size, depth)):
+            return covered
+        kept = self._splatter.needed(covered, depth)
+        if not (isinstance(kept, np.ndarray) and kept.shape == covered.shape and kept.dtype == bool):
+            given = f"{kept.dtype} of {kept.shape}" if isinstance(kept, np.ndarray) else type(kept).__name__
+            raise InputError(
+                f"needed of {self._splatter!r} gave {given}; expected a NumPy array, bool of {covered.shape}"
+            )
+        return kept & covered
+
+    def settled(self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float) -> np.ndarray:
+        """See `Needed`."""
+        if too_far(max(size, self.size or 0.0), depth):
+            return np.zeros(covered.shape[1:], bool)
+        from rts.sampling import interiors_kernels
+
+        return interiors_kernels.settle(covered, depth, kept, self._splatter.reach)
 
 
 class Inspection(Needed):
@@ -76,7 +115,9 @@ class Inspection(Needed):
     """
 
     def __init__(self, needed: AnyNeeded | None):
-        self._needed, self._lock = needed, threading.Lock()
+        self._needed, self._lock = None if needed is None else adapted(needed, Needed), threading.Lock()
+        self.settles = self._needed is not None and self._needed.settles
+        self.size = None if self._needed is None else self._needed.size
         self.short = 0
         self.most: int | None = None
         self.beyond = np.zeros(0, np.int64)
@@ -93,6 +134,11 @@ class Inspection(Needed):
             self.most = int(np.flatnonzero(counted).max()) + 1
         return kept
 
+    def settled(self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float) -> np.ndarray:
+        """See `Needed`."""
+        assert self._needed is not None
+        return self._needed.settled(covered, depth, kept, size)
+
     def ran_out(self, cells: int) -> None:
         """See `Needed`."""
         with self._lock:
@@ -104,6 +150,7 @@ class Everything(Needed):
 
     def __init__(self, needed: AnyNeeded):
         self._needed: Needed = adapted(needed, Needed)
+        self.size = self._needed.size
 
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `Needed`."""

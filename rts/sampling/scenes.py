@@ -16,6 +16,7 @@ from rts.errors import InputError
 from rts.interfaces import AnyNeeded, CheckedPart, Part, Splatter
 from rts.records import Fine, Sampled
 from rts.sampling.adaptive import Adaptive, finest
+from rts.sampling.cache import Entry
 from rts.sampling.fine import Where, fine_samples
 from rts.sampling.merging import merge
 from rts.sampling.prepared import PreparedParts
@@ -37,6 +38,7 @@ def sample(
     supersample: int | Adaptive = 1,
     capacity: int | None = None,
     engine: str | None = None,
+    settles: bool = False,
 ) -> Sampled:
     """Find where the rays through cells' centres meet the surfaces: the half of `render` without derivative.
 
@@ -51,6 +53,9 @@ def sample(
         supersample: as in `render`.
         capacity: as in `render`.
         engine: as in `render`.
+        settles: leave out samples of one part of one colour that only cells amid them need, which show this colour
+            whatever moves. What renders them must be given the values of θ, transform and camera that are given here.
+            `render` does so.
 
     Returns:
         Samples for `render_samples`, which may be handed to a function under `jax.jit`.
@@ -68,7 +73,7 @@ def sample(
             f"contrast of Adaptive is {supersample.contrast}; expected None, since rts.sample knows no colours; render "
             f"with it, or leave it out"
         )
-    options = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
+    options = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity, settles=settles)
     return sampled_scene(scene, scene.camera, size, **options)
 
 
@@ -124,8 +129,12 @@ def sampled_scene(
     layers: int | Literal["auto"],
     supersample: int | Adaptive,
     capacity: int | None,
+    settles: bool = False,
 ) -> Sampled:
-    """The samples of a window of the image, through the camera of this window."""
+    """The samples of a window of the image, through the camera of this window.
+
+    See `sample`; where `settles`, samples that only cells of one colour need may be left out.
+    """
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, capacity=capacity)
     if isinstance(supersample, Adaptive):
         coarse = sampled_scene(scene, camera, size, supersample=1, **options)
@@ -135,7 +144,8 @@ def sampled_scene(
     height, width = side * size[0], side * size[1]
     check_memory(height, width, planned(layers), capacity, gradient=scene.suited[0].differentiates)
     apron = apron_of(splatter)
-    needed = None if splatter is None else needed_by(splatter, scene.parts)
+    sizes = [entry.size if isinstance(entry, Entry) else None for entry in scene.entries]
+    needed = None if splatter is None else needed_by(splatter, scene.parts, sizes, settles)
     wide = _widened(scene, camera, (height, width), apron)
     taken = partial(_taken, scene, wide, capacity=capacity, facing=_reads_facing(splatter))
     sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)

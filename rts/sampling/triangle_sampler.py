@@ -17,7 +17,7 @@ from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSur
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.facing import facing as facing_of
-from rts.sampling.packing import lift, repack
+from rts.sampling.packing import largest, lift, repack
 from rts.sampling.settling import on_surface, refined
 from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
@@ -114,6 +114,9 @@ class TriangleSampler(Sampler):
             camera = camera if size is None else camera.for_size(size)
             camera = camera.within(part.transform).map(lambda m: engine_of(m).to_numpy(m))
         built = self._built(surface, inputs, camera, size)
+        arrays = leaves(stopped({name: part.theta[name] for name in surface.reads(part.theta)}))
+        read = [engine_of(x).to_numpy(x) for x in arrays]
+        built = built._replace(size=max([built.size or 0.0, *(largest(x) for x in read if x.dtype.kind == "f")]))
         return built._replace(inputs=map_leaves(np.copy, inputs)) if surface.refines else built
 
     def _built(self, surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Entry:
@@ -121,7 +124,7 @@ class TriangleSampler(Sampler):
         proxy = checked_proxy(surface, inputs, camera, size)
         # A copy, since the arrays given may be changed in place, or lent for the length of one call only.
         proxy = proxy._replace(vertices=proxy.vertices.copy())
-        return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None)
+        return Entry(proxy, self.prepare(proxy) if len(proxy.faces) else None, largest(proxy.vertices))
 
     def _entry(self, surface: TriangleSurface, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
         """What `_built` gives, kept from call to call where that pays."""
@@ -138,7 +141,7 @@ class TriangleSampler(Sampler):
                 return None
             proxy = proxy._replace(vertices=proxy.vertices.copy())
             updated = self.update(old.prepared, proxy)
-            return None if updated is None else Entry(proxy, updated)
+            return None if updated is None else Entry(proxy, updated, largest(proxy.vertices))
 
         key = (fingerprint(inputs), beside)
         return self._keeper.get(unwrapped(surface), key, lambda: self._built(surface, inputs, camera, size), follow)
@@ -184,6 +187,8 @@ class TriangleSampler(Sampler):
         tables = shape.tables(surface) if surface.refines else {}
         shader = adapted(part.shader, Shader)
         asked = None if shader is None else shader.reads
+        needed = None if needed is None else adapted(needed, Needed)
+        settles = needed is not None and needed.settles and cells is None and not surface.refines
         attributes = _attribute_specs(surface, asked, host_theta, shape, like)
 
         transform = [] if part.transform is None else [part.transform]
@@ -204,14 +209,16 @@ class TriangleSampler(Sampler):
                 found.depth,
                 found.overflow,
                 *([found.facing] if tells else []),
+                *([found.settled] if settles else []),
                 *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
                 *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
             )
 
         sides = [ArraySpec((layers, *shape.size), np.int16)] if tells else []
-        specs = *shape.specs(surface.sample_widths), *sides, *tables.values(), *attributes.values()
+        amid = [ArraySpec(size, np.bool_)] if settles else []
+        specs = *shape.specs(surface.sample_widths), *sides, *amid, *tables.values(), *attributes.values()
         results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *listed, *leaves(inputs))
-        first = 5 + len(sides)
+        first = 5 + len(sides) + len(amid)
         rest = first + len(tables)
         return Samples(
             *results[:5],
@@ -221,6 +228,7 @@ class TriangleSampler(Sampler):
             centered=surface.centered,
             by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
             facing=results[5] if tells else None,
+            settled=results[first - 1] if settles else None,
         )
 
     def _found(
@@ -231,7 +239,7 @@ class TriangleSampler(Sampler):
         camera: Camera,
         shape: _Shape,
         tables: Mapping[str, ArraySpec],
-        needed: AnyNeeded | None,
+        needed: Needed | None,
         entry: Entry | None,
         cells: np.ndarray | None,
         tells: bool,
@@ -251,12 +259,21 @@ class TriangleSampler(Sampler):
         covered = fragments.triangle_ids >= 0
         if not (surface.refines and surface.refine_moves):
             kept = covered if needed is None else needed(covered, fragments.depth)
+            settled, size = None, found.size
+            if needed is not None and not surface.refines:
+                if size is None:
+                    # Vertices that were looked at as a part of θ need not be looked at again.
+                    read = any(np.may_share_memory(x, found.proxy.vertices) for x in leaves(inputs))
+                    size = needed.size if read and needed.size is not None else largest(found.proxy.vertices)
+                if needed.settles and cells is None:
+                    settled = needed.settled(covered, fragments.depth, kept, size)
             sides = None
             if tells:
                 pieces = checked_pieces(surface, found.proxy)
                 sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
             if not surface.refines:
-                return replace(lift(fragments, found.proxy, shape.capacity, kept), facing=sides)
+                lifted = lift(fragments, found.proxy, shape.capacity, kept, size)
+                return replace(lifted, facing=sides, settled=settled)
             lifted = lift(fragments, found.proxy, None, kept)
             samples, _ = refined(surface, inputs, lifted, camera, tables, shape.view, cells)
             return replace(repack(samples, samples.row >= 0, shape.capacity), facing=sides)
@@ -265,7 +282,7 @@ class TriangleSampler(Sampler):
         # `needed` is asked only now, since it goes by the final depths.
         left = kept = settled.row >= 0
         if needed is not None:
-            adapted(needed, Needed).ran_out(int((covered[-1] & ~left[-1]).sum()))
+            needed.ran_out(int((covered[-1] & ~left[-1]).sum()))
             kept = needed(left, settled.depth)
         return repack(settled, kept, shape.capacity)
 

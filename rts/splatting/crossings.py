@@ -17,11 +17,13 @@ m. On planes R is zero.
 
 The sources of a covered target q of a pair are of b where they form a pair with q, and else of a where they are paired
 front to front with it. ∇z_a and ∇z_b are differences over q's neighbours in its row and column. A source of neither, if
-it has two layers, is of the sheet whose plane is nearer. Where all nine are of a sheet the image has the derivative of
+it has two layers, is of the sheet whose plane is nearer. Where all nine are of a sheet the image's derivative in
+positions is that of
 
     (Ŵ_a c_a + Ŵ_b c_b) / (Ŵ_a + Ŵ_b),    c = Σ w rgba / Σ w over the fronts of one sheet:
 
-coverage Ŵ moves with the line, mean colours with their samples. Its value is what it was.
+coverage Ŵ moves with the line, mean colours with their samples. Its value, and its derivative in colours, are what they
+were.
 """
 
 from __future__ import annotations
@@ -29,13 +31,14 @@ from __future__ import annotations
 import functools
 import math
 import operator
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rts.engines import namespace, stopped
 from rts.splatting.kernel import TIE, Kernel
-from rts.splatting.layers import AROUND, Layers, Steps, opposite
+from rts.splatting.layers import AROUND, NEIGHBOURS, Layers, Steps, opposite
 from rts.trees import Array
 
 LARGEST = 0.5
@@ -51,52 +54,61 @@ HALF = [(1, 0), (0, 1), (1, 1), (1, -1)]
 """Steps from one cell of each pair to the other."""
 
 
-def with_lines(kernel: Kernel, layers: Layers, shift: dict[Steps, Array], image: Array) -> Array:
-    """The image (H, W, 4), with derivatives that follow lines of crossing beside them.
+class Lines(NamedTuple):
+    """Targets whose derivative in positions follows a line, and what is decided for them.
+
+    Attributes:
+        target: (H, W) bool, which these are.
+        other: for each offset from source to target but (0, 0), where the source is of sheet b (H, W).
+        slopes: (∂x, ∂y) of the sheets a and b, (H, W) each.
+    """
+
+    target: Array
+    other: dict[Steps, Array]
+    slopes: list[tuple[Array, Array]]
+
+    def sums(self, values: Callable[[int, int], Array]) -> list[Array]:
+        """The sum over each sheet of values (H, W, ·) of sources, which are given by the offset from them."""
+        found: list[Any] = [0.0, 0.0]
+        for n in NEIGHBOURS:
+            given, other = values(*n), self.other[n] if n in self.other else self.target & False
+            for i, here in enumerate((self.target & ~other, self.target & other)):
+                found[i] = found[i] + namespace(given).where(here[..., None], given, 0.0)
+        return found
+
+
+def motion(kernel: Kernel, layers: Layers, lines: Lines) -> Array:
+    """How lines move the image: zeros (H, W, 4) with derivatives in positions.
 
     Args:
         kernel: the splatter.
         layers: its samples, of at least two layers.
-        shift: for each offset (u, v) from source to target, the targets' number s; 0 at empty targets.
-        image: (H, W, 4).
+        lines: see `targets`.
     """
-    xp = layers.xp
-    target, swapped, slopes = targets(layers, shift)
-    motion = [
+    xp, target = layers.xp, lines.target
+    moves = [
         xp.where(target[..., None], layers.at(p, 0, 0) - stopped(layers.at(p, 0, 0)), 0.0) for p in layers.position[:2]
     ]
-    rates = [m[..., 2] - dx * m[..., 0] - dy * m[..., 1] for m, (dx, dy) in zip(motion, slopes, strict=True)]
-    gradient = xp.stack([a - b for a, b in zip(*slopes, strict=True)], axis=-1)
+    rates = [m[..., 2] - dx * m[..., 0] - dy * m[..., 1] for m, (dx, dy) in zip(moves, lines.slopes, strict=True)]
+    gradient = xp.stack([a - b for a, b in zip(*lines.slopes, strict=True)], axis=-1)
     square = xp.where(target, xp.sum(gradient * gradient, axis=-1), 1.0)
     line = -((rates[0] - rates[1]) / square)[..., None] * xp.where(target[..., None], gradient, 0.0)
     still = stopped(xp.stack(kernel.offsets(layers.position[0]), axis=-1))
 
-    sums: list[Any] = [0.0, 0.0]
-    coverage: list[Any] = [0.0, 0.0]
-    for n in shift:
-        given, moving = layers.splats(*n)[0], kernel.weight(layers.at(still, *n) + kernel.gamma * line, *n)
-        other = swapped[n] if n in swapped else target & False
-        for i, here in enumerate((target & ~other, target & other)):
-            sums[i] = sums[i] + xp.where(here[..., None], given, 0.0)
-            coverage[i] = coverage[i] + xp.where(here, moving, 0.0)
-    # Weights may vanish, of samples that are not where they were cast.
-    target = target & (sums[0][..., 4] > 0) & (sums[1][..., 4] > 0)
-    safe = [xp.where(target[..., None], s[..., 4:], 1.0) for s in sums]
-    total = xp.where(target, coverage[0] + coverage[1], 1.0)[..., None]
-    mixed = sum(w[..., None] / total * (s[..., :4] / over) for w, s, over in zip(coverage, sums, safe, strict=True))
-    return xp.where(target[..., None], stopped(image) + (mixed - stopped(mixed)), image)
+    coverage = lines.sums(lambda u, v: kernel.weight(layers.at(still, u, v) + kernel.gamma * line, u, v)[..., None])
+    given = lines.sums(lambda u, v: stopped(layers.color(0, u, v)) * layers.weight(0, u, v)[..., None])
+    means = [g[..., :4] / xp.where(target[..., None], g[..., 4:], 1.0) for g in given]
+    total = xp.where(target[..., None], coverage[0] + coverage[1], 1.0)
+    mixed = sum(w / total * mean for w, mean in zip(coverage, means, strict=True))
+    return xp.where(target[..., None], mixed - stopped(mixed), 0.0)
 
 
-def targets(layers: Layers, shift: dict[Steps, Array]) -> tuple[Array, dict[Steps, Array], list[tuple[Array, Array]]]:
-    """Targets whose derivative follows a line, and what is decided for them.
+def targets(layers: Layers, shift: dict[Steps, Array]) -> Lines:
+    """The targets whose derivative in positions follows a line.
 
     Args:
-        layers: see `with_lines`.
-        shift: see `with_lines`.
-
-    Returns:
-        Which targets (H, W) these are; for each offset from source to target but (0, 0), where the source is of sheet b
-        (H, W); and the slopes (∂x, ∂y) of the sheets a and b, (H, W) each.
+        layers: the samples, of at least two layers.
+        shift: for each offset (u, v) from source to target, the targets' number s; 0 at empty targets.
     """
     xp = layers.xp
     two = layers.at(layers.covered[1], 0, 0)
@@ -122,7 +134,10 @@ def targets(layers: Layers, shift: dict[Steps, Array]) -> tuple[Array, dict[Step
         same[m] = same[m] | (free & (straight <= crossed))
         swapped[m] = swapped[m] | (free & (crossed < straight))
         target = target & (same[m] | swapped[m])
-    return target, {opposite(m): b for m, b in swapped.items()}, slopes
+    lines = Lines(target, {opposite(m): b for m, b in swapped.items()}, slopes)
+    # Weights may vanish, of samples that are not where they were cast.
+    a, b = lines.sums(lambda u, v: stopped(layers.color(0, u, v)[..., 4:] * layers.weight(0, u, v)[..., None]))
+    return lines._replace(target=target & (a[..., 0] > 0) & (b[..., 0] > 0))
 
 
 def pairs(z0: Array, z1: Array, two: Array, extent: Array | float) -> dict[Steps, Array]:

@@ -16,6 +16,7 @@ import abc
 import functools
 import math
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -50,6 +51,12 @@ class Kernel(Splatter):
     sigma: float = SIGMA
     epsilon: float = EPSILON
     calibration: float | None = 1.0
+    _knows_settled: ClassVar[bool] = True
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if "image" in vars(cls):
+            cls._knows_settled = "_knows_settled" in vars(cls)
 
     def __post_init__(self):
         if not (is_real(self.sigma) and LEAST_SIGMA <= self.sigma <= LARGEST_SIGMA):
@@ -63,7 +70,12 @@ class Kernel(Splatter):
         """See `rts.Splatter`."""
         if splats.rgba.shape[0] == 0:
             return nothing(splats.rgba, splats.row)
-        return self.accumulate(splats)
+        return settled(self.accumulate(splats), splats)
+
+    @property
+    def settles(self) -> bool:
+        """See `rts.Splatter`: True where weights fill a cell, and not in a class with an `image` of its own."""
+        return self._knows_settled and self.epsilon >= LEAST_EPSILON
 
     @abc.abstractmethod
     def accumulate(self, splats: Splats) -> Array:
@@ -112,6 +124,13 @@ class Kernel(Splatter):
         scale = 1 / (2 * self.sigma**2)
         peak = math.sqrt(1 + self.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
         return peak * namespace(distance).exp(-(distance**2) * scale)
+
+
+def settled(image: Array, splats: Splats) -> Array:
+    """The image of all cells (H, W, 4), with the one colour of all samples where cells are settled."""
+    if splats.settled is None:
+        return image
+    return namespace(image).where(splats.settled[..., None], splats.rgba[0], image)
 
 
 def exact_calibration(sigma: float, reach: int = 1) -> float:

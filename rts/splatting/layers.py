@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.engines import namespace
+from rts.engines import namespace, stopped
 from rts.errors import InputError
 from rts.operations.operation import known_value
 from rts.records import MORE, Splats
@@ -128,12 +128,29 @@ class Layers(Depths):
         self._color = [_weighted(unpack(splats.rgba, c), (c >= 0)[..., None]) for c in every]
         self._weights = [weights(p) for p in self.position]
 
-    def splats(self, u: int, v: int) -> list[Array]:
-        """What the sources' layers give, K times (H, W, 5): weighted colours and the weight."""
-        return [
-            self.at(color * (wx[u] * wy[v])[..., None], u, v)
-            for color, (wx, wy) in zip(self._color, self._weights, strict=True)
-        ]
+    def splats(self, u: int, v: int, still: Array | None = None) -> list[Array]:
+        """What the sources' layers give, K times (H, W, 5): weighted colours and the weight.
+
+        Args:
+            u: along x.
+            v: along y.
+            still: (H, W), targets at which no weight has a derivative; None for none.
+        """
+        found = []
+        for k in range(len(self._color)):
+            weight = self.weight(k, u, v)
+            weight = weight if still is None else self.xp.where(still, stopped(weight), weight)
+            found.append(self.color(k, u, v) * weight[..., None])
+        return found
+
+    def color(self, k: int, u: int, v: int) -> Array:
+        """Colours of the sources' layer k, and one (H, W, 5); zeros where it is not covered."""
+        return self.at(self._color[k], u, v)
+
+    def weight(self, k: int, u: int, v: int) -> Array:
+        """Weights of the sources' layer k (H, W); of any value where it is not covered."""
+        wx, wy = self._weights[k]
+        return self.at(wx[u] * wy[v], u, v)
 
 
 def nothing(rgba: Array, row: Array) -> Array:

@@ -62,26 +62,27 @@ class Visible(Kernel):
         m = xp.full_like(row[0], none)
         for n, s in shift.items():
             m = xp.where(shown[n] & (-s < m), -s, m)
+        differentiates = engine_of(splats.positions).differentiates
+        lines = crossings.targets(layers, shift) if self.crossings and none > 1 and differentiates else None
+        still = None if lines is None else lines.target
         revealed = sum(xp.where(m == k, z, 0.0) for k, z in enumerate(layers.target))
 
         front, surface, behind = 0.0, 0.0, 0.0
         for n, s in shift.items():
             hidden = xp.where(s < 0, 0, nearest(layers.source(*n), revealed, s, xp))
             hidden = xp.where(m < none, hidden, none)
-            for k, given in enumerate(layers.splats(*n)):
+            for k, given in enumerate(layers.splats(*n, still=still)):
                 if k == 0:
                     front = front + xp.where((s > 0)[..., None], given, 0.0)
                 surface = surface + xp.where((s == k)[..., None], given, 0.0)
                 behind = behind + xp.where((hidden == k)[..., None], given, 0.0)
         colors = [normalised(b, xp) for b in (front, surface, behind)]
-        differentiates = engine_of(splats.positions).differentiates
         if self.rims and differentiates:
             gains = rims.gains(self, layers, shift, splats.part)
             for i, (total, gain) in enumerate(zip((front, surface), gains, strict=True)):
-                colors[i] = colors[i] + rims.spread(total, gain)
+                colors[i] = colors[i] + rims.spread(total, gain if still is None else xp.where(still, 0.0, gain))
         image = over(colors[0], over(*colors[1:]))
-        lines = self.crossings and none > 1 and differentiates
-        return crossings.with_lines(self, layers, shift, image) if lines else image
+        return image if lines is None else image + crossings.motion(self, layers, lines)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`: those of `Kernel`, what may be chords' other ends, both layers near lines of crossing."""

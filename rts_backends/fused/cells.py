@@ -23,7 +23,7 @@ from rts_backends.fused import choices as listing
 from rts_backends.fused import crossings, mixed, outlines, stencil
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
-from rts_backends.fused.survey import BLOCK, survey
+from rts_backends.fused.survey import BLOCK, FLAT, collect, paint, survey
 
 
 class Settings(NamedTuple):
@@ -85,6 +85,7 @@ class Cells:
         part: (K, H, W) integers, the part of each sample; None, or no layers, where that is not known.
         facing: (K, H, W) integers, which piece shows which side; None, or no layers, where that is not told.
         wanted: (H, W) bool, the targets to fill, others may be anything; None, or no rows, for all.
+        settled: (H, W) bool, targets that show the colour of all samples, whatever moves; None, or no rows, for none.
 
     Raises:
         InputError: shapes that do not fit, or `row` refers to a sample that is not there.
@@ -100,6 +101,7 @@ class Cells:
         part: np.ndarray | None = None,
         facing: np.ndarray | None = None,
         wanted: np.ndarray | None = None,
+        settled: np.ndarray | None = None,
     ):
         if positions.shape[1:] != (3,) or rgba.shape != (len(positions), 4):
             given = f"{positions.shape} and {rgba.shape}"
@@ -111,6 +113,7 @@ class Cells:
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
         self.facing = read_only(self.row[:0] if facing is None else facing, np.int16)
         self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
+        self.settled = read_only(np.empty((0, row.shape[2])) if settled is None else settled, np.bool_)
         self.visible, self.border = settings.kind == "visible", settings.border
         self.rims = self.visible and settings.rims
         self.crosses = self.visible and settings.crossings
@@ -160,6 +163,8 @@ class Cells:
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
         if self._wanted is not None:
             states *= self._wanted
+        if len(self.settled):
+            states[self.settled] = FLAT
         least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
         # See `rts.splatting.layers`: nothing is nearer to what is beyond everything than to a front.
         extent = largest - least
@@ -171,6 +176,9 @@ class Cells:
             if self._wanted is not None:
                 found, marks = marks, np.empty_like(marks)
                 parallel(listing.narrow, height, found, self._wanted, marks, counts, work=self.row[0].size)
+            if len(self.settled) and not self.visible:
+                marks &= ~self.settled
+                counts = marks.sum(axis=1, dtype=np.int64)
         offsets = np.concatenate([[0], np.cumsum(counts)])
         columns = np.empty(offsets[-1], np.int32)
         ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
@@ -209,7 +217,7 @@ class Cells:
             rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
             arrays = self.positions, self.rgba, self.row, *self._numbers, self.part, kind.type(choices.extent), rules
             listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
-            parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=200 * len(found.columns))
+            parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=50 * len(found.columns))
         return found
 
     @cached_property
@@ -220,19 +228,35 @@ class Cells:
         arrays = self.positions, self.rgba, self.row, *self._numbers
         return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent))
 
+    @cached_property
+    def drawn(self) -> np.ndarray:
+        """(H, W) uint8, states of targets that are drawn from their sources: settled ones are EMPTY."""
+        states = self.choices.states
+        return states * ~self.settled if len(self.settled) else states
+
     def image(self, out: np.ndarray) -> None:
         """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""
         if out.size:
-            given = *self.plain_arguments, self.choices.states, self.border
+            given = *self.plain_arguments, self.drawn, self.border
             parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
             if len(self.choices.columns):
                 parallel(mixed.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10)
+            if len(self.settled):
+                parallel(paint, len(out), self.settled, self.border, self.rgba[:1], out[None], work=out.size // 8)
 
     def vjp(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
         """Fill the gradients of positions (N, 3) and rgba (N, 4), zeros or None, from the image's (H, W, 4)."""
-        _, height, _ = self.row.shape
         if not self.row.size:
             return
+        self._pull(g, g_positions, g_rgba)
+        if len(self.settled) and g_rgba is not None:
+            sums = np.zeros((len(g), 4), g.dtype)
+            parallel(collect, len(g), self.settled, self.border, read_only(g), sums, work=g.size // 4)
+            g_rgba[0] += sums.sum(axis=0)
+
+    def _pull(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
+        """`vjp` of the targets that are not settled."""
+        height = self.row.shape[1]
         if self.choices.repeated:
             self._vjp_of_repeated(g, g_positions, g_rgba)
             return
@@ -241,21 +265,31 @@ class Cells:
             np.empty((0, 3), kind) if g_positions is None else g_positions,
             np.empty((0, 4), kind) if g_rgba is None else g_rgba,
         )
-        given, crossed = g, len(self.crossings.columns) > 0
+        crossed = len(self.crossings.columns) > 0
+        g = own = read_only(g)
         if crossed:
-            g = given.copy()
-            crossings.hide(self.crossings, self.border, g)
-        g = read_only(g)
-        plain = *self.plain_arguments, self.choices.states, self.border
-        parallel(stencil.pull, height, *plain, g, *found, work=self._plain_work)
-        if count := len(self.choices.columns):
+            own = g.copy()
+            crossings.hide(self.crossings, self.border, own)
+            own = read_only(own)
+        plain = *self.plain_arguments, self.drawn, self.border
+        parallel(stencil.pull, height, *plain, own, *found, work=self._plain_work)
+        if crossed:
+            self._pull_mixed(own, found[0], found[1][:0])
+            self._pull_mixed(g, found[0][:0], found[1])
+            crossings.pull(self.rgba, self.row, self.crossings, self.border, g, *found)
+        else:
+            self._pull_mixed(g, *found)
+        if self.rims and g_positions is not None:
+            outlines.pull(self.row, self.outlines, self.border, own, g_positions)
+
+    def _pull_mixed(self, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray) -> None:
+        """Add to the gradients what mixed targets give; to those of no rows, nothing."""
+        count, height = len(self.choices.columns), self.row.shape[1]
+        if count and (len(g_positions) or len(g_rgba)):
             adjoints = np.empty((count, 3, 5), g.dtype)
             parallel(mixed.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=self._mixed_work // 5)
-            parallel(mixed.pull, height, *self.mixed_arguments, adjoints, *found, work=self._mixed_work)
-        if self.rims and g_positions is not None:
-            outlines.pull(self.row, self.outlines, self.border, g, g_positions)
-        if crossed:
-            crossings.pull(self.rgba, self.row, self.crossings, self.border, read_only(given), *found)
+            given = *self.mixed_arguments, adjoints, g_positions, g_rgba
+            parallel(mixed.pull, height, *given, work=self._mixed_work)
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
         """Fill tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4), or None."""
@@ -265,7 +299,7 @@ class Cells:
             read_only(np.empty((len(out), 0, size), out.dtype) if t is None else t)
             for t, size in ((t_positions, 3), (t_rgba, 4))
         )
-        parallel(stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.choices.states, self.border, out)
+        parallel(stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.drawn, self.border, out)
         if len(self.choices.columns):
             given = *self.mixed_arguments, self.choices.sums, tangents, self.border
             parallel(mixed.push, out.shape[1], *given, out, work=self._mixed_work * len(out))
@@ -273,8 +307,12 @@ class Cells:
             given = self.row, self.outlines, tangents[0], self.border
             parallel(outlines.push, out.shape[1], *given, out, work=80 * len(self.outlines.columns) * len(out))
         if count := len(self.crossings.columns):
-            given = self.rgba, self.row, self.crossings, *tangents, self.border
+            arrays = self.positions, self.rgba, self.row, *self._numbers
+            given = *arrays, self.choices.ranges, self.choices.sums, self.crossings, *tangents, self.border
             parallel(crossings.push, out.shape[1], *given, out, work=80 * count * len(out))
+        if len(self.settled):
+            colors = np.zeros((len(out), 4), out.dtype) if t_rgba is None else t_rgba[:, 0]
+            parallel(paint, out.shape[1], self.settled, self.border, read_only(colors), out, work=out.size // 8)
 
     def _vjp_of_repeated(self, g: np.ndarray, *results: np.ndarray | None) -> None:
         """`vjp` with a copy of the sample for each cell, whose gradients are then added in the order of the cells."""
@@ -288,7 +326,7 @@ class Cells:
         copy.__dict__.pop("crossings", None)
         copy.positions, copy.rgba = read_only(self.positions[index]), read_only(self.rgba[index])
         found = [None if x is None else np.zeros((len(index), x.shape[1]), x.dtype) for x in results]
-        copy.vjp(g, *found)
+        copy._pull(g, *found)
         for result, values in zip(results, found, strict=True):
             if result is not None and values is not None:
                 np.add.at(result, index, values)

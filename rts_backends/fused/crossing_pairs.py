@@ -1,7 +1,7 @@
 """Between which cells lines run where surfaces cross: the pairs of `rts.splatting.crossings`, compiled.
 
-They are found by a test that vector instructions do and that few other cells pass: on either side of a line the gap
-between two layers grows.
+They are found by a test that vector instructions do and that few other cells pass: beside a line the gap between two
+layers is small, and grows.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from rts.threads import parallel
 BORDER = 3
 """Rows around those of arrays of depths (2, ·, W), and rows and columns around those of their gaps (·, ·): so far from
 a cell are those that decide whether it is in a pair with a neighbour. Rows y below count from the first of all."""
-STEPS = ((1, 0), (0, 1), (1, 1), (1, -1))
+STEPS = np.array(specification.HALF)
 """Steps (x, y) from one cell of each pair to the other, which bits 0 to 3 stand for."""
-CHUNK, FEW = 16, 8
-"""Cells that are passed over at once; and the share of a row's cells, 1 / FEW, that are looked at one by one."""
+CHUNK = 32
+"""Cells that are passed over at once."""
 ROWS = 32
 """That are looked at together, so that they stay near the processor."""
 
@@ -57,71 +57,88 @@ def no_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @kernel
-def gather(start, stop, positions, row, z, gap):
-    """Depths of the first two layers of rows [start, stop), where there are both, and the gaps between them."""
-    columns = np.empty(row.shape[2], np.int32)
-    for y in range(start, stop):
-        _load_cells(z[:, y + BORDER], gap[y + BORDER], columns, positions, row, y)
+def gather(start, stop, positions, row, some, z, gap):
+    """Fill those rows of depths and gaps, in [start, stop) of all that there are, that decide about pairs in others.
+
+    Args:
+        start: first row, of those of z.
+        stop: end of the rows.
+        positions: (N, 3).
+        row: (K, H, W).
+        some: (H,), whether there are pairs in a row.
+        z: (2, H + 2 BORDER, W), to be filled with depths of the first two layers, where there are both.
+        gap: (H + 2 BORDER, W + 2 BORDER), to be filled with how far they are apart, or infinity.
+    """
+    height = len(some)
+    for at in range(start, stop):
+        y = at - BORDER
+        if _any(some[max(y - BORDER, 0) : min(max(y + BORDER + 1, 0), height)]):
+            gap[at] = np.inf
+            if 0 <= y < height:
+                _load_cells(z[:, at], gap[at], positions, row, y)
 
 
 @kernel
 def find_in_cells(start, stop, positions, row, rules, bits, some):
     """Find pairs whose first cell lies in rows [start, stop)."""
     _, height, width = row.shape
-    z, gap, counts = _window(width, positions.dtype)
-    columns = np.empty((len(gap), width), np.int32)
+    z, gap, most = _window(width, positions.dtype)
     for top in range(start, stop, ROWS):
         bottom = min(top + ROWS, stop)
-        gap[:] = np.inf
-        counts[:] = 0
-        for y in range(max(top - BORDER, 0), min(bottom + BORDER, height)):
-            at = y - top + BORDER
-            counts[at] = _load_cells(z[:, at], gap[at], columns[at], positions, row, y)
-        _find(top, bottom, z, gap, counts, columns, rules, bits, some)
+        there = False
+        for at in range(bottom - top + 2 * BORDER):
+            y = top - BORDER + at
+            gap[at] = np.inf
+            if 0 <= y < height:
+                there |= _load_cells(z[:, at], gap[at], positions, row, y)
+        if there:
+            _find(top, bottom, z, gap, most, rules, bits, some)
 
 
 @kernel
 def _find_in_depths(start, stop, covered, depth, rules, bits, some):
     """Find pairs whose first cell lies in rows [start, stop)."""
     _, height, width = covered.shape
-    z, gap, counts = _window(width, depth.dtype)
-    columns = np.empty((len(gap), 0), np.int32)
+    z, gap, most = _window(width, depth.dtype)
     for top in range(start, stop, ROWS):
         bottom = min(top + ROWS, stop)
-        gap[:] = np.inf
-        counts[:] = 0
-        for y in range(max(top - BORDER, 0), min(bottom + BORDER, height)):
-            at = y - top + BORDER
-            if _any(covered[1, y]):
-                counts[at] = width
+        there = False
+        for at in range(bottom - top + 2 * BORDER):
+            y = top - BORDER + at
+            gap[at] = np.inf
+            if 0 <= y < height and _any(covered[1, y]):
+                there = True
                 z[0, at], z[1, at] = depth[0, y], depth[1, y]
                 _subtract(gap[at, BORDER:-BORDER], covered[0, y], covered[1, y], depth[0, y], depth[1, y])
-        _find(top, bottom, z, gap, counts, columns, rules, bits, some)
+        if there:
+            _find(top, bottom, z, gap, most, rules, bits, some)
 
 
 @compiled
 def _window(width, kind):
-    """Arrays of depths and gaps for some rows and those around them, and for how many cells of each have two layers."""
+    """Arrays of depths and gaps for some rows and those around them, and of the largest gaps there."""
     rows = ROWS + 2 * BORDER
-    return np.empty((2, rows, width), kind), np.empty((rows, width + 2 * BORDER), kind), np.empty(rows, np.int64)
+    return np.empty((2, rows, width), kind), np.empty((rows, width + 2 * BORDER), kind), np.empty((rows, width), kind)
 
 
 @compiled
-def _load_cells(z, gap, columns, positions, row, y):
-    """Fill depths (2, W) of a row, gaps and columns of its cells of two layers; returns how many there are."""
-    width, count = row.shape[2], 0
+def _load_cells(z, gap, positions, row, y):
+    """Fill depths (2, W) of a row and gaps, of its cells of two layers; whether there are any."""
+    width, found = row.shape[2], False
     for left in range(0, width, CHUNK):
         right = min(left + CHUNK, width)
-        if not _some(row[1, y, left:right]):
+        last = row.dtype.type(-1)
+        for x in range(left, right):
+            last = max(last, row[1, y, x])
+        if last < 0:
             continue
         for x in range(left, right):
             i, j = row[0, y, x], row[1, y, x]
             if j >= 0 and i >= 0:
                 z[0, x], z[1, x] = positions[i, 2], positions[j, 2]
                 gap[x + BORDER] = positions[j, 2] - positions[i, 2]
-                columns[count] = x
-                count += 1
-    return count
+                found = True
+    return found
 
 
 @compiled
@@ -131,69 +148,67 @@ def _subtract(gap, covered0, covered1, depth0, depth1):
         gap[x] = depth1[x] - depth0[x] if covered0[x] & covered1[x] else infinity
 
 
-# Loops that the compiler makes vector instructions of, as it does not of methods of arrays.
-
-
 @compiled
 def _any(flags):
-    most = np.uint8(0)
+    # A loop that the compiler makes vector instructions of, as it does not of methods of arrays.
+    found = np.uint8(0)
     for flag in flags:
-        most = max(most, np.uint8(flag))
-    return most > 0
+        found = max(found, np.uint8(flag))
+    return found > 0
 
 
 @compiled
-def _some(cells):
-    most = cells.dtype.type(-1)
-    for i in cells:
-        most = max(most, i)
-    return most >= 0
-
-
-@compiled
-def _find(start, stop, z, gap, counts, columns, rules, bits, some):
-    """Find pairs in a window of rows, of which each has so many cells of two layers; the columns of these, if few."""
+def _find(start, stop, z, gap, most, rules, bits, some):
+    """Find pairs in a window of rows, the first cells of which lie in rows [start, stop)."""
     width = z.shape[2]
-    marks = np.empty(width, np.uint8)
-    for y in range(BORDER, stop - start + BORDER):
-        if counts[y] == 0:
+    rows, marks = stop - start + 2 * BORDER, np.empty(width, np.uint8)
+    for y in range(BORDER - 2, rows - BORDER + 2):
+        _largest(most[y], gap[y, BORDER - 1 :], gap[y, BORDER:], gap[y, BORDER + 1 :])
+    for y in range(BORDER - 1, rows - BORDER + 1):
+        _suspect(marks, gap[y, BORDER:], most[y - 1], most[y], most[y + 1])
+        if not _any(marks):
             continue
-        for i in range(4):
-            u, v = STEPS[i]
-            before, here = gap[y - v, BORDER - u :], gap[y, BORDER:]
-            there, after = gap[y + v, BORDER + u :], gap[y + 2 * v, BORDER + 2 * u :]
-            if FEW * counts[y] < width:
-                for n in range(counts[y]):
-                    x = columns[y, n]
-                    if _grows(before[x], here[x], there[x], after[x]) and _crosses(z, gap, rules, y, x, v, u):
-                        bits[start + y - BORDER, x] |= np.uint8(1 << i)
-                        some[start + y - BORDER] = True
-                continue
-            _suspect(marks, before, here, there, after)
-            if not _any(marks):
-                continue
-            for x in range(width):
-                if marks[x] and _crosses(z, gap, rules, y, x, v, u):
-                    bits[start + y - BORDER, x] |= np.uint8(1 << i)
-                    some[start + y - BORDER] = True
+        for left in range(0, width, CHUNK):
+            right, found = min(left + CHUNK, width), np.uint8(0)
+            for x in range(left, right):
+                found |= marks[x]
+            for x in range(left, right if found else left):
+                # The cell as the first and as the second of pairs. Calls with arrays are dear: few come so far.
+                for n in range(8 if marks[x] else 0):
+                    u, v = STEPS[n & 3, 0], STEPS[n & 3, 1]
+                    qy, at = (y - v, x - u + BORDER) if n > 3 else (y, x + BORDER)
+                    if not _grows(gap[qy - v, at - u], gap[qy, at], gap[qy + v, at + u], gap[qy + 2 * v, at + 2 * u]):
+                        continue
+                    inside = BORDER <= qy < rows - BORDER and BORDER <= at < width + BORDER
+                    if inside and _crosses(z, gap, rules, qy, at - BORDER, v, u):
+                        bits[start + qy - BORDER, at - BORDER] |= np.uint8(1 << (n & 3))
+                        some[start + qy - BORDER] = True
 
 
 @compiled
-def _suspect(marks, before, here, there, after):
-    """Mark cells where the gap grows on both sides of a pair."""
-    for x in range(len(marks)):
-        marks[x] = np.uint8(_grows(before[x], here[x], there[x], after[x]))
+def _largest(most, before, here, after):
+    """The largest gap of each cell and its neighbours in the row, of those that are known; −1 if none is."""
+    infinity, none = most.dtype.type(np.inf), most.dtype.type(-1)
+    for x in range(len(most)):
+        a, b, c = before[x], here[x], after[x]
+        a, b, c = a if a < infinity else none, b if b < infinity else none, c if c < infinity else none
+        a = b if b > a else a
+        most[x] = c if c > a else a
 
 
 @compiled
-def _grows(b, h, t, a):
-    """Whether the gap grows from a pair's two cells on either side; where it is not known it is infinity.
+def _suspect(marks, gap, above, level, below):
+    """Mark cells of two layers, beside which there is a gap that is larger by far.
 
-    R is at least what the gaps alone change by, |b − 2 h − t| + |a − 2 t − h|, and at most half of h + t: 3 / 2, 1 / 2
-    and 5 / 2 less what rounding may do.
+    Of the two cells of each pair one at least is among them, whatever rounding does: with gaps h and t, and b and a
+    beyond them, R is at least |b − 2 h − t| + |a − 2 t − h|, or twice one of these, and less than half of h + t.
     """
-    own, other, both = np.float32(1.49), np.float32(0.49), np.float32(2.49)
-    return (b > own * h + other * t) & (a > own * t + other * h) & (b + a > both * (h + t))
+    infinity, times = gap.dtype.type(np.inf), gap.dtype.type(1.7)
+    for x in range(len(marks)):
+        a, b, c = above[x], level[x], below[x]
+        a = b if b > a else a
+        a = c if c > a else a
+        marks[x] = np.uint8((gap[x] < infinity) & (a > times * gap[x]))
 
 
 @compiled
@@ -203,6 +218,16 @@ def _crosses(z, gap, rules, y, x, v, u):
     if not ratio < rules.largest:
         return False
     return ratio < _ratio(z, gap, rules, y - v, x - u, v, u) and ratio <= _ratio(z, gap, rules, y + v, x + u, v, u)
+
+
+@compiled
+def _grows(b, h, t, a):
+    """Whether the gap grows on either side of a pair's two cells as it must (see `_suspect`), but for rounding."""
+    infinity, most = np.float32(np.inf), np.float32(0.52) * (h + t)
+    before, after = abs(b - h - h - t), abs(a - t - t - h)
+    # What is not known is infinite, and the other side counts twice; without either gap all is infinite, or no number.
+    before, after = before if b < infinity else after, after if a < infinity else before
+    return (before + after < most) & (most < infinity)
 
 
 @compiled
@@ -245,7 +270,7 @@ def _keep(covered, bits, some, reach, kept):
             for i in range(4 if bits[y, x] else 0):
                 if bits[y, x] >> i & 1:
                     for step in range(2):
-                        px, py = x + step * STEPS[i][0], y + step * STEPS[i][1]
+                        px, py = x + step * STEPS[i, 0], y + step * STEPS[i, 1]
                         for row in range(max(py - reach, 0), min(py + reach + 1, height)):
                             _keep_around(kept[0, row], covered[0, row], px, reach)
                             _keep_around(kept[1, row], covered[1, row], px, reach)

@@ -1,7 +1,7 @@
 """Lines where surfaces pass through one another, as `rts.splatting.crossings` says, for the compiled `Visible`.
 
-Targets beside a line have their derivative from here, in place of all that others add. They are few: the gradient adds
-up in their order, on one thread.
+Targets beside a line have their derivative in positions from here, in place of all that others add, and that in colours
+where they are not mixed. They are few: the gradient adds up in their order, on one thread.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from rts.compiling import compiled, kernel
 from rts.threads import parallel
 from rts_backends.fused.crossing_pairs import BORDER, STEPS, Rules, find_in_cells, gather, has_two, no_pairs
-from rts_backends.fused.mixed import splat
+from rts_backends.fused.mixed import splat, tint_of
 from rts_backends.fused.survey import FLAT
 
 NEITHER, SHEET_A, SHEET_B = 2, 0, 1
@@ -26,14 +26,17 @@ class Crossings(NamedTuple):
     Attributes:
         offsets: (H + 1,) int64, where the cells of each row begin in the lists below.
         columns: (M,) int32, their columns; −1 where the derivative is none of a line after all.
+        mixed: (M,) int64, their places in the list of mixed targets (`rts_backends.fused.cells.Choices`), or −1.
         sheets: (M, 9) uint8, of which sheet each source is; source 3 (v + 1) + (u + 1) lies at −(u, v).
-        weights: (M, 9, 3), of the sources' fronts in that of all: the weight, and its slopes with their position.
+        weights: (M, 9, 3), of the sources' fronts: the share of their colour in that of a target that is not mixed; and
+            the slopes of the weight with their position, in the weight of all.
         colors: (M, 2, 4), the sheets' mean colours.
         slopes: (M, 5), by how much of the difference of these the colour changes with the rate of ġ; ∇z of the sheets.
     """
 
     offsets: np.ndarray
     columns: np.ndarray
+    mixed: np.ndarray
     sheets: np.ndarray
     weights: np.ndarray
     colors: np.ndarray
@@ -49,7 +52,8 @@ def _empty(offsets: np.ndarray, kind: np.dtype) -> Crossings:
     count = offsets[-1]
     shapes = (count, 9, 3), (count, 2, 4), (count, 5)
     arrays = (np.empty(shape, kind) for shape in shapes)
-    return Crossings(offsets, np.empty(count, np.int32), np.empty((count, 9), np.uint8), *arrays)
+    listed = np.empty(count, np.int32), np.empty(count, np.int64), np.empty((count, 9), np.uint8)
+    return Crossings(offsets, *listed, *arrays)
 
 
 def listed(arrays: tuple, choices: Any, extent: np.floating) -> Crossings:
@@ -70,8 +74,8 @@ def listed(arrays: tuple, choices: Any, extent: np.floating) -> Crossings:
     if not some.any():
         return nothing(height, kind)
     rows = height + 2 * BORDER
-    z, gap = np.empty((2, rows, width), kind), np.full((rows, width + 2 * BORDER), np.inf, kind)
-    parallel(gather, height, positions, row, z, gap, work=row[0].size)
+    z, gap = np.empty((2, rows, width), kind), np.empty((rows, width + 2 * BORDER), kind)
+    parallel(gather, rows, positions, row, some, z, gap, work=row[0].size)
     around, counts = np.zeros((height, width), np.uint16), np.zeros(height, np.int64)
     seen = row, choices.mixed, choices.offsets, choices.columns, choices.ranges, z, gap
     parallel(_list, height, bits, some, choices.states, *seen, rules, around, counts, work=row[0].size)
@@ -107,7 +111,7 @@ def _steps(bits, y, x):
     """The steps from a cell to the others of its pairs."""
     height, found = len(bits), 0
     for i in range(4):
-        u, v = STEPS[i]
+        u, v = STEPS[i, 0], STEPS[i, 1]
         if bits[y, x] >> i & 1:
             found |= 1 << (3 * (v + 1) + u + 1)
         if 0 <= y - v < height and 0 <= x - u and bits[y - v, x - u] >> i & 1:
@@ -150,6 +154,7 @@ def _fill(
         for x in range(row.shape[2] if found.offsets[y + 1] > d else 0):
             if around[y, x]:
                 m = _place(columns, m, mixed, y, x)
+                found.mixed[d] = m if mixed[y, x] else -1
                 _decide(found.sheets[d], slopes, row, mixed, ranges, m, z, gap, rules, around[y, x], y, x)
                 _weigh(d, found, slopes, positions, rgba, row, y, x, scale, peak, gamma)
                 d += 1
@@ -249,8 +254,8 @@ def _weigh(d, found, slopes, positions, rgba, row, y, x, scale, peak, gamma):
         return
     over = one / (wa + wb)
     for n in range(9):
-        for j in range(3):
-            weights[n, j] *= over
+        weights[n, 0] /= max(wa + wb, one)
+        weights[n, 1], weights[n, 2] = over * weights[n, 1], over * weights[n, 2]
     for c in range(4):
         colors[SHEET_A, c] /= wa
         colors[SHEET_B, c] /= wb
@@ -269,34 +274,52 @@ def rate(slopes, t_positions, i, j):
 
 
 @compiled
-def change_of(pixel, d, found, rgba, row, y, t_positions, t_rgba):
+def change_of(pixel, d, found, positions, rgba, row, scale, peak, gamma, ranges, sums, y, t_positions, t_rgba):
     """The derivative (4,) of a listed target along tangents (N, 3) and (N, 4), or of no rows: zeros."""
-    x, moved, tinted = found.columns[d], len(t_positions) > 0, len(t_rgba) > 0
+    x, m = found.columns[d], found.mixed[d]
     colors, moves = found.colors[d], pixel.dtype.type(0)
-    if moved:
+    if len(t_positions) > 0:
         moves = found.slopes[d, 0] * rate(found.slopes[d], t_positions, row[0, y, x], row[1, y, x])
     for c in range(4):
         pixel[c] = moves * (colors[SHEET_B, c] - colors[SHEET_A, c])
-    for n in range(9):
+    for n in range(9 if len(t_positions) > 0 else 0):
         i, weights, own = row[0, y + 1 - n // 3, x + 1 - n % 3], found.weights[d, n], colors[found.sheets[d, n]]
-        if moved:
-            change = weights[1] * t_positions[i, 0] + weights[2] * t_positions[i, 1]
-            for c in range(4):
-                pixel[c] += change * (rgba[i, c] - own[c])
-        if tinted:
-            for c in range(4):
-                pixel[c] += weights[0] * t_rgba[i, c]
+        change = weights[1] * t_positions[i, 0] + weights[2] * t_positions[i, 1]
+        for c in range(4):
+            pixel[c] += change * (rgba[i, c] - own[c])
+    if len(t_rgba) > 0 and m >= 0:
+        tint_of(pixel, sums[m], positions, row, y, x, ranges[m], scale, peak, gamma, t_rgba)
+    for n in range(9 if len(t_rgba) > 0 and m < 0 else 0):
+        for c in range(4):
+            pixel[c] += found.weights[d, n, 0] * t_rgba[row[0, y + 1 - n // 3, x + 1 - n % 3], c]
 
 
 @kernel
-def push(start, stop, rgba, row, found, t_positions, t_rgba, border, out):
+def push(
+    start,
+    stop,
+    positions,
+    rgba,
+    row,
+    scale,
+    peak,
+    gamma,
+    ranges,
+    sums,
+    found,
+    t_positions,
+    t_rgba,
+    border,
+    out,
+):
     """Put the derivatives of listed targets into rows [start, stop) of the tangents (T, H, W, 4)."""
+    given = positions, rgba, row, scale, peak, gamma, ranges, sums
     for y in range(start + border, stop + border):
         for d in range(found.offsets[y], found.offsets[y + 1]):
             x = found.columns[d] - border
             if 0 <= x < out.shape[2]:
                 for t in range(len(out)):
-                    change_of(out[t, y - border, x], d, found, rgba, row, y, t_positions[t], t_rgba[t])
+                    change_of(out[t, y - border, x], d, found, *given, y, t_positions[t], t_rgba[t])
 
 
 @kernel
@@ -311,7 +334,10 @@ def hide(found, border, g):
 
 @kernel
 def pull(rgba, row, found, border, g, g_positions, g_rgba):
-    """Add to the gradients of positions (N, 3) and rgba (N, 4), or of no rows, what listed targets give."""
+    """Add to the gradients of positions (N, 3) and rgba (N, 4), or of no rows, what listed targets give.
+
+    To that of rgba those give nothing that are mixed.
+    """
     zero = g.dtype.type(0)
     for y in range(border, len(g) + border):
         for d in range(found.offsets[y], found.offsets[y + 1]):
@@ -336,6 +362,6 @@ def pull(rgba, row, found, border, g, g_positions, g_rgba):
                         change += h[c] * (rgba[i, c] - own[c])
                     g_positions[i, 0] += weights[1] * change
                     g_positions[i, 1] += weights[2] * change
-                if len(g_rgba) > 0:
+                if len(g_rgba) > 0 and found.mixed[d] < 0:
                     for c in range(4):
                         g_rgba[i, c] += weights[0] * h[c]

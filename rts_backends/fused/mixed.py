@@ -115,7 +115,7 @@ def pull(
 @kernel
 def push(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, sums, tangents, border, out):
     """Fill mixed targets of rows [start, stop) of `out` (T, H, W, 4); `tangents` are those of positions and rgba."""
-    one, changes = out.dtype.type(1), np.empty((len(out), 3, 5), out.dtype)
+    changes = np.empty((len(out), 3, 5), out.dtype)
     for y in range(start + border, stop + border):
         for d in range(offsets[y], offsets[y + 1]):
             x, total = columns[d], sums[d]
@@ -123,11 +123,38 @@ def push(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns
                 continue
             changes_of(changes, total, positions, rgba, row, y, x, choices[d], scale, peak, gamma, *tangents)
             for t in range(len(out)):
-                change, pixel = changes[t], out[t, y - border, x - border]
                 for c in range(4):
-                    back = total[1, c] + (one - total[1, 3]) * total[2, c]
-                    d_back = change[1, c] - change[1, 3] * total[2, c] + (one - total[1, 3]) * change[2, c]
-                    pixel[c] = change[0, c] - change[0, 3] * back + (one - total[0, 3]) * d_back
+                    out[t, y - border, x - border, c] = composited(total, changes[t], c)
+
+
+@compiled
+def composited(total, change, c):
+    """The tangent of a channel of a target, from the normalised sums (3, 5) of its buffers and their tangents."""
+    one = total.dtype.type(1)
+    back = total[1, c] + (one - total[1, 3]) * total[2, c]
+    d_back = change[1, c] - change[1, 3] * total[2, c] + (one - total[1, 3]) * change[2, c]
+    return change[0, c] - change[0, 3] * back + (one - total[0, 3]) * d_back
+
+
+@compiled
+def tint_of(pixel, total, positions, row, y, x, choice, scale, peak, gamma, t_rgba):
+    """Add to a pixel (4,) what a target changes by along a tangent (N, 4) of colours."""
+    _, height, width = row.shape
+    change = np.zeros((3, 5), total.dtype)
+    for n in range(9):
+        v, u = n // 3 - 1, n % 3 - 1
+        py, px = y - v, x - u
+        if not (0 <= py < height and 0 <= px < width):
+            continue
+        for b in range(3):
+            for k in range(choice[n, b, 0], choice[n, b, 1]):
+                i = row[k, py, px]
+                if i >= 0:
+                    w, _, _ = splat(positions, i, py, px, u, v, scale, peak, gamma)
+                    for c in range(4):
+                        change[b, c] += w / max(total[b, 4], total.dtype.type(1)) * t_rgba[i, c]
+    for c in range(4):
+        pixel[c] += composited(total, change, c)
 
 
 @compiled

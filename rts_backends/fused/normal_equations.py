@@ -20,7 +20,7 @@ from rts.threads import parallel, read_only
 from rts.trees import Array
 from rts_backends.fused.cells import Cells, Settings
 from rts_backends.fused.crossings import change_of
-from rts_backends.fused.mixed import changes_of
+from rts_backends.fused.mixed import changes_of, composited
 from rts_backends.fused.outlines import gain
 from rts_backends.fused.rows import (
     PITCH,
@@ -57,10 +57,10 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
     Args:
         settings: the splatter, as numbers.
         engine: the engine of the arrays.
-        *given: positions, rgba, row, part, facing, wanted and the arguments of `normal_equations` from `t_positions`,
-            arrays or None.
+        *given: positions, rgba, row, part, facing, wanted, settled and the arguments of `normal_equations` from
+            `t_positions`, arrays or None.
     """
-    positions, rgba, row, _, _, _, t_positions, _, target = given[:9]
+    positions, rgba, row, _, _, _, _, t_positions, _, target = given[:10]
     kind = {32: np.float32, 64: np.float64}.get(engine.namespace.finfo(positions.dtype).bits)
     there = [x for x in given if x is not None]
     if kind is None or rgba.dtype != positions.dtype or not engine.on_host(*there):
@@ -72,9 +72,9 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
     def host(*arrays: Any) -> tuple[np.ndarray, ...]:
         it = iter(arrays)
         whole: list[Any] = [next(it) if there else None for there in present]
-        positions, rgba, row, part, facing, wanted, *rest = whole
-        used = int(row.max(initial=-1)) + 1  # Under `jit` many more rows may be allotted.
-        cells = Cells(settings, positions[:used], rgba[:used], row, part=part, facing=facing, wanted=wanted)
+        positions, rgba, row, part, facing, wanted, settled, *rest = whole
+        used = max(1, int(row.max(initial=-1)) + 1)  # Under `jit` many more rows may be allotted.
+        cells = Cells(settings, positions[:used], rgba[:used], row, None, part, facing, wanted, settled)
         return tuple(np.asarray(x, kind) for x in normal_equations(cells, *rest))
 
     count = t_positions.shape[0]
@@ -107,7 +107,8 @@ def normal_equations(
     fields = (read_only(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
     bands, fine = -(-len(target) // BAND), _cells_a_pixel(cells.row.shape, cells.border, target.shape)
     sums = np.zeros((bands, count + 1, count + 1))
-    drawn = cells.plain_arguments, cells.row, cells.choices, cells.outlines, cells.crossings
+    plain, choices = cells.plain_arguments, cells.choices._replace(states=cells.drawn)
+    drawn = plain, cells.row, choices, cells.outlines, cells.crossings, cells.settled
     given = *drawn, tangents, tuple(fields), cells.border, fine
     parallel(_accumulate, bands, ALPHA if target.shape[2] == 1 else COLORS, *given, sums)
     total = sums.sum(axis=0) / max(target.size, 1)
@@ -126,7 +127,9 @@ def _any(tangents: np.ndarray) -> bool:
 
 
 @kernel
-def _accumulate(start, stop, planes, plain, row, choices, outlines, crossings, tangents, fields, border, fine, sums):
+def _accumulate(
+    start, stop, planes, plain, row, choices, outlines, crossings, settled, tangents, fields, border, fine, sums
+):
     """Products (B, T + 1, T + 1) of tangents and, last, residuals in bands [start, stop); the lower triangles.
 
     Of rows of pixels that are means of `fine` rows and columns of cells.
@@ -155,6 +158,8 @@ def _accumulate(start, stop, planes, plain, row, choices, outlines, crossings, t
             loaded[:] = -9
             changing = False
             for y in range(top * fine, bottom * fine):
+                if len(fields[1]) > 0 and not _counts(fields[1][y // fine, own : own + pixels]):
+                    continue
                 at = y + border, left + border
                 moving_row = busy(choices.states, *at, count, least) or busy(choices.mixed, *at, count, 1)
                 if moving_row:
@@ -180,9 +185,12 @@ def _accumulate(start, stop, planes, plain, row, choices, outlines, crossings, t
                     composite(value, layers, count)
                     _mix(change, value, plain, row, choices, tangents, border, y, left, count, changes)
                     _move_outlines(change, row, outlines, t_positions, border, y, left, count)
-                    _move_lines(change, rgba, row, crossings, tangents, border, y, left, count)
+                    _move_lines(change, plain, row, choices, crossings, tangents, border, y, left, count)
                 else:
                     fill(value, rgba, row[0, y + border, border:], choices.states[y + border, border:], left, count)
+                if len(settled) > 0:
+                    cells = settled[y + border, border + left : border + left + count]
+                    moving_row |= _settle(change, value, rgba, t_rgba, cells, moving_row)
                 if fine > 1:
                     if y % fine == 0:
                         mean[:] = kind(0)
@@ -225,9 +233,7 @@ def _mix(change, value, plain, row, choices, tangents, border, y, left, count, c
             back = total[1, c] + (one - total[1, 3]) * total[2, c]
             value[c * PITCH + j] = total[0, c] + (one - total[0, 3]) * back
             for n in range(len(change)):
-                own = changes[n]
-                d_back = own[1, c] - own[1, 3] * total[2, c] + (one - total[1, 3]) * own[2, c]
-                change[n, c * PITCH + j] = own[0, c] - own[0, 3] * back + (one - total[0, 3]) * d_back
+                change[n, c * PITCH + j] = composited(total, changes[n], c)
 
 
 @compiled
@@ -244,18 +250,49 @@ def _move_outlines(change, row, outlines, t_positions, border, y, left, count):
 
 
 @compiled
-def _move_lines(change, rgba, row, crossings, tangents, border, y, left, count):
+def _move_lines(change, plain, row, choices, crossings, tangents, border, y, left, count):
     """The derivatives of targets beside lines of crossing in a row of a tile, in place of all others."""
+    positions, rgba, _, scale, peak, gamma = plain
     t_positions, t_rgba = tangents
+    given = positions, rgba, row, scale, peak, gamma, choices.ranges, choices.sums
     pixel = np.empty(4, change.dtype)
     for d in range(crossings.offsets[y + border], crossings.offsets[y + border + 1]):
         j = crossings.columns[d] - border - left
         if not 0 <= j < count:
             continue
         for n in range(len(change)):
-            change_of(pixel, d, crossings, rgba, row, y + border, t_positions[n], t_rgba[n])
+            change_of(pixel, d, crossings, *given, y + border, t_positions[n], t_rgba[n])
             for c in range(4):
                 change[n, c * PITCH + j] = pixel[c]
+
+
+@compiled
+def _counts(weights):
+    """Whether any weight (·, C) is not zero."""
+    some = False
+    for j in range(len(weights)):
+        for c in range(weights.shape[1]):
+            some |= weights[j, c] != 0
+    return some
+
+
+@compiled
+def _settle(change, value, rgba, t_rgba, settled, moving):
+    """Values and tangents of the settled targets of a row of a tile; whether any of these changes."""
+    some, colored = False, t_rgba.shape[1] > 0
+    for j in range(len(settled)):
+        some |= settled[j]
+    if not some:
+        return False
+    if colored and not moving:
+        change[:] = change.dtype.type(0)
+    for j in range(len(settled)):
+        if settled[j]:
+            for c in range(4):
+                value[c * PITCH + j] = rgba[0, c]
+                for n in range(len(change) if colored or moving else 0):
+                    change[n, c * PITCH + j] = t_rgba[n, 0, c] if colored else change.dtype.type(0)
+    return colored
 
 
 @compiled

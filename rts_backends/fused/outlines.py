@@ -95,6 +95,13 @@ def find(start, stop, positions, row, reach, states, mixed, offsets, columns, ra
             ends[y, columns[d]] |= _ends_before_others(ranges[d], row, y, columns[d])
 
 
+_BITS = (np.arange(512)[:, None] >> np.arange(9) & 1).astype(np.int8)
+ALONG = (_BITS @ [(n % 3 - 1, n // 3 - 1) for n in range(9)]).astype(np.int64)
+OPPOSITE = (_BITS[:, ::-1].astype(np.int64) << np.arange(9)).sum(axis=1)
+LOWEST = _BITS.argmax(axis=1)
+"""What nine directions as bits sum up to, the bits of those opposite, and the place of the first that is set."""
+
+
 @kernel
 def narrow(start, stop, marks, wanted, kept, counts):
     """Leave out marks of rows [start, stop) that are neither wanted nor beside wanted ones.
@@ -172,63 +179,59 @@ def _ends_before_others(choice, row, y, x):
 @compiled
 def _rule(positions, row, part, ends, y, x, extent, rules):
     """β and the partner's sample of a cell whose front ends somewhere."""
-    along_x, along_y = 0, 0
-    for n in range(9):
-        if ends[y, x] >> n & 1:
-            along_x, along_y = along_x + n % 3 - 1, along_y + n // 3 - 1
-    one = positions.dtype.type(1)
-    two, beta, partner = one + one, positions.dtype.type(0), -1
-    best, deep = -1000, False
-    for n in range(9):
+    one, two, bits = positions.dtype.type(1), positions.dtype.type(2), np.int64(ends[y, x])
+    beta, partner, best, deep, steepest = positions.dtype.type(0), -1, -1000, False, two
+    along_x, along_y, left = ALONG[bits, 0], ALONG[bits, 1], bits & ~OPPOSITE[bits]
+    paired = len(part) > 1 and part[0, y, x] == part[1, y, x]
+    own = _gap(positions, row, y, x) if paired else beta
+    while left:
+        n = LOWEST[left]
+        left &= left - 1
         u, v = n % 3 - 1, n // 3 - 1
-        if not _usable(row, ends, y, x, n):
+        py, px = y - v, x - u
+        if not _covered(row, py, px):
             continue
-        if _closes(positions, row, part, y, x, y - v, x - u, rules.converging):
-            return -rules.half, row[1, y, x]
-        ratio = _ratio(positions, row, ends, y, x, n, rules.flat * extent)
-        rim, along = ratio > rules.least, u * along_x + v * along_y
+        if paired:
+            inner = _gap(positions, row, py, px)
+            if rules.converging * own * own <= inner * inner:
+                return -rules.half, row[1, y, x]
+        along = u * along_x + v * along_y
         score = along * abs(along) * (3 - abs(u) - abs(v))
+        if deep and score <= best:
+            continue
+        ratio = _ratio(positions, row, ends, y, x, v, u, rules.flat * extent)
+        rim = ratio > rules.least
         if (rim and not deep) or (rim == deep and score > best):
-            best, deep, partner = score, rim, row[0, y - v, x - u]
-            beta = rules.half
-            if rim:
-                root = (one + two * ratio - ratio * ratio) / (two * ratio * (ratio - one))
-                beta = min(max(root, positions.dtype.type(0)), rules.largest)
+            best, deep, partner, beta, steepest = score, rim, row[0, py, px], rules.half, ratio
+    if deep:
+        root = (one + two * steepest - steepest * steepest) / (two * steepest * (steepest - one))
+        beta = min(max(root, positions.dtype.type(0)), rules.largest)
     return beta, partner
 
 
 @compiled
-def _usable(row, ends, y, x, n):
-    """Whether the front of a cell ends in direction n, and not in the other, where there is a cell with a sample."""
+def _covered(row, y, x):
+    """Whether there is a cell, and a sample in it."""
     _, height, width = row.shape
-    py, px = y + 1 - n // 3, x + 1 - n % 3
-    if not (ends[y, x] >> n & 1) or ends[y, x] >> (8 - n) & 1:
-        return False
-    return 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0
+    return 0 <= y < height and 0 <= x < width and row[0, y, x] >= 0
 
 
 @compiled
-def _ratio(positions, row, ends, y, x, n, flat):
+def _gap(positions, row, y, x):
+    """How far the second layer of a covered cell lies behind the first; NaN, which compares as false, without one."""
+    i, j = row[0, y, x], row[1, y, x]
+    return positions[j, 2] - positions[i, 2] if j >= 0 else positions.dtype.type(np.nan)
+
+
+@compiled
+def _ratio(positions, row, ends, y, x, v, u, flat):
     """The ratio r of `rts.splatting.rims` along a usable direction; 0 where the surface does not go on, or not fall."""
-    _, height, width = row.shape
-    v, u = n // 3 - 1, n % 3 - 1
-    zero = positions.dtype.type(0)
-    py, px = y - 2 * v, x - 2 * u
-    if not (0 <= py < height and 0 <= px < width) or row[0, py, px] < 0 or ends[y - v, x - u] >> (8 - n) & 1:
+    zero, py, px = positions.dtype.type(0), y - 2 * v, x - 2 * u
+    if not _covered(row, py, px) or ends[y - v, x - u] >> (4 - 3 * v - u) & 1:
         return zero
     middle = positions[row[0, y - v, x - u], 2]
     slope = middle - positions[row[0, py, px], 2]
     return (positions[row[0, y, x], 2] - middle) / slope if slope > flat else zero
-
-
-@compiled
-def _closes(positions, row, part, y, x, py, px, converging):
-    """Whether the first two layers of a cell are of one part, and the gap between them runs to zero from (py, px)."""
-    if len(part) < 2 or row[1, y, x] < 0 or row[1, py, px] < 0 or part[0, y, x] != part[1, y, x]:
-        return False
-    own = positions[row[1, y, x], 2] - positions[row[0, y, x], 2]
-    inner = positions[row[1, py, px], 2] - positions[row[0, py, px], 2]
-    return converging * own * own <= inner * inner
 
 
 @kernel
@@ -274,57 +277,73 @@ def fill(
         marks: (H, W) of `find` or `narrow`.
         found: `Outlines`, to be filled but for its offsets.
     """
-    own, plain = np.zeros((3, 5), positions.dtype), np.zeros((9, 3, 2), ranges.dtype)
-    slope = positions.dtype.type(2) * scale * gamma
-    plain[:, 1, 1] = 1
+    beta, partner, offsets, columns, gives, slopes, changes = found
     for y in range(start, stop):
-        d, m = found.offsets[y], firsts[y]
+        d, m = offsets[y], firsts[y]
         for x in range(marks.shape[1]):
             if not marks[y, x]:
                 m += mixed[y, x]
                 continue
-            if row[0, y, x] >= 0:
-                found.beta[y, x] = positions.dtype.type(0)
+            covered = row[0, y, x] >= 0
+            if covered:
+                beta[y, x] = positions.dtype.type(0)
                 if ends[y, x]:
-                    found.beta[y, x], found.partner[y, x] = _rule(positions, row, part, ends, y, x, extent, rules)
+                    beta[y, x], partner[y, x] = _rule(positions, row, part, ends, y, x, extent, rules)
             if marks[y, x] == BESIDE:
                 m += mixed[y, x]
                 continue
-            found.columns[d] = x
-            _weigh(own[1], found.slopes[d], positions, rgba, row, y, x, scale, peak, gamma, slope)
+            columns[d] = x
+            given = JOINED if covered else SURFACE
+            own = _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, peak, gamma, given)
             if mixed[y, x]:
-                _list(found.gives[d], found.changes[d], ranges[m], sums[m], row, y, x)
+                _list(gives[d], changes[d], ranges[m], sums[m], row, y, x)
                 m += 1
             else:
-                _list(found.gives[d], found.changes[d], plain, own, row, y, x)
+                _change(gives, changes, d, own)
             d += 1
 
 
+# Not handed views of single targets, since to make and to count these takes as long as the work.
+
+
 @compiled
-def _weigh(total, slopes, positions, rgba, row, y, x, scale, peak, gamma, slope):
-    """Sums (5,) of the fronts around a target, colours over the weight; and the slopes (9, 2) of their weights."""
+def _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, peak, gamma, given):
+    """List the slopes of the weights of the fronts around a target, and that each gives what is given.
+
+    Returns their sums, of colours and weights.
+    """
     _, height, width = row.shape
-    total[:] = total.dtype.type(0)
-    for n in range(9):
-        v, u = n // 3 - 1, n % 3 - 1
-        py, px = y - v, x - u
-        if not (0 <= py < height and 0 <= px < width) or row[0, py, px] < 0:
-            continue
-        i = row[0, py, px]
-        w, dx, dy = splat(positions, i, py, px, u, v, scale, peak, gamma)
-        slopes[n, 0], slopes[n, 1] = slope * w * dx, slope * w * dy
-        for c in range(4):
-            total[c] += w * rgba[i, c]
-        total[4] += w
-    if total[4] > 1:
-        for c in range(4):
-            total[c] /= total[4]
+    zero, slope = positions.dtype.type(0), positions.dtype.type(2) * scale * gamma
+    red, green, blue, alpha, weight, n = zero, zero, zero, zero, zero, 0
+    for v in range(-1, 2):
+        for u in range(-1, 2):
+            py, px = y - v, x - u
+            i = row[0, py, px] if 0 <= py < height and 0 <= px < width else -1
+            gives[d, n] = NOTHING
+            if i >= 0:
+                w, dx, dy = splat(positions, i, py, px, u, v, scale, peak, gamma)
+                gives[d, n], slopes[d, n, 0], slopes[d, n, 1] = given, slope * w * dx, slope * w * dy
+                red, green, blue = red + w * rgba[i, 0], green + w * rgba[i, 1], blue + w * rgba[i, 2]
+                alpha, weight = alpha + w * rgba[i, 3], weight + w
+            n += 1
+    return red, green, blue, alpha, weight
+
+
+@compiled
+def _change(gives, changes, d, total):
+    """How the colour of a target changes with its coverage, to which all fronts around it give."""
+    zero, one = changes.dtype.type(0), changes.dtype.type(1)
+    partial = zero < total[4] < one
+    over = one / total[4] if partial else zero
+    for c in range(4):
+        changes[d, 0, c], changes[d, 1, c] = zero, over * total[c]
+    for n in range(0 if partial else 9):
+        gives[d, n] = NOTHING
 
 
 @compiled
 def _list(gives, changes, choice, total, row, y, x):
-    """What the sources of a target give, and how its colour changes with the coverage of its buffers."""
-    _, height, width = row.shape
+    """What the sources of a mixed target give, and how its colour changes with the coverage of its buffers."""
     zero, one = total.dtype.type(0), total.dtype.type(1)
     front, surface = zero < total[0, 4] < one, zero < total[1, 4] < one
     for c in range(4):
@@ -335,7 +354,7 @@ def _list(gives, changes, choice, total, row, y, x):
     for n in range(9):
         py, px = y + 1 - n // 3, x + 1 - n % 3
         gives[n] = NOTHING
-        if not (0 <= py < height and 0 <= px < width) or row[0, py, px] < 0:
+        if not _covered(row, py, px):
             continue
         if front and choice[n, 0, 1] == 1:
             gives[n] = FRONT

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
+from rts.sampling.interiors_kernels import bounds
 from rts.splatting.kernel import LEAST_EPSILON, TIE
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel
@@ -38,22 +39,10 @@ def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.nda
 @kernel
 def _extent(start, stop, covered, depth, extent):
     """The least and the largest depth in each row, and zero."""
-    low, high = np.empty(covered.shape[2], depth.dtype), np.empty(covered.shape[2], depth.dtype)
     for y in range(start, stop):
-        low[:] = high[:] = depth.dtype.type(0)
         for k in range(len(covered)):
-            _enlarge(low, high, covered[k, y], depth[k, y])
-        for x in range(len(low)):
-            extent[0, y], extent[1, y] = min(extent[0, y], low[x]), max(extent[1, y], high[x])
-
-
-@compiled
-def _enlarge(low, high, covered, depth):
-    zero = depth.dtype.type(0)
-    for x in range(len(low)):
-        z = depth[x] if covered[x] else zero
-        low[x] = z if z < low[x] else low[x]
-        high[x] = z if z > high[x] else high[x]
+            low, high = bounds(depth[k, y], covered[k, y])
+            extent[0, y], extent[1, y] = min(low, extent[0, y]), max(high, extent[1, y])
 
 
 @kernel

@@ -23,6 +23,7 @@ class _Fused(splatting.Kernel):
 
     kind: ClassVar[str]
     averages = True
+    _knows_settled = True
 
     def image(self, splats: Splats) -> Array:
         """See `rts.splatting.Kernel`."""
@@ -43,8 +44,10 @@ class _Fused(splatting.Kernel):
         part = splats.row[:0, :, :] if splats.part is None else splats.part
         facing = self._facing(splats)
         facing = splats.row[:0, :, :] if facing is None else facing
-        wanted = splats.row[0, :0, :] if splats.wanted is None else splats.wanted
-        return IMAGE(splats.positions, splats.rgba, splats.row, part, facing, wanted, settings=self._settings(border))
+        none = splats.row[0, :0, :]
+        wanted, settled = (none if x is None else x for x in (splats.wanted, splats.settled))
+        given = splats.positions, splats.rgba, splats.row, part, facing, wanted, settled
+        return IMAGE(*given, settings=self._settings(border))
 
     def _facing(self, splats: Splats) -> Array | None:
         return splats.facing if self.reads_facing else None
@@ -66,7 +69,8 @@ class _Fused(splatting.Kernel):
             return None
         from rts_backends.fused import normal_equations
 
-        own = splats.positions, splats.rgba, splats.row, splats.part, self._facing(splats), splats.wanted
+        own = splats.positions, splats.rgba, splats.row, splats.part, self._facing(splats)
+        own += splats.wanted, splats.settled
         given = *own, t_positions, t_rgba, target, weights, background
         return normal_equations.equations(self._settings(splats.border), engine_of(given), *given)
 
@@ -106,17 +110,33 @@ _SPECIFICATIONS = {"single": splatting.Single, "multi": splatting.Multi, "visibl
 
 
 def _specification(
-    positions: Array, rgba: Array, row: Array, part: Array, facing: Array, wanted: Array, *, settings: Settings
+    positions: Array,
+    rgba: Array,
+    row: Array,
+    part: Array,
+    facing: Array,
+    wanted: Array,
+    settled: Array,
+    *,
+    settings: Settings,
 ) -> Array:
     given = settings.sigma, settings.epsilon, settings.gamma
     options = {"rims": settings.rims, "crossings": settings.crossings} if settings.kind == "visible" else {}
-    known = (x if x.shape[0] else None for x in (part, facing))
-    splats = Splats(positions, rgba, row, *known)
-    return without_border(_SPECIFICATIONS[settings.kind](*given, **options).accumulate(splats), settings.border)
+    part, facing, settled = (x if x.shape[0] else None for x in (part, facing, settled))
+    splats = Splats(positions, rgba, row, part, facing, settled)
+    return without_border(_SPECIFICATIONS[settings.kind](*given, **options).image(splats), settings.border)
 
 
 def _shape(
-    positions: tuple, rgba: tuple, row: tuple, part: tuple, facing: tuple, wanted: tuple, *, settings: Settings
+    positions: tuple,
+    rgba: tuple,
+    row: tuple,
+    part: tuple,
+    facing: tuple,
+    wanted: tuple,
+    settled: tuple,
+    *,
+    settings: Settings,
 ) -> tuple[int, ...]:
     return *(max(0, n - 2 * settings.border) for n in row[1:]), 4
 
@@ -145,7 +165,7 @@ _OPTIONS: dict[str, Any] = {"differentiable": 2, "packed": (0, 1), "used": _used
 IMAGE = Operation(
     "rts.image",
     _specification,
-    (2, 2, 3, 3, 3, 2),
+    (2, 2, 3, 3, 3, 2, 2),
     _shape,
     _forward,
     _push,
@@ -154,6 +174,6 @@ IMAGE = Operation(
     sweeps=True,
     **_OPTIONS,
 )
-"""The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing and wanted, without the border.
+"""The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled, without a border.
 
 The last three are those of `rts.Splats`; (0, H, W) and (0, W) where they are not known."""

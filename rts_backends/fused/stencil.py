@@ -126,6 +126,16 @@ def load_image(s, image, states, least, border, y, first, count):
 
 
 @compiled
+def _any(planes, count):
+    """Whether any number of four planes is not zero."""
+    some = False
+    for c in range(4):
+        for j in range(count):
+            some |= planes[c * PITCH + j] != 0
+    return some
+
+
+@compiled
 def gather(to, s, above, level, below, count):
     """Sums of w, w u and w v over nine targets' adjoints: for colour the first, and the three along (colour, 1).
 
@@ -163,11 +173,14 @@ def pull(start, stop, positions, rgba, row, scale, peak, gamma, states, border, 
         loaded[:] = -9
         for y in range(start - 1, stop + 1):
             adjoint = slot(adjoints, 0, y, SUMS)
-            active[(y + 3) % 3] = busy(states, y, left - 1, count + 2, least)
-            if active[(y + 3) % 3]:
+            some = busy(states, y, left - 1, count + 2, least)
+            if some:
+                load_image(given, g, states, least, border, y, left - 1, count + 2)
+                some = _any(given, count + 2)
+            active[(y + 3) % 3] = some
+            if some:
                 load_around(sources, loaded, positions, rgba, row, y, left - 2, count + 4, scale, peak, gamma)
                 normalised_sums(total, sources, layers, y, count + 2)
-                load_image(given, g, states, least, border, y, left - 1, count + 2)
                 adjoint_row(adjoint, total, given, layers, count + 2)
             else:
                 adjoint[:] = g.dtype.type(0)

@@ -116,3 +116,26 @@ def _decide(states, covered0, covered1, covered2, calm0, calm1, calm2, joins1, j
         some |= covered2[x] | covered2[x + 1] | covered2[x + 2]
         flat = calm0[x + 1] & calm1[x + 1] & calm2[x + 1] & joins1[x + 1] & joins2[x + 1]
         states[x] = (some << 1) - flat
+
+
+@kernel
+def paint(start, stop, settled, border, colors, images):
+    """Give settled targets of rows [start, stop) of images (T, H, W, 4), which have no border, their colours (T, 4)."""
+    for n in range(len(images)):
+        red, green, blue, alpha = colors[n, 0], colors[n, 1], colors[n, 2], colors[n, 3]
+        for y in range(start, stop):
+            image = images[n, y]
+            cells = settled[y + border, border : border + len(image)]
+            for x in range(len(image)):
+                if cells[x]:
+                    image[x, 0], image[x, 1], image[x, 2], image[x, 3] = red, green, blue, alpha
+
+
+@kernel
+def collect(start, stop, settled, border, g, sums):
+    """Sums (H, 4) of the gradient (H, W, 4) of an image without a border at settled targets of rows [start, stop)."""
+    for y in range(start, stop):
+        for x in range(g.shape[1]):
+            if settled[y + border, x + border]:
+                for c in range(4):
+                    sums[y, c] += g[y, x, c]

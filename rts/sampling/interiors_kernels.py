@@ -1,0 +1,142 @@
+"""Cells that show one colour whatever moves: they need no samples, nor do those that affect only such cells."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.compiling import compiled, kernel
+from rts.threads import parallel
+
+LONG = 2
+"""Nanoseconds that a cell of a layer takes."""
+
+
+def settle(covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, reach: int) -> np.ndarray:
+    """Cells (H, W) bool amid nine fronts and no hidden sample that is kept; other samples are left out.
+
+    Those stay that are within reach of a cell that is not settled. So do the nearest and the farthest, since the depth
+    of what is empty goes by them.
+
+    Args:
+        covered: (K, H, W) bool.
+        depth: (K, H, W) float, of one dtype.
+        kept: (K, H, W) bool, samples that are needed where colours differ; changed in place.
+        reach: cells.
+    """
+    layers, height, width = covered.shape
+    covered, depth = np.ascontiguousarray(covered), np.ascontiguousarray(depth)
+    found, near = np.empty((height, width), np.bool_), np.empty((height, width), np.bool_)
+    extremes = np.zeros((2, height), depth.dtype)
+    parallel(_settle, height, covered, depth, kept, reach, found, near, extremes, work=LONG * covered.size)
+    least, largest = extremes[0].min(initial=0), extremes[1].max(initial=0)
+    farthest = [_place(extremes[i], x, depth, kept) for i, x in enumerate((least, largest)) if x]
+    parallel(_drop, height, near, kept, work=covered.size // 8)
+    for k, y, x in farthest:
+        kept[: k + 1, y, x] = covered[: k + 1, y, x]
+    return found
+
+
+def _place(extremes: np.ndarray, depth: np.floating, depths: np.ndarray, kept: np.ndarray) -> tuple[int, int, int]:
+    """Layer, row and column of the first sample of a depth that is one of the extremes (H,) of the rows."""
+    y = int((extremes == depth).argmax())
+    k, x = np.argwhere(kept[:, y] & (depths[:, y] == depth))[0]
+    return int(k), y, int(x)
+
+
+@kernel
+def _settle(start, stop, covered, depth, kept, reach, found, near, extremes):
+    """Fill rows [start, stop) of what is found, of cells near any that are not, and of extremes of the depths."""
+    layers, height, width = covered.shape
+    around = reach + 1
+    rows = stop - start + 2 * around
+    # A border of cells that are not amid fronts, as nothing is known there.
+    loose, middle = np.ones((rows, width + 2 * around), np.uint8), slice(around, around + width)
+    wide, far = np.ones((rows, width), np.uint8), 2 * around - 2
+    column, nine = np.empty(width + 2 * around, np.uint8), np.empty(width + 2 * around - 2, np.uint8)
+    for r in range(rows):
+        y = start - around + r
+        if 0 <= y < height:
+            _load(loose[r, middle], covered[0, y])
+            for k in range(1, layers):
+                _add(loose[r, middle], kept[k, y])
+    for r in range(rows - 2):
+        _unite(column, loose[r], loose[r + 1], loose[r + 2])
+        _unite(nine, column, column[1:], column[2:])
+        y = start - around + r + 1
+        if start <= y < stop:
+            _reverse(found[y], nine[around - 1 :])
+        # What is wider is united of threes.
+        _unite(wide[r], nine, nine[min(3, far) :], nine[far:])
+        for v in range(6, far, 3):
+            _join(wide[r], nine[v:])
+    for y in range(start, stop):
+        r = y - start
+        _near(near[y], wide[r], wide[r + min(3, far)], wide[r + far])
+        for v in range(6, far, 3):
+            _join(near[y], wide[r + v])
+        for k in range(layers):
+            low, high = bounds(depth[k, y], kept[k, y])
+            extremes[0, y], extremes[1, y] = min(low, extremes[0, y]), max(high, extremes[1, y])
+
+
+@kernel
+def _drop(start, stop, near, kept):
+    """Leave out what is not near."""
+    for k in range(len(kept)):
+        for y in range(start, stop):
+            _mask(kept[k, y], near[y])
+
+
+# Rows are handed over one by one, which the compiler needs to see that they do not overlap.
+
+
+@compiled
+def _load(loose, covered):
+    for x in range(len(loose)):
+        loose[x] = np.uint8(1) - np.uint8(covered[x])
+
+
+@compiled
+def _add(loose, kept):
+    for x in range(len(loose)):
+        loose[x] |= np.uint8(kept[x])
+
+
+@compiled
+def _join(to, cells):
+    for x in range(len(to)):
+        to[x] |= cells[x]
+
+
+@compiled
+def _reverse(to, cells):
+    for x in range(len(to)):
+        to[x] = cells[x] == 0
+
+
+@compiled
+def _unite(to, a, b, c):
+    for x in range(len(to)):
+        to[x] = a[x] | b[x] | c[x]
+
+
+@compiled
+def _near(to, a, b, c):
+    for x in range(len(to)):
+        to[x] = (a[x] | b[x] | c[x]) != 0
+
+
+@compiled
+def _mask(kept, near):
+    for x in range(len(kept)):
+        kept[x] &= near[x]
+
+
+@numba.njit(nogil=True, fastmath={"nnan", "nsz", "reassoc"})
+def bounds(depth, covered):
+    """The least and the largest depth of those that are covered, and zero."""
+    low = high = depth.dtype.type(0)
+    for x in range(len(depth)):
+        z = depth[x] if covered[x] else depth.dtype.type(0)
+        low, high = min(low, z), max(high, z)
+    return low, high

@@ -1,0 +1,219 @@
+"""Cells amid one colour are known without samples: image and derivatives are those of all samples."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from helpers import DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere, quad, to_numpy
+
+import rts
+from rts import splatting
+from rts.sampling.interiors_kernels import settle
+from rts.sampling.scenes import sample
+from rts.splatting.layers import dilated
+
+pytestmark = pytest.mark.sampling
+
+MESH = rts.plugin("rts.surfaces", "mesh")
+CAMERA = rts.Camera.look_at((0.3, 0.4, 4.0), (0, 0, 0), fov_y=40)
+SIZE = (60, 52)
+
+
+def joined(*meshes):
+    """One mesh of several."""
+    first = np.cumsum([0, *(len(vertices) for vertices, _ in meshes)])
+    faces = [triangles + n for (_, triangles), n in zip(meshes, first, strict=False)]
+    return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)
+
+
+SCENES = {
+    "sphere": icosphere(3, 0.9),
+    "box before a card": joined(box(0.5), quad(-1.0, 1.0, -1.0, 1.0, -0.8)),
+    "spheres that cross": joined(icosphere(2, 0.8), (icosphere(2, 0.8)[0] + np.float32((0.5, 0, 0)), icosphere(2)[1])),
+    "cut by the frame": icosphere(3, 1.6),
+}
+
+
+class Painted(rts.Shader):
+    """One colour, an entry of θ."""
+
+    opaque = uniform = True
+    reads = ()
+
+    def __call__(self, theta, gbuffer, camera):
+        xp, color = rts.namespace(theta["color"]), theta["color"]
+        return xp.broadcast_to(xp.concat([color, xp.ones_like(color[:1])]), (gbuffer["position"].shape[0], 4))
+
+
+def part_of(vertices, name, color=None, **options):
+    theta = {"vertices": vertices} if color is None else {"vertices": vertices, "color": color}
+    return rts.Part(MESH(SCENES[name][1]), theta, "silhouette" if color is None else Painted(), **options)
+
+
+def sampled_image(part, settles, splatter="visible", **options):
+    sampled = sample(part, CAMERA, SIZE, splatter=splatter, settles=settles, **options)
+    return rts.render_samples(sampled, part, CAMERA, splatter=splatter), sampled
+
+
+@pytest.mark.parametrize(("layers", "reach"), [(1, 3), (3, 3), (2, 1), (2, 2), (2, 4)])
+def test_settled_cells_are_amid_fronts_and_what_is_left_out_is_far_from_all_others(layers, reach):
+    rng = np.random.default_rng(layers)
+    for shape in ((30, 41), (1, 9), (70, 3)):
+        front = ~dilated(rng.random(shape) < 0.01)
+        covered = np.logical_and.accumulate(np.stack([front, *(rng.random((layers - 1, *shape)) < 0.5)]), axis=0)
+        kept = covered & np.stack([front, *(dilated(rng.random(shape) < 0.01) for _ in range(layers - 1))])
+        depth = np.sort(rng.random(covered.shape).astype(np.float32), axis=0)
+        loose = np.pad(~front | kept[1:].any(axis=0), 9, constant_values=True)
+        expected = ~dilated(loose)[9:-9, 9:-9]
+        for _ in range(reach + 1):
+            loose = dilated(loose)
+        left = kept & loose[9:-9, 9:-9]
+        if kept.any():  # The farthest stays, whose depth sets the scale of what is empty.
+            k, y, x = np.unravel_index(np.where(kept, depth, -1).argmax(), kept.shape)
+            left[: k + 1, y, x] = covered[: k + 1, y, x]
+        found = settle(covered, depth, kept, reach)
+        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(kept, left)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+@pytest.mark.parametrize("splatter", ["single", "multi", "visible"])
+@pytest.mark.parametrize("name", ["sphere", "box before a card"])
+def test_the_image_and_its_derivatives_are_those_of_all_samples(name, splatter, target):
+    vertices = SCENES[name][0].astype(np.float32)
+    along = np.random.default_rng(1).normal(size=vertices.shape).astype(np.float32)
+    weights = arrays(target, np.random.default_rng(0).normal(size=(*SIZE, 4)).astype(np.float32))
+    found, counts, inner = [], [], slice(2, -2) if splatter != "visible" else slice(4, -4)
+    for settles in (False, True):
+        sampled = sampled_image(part_of(arrays(target, vertices), name), settles, splatter)[1]
+        counts.append(int((to_numpy(sampled.row) >= 0).sum()))
+
+        def image(v, sampled=sampled):
+            return rts.render_samples(sampled, part_of(v, name), CAMERA, splatter=splatter)
+
+        def loss(v, image=image):
+            return (image(v) * weights).sum()
+
+        v, t = arrays(target, vertices), arrays(target, along)
+        found.append([*derivative(target, image, v, t), gradient(target, loss, v)])
+    assert counts[1] < counts[0]
+    (image, push, pull), (image_settled, push_settled, pull_settled) = [[to_numpy(x) for x in f] for f in found]
+    # Sums of weights over their sum are one but for rounding, and do not change but for rounding.
+    np.testing.assert_allclose(image_settled, image, rtol=0, atol=3e-7)
+    np.testing.assert_allclose(push_settled, push, rtol=0, atol=1e-6 * np.abs(push).max())
+    np.testing.assert_array_equal(push_settled[to_numpy(sampled.settled)[inner, inner]], 0)
+    np.testing.assert_array_equal(pull_settled, pull)
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("make", [splatting.Visible, splatting.Multi, partial(splatting.Visible, rims=False)])
+def test_the_specification_agrees(name, make):
+    import torch
+
+    results = []
+    for settles in (False, True):
+        vertices = torch.tensor(SCENES[name][0], dtype=torch.float64, requires_grad=True)
+        color = torch.tensor([0.3, 0.6, 0.2], dtype=torch.float64, requires_grad=True)
+        image, sampled = sampled_image(part_of(vertices, name, color), settles, make())
+        weights = torch.from_numpy(np.random.default_rng(2).normal(size=(*SIZE, 4)))
+        (image * weights).sum().backward()
+        results.append((image.detach().numpy(), vertices.grad.numpy(), color.grad.numpy()))
+    assert sampled.settled.any()
+    for whole, settled in zip(*results, strict=True):
+        np.testing.assert_allclose(settled, whole, rtol=0, atol=1e-10 * max(1, np.abs(whole).max()))
+
+
+@pytest.mark.parametrize("supersample", [1, 2])
+@pytest.mark.parametrize("color", [None, "free"])
+def test_normal_equations_are_those_of_all_samples(color, supersample, monkeypatch):
+    import torch
+
+    from rts.fitting import image_residuals
+
+    parameters = {"pose": torch.tensor([0.1, 0.2, 0.0, 0.02, 0.0, 0.0], dtype=torch.float64)}
+    if color:
+        parameters["color"] = torch.tensor([0.3, 0.6, 0.2], dtype=torch.float64)
+
+    def scene(p):
+        return part_of(SCENES["sphere"][0], "sphere", p.get("color"), transform=rts.rigid(p["pose"]))
+
+    target = np.random.default_rng(3).random((*SIZE, 4 if color else 1))
+    residuals = rts.ImageResiduals(scene, CAMERA, SIZE, target, supersample=supersample)
+    found = residuals.normal_equations(parameters)
+    monkeypatch.setattr(image_residuals, "sample", lambda *a, settles, **k: sample(*a, **k))
+    for settled, whole in zip(found, residuals.normal_equations(parameters), strict=True):
+        np.testing.assert_allclose(settled, whole, rtol=1e-9, atol=1e-12)
+
+
+def test_where_all_is_covered_the_image_is_that_colour_and_nothing_moves():
+    import torch
+
+    vertices = torch.tensor(quad(-9, 9, -9, 9, 0.0)[0], requires_grad=True)
+    part = rts.Part(MESH(quad(-9, 9, -9, 9, 0.0)[1]), {"vertices": vertices})
+    image = rts.render(part, CAMERA, SIZE)
+    image.sum().backward()
+    assert (image == 1).all() and (vertices.grad == 0).all()
+
+
+def test_the_number_of_threads_changes_nothing(monkeypatch):
+    found = []
+    for threads in ("1", "2"):
+        monkeypatch.setenv("RTS_NUM_THREADS", threads)
+        image, sampled = sampled_image(part_of(SCENES["box before a card"][0], "box before a card"), True)
+        found.append([image, sampled.settled, sampled.row])
+    for one, two in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+class Twice(splatting.Visible):
+    """A splatter with an image of its own."""
+
+    def image(self, splats):
+        return super().image(splats)
+
+
+def test_samples_are_left_out_only_where_nothing_can_depend_on_them():
+    vertices = SCENES["sphere"][0]
+    part, painted = part_of(vertices, "sphere"), part_of(vertices, "sphere", np.array([1.0, 0.0, 0.0]))
+    normals = part.replace(shader="normals")
+    settled = [
+        sampled_image(scene, True, splatter)[1].settled is not None
+        for scene, splatter in (
+            (part, "visible"),
+            (painted, "multi"),
+            (normals, "visible"),
+            ([part, part], "visible"),
+            (part, Twice()),
+            (part, "none"),
+            (part, splatting.Visible(epsilon=0.0)),
+        )
+    ]
+    assert settled == [True, True, False, False, False, False, False]
+
+
+@pytest.mark.parametrize("kind", ["single", "multi", "visible"])
+def test_what_has_no_cotangent_is_not_pulled_and_what_has_no_weight_not_swept(kind):
+    import torch
+
+    vertices = torch.tensor(SCENES["sphere"][0], requires_grad=True)
+    image = sampled_image(part_of(vertices, "sphere"), True, kind)[0]
+    weights = torch.zeros((*SIZE, 4))
+    weights[20:33, 5:20] = torch.from_numpy(np.random.default_rng(4).normal(size=(13, 15, 4)).astype(np.float32))
+    (whole,) = torch.autograd.grad((image * (weights + 0)).sum(), vertices, retain_graph=True)
+    # A gradient that is tiny instead of zero elsewhere is pulled there.
+    tiny = torch.where(weights == 0, 1e-30, weights)
+    (pulled,) = torch.autograd.grad((image * tiny).sum(), vertices)
+    assert whole.abs().max() > 0
+    np.testing.assert_allclose(whole, pulled, rtol=0, atol=1e-6 * float(whole.abs().max()))
+
+    def scene(p):
+        return part_of(SCENES["sphere"][0], "sphere", transform=rts.rigid(p["pose"]))
+
+    parameters = {"pose": torch.tensor([0.1, 0.2, 0.0, 0.02, 0.0, 0.0], dtype=torch.float64)}
+    target, mask = np.random.default_rng(3).random((*SIZE, 1)), weights[..., 3:].numpy().astype(float)
+    found = [
+        rts.ImageResiduals(scene, CAMERA, SIZE, target, weights=w, splatter=kind).normal_equations(parameters)
+        for w in (mask, np.where(mask == 0, 1e-30, mask))
+    ]
+    for masked, every in zip(*found, strict=True):
+        np.testing.assert_allclose(masked, every, rtol=1e-9, atol=1e-15)
