@@ -23,13 +23,15 @@ PACKAGES = ("rts", "rts_backends", "rts_surfaces")
 
 def kernel(function: Callable | None = None, **options: Any) -> Any:
     """Compile a loop that Python calls, without the interpreter lock, and keep it on disk; `options` are numba's."""
-    decorate = numba.njit(nogil=True, cache=True, no_cfunc_wrapper=True, **options)
+    options |= {"nogil": True, "cache": True, "no_cfunc_wrapper": True}
+    decorate = numba.njit(**options)
     return decorate if function is None else decorate(function)
 
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
     """Compile a function that only compiled loops call; Python cannot. `options` are numba's."""
-    decorate = numba.njit(nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)
+    options |= {"nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    decorate = numba.njit(**options)
     return decorate if function is None else decorate(function)
 
 

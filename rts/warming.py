@@ -32,7 +32,6 @@ from rts.sampling.scenes import sample
 from rts.threads import thread_count
 
 SIZE = (24, 32)
-CAMERA = Camera.look_at((0.3, 0.8, 3), (0, 0, 0), fov_y=40)
 
 
 def warmup(processes: int | None = None) -> float:
@@ -72,12 +71,16 @@ def _in_process(task: str) -> None:
         raise RtsError(f"could not compile what {task} needs: {said[-1]}")
 
 
+def _camera() -> Camera:
+    return Camera.look_at((0.3, 0.8, 3), (0, 0, 0), fov_y=40)
+
+
 def _parts() -> list[Part]:
     """Two octahedra that pass through one another, so that all that splatters distinguish is there."""
     corners = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
     faces = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
     surface = registry.plugin("rts.surfaces", "mesh")(np.array(faces))
-    color = np.float32([0.2, 0.5, 0.8])
+    color = np.array([0.2, 0.5, 0.8], np.float32)
     theta = [{"vertices": corners * 0.9, "color": color}, {"vertices": corners[:, ::-1] * 0.7 + 0.3, "color": color}]
     return [Part(surface, each, shader) for each, shader in zip(theta, ("lambert", "silhouette"), strict=True)]
 
@@ -95,8 +98,8 @@ def _samplers() -> list[Any]:
 def _sampling() -> None:
     for sampler in _samplers():
         for parts in (_parts()[:1], _parts()):
-            sample(parts, CAMERA, SIZE, sampler=sampler)
-    render(_parts(), CAMERA, SIZE, supersample=Adaptive(2))
+            sample(parts, _camera(), SIZE, sampler=sampler)
+    render(_parts(), _camera(), SIZE, supersample=Adaptive(2))
 
 
 def _splatting() -> None:
@@ -116,13 +119,13 @@ def _splatting() -> None:
 
 def _rendering() -> None:
     parts = _parts()
-    render(parts[0], CAMERA, SIZE)
+    render(parts[0], _camera(), SIZE)
     if find_spec("torch") is None:
         return
 
     def image(vertices: Any, pose: Any) -> Any:
         moved = parts[0].replace(theta={**parts[0].theta, "vertices": vertices}, transform=rigid(pose))
-        return render([moved, parts[1]], CAMERA, SIZE)
+        return render([moved, parts[1]], _camera(), SIZE)
 
     _differentiate(image, parts[0].theta["vertices"], np.zeros(6, np.float32))
 
@@ -131,10 +134,10 @@ def _fitting() -> None:
     if find_spec("torch") is None:
         return
     part = _parts()[0].replace(shader="silhouette")
-    target = render(part, CAMERA, SIZE)
+    target = render(part, _camera(), SIZE)
     for splatter in ("visible", "single"):
         residuals = ImageResiduals(
-            lambda pose: part.replace(transform=rigid(pose)), CAMERA, SIZE, target, splatter=splatter
+            lambda pose: part.replace(transform=rigid(pose)), _camera(), SIZE, target, splatter=splatter
         )
         fit(residuals, _torch().full((6,), 0.02), method="lm", steps=2)
 

@@ -24,7 +24,7 @@ def specialisations():
     ours = ("rts", "rts_backends", "rts_surfaces")
     modules = [m for name, m in sys.modules.items() if name.partition(".")[0] in ours]
     found = {id(x): x for m in modules for x in vars(m).values() if isinstance(x, Dispatcher)}
-    kept = [x for x in found.values() if x.overloads and hasattr(x._cache, "cache_path")]
+    kept = [x for x in found.values() if x.overloads and x._cache.cache_path is not None]
     return {f"{x.__module__}.{x.__name__}": len(x.overloads) for x in kept}
 
 vertices = np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0.5), (-1, 0, -1)], np.float32)
@@ -45,7 +45,7 @@ print(len(first), max(first.values()), *sorted(first))
 def test_the_first_render_compiles_few_kernels_each_once():
     done = subprocess.run([sys.executable, "-c", FIRST_RENDER], capture_output=True, text=True, check=True)
     count, most, *_ = done.stdout.split()
-    assert 8 <= int(count) <= 16, done.stdout
+    assert 8 <= int(count) <= 20, done.stdout
     assert int(most) == 1, done.stdout
     assert not done.stderr  # It is no terminal.
 
