@@ -132,7 +132,7 @@ def _mask(kept, near):
         kept[x] &= near[x]
 
 
-@numba.njit(nogil=True, fastmath={"nnan", "nsz", "reassoc"})
+@compiled(fastmath={"nnan", "nsz", "reassoc"})
 def bounds(depth, covered):
     """The least and the largest depth of those that are covered, and zero."""
     low = high = depth.dtype.type(0)
