@@ -137,6 +137,9 @@ class Renderer:
         return _image(scene, self._size, self._background, **self._options)
 
 
+PreparedParts._made = Renderer
+
+
 def _image(
     scene: Scene,
     size: tuple[int, int],

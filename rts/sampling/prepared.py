@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
 
 from rts.arguments import check_pixels
 from rts.camera import Camera
 from rts.checks import check_changes, check_sampler, check_scene, suited_sampler
 from rts.interfaces import Part
 from rts.sampling.cache import Entry
-
-if TYPE_CHECKING:
-    from rts.rendering import Renderer
+from rts.trees import Array
 
 
 class PreparedParts:
@@ -25,6 +23,9 @@ class PreparedParts:
         samplers: the sampler of each.
         entries: what the sampler has built of each, or None where it builds nothing.
     """
+
+    _made: ClassVar[Callable[..., Callable[..., Array]]]
+    """Makes a renderer; set by `rts.rendering`, which builds on this module."""
 
     def __init__(self, parts: Sequence[Part], samplers: Sequence[Any], entries: Sequence[Any]):
         self.parts, self.samplers, self.entries = tuple(parts), tuple(samplers), tuple(entries)
@@ -47,7 +48,7 @@ class PreparedParts:
         parts[index] = parts[index].replace(**changes)
         return PreparedParts(parts, self.samplers, self.entries)
 
-    def renderer(self, camera: Camera, size: tuple[int, int], **settings: Any) -> Renderer:
+    def renderer(self, camera: Camera, size: tuple[int, int], **settings: Any) -> Callable[..., Array]:
         """A function that renders these parts, for loops: `draw(transform=…)`, with what changes at each call.
 
         Args:
@@ -61,9 +62,7 @@ class PreparedParts:
         Raises:
             InputError: what was given cannot be rendered.
         """
-        from rts.rendering import Renderer
-
-        return Renderer(self, camera, size, **settings)
+        return self._made(self, camera, size, **settings)
 
 
 def _built(sampler: Any, kept: Entry) -> Entry:
