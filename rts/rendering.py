@@ -83,7 +83,9 @@ def render(
     """
     scene = Scene.of(parts, camera, sampler, engine)
     size = check_size(size, layers, capacity, finest(supersample))
-    options = dict(splatter=check_splatter(splatter), layers=layers, supersample=supersample, capacity=capacity)
+    options: dict[str, Any] = dict(
+        splatter=check_splatter(splatter), layers=layers, supersample=supersample, capacity=capacity
+    )
     return _image(scene.at(size), size, check_background(background, size), **options)
 
 

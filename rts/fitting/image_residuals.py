@@ -207,7 +207,7 @@ class ImageResiduals(Residuals):
             # A window is of no ratio of its own.
             return camera if size == self.size else camera.window(self.size, (top, 0), size).replace(aspect=None)
 
-        options = dict(splatter=splatter, supersample=self.supersample, settles=True, **self._sampling)
+        options: dict[str, Any] = dict(splatter=splatter, supersample=self.supersample, settles=True, **self._sampling)
         sampled = sample(parts, window(camera), size, **options)
         colored = self._channels > 1 or not _all_opaque(parts, camera)
         band = slice(top, top + rows)

@@ -187,19 +187,19 @@ class TriangleSampler(Sampler):
         tables = shape.tables(surface) if surface.refines else {}
         shader = adapted(part.shader, Shader)
         asked = None if shader is None else shader.reads
-        needed = None if needed is None else adapted(needed, Needed)
-        settles = needed is not None and needed.settles and cells is None and not surface.refines
+        wanted: Needed | None = None if needed is None else adapted(needed, Needed)
+        settles = wanted is not None and wanted.settles and cells is None and not surface.refines
         attributes = _attribute_specs(surface, asked, host_theta, shape, like)
 
         transform = [] if part.transform is None else [part.transform]
 
-        def host(view: np.ndarray, projection: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
+        def host(view: np.ndarray, projection: np.ndarray, *rest: np.ndarray) -> tuple[Any, ...]:
             it = iter(rest[len(transform) + len(listed) :])
             host_cells = np.asarray(rest[len(transform)], np.int32) if listed else None
             host_inputs = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
             host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
             host_camera = check_camera(host_camera, *rest[: len(transform)])
-            given = shape, tables, needed, entry, host_cells, tells
+            given = shape, tables, wanted, entry, host_cells, tells
             found = self._found(surface, part.cull, host_inputs, host_camera, *given)
             gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
             return (

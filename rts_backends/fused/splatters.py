@@ -141,20 +141,25 @@ def _shape(
     return *(max(0, n - 2 * settings.border) for n in row[1:]), 4
 
 
+def _cells(settings: Settings, operands: Arrays, kept: Choices | None) -> Cells:
+    positions, rgba, row, part, facing, wanted, settled = operands
+    return Cells(settings, positions, rgba, row, kept, part, facing, wanted, settled)
+
+
 def _forward(operands: Arrays, out: np.ndarray, *, settings: Settings) -> Choices | None:
-    cells = Cells(settings, *operands[:3], None, *operands[3:])
+    cells = _cells(settings, operands, None)
     cells.image(out)
     return cells.choices if out.size else None
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, settings: Settings, kept: Choices | None) -> None:
     t_positions, t_rgba = tangents
-    Cells(settings, *operands[:3], kept, *operands[3:]).jvp(t_positions, t_rgba, out)
+    _cells(settings, operands, kept).jvp(t_positions, t_rgba, out)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings, kept: Choices | None) -> None:
     g_positions, g_rgba = results
-    Cells(settings, *operands[:3], kept, *operands[3:]).vjp(g, g_positions, g_rgba)
+    _cells(settings, operands, kept).vjp(g, g_positions, g_rgba)
 
 
 def _used(operands: Arrays) -> int:
