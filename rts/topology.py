@@ -6,8 +6,6 @@ import weakref
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from rts.arguments import quoted
 from rts.arrays import shape_of
@@ -81,6 +79,9 @@ def pieces(faces: np.ndarray) -> np.ndarray:
     Args:
         faces: (T, 3) integers.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     count = len(faces)
     start, end = faces.reshape(-1).astype(np.int64), np.roll(faces, -1, axis=1).reshape(-1).astype(np.int64)
     low, high = np.minimum(start, end), np.maximum(start, end)

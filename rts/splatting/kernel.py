@@ -73,7 +73,7 @@ class Kernel(Splatter):
         return settled(self.accumulate(splats), splats)
 
     @property
-    def settles(self) -> bool:
+    def settles(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
         """See `rts.Splatter`: True where weights fill a cell, and not in a class with an `image` of its own."""
         return self._knows_settled and self.epsilon >= LEAST_EPSILON
 
