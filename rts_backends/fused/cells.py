@@ -199,7 +199,7 @@ class Cells:
         if self.rims:
             listed = choices.mixed, choices.offsets, choices.columns, choices.ranges
             given = self.positions, self.row, self._reach, choices.states, *listed, ends, marks, counts
-            parallel(outlines.find, height, *given, work=self.row[0].size)
+            parallel(outlines.find, height, *given, work=2 * self.row[0].size)
             if self._wanted is not None:
                 found, marks = marks, np.empty_like(marks)
                 parallel(outlines.narrow, height, found, self._wanted, marks, counts, work=self.row[0].size)
@@ -217,7 +217,7 @@ class Cells:
             rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
             arrays = self.positions, self.rgba, self.row, *self._numbers, self.part, kind.type(choices.extent), rules
             listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
-            parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=50 * len(found.columns))
+            parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=150 * len(found.columns))
         return found
 
     @cached_property

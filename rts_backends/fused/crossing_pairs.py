@@ -46,7 +46,7 @@ def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np
     """Mark in `kept` (K, H, W) what `rts.splatting.crossings.sheets` keeps."""
     _, height, width = covered.shape
     bits, some = no_pairs(height, width)
-    parallel(_find_in_depths, height, covered, depth, Rules.of(extent), bits, some, work=covered[0].size)
+    parallel(_find_in_depths, height, covered, depth, Rules.of(extent), bits, some, work=3 * covered[0].size)
     if some.any():
         _keep(covered, bits, some, specification.KEPT, kept)
 

@@ -70,7 +70,7 @@ def listed(arrays: tuple, choices: Any, extent: np.floating) -> Crossings:
     if len(row) < 2 or not (row[1] >= 0).any():
         return nothing(height, kind)
     rules, bits, some = Rules.of(extent), *no_pairs(height, width)
-    parallel(find_in_cells, height, positions, row, rules, bits, some, work=row[0].size)
+    parallel(find_in_cells, height, positions, row, rules, bits, some, work=3 * row[0].size)
     if not some.any():
         return nothing(height, kind)
     rows = height + 2 * BORDER
