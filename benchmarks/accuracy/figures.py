@@ -22,6 +22,8 @@ SHOWN, CONTRAST = slice(36, 228), 2.0
 """Rows and columns of A, B and C that are shown, and the factor on their derivatives."""
 CONTRAST_LOW = 10.0
 """The factor on low-passed differences."""
+OUTLINES = {"4 × 4 at outlines": "D", "4 × 4 around outlines": "P", "8 × 8 at outlines": "*"}
+"""Samples where outlines are, and their marks in the figure of times."""
 FAILURES = (
     ("wires 0.5 px", 2, (88, 168, 72, 152)),
     ("half-plane", 2, (116, 140, 116, 140)),
@@ -78,11 +80,9 @@ def error_vs_time(results: dict, path: Path) -> None:
     for axes, scene in zip(figure.subplots(1, len(scenes), sharey=True, squeeze=False)[0], scenes, strict=True):
         for start, end, label, style in (
             ("visible", ("2", "4"), "visible, K = 2, s × s samples a pixel", {"color": "#c2410c", "marker": "o"}),
-            (
-                "visible",
-                ("outlines",),
-                "the same, at or around outlines only",
-                {"color": "#c026d3", "marker": "D", "linestyle": "none"},
+            *(
+                ("visible", (where,), f"the same, {where}", {"color": "#c026d3", "marker": marker, "linestyle": "none"})
+                for where, marker in OUTLINES.items()
             ),
             ("Mitsuba", ("",), "Mitsuba 3, direct_projective", {"color": "#1d4ed8", "marker": "s"}),
             ("DEODR", ("",), "DEODR", {"color": "#15803d", "marker": "^"}),
@@ -116,9 +116,11 @@ def error_vs_time(results: dict, path: Path) -> None:
 
 
 def _sampled(method: str) -> str:
-    """What a point is called beside its line."""
+    """What a point is called beside its line; those at outlines stand in the legend."""
     if method.startswith("Mitsuba"):
         return method.split(", ")[1]
+    if method.endswith("outlines"):
+        return ""
     return (method.split(", ")[2:] or ["1 × 1"])[0] if method.startswith("visible") else ""
 
 
