@@ -23,9 +23,9 @@ check: lint types test wheel oldest
 demo: $(VENV)/.demo
 	$(BIN)/rts demo -o out
 
-# Kernels that both workers need are compiled once, ahead.
+# Kernels that both workers need are compiled once, ahead; where that fails, the tests say more.
 test: system $(VENV)/.test
-	$(BIN)/python -c "import rts; rts.warmup()"
+	-$(BIN)/rts warmup
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
 
 # Ruff: rules and format of Python, in Markdown too.

@@ -13,9 +13,9 @@ METHODS: Mapping[str, Mapping[str, str]] = {
 VARIABLES: Mapping[str, Mapping[str, Any]] = {
     "rts.engines": {"differentiates": True},
     "rts.surfaces": {"refines": False, "depends_on_view": False},
-    "rts.samplers": {"culls": False, "prunes": False, "takes_cells": False},
+    "rts.samplers": {"culls": False, "prunes": False, "takes_cells": False, "tells_facing": False},
     "rts.shaders": {"opaque": False, "uniform": False, "reads": None},
-    "rts.splatters": {"layers": None, "reach": 1, "prunes": False, "sums_products": False},
+    "rts.splatters": {"layers": None, "reach": 1, "reads_facing": False, "prunes": False, "sums_products": False},
 }
 """Group → class variable of its base → its default, for plugins of other classes."""
 

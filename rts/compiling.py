@@ -40,7 +40,7 @@ class _Progress(event.Listener):
 
     def __init__(self) -> None:
         self.count, self.seconds = 0, 0.0
-        self._depth, self._since, self._told = 0, 0.0, False
+        self._depth, self._since = 0, 0.0
 
     def on_start(self, event: Any) -> None:
         """Begin to count time, or go deeper; the lock of the compiler is held."""

@@ -155,7 +155,8 @@ def plugin(group: str, name: str) -> Any:
 
 def built_in_surfaces() -> dict[str, str]:
     """Class → name of the surfaces that the library's own distribution registers, such as "Mesh" → "mesh"."""
-    own = _entries("rts.engines")["numpy"][0].dist
+    numpy = _entries("rts.engines").get("numpy")  # Missing where the sources alone are in the path.
+    own = numpy[0].dist if numpy else None
     return {
         entry.attr: name
         for name, entries in _entries("rts.surfaces").items()

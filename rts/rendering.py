@@ -130,9 +130,9 @@ class Renderer:
             InputError: there is no such part or field, or what is given does not suit.
         """
         scene = self._scene
+        check_changes(index, changes, len(scene.parts))
         if changes:
             parts = list(scene.parts)
-            check_changes(index, changes, len(parts))
             parts[index] = changed_part(index, parts[index], changes)
             suited = suiting_scene(parts, scene.camera, engine=self._engine)
             scene = scene._replace(parts=parts, suited=suited)
@@ -219,7 +219,8 @@ def render_samples(
         (H, W, 4) premultiplied linear RGBA, row 0 on top.
 
     Raises:
-        InputError: the samples are not of these parts, or their apron is too narrow for the splatter.
+        InputError: the samples are not of these parts, their apron is too narrow for the splatter, or some that it
+            needs were left out.
         EngineError: torch and jax arrays in one scene.
     """
     if not isinstance(sampled, Sampled):
@@ -236,6 +237,11 @@ def render_samples(
         raise InputError(
             f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
             f"{apron_of(splatter)}; give it to rts.sample, too"
+        )
+    if sampled.settled is not None and not (splatter.settles and scene.parts[0].shader.uniform):
+        raise InputError(
+            f"samples of cells amid one colour were left out (settles=True), which {splatter!r} and "
+            f"{scene.parts[0].shader!r} need; give rts.sample this splatter and these parts, or leave it out"
         )
     sampled = _narrowed(sampled, apron - apron_of(splatter))
     background = check_background(background, size)

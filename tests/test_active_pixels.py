@@ -137,6 +137,7 @@ def test_it_is_a_static_value():
         (4, "4"),
         (Adaptive(4), "adaptive:4"),
         (Adaptive(8, dilated=False, contrast=0.2), "adaptive:8:dilated=False:contrast=0.2"),
+        (Adaptive(4, contrast=1e-5), "adaptive:4:contrast=1e-05"),
     ],
 )
 def test_texts_stand_for_it(given, text):
@@ -150,6 +151,8 @@ def test_texts_stand_for_it(given, text):
         ("adaptive", "is no supersample"),
         ("dense:4", "is no supersample"),
         ("adaptive:1", "samples of Adaptive is 1"),
+        ("adaptive:4:contrast=much", "'contrast=much' of 'adaptive:4:contrast=much' is none of"),
+        ("adaptive:4:contrast=nan", "contrast of Adaptive is nan"),
         ("adaptive:4:dilated=1", "'dilated=1' of 'adaptive:4:dilated=1' is none of"),
     ],
 )

@@ -646,6 +646,7 @@ def test_a_renderer_refuses_what_render_refuses():
         ({"transform": np.eye(3)}, r"transform of part 0 .*expected a \(4, 4\) array"),
         ({"surface": Mesh(icosphere(1)[1])}, "keeps its surface"),
         ({"index": 1, "transform": np.eye(4)}, "one of 1 parts"),
+        ({"index": 1}, "one of 1 parts"),
         ({"colour": 1}, "colour"),
     ):
         with pytest.raises(InputError, match=words):

@@ -163,6 +163,19 @@ def test_fine_samples_are_told_too():
     assert np.abs(image - expected).sum() < 0.5 * np.abs(by_depth - expected).sum()
 
 
+def test_samplers_that_know_no_lists_of_cells_tell_them_too():
+    class Whole(rts.plugin("rts.samplers", "raster")):
+        takes_cells = False
+
+    options = dict(supersample=rts.Adaptive(2), layers=3)
+    listed, by_depth = (
+        rts.render(scene(), CAMERA, SIZE, sampler="raster", splatter=s, **options) for s in (Visible(), BY_DEPTH)
+    )
+    whole = rts.render(scene(), CAMERA, SIZE, sampler=Whole(), **options)
+    np.testing.assert_allclose(whole, listed, atol=1e-6)
+    assert np.abs(whole - by_depth).max() > 1e-3
+
+
 @pytest.mark.parametrize("layers", [2, 4])
 def test_the_compiled_splatter_is_the_specification(layers):
     rng = np.random.default_rng(layers)

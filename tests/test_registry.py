@@ -148,6 +148,8 @@ def test_details_say_what_each_plugin_can_do():
     assert able("surfaces", "sdf")["rays"] and not able("surfaces", "sdf")["triangles"]
     assert able("samplers", "raster")["culls"] and not able("samplers", "rays")["culls"]
     assert able("splatters", "single")["layers"] == 1 and able("splatters", "visible")["layers"] is None
+    assert able("samplers", "raster")["tells_facing"] and not able("samplers", "rays")["tells_facing"]
+    assert able("splatters", "visible")["reads_facing"] and not able("splatters", "multi")["reads_facing"]
     assert able("engines", "numpy") == {"differentiates": False}
     assert able("shaders", "silhouette")["uniform"] and able("shaders", "textured")["reads"] is not None
     assert found["rts.surfaces", "mesh"].ready and found["rts.surfaces", "mesh"].missing == ()

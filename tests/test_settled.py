@@ -191,6 +191,14 @@ def test_samples_are_left_out_only_where_nothing_can_depend_on_them():
     assert settled == [True, True, False, False, False, False, False]
 
 
+def test_what_needs_the_samples_that_were_left_out_is_refused():
+    part = part_of(SCENES["sphere"][0], "sphere")
+    sampled = sampled_image(part, True)[1]
+    for given, splatter in ((part, "none"), (part, Twice()), (part.replace(shader="normals"), "visible")):
+        with pytest.raises(rts.InputError, match="were left out"):
+            rts.render_samples(sampled, given, CAMERA, splatter=splatter)
+
+
 @pytest.mark.parametrize("kind", ["single", "multi", "visible"])
 def test_what_has_no_cotangent_is_not_pulled_and_what_has_no_weight_not_swept(kind):
     import torch

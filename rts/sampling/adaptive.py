@@ -79,11 +79,18 @@ def of_text(text: str) -> int | Adaptive:
         name, _, value = word.partition("=")
         if word in values:
             options.update([values[word]])
-        elif name == "contrast" and value.replace(".", "", 1).isdecimal():
-            options[name] = float(value)
+        elif name == "contrast" and (least := _number(value)) is not None:
+            options[name] = least
         else:
             raise InputError(f"{word!r} of {text!r} is none of dilated=True, dilated=False and contrast=0.2")
     return Adaptive(int(number), **options) if rest else int(number)
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
 
 
 def finest(supersample: Any) -> Any:

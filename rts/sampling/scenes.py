@@ -184,11 +184,11 @@ def _taken(
         chosen = suited_sampler(chosen, part, scene.camera)
         known: dict[str, Any] = {} if entry is None else {"entry": entry}
         seen = wide.camera.within(part.transform)
+        if facing and chosen.tells_facing:
+            known["facing"] = True
         if cells is not None and not chosen.takes_cells:
             samples.append(at_cells(chosen.sample(part, seen, wide.grid, count, **known), cells, capacity))
             continue
-        if facing and chosen.tells_facing:
-            known["facing"] = True
         if needed is not None and chosen.prunes:
             pruned = len(scene.parts) == 1
             known["needed"] = needed if pruned else Everything(needed)

@@ -267,8 +267,9 @@ def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
     layers, count = whole.row.shape[0], whole.ids.shape[0]
     rows = count if capacity is None else capacity
     grid = layers, *cells.shape
+    told = [] if whole.facing is None else [whole.facing]
 
-    def host(row: np.ndarray, depth: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, ...]:
+    def host(row: np.ndarray, depth: np.ndarray, cells: np.ndarray, *told: np.ndarray) -> tuple[np.ndarray, ...]:
         there = cells >= 0
         at = np.where(there, cells, 0)
         row, depth = (x.reshape(layers, -1)[:, at] for x in (row, depth))
@@ -278,7 +279,9 @@ def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
         number[covered] = np.where(np.arange(len(index)) < rows, np.arange(len(index)), -1)
         kept = np.zeros(max(1, len(index)) if capacity is None else rows, np.int32)
         kept[: len(index)] = index[: len(kept)]
-        return kept, number, np.where(number >= 0, depth, 0), np.asarray(max(0, len(index) - rows), np.int32)
+        sides = (np.where(number >= 0, x.reshape(layers, -1)[:, at], 0).astype(np.int16) for x in told)
+        dropped = np.asarray(max(0, len(index) - rows), np.int32)
+        return kept, number, np.where(number >= 0, depth, 0), dropped, *sides
 
     kind = np.float64 if namespace(whole.depth).finfo(whole.depth.dtype).bits == 64 else np.float32
     specs = (
@@ -286,8 +289,10 @@ def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
         ArraySpec(grid, np.int32),
         ArraySpec(grid, kind),
         ArraySpec((), np.int32),
+        *(ArraySpec(grid, np.int16) for _ in told),
     )
-    index, row, depth, overflow = engine_of(whole).call_host(host, specs, whole.row, whole.depth, cells)
+    given = whole.row, whole.depth, cells, *told
+    index, row, depth, overflow, *facing = engine_of(whole).call_host(host, specs, *given)
     xp, gbuffer = namespace(index), whole.gbuffer
     tables = whole.tables.items()
     return replace(
@@ -299,6 +304,7 @@ def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
         overflow=whole.overflow + overflow,
         tables={k: xp.take(v, index, axis=0) if k in whole.by_sample else v for k, v in tables},
         gbuffer=None if gbuffer is None else {k: xp.take(v, index, axis=0) for k, v in gbuffer.items()},
+        facing=facing[0] if facing else None,
     )
 
 
