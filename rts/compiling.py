@@ -36,11 +36,14 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
 
 
 class _Progress(event.Listener):
-    """One line on a terminal while kernels are compiled: how many, in which time; nothing where they are on disk."""
+    """Lines on a terminal while kernels are compiled: how many, in which time; nothing where they are on disk.
+
+    Each comes after twice the time of the one before, and is whole, since nobody knows which kernel is the last.
+    """
 
     def __init__(self) -> None:
         self.count, self.seconds = 0, 0.0
-        self._depth, self._since = 0, 0.0
+        self._depth, self._since, self._next = 0, 0.0, TOLD_AFTER
 
     def on_start(self, event: Any) -> None:
         """Begin to count time, or go deeper; the lock of the compiler is held."""
@@ -54,8 +57,9 @@ class _Progress(event.Listener):
         if self._depth == 0 and _is_ours(event.data["dispatcher"]):
             self.count, self.seconds = self.count + 1, self.seconds + time.perf_counter() - self._since
             stream = sys.stderr
-            if self.seconds > TOLD_AFTER and stream is not None and stream.isatty():
-                stream.write(f"\rrts: compiling kernels (once): {self.count} in {self.seconds:.0f} s \x1b[K")
+            if self.seconds > self._next and stream is not None and stream.isatty():
+                self._next = 2 * self.seconds
+                stream.write(f"rts: compiling kernels (once): {self.count} in {self.seconds:.0f} s\n")
                 stream.flush()
 
 

@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -95,6 +94,14 @@ def _samplers() -> list[Any]:
     return found
 
 
+def _has_torch() -> bool:
+    try:
+        registry.plugin("rts.engines", "torch")
+    except PluginError:
+        return False
+    return True
+
+
 def _sampling() -> None:
     for sampler in _samplers():
         for parts in (_parts()[:1], _parts()):
@@ -113,14 +120,14 @@ def _splatting() -> None:
     positions, rgba = positions.reshape(-1, 3).astype(np.float32), rng.random((depth.size, 4)).astype(np.float32)
     splatter = registry.plugin("rts.splatters", "visible")()
     splatter.splat(positions, rgba, row)
-    if find_spec("torch") is not None:
+    if _has_torch():
         _differentiate(lambda p, c: splatter.splat(p, c, _torch().as_tensor(row)), positions, rgba)
 
 
 def _rendering() -> None:
     parts = _parts()
     render(parts[0], _camera(), SIZE)
-    if find_spec("torch") is None:
+    if not _has_torch():
         return
 
     def image(vertices: Any, pose: Any) -> Any:
@@ -131,7 +138,7 @@ def _rendering() -> None:
 
 
 def _fitting() -> None:
-    if find_spec("torch") is None:
+    if not _has_torch():
         return
     part = _parts()[0].replace(shader="silhouette")
     target = render(part, _camera(), SIZE)

@@ -514,6 +514,7 @@ def warmup(
     """Compile ahead what ordinary renders and fits use, in several processes; else it is compiled when first used."""
     import rts
 
+    _say("compiling what is not on disk yet, up to a minute")
     _say(f"compiled and kept on disk, {rts.warmup(processes or None):.0f} s")
 
 
