@@ -154,7 +154,7 @@ def _image(
 ) -> Array:
     """The image of a scene for images of a size; see `render`."""
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
-    bands = _bands(*size, layers, supersample)
+    bands = bands_of(*size, layers, supersample)
     suited = scene.suited if is_constant(background) else scene.suiting(background)
     if isinstance(supersample, Adaptive) and supersample.contrast is not None:
         image = _of_contrast(scene, size, suited, **options)
@@ -301,7 +301,7 @@ def _cropped(splatter: Splatter, splats: Splats) -> Array:
     return image
 
 
-def _bands(
+def bands_of(
     height: int, width: int, layers: int | Literal["auto"], supersample: int | Adaptive
 ) -> list[tuple[int, int]]:
     """(first row, number of rows) of the bands in which a supersampled image is rendered."""

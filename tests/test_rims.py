@@ -432,7 +432,7 @@ def test_bands_make_no_difference_to_outlines(monkeypatch):
     for band in (rendering.BAND, 500):
         monkeypatch.setattr(rendering, "BAND", band)
         found.append(derivative("torch-cpu", image, angle, one)[1])
-    assert len(rendering._bands(20, 24, 2, 2)) > 5 and np.abs(found[0]).max() > 1
+    assert len(rendering.bands_of(20, 24, 2, 2)) > 5 and np.abs(found[0]).max() > 1
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-3)
 
 

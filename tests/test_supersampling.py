@@ -45,11 +45,11 @@ def test_a_pixel_is_the_average_of_its_samples(target, s):
 
 @pytest.mark.parametrize("target", ALL)
 def test_bands_make_no_difference_to_the_image(target, narrow_bands, monkeypatch):
-    assert len(rendering._bands(*SIZE, 2, 3)) == 3
+    assert len(rendering.bands_of(*SIZE, 2, 3)) == 3
     vertices, background = arrays(target, (CORNERS, np.random.default_rng(0).random((*SIZE, 3))))
     found = to_numpy(image(vertices, 3, background=background))
     monkeypatch.undo()
-    assert len(rendering._bands(*SIZE, 2, 3)) == 1
+    assert len(rendering.bands_of(*SIZE, 2, 3)) == 1
     np.testing.assert_allclose(found, to_numpy(image(vertices, 3, background=background)), rtol=0, atol=2e-5)
 
 
@@ -91,7 +91,7 @@ def test_gradients_shade_each_band_again_instead_of_keeping_it(narrow_bands):
             calls.append(splats.row.shape)
             return super().image(splats)
 
-    bands = len(rendering._bands(*SIZE, 2, 3))
+    bands = len(rendering.bands_of(*SIZE, 2, 3))
     gradient(TORCH[0], lambda v: image(v, 3, splatter=Counting()).sum(), arrays(TORCH[0], CORNERS))
     assert len(calls) == 2 * bands
 
@@ -130,7 +130,7 @@ def test_bands_of_a_closed_surface_have_no_seams(splatter, monkeypatch):
     for band in (2**30, 2**11):
         monkeypatch.setattr(rendering, "BAND", band)
         found.append(rts.render(part, CAMERA, (24, 24), supersample=4, splatter=splatter, layers=3))
-    assert len(rendering._bands(24, 24, 3, 4)) > 8
+    assert len(rendering.bands_of(24, 24, 3, 4)) > 8
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-6)
 
 

@@ -29,8 +29,7 @@ from rts.fitting.names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.interfaces import CheckedPart, Part, Residuals, Splatter
 from rts.records import ArraySpec, Fine, Splats
-from rts.rendering import _bands as bands_of
-from rts.rendering import render
+from rts.rendering import bands_of, render
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.scenes import sample

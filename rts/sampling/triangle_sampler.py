@@ -269,7 +269,8 @@ class TriangleSampler(Sampler):
                     settled = needed.settled(covered, fragments.depth, kept, size)
             sides = None
             if tells:
-                pieces = checked_pieces(surface, found.proxy)
+                # Nobody looks at them where no sample is hidden, and to find them takes long.
+                pieces = checked_pieces(surface, found.proxy) if kept[1:].any() else np.zeros(1, np.int16)
                 sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
             if not surface.refines:
                 lifted = lift(fragments, found.proxy, shape.capacity, kept, size)
