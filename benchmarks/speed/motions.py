@@ -35,6 +35,7 @@ def cases(folder: Path) -> dict[str, tuple]:
         "bunny, K = 2, lambert": (*bunny, "lambert", 2, "none"),
         "sphere, K = 2": (*ball, "silhouette", 2, "none"),
         "sheet, K = 2": (*leaf, "silhouette", 2, "none"),
+        "spheres that cross, K = 2, lambert": (*through(ball), "lambert", 2, "none"),
     }
 
 
@@ -42,6 +43,14 @@ def mesh_of(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) float32 and faces (T, 3) of what moves in a scene."""
     part = scene.rest[0]
     return np.asarray(part.theta["vertices"], np.float32), part.surface.faces
+
+
+def through(mesh: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh and another of its kind that passes through it, smaller and aside by a half of its size."""
+    vertices, faces = mesh
+    middle = vertices.mean(axis=0)
+    other = middle + 0.7 * (vertices - middle) + 0.5 * (vertices[:, :1].max() - middle[0]) * np.ones(3, np.float32)
+    return np.concatenate([vertices, other]).astype(np.float32), np.concatenate([faces, faces + len(vertices)])
 
 
 def measure(case: tuple, side: int, rounds: int) -> dict[str, dict]:
