@@ -7,7 +7,7 @@ The surfaces that come with it are attributes, too, loaded when they are first u
 `rts.BSpline`, `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rts import registry, regularizers
 from rts.adapting import unwrapped
@@ -64,13 +64,14 @@ from rts.splatting import exact_calibration
 from rts.warming import warmup
 
 if TYPE_CHECKING:
-    from rts_surfaces.bezier import Bezier as Bezier
-    from rts_surfaces.bspline import BSpline as BSpline
-    from rts_surfaces.bspline import Revolution as Revolution
-    from rts_surfaces.implicit.isosurface import Isosurface as Isosurface
-    from rts_surfaces.implicit.sdf import Sdf as Sdf
-    from rts_surfaces.mesh import Mesh as Mesh
-    from rts_surfaces.subdivision.surface import Subdivision as Subdivision
+    # Names alone, so that misspelt ones are found: entry points say what they stand for, as of everybody's plugins.
+    Bezier: Any
+    BSpline: Any
+    Isosurface: Any
+    Mesh: Any
+    Revolution: Any
+    Sdf: Any
+    Subdivision: Any
 else:
 
     def __getattr__(name: str):

@@ -205,3 +205,14 @@ def low_passed(image):
     for axis in (0, 1):
         image = np.apply_along_axis(np.convolve, axis, image, g, mode="same")
     return image
+
+
+def crooked_block(folder):
+    """The file of a block that no turn maps to itself."""
+    import trimesh
+
+    path = folder / "model.ply"
+    block = trimesh.creation.box((2, 1.2, 0.8))
+    block.vertices *= 1 + np.random.default_rng(3).uniform(-0.3, 0.3, block.vertices.shape)
+    block.export(path)
+    return path

@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 import trimesh
+from helpers import crooked_block
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -42,12 +43,7 @@ def fail(*arguments, code=1):
 
 @pytest.fixture
 def model(tmp_path):
-    """A crooked block: no turn maps it to itself."""
-    path = tmp_path / "model.ply"
-    block = trimesh.creation.box((2, 1.2, 0.8))
-    block.vertices *= 1 + np.random.default_rng(3).uniform(-0.3, 0.3, block.vertices.shape)
-    block.export(path)
-    return path
+    return crooked_block(tmp_path)
 
 
 # ------------------------------------------------------------------------------------------------- program

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-import trimesh
+from helpers import crooked_block
 from typer.testing import CliRunner
 
 import rts
@@ -25,12 +25,7 @@ def run(*arguments, code=0):
 
 @pytest.fixture
 def model(tmp_path):
-    """A crooked block: no turn maps it to itself."""
-    path = tmp_path / "model.ply"
-    block = trimesh.creation.box((2, 1.2, 0.8))
-    block.vertices *= 1 + np.random.default_rng(3).uniform(-0.3, 0.3, block.vertices.shape)
-    block.export(path)
-    return path
+    return crooked_block(tmp_path)
 
 
 @pytest.fixture

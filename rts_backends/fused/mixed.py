@@ -139,20 +139,9 @@ def composited(total, change, c):
 @compiled
 def tint_of(pixel, total, positions, row, y, x, choice, scale, peak, gamma, t_rgba):
     """Add to a pixel (4,) what a target changes by along a tangent (N, 4) of colours."""
-    _, height, width = row.shape
-    change = np.zeros((3, 5), total.dtype)
-    for n in range(9):
-        v, u = n // 3 - 1, n % 3 - 1
-        py, px = y - v, x - u
-        if not (0 <= py < height and 0 <= px < width):
-            continue
-        for b in range(3):
-            for k in range(choice[n, b, 0], choice[n, b, 1]):
-                i = row[k, py, px]
-                if i >= 0:
-                    w, _, _ = splat(positions, i, py, px, u, v, scale, peak, gamma)
-                    for c in range(4):
-                        change[b, c] += w / max(total[b, 4], total.dtype.type(1)) * t_rgba[i, c]
+    # Weights do not change with colours: sums of their tangents are as those of colours.
+    change = np.empty((3, 5), total.dtype)
+    sums_of(change, positions, t_rgba, row, y, x, choice, scale, peak, gamma)
     for c in range(4):
         pixel[c] += composited(total, change, c)
 
