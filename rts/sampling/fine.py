@@ -14,7 +14,7 @@ from rts.interfaces import AnyNeeded
 from rts.records import Fine, Sampled
 from rts.sampling.adaptive import Adaptive, contrasts, outlines
 from rts.sampling.pruning import as_needed, planned
-from rts.sampling.tiles import Grid, InTiles, Layout, Room, arranged, lay_out, needed_room, of_engine, rounded
+from rts.sampling.strips import Grid, InStrips, Layout, arranged, lay_out, of_engine, rounded
 from rts.splatting.layers import dilated
 
 
@@ -50,7 +50,7 @@ def fine_samples(
     layers: int | Literal["auto"],
     capacity: int | None,
 ) -> Fine:
-    """Fine samples of active pixels and their apron, in tiles.
+    """Fine samples of active pixels and their apron, in strips.
 
     Args:
         coarse: one sample a pixel.
@@ -62,9 +62,10 @@ def fine_samples(
         capacity: rows to allot, or None for as many as there are, or could be.
     """
     sizes, engine = [s.ids.shape[-2] for s in coarse.samples], engine_of(coarse)
-    room, most = grid.room(capacity, planned(layers)), planned(layers)
+    most = planned(layers)
     row, depth = engine.known(coarse.row), engine.known(coarse.depth)
     if row is None or depth is None or row.ndim != 3:
+        room = grid.room(capacity, most)
         check_memory(1, room.cells, most, capacity, gradient=engine.differentiates)
 
         def laid_out(row: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -74,12 +75,11 @@ def fine_samples(
         known, allotted = None, most * room.cells
     else:
         pixels, few = active(row, depth, sizes, coarse.apron, where), engine.padded(coarse.row)
-        room = needed_room(pixels, grid) if capacity is None else room
-        room = Room(rounded(room.tiles), room.cells) if few else room
+        room = None if capacity is None else grid.room(capacity, most)
         host = lay_out(pixels, grid, room, rounded if few else int)
         check_memory(1, host.cells.size, most, capacity, gradient=engine.differentiates)
         layout, allotted = of_engine(host, engine, coarse.depth), None
-        known = None if needed is None else InTiles(needed, host)
+        known = None if needed is None else InStrips(needed, host)
     taken = partial(take, capacity=allotted, cells=layout.cells)
     sampled = taken(layers, known) if layers != "auto" else as_needed(taken, known)
     return arranged(sampled, layout, grid)

@@ -21,7 +21,7 @@ from rts.sampling.fine import Where, fine_samples
 from rts.sampling.merging import merge
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.pruning import Everything, as_needed, needed_by, planned, prune
-from rts.sampling.tiles import Grid, at_cells
+from rts.sampling.strips import Grid, at_cells
 from rts.splatting.visible import Visible
 from rts.trees import Array, Tree
 
