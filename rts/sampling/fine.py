@@ -32,9 +32,17 @@ class Where(NamedTuple):
     colors: np.ndarray | None = None
 
 
-def active(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], apron: int, where: Where) -> np.ndarray:
+def active(
+    row: np.ndarray,
+    depth: np.ndarray,
+    settled: np.ndarray | None = None,
+    *,
+    sizes: Sequence[int],
+    apron: int,
+    where: Where,
+) -> np.ndarray:
     """Active pixels (H, W) bool of coarse samples (K, ·, ·) with an apron; see `outlines`."""
-    found = outlines(row, depth, sizes)
+    found = outlines(row, depth, sizes, settled)
     if where.colors is not None and where.adaptive.contrast is not None:
         found |= contrasts(row[0], where.colors, where.adaptive.contrast)
     found = dilated(found) if where.dilates else found
@@ -62,19 +70,20 @@ def fine_samples(
         capacity: rows to allot, or None for as many as there are, or could be.
     """
     sizes, engine = [s.ids.shape[-2] for s in coarse.samples], engine_of(coarse)
-    most = planned(layers)
-    row, depth = engine.known(coarse.row), engine.known(coarse.depth)
-    if row is None or depth is None or row.ndim != 3:
+    most, told = planned(layers), [coarse.row, coarse.depth, *([] if coarse.settled is None else [coarse.settled])]
+    find = partial(active, sizes=sizes, apron=coarse.apron, where=where)
+    given = [engine.known(x) for x in told]
+    if given[0] is None or given[1] is None or given[0].ndim != 3:
         room = grid.room(capacity, most)
         check_memory(1, room.cells, most, capacity, gradient=engine.differentiates)
 
-        def laid_out(row: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, ...]:
-            return tuple(lay_out(active(row, depth, sizes, coarse.apron, where), grid, room))
+        def laid_out(*given: np.ndarray) -> tuple[np.ndarray, ...]:
+            return tuple(lay_out(find(*given), grid, room))
 
-        layout = Layout(*engine.call_host(laid_out, Layout.specs(grid, room), coarse.row, coarse.depth))
+        layout = Layout(*engine.call_host(laid_out, Layout.specs(grid, room), *told))
         known, allotted = None, most * room.cells
     else:
-        pixels, few = active(row, depth, sizes, coarse.apron, where), engine.padded(coarse.row)
+        pixels, few = find(*given), engine.padded(coarse.row)
         room = None if capacity is None else grid.room(capacity, most)
         host = lay_out(pixels, grid, room, rounded if few else int)
         check_memory(1, host.cells.size, most, capacity, gradient=engine.differentiates)

@@ -137,7 +137,7 @@ def sampled_scene(
     """
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, capacity=capacity)
     if isinstance(supersample, Adaptive):
-        coarse = sampled_scene(scene, camera, size, supersample=1, **options)
+        coarse = sampled_scene(scene, camera, size, supersample=1, settles=settles, **options)
         fine = fine_scene(scene, camera, size, coarse, adaptive=supersample, **options)
         return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)
     side = int(supersample)
