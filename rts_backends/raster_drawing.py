@@ -46,7 +46,7 @@ def draw_cells(
 ):
     """As `draw`, of some cells: arrays (K, M) are of their list; `bits`, `table` and `numbers` are those of `Blocks`.
 
-    Each band is drawn as a picture, of which only the blocks that hold such cells are touched.
+    Each band is drawn as a picture, of which only what is near such cells is touched.
     """
     triangle_ids, barycentrics, depths = fragments
     layers, height, width = len(triangle_ids), len(bits), table.shape[1] * BAND_ROWS
@@ -54,23 +54,34 @@ def draw_cells(
     within = np.empty((layers, BAND_ROWS, width, 2), np.float32)
     given = offsets, items, listed, vertices, matrix, view_depth, keep, bits
     for band in range(first, last):
-        for column in range(table.shape[1]):
-            if table[band, column] >= 0:
-                block = slice(column * BAND_ROWS, (column + 1) * BAND_ROWS)
-                nearest[:, :, block], drawn[:, :, block], within[:, :, block] = np.inf, -1, 0
-        _draw(band, given, min(height, (band + 1) * BAND_ROWS), 0, nearest, drawn, within)
-        for column in range(table.shape[1]):
-            if table[band, column] < 0:
-                continue
-            for row in range(BAND_ROWS):
+        top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
+        for j in range(top, end):
+            for column in range(table.shape[1]):
+                if bits[j, column] != 0:
+                    _clear(column * BAND_ROWS, nearest[:, j - top], drawn[:, j - top], within[:, j - top])
+        _draw(band, given, end, 0, nearest, drawn, within)
+        for j in range(top, end):
+            for column in range(table.shape[1]):
+                if bits[j, column] == 0:
+                    continue
                 for u in range(BAND_ROWS):
-                    m, i = numbers[table[band, column], row, u], column * BAND_ROWS + u
+                    m, i = numbers[table[band, column], j - top, u], column * BAND_ROWS + u
                     if m < 0:
                         continue
                     for k in range(layers):
-                        z = nearest[k, row, i]
-                        triangle_ids[k, m], depths[k, m] = drawn[k, row, i], z if z < np.inf else 0.0
-                        barycentrics[k, m, 0], barycentrics[k, m, 1] = within[k, row, i, 0], within[k, row, i, 1]
+                        z = nearest[k, j - top, i]
+                        triangle_ids[k, m], depths[k, m] = drawn[k, j - top, i], z if z < np.inf else 0.0
+                        barycentrics[k, m, 0] = within[k, j - top, i, 0]
+                        barycentrics[k, m, 1] = within[k, j - top, i, 1]
+
+
+@compiled
+def _clear(first, nearest, triangle_ids, barycentrics):
+    """Empty the layers (K, W) of as many cells of a row as a block has."""
+    for k in range(len(nearest)):
+        for i in range(first, first + BAND_ROWS):
+            nearest[k, i], triangle_ids[k, i] = np.inf, -1
+            barycentrics[k, i, 0] = barycentrics[k, i, 1] = np.float32(0)
 
 
 @compiled(error_model="numpy")
