@@ -30,7 +30,7 @@ def put(start, stop, image, fine, pixel, side, out):
 
 @kernel
 def pull(start, stop, g, pixel, side, image, fine):
-    """Gradients of both images, zeros to be filled, from rows [start, stop) of the result's; nothing of one without rows."""
+    """Gradients of both images, zeros to be filled, from rows [start, stop) of the result's; none without rows."""
     _, width, channels = g.shape
     across, share = fine.shape[1] // side, g.dtype.type(1) / g.dtype.type(side * side)
     for y in range(start, stop):
