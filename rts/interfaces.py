@@ -75,10 +75,13 @@ class Surface(Evaluator):
     Attributes:
         sample_widths: (I, P), how many integers and reals a sample has, after `refine`. Every surface sets it.
         centered: whether samples lie on the rays through cells' centres.
+        param_step: by how much the two `params` of a sample are changed to tell how position and uv change with them,
+            which mipmaps go by; larger where both are linear in them.
     """
 
     sample_widths: tuple[int, int] = (-1, -1)
     centered: bool = True
+    param_step: float = 2**-8
 
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Raise an `InputError` of one line where an entry is missing or of a wrong shape; values may be traced."""
