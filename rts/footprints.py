@@ -34,8 +34,8 @@ def uv_footprint(
     """∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y (N, 4) for one cell to the right and one cell down; without derivative.
 
     It is the derivative on the tangent plane of each sample, so that it looks at no other sample: outlines and seams of
-    uv have no effect. The surface is evaluated at parameters beside the sample's, `Surface.param_step` away; the projection
-    is differentiated exactly.
+    uv have no effect. The surface is evaluated at parameters beside the sample's, `Surface.param_step` away; the
+    projection is differentiated exactly.
 
     Args:
         surface: a surface of two parameters a sample.
@@ -52,8 +52,8 @@ def uv_footprint(
     """
     if samples.params.shape[-1] != 2:
         raise InputError(
-            f"{surface!r} has {samples.params.shape[-1]} parameters a sample; {FOOTPRINT!r}, which mipmaps need, is known "
-            f"where there are two"
+            f"{surface!r} has {samples.params.shape[-1]} parameters a sample; expected two: without them "
+            f"{FOOTPRINT!r}, which mipmaps need, is not known"
         )
     given = theta, camera, gbuffer["position"], gbuffer["uv"], samples.params
     theta, camera, position, uv, params = (stopped(constants(x, engine, like)) for x in given)

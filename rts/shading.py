@@ -3,7 +3,8 @@
 A shader is any function `shader(theta, gbuffer, camera) -> (N, 4)`. What it reads of θ is differentiable:
 
     "color" (3,) or (4,)             factor on the base colour
-    "texture" (h, w, C)              row 0 on top, C = 1, 3 or 4; sampled at gbuffer["uv"], whose v points up
+    "texture" (h, w, C)              row 0 on top, C = 1, 3 or 4; sampled at gbuffer["uv"], whose v points up; averaged
+                                     over gbuffer["uv_footprint"] by shaders with `mip=True`
     "light"                          dict of "direction" (3,) or (L, 3) towards the light, world space; "color" (3,) or
                                      (L, 3); "ambient" (3,). Default: one white light from above the camera's left
                                      shoulder and an ambient 0.2.
@@ -25,8 +26,8 @@ from rts.arrays import described, is_finite, shape_of, unit
 from rts.camera import Camera
 from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
-from rts.gbuffer import GBuffer
 from rts.footprints import FOOTPRINT
+from rts.gbuffer import GBuffer
 from rts.interfaces import Shader
 from rts.textures import WRAPS, sample_texture
 from rts.trees import Array, Tree, map_leaves
@@ -103,7 +104,7 @@ class Unlit(Shader):
     def __post_init__(self):
         if not isinstance(self.wrap, str) or self.wrap not in WRAPS:
             raise InputError(f"wrap is {quoted(self.wrap)}; expected one of {', '.join(WRAPS)}")
-        if self.mip:
+        if self.mip and self.reads is not None:
             object.__setattr__(self, "reads", (*self.reads, FOOTPRINT))
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
