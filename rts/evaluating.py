@@ -69,7 +69,7 @@ def _shown(
     engine: Engine,
     like: Array | None,
 ) -> tuple[Array, Array]:
-    """Positions (N, 3) in a grid and colours (N, 4) of the samples of all parts, in order.
+    """Positions (N, 3) in a grid and colours (N, C + 1) of the samples of all parts, in order.
 
     Args:
         sampled: the samples of each part.

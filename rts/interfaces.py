@@ -388,8 +388,10 @@ class Shader(Plugin):
         opaque: a promise that alpha is 1.
         uniform: a promise that all samples of a part have one colour.
         reads: the entries of the G-buffer that it needs besides position; None for all.
+        channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
     """
 
+    channels: int = 3
     opaque: bool = False
     uniform: bool = False
     reads: tuple[str, ...] | None = None
@@ -404,7 +406,8 @@ class Shader(Plugin):
             camera: the camera of the whole image.
 
         Returns:
-            (N, 4) premultiplied linear RGBA, in [0, 1].
+            (N, 4) premultiplied linear RGBA, in [0, 1]; (N, C + 1), alpha last, of a shader with other `channels`, all
+            of them multiplied by alpha and otherwise of any value.
 
         Raises:
             InputError: an entry that the shader needs is missing.
