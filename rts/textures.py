@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from rts.arrays import described, shape_of
@@ -36,7 +38,7 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
         )
     height, width, channels = shape
     if footprint is None:
-        return _bilinear(xp.reshape(texture, (height * width, channels)), uv, wrap, height, width, 0)
+        return _bilinear(xp.reshape(texture, (height * width, channels)), uv, wrap, height, width)
     levels, engine = pyramid(texture), engine_of(texture, uv)
     table = xp.concat([xp.reshape(x, (-1, channels)) for x in levels])
     sizes = np.array([x.shape[:2] for x in levels])
@@ -97,27 +99,33 @@ def _halved(x: Array) -> Array:
     return (m / n - part) * x[0:-1:2, ...] + m / n * x[1::2, ...] + (part + 1 / n) * x[2::2, ...]
 
 
-def _bilinear(flat: Array, uv: Array, wrap: str, height: Array, width: Array, first: Array) -> Array:
-    """(N, C) of a table whose rows from `first` on are a texture's texels, line by line.
+def _bilinear(flat: Array, uv: Array, wrap: str, height: Any, width: Any, first: Array | None = None) -> Array:
+    """Bilinear lookup (N, C) in a table of the texels of one texture, line by line, or of several, one after the other.
 
-    Height, width and first row are numbers, or arrays (N,): floats of uv's dtype, and integers.
+    Args:
+        flat: (M, C).
+        uv: (N, 2).
+        wrap: see `sample_texture`.
+        height: of the texture; where there are several, (N,) floats of uv's dtype.
+        width: as the height.
+        first: (N,) integers, the row of the table that is a texture's first; None for a single texture.
     """
     xp = namespace(flat, uv)
+    columns = width if first is None else xp.astype(width, xp.int32)
     x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
     x0, y0 = xp.floor(x), xp.floor(y)
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
 
     def texel(dx: int, dy: int) -> Array:
-        columns = width if isinstance(width, int) else xp.astype(width, xp.int32)
         index = _wrapped(y0 + dy, height, wrap) * columns + _wrapped(x0 + dx, width, wrap)
-        return xp.take(flat, index + first, axis=0)
+        return xp.take(flat, index if first is None else index + first, axis=0)
 
     top = texel(0, 0) + fx * (texel(1, 0) - texel(0, 0))
     bottom = texel(0, 1) + fx * (texel(1, 1) - texel(0, 1))
     return top + fy * (bottom - top)
 
 
-def _wrapped(index: Array, count: Array, wrap: str) -> Array:
+def _wrapped(index: Array, count: Any, wrap: str) -> Array:
     """Whole-numbered floats as indices in [0, count)."""
     xp = namespace(index)
     index = xp.where(index == index, index, 0.0)  # NaN has no texel; as an index it would be out of range.

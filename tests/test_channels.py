@@ -6,6 +6,7 @@ from helpers import ALL, CAMERA, DIFFERENTIABLE, SIZE, arrays, gradient, icosphe
 
 import rts
 from rts.errors import InputError
+from rts.splatting import Visible
 
 pytestmark = pytest.mark.rendering
 
@@ -65,7 +66,7 @@ def test_each_channel_is_as_in_an_image_of_three(target, count):
         {"splatter": "single", "supersample": 2},
         {"supersample": rts.Adaptive(3)},
         {"supersample": rts.Adaptive(3, contrast=0.5)},
-        {"splatter": rts.splatting.Visible()},
+        {"splatter": Visible()},
     ],
     ids=str,
 )
@@ -137,9 +138,11 @@ def test_features_are_fitted_to_an_image_of_theirs():
 def test_what_does_not_fit_is_refused():
     parts, plain = scene(0, 7), mesh_part(quad())
 
-    def short(theta, gbuffer, camera):
-        return gbuffer["features"]
+    class Short(rts.Shader):
+        def __call__(self, theta, gbuffer, camera):
+            return gbuffer["features"]
 
+    short = Short()
     with pytest.raises(InputError, match="part 0 gives 7 channels and that of part 1 gives 3"):
         show([parts[0], plain])
     with pytest.raises(InputError, match=r"expected \(\d+, 4\): 3 channels and alpha, as its attribute `channels`"):
