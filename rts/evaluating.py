@@ -91,11 +91,11 @@ def _shown(
         reads = part.surface.reads(part.theta)
         local = _evaluate(part, reads, samples, engine, like)
         own = seen.within(transform)
+        if "uv" in local and FOOTPRINT not in local:
+            given = part.surface, {k: part.theta[k] for k in reads}, samples, local, own, wide.grid, engine, like
+            local.defer(FOOTPRINT, partial(uv_footprint, *given))
         theta = {k: v if k in reads else constants(v, engine, like) for k, v in part.theta.items()}
         world = _to_world(_readable(local, samples, engine), transform)
-        if "uv" in local and FOOTPRINT not in local:
-            given = part.surface, {k: theta[k] for k in reads}, samples, local, own, wide.grid, engine, like
-            world.defer(FOOTPRINT, partial(uv_footprint, *given))
         rgba = _shaded(part, theta, world, camera)
         check_shaded(rgba, local["position"].shape[0], part.shader)
         positions.append(constants(own.project(local["position"], wide.grid), engine, dtype))

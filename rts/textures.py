@@ -82,6 +82,7 @@ def level_of(footprint: Array, size: tuple[int, int]) -> Array:
     xp, (height, width), f = namespace(footprint), size, stopped(footprint)
     u, v = f[:, 0::2] * width, f[:, 1::2] * height
     texels = xp.max(u * u + v * v, axis=1)
+    texels = xp.where(texels == texels, texels, 1.0)  # NaN is no level.
     coarsest = max(height, width).bit_length() - 1
     return xp.clip(0.5 * xp.log2(xp.clip(texels, 1.0, 4.0**coarsest)), 0.0, float(coarsest))
 

@@ -71,8 +71,10 @@ def test_each_level_averages_equal_areas_of_the_one_before(target, size):
 
 
 def test_the_level_is_the_logarithm_of_the_longer_side_in_texels():
-    footprint = np.array([(1 / 16, 0, 0, 1 / 8), (3 / 16, 4 / 8, 0, 0), (0, 0, 0, 0), (9, 0, 0, 9), (0, np.inf, 0, 0)])
-    expected = [0, np.log2(5), 0, 4, 4]
+    footprint = np.array(
+        [(1 / 16, 0, 0, 1 / 8), (3 / 16, 4 / 8, 0, 0), (0, 0, 0, 0), (9, 0, 0, 9), (0, np.inf, 0, 0), (0, np.nan, 0, 0)]
+    )
+    expected = [0, np.log2(5), 0, 4, 4, 0]
     np.testing.assert_allclose(level_of(footprint, (8, 16)), expected)
 
 
