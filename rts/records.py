@@ -135,10 +135,10 @@ class Samples:
 
 @record(static=("supersample", "apron"))
 class Fine:
-    """The fine samples of an adaptively sampled scene: cells of active pixels and an apron around them, in tiles.
+    """The fine samples of an adaptively sampled scene: cells of active pixels and an apron around them, in strips.
 
-    Tiles lie side by side in one layout of h × w cells, which splatters take as they take any picture. What lies
-    outside of active pixels there is no part of the image.
+    Runs of strips lie side by side in one layout of h × w cells, which splatters take as they take any picture. What
+    lies outside of active pixels there is no part of the image.
 
     Attributes:
         samples: one `Samples` for each part; `row` and `depth` are of a list of cells.
