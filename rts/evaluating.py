@@ -140,7 +140,7 @@ def evaluated_together(
 
 
 def _can_be_joined(view: Sampled, engine: Engine) -> bool:
-    """Whether samples can stand in one table with those of other views: in rows that are all used, and no table else."""
+    """Whether samples can stand in one table with those of other views: all rows are used, and no table is shared."""
     if not engine.owns(view.row) or engine.padded(view.row):
         return False
     return all(s.gbuffer is None and set(s.by_sample) == set(s.tables) for s in view.samples)

@@ -297,15 +297,15 @@ def splatted(
     if splats is None:
         splats = to_splats(sampled, scene.parts, scene.camera, window, *suited)
     if sampled.fine is None:
-        image = _cropped(splatter, splats)
+        image = cropped(splatter, splats)
         return image if sampled.supersample == 1 else averaged(image, sampled.supersample)
     coarse = constants(sampled.fine.coarse, *suiting(splats.rgba))
-    image = _cropped(splatter, splats.replace(wanted=coarse))
-    finer = _cropped(splatter, to_fine_splats(sampled.fine, scene.parts, scene.camera, *suited))
+    image = cropped(splatter, splats.replace(wanted=coarse))
+    finer = cropped(splatter, to_fine_splats(sampled.fine, scene.parts, scene.camera, *suited))
     return with_inset(image, finer, constants(sampled.fine.pixel, engine_of(image), image), sampled.fine.supersample)
 
 
-def _cropped(splatter: Splatter, splats: Splats) -> Array:
+def cropped(splatter: Splatter, splats: Splats) -> Array:
     """The image (h, w, 4) of splats without their border."""
     image = splatter.cropped(splats)
     expected = *(n - 2 * splats.border for n in splats.row.shape[1:]), 4

@@ -135,7 +135,8 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
         *args: handed on.
         work: nanoseconds that it takes on one thread, roughly.
     """
-    if work < LITTLE_WORK or count <= 1 or (threads := thread_count()) == 1:
+    # In a task of another loop there may be no helper left, and to ask takes time.
+    if work < LITTLE_WORK or count <= 1 or (threads := thread_count()) == 1 or not (free := _helpers.free(threads - 1)):
         kernel(0, count, *args)
         return
     tasks = min(count, threads * TASKS_PER_THREAD)
@@ -149,8 +150,7 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
     # The caller works too. A helper that has not woken by the time all is begun is not waited for.
     jobs: list[_Job] = []
     try:
-        # Of a loop inside of another's task there may be none left, and to ask takes time.
-        for _ in range(_helpers.free(threads - 1)):
+        for _ in range(free):
             jobs.append(_Job(share))
             _helpers.ask(jobs[-1], threads - 1)
         share()

@@ -12,11 +12,14 @@ from rts.checks import check_background, check_cameras, check_size, check_splatt
 from rts.engines import Engine, is_constant, namespace, suiting_scene, uncompiled
 from rts.errors import InputError
 from rts.evaluating import evaluated_together, to_splats
-from rts.interfaces import Part
-from rts.rendering import bands_of, image_of, over_background, seen, splatted
+from rts.interfaces import Part, Splatter
+from rts.operations.inset import averaged
+from rts.records import Splats
+from rts.rendering import bands_of, cropped, image_of, over_background, seen, splatted
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.scenes import Scene, sampled_scene
+from rts.splatting.side_by_side import Picture, at_once
 from rts.threads import each
 from rts.trees import Array
 
@@ -104,11 +107,28 @@ def _images(
 
     views = each(lambda own: sampled_scene(own, own.camera, size, settles=True, **options), scenes)
     evaluated = evaluated_together(views, scenes[0].parts, *suited)
+    splats = [
+        to_splats(sampled, own.parts, own.camera, own.camera, *suited, known)
+        for own, sampled, known in zip(scenes, views, evaluated, strict=True)
+    ]
+    splatter = options["splatter"]
+    if evaluated[0] is None or views[0].fine is not None:
+        shown = zip(scenes, views, splats, strict=True)
+        return [splatted(sampled, own, own.camera, suited, splatter, given) for own, sampled, given in shown]
+    most = at_once(splats[0].row.shape[1:])
     images = []
-    for scene, sampled, known in zip(scenes, views, evaluated, strict=True):
-        splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, *suited, known)
-        images.append(splatted(sampled, scene, scene.camera, suited, options["splatter"], splats))
+    for first in range(0, len(splats), most):
+        images += _side_by_side(splats[first : first + most], splatter, int(supersample))
     return images
+
+
+def _side_by_side(splats: Sequence[Splats], splatter: Splatter, side: int) -> list[Array]:
+    """The images of several views, by one splat."""
+    picture = Picture.of(len(splats), splats[0].row.shape[1:])
+    cells = picture.apart(cropped(splatter, picture.joined(splats)), splats[0].border)
+    xp, (count, height, width, _) = namespace(cells), cells.shape
+    image = cells if side == 1 else averaged(xp.reshape(cells, (count * height, width, 4)), side)
+    return list(xp.unstack(xp.reshape(image, (count, height // side, width // side, 4))))
 
 
 def _concurrent(scene: Scene) -> bool:
