@@ -204,7 +204,7 @@ class ImageResiduals(Residuals):
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
         """Mean square () of the n residuals, JᵀJ / n (U, U) and Jᵀr / n (U,) for the U numbers in the parameters."""
         if self._views:
-            self.scene(parameters)  # It says so if there are too many cameras, or too few.
+            self.scene(parameters)  # Refused where there are not as many cameras.
             found = [view.normal_equations(parameters) for view in self._views]
             value, matrix, gradient = (sum(x[1:], x[0]) / len(x) for x in zip(*found, strict=True))
             return value, matrix, gradient
