@@ -106,7 +106,7 @@ class Camera:
         cameras = list(cameras) if isinstance(cameras, (list, tuple)) else []
         if not cameras or not all(isinstance(camera, Camera) and not camera.is_stacked for camera in cameras):
             raise InputError("Camera.stack was not given a list of cameras of one view each")
-        aspects = {camera.aspect for camera in cameras}
+        aspects: set[Any] = {camera.aspect for camera in cameras}
         if "open" in aspects and len(aspects) > 1:
             raise InputError(
                 "some cameras know their ratio of width to height and some leave it open; call "

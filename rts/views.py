@@ -100,8 +100,8 @@ def _images(
         return [draw(scene) for scene in scenes]
     if not suited[0].differentiates:
         return each(draw, scenes)
-    supersample, layers = options["supersample"], options["layers"]
-    whole = len(bands_of(*size, layers, supersample)) == 1
+    supersample: Any = options["supersample"]
+    whole = len(bands_of(*size, options["layers"], supersample)) == 1
     if not whole or (isinstance(supersample, Adaptive) and supersample.contrast is not None):
         return [draw(scene) for scene in scenes]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -174,7 +174,7 @@ class ImageResiduals(Residuals):
         several = bool(self._views) or self._view is not None
         if not several and (not isinstance(camera, Camera) or camera.is_stacked):
             raise InputError("there are several cameras for a target of one view; expected targets (B, H, W, ·)")
-        cameras = check_cameras(camera) if several else [camera]
+        cameras: list[Any] = check_cameras(camera) if several else [camera]
         if self._views and len(cameras) != len(self._views):
             raise InputError(f"there are {len(cameras)} cameras for targets of {len(self._views)} views")
         cameras = cameras if self._view is None else [cameras[self._view]]
@@ -187,8 +187,8 @@ class ImageResiduals(Residuals):
 
     def _scene_as_given(self, parameters: Tree) -> tuple[Any, Cameras]:
         found = self._scene(parameters)
-        if isinstance(found, tuple) and len(found) == 2 and _are_cameras(found[1]):
-            return found[0], found[1]
+        if isinstance(found, tuple) and len(found) == 2 and _are_cameras(given := found[1]):
+            return found[0], given
         given = found if isinstance(found, (list, tuple)) else [found]
         if not given or not all(isinstance(part, (Part, PreparedParts)) for part in given):
             kinds = ", ".join(map(kind_of, given)) or "nothing"
@@ -357,7 +357,7 @@ def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tupl
     return xp.reshape(small, (*size, *kind[2:])), xp.reshape(xp.sqrt(total), (*size, *shape[2:]))
 
 
-def _are_cameras(given: Any) -> bool:
+def _are_cameras(given: Any) -> TypeGuard[Cameras]:
     """Whether it is a camera, or a list of some."""
     if isinstance(given, (list, tuple)):
         return len(given) > 0 and all(isinstance(camera, Camera) for camera in given)
@@ -367,7 +367,7 @@ def _are_cameras(given: Any) -> bool:
 def _view_count(target: Any, size: tuple[int, int]) -> int | None:
     """How many views a target is of; None for one, without an axis of its own."""
     if isinstance(target, (list, tuple)):
-        return len(target) if target and shape_of(target[0])[:2] == size else None
+        return len(target) if len(target) > 0 and shape_of(target[0])[:2] == size else None
     shape = shape_of(target)
     return shape[0] if len(shape) > 3 or (shape[1:3] == size and shape[:2] != size) else None
 
