@@ -118,7 +118,7 @@ def _images(
     most = at_once(splats[0].row.shape[1:])
     images = []
     for first in range(0, len(splats), most):
-        images += _side_by_side(splats[first : first + most], splatter, int(supersample))
+        images += _side_by_side(splats[first : first + most], splatter, int(options["supersample"]))
     return images
 
 

@@ -96,7 +96,7 @@ class ImageResiduals(Residuals):
             raise InputError(f"scene is {quoted(scene)}; expected a function: parameters → parts, or (parts, camera)")
         if camera is not None and not _are_cameras(camera):
             raise InputError(
-                f"camera is {quoted(camera)}; expected an rts.Camera, or several, or None where scene gives one"
+                f"camera is {quoted(camera)}; expected an rts.Camera, or None where scene gives one, or several cameras"
             )
         self.size = check_size(size, layers, capacity, finest(supersample))
         self._scene, self._camera, self._splatter = scene, camera, check_splatter(splatter)
@@ -367,7 +367,7 @@ def _are_cameras(given: Any) -> TypeGuard[Cameras]:
 def _view_count(target: Any, size: tuple[int, int]) -> int | None:
     """How many views a target is of; None for one, without an axis of its own."""
     if isinstance(target, (list, tuple)):
-        return len(target) if len(target) > 0 and shape_of(target[0])[:2] == size else None
+        return len(target) if any(shape_of(x)[:2] == size for x in target) else None
     shape = shape_of(target)
     return shape[0] if len(shape) > 3 or (shape[1:3] == size and shape[:2] != size) else None
 
