@@ -43,11 +43,33 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Chec
         kinds = ", ".join(sorted({type(p).__name__ for p in given})) or "nothing"
         raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
     if not isinstance(camera, Camera):
-        raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera")
+        several = isinstance(camera, (list, tuple)) and any(isinstance(c, Camera) for c in camera)
+        hint = "; rts.render_views takes several" if several else ""
+        raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera{hint}")
+    if camera.is_stacked:
+        raise InputError(
+            f"camera is of several views, its view {described(camera.view)}; expected that of one: rts.render_views "
+            f"takes several, and camera.unstack() gives them one by one"
+        )
     camera = _check_camera(camera)
     checked = [_check_part(index, part) for index, part in enumerate(given)]
     check_channels(checked)
     return checked, camera
+
+
+def check_cameras(cameras: Any) -> list[Camera]:
+    """Checked cameras of several views, of a list or of what `Camera.stack` made."""
+    if isinstance(cameras, Camera):
+        if not cameras.is_stacked:
+            raise InputError("cameras is the camera of one view; expected several, or what Camera.stack made of them")
+        listed = cameras.unstack()
+    else:
+        listed = list(cameras) if isinstance(cameras, (list, tuple)) else []
+        if not listed or not all(isinstance(camera, Camera) for camera in listed):
+            raise InputError(f"cameras is {quoted(cameras)}; expected a list of rts.Camera, or what Camera.stack made")
+        if any(camera.is_stacked for camera in listed):
+            raise InputError("cameras holds a stack; expected cameras of one view each, or one stack")
+    return [_check_camera(camera) for camera in listed]
 
 
 def _check_camera(camera: Camera) -> Camera:
@@ -159,7 +181,9 @@ def check_matrix(name: str, matrix: Any) -> Array:
     """A (4, 4) matrix of floating numbers; anything else is refused."""
     matrix = from_numbers(matrix, name)
     if shape_of(matrix) != (4, 4):
-        raise InputError(f"{name} {described(matrix)}; expected a (4, 4) array")
+        several = len(shape_of(matrix)) == 3 and shape_of(matrix)[1:] == (4, 4)
+        hint = "; for several views call rts.render_views, for several poses vmap of rts.render" if several else ""
+        raise InputError(f"{name} {described(matrix)}; expected a (4, 4) array{hint}")
     if isinstance(matrix, np.ndarray):
         return matrix if matrix.dtype.kind == "f" else matrix.astype(np.float64)
     check_floating(name, matrix)

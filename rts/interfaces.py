@@ -70,7 +70,7 @@ class Evaluator(Plugin):
 class Surface(Evaluator):
     """A kind of surface. It holds topology and is immutable; its numbers come as θ.
 
-    Subclass `TriangleSurface`, `RaySurface`, or both.
+    Subclass `TriangleSurface`, `RaySurface`, or both. Several threads may call its methods at once.
 
     Attributes:
         sample_widths: (I, P), how many integers and reals a sample has, after `refine`. Every surface sets it.
@@ -337,12 +337,14 @@ class Sampler(Plugin):
             the samples are then (K, L, C). Without it all cells are sampled, and those that are not listed left out.
         tells_facing: whether `sample` also takes the keyword `facing`: whether to find `Samples.facing`, which is of
             interest in cells with hidden samples, and beside them.
+        concurrent: whether several threads may call `sample` at once, so that `rts.render_views` takes views at once.
     """
 
     culls: bool = False
     prunes: bool = False
     takes_cells: bool = False
     tells_facing: bool = False
+    concurrent: bool = False
 
     @abc.abstractmethod
     def sample(

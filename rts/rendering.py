@@ -13,7 +13,17 @@ from rts.arguments import quoted
 from rts.camera import Camera
 from rts.channels import cropped_image
 from rts.checks import changed_part, check_background, check_changes, check_channels, check_size, check_splatter
-from rts.engines import constants, engine_of, is_constant, namespace, suiting, suiting_scene, uncompiled, value_of
+from rts.engines import (
+    Engine,
+    constants,
+    engine_of,
+    is_constant,
+    namespace,
+    suiting,
+    suiting_scene,
+    uncompiled,
+    value_of,
+)
 from rts.errors import EmptyImageWarning, InputError, warn
 from rts.evaluating import to_fine_splats, to_splats
 from rts.interfaces import Part, Splatter
@@ -146,33 +156,36 @@ class Renderer:
 PreparedParts._made = Renderer
 
 
-def _image(
+def _image(scene: Scene, size: tuple[int, int], background: Array | None, **options: Any) -> Array:
+    """The image of a scene for images of a size; see `render`."""
+    suited = scene.suited if is_constant(background) else scene.suiting(background)
+    return over_background(seen(image_of(scene, size, suited, **options), scene), background)
+
+
+def image_of(
     scene: Scene,
     size: tuple[int, int],
-    background: Array | None,
+    suited: tuple[Engine, Array | None],
     *,
     splatter: Splatter,
     layers: int | Literal["auto"],
     supersample: int | Adaptive,
     capacity: int | None,
 ) -> Array:
-    """The image of a scene for images of a size; see `render`."""
+    """The image of a scene for images of a size, over nothing; `suited` is for the half with derivatives."""
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
     bands = bands_of(*size, layers, supersample)
-    suited = scene.suited if is_constant(background) else scene.suiting(background)
     if isinstance(supersample, Adaptive) and supersample.contrast is not None:
-        image = _of_contrast(scene, size, suited, **options)
-        return _over_background(_seen(image, scene), background)
+        return _of_contrast(scene, size, suited, **options)
     if len(bands) == 1:
         sampled = sampled_scene(scene, scene.camera, size, settles=True, **options)
-        image = _splatted(sampled, scene, scene.camera, suited, splatter)
-        return _over_background(_seen(image, scene), background)
+        return splatted(sampled, scene, scene.camera, suited, splatter)
     images = []
     for top, rows in bands:
         window = scene.camera.window(size, (top, 0), (rows, size[1]))
         take = partial(sampled_scene, scene, window, (rows, size[1]), settles=True, **options)
-        images.append(suited[0].checkpoint(take, lambda s, w=window: _splatted(s, scene, w, suited, splatter)))
-    return _over_background(_seen(namespace(*images).concat(images), scene), background)
+        images.append(suited[0].checkpoint(take, lambda s, w=window: splatted(s, scene, w, suited, splatter)))
+    return namespace(*images).concat(images)
 
 
 def _of_contrast(
@@ -195,7 +208,7 @@ def _of_contrast(
             f"cannot depend on values that are not known yet"
         )
     fine = fine_scene(scene, scene.camera, size, coarse, adaptive=supersample, colors=colors, **options)
-    return _splatted(replace(coarse, fine=fine), scene, scene.camera, suited, splatter, splats)
+    return splatted(replace(coarse, fine=fine), scene, scene.camera, suited, splatter, splats)
 
 
 @uncompiled
@@ -250,7 +263,7 @@ def render_samples(
     sampled = _narrowed(sampled, apron - apron_of(splatter))
     background = check_background(background, size, scene.channels)
     suited = scene.suiting(sampled, background)
-    return _over_background(_splatted(sampled, scene, scene.camera, suited, splatter), background)
+    return over_background(splatted(sampled, scene, scene.camera, suited, splatter), background)
 
 
 def _narrowed(sampled: Sampled, cells: int) -> Sampled:
@@ -267,7 +280,7 @@ def _narrowed(sampled: Sampled, cells: int) -> Sampled:
     return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, **known)
 
 
-def _splatted(
+def splatted(
     sampled: Sampled,
     scene: Scene,
     window: Camera,
@@ -308,8 +321,8 @@ def bands_of(
     return [(top, end - top) for top, end in itertools.pairwise(edges)]
 
 
-def _seen(image: Array, scene: Scene) -> Array:
-    """The image, with a warning if nothing is seen in it."""
+def seen(image: Array, scene: Scene, name: str = "the image") -> Array:
+    """The image, with a warning if nothing is seen in it, which calls it by a name."""
     engine, (height, width) = engine_of(image), image.shape[:2]
     if not engine.on_host(image):
         seen = value_of(engine.namespace.any(image[..., -1] > 0))
@@ -318,11 +331,12 @@ def _seen(image: Array, scene: Scene) -> Array:
     known = engine.known(image)
     if known is None or known[..., :: max(1, height // 8), :: max(1, width // 8), -1].any() or known[..., -1].any():
         return image
-    warn(f"nothing is seen in the image: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
+    warn(f"nothing is seen in {name}: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
     return image
 
 
-def _over_background(image: Array, background: Array | None) -> Array:
+def over_background(image: Array, background: Array | None) -> Array:
+    """Images (..., H, W, 4) composited onto a background."""
     if background is None:
         return image
     over: Array = constants(background, engine_of(image), image)
