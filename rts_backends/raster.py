@@ -44,12 +44,13 @@ BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 class Raster(TriangleSampler):
     """K-buffer rasterization with a top-left fill rule; ties in depth go to the lower triangle index."""
 
-    _scratch: dict[tuple, tuple]
+    concurrent = True
+    _scratch: tuple[tuple, list[tuple]]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Give every instance room to keep scratch memory, whatever `__init__` a subclass has."""
         self = super().__new__(cls, *args, **kwargs)
-        self._scratch = {}  # At most one; whoever draws takes it out, so threads never share.
+        self._scratch = (), []  # Of one size alone; whoever draws takes his out, so threads never share.
         return self
 
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
@@ -79,10 +80,13 @@ class Raster(TriangleSampler):
         # Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
         # room for every vertex and triangle, but only what is used is ever touched.
         key = len(vertices), len(faces)
-        screen, listed = self._scratch.pop(key, None) or (
-            np.empty(len(vertices), np.int32),
-            np.empty((len(faces), LISTED), np.int32),
-        )
+        scratch = self._scratch
+        if scratch[0] != key:
+            scratch = self._scratch = key, []
+        try:
+            screen, listed = scratch[1].pop()
+        except IndexError:
+            screen, listed = np.empty(len(vertices), np.int32), np.empty((len(faces), LISTED), np.int32)
         step = (max(size) / 2 + 2) / float(LIMIT)
         to_steps = np.diag([1 / step, 1 / step, 1, 1])
         to_steps[:2, 3] = -width / 2 / step, -height / 2 / step
@@ -107,7 +111,7 @@ class Raster(TriangleSampler):
                     x[:, absent] = nothing
             flat = tuple(x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments)
             parallel(draw_cells, bands, *given, blocks.table, blocks.numbers, flat)
-        self._scratch = {key: (screen, listed)}
+        scratch[1].append((screen, listed))
         return fragments
 
 

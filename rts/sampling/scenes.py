@@ -94,6 +94,11 @@ class Scene(NamedTuple):
     entries: Sequence[Any]
     suited: tuple[Engine, Array | None]
 
+    @property
+    def channels(self) -> int:
+        """The number of channels that its shaders give, besides alpha."""
+        return self.parts[0].shader.channels
+
     @classmethod
     def of(
         cls,

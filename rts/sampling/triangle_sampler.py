@@ -35,6 +35,8 @@ class TriangleSampler(Sampler):
     Attributes:
         builds: whether something is worth building once for a proxy; True in a class with its own `prepare`.
         follows: whether what was prepared can follow moved vertices; True in a class with its own `update`.
+        concurrent: whether several threads may call `rasterize` at once; those of a sampler that `follows` wait for one
+            another in any case.
     """
 
     DECLARES = True
@@ -248,14 +250,7 @@ class TriangleSampler(Sampler):
         # Of tables there is but one set, so that no samples can be added later.
         more = surface.refines and surface.refine_moves and not tables
         grid = max(shape.layers + 1, LEAST_LAYERS) if more else shape.layers, *shape.size
-        with self._keeper.lock:
-            found = entry or self._entry(surface, inputs, camera, shape.view)
-            if len(found.proxy.faces):
-                given = found.prepared, camera, shape.view, grid[0], cull
-                fragments = self.rasterize(*given) if cells is None else self.rasterize_cells(*given, cells)
-                check_fragments(fragments, grid, len(found.proxy.faces), self)
-            else:
-                fragments = _no_fragments(grid)
+        found, fragments = self._fragments(surface, cull, inputs, camera, shape.view, grid, entry, cells)
         covered = fragments.triangle_ids >= 0
         if not (surface.refines and surface.refine_moves):
             kept = covered if needed is None else needed(covered, fragments.depth)
@@ -286,6 +281,33 @@ class TriangleSampler(Sampler):
             needed.ran_out(int((covered[-1] & ~left[-1]).sum()))
             kept = needed(left, settled.depth)
         return repack(settled, kept, shape.capacity)
+
+    def _fragments(
+        self,
+        surface: TriangleSurface,
+        cull: str,
+        inputs: Tree,
+        camera: Camera,
+        view: tuple[int, int],
+        grid: tuple[int, int, int],
+        entry: Entry | None,
+        cells: np.ndarray | None,
+    ) -> tuple[Entry, Fragments]:
+        """What is prepared of a surface, and the fragments (K, ·, ·) of a grid of the size `view`, or of some cells."""
+
+        def drawn(found: Entry) -> Fragments:
+            if not len(found.proxy.faces):
+                return _no_fragments(grid)
+            given = found.prepared, camera, view, grid[0], cull
+            fragments = self.rasterize(*given) if cells is None else self.rasterize_cells(*given, cells)
+            check_fragments(fragments, grid, len(found.proxy.faces), self)
+            return fragments
+
+        with self._keeper.lock:
+            found = entry or self._entry(surface, inputs, camera, view)
+            if self.follows or not self.concurrent:
+                return found, drawn(found)
+        return found, drawn(found)
 
 
 class _Shape(NamedTuple):
