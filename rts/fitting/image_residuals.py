@@ -359,9 +359,8 @@ def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tupl
 
 def _are_cameras(given: Any) -> TypeGuard[Cameras]:
     """Whether it is a camera, or a list of some."""
-    if isinstance(given, (list, tuple)):
-        return len(given) > 0 and all(isinstance(camera, Camera) for camera in given)
-    return isinstance(given, Camera)
+    listed: list[Any] = list(given) if isinstance(given, (list, tuple)) else [given]
+    return len(listed) > 0 and all(isinstance(camera, Camera) for camera in listed)
 
 
 def _view_count(target: Any, size: tuple[int, int]) -> int | None:
