@@ -571,6 +571,10 @@ class Camera:
         size, points = check_pixels(size), from_numbers(points, "points")
         if shape_of(points)[-1:] != (3,):
             raise InputError(f"points {described(points)}; expected (N, 3)")
+        return projective_map(self.pixel_rows(size), points)
+
+    def pixel_rows(self, size: tuple[int, int]) -> Array:
+        """Affine maps (4, 4) of world points: pixel x times w, pixel y times w, w, and linear depth."""
         (x, y), p = (size[1] / 2, size[0] / 2), self.for_size(size).projection
         from_clip = np.array([[x, 0, 0, x], [0, -y, 0, y], [0, 0, 0, 1], [0, 0, 0, 0]])
         depth = np.zeros((4, 4))
@@ -578,8 +582,7 @@ class Camera:
         engine, own = engine_of(p), engine_of(self.view)
         # Products of constant matrices are computed in NumPy.
         rows = matmul(engine.constant(from_clip, p), p) + engine.constant(depth, p)
-        rows = matmul(constants(rows, own, None if is_constant(self.view) else self.view), self.view)
-        return projective_map(rows, points)
+        return matmul(constants(rows, own, None if is_constant(self.view) else self.view), self.view)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""

@@ -52,7 +52,9 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Chec
             f"takes several, and camera.unstack() gives them one by one"
         )
     camera = _check_camera(camera)
-    return [_check_part(index, part) for index, part in enumerate(given)], camera
+    checked = [_check_part(index, part) for index, part in enumerate(given)]
+    check_channels(checked)
+    return checked, camera
 
 
 def check_cameras(cameras: Any) -> list[Camera]:
@@ -97,6 +99,32 @@ def _check_part(index: int, part: Part) -> CheckedPart:
     if isinstance(reads, str) or not set(reads) <= set(theta):
         raise InputError(f"reads of {surface!r} gave {reads!r}; expected names of entries of theta: {sorted(theta)}")
     return CheckedPart(surface, theta, shader, transform, part.cull)
+
+
+def check_channels(parts: Sequence[CheckedPart]) -> int:
+    """The number of channels besides alpha that the shaders of all parts give, refused where it is not one number."""
+    count = parts[0].shader.channels
+    for index, part in enumerate(parts):
+        if not is_count(part.shader.channels):
+            raise InputError(
+                f"channels of the shader {quoted(part.shader)} is {quoted(part.shader.channels)}; expected an integer "
+                f"of at least 1"
+            )
+        if part.shader.channels != count:
+            raise InputError(
+                f"the shader of part 0 gives {count} channels and that of part {index} gives {part.shader.channels}; "
+                f"expected the same number for all parts of a scene"
+            )
+    return count
+
+
+def check_colors(channels: int) -> None:
+    """Refuse images that are no colours, where they are to be looked at as such."""
+    if channels != 3:
+        raise InputError(
+            f"the scene's shaders give {channels} channels besides alpha; expected 3: look at three of them at a "
+            f"time, by a shader that gives those"
+        )
 
 
 def check_changes(index: int, changes: Mapping[str, Any], count: int) -> None:
@@ -213,15 +241,17 @@ def is_real(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
-def check_background(background: Any, size: tuple[int, int]) -> Array | None:
-    """The background as an array, refused where it fits no image of this size."""
+def check_background(background: Any, size: tuple[int, int], channels: int) -> Array | None:
+    """The background as an array, refused where it fits no image of this size and number of channels."""
     if background is None:
         return None
     background = from_numbers(background, "background")
-    if shape_of(background) not in ((3,), (4,), (*size, 3), (*size, 4)):
+    few, all_ = channels, channels + 1
+    if shape_of(background) not in ((few,), (all_,), (*size, few), (*size, all_)):
         height, width = size
         raise InputError(
-            f"background {described(background)}; expected (3,), (4,), ({height}, {width}, 3) or ({height}, {width}, 4)"
+            f"background {described(background)}; expected ({few},), ({all_},), ({height}, {width}, {few}) or "
+            f"({height}, {width}, {all_})"
         )
     check_floating("background", background)
     if not is_finite(background):
@@ -235,10 +265,13 @@ def check_floating(name: str, value: Array) -> None:
         raise InputError(f"{name} has dtype {value.dtype}; expected floating numbers")
 
 
-def check_shaded(rgba: Any, count: int, shader: Any) -> None:
+def check_shaded(rgba: Any, count: int, shader: Shader) -> None:
     """Refuse what a shader should not have returned: another shape, or no floating numbers."""
-    if shape_of(rgba) != (count, 4):
-        raise InputError(f"what the shader {quoted(shader)} returned {described(rgba)}; expected ({count}, 4)")
+    expected, shape = (count, shader.channels + 1), shape_of(rgba)
+    if shape != expected:
+        other = len(shape) == 2 and shape[0] == count and shape[1] > 4
+        hint = f": {shader.channels} channels and alpha, as its attribute `channels` says" if other else ""
+        raise InputError(f"what the shader {quoted(shader)} returned {described(rgba)}; expected {expected}{hint}")
     check_floating(f"what the shader {quoted(shader)} returned", rgba)
 
 

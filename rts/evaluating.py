@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 from rts.arrays import described, shape_of
 from rts.camera import Camera
 from rts.checks import check_shaded, check_splats
 from rts.engines import Engine, constants, engine_of, is_constant, namespace, suiting
 from rts.errors import InputError
+from rts.footprints import FOOTPRINT, uv_footprint
 from rts.gbuffer import GBuffer
 from rts.interfaces import CheckedPart
 from rts.operations.linear import affine_map
@@ -77,7 +78,7 @@ def _shown(
     like: Array | None,
     evaluated: Sequence[GBuffer] | None = None,
 ) -> tuple[Array, Array]:
-    """Positions (N, 3) in a grid and colours (N, 4) of the samples of all parts, in order.
+    """Positions (N, 3) in a grid and colours (N, C + 1) of the samples of all parts, in order.
 
     Args:
         sampled: the samples of each part.
@@ -99,11 +100,15 @@ def _shown(
         transform = constants(part.transform, engine, like)
         reads = part.surface.reads(part.theta)
         local = _evaluate(part, reads, samples, engine, like) if evaluated is None else evaluated[index]
+        own = seen.within(transform)
+        if "uv" in local and FOOTPRINT not in local:
+            given = part.surface, {k: part.theta[k] for k in reads}, samples, local, own, wide.grid, engine, like
+            local.defer(FOOTPRINT, partial(uv_footprint, *given))
         theta = {k: v if k in reads else constants(v, engine, like) for k, v in part.theta.items()}
         world = _to_world(_readable(local, samples, engine), transform)
         rgba = _shaded(part, theta, world, camera)
         check_shaded(rgba, local["position"].shape[0], part.shader)
-        positions.append(constants(seen.within(transform).project(local["position"], wide.grid), engine, dtype))
+        positions.append(constants(own.project(local["position"], wide.grid), engine, dtype))
         check_splats(index, part, world, positions[-1], rgba, row, first)
         colors.append(constants(rgba, engine, dtype))
         first += samples.ids.shape[-2]

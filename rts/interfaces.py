@@ -75,10 +75,13 @@ class Surface(Evaluator):
     Attributes:
         sample_widths: (I, P), how many integers and reals a sample has, after `refine`. Every surface sets it.
         centered: whether samples lie on the rays through cells' centres.
+        param_step: by how much the two `params` of a sample are changed to tell how position and uv change with them,
+            which mipmaps go by; larger where both are linear in them.
     """
 
     sample_widths: tuple[int, int] = (-1, -1)
     centered: bool = True
+    param_step: float = 2**-8
 
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Raise an `InputError` of one line where an entry is missing or of a wrong shape; values may be traced."""
@@ -387,8 +390,10 @@ class Shader(Plugin):
         opaque: a promise that alpha is 1.
         uniform: a promise that all samples of a part have one colour.
         reads: the entries of the G-buffer that it needs besides position; None for all.
+        channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
     """
 
+    channels: int = 3
     opaque: bool = False
     uniform: bool = False
     reads: tuple[str, ...] | None = None
@@ -403,7 +408,8 @@ class Shader(Plugin):
             camera: the camera of the whole image.
 
         Returns:
-            (N, 4) premultiplied linear RGBA, in [0, 1].
+            (N, 4) premultiplied linear RGBA, in [0, 1]; (N, C + 1), alpha last, of a shader with other `channels`, all
+            of them multiplied by alpha and otherwise of any value.
 
         Raises:
             InputError: an entry that the shader needs is missing.

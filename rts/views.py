@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from rts.arrays import described, shape_of
 from rts.camera import Camera
+from rts.channels import cropped_image
 from rts.checks import check_background, check_cameras, check_size, check_splatter, suited_sampler
 from rts.engines import Engine, is_constant, namespace, suiting_scene, uncompiled
 from rts.errors import InputError
@@ -15,7 +16,7 @@ from rts.evaluating import evaluated_together, to_splats
 from rts.interfaces import Part, Splatter
 from rts.operations.inset import averaged
 from rts.records import Splats
-from rts.rendering import bands_of, cropped, image_of, over_background, seen, splatted
+from rts.rendering import bands_of, image_of, over_background, seen, splatted
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.scenes import Scene, sampled_scene
@@ -52,7 +53,7 @@ def render_views(
         splatter: as in `render`.
         layers: as in `render`.
         supersample: as in `render`.
-        background: as in `render`, of every view; or (B, H, W, 3 or 4).
+        background: as in `render`, of every view; or (B, H, W, ·), one for each.
         capacity: as in `render`; of each view.
         engine: as in `render`.
 
@@ -71,7 +72,7 @@ def render_views(
     scene, size = Scene.of(parts, listed[0], sampler, engine), check_size(size, layers, capacity, finest(supersample))
     suited = suiting_scene(scene.parts, listed, engine=engine)
     scenes = [scene._replace(camera=camera, suited=suited).at(size) for camera in listed]
-    background = _check_backgrounds(background, len(listed), size)
+    background = _check_backgrounds(background, len(listed), size, scene.channels)
     if not is_constant(background):
         suited = scene.suiting(listed, background)
     options: dict[str, Any] = dict(
@@ -82,13 +83,13 @@ def render_views(
     return over_background(namespace(*images).stack(images), background)
 
 
-def _check_backgrounds(background: Any, count: int, size: tuple[int, int]) -> Array | None:
+def _check_backgrounds(background: Any, count: int, size: tuple[int, int], channels: int) -> Array | None:
     """One background for all views, or one for each."""
     if background is None or len(shape_of(background)) < 4:
-        return check_background(background, size)
+        return check_background(background, size, channels)
     if shape_of(background)[0] != count:
         raise InputError(f"background {described(background)}; expected ({count}, ...), one for each view, or one")
-    return namespace(background).stack([check_background(background[b, ...], size) for b in range(count)])
+    return namespace(background).stack([check_background(background[b, ...], size, channels) for b in range(count)])
 
 
 def _images(
@@ -125,10 +126,10 @@ def _images(
 def _side_by_side(splats: Sequence[Splats], splatter: Splatter, side: int) -> list[Array]:
     """The images of several views, by one splat."""
     picture = Picture.of(len(splats), splats[0].row.shape[1:])
-    cells = picture.apart(cropped(splatter, picture.joined(splats)), splats[0].border)
-    xp, (count, height, width, _) = namespace(cells), cells.shape
-    image = cells if side == 1 else averaged(xp.reshape(cells, (count * height, width, 4)), side)
-    return list(xp.unstack(xp.reshape(image, (count, height // side, width // side, 4))))
+    cells = picture.apart(cropped_image(splatter, picture.joined(splats)), splats[0].border)
+    xp, (count, height, width, channels) = namespace(cells), cells.shape
+    image = cells if side == 1 else averaged(xp.reshape(cells, (count * height, width, channels)), side)
+    return list(xp.unstack(xp.reshape(image, (count, height // side, width // side, channels))))
 
 
 def _concurrent(scene: Scene) -> bool:

@@ -21,7 +21,7 @@ from rts.compiling import compiled, kernel
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel, read_only
-from rts_backends import raster_cells
+from rts_backends.raster_cells import Blocks, touches
 from rts_backends.raster_drawing import BAND_ROWS, LISTED, draw, draw_cells
 from rts_backends.triangles import facing, pixel_matrix, to_corner
 
@@ -93,28 +93,24 @@ class Raster(TriangleSampler):
         parallel(_project, len(vertices), vertices, to_steps @ matrix, screen, work=4 * len(vertices))
         chunks, bands = -(-len(faces) // CHUNK), -(-height // BAND_ROWS)
         spans, counts = np.empty((chunks, 2), np.int64), np.zeros((bands, chunks), np.int64)
-        given = vertices, faces, screen, matrix, height, width, step, keep
+        blocks = Blocks.everything() if cells is None else Blocks.of(cells, size)
+        given = vertices, faces, screen, matrix, height, width, step, keep, blocks.bits
         parallel(_select, chunks, *given, listed, spans, counts, work=10 * len(faces))
-        blocks = None if cells is None else raster_cells.Blocks.of(cells, size)
-        if blocks is not None:
-            parallel(raster_cells.narrow, chunks, listed, blocks.bits, spans, counts, work=5 * int(counts.sum()))
         offsets = np.append(0, np.cumsum(counts.sum(axis=1)))
         places = offsets[:-1, None] + np.cumsum(counts, axis=1) - counts
         items = np.empty(offsets[-1], np.uint32)
         parallel(_sort, chunks, listed, spans, places, items, work=8 * len(items))
-        given = offsets, items, listed, vertices, matrix, -camera.view[2], keep
-        if blocks is None or cells is None:
-            fragments = Fragments(
-                np.empty((layers, height, width), np.int32),
-                np.empty((layers, height, width, 2), np.float32),
-                np.empty((layers, height, width), np.float32),
-            )
-            parallel(draw, bands, *given, *fragments)
+        shape = layers, *(size if cells is None else cells.shape)
+        fragments = Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
+        given = offsets, items, listed, vertices, matrix, -camera.view[2], keep, blocks.bits
+        if cells is None:
+            parallel(draw, bands, *given, tuple(fragments))
         else:
-            fragments = blocks.nothing(cells, layers)
-            flat = [x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments]
-            nearest = np.full((layers, cells.size), np.inf)
-            parallel(draw_cells, bands, *given, blocks.table, blocks.numbers, nearest, *flat)
+            if (absent := cells < 0).any():
+                for x, nothing in zip(fragments, (-1, 0, 0), strict=True):
+                    x[:, absent] = nothing
+            flat = tuple(x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments)
+            parallel(draw_cells, bands, *given, blocks.table, blocks.numbers, flat)
         scratch[1].append((screen, listed))
         return fragments
 
@@ -144,8 +140,8 @@ def _project(start, stop, vertices, m, screen):
 
 
 @kernel(error_model="numpy")
-def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, listed, spans, counts):
-    """List the triangles that may cover a pixel's centre, and count them.
+def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, bits, listed, spans, counts):
+    """List the triangles that may cover a pixel's centre, of those that `bits` of `Blocks` tell; and count them.
 
     Chunks of one call follow on each other in the list; `spans` (chunks, 2) says where each begins and ends, `counts`
     (bands, chunks) how many of its triangles touch a band of rows.
@@ -173,7 +169,7 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
                     x0 * step + middle, x1 * step + middle, y0 * step + center, y1 * step + center, height, width, step
                 )
                 box[0, b], box[1, b], box[2, b], box[3, b] = i0, i1, j0, j1
-                # Where there is one centre, most triangles whose box holds it do not.
+                # Where there is one centre, most triangles whose box holds it do not. Half of a mesh faces away.
                 x, y = (i0 + half - middle) / step, (j0 + half - center) / step
                 ax, ay, bx, by, cx, cy = xa - x, ya - y, xb - x, yb - y, xc - x, yc - y
                 ea, eb, ec = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
@@ -181,10 +177,10 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
                 # and their sum by twice that. The rest is for the centre, which is rounded to a hundredth.
                 bound = more * (x1 - x0 + y1 - y0 + four)
                 away = (ea + eb + ec) * sign < -(bound + bound)
-                missed = ((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound)) | away
                 placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
                 clips[b] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)
-                near[b] = clips[b] | ((i0 <= i1) & (j0 <= j1) & ~((i0 == i1) & (j0 == j1) & placed & missed))
+                missed = ((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound) & (i0 == i1) & (j0 == j1)) | away
+                near[b] = clips[b] | ((i0 <= i1) & (j0 <= j1) & ~(placed & missed))
             count = 0
             for b in range(len(block)):
                 chosen[count] = b
@@ -198,6 +194,8 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
                     i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
                     if i0 > i1 or j0 > j1:
                         continue
+                if len(bits) > 0 and not touches(bits, np.uint32(i0), np.uint32(i1), np.uint32(j0), np.uint32(j1)):
+                    continue
                 listed[found, 0] = start + b
                 listed[found, 1], listed[found, 2], listed[found, 3] = block[b, 0], block[b, 1], block[b, 2]
                 listed[found, 4], listed[found, 5], listed[found, 6], listed[found, 7] = i0, i1, j0, j1

@@ -21,6 +21,7 @@ from rts.checks import (
     check_scene,
     check_size,
     check_splatter,
+    is_count,
 )
 from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting
 from rts.errors import InputError
@@ -41,9 +42,6 @@ Parts = Part | Sequence[Part] | PreparedParts
 Cameras = Camera | Sequence[Camera]
 Scene = Callable[[Tree], "Parts | tuple[Parts, Cameras]"]
 
-CHANNELS = {1: slice(3, 4), 3: slice(0, 3), 4: slice(0, 4)}
-"""Which channels of an image a target has, by their number."""
-
 
 class ImageResiduals(Residuals):
     """The difference between the render of a scene and a target, as a function of the scene's parameters.
@@ -58,7 +56,8 @@ class ImageResiduals(Residuals):
         camera: the camera, where `scene` gives none; of several views a list, or what `Camera.stack` made of it.
         size: (height, width) in pixels.
         target: (H, W) or (H, W, 1), compared with the image's alpha; (H, W, 3) with its premultiplied linear colours;
-            or (H, W, 4) with both. Floating; a constant. Of several views (B, H, W, ·), or a list.
+            or (H, W, 4) with both. Floating; a constant. For 3 and 4 read C and C + 1 where the image has C channels.
+            Of several views (B, H, W, ·), or a list.
         weights: factors on the differences, (H, W), (H, W, 1) or of the target's shape; such as a mask. Floating or
             bool; constants. Of several views (B, H, W, ·), or a list.
         background: as in `render`; a constant. It is that of every view.
@@ -67,6 +66,8 @@ class ImageResiduals(Residuals):
         layers: as in `render`.
         supersample: as in `render`.
         capacity: as in `render`.
+        channels: C of the image, as the scene's shaders say it. Where it is not 3, Levenberg–Marquardt takes the
+            Jacobian.
 
     Attributes:
         size: (height, width).
@@ -91,6 +92,7 @@ class ImageResiduals(Residuals):
         layers: int | Literal["auto"] = 2,
         supersample: int | Adaptive = 1,
         capacity: int | None = None,
+        channels: int = 3,
     ):
         if not callable(scene):
             raise InputError(f"scene is {quoted(scene)}; expected a function: parameters → parts, or (parts, camera)")
@@ -100,7 +102,10 @@ class ImageResiduals(Residuals):
             )
         self.size = check_size(size, layers, capacity, finest(supersample))
         self._scene, self._camera, self._splatter = scene, camera, check_splatter(splatter)
-        self._background = check_background(background, self.size)
+        if not is_count(channels):
+            raise InputError(f"channels is {quoted(channels)}; expected an integer of at least 1")
+        self._image_channels = channels
+        self._background = check_background(background, self.size, channels)
         self.supersample = _checked_supersample(supersample)
         self._sampling: dict[str, Any] = {"sampler": check_sampler(sampler), "layers": layers, "capacity": capacity}
         self._full, self._sigma = self.size, 0.0
@@ -119,7 +124,7 @@ class ImageResiduals(Residuals):
 
     def _take(self, target: Any, weights: Any) -> None:
         """Compare with this target (H, W, ·) of one view."""
-        self._target, self._channels = _checked_target(target, self.size)
+        self._target, self._channels = _checked_target(target, self.size, self._image_channels)
         self._weights = _checked_weights(weights, self._target.shape, self.size)
 
     def __call__(self, parameters: Tree) -> Array:
@@ -139,12 +144,23 @@ class ImageResiduals(Residuals):
         """`weights * (image − target)` of one view."""
         image = constants(image, engine_of(image, parameters), exemplar(parameters))
         target, weights, _ = self._constants(image)
-        difference = image[..., CHANNELS[self._channels]] - target
+        self._refuse_other(image.shape[-1] - 1)
+        # Alpha is last; a target of one channel is one of it alone.
+        difference = image[..., -1:] if self._channels == 1 else image[..., : self._channels]
+        difference = difference - target
         if weights is not None:
             difference = difference * weights
         if self._sigma:
             difference = blurred(difference, self._sigma)
         return namespace(image).reshape(difference, tuple(self._target.shape))
+
+    def _refuse_other(self, channels: int) -> None:
+        """Refuse images of another number of channels than the target is for."""
+        if channels != self._image_channels:
+            raise InputError(
+                f"the scene's shaders give {channels} channels besides alpha, and the target is for "
+                f"{self._image_channels}; give channels={channels}, and a target for it"
+            )
 
     def at_stage(self, stage: Stage) -> ImageResiduals:
         """The residuals at another resolution, for the same camera and extent of the image; see `rts.fit`.
@@ -214,6 +230,7 @@ class ImageResiduals(Residuals):
             not self._sigma
             and splatter.sums_products
             and engine.differentiates
+            and self._image_channels == 3
             and (self.supersample == 1 or splatter.averages)
             and not (isinstance(self.supersample, Adaptive) and self.supersample.contrast is not None)
         ):
@@ -248,7 +265,9 @@ class ImageResiduals(Residuals):
 
         options: dict[str, Any] = dict(splatter=splatter, supersample=self.supersample, settles=True, **self._sampling)
         sampled = sample(parts, window(camera), size, **options)
-        colored = self._channels > 1 or not _all_opaque(parts, camera)
+        checked, _ = _checked(parts, camera)
+        self._refuse_other(checked[0].shader.channels)
+        colored = self._channels > 1 or not all(part.shader.opaque for part in checked)
         band = slice(top, top + rows)
         fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
 
@@ -289,7 +308,7 @@ class ImageResiduals(Residuals):
         return value, matrix, gradient
 
     def _constants(self, like: Array) -> tuple[Array, Array | None, Array | None]:
-        """Target (H, W, C), weights (H, W, 1 or C) and background (H, W, 4) in the engine of an array."""
+        """Target (H, W, C), weights (H, W, 1 or C) and background, with alpha, in the engine of an array."""
         engine = engine_of(like, self._target, self._weights, self._background)
         fields = constants((self._target, self._weights, self._background), engine, like)
         xp = namespace(like)
@@ -299,9 +318,9 @@ class ImageResiduals(Residuals):
         if weights is not None:
             weights = xp.reshape(weights, (*self.size, -1))
         if background is not None:
-            if background.shape[-1] == 3:
+            if background.shape[-1] == self._image_channels:
                 background = xp.concat([background, xp.ones_like(background[..., :1])], axis=-1)
-            background = xp.broadcast_to(background, (*self.size, 4))
+            background = xp.broadcast_to(background, (*self.size, self._image_channels + 1))
         return target, weights, background
 
 
@@ -385,21 +404,17 @@ def _checked(parts: Parts, camera: Camera) -> tuple[list[CheckedPart], Camera]:
     return check_scene(parts.parts if isinstance(parts, PreparedParts) else parts, camera)
 
 
-def _all_opaque(parts: Parts, camera: Camera) -> bool:
-    return all(part.shader.opaque for part in _checked(parts, camera)[0])
-
-
-def _checked_target(target: Any, size: tuple[int, int]) -> tuple[Array, int]:
-    """The target, and its number of channels."""
+def _checked_target(target: Any, size: tuple[int, int], channels: int) -> tuple[Array, int]:
+    """The target for images of so many channels besides alpha, and its own number of them."""
     if target is None:
         raise InputError("target is None; expected an array, such as what rts.load_image gives")
     target = from_numbers(target, "target")
     shape = shape_of(target)
-    if shape[:2] != size or shape[2:] not in ((), *((c,) for c in CHANNELS)):
+    if shape[:2] != size or shape[2:] not in ((), (1,), (channels,), (channels + 1,)):
         height, width = size
         raise InputError(
-            f"target {described(target)}; expected ({height}, {width}) or ({height}, {width}, 1) to compare "
-            f"with alpha, ({height}, {width}, 3) with colours, or ({height}, {width}, 4) with both"
+            f"target {described(target)}; expected ({height}, {width}) or ({height}, {width}, 1) to compare with "
+            f"alpha, ({height}, {width}, {channels}) with colours, or ({height}, {width}, {channels + 1}) with both"
         )
     check_floating("target", target)
     _check_finite("target", target)
