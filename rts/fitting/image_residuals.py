@@ -386,9 +386,8 @@ def _view_count(target: Any, size: tuple[int, int]) -> int | None:
     """How many views a target is of; None for one, without an axis of its own."""
     if isinstance(target, (list, tuple)):
         return len(target) if any(shape_of(x)[:2] == size for x in target) else None
-    shape = shape_of(target)
-    several = len(shape) > 3 or (shape[1:3] == size and shape[:2] != size)
-    return shape[0] if several else None
+    shape: Any = shape_of(target)
+    return shape[0] if len(shape) > 3 or (shape[1:3] == size and shape[:2] != size) else None
 
 
 def _of_views(weights: Any, count: int) -> Sequence[Any]:
