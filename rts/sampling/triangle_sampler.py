@@ -16,6 +16,8 @@ from rts.errors import InputError
 from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSurface, as_surface
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
+from rts.sampling.exits import Exits, beside_outlines
+from rts.sampling.exits import exits as exits_of
 from rts.sampling.facing import facing as facing_of
 from rts.sampling.packing import largest, lift, repack
 from rts.sampling.settling import on_surface, refined
@@ -45,6 +47,7 @@ class TriangleSampler(Sampler):
     prunes = True
     takes_cells = True
     tells_facing = True
+    tells_exits = True
     _keeper: Keeper
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
@@ -158,6 +161,7 @@ class TriangleSampler(Sampler):
         entry: Entry | None = None,
         cells: Array | None = None,
         facing: bool = False,
+        exits: bool = False,
     ) -> Samples:
         """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
 
@@ -171,6 +175,7 @@ class TriangleSampler(Sampler):
             entry: what `hold` gave, to be used without a look at the surface's inputs.
             cells: as in `rts.Sampler`.
             facing: as in `rts.Sampler`; surfaces that move samples off their triangles tell nothing.
+            exits: as in `rts.Sampler`; surfaces with a `refine` tell nothing, nor do lists of cells.
 
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
@@ -180,6 +185,7 @@ class TriangleSampler(Sampler):
         shape = _Shape(layers, size if cells is None else tuple(cells.shape), capacity, size)
         tells = facing and layers > 1 and part.cull == "none" and surface.tells_pieces
         tells = tells and not (surface.refines and surface.refine_moves)
+        exits = exits and part.cull == "back" and cells is None and not surface.refines
         listed = [] if cells is None else [cells]
         inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
         reads = {name: theta[name] for name in surface.reads(theta)}
@@ -199,7 +205,7 @@ class TriangleSampler(Sampler):
             host_inputs = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
             host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
             host_camera = check_camera(host_camera, *rest[: len(transform)])
-            given = shape, tables, wanted, entry, host_cells, tells
+            given = shape, tables, wanted, entry, host_cells, tells, exits
             found = self._found(surface, part.cull, host_inputs, host_camera, *given)
             gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
             return (
@@ -210,15 +216,17 @@ class TriangleSampler(Sampler):
                 found.overflow,
                 *([found.facing] if tells else []),
                 *([found.settled] if settles else []),
+                *([found.exit] if exits else []),
                 *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
                 *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
             )
 
         sides = [ArraySpec((layers, *shape.size), np.int16)] if tells else []
         amid = [ArraySpec(size, np.bool_)] if settles else []
-        specs = *shape.specs(surface.sample_widths), *sides, *amid, *tables.values(), *attributes.values()
+        behind = [ArraySpec(size, np.int32)] if exits else []
+        specs = *shape.specs(surface.sample_widths), *sides, *amid, *behind, *tables.values(), *attributes.values()
         results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *listed, *leaves(inputs))
-        first = 5 + len(sides) + len(amid)
+        first = 5 + len(sides) + len(amid) + len(behind)
         rest = first + len(tables)
         return Samples(
             *results[:5],
@@ -228,7 +236,8 @@ class TriangleSampler(Sampler):
             centered=surface.centered,
             by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
             facing=results[5] if tells else None,
-            settled=results[first - 1] if settles else None,
+            settled=results[5 + len(sides)] if settles else None,
+            exit=results[first - 1] if exits else None,
         )
 
     def _found(
@@ -243,8 +252,12 @@ class TriangleSampler(Sampler):
         entry: Entry | None,
         cells: np.ndarray | None,
         tells: bool,
+        exits: bool,
     ) -> Samples:
-        """The samples that are to be kept, on the host; if it `tells`, with what faces the viewer."""
+        """The samples that are to be kept, on the host.
+
+        With what faces the viewer, if it `tells`, and with `exits`.
+        """
         # Of tables there is but one set, so that no samples can be added later.
         more = surface.refines and surface.refine_moves and not tables
         grid = max(shape.layers + 1, LEAST_LAYERS) if more else shape.layers, *shape.size
@@ -256,9 +269,12 @@ class TriangleSampler(Sampler):
                 check_fragments(fragments, grid, len(found.proxy.faces), self)
             else:
                 fragments = _no_fragments(grid)
-        covered = fragments.triangle_ids >= 0
+            covered = fragments.triangle_ids >= 0
+            kept = covered
+            if needed is not None and not (surface.refines and surface.refine_moves):
+                kept = needed(covered, fragments.depth)
+            behind = self._exits(found, camera, fragments, kept) if exits else None
         if not (surface.refines and surface.refine_moves):
-            kept = covered if needed is None else needed(covered, fragments.depth)
             settled, size = None, found.size
             if needed is not None and not surface.refines:
                 if size is None:
@@ -273,7 +289,7 @@ class TriangleSampler(Sampler):
                 pieces = checked_pieces(surface, found.proxy) if kept[1:].any() else np.zeros(1, np.int16)
                 sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
             if not surface.refines:
-                lifted = lift(fragments, found.proxy, shape.capacity, kept, size)
+                lifted = lift(fragments, found.proxy, shape.capacity, kept, size, behind)
                 return replace(lifted, facing=sides, settled=settled)
             lifted = lift(fragments, found.proxy, None, kept)
             samples, _ = refined(surface, inputs, lifted, camera, tables, shape.view, cells)
@@ -286,6 +302,17 @@ class TriangleSampler(Sampler):
             needed.ran_out(int((covered[-1] & ~left[-1]).sum()))
             kept = needed(left, settled.depth)
         return repack(settled, kept, shape.capacity)
+
+    def _exits(self, entry: Entry, camera: Camera, fragments: Fragments, kept: np.ndarray) -> Exits:
+        """Where rays leave the part, in the cells in which that matters."""
+        cells, size = beside_outlines(kept), kept.shape[1:]
+        shape = 2, *cells.shape
+        if cells.size:
+            both = self.rasterize_cells(entry.prepared, camera, size, 2, "none", cells)
+            check_fragments(both, shape, len(entry.proxy.faces), self)
+        else:
+            both = _no_fragments(shape)
+        return exits_of(cells, fragments.triangle_ids[0], both, entry.proxy, camera)
 
 
 class _Shape(NamedTuple):
