@@ -12,7 +12,9 @@ that they compile to vector instructions and no jump is mispredicted; what is ra
 
 from __future__ import annotations
 
-from typing import Any, Self
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -44,6 +46,7 @@ BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 class Raster(TriangleSampler):
     """K-buffer rasterization with a top-left fill rule; ties in depth go to the lower triangle index."""
 
+    tells_exits = True
     _scratch: dict[tuple, tuple]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
@@ -54,65 +57,107 @@ class Raster(TriangleSampler):
 
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
-        return self._drawn(prepared, camera, size, layers, cull, None)
+        with self._listed(prepared, camera, size, cull) as (listed,):
+            return listed.drawn(layers)
 
     def rasterize_cells(
         self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
     ) -> Fragments:
         """See `TriangleSampler.rasterize_cells`: triangles that touch no block of these cells are passed over."""
-        return self._drawn(prepared, camera, size, layers, cull, cells)
+        with self._listed(prepared, camera, size, cull) as (listed,):
+            return listed.drawn_cells(layers, cells)
 
-    def _drawn(
+    def rasterize_with_backs(
         self,
         prepared: Proxy,
         camera: Camera,
         size: tuple[int, int],
         layers: int,
-        cull: str,
-        cells: np.ndarray | None,
-    ) -> Fragments:
-        """Fragments of all cells, or of some."""
-        height, width = size
+        choose: Callable[[Fragments], np.ndarray],
+    ) -> tuple[Fragments, np.ndarray, Fragments]:
+        """See `TriangleSampler.rasterize_with_backs`: both are listed at once."""
+        with self._listed(prepared, camera, size, "back", "front") as (fronts, backs):
+            fragments = fronts.drawn(layers)
+            cells = choose(fragments)
+            return fragments, cells, backs.drawn_cells(1, cells)
+
+    @contextmanager
+    def _listed(self, prepared: Proxy, camera: Camera, size: tuple[int, int], *culls: str) -> Iterator[list[_Listed]]:
+        """The triangles that may cover a pixel's centre, for each way of culling, of which the second is opposite."""
         # With unsigned indices compiled code need not look for negative ones, which count from the end.
         vertices, faces = read_only(prepared.vertices), read_only(prepared.faces, np.int32).view(np.uint32)
-        matrix, keep = pixel_matrix(camera, size), facing(camera, cull)
+        matrix, keeps = pixel_matrix(camera, size), [facing(camera, cull) for cull in culls]
         # Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
         # room for every vertex and triangle, but only what is used is ever touched.
         key = len(vertices), len(faces)
         screen, listed = self._scratch.pop(key, None) or (
             np.empty(len(vertices), np.int32),
-            np.empty((len(faces), LISTED), np.int32),
+            np.empty((2, len(faces), LISTED), np.int32),
         )
+        height, width = size
         step = (max(size) / 2 + 2) / float(LIMIT)
         to_steps = np.diag([1 / step, 1 / step, 1, 1])
         to_steps[:2, 3] = -width / 2 / step, -height / 2 / step
         parallel(_project, len(vertices), vertices, to_steps @ matrix, screen, work=4 * len(vertices))
-        chunks, bands = -(-len(faces) // CHUNK), -(-height // BAND_ROWS)
-        spans, counts = np.empty((chunks, 2), np.int64), np.zeros((bands, chunks), np.int64)
-        given = vertices, faces, screen, matrix, height, width, step, keep
+        chunks, bands, sides = -(-len(faces) // CHUNK), -(-height // BAND_ROWS), len(keeps)
+        spans, counts = np.empty((sides, chunks, 2), np.int64), np.zeros((sides, bands, chunks), np.int64)
+        given = vertices, faces, screen, matrix, height, width, step, keeps[0]
         parallel(_select, chunks, *given, listed, spans, counts, work=10 * len(faces))
-        blocks = None if cells is None else raster_cells.Blocks.of(cells, size)
-        if blocks is not None:
-            parallel(raster_cells.narrow, chunks, listed, blocks.bits, spans, counts, work=5 * int(counts.sum()))
+        view = vertices, matrix, -camera.view[2]
+        yield [_Listed(size, *view, *side) for side in zip(keeps, listed, spans, counts, strict=False)]
+        self._scratch = {key: (screen, listed)}
+
+
+class _Listed(NamedTuple):
+    """Triangles that may cover a pixel's centre.
+
+    Attributes:
+        size: (height, width).
+        vertices: (V, 3) float32.
+        matrix: (4, 4), from vertices to pixels.
+        view_depth: (4,), the row of the view that gives depth.
+        keep: sign of the determinants to keep, or 0.
+        listed: (·, LISTED) int32, what is listed of each.
+        spans: (chunks, 2), where those of each chunk of triangles begin and end in the list.
+        counts: (bands, chunks), how many of them touch each band of rows.
+    """
+
+    size: tuple[int, int]
+    vertices: np.ndarray
+    matrix: np.ndarray
+    view_depth: np.ndarray
+    keep: float
+    listed: np.ndarray
+    spans: np.ndarray
+    counts: np.ndarray
+
+    def drawn(self, layers: int) -> Fragments:
+        """Fragments of all cells."""
+        shape = layers, *self.size
+        fragments = Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
+        parallel(draw, len(self.counts), *self._sorted(), *fragments)
+        return fragments
+
+    def drawn_cells(self, layers: int, cells: np.ndarray) -> Fragments:
+        """Fragments of some cells (L, C), as flat indices; the list is narrowed to what touches them."""
+        blocks, chunks = raster_cells.Blocks.of(cells, self.size), self.counts.shape[1]
+        given = self.listed, blocks.bits, self.spans, self.counts
+        parallel(raster_cells.narrow, chunks, *given, work=15 * int(self.counts.sum()))
+        fragments = blocks.nothing(cells, layers)
+        flat = [x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments]
+        nearest = np.full((layers, cells.size), np.inf)
+        given = *self._sorted(), blocks.table, blocks.numbers, nearest
+        parallel(draw_cells, len(self.counts), *given, *flat)
+        return fragments
+
+    def _sorted(self) -> tuple[Any, ...]:
+        """Arguments of what draws the list, sorted by bands."""
+        counts = self.counts
         offsets = np.append(0, np.cumsum(counts.sum(axis=1)))
         places = offsets[:-1, None] + np.cumsum(counts, axis=1) - counts
         items = np.empty(offsets[-1], np.uint32)
-        parallel(_sort, chunks, listed, spans, places, items, work=8 * len(items))
-        given = offsets, items, listed, vertices, matrix, -camera.view[2], keep
-        if blocks is None or cells is None:
-            fragments = Fragments(
-                np.empty((layers, height, width), np.int32),
-                np.empty((layers, height, width, 2), np.float32),
-                np.empty((layers, height, width), np.float32),
-            )
-            parallel(draw, bands, *given, *fragments)
-        else:
-            fragments = blocks.nothing(cells, layers)
-            flat = [x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments]
-            nearest = np.full((layers, cells.size), np.inf)
-            parallel(draw_cells, bands, *given, blocks.table, blocks.numbers, nearest, *flat)
-        self._scratch = {key: (screen, listed)}
-        return fragments
+        parallel(_sort, counts.shape[1], self.listed, self.spans, places, items, work=8 * len(items))
+        return offsets, items, self.listed, self.vertices, self.matrix, self.view_depth, self.keep
 
 
 @kernel(error_model="numpy")
@@ -141,20 +186,20 @@ def _project(start, stop, vertices, m, screen):
 
 @kernel(error_model="numpy")
 def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, listed, spans, counts):
-    """List the triangles that may cover a pixel's centre, and count them.
+    """List the triangles that may cover a pixel's centre, and count them; once, or again for the side that is culled.
 
-    Chunks of one call follow on each other in the list; `spans` (chunks, 2) says where each begins and ends, `counts`
-    (bands, chunks) how many of its triangles touch a band of rows.
+    Chunks of one call follow on each other in a list; `spans` (·, chunks, 2) says where each begins and ends, `counts`
+    (·, bands, chunks) how many of its triangles touch a band of rows.
     """
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
-    clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
+    clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty((2, LONG_BLOCK), np.bool_)
     chosen, corners = np.empty(LONG_BLOCK, np.uint32), np.empty((3, 4))
     step, sign = np.float32(step), np.float32(keep)
     more = np.float32(1.25)
     middle, center, half, four = np.float32(width / 2), np.float32(height / 2), np.float32(0.5), np.float32(4)
-    found = first * CHUNK
+    sides, found = len(spans), np.full(len(spans), first * CHUNK)
     for chunk in range(first, last):
-        spans[chunk, 0] = found
+        spans[:, chunk, 0] = found
         end = min(len(faces), (chunk + 1) * CHUNK)
         for start in range(chunk * CHUNK, end, LONG_BLOCK):
             block = faces[start : min(end, start + LONG_BLOCK)]
@@ -176,31 +221,34 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
                 # Rounding changes coordinates by half a step at most, so these by the sum of the box's sides and 2.5,
                 # and their sum by twice that. The rest is for the centre, which is rounded to a hundredth.
                 bound = more * (x1 - x0 + y1 - y0 + four)
-                away = (ea + eb + ec) * sign < -(bound + bound)
-                missed = ((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound)) | away
+                area = (ea + eb + ec) * sign
+                missed = (min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound)
                 placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
                 clips[b] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)
-                near[b] = clips[b] | ((i0 <= i1) & (j0 <= j1) & ~((i0 == i1) & (j0 == j1) & placed & missed))
-            count = 0
-            for b in range(len(block)):
-                chosen[count] = b
-                count += near[b]
-            for b in chosen[:count]:
-                i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
-                if clips[b]:
-                    for c in range(3):
-                        to_corner(matrix, vertices, block[b, c], corners, c)
-                    x0, x1, y0, y1 = _clipped_box(corners, width, height)
-                    i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
-                    if i0 > i1 or j0 > j1:
-                        continue
-                listed[found, 0] = start + b
-                listed[found, 1], listed[found, 2], listed[found, 3] = block[b, 0], block[b, 1], block[b, 2]
-                listed[found, 4], listed[found, 5], listed[found, 6], listed[found, 7] = i0, i1, j0, j1
-                found += 1
-                for band in range(int(j0) // BAND_ROWS, int(j1) // BAND_ROWS + 1):
-                    counts[band, chunk] += 1
-        spans[chunk, 1] = found
+                inside, alone = (i0 <= i1) & (j0 <= j1), placed & (i0 == i1) & (j0 == j1)
+                near[0, b] = clips[b] | (inside & ~(alone & (missed | (area < -(bound + bound)))))
+                near[1, b] = clips[b] | (inside & ~(alone & (missed | (area > bound + bound))))
+            for side in range(sides):
+                count = 0
+                for b in range(len(block)):
+                    chosen[count] = b
+                    count += near[side, b]
+                for b in chosen[:count]:
+                    i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
+                    if clips[b]:
+                        for c in range(3):
+                            to_corner(matrix, vertices, block[b, c], corners, c)
+                        x0, x1, y0, y1 = _clipped_box(corners, width, height)
+                        i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
+                        if i0 > i1 or j0 > j1:
+                            continue
+                    entry = listed[side, found[side]]
+                    entry[0], entry[1], entry[2], entry[3] = start + b, block[b, 0], block[b, 1], block[b, 2]
+                    entry[4], entry[5], entry[6], entry[7] = i0, i1, j0, j1
+                    found[side] += 1
+                    for band in range(int(j0) // BAND_ROWS, int(j1) // BAND_ROWS + 1):
+                        counts[side, band, chunk] += 1
+        spans[:, chunk, 1] = found
 
 
 @compiled

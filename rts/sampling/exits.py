@@ -6,10 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.records import Fragments, Proxy
-from rts.sampling.facing import eye
-from rts.threads import parallel, read_only
+from rts.records import Fragments
+from rts.threads import read_only
 
 
 class Exits(NamedTuple):
@@ -17,13 +15,19 @@ class Exits(NamedTuple):
 
     Attributes:
         cells: (1, M) int32, flat indices of cells in the grid.
-        fragments: (1, 1, M), what lies behind the front in them.
+        fragments: (1, 1, M), what is seen from behind in them.
         there: (1, 1, M) bool, whether the ray leaves there.
     """
 
     cells: np.ndarray
     fragments: Fragments
     there: np.ndarray
+
+    @classmethod
+    def of(cls, fragments: Fragments, cells: np.ndarray, backs: Fragments) -> Exits:
+        """The exits among backs (1, 1, M), those that do not lie before the fronts of fragments (K, H, W)."""
+        front = fragments.depth[0].reshape(-1)[cells]
+        return cls(cells, backs, (backs.triangle_ids >= 0) & (backs.depth >= front))
 
 
 def beside_outlines(kept: np.ndarray) -> np.ndarray:
@@ -36,30 +40,6 @@ def beside_outlines(kept: np.ndarray) -> np.ndarray:
     """
     from rts.sampling import exits_kernels
 
-    _, height, width = kept.shape
-    kept, counts = np.ascontiguousarray(kept), np.empty(height, np.int64)
-    marks = np.empty((2, height, width), np.uint8)
-    parallel(exits_kernels.find, height, kept, marks[0], work=kept.size)
-    parallel(exits_kernels.widen, height, kept[0], *marks, counts, work=kept[0].size)
-    cells, offsets = np.empty((1, counts.sum()), np.int32), np.cumsum(counts) - counts
-    parallel(exits_kernels.gather, height, marks[1], offsets, cells[0], work=kept[0].size)
-    return cells
-
-
-def exits(cells: np.ndarray, front: np.ndarray, both: Fragments, proxy: Proxy, camera: Camera) -> Exits:
-    """The exits among what lies behind fronts.
-
-    Args:
-        cells: (1, M) int32, flat indices of cells in the grid.
-        front: (H, W) int32, the triangle in front in each cell.
-        both: (2, 1, M), the two nearest triangles of these cells, whichever side they show.
-        proxy: the triangles.
-        camera: host matrices.
-    """
-    from rts.sampling import exits_kernels
-
-    there = np.empty(cells.shape[1], bool)
-    triangles = read_only(proxy.vertices), read_only(proxy.faces, np.int32), eye(camera)
-    ids = np.ascontiguousarray(both.triangle_ids).reshape(2, -1)
-    exits_kernels.choose(cells[0], front.reshape(-1), ids, *triangles, there)
-    return Exits(cells, Fragments(*(x[1:] for x in both)), there[None, None])
+    cells = np.empty(kept[0].size, np.int32)
+    count = exits_kernels.find(read_only(kept), cells)
+    return cells[None, :count]

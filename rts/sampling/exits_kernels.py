@@ -1,65 +1,44 @@
-"""Which cells lie beside outlines, and where rays leave parts, compiled."""
+"""Which cells lie beside outlines, compiled."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from rts.compiling import compiled, kernel
-from rts.sampling.facing_kernels import is_front
-
-NEAR, COVERED = np.uint8(1), np.uint8(2)
 
 
 @kernel
-def find(start, stop, kept, marks):
-    """Mark in rows [start, stop) of `marks` (H, W) the fronts beside what may end them; see `exits.beside_outlines`."""
+def find(kept, cells):
+    """Fill `cells` (H · W,) with the places that `exits.beside_outlines` returns; how many there are."""
     layers, height, width = kept.shape
-    ends = np.ones((3, width + 2), np.uint8)
-    for y in range(start - 1, stop + 1):
-        level = ends[(y + 3) % 3]
+    # Of three rows each, and one more cell at each side: what ends fronts, and fronts beside that.
+    ends, near = np.zeros((3, width + 2), np.uint8), np.zeros((3, width + 2), np.uint8)
+    wide, count = np.empty(width, np.uint8), 0
+    for y in range(height + 2):
+        level = ends[y % 3]
         level[:] = 0
-        if 0 <= y < height:
-            _empty(level[1:-1], kept[0, y])
+        if y < height:
+            _add_empty(level[1:-1], kept[0, y])
             for k in range(1, layers):
                 _add(level[1:-1], kept[k, y])
-        if y > start:
-            spread(marks[y - 1], ends[(y + 1) % 3], ends[(y + 2) % 3], level, kept[0, y - 1])
-
-
-@kernel
-def widen(start, stop, fronts, marks, wide, counts):
-    """Mark in rows [start, stop) of `wide` the fronts (H, W) that are marked or beside such; and count them."""
-    height, width = marks.shape
-    near = np.empty((3, width + 2), np.uint8)
-    for y in range(start - 1, stop + 1):
-        level = near[(y + 3) % 3]
-        level[:] = 0
-        if 0 <= y < height:
-            _add(level[1:-1], marks[y])
-        if y > start:
-            spread(wide[y - 1], near[(y + 1) % 3], near[(y + 2) % 3], level, fronts[y - 1])
-            counts[y - 1] = wide[y - 1].sum()
-
-
-@kernel
-def gather(start, stop, marks, offsets, cells):
-    """Fill `cells` (M,) with the places of marks in rows [start, stop), from `offsets` (H,) on."""
-    width = marks.shape[1]
-    for y in range(start, stop):
-        n = offsets[y]
-        for x in range(width):
-            if marks[y, x]:
-                cells[n] = y * width + x
-                n += 1
+        beside = near[(y + 2) % 3]
+        beside[:] = 0
+        if 0 < y <= height:
+            _spread(beside[1:-1], ends[(y + 1) % 3], ends[(y + 2) % 3], level, kept[0, y - 1])
+        if y > 1 and _spread(wide, near[y % 3], near[(y + 1) % 3], beside, kept[0, y - 2]):
+            for x in range(width):
+                cells[count] = (y - 2) * width + x
+                count += wide[x]
+    return count
 
 
 # Rows are handed over one by one, which the compiler needs to see that they do not overlap.
 
 
 @compiled
-def _empty(level, covered):
+def _add_empty(level, covered):
     for x in range(len(covered)):
-        level[x] = np.uint8(not covered[x])
+        level[x] |= np.uint8(not covered[x])
 
 
 @compiled
@@ -69,16 +48,11 @@ def _add(level, marks):
 
 
 @compiled
-def spread(near, above, level, below, where):
-    """Cells of a row that have a mark in their 3 × 3 window, among those that count."""
-    for x in range(len(near)):
+def _spread(found, above, level, below, where):
+    """Mark the cells of a row that have a mark in their 3 × 3 window, among those that count; whether there is any."""
+    some = np.uint8(0)
+    for x in range(len(found)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
-        near[x] = (around | below[x] | below[x + 1] | below[x + 2]) & np.uint8(where[x])
-
-
-@kernel
-def choose(cells, front, ids, vertices, faces, eye, there):
-    """Whether rays leave a part (M,) at the second of two triangles `ids` (2, M), the first of which is the front's."""
-    for m in range(len(cells)):
-        behind = ids[1, m]
-        there[m] = behind >= 0 and ids[0, m] == front[cells[m]] and not is_front(vertices, faces, behind, eye)
+        found[x] = (around | below[x] | below[x + 1] | below[x + 2]) & np.uint8(where[x])
+        some |= found[x]
+    return some != 0

@@ -29,7 +29,7 @@ def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eye, listed, 
                         piece = pieces[t] if len(pieces) > 1 else pieces[0]
                         if piece > 0 and k == layers - 1:
                             piece += more
-                        found[k, y - 1, x] = piece if is_front(vertices, faces, t, eye) else -piece
+                        found[k, y - 1, x] = piece if _front(vertices, faces, t, eye) else -piece
 
 
 # Rows are handed over one by one, which the compiler needs to see that they do not overlap.
@@ -49,7 +49,7 @@ def _spread(near, above, level, below):
 
 
 @compiled
-def is_front(vertices, faces, t, eye):
+def _front(vertices, faces, t, eye):
     """Whether a triangle is seen from the side from which its corners go round counter-clockwise."""
     a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
     x, y, z = np.float64(vertices[a, 0]), np.float64(vertices[a, 1]), np.float64(vertices[a, 2])

@@ -20,9 +20,8 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         overflow = overflow + s.overflow
     if len(samples) == 1:
         only = samples[0]
-        return Sampled(
-            tuple(samples), only.row, only.depth, overflow, facing=only.facing, settled=only.settled, exit=only.exit
-        )
+        told = {name: getattr(only, name) for name in ("facing", "settled", "exit")}
+        return Sampled(tuple(samples), only.row, only.depth, overflow, **told)
     given = [*(s.row for s in samples), *(s.depth for s in samples)]
     if any(s.facing is not None for s in samples):
         given += [_nothing_told(s.row) if s.facing is None else s.facing for s in samples]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
@@ -17,7 +17,6 @@ from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSur
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines
-from rts.sampling.exits import exits as exits_of
 from rts.sampling.facing import facing as facing_of
 from rts.sampling.packing import largest, lift, repack
 from rts.sampling.settling import on_surface, refined
@@ -37,6 +36,7 @@ class TriangleSampler(Sampler):
     Attributes:
         builds: whether something is worth building once for a proxy; True in a class with its own `prepare`.
         follows: whether what was prepared can follow moved vertices; True in a class with its own `update`.
+        tells_exits: whether `rasterize` knows cull="front", too, or the class has its own `rasterize_with_backs`.
     """
 
     DECLARES = True
@@ -47,7 +47,6 @@ class TriangleSampler(Sampler):
     prunes = True
     takes_cells = True
     tells_facing = True
-    tells_exits = True
     _keeper: Keeper
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
@@ -78,7 +77,8 @@ class TriangleSampler(Sampler):
             camera: NumPy float64 matrices; world is the proxy's local space.
             size: (height, width).
             layers: K.
-            cull: "none", or "back": ignore triangles whose normal (counter-clockwise winding) faces away.
+            cull: "none", or "back": ignore triangles whose normal (counter-clockwise winding) faces away; and where a
+                class `tells_exits`, "front": ignore the others.
 
         Returns:
             Fragments, front to back in each pixel; no layer follows an empty one.
@@ -105,6 +105,34 @@ class TriangleSampler(Sampler):
         at = np.where(there, cells, 0)
         ids = np.where(there, whole.triangle_ids.reshape(layers, -1)[:, at], -1)
         return Fragments(ids, whole.barycentrics.reshape(layers, -1, 2)[:, at], whole.depth.reshape(layers, -1)[:, at])
+
+    def rasterize_with_backs(
+        self,
+        prepared: Any,
+        camera: Camera,
+        size: tuple[int, int],
+        layers: int,
+        choose: Callable[[Fragments], np.ndarray],
+    ) -> tuple[Fragments, np.ndarray, Fragments]:
+        """`rasterize` with cull="back", and in some cells the nearest triangle that is seen from behind.
+
+        It is called where a class `tells_exits`. The default calls `rasterize_cells` with cull="front".
+
+        Args:
+            prepared: see `rasterize`.
+            camera: see `rasterize`.
+            size: see `rasterize`.
+            layers: see `rasterize`.
+            choose: fragments → the cells (L, C) int32, flat indices of cells in the grid.
+
+        Returns:
+            Fragments (K, H, W), the cells that were chosen, and their fragments (1, L, C).
+        """
+        fragments = self.rasterize(prepared, camera, size, layers, "back")
+        cells = choose(fragments)
+        if not cells.size:
+            return fragments, cells, _no_fragments((1, *cells.shape))
+        return fragments, cells, self.rasterize_cells(prepared, camera, size, 1, "front", cells)
 
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
         """See `Sampler`: the proxy of a part, and what is prepared of it."""
@@ -261,20 +289,28 @@ class TriangleSampler(Sampler):
         # Of tables there is but one set, so that no samples can be added later.
         more = surface.refines and surface.refine_moves and not tables
         grid = max(shape.layers + 1, LEAST_LAYERS) if more else shape.layers, *shape.size
+        moves = surface.refines and surface.refine_moves
+
+        def keep(fragments: Fragments) -> np.ndarray:
+            """Which of the fragments, where nothing moves them any more, are samples."""
+            covered = fragments.triangle_ids >= 0
+            return covered if needed is None else needed(covered, fragments.depth)
+
+        kept = behind = None
         with self._keeper.lock:
             found = entry or self._entry(surface, inputs, camera, shape.view)
-            if len(found.proxy.faces):
-                given = found.prepared, camera, shape.view, grid[0], cull
+            given = found.prepared, camera, shape.view, grid[0], cull
+            if not len(found.proxy.faces):
+                fragments = _no_fragments(grid)
+                behind = Exits(np.zeros((1, 0), np.int32), _no_fragments((1, 1, 0)), np.zeros((1, 1, 0), bool))
+            elif exits:
+                fragments, kept, behind = self._with_exits(found, camera, grid, keep)
+            else:
                 fragments = self.rasterize(*given) if cells is None else self.rasterize_cells(*given, cells)
                 check_fragments(fragments, grid, len(found.proxy.faces), self)
-            else:
-                fragments = _no_fragments(grid)
-            covered = fragments.triangle_ids >= 0
-            kept = covered
-            if needed is not None and not (surface.refines and surface.refine_moves):
-                kept = needed(covered, fragments.depth)
-            behind = self._exits(found, camera, fragments, kept) if exits else None
-        if not (surface.refines and surface.refine_moves):
+        covered = fragments.triangle_ids >= 0
+        if not moves:
+            kept = keep(fragments) if kept is None else kept
             settled, size = None, found.size
             if needed is not None and not surface.refines:
                 if size is None:
@@ -289,7 +325,7 @@ class TriangleSampler(Sampler):
                 pieces = checked_pieces(surface, found.proxy) if kept[1:].any() else np.zeros(1, np.int16)
                 sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
             if not surface.refines:
-                lifted = lift(fragments, found.proxy, shape.capacity, kept, size, behind)
+                lifted = lift(fragments, found.proxy, shape.capacity, kept, size, behind if exits else None)
                 return replace(lifted, facing=sides, settled=settled)
             lifted = lift(fragments, found.proxy, None, kept)
             samples, _ = refined(surface, inputs, lifted, camera, tables, shape.view, cells)
@@ -303,16 +339,21 @@ class TriangleSampler(Sampler):
             kept = needed(left, settled.depth)
         return repack(settled, kept, shape.capacity)
 
-    def _exits(self, entry: Entry, camera: Camera, fragments: Fragments, kept: np.ndarray) -> Exits:
-        """Where rays leave the part, in the cells in which that matters."""
-        cells, size = beside_outlines(kept), kept.shape[1:]
-        shape = 2, *cells.shape
-        if cells.size:
-            both = self.rasterize_cells(entry.prepared, camera, size, 2, "none", cells)
-            check_fragments(both, shape, len(entry.proxy.faces), self)
-        else:
-            both = _no_fragments(shape)
-        return exits_of(cells, fragments.triangle_ids[0], both, entry.proxy, camera)
+    def _with_exits(
+        self, entry: Entry, camera: Camera, grid: tuple[int, int, int], keep: Callable[[Fragments], np.ndarray]
+    ) -> tuple[Fragments, np.ndarray, Exits]:
+        """Fragments of a culled part, which of them to keep, and its exits beside outlines."""
+        kept: list[np.ndarray] = []
+        count = len(entry.proxy.faces)
+
+        def beside(fragments: Fragments) -> np.ndarray:
+            check_fragments(fragments, grid, count, self)
+            kept.append(keep(fragments))
+            return beside_outlines(kept[0])
+
+        fragments, cells, backs = self.rasterize_with_backs(entry.prepared, camera, grid[1:], grid[0], beside)
+        check_fragments(backs, (1, *cells.shape), count, self)
+        return fragments, kept[0], Exits.of(fragments, cells, backs)
 
 
 class _Shape(NamedTuple):

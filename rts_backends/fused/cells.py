@@ -224,9 +224,8 @@ class Cells:
             arrays = self.positions, self.rgba, self.row, *self._numbers
             decide = self.part, self.exits, kind.type(choices.extent), rules
             listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
-            parallel(
-                outlines.fill, height, *arrays, *decide, *listed, ends, marks, found, work=150 * len(found.columns)
-            )
+            given = *arrays, *decide, *listed, ends, marks
+            parallel(outlines.fill, height, *given, found, work=150 * len(found.columns))
         return found
 
     @cached_property

@@ -184,7 +184,7 @@ IMAGE = Operation(
     sweeps=True,
     **_OPTIONS,
 )
-"""The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled and exit, without a
-border.
+"""The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled and exit, without
+a border.
 
 The last five are those of `rts.Splats`; (0, H, W) and (0, W) where they are not known."""
