@@ -225,9 +225,9 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
                 missed = (min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound)
                 placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
                 clips[b] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)
-                inside, alone = (i0 <= i1) & (j0 <= j1), placed & (i0 == i1) & (j0 == j1)
-                near[0, b] = clips[b] | (inside & ~(alone & (missed | (area < -(bound + bound)))))
-                near[1, b] = clips[b] | (inside & ~(alone & (missed | (area > bound + bound))))
+                near_one = (i0 <= i1) & (j0 <= j1) & ~((i0 == i1) & (j0 == j1) & placed & missed)
+                near[0, b] = clips[b] | (near_one & ~(placed & (area < -(bound + bound))))
+                near[1, b] = clips[b] | (near_one & ~(placed & (area > bound + bound)))
             for side in range(sides):
                 count = 0
                 for b in range(len(block)):

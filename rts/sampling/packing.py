@@ -51,12 +51,11 @@ def lift(
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
     beside = () if exits is None else ((exits.fragments, exits.there),)
     packed = packing_kernels.pack(fragments, kept, table, corner_params, capacity or 0, *beside)
-    samples = Samples(*packed[:4], np.asarray(max(0, packed[4] - len(packed[0])), np.int32))
-    if exits is None:
-        return samples
-    found = np.full(kept[0].shape, -1, np.int32)
-    found.reshape(-1)[exits.cells[0]] = packed[5][0, 0]
-    return replace(samples, exit=found)
+    found = None
+    if exits is not None:
+        found = np.full(kept[0].shape, -1, np.int32)
+        found.reshape(-1)[exits.cells[0]] = packed[5][0, 0]
+    return Samples(*packed[:4], np.asarray(max(0, packed[4] - len(packed[0])), np.int32), exit=found)
 
 
 def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:

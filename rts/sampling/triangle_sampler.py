@@ -352,7 +352,8 @@ class TriangleSampler(Sampler):
             return beside_outlines(kept[0])
 
         fragments, cells, backs = self.rasterize_with_backs(entry.prepared, camera, grid[1:], grid[0], beside)
-        check_fragments(backs, (1, *cells.shape), count, self)
+        if cells.size:
+            check_fragments(backs, (1, *cells.shape), count, self)
         return fragments, kept[0], Exits.of(fragments, cells, backs)
 
 
