@@ -61,6 +61,7 @@ from rts.sampling.prepared import prepare
 from rts.sampling.scenes import sample
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.splatting import exact_calibration
+from rts.views import render_views
 from rts.warming import warmup
 
 if TYPE_CHECKING:
@@ -148,6 +149,7 @@ __all__ = [
     "regularizers",
     "render",
     "render_samples",
+    "render_views",
     "rigid",
     "sample",
     "save_animation",

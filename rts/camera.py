@@ -12,7 +12,7 @@ camera's matrices are of that kind; give numbers or NumPy arrays, and they are f
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -87,6 +87,50 @@ class Camera:
         made = object.__new__(Camera)  # Nothing is left to check, and cameras are copied often.
         made.__dict__.update({**self.__dict__, **changes})
         return made
+
+    # ------------------------------------------------------------------------------------------ several views
+
+    @classmethod
+    def stack(cls, cameras: Sequence[Camera]) -> Camera:
+        """The cameras of several views as one, for `rts.render_views`: both matrices are (B, 4, 4).
+
+        It is a tree of two arrays, as any camera: `jax.vmap` and `torch.vmap` hand on one camera after the other.
+        `unstack()[b]` is the camera of view b.
+
+        Args:
+            cameras: at least one, each of one view.
+
+        Raises:
+            InputError: no cameras, or some leave the ratio of width to height open, and some do not.
+        """
+        cameras = list(cameras) if isinstance(cameras, (list, tuple)) else []
+        if not cameras or not all(isinstance(camera, Camera) and not camera.is_stacked for camera in cameras):
+            raise InputError("Camera.stack was not given a list of cameras of one view each")
+        aspects: set[Any] = {camera.aspect for camera in cameras}
+        if "open" in aspects and len(aspects) > 1:
+            raise InputError(
+                "some cameras know their ratio of width to height and some leave it open; call "
+                "for_size((height, width)) of each first"
+            )
+        xp, both = promote(*(m for camera in cameras for m in (camera.view, camera.projection)))
+        return cls(xp.stack(both[::2]), xp.stack(both[1::2]), aspects.pop() if len(aspects) == 1 else None)
+
+    def unstack(self) -> list[Camera]:
+        """The cameras that `stack` made one of; either matrix may be (4, 4), and is that of all.
+
+        Raises:
+            InputError: it is a camera of one view, or the matrices are not (B, 4, 4).
+        """
+        shapes = [shape_of(m) for m in (self.view, self.projection)]
+        counts = {shape[0] for shape in shapes if len(shape) == 3}
+        if len(counts) != 1 or 0 in counts or any(shape[-2:] != (4, 4) or len(shape) > 3 for shape in shapes):
+            raise InputError(f"view and projection have shapes {shapes[0]} and {shapes[1]}; expected (B, 4, 4)")
+        return [self.map(lambda m, b=b: m[b, ...] if len(shape_of(m)) == 3 else m) for b in range(counts.pop())]
+
+    @property
+    def is_stacked(self) -> bool:
+        """Whether it holds several views."""
+        return len(shape_of(self.view)) == 3 or len(shape_of(self.projection)) == 3
 
     # ---------------------------------------------------------------------------------------- constructors
 
@@ -527,6 +571,10 @@ class Camera:
         size, points = check_pixels(size), from_numbers(points, "points")
         if shape_of(points)[-1:] != (3,):
             raise InputError(f"points {described(points)}; expected (N, 3)")
+        return projective_map(self.pixel_rows(size), points)
+
+    def pixel_rows(self, size: tuple[int, int]) -> Array:
+        """Affine maps (4, 4) of world points: pixel x times w, pixel y times w, w, and linear depth."""
         (x, y), p = (size[1] / 2, size[0] / 2), self.for_size(size).projection
         from_clip = np.array([[x, 0, 0, x], [0, -y, 0, y], [0, 0, 0, 1], [0, 0, 0, 0]])
         depth = np.zeros((4, 4))
@@ -534,8 +582,7 @@ class Camera:
         engine, own = engine_of(p), engine_of(self.view)
         # Products of constant matrices are computed in NumPy.
         rows = matmul(engine.constant(from_clip, p), p) + engine.constant(depth, p)
-        rows = matmul(constants(rows, own, None if is_constant(self.view) else self.view), self.view)
-        return projective_map(rows, points)
+        return matmul(constants(rows, own, None if is_constant(self.view) else self.view), self.view)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""

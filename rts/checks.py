@@ -43,9 +43,33 @@ def check_scene(parts: Part | Sequence[Part], camera: Camera) -> tuple[list[Chec
         kinds = ", ".join(sorted({type(p).__name__ for p in given})) or "nothing"
         raise InputError(f"parts holds {kinds}; expected an rts.Part or several")
     if not isinstance(camera, Camera):
-        raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera")
+        several = isinstance(camera, (list, tuple)) and any(isinstance(c, Camera) for c in camera)
+        hint = "; rts.render_views takes several" if several else ""
+        raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera{hint}")
+    if camera.is_stacked:
+        raise InputError(
+            f"camera is of several views, its view {described(camera.view)}; expected that of one: rts.render_views "
+            f"takes several, and camera.unstack() gives them one by one"
+        )
     camera = _check_camera(camera)
-    return [_check_part(index, part) for index, part in enumerate(given)], camera
+    checked = [_check_part(index, part) for index, part in enumerate(given)]
+    check_channels(checked)
+    return checked, camera
+
+
+def check_cameras(cameras: Any) -> list[Camera]:
+    """Checked cameras of several views, of a list or of what `Camera.stack` made."""
+    if isinstance(cameras, Camera):
+        if not cameras.is_stacked:
+            raise InputError("cameras is the camera of one view; expected several, or what Camera.stack made of them")
+        listed = cameras.unstack()
+    else:
+        listed = list(cameras) if isinstance(cameras, (list, tuple)) else []
+        if not listed or not all(isinstance(camera, Camera) for camera in listed):
+            raise InputError(f"cameras is {quoted(cameras)}; expected a list of rts.Camera, or what Camera.stack made")
+        if any(camera.is_stacked for camera in listed):
+            raise InputError("cameras holds a stack; expected cameras of one view each, or one stack")
+    return [_check_camera(camera) for camera in listed]
 
 
 def _check_camera(camera: Camera) -> Camera:
@@ -75,6 +99,32 @@ def _check_part(index: int, part: Part) -> CheckedPart:
     if isinstance(reads, str) or not set(reads) <= set(theta):
         raise InputError(f"reads of {surface!r} gave {reads!r}; expected names of entries of theta: {sorted(theta)}")
     return CheckedPart(surface, theta, shader, transform, part.cull)
+
+
+def check_channels(parts: Sequence[CheckedPart]) -> int:
+    """The number of channels besides alpha that the shaders of all parts give, refused where it is not one number."""
+    count = parts[0].shader.channels
+    for index, part in enumerate(parts):
+        if not is_count(part.shader.channels):
+            raise InputError(
+                f"channels of the shader {quoted(part.shader)} is {quoted(part.shader.channels)}; expected an integer "
+                f"of at least 1"
+            )
+        if part.shader.channels != count:
+            raise InputError(
+                f"the shader of part 0 gives {count} channels and that of part {index} gives {part.shader.channels}; "
+                f"expected the same number for all parts of a scene"
+            )
+    return count
+
+
+def check_colors(channels: int) -> None:
+    """Refuse images that are no colours, where they are to be looked at as such."""
+    if channels != 3:
+        raise InputError(
+            f"the scene's shaders give {channels} channels besides alpha; expected 3: look at three of them at a "
+            f"time, by a shader that gives those"
+        )
 
 
 def check_changes(index: int, changes: Mapping[str, Any], count: int) -> None:
@@ -131,7 +181,9 @@ def check_matrix(name: str, matrix: Any) -> Array:
     """A (4, 4) matrix of floating numbers; anything else is refused."""
     matrix = from_numbers(matrix, name)
     if shape_of(matrix) != (4, 4):
-        raise InputError(f"{name} {described(matrix)}; expected a (4, 4) array")
+        several = len(shape_of(matrix)) == 3 and shape_of(matrix)[1:] == (4, 4)
+        hint = "; for several views call rts.render_views, for several poses vmap of rts.render" if several else ""
+        raise InputError(f"{name} {described(matrix)}; expected a (4, 4) array{hint}")
     if isinstance(matrix, np.ndarray):
         return matrix if matrix.dtype.kind == "f" else matrix.astype(np.float64)
     check_floating(name, matrix)
@@ -189,15 +241,17 @@ def is_real(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
-def check_background(background: Any, size: tuple[int, int]) -> Array | None:
-    """The background as an array, refused where it fits no image of this size."""
+def check_background(background: Any, size: tuple[int, int], channels: int) -> Array | None:
+    """The background as an array, refused where it fits no image of this size and number of channels."""
     if background is None:
         return None
     background = from_numbers(background, "background")
-    if shape_of(background) not in ((3,), (4,), (*size, 3), (*size, 4)):
+    few, all_ = channels, channels + 1
+    if shape_of(background) not in ((few,), (all_,), (*size, few), (*size, all_)):
         height, width = size
         raise InputError(
-            f"background {described(background)}; expected (3,), (4,), ({height}, {width}, 3) or ({height}, {width}, 4)"
+            f"background {described(background)}; expected ({few},), ({all_},), ({height}, {width}, {few}) or "
+            f"({height}, {width}, {all_})"
         )
     check_floating("background", background)
     if not is_finite(background):
@@ -211,10 +265,13 @@ def check_floating(name: str, value: Array) -> None:
         raise InputError(f"{name} has dtype {value.dtype}; expected floating numbers")
 
 
-def check_shaded(rgba: Any, count: int, shader: Any) -> None:
+def check_shaded(rgba: Any, count: int, shader: Shader) -> None:
     """Refuse what a shader should not have returned: another shape, or no floating numbers."""
-    if shape_of(rgba) != (count, 4):
-        raise InputError(f"what the shader {quoted(shader)} returned {described(rgba)}; expected ({count}, 4)")
+    expected, shape = (count, shader.channels + 1), shape_of(rgba)
+    if shape != expected:
+        other = len(shape) == 2 and shape[0] == count and shape[1] > 4
+        hint = f": {shader.channels} channels and alpha, as its attribute `channels` says" if other else ""
+        raise InputError(f"what the shader {quoted(shader)} returned {described(rgba)}; expected {expected}{hint}")
     check_floating(f"what the shader {quoted(shader)} returned", rgba)
 
 

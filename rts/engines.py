@@ -130,6 +130,15 @@ class Engine(Plugin):
         """Wait until the arrays are computed, and return them."""
         return x
 
+    def concurrent(self) -> bool:
+        """Whether other threads may call host functions with its arrays now, as this thread would; False by default."""
+        return False
+
+    def split(self, x: Array, sizes: Sequence[int]) -> Sequence[Array]:
+        """The array cut along its first axis into pieces of these sizes."""
+        ends = np.cumsum(sizes)
+        return [x[end - size : end, ...] for size, end in zip(sizes, ends.tolist(), strict=True)]
+
     def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], Array], state: Tree, most: int) -> Tree:
         """Do `state = body(state)` as long as `going(state)`, () bool, is true, at most `most` times.
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
 
 from rts.arrays import described, shape_of
 from rts.camera import Camera
 from rts.checks import check_shaded, check_splats
 from rts.engines import Engine, constants, engine_of, is_constant, namespace, suiting
 from rts.errors import InputError
+from rts.footprints import FOOTPRINT, uv_footprint
 from rts.gbuffer import GBuffer
 from rts.interfaces import CheckedPart
 from rts.operations.linear import affine_map
@@ -19,7 +22,13 @@ from rts.trees import Array, Tree
 
 
 def to_splats(
-    sampled: Sampled, parts: Sequence[CheckedPart], camera: Camera, window: Camera, engine: Engine, like: Array | None
+    sampled: Sampled,
+    parts: Sequence[CheckedPart],
+    camera: Camera,
+    window: Camera,
+    engine: Engine,
+    like: Array | None,
+    evaluated: Sequence[GBuffer] | None = None,
 ) -> Splats:
     """Evaluate, shade and project samples: what splatters take, with the apron as border. Fine ones are left out.
 
@@ -30,12 +39,13 @@ def to_splats(
         window: the camera of the samples.
         engine: the engine to compute with.
         like: an array that sets dtype and device of its constants and of the splats.
+        evaluated: what `evaluated_together` gave for these samples, if they have been evaluated.
     """
     grid, apron = tuple(sampled.row.shape[1:]), sampled.apron
     wide = Wide(window.with_apron((grid[0] - 2 * apron, grid[1] - 2 * apron), apron), grid)
     if not engine.owns(sampled.row):
         sampled = constants(sampled, engine, like if engine.differentiates else None)
-    positions, rgba = _shown(sampled.samples, sampled.row, parts, camera, wide, engine, like)
+    positions, rgba = _shown(sampled.samples, sampled.row, parts, camera, wide, engine, like, evaluated)
     cells = sampled.row, sampled.part, sampled.facing, sampled.settled, sampled.exit
     if not engine.owns(rgba):
         cells = constants(cells, *suiting(positions, rgba))
@@ -67,8 +77,9 @@ def _shown(
     wide: Wide,
     engine: Engine,
     like: Array | None,
+    evaluated: Sequence[GBuffer] | None = None,
 ) -> tuple[Array, Array]:
-    """Positions (N, 3) in a grid and colours (N, 4) of the samples of all parts, in order.
+    """Positions (N, 3) in a grid and colours (N, C + 1) of the samples of all parts, in order.
 
     Args:
         sampled: the samples of each part.
@@ -78,6 +89,7 @@ def _shown(
         wide: the grid, and its camera.
         engine: the engine to compute with.
         like: an array that sets dtype and device of its constants and of what is returned.
+        evaluated: the G-buffer of each part, if it is known.
     """
     dtype = like
     if not engine.differentiates:
@@ -88,12 +100,16 @@ def _shown(
     for index, (part, samples) in enumerate(zip(parts, sampled, strict=True)):
         transform = constants(part.transform, engine, like)
         reads = part.surface.reads(part.theta)
-        local = _evaluate(part, reads, samples, engine, like)
+        local = _evaluate(part, reads, samples, engine, like) if evaluated is None else evaluated[index]
+        own = seen.within(transform)
+        if "uv" in local and FOOTPRINT not in local:
+            given = part.surface, {k: part.theta[k] for k in reads}, samples, local, own, wide.grid, engine, like
+            local.defer(FOOTPRINT, partial(uv_footprint, *given))
         theta = {k: v if k in reads else constants(v, engine, like) for k, v in part.theta.items()}
         world = _to_world(_readable(local, samples, engine), transform)
         rgba = _shaded(part, theta, world, camera)
         check_shaded(rgba, local["position"].shape[0], part.shader)
-        positions.append(constants(seen.within(transform).project(local["position"], wide.grid), engine, dtype))
+        positions.append(constants(own.project(local["position"], wide.grid), engine, dtype))
         check_splats(index, part, world, positions[-1], rgba, row, first)
         colors.append(constants(rgba, engine, dtype))
         first += samples.ids.shape[-2]
@@ -104,6 +120,66 @@ def _shown(
         return positions[0], colors[0]
     xp = namespace(positions[0])
     return xp.concat(positions), xp.concat(colors)
+
+
+def evaluated_together(
+    views: Sequence[Sampled], parts: Sequence[CheckedPart], engine: Engine, like: Array | None
+) -> list[Sequence[GBuffer] | None]:
+    """The G-buffers of all parts at the samples of each of several views, in local space; None where they stay apart.
+
+    A surface is asked once, for the samples of all views: what it computes of the whole of θ serves them all.
+
+    Args:
+        views: the samples of each view, in arrays of the engine.
+        parts: checked parts.
+        engine: the engine to compute with.
+        like: an array that sets dtype and device of its constants.
+    """
+    if not all(_can_be_joined(view, engine) for view in views):
+        return [None] * len(views)
+    found = []
+    for index, part in enumerate(parts):
+        own = [view.samples[index] for view in views]
+        whole = _evaluate(part, part.surface.reads(part.theta), _joined(own), engine, like)
+        found.append(_apart(whole, [samples.ids.shape[0] for samples in own], engine))
+    return list(zip(*found, strict=True))
+
+
+def _can_be_joined(view: Sampled, engine: Engine) -> bool:
+    """Whether samples can stand in one table with those of other views: all rows are used, and no table is shared."""
+    if not engine.owns(view.row) or engine.padded(view.row):
+        return False
+    return all(s.gbuffer is None and set(s.by_sample) == set(s.tables) for s in view.samples)
+
+
+def _joined(views: Sequence[Samples]) -> Samples:
+    """The samples of a part in several views as those of one, whose grids lie one above the other."""
+    xp, first, rows = namespace(views[0].row), 0, []
+    for samples in views:
+        rows.append(xp.where(samples.row >= 0, samples.row + first, samples.row))
+        first += samples.ids.shape[0]
+    return replace(
+        views[0],
+        ids=xp.concat([s.ids for s in views]),
+        params=xp.concat([s.params for s in views]),
+        row=xp.concat(rows, axis=1),
+        depth=xp.concat([s.depth for s in views], axis=1),
+        overflow=sum(s.overflow for s in views),
+        tables={name: xp.concat([s.tables[name] for s in views]) for name in views[0].tables},
+        facing=None,
+        settled=None,
+    )
+
+
+def _apart(gbuffer: GBuffer, sizes: Sequence[int], engine: Engine) -> list[GBuffer]:
+    """The G-buffers of several views, of so many samples each, from one of them all."""
+    split = cache(lambda name: engine.split(gbuffer[name], sizes))
+    views = []
+    for b in range(len(sizes)):
+        views.append(GBuffer(position=split("position")[b]))
+        for name in set(gbuffer) - {"position"}:
+            views[b].defer(name, lambda name=name, b=b: split(name)[b])
+    return views
 
 
 def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:

@@ -14,6 +14,8 @@ class GBuffer(dict):
     Surfaces give it in local space; shaders get it with positions and normals in world space. An attribute may be
     deferred: it is computed when first read, so a shader pays for what it reads. To read one that is missing raises an
     `InputError`. Built-in surfaces use the names position, normal, uv and color, and any others that the user adds.
+    Where there is uv, shaders also get "uv_footprint" (N, 4): ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for one sample to the right
+    and one down, without derivative.
     """
 
     def __init__(self, *args: Any, **kwargs: Any):

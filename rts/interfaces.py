@@ -70,15 +70,18 @@ class Evaluator(Plugin):
 class Surface(Evaluator):
     """A kind of surface. It holds topology and is immutable; its numbers come as θ.
 
-    Subclass `TriangleSurface`, `RaySurface`, or both.
+    Subclass `TriangleSurface`, `RaySurface`, or both. Several threads may call its methods at once.
 
     Attributes:
         sample_widths: (I, P), how many integers and reals a sample has, after `refine`. Every surface sets it.
         centered: whether samples lie on the rays through cells' centres.
+        param_step: by how much the two `params` of a sample are changed to tell how position and uv change with them,
+            which mipmaps go by; larger where both are linear in them.
     """
 
     sample_widths: tuple[int, int] = (-1, -1)
     centered: bool = True
+    param_step: float = 2**-8
 
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Raise an `InputError` of one line where an entry is missing or of a wrong shape; values may be traced."""
@@ -336,6 +339,7 @@ class Sampler(Plugin):
             interest in cells with hidden samples, and beside them.
         tells_exits: whether `sample` also takes the keyword `exits`: whether to find `Samples.exit` of parts that are
             culled, which is of interest in cells at outlines, and beside them.
+        concurrent: whether several threads may call `sample` at once, so that `rts.render_views` takes views at once.
     """
 
     culls: bool = False
@@ -343,6 +347,7 @@ class Sampler(Plugin):
     takes_cells: bool = False
     tells_facing: bool = False
     tells_exits: bool = False
+    concurrent: bool = False
 
     @abc.abstractmethod
     def sample(
@@ -388,8 +393,10 @@ class Shader(Plugin):
         opaque: a promise that alpha is 1.
         uniform: a promise that all samples of a part have one colour.
         reads: the entries of the G-buffer that it needs besides position; None for all.
+        channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
     """
 
+    channels: int = 3
     opaque: bool = False
     uniform: bool = False
     reads: tuple[str, ...] | None = None
@@ -404,7 +411,8 @@ class Shader(Plugin):
             camera: the camera of the whole image.
 
         Returns:
-            (N, 4) premultiplied linear RGBA, in [0, 1].
+            (N, 4) premultiplied linear RGBA, in [0, 1]; (N, C + 1), alpha last, of a shader with other `channels`, all
+            of them multiplied by alpha and otherwise of any value.
 
         Raises:
             InputError: an entry that the shader needs is missing.

@@ -138,10 +138,10 @@ class Samples:
 
 @record(static=("supersample", "apron"))
 class Fine:
-    """The fine samples of an adaptively sampled scene: cells of active pixels and an apron around them, in tiles.
+    """The fine samples of an adaptively sampled scene: cells of active pixels and an apron around them, in strips.
 
-    Tiles lie side by side in one layout of h × w cells, which splatters take as they take any picture. What lies
-    outside of active pixels there is no part of the image.
+    Runs of strips lie side by side in one layout of h × w cells, which splatters take as they take any picture. What
+    lies outside of active pixels there is no part of the image.
 
     Attributes:
         samples: one `Samples` for each part; `row` and `depth` are of a list of cells.
@@ -234,7 +234,8 @@ class Splats:
 
     Attributes:
         positions: (N, 3) pixel x, pixel y, linear depth; differentiable.
-        rgba: (N, 4) premultiplied, of the engine of the positions; differentiable.
+        rgba: (N, 4) premultiplied, of the engine of the positions; differentiable. Where shaders give other numbers of
+            channels, (N, C + 1): splatters are given three of them at a time, and alpha.
         row: (K, H, W) int32, the sample of each cell front to back, or −1; an array of the positions' engine.
         part: (K, H, W) int32, the part of each sample, or −1; None if that is not known.
         facing: (K, H, W) integers, the number of the piece of surface in each cell, negative where it is seen from

@@ -10,10 +10,20 @@ from functools import partial
 from typing import Any, Literal
 
 from rts.arguments import quoted
-from rts.arrays import described, shape_of
 from rts.camera import Camera
-from rts.checks import changed_part, check_background, check_changes, check_size, check_splatter
-from rts.engines import constants, engine_of, is_constant, namespace, suiting, suiting_scene, uncompiled, value_of
+from rts.channels import cropped_image
+from rts.checks import changed_part, check_background, check_changes, check_channels, check_size, check_splatter
+from rts.engines import (
+    Engine,
+    constants,
+    engine_of,
+    is_constant,
+    namespace,
+    suiting,
+    suiting_scene,
+    uncompiled,
+    value_of,
+)
 from rts.errors import EmptyImageWarning, InputError, warn
 from rts.evaluating import to_fine_splats, to_splats
 from rts.interfaces import Part, Splatter
@@ -58,7 +68,7 @@ def render(
             bands of rows, so that memory stays bounded; in a gradient each band is then made once more. Or an
             `rts.Adaptive`, for as many only where outlines are; there are no bands then.
         background: colour (3,) or (4,), or image (H, W, 3 or 4), premultiplied, to composite onto; None for
-            transparent.
+            transparent. Of C or C + 1 channels where the image has C and alpha.
         capacity: number of rows to allot for the samples of a part inside `jax.jit`, where shapes must be known. None
             for the worst case, layers × cells. If a third of the cells are covered, pass a third of that. What does not
             fit is dropped, deepest layers first, and counted: `overflow` of `rts.sample` is above 0, then. Where the
@@ -69,7 +79,8 @@ def render(
             are all NumPy, but a shader holds a network. None for the engine of the arrays.
 
     Returns:
-        (H, W, 4) premultiplied linear RGBA, row 0 on top. Its dtype is the widest floating one of the torch or jax
+        (H, W, 4) premultiplied linear RGBA, row 0 on top; (H, W, C + 1), alpha last, where shaders say that they give
+        C `channels`. Its dtype is the widest floating one of the torch or jax
         arrays in parts and camera; in a scene of NumPy arrays, the widest in any θ; at least float32. What else is
         NumPy, such as a camera in float64, does not widen it.
 
@@ -86,7 +97,7 @@ def render(
     options: dict[str, Any] = dict(
         splatter=check_splatter(splatter), layers=layers, supersample=supersample, capacity=capacity
     )
-    return _image(scene.at(size), size, check_background(background, size), **options)
+    return _image(scene.at(size), size, check_background(background, size, scene.channels), **options)
 
 
 class Renderer:
@@ -110,7 +121,8 @@ class Renderer:
     ):
         scene, self._engine = Scene.of(parts, camera, "auto", engine), engine
         self._size = check_size(size, layers, capacity, finest(supersample))
-        self._scene, self._background = scene.at(self._size), check_background(background, self._size)
+        self._scene = scene.at(self._size)
+        self._background = check_background(background, self._size, scene.channels)
         self._options: dict[str, Any] = dict(
             splatter=check_splatter(splatter), layers=layers, supersample=supersample, capacity=capacity
         )
@@ -134,6 +146,8 @@ class Renderer:
         if changes:
             parts = list(scene.parts)
             parts[index] = changed_part(index, parts[index], changes)
+            if "shader" in changes:
+                check_background(self._background, self._size, check_channels(parts))
             suited = suiting_scene(parts, scene.camera, engine=self._engine)
             scene = scene._replace(parts=parts, suited=suited)
         return _image(scene, self._size, self._background, **self._options)
@@ -142,33 +156,36 @@ class Renderer:
 PreparedParts._made = Renderer
 
 
-def _image(
+def _image(scene: Scene, size: tuple[int, int], background: Array | None, **options: Any) -> Array:
+    """The image of a scene for images of a size; see `render`."""
+    suited = scene.suited if is_constant(background) else scene.suiting(background)
+    return over_background(seen(image_of(scene, size, suited, **options), scene), background)
+
+
+def image_of(
     scene: Scene,
     size: tuple[int, int],
-    background: Array | None,
+    suited: tuple[Engine, Array | None],
     *,
     splatter: Splatter,
     layers: int | Literal["auto"],
     supersample: int | Adaptive,
     capacity: int | None,
 ) -> Array:
-    """The image of a scene for images of a size; see `render`."""
+    """The image of a scene for images of a size, over nothing; `suited` is for the half with derivatives."""
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
     bands = bands_of(*size, layers, supersample)
-    suited = scene.suited if is_constant(background) else scene.suiting(background)
     if isinstance(supersample, Adaptive) and supersample.contrast is not None:
-        image = _of_contrast(scene, size, suited, **options)
-        return _over_background(_seen(image, scene), background)
+        return _of_contrast(scene, size, suited, **options)
     if len(bands) == 1:
         sampled = sampled_scene(scene, scene.camera, size, settles=True, **options)
-        image = _splatted(sampled, scene, scene.camera, suited, splatter)
-        return _over_background(_seen(image, scene), background)
+        return splatted(sampled, scene, scene.camera, suited, splatter)
     images = []
     for top, rows in bands:
         window = scene.camera.window(size, (top, 0), (rows, size[1]))
         take = partial(sampled_scene, scene, window, (rows, size[1]), settles=True, **options)
-        images.append(suited[0].checkpoint(take, lambda s, w=window: _splatted(s, scene, w, suited, splatter)))
-    return _over_background(_seen(namespace(*images).concat(images), scene), background)
+        images.append(suited[0].checkpoint(take, lambda s, w=window: splatted(s, scene, w, suited, splatter)))
+    return namespace(*images).concat(images)
 
 
 def _of_contrast(
@@ -191,7 +208,7 @@ def _of_contrast(
             f"cannot depend on values that are not known yet"
         )
     fine = fine_scene(scene, scene.camera, size, coarse, adaptive=supersample, colors=colors, **options)
-    return _splatted(replace(coarse, fine=fine), scene, scene.camera, suited, splatter, splats)
+    return splatted(replace(coarse, fine=fine), scene, scene.camera, suited, splatter, splats)
 
 
 @uncompiled
@@ -244,9 +261,9 @@ def render_samples(
             f"{scene.parts[0].shader!r} need; give rts.sample this splatter and these parts, or leave it out"
         )
     sampled = _narrowed(sampled, apron - apron_of(splatter))
-    background = check_background(background, size)
+    background = check_background(background, size, scene.channels)
     suited = scene.suiting(sampled, background)
-    return _over_background(_splatted(sampled, scene, scene.camera, suited, splatter), background)
+    return over_background(splatted(sampled, scene, scene.camera, suited, splatter), background)
 
 
 def _narrowed(sampled: Sampled, cells: int) -> Sampled:
@@ -264,7 +281,7 @@ def _narrowed(sampled: Sampled, cells: int) -> Sampled:
     return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, **known)
 
 
-def _splatted(
+def splatted(
     sampled: Sampled,
     scene: Scene,
     window: Camera,
@@ -285,21 +302,12 @@ def _splatted(
     if splats is None:
         splats = to_splats(sampled, scene.parts, scene.camera, window, *suited)
     if sampled.fine is None:
-        image = _cropped(splatter, splats)
+        image = cropped_image(splatter, splats)
         return image if sampled.supersample == 1 else averaged(image, sampled.supersample)
     coarse = constants(sampled.fine.coarse, *suiting(splats.rgba))
-    image = _cropped(splatter, splats.replace(wanted=coarse))
-    finer = _cropped(splatter, to_fine_splats(sampled.fine, scene.parts, scene.camera, *suited))
+    image = cropped_image(splatter, splats.replace(wanted=coarse))
+    finer = cropped_image(splatter, to_fine_splats(sampled.fine, scene.parts, scene.camera, *suited))
     return with_inset(image, finer, constants(sampled.fine.pixel, engine_of(image), image), sampled.fine.supersample)
-
-
-def _cropped(splatter: Splatter, splats: Splats) -> Array:
-    """The image (h, w, 4) of splats without their border."""
-    image = splatter.cropped(splats)
-    expected = *(n - 2 * splats.border for n in splats.row.shape[1:]), 4
-    if shape_of(image) != expected:
-        raise InputError(f"the image of {splatter!r} {described(image)}; expected {expected} without the border")
-    return image
 
 
 def bands_of(
@@ -314,25 +322,26 @@ def bands_of(
     return [(top, end - top) for top, end in itertools.pairwise(edges)]
 
 
-def _seen(image: Array, scene: Scene) -> Array:
-    """The image, with a warning if nothing is seen in it."""
+def seen(image: Array, scene: Scene, name: str = "the image") -> Array:
+    """The image, with a warning if nothing is seen in it, which calls it by a name."""
     engine, (height, width) = engine_of(image), image.shape[:2]
     if not engine.on_host(image):
-        seen = value_of(engine.namespace.any(image[..., 3] > 0))
+        seen = value_of(engine.namespace.any(image[..., -1] > 0))
         if seen is None or seen.any():
             return image
     known = engine.known(image)
-    if known is None or known[..., :: max(1, height // 8), :: max(1, width // 8), 3].any() or known[..., 3].any():
+    if known is None or known[..., :: max(1, height // 8), :: max(1, width // 8), -1].any() or known[..., -1].any():
         return image
-    warn(f"nothing is seen in the image: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
+    warn(f"nothing is seen in {name}: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
     return image
 
 
-def _over_background(image: Array, background: Array | None) -> Array:
+def over_background(image: Array, background: Array | None) -> Array:
+    """Images (..., H, W, 4) composited onto a background."""
     if background is None:
         return image
     over: Array = constants(background, engine_of(image), image)
     xp = namespace(image)
-    if over.shape[-1] == 3:
+    if over.shape[-1] < image.shape[-1]:
         over = xp.concat([over, xp.ones_like(over[..., :1])], axis=-1)
-    return image + (1 - image[..., 3:]) * over
+    return image + (1 - image[..., -1:]) * over

@@ -3,7 +3,8 @@
 A shader is any function `shader(theta, gbuffer, camera) -> (N, 4)`. What it reads of θ is differentiable:
 
     "color" (3,) or (4,)             factor on the base colour
-    "texture" (h, w, C)              row 0 on top, C = 1, 3 or 4; sampled at gbuffer["uv"], whose v points up
+    "texture" (h, w, C)              row 0 on top, C = 1, 3 or 4; sampled at gbuffer["uv"], whose v points up; averaged
+                                     over gbuffer["uv_footprint"] by shaders with `mip=True`
     "light"                          dict of "direction" (3,) or (L, 3) towards the light, world space; "color" (3,) or
                                      (L, 3); "ambient" (3,). Default: one white light from above the camera's left
                                      shoulder and an ambient 0.2.
@@ -25,11 +26,12 @@ from rts.arrays import described, is_finite, shape_of, unit
 from rts.camera import Camera
 from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
+from rts.footprints import FOOTPRINT
 from rts.gbuffer import GBuffer
 from rts.interfaces import Shader
+from rts.textures import WRAPS, sample_texture
 from rts.trees import Array, Tree, map_leaves
 
-WRAPS = ("repeat", "mirror", "clamp")
 DEFAULT_AMBIENT, DEFAULT_DIFFUSE = 0.2, 0.8
 LIGHT_ENTRIES = ("direction", "color", "ambient")
 DEFAULT_LIGHT = (-0.3, 0.5, 0.81)  # In camera space.
@@ -90,15 +92,20 @@ class Unlit(Shader):
     Attributes:
         wrap: how the texture goes on outside [0, 1]: "repeat", "mirror" or "clamp".
         opaque: whether to ignore the alpha of texture and colours.
+        mip: whether to average the texture over about what a sample covers of it, trilinearly in a pyramid (mipmaps),
+            so that texels smaller than samples do not alias. How much that is has no derivative.
     """
 
     wrap: str = "repeat"
     opaque: bool = True
+    mip: bool = False
     reads = ("color", "uv")
 
     def __post_init__(self):
         if not isinstance(self.wrap, str) or self.wrap not in WRAPS:
             raise InputError(f"wrap is {quoted(self.wrap)}; expected one of {', '.join(WRAPS)}")
+        if self.mip and self.reads is not None:
+            object.__setattr__(self, "reads", (*self.reads, FOOTPRINT))
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
         """See `rts.Shader`."""
@@ -110,7 +117,8 @@ class Unlit(Shader):
         position = gbuffer["position"]
         xp = namespace(position)
         if "texture" in theta and "uv" in gbuffer:
-            base = sample_texture(theta["texture"], gbuffer["uv"], self.wrap)
+            footprint = gbuffer[FOOTPRINT] if self.mip else None
+            base = sample_texture(theta["texture"], gbuffer["uv"], self.wrap, footprint)
         elif "color" in gbuffer:
             base = gbuffer["color"]
         else:
@@ -201,52 +209,6 @@ def _towards(gbuffer: GBuffer, camera: Camera) -> Array:
 
 def _turned(normal: Array, toward: Array) -> Array:
     return namespace(normal).where(_dot(normal, toward) < 0, -normal, normal)
-
-
-def sample_texture(texture: Array, uv: Array, wrap: str = "repeat") -> Array:
-    """Bilinear texture lookup, differentiable in texture and uv.
-
-    Args:
-        texture: (h, w, C), row 0 on top; texel (i, j) has its centre at u = (j + 0.5) / w, v = 1 − (i + 0.5) / h.
-        uv: (N, 2), u to the right and v up; (0, 0) is the lower left corner of the image.
-        wrap: "repeat", "mirror" or "clamp" outside [0, 1].
-
-    Returns:
-        (N, C).
-    """
-    shape = shape_of(texture)
-    if len(shape) != 3 or shape[2] not in (1, 3, 4) or 0 in shape:
-        raise InputError(f"the texture {described(texture)}; expected (h, w, C) with C = 1, 3 or 4")
-    xp = namespace(texture, uv)
-    if not xp.isdtype(texture.dtype, "real floating"):
-        raise InputError(
-            f"the texture has dtype {texture.dtype}; expected floating numbers, linear and from 0 to 1 (rts.load_image)"
-        )
-    height, width, channels = shape
-    flat = xp.reshape(texture, (height * width, channels))
-    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    x0, y0 = xp.floor(x), xp.floor(y)
-    fx, fy = (x - x0)[:, None], (y - y0)[:, None]
-
-    def texel(dx: int, dy: int) -> Array:
-        index = _wrapped(y0 + dy, height, wrap) * width + _wrapped(x0 + dx, width, wrap)
-        return xp.take(flat, index, axis=0)
-
-    top = texel(0, 0) + fx * (texel(1, 0) - texel(0, 0))
-    bottom = texel(0, 1) + fx * (texel(1, 1) - texel(0, 1))
-    return top + fy * (bottom - top)
-
-
-def _wrapped(index: Array, count: int, wrap: str) -> Array:
-    """Whole-numbered floats as indices in [0, count)."""
-    xp = namespace(index)
-    index = xp.where(index == index, index, 0.0)  # NaN has no texel; as an index it would be out of range.
-    if wrap == "repeat":
-        index = index - xp.floor(index / count) * count
-    elif wrap == "mirror":
-        index = index - xp.floor(index / (2 * count)) * (2 * count)
-        index = xp.where(index >= count, 2 * count - 1 - index, index)
-    return xp.astype(xp.clip(index, 0, count - 1), xp.int32)
 
 
 def _light(theta: Mapping[str, Tree], camera: Camera) -> dict[str, Array]:

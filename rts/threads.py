@@ -11,9 +11,9 @@ import itertools
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,9 @@ TASKS_PER_THREAD = 4
 
 LITTLE_WORK = 100_000
 """Nanoseconds, below which a loop stays on the thread that asks for it: to ask another takes tens of thousands."""
+
+_In = TypeVar("_In")
+_Out = TypeVar("_Out")
 
 
 def _nothing() -> None:
@@ -48,12 +51,14 @@ class _Job:
             self.work = _nothing
         return mine
 
-    def run(self) -> None:
-        """Do the work, and mark it as done."""
+    def run(self, under_way: set[_Job]) -> None:
+        """Do the work, and mark it as done; as long as it goes on, it is in the set."""
+        under_way.add(self)
         try:
             self.work()
         except BaseException as error:
             self.error = error
+        under_way.discard(self)
         self._going.release()
 
     def wait(self) -> None:
@@ -67,7 +72,12 @@ class _Helpers:
     def __init__(self) -> None:
         self.count = 0
         self._jobs: SimpleQueue[_Job] = SimpleQueue()
+        self._under_way: set[_Job] = set()
         self._lock = threading.Lock()
+
+    def free(self, count: int) -> int:
+        """How many of so many helpers have nothing to do, or are not there yet."""
+        return max(0, count - len(self._under_way))
 
     def ask(self, job: _Job, count: int) -> None:
         """Hand a job to one of so many helpers."""
@@ -85,7 +95,7 @@ class _Helpers:
         while True:
             job = self._jobs.get()
             if job.claim():
-                job.run()
+                job.run(self._under_way)
             del job  # A thread that waits must not keep arrays alive.
 
 
@@ -126,7 +136,8 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
         *args: handed on.
         work: nanoseconds that it takes on one thread, roughly.
     """
-    if work < LITTLE_WORK or count <= 1 or (threads := thread_count()) == 1:
+    # In a task of another loop there may be no helper left, and to ask takes time.
+    if work < LITTLE_WORK or count <= 1 or (threads := thread_count()) == 1 or not (free := _helpers.free(threads - 1)):
         kernel(0, count, *args)
         return
     tasks = min(count, threads * TASKS_PER_THREAD)
@@ -140,7 +151,7 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
     # The caller works too. A helper that has not woken by the time all is begun is not waited for.
     jobs: list[_Job] = []
     try:
-        for _ in range(threads - 1):
+        for _ in range(free):
             jobs.append(_Job(share))
             _helpers.ask(jobs[-1], threads - 1)
         share()
@@ -152,3 +163,28 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
     for job in jobs:
         if job.error is not None:
             raise job.error
+
+
+def each(f: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
+    """The results of a function for each of some items, on all cores; the loops inside of it share those that are left.
+
+    Where it fails for several items, the error is that of the first.
+
+    Args:
+        f: a function that several threads may call at once.
+        items: what to call it with, in this order.
+    """
+    found: list[Any] = [None] * len(items)
+    errors: dict[int, Exception] = {}
+
+    def some(start: int, stop: int) -> None:
+        for i in range(start, stop):
+            try:
+                found[i] = f(items[i])
+            except Exception as error:
+                errors[i] = error
+
+    parallel(some, len(items))
+    if errors:
+        raise errors[min(errors)]
+    return found

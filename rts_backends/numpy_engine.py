@@ -52,6 +52,10 @@ class NumpyEngine(Engine):
         """True: NumPy's products keep their precision."""
         return True
 
+    def concurrent(self) -> bool:
+        """True: NumPy keeps nothing that belongs to a thread."""
+        return True
+
     def stop_gradient(self, x: Array) -> Array:
         """`x` itself."""
         return x

@@ -12,9 +12,7 @@ that they compile to vector instructions and no jump is mispredicted; what is ra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -23,7 +21,7 @@ from rts.compiling import compiled, kernel
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel, read_only
-from rts_backends import raster_cells
+from rts_backends.raster_cells import Blocks, touches
 from rts_backends.raster_drawing import BAND_ROWS, LISTED, draw, draw_cells
 from rts_backends.triangles import facing, pixel_matrix, to_corner
 
@@ -47,117 +45,75 @@ class Raster(TriangleSampler):
     """K-buffer rasterization with a top-left fill rule; ties in depth go to the lower triangle index."""
 
     tells_exits = True
-    _scratch: dict[tuple, tuple]
+    concurrent = True
+    _scratch: tuple[tuple, list[tuple]]
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Give every instance room to keep scratch memory, whatever `__init__` a subclass has."""
         self = super().__new__(cls, *args, **kwargs)
-        self._scratch = {}  # At most one; whoever draws takes it out, so threads never share.
+        self._scratch = (), []  # Of one size alone; whoever draws takes his out, so threads never share.
         return self
 
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
-        with self._listed(prepared, camera, size, cull) as (listed,):
-            return listed.drawn(layers)
+        return self._drawn(prepared, camera, size, layers, cull, None)
 
     def rasterize_cells(
         self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
     ) -> Fragments:
         """See `TriangleSampler.rasterize_cells`: triangles that touch no block of these cells are passed over."""
-        with self._listed(prepared, camera, size, cull) as (listed,):
-            return listed.drawn_cells(layers, cells)
+        return self._drawn(prepared, camera, size, layers, cull, cells)
 
-    def rasterize_with_backs(
+    def _drawn(
         self,
         prepared: Proxy,
         camera: Camera,
         size: tuple[int, int],
         layers: int,
-        choose: Callable[[Fragments], np.ndarray],
-    ) -> tuple[Fragments, np.ndarray, Fragments]:
-        """See `TriangleSampler.rasterize_with_backs`: both are listed at once."""
-        with self._listed(prepared, camera, size, "back", "front") as (fronts, backs):
-            fragments = fronts.drawn(layers)
-            cells = choose(fragments)
-            return fragments, cells, backs.drawn_cells(1, cells)
-
-    @contextmanager
-    def _listed(self, prepared: Proxy, camera: Camera, size: tuple[int, int], *culls: str) -> Iterator[list[_Listed]]:
-        """The triangles that may cover a pixel's centre, for each way of culling, of which the second is opposite."""
+        cull: str,
+        cells: np.ndarray | None,
+    ) -> Fragments:
+        """Fragments of all cells, or of some."""
+        height, width = size
         # With unsigned indices compiled code need not look for negative ones, which count from the end.
         vertices, faces = read_only(prepared.vertices), read_only(prepared.faces, np.int32).view(np.uint32)
-        matrix, keeps = pixel_matrix(camera, size), [facing(camera, cull) for cull in culls]
+        matrix, keep = pixel_matrix(camera, size), facing(camera, cull)
         # Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
         # room for every vertex and triangle, but only what is used is ever touched.
         key = len(vertices), len(faces)
-        screen, listed = self._scratch.pop(key, None) or (
-            np.empty(len(vertices), np.int32),
-            np.empty((2, len(faces), LISTED), np.int32),
-        )
-        height, width = size
+        scratch = self._scratch
+        if scratch[0] != key:
+            scratch = self._scratch = key, []
+        try:
+            screen, listed = scratch[1].pop()
+        except IndexError:
+            screen, listed = np.empty(len(vertices), np.int32), np.empty((len(faces), LISTED), np.int32)
         step = (max(size) / 2 + 2) / float(LIMIT)
         to_steps = np.diag([1 / step, 1 / step, 1, 1])
         to_steps[:2, 3] = -width / 2 / step, -height / 2 / step
         parallel(_project, len(vertices), vertices, to_steps @ matrix, screen, work=4 * len(vertices))
-        chunks, bands, sides = -(-len(faces) // CHUNK), -(-height // BAND_ROWS), len(keeps)
-        spans, counts = np.empty((sides, chunks, 2), np.int64), np.zeros((sides, bands, chunks), np.int64)
-        given = vertices, faces, screen, matrix, height, width, step, keeps[0]
+        chunks, bands = -(-len(faces) // CHUNK), -(-height // BAND_ROWS)
+        spans, counts = np.empty((chunks, 2), np.int64), np.zeros((bands, chunks), np.int64)
+        blocks = Blocks.everything() if cells is None else Blocks.of(cells, size)
+        given = vertices, faces, screen, matrix, height, width, step, keep, blocks.bits
         parallel(_select, chunks, *given, listed, spans, counts, work=10 * len(faces))
-        view = vertices, matrix, -camera.view[2]
-        yield [_Listed(size, *view, *side) for side in zip(keeps, listed, spans, counts, strict=False)]
-        self._scratch = {key: (screen, listed)}
-
-
-class _Listed(NamedTuple):
-    """Triangles that may cover a pixel's centre.
-
-    Attributes:
-        size: (height, width).
-        vertices: (V, 3) float32.
-        matrix: (4, 4), from vertices to pixels.
-        view_depth: (4,), the row of the view that gives depth.
-        keep: sign of the determinants to keep, or 0.
-        listed: (·, LISTED) int32, what is listed of each.
-        spans: (chunks, 2), where those of each chunk of triangles begin and end in the list.
-        counts: (bands, chunks), how many of them touch each band of rows.
-    """
-
-    size: tuple[int, int]
-    vertices: np.ndarray
-    matrix: np.ndarray
-    view_depth: np.ndarray
-    keep: float
-    listed: np.ndarray
-    spans: np.ndarray
-    counts: np.ndarray
-
-    def drawn(self, layers: int) -> Fragments:
-        """Fragments of all cells."""
-        shape = layers, *self.size
-        fragments = Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
-        parallel(draw, len(self.counts), *self._sorted(), *fragments)
-        return fragments
-
-    def drawn_cells(self, layers: int, cells: np.ndarray) -> Fragments:
-        """Fragments of some cells (L, C), as flat indices; the list is narrowed to what touches them."""
-        blocks, chunks = raster_cells.Blocks.of(cells, self.size), self.counts.shape[1]
-        given = self.listed, blocks.bits, self.spans, self.counts
-        parallel(raster_cells.narrow, chunks, *given, work=15 * int(self.counts.sum()))
-        fragments = blocks.nothing(cells, layers)
-        flat = [x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments]
-        nearest = np.full((layers, cells.size), np.inf)
-        given = *self._sorted(), blocks.table, blocks.numbers, nearest
-        parallel(draw_cells, len(self.counts), *given, *flat)
-        return fragments
-
-    def _sorted(self) -> tuple[Any, ...]:
-        """Arguments of what draws the list, sorted by bands."""
-        counts = self.counts
         offsets = np.append(0, np.cumsum(counts.sum(axis=1)))
         places = offsets[:-1, None] + np.cumsum(counts, axis=1) - counts
         items = np.empty(offsets[-1], np.uint32)
-        parallel(_sort, counts.shape[1], self.listed, self.spans, places, items, work=8 * len(items))
-        return offsets, items, self.listed, self.vertices, self.matrix, self.view_depth, self.keep
+        parallel(_sort, chunks, listed, spans, places, items, work=8 * len(items))
+        shape = layers, *(size if cells is None else cells.shape)
+        fragments = Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
+        given = offsets, items, listed, vertices, matrix, -camera.view[2], keep, blocks.bits
+        if cells is None:
+            parallel(draw, bands, *given, tuple(fragments))
+        else:
+            if (absent := cells < 0).any():
+                for x, nothing in zip(fragments, (-1, 0, 0), strict=True):
+                    x[:, absent] = nothing
+            flat = tuple(x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments)
+            parallel(draw_cells, bands, *given, blocks.table, blocks.numbers, flat)
+        scratch[1].append((screen, listed))
+        return fragments
 
 
 @kernel(error_model="numpy")
@@ -185,21 +141,21 @@ def _project(start, stop, vertices, m, screen):
 
 
 @kernel(error_model="numpy")
-def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, listed, spans, counts):
-    """List the triangles that may cover a pixel's centre, and count them; once, or again for the side that is culled.
+def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, bits, listed, spans, counts):
+    """List the triangles that may cover a pixel's centre, of those that `bits` of `Blocks` tell; and count them.
 
-    Chunks of one call follow on each other in a list; `spans` (·, chunks, 2) says where each begins and ends, `counts`
-    (·, bands, chunks) how many of its triangles touch a band of rows.
+    Chunks of one call follow on each other in the list; `spans` (chunks, 2) says where each begins and ends, `counts`
+    (bands, chunks) how many of its triangles touch a band of rows.
     """
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
-    clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty((2, LONG_BLOCK), np.bool_)
+    clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
     chosen, corners = np.empty(LONG_BLOCK, np.uint32), np.empty((3, 4))
     step, sign = np.float32(step), np.float32(keep)
     more = np.float32(1.25)
     middle, center, half, four = np.float32(width / 2), np.float32(height / 2), np.float32(0.5), np.float32(4)
-    sides, found = len(spans), np.full(len(spans), first * CHUNK)
+    found = first * CHUNK
     for chunk in range(first, last):
-        spans[:, chunk, 0] = found
+        spans[chunk, 0] = found
         end = min(len(faces), (chunk + 1) * CHUNK)
         for start in range(chunk * CHUNK, end, LONG_BLOCK):
             block = faces[start : min(end, start + LONG_BLOCK)]
@@ -214,41 +170,40 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
                     x0 * step + middle, x1 * step + middle, y0 * step + center, y1 * step + center, height, width, step
                 )
                 box[0, b], box[1, b], box[2, b], box[3, b] = i0, i1, j0, j1
-                # Where there is one centre, most triangles whose box holds it do not.
+                # Where there is one centre, most triangles whose box holds it do not. Half of a mesh faces away.
                 x, y = (i0 + half - middle) / step, (j0 + half - center) / step
                 ax, ay, bx, by, cx, cy = xa - x, ya - y, xb - x, yb - y, xc - x, yc - y
                 ea, eb, ec = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
                 # Rounding changes coordinates by half a step at most, so these by the sum of the box's sides and 2.5,
                 # and their sum by twice that. The rest is for the centre, which is rounded to a hundredth.
                 bound = more * (x1 - x0 + y1 - y0 + four)
-                area = (ea + eb + ec) * sign
-                missed = (min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound)
+                away = (ea + eb + ec) * sign < -(bound + bound)
                 placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
                 clips[b] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)
-                near_one = (i0 <= i1) & (j0 <= j1) & ~((i0 == i1) & (j0 == j1) & placed & missed)
-                near[0, b] = clips[b] | (near_one & ~(placed & (area < -(bound + bound))))
-                near[1, b] = clips[b] | (near_one & ~(placed & (area > bound + bound)))
-            for side in range(sides):
-                count = 0
-                for b in range(len(block)):
-                    chosen[count] = b
-                    count += near[side, b]
-                for b in chosen[:count]:
-                    i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
-                    if clips[b]:
-                        for c in range(3):
-                            to_corner(matrix, vertices, block[b, c], corners, c)
-                        x0, x1, y0, y1 = _clipped_box(corners, width, height)
-                        i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
-                        if i0 > i1 or j0 > j1:
-                            continue
-                    entry = listed[side, found[side]]
-                    entry[0], entry[1], entry[2], entry[3] = start + b, block[b, 0], block[b, 1], block[b, 2]
-                    entry[4], entry[5], entry[6], entry[7] = i0, i1, j0, j1
-                    found[side] += 1
-                    for band in range(int(j0) // BAND_ROWS, int(j1) // BAND_ROWS + 1):
-                        counts[side, band, chunk] += 1
-        spans[:, chunk, 1] = found
+                missed = ((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound) & (i0 == i1) & (j0 == j1)) | away
+                near[b] = clips[b] | ((i0 <= i1) & (j0 <= j1) & ~(placed & missed))
+            count = 0
+            for b in range(len(block)):
+                chosen[count] = b
+                count += near[b]
+            for b in chosen[:count]:
+                i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
+                if clips[b]:
+                    for c in range(3):
+                        to_corner(matrix, vertices, block[b, c], corners, c)
+                    x0, x1, y0, y1 = _clipped_box(corners, width, height)
+                    i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
+                    if i0 > i1 or j0 > j1:
+                        continue
+                if len(bits) > 0 and not touches(bits, np.uint32(i0), np.uint32(i1), np.uint32(j0), np.uint32(j1)):
+                    continue
+                listed[found, 0] = start + b
+                listed[found, 1], listed[found, 2], listed[found, 3] = block[b, 0], block[b, 1], block[b, 2]
+                listed[found, 4], listed[found, 5], listed[found, 6], listed[found, 7] = i0, i1, j0, j1
+                found += 1
+                for band in range(int(j0) // BAND_ROWS, int(j1) // BAND_ROWS + 1):
+                    counts[band, chunk] += 1
+        spans[chunk, 1] = found
 
 
 @compiled

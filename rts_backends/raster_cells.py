@@ -6,15 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.compiling import kernel
-from rts.records import Fragments
+from rts.compiling import compiled, kernel
 
 SIDE = 16
 """Cells along each side of a block, which are as many as rows of a band of the rasterizer."""
-
-BOX, LISTED = 4, 8
-"""Where the box of a listed triangle begins in what is listed of it, first and last column and row; and where it ends.
-"""
 
 ALL = np.uint32(2**SIDE - 1)
 
@@ -37,73 +32,48 @@ class Blocks(NamedTuple):
         """The blocks of cells (L, C), flat indices in a grid of (height, width), or −1."""
         height, width = size
         table = np.full((-(-height // SIDE), -(-width // SIDE)), -1, np.int32)
-        cells = np.ascontiguousarray(cells, np.int32).reshape(-1)
-        numbers = np.full((_number(cells, width, table), SIDE, SIDE), -1, np.int32)
+        numbers = np.empty((table.size, SIDE, SIDE), np.int32)
         bits = np.zeros((height, table.shape[1]), np.uint16)
-        _fill(cells, width, table, numbers, bits)
-        return cls(table, numbers, bits)
+        count = _fill(np.ascontiguousarray(cells, np.int32).reshape(-1), width, table, numbers, bits)
+        return cls(table, numbers[:count], bits)
 
-    @staticmethod
-    def nothing(cells: np.ndarray, layers: int) -> Fragments:
-        """Empty fragments (K, L, C)."""
-        shape = layers, *cells.shape
-        ids, barycentrics = np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32)
-        return Fragments(ids, barycentrics, np.zeros(shape, np.float32))
-
-
-@kernel
-def _number(cells, width, table):
-    """Number the blocks that hold any cells; how many there are."""
-    count = 0
-    for cell in cells:
-        if cell >= 0:
-            y, x = cell // width // SIDE, cell % width // SIDE
-            if table[y, x] < 0:
-                table[y, x] = count
-                count += 1
-    return count
+    @classmethod
+    def everything(cls) -> Blocks:
+        """What stands for all cells: no blocks, and no bits."""
+        return cls(np.empty((0, 0), np.int32), np.empty((0, SIDE, SIDE), np.int32), np.empty((0, 0), np.uint16))
 
 
 @kernel
 def _fill(cells, width, table, numbers, bits):
+    """Number the blocks that hold any cells, and fill in what these are; how many there are."""
+    count, last, y, x, side = 0, -2, 0, 0, np.uint32(SIDE)
     for m in range(len(cells)):
-        if cells[m] >= 0:
-            y, x = cells[m] // width, cells[m] % width
-            numbers[table[y // SIDE, x // SIDE], y % SIDE, x % SIDE] = m
-            bits[y, x // SIDE] |= np.uint16(1 << x % SIDE)
+        cell = cells[m]
+        if cell < 0:
+            continue
+        x += 1
+        if cell != last + 1 or x == width:  # Most follow on each other.
+            y, x = cell // width, cell % width
+        last = cell
+        v, u = np.uint32(y), np.uint32(x)
+        if table[v // side, u // side] < 0:
+            table[v // side, u // side] = count
+            numbers[count] = -1
+            count += 1
+        numbers[np.uint32(table[v // side, u // side]), v % side, u % side] = m
+        bits[v, u // side] |= np.uint16(1 << u % side)
+    return count
 
 
-@kernel
-def narrow(first, last, listed, bits, spans, counts):
-    """Leave out listed triangles whose box of pixels holds none of the cells.
-
-    Args:
-        first: first chunk.
-        last: past the last chunk.
-        listed: see `rts_backends.raster`.
-        bits: of `Blocks`.
-        spans: (chunks, 2), where each chunk begins and ends in the list; ends are changed.
-        counts: (bands, chunks), to be counted anew.
-    """
-    for chunk in range(first, last):
-        counts[:, chunk] = 0
-        found = spans[chunk, 0]
-        for n in range(spans[chunk, 0], spans[chunk, 1]):
-            left, right = np.uint32(listed[n, BOX]), np.uint32(listed[n, BOX + 1])
-            top, bottom = np.uint32(listed[n, BOX + 2]), np.uint32(listed[n, BOX + 3])
-            i0, i1 = left // np.uint32(SIDE), right // np.uint32(SIDE)
-            begin, end = ALL << left % np.uint32(SIDE) & ALL, ALL >> (np.uint32(SIDE - 1) - right % np.uint32(SIDE))
-            touches = False
-            for y in range(top, bottom + 1):
-                for i in range(i0, i1 + 1):
-                    mask = (begin if i == i0 else ALL) & (end if i == i1 else ALL)
-                    touches |= (bits[y, i] & mask) != 0
-                if touches:
-                    break
-            if touches:
-                for r in range(LISTED):
-                    listed[found, r] = listed[n, r]
-                found += 1
-                for j in range(top // np.uint32(SIDE), bottom // np.uint32(SIDE) + 1):
-                    counts[j, chunk] += 1
-        spans[chunk, 1] = found
+@compiled
+def touches(bits, left, right, top, bottom):
+    """Whether a box of cells, of which the first and last columns and rows are given, holds any that are asked for."""
+    side = np.uint32(SIDE)
+    i0, i1 = left // side, right // side
+    begin, end = ALL << left % side & ALL, ALL >> (side - np.uint32(1) - right % side)
+    for y in range(top, bottom + np.uint32(1)):
+        for i in range(i0, i1 + np.uint32(1)):
+            mask = (begin if i == i0 else ALL) & (end if i == i1 else ALL)
+            if bits[y, i] & mask != 0:
+                return True
+    return False

@@ -15,7 +15,7 @@ from rts_backends.triangles import owns
 BAND_ROWS = raster_cells.SIDE
 BLOCK = 64
 
-LISTED = raster_cells.LISTED
+LISTED = 8
 """What is listed of a triangle: its index, its three corners, and its first and last column and row of pixels."""
 
 NUMBERS = 18
@@ -23,48 +23,18 @@ NUMBERS = 18
 
 
 @kernel(error_model="numpy")
-def draw(first, last, offsets, items, listed, vertices, matrix, view_depth, keep, triangle_ids, barycentrics, depths):
-    """Fill the three fragment arrays, band by band."""
+def draw(first, last, offsets, items, listed, vertices, matrix, view_depth, keep, bits, fragments):
+    """Fill the three fragment arrays, band by band; `bits` are those of `Blocks` for all cells."""
+    triangle_ids, barycentrics, depths = fragments
     layers, height, width = triangle_ids.shape
     nearest = np.empty((layers, BAND_ROWS, width))
-    entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
-    numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
-    most = 4 * BLOCK
-    hits = np.empty((most + width, 2), np.int32)
+    given = offsets, items, listed, vertices, matrix, view_depth, keep, bits
     for band in range(first, last):
-        top, bottom = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS) - 1
-        rows = slice(top, bottom + 1)
-        nearest[:], triangle_ids[:, rows], barycentrics[:, rows] = np.inf, -1, 0
-        for start in range(offsets[band], offsets[band + 1], BLOCK):
-            block = items[start : min(offsets[band + 1], start + BLOCK)]
-            _gather(block, listed, vertices, entries, points)
-            _set_up(len(block), points, matrix, view_depth, keep, top, bottom, entries, numbers, clips)
-            _cover(len(block), entries, numbers, covers)
-            found = 0
-            for b in range(len(block)):
-                i0, i1, j0, j1 = entries[4, b], entries[5, b], entries[6, b], entries[7, b]
-                place = b * BAND_ROWS + j0 - top
-                if (i1 - i0 < 2) & (j1 - j0 < 2):
-                    for n in range(4):
-                        hits[found, 0], hits[found, 1] = place + (n >> 1), i0 + (n & 1)
-                        found += (covers[b] >> n) & 1
-                    continue
-                for j in range(j0, j1 + 1):
-                    y = j + 0.5
-                    ra, rb = numbers[1, b] * y + numbers[2, b], numbers[4, b] * y + numbers[5, b]
-                    rc = numbers[7, b] * y + numbers[8, b]
-                    for i in range(i0, i1 + 1):
-                        x = i + 0.5
-                        ea, eb, ec = numbers[0, b] * x + ra, numbers[3, b] * x + rb, numbers[6, b] * x + rc
-                        hits[found, 0], hits[found, 1] = place, i
-                        found += (ea >= 0) & (eb >= 0) & (ec >= 0)
-                    place += 1
-                    if found > most - 4:
-                        _insert(hits[:found], top, entries, numbers, clips, nearest, triangle_ids, barycentrics)
-                        found = 0
-            _insert(hits[:found], top, entries, numbers, clips, nearest, triangle_ids, barycentrics)
+        top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
+        nearest[:], triangle_ids[:, top:end], barycentrics[:, top:end] = np.inf, -1, 0
+        _draw(band, given, end, top, nearest, triangle_ids, barycentrics)
         for k in range(layers):
-            for j in range(top, bottom + 1):
+            for j in range(top, end):
                 for i in range(width):
                     z = nearest[k, j - top, i]
                     depths[k, j, i] = z if z < np.inf else 0.0
@@ -72,88 +42,101 @@ def draw(first, last, offsets, items, listed, vertices, matrix, view_depth, keep
 
 @kernel(error_model="numpy")
 def draw_cells(
-    first,
-    last,
-    offsets,
-    items,
-    listed,
-    vertices,
-    matrix,
-    view_depth,
-    keep,
-    table,
-    members,
-    nearest,
-    triangle_ids,
-    barycentrics,
-    depths,
+    first, last, offsets, items, listed, vertices, matrix, view_depth, keep, bits, table, numbers, fragments
 ):
-    """As `draw`, of some cells: arrays (K, M) are of their list; `table` and `members` are those of `Blocks`."""
-    entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
-    numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
-    most = 4 * BLOCK
-    hits = np.empty((most + table.shape[1] * BAND_ROWS, 2), np.int32)
+    """As `draw`, of some cells: arrays (K, M) are of their list; `bits`, `table` and `numbers` are those of `Blocks`.
+
+    Each band is drawn as a picture, of which only what is near such cells is touched.
+    """
+    triangle_ids, barycentrics, depths = fragments
+    layers, height, width = len(triangle_ids), len(bits), table.shape[1] * BAND_ROWS
+    nearest, drawn = np.empty((layers, BAND_ROWS, width)), np.empty((layers, BAND_ROWS, width), np.int32)
+    within = np.empty((layers, BAND_ROWS, width, 2), np.float32)
+    given = offsets, items, listed, vertices, matrix, view_depth, keep, bits
     for band in range(first, last):
-        top = band * BAND_ROWS
-        for start in range(offsets[band], offsets[band + 1], BLOCK):
-            block = items[start : min(offsets[band + 1], start + BLOCK)]
-            _gather(block, listed, vertices, entries, points)
-            _set_up(len(block), points, matrix, view_depth, keep, top, top + BAND_ROWS - 1, entries, numbers, clips)
-            _cover(len(block), entries, numbers, covers)
-            found = 0
-            for b in range(len(block)):
-                i0, i1, j0, j1 = entries[4, b], entries[5, b], entries[6, b], entries[7, b]
-                place = b * BAND_ROWS + j0 - top
-                if (i1 - i0 < 2) & (j1 - j0 < 2):
-                    for n in range(4):
-                        hits[found, 0], hits[found, 1] = place + (n >> 1), i0 + (n & 1)
-                        found += (covers[b] >> n) & 1
+        top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
+        for j in range(top, end):
+            for column in range(table.shape[1]):
+                if bits[j, column] != 0:
+                    _clear(column * BAND_ROWS, nearest[:, j - top], drawn[:, j - top], within[:, j - top])
+        _draw(band, given, end, 0, nearest, drawn, within)
+        for j in range(top, end):
+            for column in range(table.shape[1]):
+                if bits[j, column] == 0:
                     continue
-                for j in range(j0, j1 + 1):
-                    y = j + 0.5
-                    ra, rb = numbers[1, b] * y + numbers[2, b], numbers[4, b] * y + numbers[5, b]
-                    rc = numbers[7, b] * y + numbers[8, b]
-                    for column in range(i0 // BAND_ROWS, i1 // BAND_ROWS + 1):
-                        if table[band, column] < 0:
-                            continue
-                        left, right = max(i0, column * BAND_ROWS), min(i1, column * BAND_ROWS + BAND_ROWS - 1)
-                        for i in range(left, right + 1):
-                            x = i + 0.5
-                            ea, eb, ec = numbers[0, b] * x + ra, numbers[3, b] * x + rb, numbers[6, b] * x + rc
-                            hits[found, 0], hits[found, 1] = place, i
-                            found += (ea >= 0) & (eb >= 0) & (ec >= 0)
-                    place += 1
-                    if found > most - 4:
-                        given = entries, numbers, clips, table[band], members, nearest, triangle_ids, barycentrics
-                        _insert_cells(hits[:found], top, *given)
-                        found = 0
-            given = entries, numbers, clips, table[band], members, nearest, triangle_ids, barycentrics
-            _insert_cells(hits[:found], top, *given)
-        for column in table[band]:
-            if column < 0:
-                continue
-            for m in members[column].flat:
-                if m >= 0:
-                    for k in range(len(nearest)):
-                        z = nearest[k, m]
-                        depths[k, m] = z if z < np.inf else 0.0
+                for u in range(BAND_ROWS):
+                    m, i = numbers[table[band, column], j - top, u], column * BAND_ROWS + u
+                    if m < 0:
+                        continue
+                    for k in range(layers):
+                        z = nearest[k, j - top, i]
+                        triangle_ids[k, m], depths[k, m] = drawn[k, j - top, i], z if z < np.inf else 0.0
+                        barycentrics[k, m, 0] = within[k, j - top, i, 0]
+                        barycentrics[k, m, 1] = within[k, j - top, i, 1]
+
+
+@compiled
+def _clear(first, nearest, triangle_ids, barycentrics):
+    """Empty the layers (K, W) of as many cells of a row as a block has."""
+    for k in range(len(nearest)):
+        for i in range(first, first + BAND_ROWS):
+            nearest[k, i], triangle_ids[k, i] = np.inf, -1
+            barycentrics[k, i, 0] = barycentrics[k, i, 1] = np.float32(0)
 
 
 @compiled(error_model="numpy")
-def _insert_cells(hits, top, entries, numbers, clips, columns, members, nearest, triangle_ids, barycentrics):
-    """As `_insert`, into the layers of those cells that are listed."""
-    for h in range(len(hits)):
+def _draw(band, given, end, shift, nearest, triangle_ids, barycentrics):
+    """Insert the triangles of a band, whose last row is the one before `end`, into layers of pixels.
+
+    Arrays (K, ·, ·) begin with row `shift` of the band's; `nearest` with its first.
+    """
+    offsets, items, listed, vertices, matrix, view_depth, keep, bits = given
+    entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
+    numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
+    most, top = 4 * BLOCK, band * BAND_ROWS
+    hits = np.empty((most + nearest.shape[2], 2), np.int32)
+    drawn = top, shift, entries, numbers, clips, nearest, triangle_ids, barycentrics
+    for start in range(offsets[band], offsets[band + 1], BLOCK):
+        block = items[start : min(offsets[band + 1], start + BLOCK)]
+        _gather(block, listed, vertices, entries, points)
+        _set_up(len(block), points, matrix, view_depth, keep, top, end - 1, entries, numbers, clips)
+        _cover(len(block), entries, numbers, covers)
+        found = 0
+        for b in range(len(block)):
+            i0, i1, j0, j1 = entries[4, b], entries[5, b], entries[6, b], entries[7, b]
+            place = b * BAND_ROWS + j0 - top
+            if (i1 - i0 < 2) & (j1 - j0 < 2):
+                for n in range(4):
+                    hits[found, 0], hits[found, 1] = place + (n >> 1), i0 + (n & 1)
+                    found += (covers[b] >> n) & 1
+                continue
+            for j in range(j0, j1 + 1):
+                y = j + 0.5
+                ra, rb = numbers[1, b] * y + numbers[2, b], numbers[4, b] * y + numbers[5, b]
+                rc = numbers[7, b] * y + numbers[8, b]
+                for i in range(i0, i1 + 1):
+                    x = i + 0.5
+                    ea, eb, ec = numbers[0, b] * x + ra, numbers[3, b] * x + rb, numbers[6, b] * x + rc
+                    hits[found, 0], hits[found, 1] = place, i
+                    found += (ea >= 0) & (eb >= 0) & (ec >= 0)
+                place += 1
+                if found > most - 4:
+                    _insert(hits[: _asked(hits, found, top, bits)], drawn)
+                    found = 0
+        _insert(hits[: _asked(hits, found, top, bits)], drawn)
+
+
+@compiled
+def _asked(hits, found, top, bits):
+    """Leave out hits (n, 2) in cells that are not asked for; how many are left."""
+    if len(bits) == 0:
+        return found
+    kept, side = 0, np.uint32(BAND_ROWS)
+    for h in range(found):
         place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
-        b, row = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS)
-        block = columns[i // np.uint32(BAND_ROWS)]
-        if block < 0:
-            continue
-        m = members[block, row, i % np.uint32(BAND_ROWS)]
-        if m < 0:
-            continue
-        found, z, p, q = _met(b, i + 0.5, row + np.uint32(top) + 0.5, numbers, clips)
-        if found:
-            _put(z, entries[0, b], p, q, nearest[:, m], triangle_ids[:, m], barycentrics[:, m])
+        hits[kept, 0], hits[kept, 1] = place, i
+        kept += (bits[np.uint32(top) + place % side, i // side] >> (i % side)) & 1
+    return kept
 
 
 # numba itself must inline these, so that lengths of rows are known: only then do their loops become vector code.
@@ -228,13 +211,14 @@ def _cover(count, entries, numbers, covers):
 
 
 @compiled(error_model="numpy")
-def _insert(hits, top, entries, numbers, clips, nearest, triangle_ids, barycentrics):
+def _insert(hits, drawn):
     """Insert the block's triangles into the layers of pixels; hits (n, 2) are triangle and row of the band, column."""
+    top, shift, entries, numbers, clips, nearest, triangle_ids, barycentrics = drawn
     for h in range(len(hits)):
         place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
         b, row = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS)
-        j = row + np.uint32(top)
-        found, z, p, q = _met(b, i + 0.5, j + 0.5, numbers, clips)
+        j = row + np.uint32(shift)
+        found, z, p, q = _met(b, i + 0.5, row + np.uint32(top) + 0.5, numbers, clips)
         if found:
             _put(z, entries[0, b], p, q, nearest[:, row, i], triangle_ids[:, j, i], barycentrics[:, j, i])
 

@@ -43,6 +43,7 @@ class Mesh(TriangleSurface):
     """
 
     proxy_is_cheap = True
+    param_step = 0.25
 
     def __init__(self, faces: Any, indices: Mapping[str, Any] | None = None):
         self.faces = index_table("faces", faces, 3)

@@ -27,7 +27,7 @@ def render(parts, supersample, **options):
 
 def activate(monkeypatch, mask):
     """Make a mask of pixels (H, W) the active ones."""
-    monkeypatch.setattr(fine, "active", lambda *_: np.ascontiguousarray(mask))
+    monkeypatch.setattr(fine, "active", lambda *_, **__: np.ascontiguousarray(mask))
 
 
 def random_mask(seed=0, share=0.3):

@@ -12,7 +12,7 @@ from adaptive_scenes import (
     render,
     scene,
 )
-from helpers import arrays, quad
+from helpers import arrays, icosphere, quad
 from loops import STEPS, Pairing
 
 import rts
@@ -79,6 +79,18 @@ def test_masks_are_dilated_for_shaders_of_more_than_one_colour_a_part():
     np.testing.assert_array_equal(active("unlit", Adaptive(4, dilated=False)), bare)
     inner = dilated(bare)[1:-1, 1:-1]
     np.testing.assert_array_equal(active("unlit", Adaptive(4))[1:-1, 1:-1], inner)
+
+
+def test_cells_amid_one_colour_are_no_outlines_though_their_samples_are_left_out():
+    vertices, faces = icosphere(3)
+    part, adaptive = rts.Part(MESH(faces), {"vertices": vertices}), Adaptive(4)
+    whole, settled = (
+        rts.sample(part, CAMERA, (48, 48), supersample=adaptive, splatter="visible", settles=s) for s in (False, True)
+    )
+    np.testing.assert_array_equal(settled.fine.pixel, whole.fine.pixel)
+    assert len(settled.samples[0].ids) < 0.7 * len(whole.samples[0].ids)
+    images = [rts.render_samples(s, part, CAMERA) for s in (whole, settled)]
+    np.testing.assert_allclose(*images, rtol=0, atol=1e-6)
 
 
 def steps_of_colour():

@@ -232,7 +232,7 @@ def test_derivatives_are_differences_at_fixed_samples():
 
 
 def test_depths_beyond_active_pixels_make_no_difference():
-    """The trap: what stands for empty layers depends on the depths of a scene, and tiles do not hold the farthest."""
+    """The trap: what stands for empty layers depends on the depths of a scene, and strips do not hold the farthest."""
     near, vertices = scene()[:2], arrays(TORCH[0], BALL, np.float64)
     parts = [
         rts.Part(p.surface, {**p.theta, "vertices": x}, "unlit") for p, x in zip(near, (vertices, CARD), strict=True)

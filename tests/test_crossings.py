@@ -23,7 +23,7 @@ class Sheets:
     """Sheets z = f(x, y) over the cells' centres, the nearest two or more of which are layers.
 
     Attributes:
-        splats: opaque, in one colour a sheet.
+        splats: opaque, in one colour and of one part a sheet.
         sheet: (N,), whose each sample is.
     """
 
@@ -39,7 +39,8 @@ class Sheets:
         row = np.where(covered, np.cumsum(covered).reshape(covered.shape) - 1, -1).astype(np.int32)
         positions = np.concatenate([place, depth[..., None]], axis=-1)[covered].astype(dtype)
         rgba = np.concatenate([colors[sheet], np.ones((*depth.shape, 1))], axis=-1)[covered].astype(dtype)
-        self.splats, self.sheet = rts.Splats(positions, rgba, row), sheet[covered]
+        part = np.where(covered, sheet, -1).astype(np.int32)
+        self.splats, self.sheet = rts.Splats(positions, rgba, row, part), sheet[covered]
         self.depth, self.covered = np.where(covered, depth, 0).astype(dtype), covered
 
     def pairs(self):
@@ -54,16 +55,18 @@ def plane(slope_x, slope_y, depth):
 
 def pushed(splatter, splats, t_positions, t_rgba=None, target="torch-cpu", dtype=np.float64):
     """The image and its derivative along tangents."""
-    positions, rgba, row, tangent = arrays(target, (splats.positions, splats.rgba, splats.row, t_positions), dtype)
+    positions, rgba, tangent = arrays(target, (splats.positions, splats.rgba, t_positions), dtype)
+    row, part = arrays(target, (splats.row, splats.part))
     t_rgba = arrays(target, np.zeros_like(splats.rgba) if t_rgba is None else t_rgba, dtype)
-    image = lambda x: splatter.image(rts.Splats(x[0], x[1], row))  # noqa: E731
+    image = lambda x: splatter.image(splats.replace(positions=x[0], rgba=x[1], row=row, part=part))  # noqa: E731
     return derivative(target, image, (positions, rgba), (tangent, t_rgba))
 
 
 def pulled(splatter, splats, along, target="torch-cpu"):
     """The gradients of positions and colours from that of the image, in float64."""
-    given, row, along = arrays(target, ((splats.positions, splats.rgba), splats.row, along), np.float64)
-    return gradient(target, lambda x: (splatter.image(rts.Splats(*x, row)) * along).sum(), given)
+    own, tables = (splats.positions, splats.rgba), (splats.row, splats.part)
+    given, tables, along = arrays(target, (own, tables, along), np.float64)
+    return gradient(target, lambda x: (splatter.image(rts.Splats(*x, *tables)) * along).sum(), given)
 
 
 def rough(seed, size=(20, 23), layers=2):
@@ -381,7 +384,7 @@ def test_normal_equations_are_products_of_tangents(fine):
     given = arrays(
         "torch-cpu", (splats.positions, splats.rgba, splats.row, tangents, tints, np.zeros(shape)), np.float64
     )
-    whole = rts.Splats(*given[:3], border=border)
+    whole = rts.Splats(*given[:3], arrays("torch-cpu", splats.part), border=border)
     found = fused.Visible().normal_equations(whole, *given[3:])
     np.testing.assert_allclose(found[1], columns @ columns.T / image.size, rtol=1e-10)
     np.testing.assert_allclose(found[2], columns @ image / image.size, rtol=1e-10)

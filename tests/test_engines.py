@@ -429,7 +429,10 @@ def test_jax_jacfwd_and_jacrev_are_a_loop_of_jvps(jax, scene_of_jax):
 def test_jax_hessian_is_that_of_torch(jax, scene_of_jax):
     torch = pytest.importorskip("torch")
     eye = scene_of_jax["eye"]
-    found = jax.jit(jax.hessian(lambda e: loss_of("jax")(with_eye(scene_of_jax, e), **SIMPLE)))(eye)
+    # As the README compiles them.
+    options: dict = {"xla_backend_optimization_level": 1, "xla_disable_hlo_passes": "fusion"}
+    hessian = jax.hessian(lambda e: loss_of("jax")(with_eye(scene_of_jax, e), **SIMPLE))
+    found = jax.jit(hessian, compiler_options=options)(eye)
     scene = arrays("torch-cpu", SCENE)
     loss = loss_of("torch-cpu")
     expected = torch.func.hessian(lambda e: loss(with_eye(scene, e), **SIMPLE))(scene["eye"])

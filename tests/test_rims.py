@@ -112,7 +112,8 @@ def corrections_by_loops(splatter, splats, tangent):
                 front = k == 0 and s > 0
                 sums[0 if front else 1] += w * np.array([*rgba[i], 1])
                 if k == 0:
-                    moves = outline[target] if covered and s == 0 else outline[source]
+                    alike = covered and (splats.part is None or splats.part[0, *target] == splats.part[0, *source])
+                    moves = outline[target] if alike and s == 0 else outline[source]
                     slope = w * splatter.gamma / splatter.sigma**2 * off
                     gains[0 if front else 1] += slope @ (moves - own[source])
         added[target] = composited(sums, gains, splatter, splats, target)
@@ -182,8 +183,8 @@ def test_derivatives_change_as_the_loops_say(target, layers, name, double):
         splats = rough(layers, seed, exits=name == "exit")
         tangent = np.random.default_rng(seed).normal(size=splats.positions.shape)
         expected, names = corrections_by_loops(Visible(), splats, tangent)
-        image, found = pushed(Visible(), splats, tangent, target)
-        same, without = pushed(Visible(rims=False), splats, tangent, target)
+        image, found = pushed(Visible(crossings=False), splats, tangent, target)
+        same, without = pushed(Visible(rims=False, crossings=False), splats, tangent, target)
         np.testing.assert_array_equal(image, same)
         np.testing.assert_allclose(found - without, expected, rtol=0, atol=1e-9)
         seen += names
@@ -441,6 +442,23 @@ def test_a_sphere_that_rolls_changes_as_one_that_moves(turns, layers, most):
             yield abs((found[..., 3] * weigh(x, y)).sum() / expected - 1)
 
     assert max(errors(True)) < most and min(errors(False)) > 0.15
+
+
+def opened(width, slope, splatter, size=64):
+    """Pixels a row that open to the ground as one of two parts leaves the other, a gap of a width (pixels) between."""
+    y, x = np.indices((size, size)) + 0.5
+    edge = size / 2 + slope * (y - size / 2)
+    covered = ((x < edge) | (x > edge + width))[None]
+    part = (x > edge)[None].astype(int)
+    splats = packed(covered, centres(1, size, size), np.full(covered.shape, 5.0), np.ones(4), part)
+    tangent = np.where(splats.row[..., None] >= 0, part[..., None] * [1.0, 0.0, 0.0], 0.0)[covered]
+    return -pushed(splatter, splats, tangent)[1][4:-4, 4:-4, 3].sum() / (size - 8)
+
+
+@pytest.mark.parametrize("width", [1.0, 0.7, 0.5])
+def test_a_gap_between_two_parts_opens_as_one_of_them_leaves(width):
+    found = [opened(width, slope, s) for slope in (0.37, 0.8) for s in (Visible(), fused.Visible())]
+    np.testing.assert_allclose(found, 1, atol=0.03)
 
 
 AXIS = np.array([0.5, 1.0, 0.0, 0.1, 0.0, 0.2])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 
@@ -14,12 +14,14 @@ from rts.arrays import described, from_numbers, is_finite, kind_of, shape_of
 from rts.camera import Camera
 from rts.checks import (
     check_background,
+    check_cameras,
     check_floating,
     check_ratio,
     check_sampler,
     check_scene,
     check_size,
     check_splatter,
+    is_count,
 )
 from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting
 from rts.errors import InputError
@@ -34,12 +36,11 @@ from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.scenes import sample
 from rts.trees import Array, Tree
+from rts.views import render_views
 
 Parts = Part | Sequence[Part] | PreparedParts
-Scene = Callable[[Tree], "Parts | tuple[Parts, Camera]"]
-
-CHANNELS = {1: slice(3, 4), 3: slice(0, 3), 4: slice(0, 4)}
-"""Which channels of an image a target has, by their number."""
+Cameras = Camera | Sequence[Camera]
+Scene = Callable[[Tree], "Parts | tuple[Parts, Cameras]"]
 
 
 class ImageResiduals(Residuals):
@@ -48,20 +49,25 @@ class ImageResiduals(Residuals):
     Usable wherever a function of parameters is, such as with `rts.fit`. Levenberg–Marquardt takes less time and memory
     for it than for a function: derivatives along all unknowns are multiplied together as the image is swept.
 
+    With a target of B views it is that of all of them, as `rts.render_views` renders them.
+
     Args:
-        scene: parameters → part or parts, or what `prepare` made of them; or a tuple of these and a camera.
-        camera: the camera, where `scene` gives none.
+        scene: parameters → part or parts, or what `prepare` made of them; or a tuple of these and a camera, or cameras.
+        camera: the camera, where `scene` gives none; of several views a list, or what `Camera.stack` made of it.
         size: (height, width) in pixels.
         target: (H, W) or (H, W, 1), compared with the image's alpha; (H, W, 3) with its premultiplied linear colours;
-            or (H, W, 4) with both. Floating; a constant.
+            or (H, W, 4) with both. Floating; a constant. For 3 and 4 read C and C + 1 where the image has C channels.
+            Of several views (B, H, W, ·), or a list.
         weights: factors on the differences, (H, W), (H, W, 1) or of the target's shape; such as a mask. Floating or
-            bool; constants.
-        background: as in `render`; a constant.
+            bool; constants. Of several views (B, H, W, ·), or a list.
+        background: as in `render`; a constant. It is that of every view.
         sampler: as in `render`.
         splatter: as in `render`.
         layers: as in `render`.
         supersample: as in `render`.
         capacity: as in `render`.
+        channels: C of the image, as the scene's shaders say it. Where it is not 3, Levenberg–Marquardt takes the
+            Jacobian.
 
     Attributes:
         size: (height, width).
@@ -75,51 +81,86 @@ class ImageResiduals(Residuals):
     def __init__(
         self,
         scene: Scene,
-        camera: Camera | None,
+        camera: Cameras | None,
         size: tuple[int, int],
-        target: Array,
+        target: Array | Sequence[Array],
         *,
-        weights: Array | None = None,
+        weights: Array | Sequence[Array] | None = None,
         background: Any = None,
         sampler: Any = "auto",
         splatter: Any = "auto",
         layers: int | Literal["auto"] = 2,
         supersample: int | Adaptive = 1,
         capacity: int | None = None,
+        channels: int = 3,
     ):
         if not callable(scene):
             raise InputError(f"scene is {quoted(scene)}; expected a function: parameters → parts, or (parts, camera)")
-        if camera is not None and not isinstance(camera, Camera):
-            raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera, or None where scene gives one")
+        if camera is not None and not _are_cameras(camera):
+            raise InputError(
+                f"camera is {quoted(camera)}; expected an rts.Camera, or None where scene gives one, or several cameras"
+            )
         self.size = check_size(size, layers, capacity, finest(supersample))
         self._scene, self._camera, self._splatter = scene, camera, check_splatter(splatter)
-        self._target, self._channels = _checked_target(target, self.size)
-        self._weights = _checked_weights(weights, self._target.shape, self.size)
-        self._background = check_background(background, self.size)
+        if not is_count(channels):
+            raise InputError(f"channels is {quoted(channels)}; expected an integer of at least 1")
+        self._image_channels = channels
+        self._background = check_background(background, self.size, channels)
         self.supersample = _checked_supersample(supersample)
         self._sampling: dict[str, Any] = {"sampler": check_sampler(sampler), "layers": layers, "capacity": capacity}
         self._full, self._sigma = self.size, 0.0
+        self._view: int | None = None
+        self._views: list[ImageResiduals] = []
+        if (count := _view_count(target, self.size)) is None:
+            self._take(target, weights)
+            return
+        for b, (own, factors) in enumerate(zip(target, _of_views(weights, count), strict=True)):
+            view = copy(self)
+            view._view, view._views = b, []
+            view._take(own, factors)
+            self._views.append(view)
+        if len(kinds := {tuple(view._target.shape[2:]) for view in self._views}) > 1:
+            raise InputError(f"targets of views have the channels {sorted(kinds)}; expected one kind for all views")
+
+    def _take(self, target: Any, weights: Any) -> None:
+        """Compare with this target (H, W, ·) of one view."""
+        self._target, self._channels = _checked_target(target, self.size, self._image_channels)
+        self._weights = _checked_weights(weights, self._target.shape, self.size)
 
     def __call__(self, parameters: Tree) -> Array:
         """`weights * (image − target)`, of the target's shape."""
         parts, camera = self.scene(parameters)
-        image = render(
-            parts,
-            camera,
-            self.size,
-            splatter=self._splatter,
-            supersample=self.supersample,
-            background=self._background,
-            **self._sampling,
+        options: dict[str, Any] = dict(
+            splatter=self._splatter, supersample=self.supersample, background=self._background, **self._sampling
         )
+        if not self._views:
+            return self._difference(render(parts, camera, self.size, **options), parameters)
+        images = render_views(parts, camera, self.size, **options)
+        return namespace(images).stack(
+            [view._difference(images[b, ...], parameters) for b, view in enumerate(self._views)]
+        )
+
+    def _difference(self, image: Array, parameters: Tree) -> Array:
+        """`weights * (image − target)` of one view."""
         image = constants(image, engine_of(image, parameters), exemplar(parameters))
         target, weights, _ = self._constants(image)
-        difference = image[..., CHANNELS[self._channels]] - target
+        self._refuse_other(image.shape[-1] - 1)
+        # Alpha is last; a target of one channel is one of it alone.
+        difference = image[..., -1:] if self._channels == 1 else image[..., : self._channels]
+        difference = difference - target
         if weights is not None:
             difference = difference * weights
         if self._sigma:
             difference = blurred(difference, self._sigma)
         return namespace(image).reshape(difference, tuple(self._target.shape))
+
+    def _refuse_other(self, channels: int) -> None:
+        """Refuse images of another number of channels than the target is for."""
+        if channels != self._image_channels:
+            raise InputError(
+                f"the scene's shaders give {channels} channels besides alpha, and the target is for "
+                f"{self._image_channels}; give channels={channels}, and a target for it"
+            )
 
     def at_stage(self, stage: Stage) -> ImageResiduals:
         """The residuals at another resolution, for the same camera and extent of the image; see `rts.fit`.
@@ -132,28 +173,38 @@ class ImageResiduals(Residuals):
             stage: the resolution.
         """
         made = copy(self)
+        made._views = [view.at_stage(stage) for view in self._views]
         made._sigma = float(stage.sigma)
         made.supersample = self.supersample if stage.supersample is None else _checked_supersample(stage.supersample)
         made.size = stage.size(self.size)
         if made.size != self.size:
-            made._target, made._weights = _shrunk(self._target, self._weights, made.size)
+            if not self._views:
+                made._target, made._weights = _shrunk(self._target, self._weights, made.size)
             if self._background is not None and len(self._background.shape) == 3:
                 made._background = box_filtered(self._background, made.size)
         return made
 
-    def scene(self, parameters: Tree) -> tuple[Any, Camera]:
-        """Parts and camera for these parameters."""
+    def scene(self, parameters: Tree) -> tuple[Any, Any]:
+        """Parts and camera for these parameters; of several views a list of cameras."""
         parts, camera = self._scene_as_given(parameters)
+        several = bool(self._views) or self._view is not None
+        if not several and (not isinstance(camera, Camera) or camera.is_stacked):
+            raise InputError("there are several cameras for a target of one view; expected targets (B, H, W, ·)")
+        cameras: list[Any] = check_cameras(camera) if several else [camera]
+        if self._views and len(cameras) != len(self._views):
+            raise InputError(f"there are {len(cameras)} cameras for targets of {len(self._views)} views")
+        cameras = cameras if self._view is None else [cameras[self._view]]
         if self.size != self._full:
             # Sides are rounded: the ratio of fewer pixels may be another, what they show is the same.
-            check_ratio(camera, self._full)
-            camera = camera.for_size(self._full).replace(aspect=None)
-        return parts, camera
+            for own in cameras:
+                check_ratio(own, self._full)
+            cameras = [own.for_size(self._full).replace(aspect=None) for own in cameras]
+        return parts, cameras if self._views else cameras[0]
 
-    def _scene_as_given(self, parameters: Tree) -> tuple[Any, Camera]:
+    def _scene_as_given(self, parameters: Tree) -> tuple[Any, Cameras]:
         found = self._scene(parameters)
-        if isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Camera):
-            return found[0], found[1]
+        if isinstance(found, tuple) and len(found) == 2 and _are_cameras(given := found[1]):
+            return found[0], given
         given = found if isinstance(found, (list, tuple)) else [found]
         if not given or not all(isinstance(part, (Part, PreparedParts)) for part in given):
             kinds = ", ".join(map(kind_of, given)) or "nothing"
@@ -168,12 +219,18 @@ class ImageResiduals(Residuals):
 
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
         """Mean square () of the n residuals, JᵀJ / n (U, U) and Jᵀr / n (U,) for the U numbers in the parameters."""
+        if self._views:
+            self.scene(parameters)  # Refused where there are not as many cameras.
+            found = [view.normal_equations(parameters) for view in self._views]
+            value, matrix, gradient = (sum(x[1:], x[0]) / len(x) for x in zip(*found, strict=True))
+            return value, matrix, gradient
         engine = engine_of(parameters)
         splatter, found = self._splatter, None
         if (
             not self._sigma
             and splatter.sums_products
             and engine.differentiates
+            and self._image_channels == 3
             and (self.supersample == 1 or splatter.averages)
             and not (isinstance(self.supersample, Adaptive) and self.supersample.contrast is not None)
         ):
@@ -208,7 +265,9 @@ class ImageResiduals(Residuals):
 
         options: dict[str, Any] = dict(splatter=splatter, supersample=self.supersample, settles=True, **self._sampling)
         sampled = sample(parts, window(camera), size, **options)
-        colored = self._channels > 1 or not _all_opaque(parts, camera)
+        checked, _ = _checked(parts, camera)
+        self._refuse_other(checked[0].shader.channels)
+        colored = self._channels > 1 or not all(part.shader.opaque for part in checked)
         band = slice(top, top + rows)
         fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
 
@@ -249,7 +308,7 @@ class ImageResiduals(Residuals):
         return value, matrix, gradient
 
     def _constants(self, like: Array) -> tuple[Array, Array | None, Array | None]:
-        """Target (H, W, C), weights (H, W, 1 or C) and background (H, W, 4) in the engine of an array."""
+        """Target (H, W, C), weights (H, W, 1 or C) and background, with alpha, in the engine of an array."""
         engine = engine_of(like, self._target, self._weights, self._background)
         fields = constants((self._target, self._weights, self._background), engine, like)
         xp = namespace(like)
@@ -259,9 +318,9 @@ class ImageResiduals(Residuals):
         if weights is not None:
             weights = xp.reshape(weights, (*self.size, -1))
         if background is not None:
-            if background.shape[-1] == 3:
+            if background.shape[-1] == self._image_channels:
                 background = xp.concat([background, xp.ones_like(background[..., :1])], axis=-1)
-            background = xp.broadcast_to(background, (*self.size, 4))
+            background = xp.broadcast_to(background, (*self.size, self._image_channels + 1))
         return target, weights, background
 
 
@@ -317,25 +376,46 @@ def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tupl
     return xp.reshape(small, (*size, *kind[2:])), xp.reshape(xp.sqrt(total), (*size, *shape[2:]))
 
 
+def _are_cameras(given: Any) -> TypeGuard[Cameras]:
+    """Whether it is a camera, or a list of some."""
+    if isinstance(given, (list, tuple)):
+        return len(given) > 0 and all(isinstance(camera, Camera) for camera in given)
+    return isinstance(given, Camera)
+
+
+def _view_count(target: Any, size: tuple[int, int]) -> int | None:
+    """How many views a target is of; None for one, without an axis of its own."""
+    if isinstance(target, (list, tuple)):
+        return len(target) if any(shape_of(x)[:2] == size for x in target) else None
+    shape = shape_of(target)
+    return shape[0] if len(shape) > 3 or (shape[1:3] == size and shape[:2] != size) else None
+
+
+def _of_views(weights: Any, count: int) -> Sequence[Any]:
+    """The weights of each view."""
+    if weights is None:
+        return [None] * count
+    given = len(weights) if isinstance(weights, (list, tuple)) else (shape_of(weights) or (0,))[0]
+    if given != count:
+        raise InputError(f"weights are of {given} views; expected {count}, as many as targets")
+    return weights
+
+
 def _checked(parts: Parts, camera: Camera) -> tuple[list[CheckedPart], Camera]:
     return check_scene(parts.parts if isinstance(parts, PreparedParts) else parts, camera)
 
 
-def _all_opaque(parts: Parts, camera: Camera) -> bool:
-    return all(part.shader.opaque for part in _checked(parts, camera)[0])
-
-
-def _checked_target(target: Any, size: tuple[int, int]) -> tuple[Array, int]:
-    """The target, and its number of channels."""
+def _checked_target(target: Any, size: tuple[int, int], channels: int) -> tuple[Array, int]:
+    """The target for images of so many channels besides alpha, and its own number of them."""
     if target is None:
         raise InputError("target is None; expected an array, such as what rts.load_image gives")
     target = from_numbers(target, "target")
     shape = shape_of(target)
-    if shape[:2] != size or shape[2:] not in ((), *((c,) for c in CHANNELS)):
+    if shape[:2] != size or shape[2:] not in ((), (1,), (channels,), (channels + 1,)):
         height, width = size
         raise InputError(
-            f"target {described(target)}; expected ({height}, {width}) or ({height}, {width}, 1) to compare "
-            f"with alpha, ({height}, {width}, 3) with colours, or ({height}, {width}, 4) with both"
+            f"target {described(target)}; expected ({height}, {width}) or ({height}, {width}, 1) to compare with "
+            f"alpha, ({height}, {width}, {channels}) with colours, or ({height}, {width}, {channels + 1}) with both"
         )
     check_floating("target", target)
     _check_finite("target", target)

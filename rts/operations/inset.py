@@ -6,7 +6,7 @@ import numpy as np
 
 from rts.engines import namespace
 from rts.operations.operation import Arrays, Operation, Some
-from rts.threads import read_only
+from rts.threads import parallel, read_only
 from rts.trees import Array
 
 
@@ -46,7 +46,7 @@ def _forward(operands: Arrays, out: np.ndarray, *, side: int) -> None:
     from rts.operations import inset_kernels
 
     image, fine, pixel = map(read_only, operands)
-    inset_kernels.put(image, fine, pixel, side, out)
+    parallel(inset_kernels.put, len(out), image, fine, pixel, side, out, work=out.size)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, side: int) -> None:
@@ -59,7 +59,7 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some, *, side: int) -> None:
     from rts.operations import inset_kernels
 
     image, fine = (np.empty((0, 0, g.shape[2]), g.dtype) if x is None else x for x in results)
-    inset_kernels.pull(read_only(g), read_only(operands[2]), side, image, fine)
+    parallel(inset_kernels.pull, len(g), read_only(g), read_only(operands[2]), side, image, fine, work=g.size)
 
 
 INSET = Operation("rts.inset", _specification, (3, 3, 2), _shape, _forward, _push, _pull, differentiable=2)

@@ -6,11 +6,11 @@ from rts.compiling import kernel
 
 
 @kernel
-def put(image, fine, pixel, side, out):
-    """Fill out (H, W, C); see `rts.operations.inset.with_inset`."""
-    height, width, channels = out.shape
+def put(start, stop, image, fine, pixel, side, out):
+    """Fill rows [start, stop) of out (H, W, C); see `rts.operations.inset.with_inset`."""
+    _, width, channels = out.shape
     across, share = fine.shape[1] // side, out.dtype.type(1) / out.dtype.type(side)
-    for y in range(height):
+    for y in range(start, stop):
         for x in range(width):
             if pixel[y, x] < 0:
                 for c in range(channels):
@@ -29,11 +29,11 @@ def put(image, fine, pixel, side, out):
 
 
 @kernel
-def pull(g, pixel, side, image, fine):
-    """Gradients of both images, zeros to be filled, from that of the result; nothing of one without rows."""
-    height, width, channels = g.shape
+def pull(start, stop, g, pixel, side, image, fine):
+    """Gradients of both images, zeros to be filled, from rows [start, stop) of the result's; none without rows."""
+    _, width, channels = g.shape
     across, share = fine.shape[1] // side, g.dtype.type(1) / g.dtype.type(side * side)
-    for y in range(height):
+    for y in range(start, stop):
         for x in range(width):
             if pixel[y, x] < 0:
                 if len(image):

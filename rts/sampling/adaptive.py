@@ -98,17 +98,21 @@ def finest(supersample: Any) -> Any:
     return supersample.samples if isinstance(supersample, Adaptive) else supersample
 
 
-def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int]) -> np.ndarray:
+def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: np.ndarray | None = None) -> np.ndarray:
     """Cells (H, W) bool whose fronts end towards a neighbour, or a neighbour's towards them.
 
     Args:
         row: (K, H, W) int32 of one sample a pixel.
         depth: (K, H, W).
         sizes: the number of rows of each part.
+        settled: (H, W) bool, cells that are covered by the only part, with a sample or without; None for none.
     """
     from rts.sampling import adaptive_kernels
     from rts.splatting.visible import CONTINUED
 
+    if settled is not None:
+        # None of their layers is hidden, nor is any beside them: depths there are not looked at.
+        row = np.concatenate([np.maximum(row[:1], settled - np.int32(1)), row[1:]])
     depth, kind = read_only(depth), depth.dtype.type
     extent = max(depth.max(initial=0), 0) - min(depth.min(initial=0), 0)
     marks = np.empty(row.shape[1:], np.uint8)

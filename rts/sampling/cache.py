@@ -41,7 +41,7 @@ class Entry(NamedTuple):
 class Keeper:
     """The entries of one sampler: bounded in number, released with their surfaces.
 
-    A sampler's calls go through its keeper's `lock`, since an entry may be moved in place.
+    Entries are looked up under its keeper's `lock`, and drawn under it where they may be moved in place.
     """
 
     def __init__(self) -> None:

@@ -8,6 +8,9 @@ from rts.camera import Camera
 from rts.records import MORE, Fragments, Proxy
 from rts.threads import parallel, read_only
 
+OTHER_COLUMNS = np.array([[j for j in range(4) if j != i] for i in range(4)])
+ALTERNATING = np.array([1, -1, 1, -1])
+
 
 def facing(
     fragments: Fragments, kept: np.ndarray, proxy: Proxy, pieces: np.ndarray, camera: Camera, listed: bool
@@ -44,7 +47,8 @@ def eye(camera: Camera) -> np.ndarray:
     infinity: n · e > 0.
     """
     rows = camera.projection[[0, 1, 3]] @ camera.view
-    found = np.array([(-1) ** i * np.linalg.det(np.delete(rows, i, axis=1)) for i in range(4)])
+    minors = rows[:, OTHER_COLUMNS].transpose(1, 0, 2)
+    *found, handedness = np.linalg.det(np.concatenate([minors, camera.view[None, :3, :3]]))
     p = camera.projection
-    winding = np.linalg.det(camera.view[:3, :3]) * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0])
-    return found if winding > 0 else -found
+    winding = handedness * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0])
+    return np.array(found) * ALTERNATING if winding > 0 else -np.array(found) * ALTERNATING

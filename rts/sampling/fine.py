@@ -14,7 +14,7 @@ from rts.interfaces import AnyNeeded
 from rts.records import Fine, Sampled
 from rts.sampling.adaptive import Adaptive, contrasts, outlines
 from rts.sampling.pruning import as_needed, planned
-from rts.sampling.tiles import Grid, InTiles, Layout, Room, arranged, lay_out, needed_room, of_engine, rounded
+from rts.sampling.strips import Grid, InStrips, Layout, arranged, lay_out, of_engine, rounded
 from rts.splatting.layers import dilated
 
 
@@ -32,9 +32,17 @@ class Where(NamedTuple):
     colors: np.ndarray | None = None
 
 
-def active(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], apron: int, where: Where) -> np.ndarray:
+def active(
+    row: np.ndarray,
+    depth: np.ndarray,
+    settled: np.ndarray | None = None,
+    *,
+    sizes: Sequence[int],
+    apron: int,
+    where: Where,
+) -> np.ndarray:
     """Active pixels (H, W) bool of coarse samples (K, ·, ·) with an apron; see `outlines`."""
-    found = outlines(row, depth, sizes)
+    found = outlines(row, depth, sizes, settled)
     if where.colors is not None and where.adaptive.contrast is not None:
         found |= contrasts(row[0], where.colors, where.adaptive.contrast)
     found = dilated(found) if where.dilates else found
@@ -50,7 +58,7 @@ def fine_samples(
     layers: int | Literal["auto"],
     capacity: int | None,
 ) -> Fine:
-    """Fine samples of active pixels and their apron, in tiles.
+    """Fine samples of active pixels and their apron, in strips.
 
     Args:
         coarse: one sample a pixel.
@@ -62,24 +70,25 @@ def fine_samples(
         capacity: rows to allot, or None for as many as there are, or could be.
     """
     sizes, engine = [s.ids.shape[-2] for s in coarse.samples], engine_of(coarse)
-    room, most = grid.room(capacity, planned(layers)), planned(layers)
-    row, depth = engine.known(coarse.row), engine.known(coarse.depth)
-    if row is None or depth is None or row.ndim != 3:
+    most, told = planned(layers), [coarse.row, coarse.depth, *([] if coarse.settled is None else [coarse.settled])]
+    find = partial(active, sizes=sizes, apron=coarse.apron, where=where)
+    given = [engine.known(x) for x in told]
+    if given[0] is None or given[1] is None or given[0].ndim != 3:
+        room = grid.room(capacity, most)
         check_memory(1, room.cells, most, capacity, gradient=engine.differentiates)
 
-        def laid_out(row: np.ndarray, depth: np.ndarray) -> tuple[np.ndarray, ...]:
-            return tuple(lay_out(active(row, depth, sizes, coarse.apron, where), grid, room))
+        def laid_out(*given: np.ndarray) -> tuple[np.ndarray, ...]:
+            return tuple(lay_out(find(*given), grid, room))
 
-        layout = Layout(*engine.call_host(laid_out, Layout.specs(grid, room), coarse.row, coarse.depth))
+        layout = Layout(*engine.call_host(laid_out, Layout.specs(grid, room), *told))
         known, allotted = None, most * room.cells
     else:
-        pixels, few = active(row, depth, sizes, coarse.apron, where), engine.padded(coarse.row)
-        room = needed_room(pixels, grid) if capacity is None else room
-        room = Room(rounded(room.tiles), room.cells) if few else room
+        pixels, few = find(*given), engine.padded(coarse.row)
+        room = None if capacity is None else grid.room(capacity, most)
         host = lay_out(pixels, grid, room, rounded if few else int)
         check_memory(1, host.cells.size, most, capacity, gradient=engine.differentiates)
         layout, allotted = of_engine(host, engine, coarse.depth), None
-        known = None if needed is None else InTiles(needed, host)
+        known = None if needed is None else InStrips(needed, host)
     taken = partial(take, capacity=allotted, cells=layout.cells)
     sampled = taken(layers, known) if layers != "auto" else as_needed(taken, known)
     return arranged(sampled, layout, grid)

@@ -21,7 +21,7 @@ from rts.sampling.fine import Where, fine_samples
 from rts.sampling.merging import merge
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.pruning import Everything, as_needed, needed_by, planned, prune
-from rts.sampling.tiles import Grid, at_cells
+from rts.sampling.strips import Grid, at_cells
 from rts.splatting.visible import Visible
 from rts.trees import Array, Tree
 
@@ -94,6 +94,11 @@ class Scene(NamedTuple):
     entries: Sequence[Any]
     suited: tuple[Engine, Array | None]
 
+    @property
+    def channels(self) -> int:
+        """The number of channels that its shaders give, besides alpha."""
+        return self.parts[0].shader.channels
+
     @classmethod
     def of(
         cls,
@@ -137,7 +142,7 @@ def sampled_scene(
     """
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, capacity=capacity)
     if isinstance(supersample, Adaptive):
-        coarse = sampled_scene(scene, camera, size, supersample=1, **options)
+        coarse = sampled_scene(scene, camera, size, supersample=1, settles=settles, **options)
         fine = fine_scene(scene, camera, size, coarse, adaptive=supersample, **options)
         return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)
     side = int(supersample)

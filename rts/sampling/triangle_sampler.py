@@ -36,7 +36,9 @@ class TriangleSampler(Sampler):
     Attributes:
         builds: whether something is worth building once for a proxy; True in a class with its own `prepare`.
         follows: whether what was prepared can follow moved vertices; True in a class with its own `update`.
-        tells_exits: whether `rasterize` knows cull="front", too, or the class has its own `rasterize_with_backs`.
+        tells_exits: whether `rasterize` knows cull="front", too.
+        concurrent: whether several threads may call `rasterize` at once; those of a sampler that `follows` wait for one
+            another in any case.
     """
 
     DECLARES = True
@@ -105,34 +107,6 @@ class TriangleSampler(Sampler):
         at = np.where(there, cells, 0)
         ids = np.where(there, whole.triangle_ids.reshape(layers, -1)[:, at], -1)
         return Fragments(ids, whole.barycentrics.reshape(layers, -1, 2)[:, at], whole.depth.reshape(layers, -1)[:, at])
-
-    def rasterize_with_backs(
-        self,
-        prepared: Any,
-        camera: Camera,
-        size: tuple[int, int],
-        layers: int,
-        choose: Callable[[Fragments], np.ndarray],
-    ) -> tuple[Fragments, np.ndarray, Fragments]:
-        """`rasterize` with cull="back", and in some cells the nearest triangle that is seen from behind.
-
-        It is called where a class `tells_exits`. The default calls `rasterize_cells` with cull="front".
-
-        Args:
-            prepared: see `rasterize`.
-            camera: see `rasterize`.
-            size: see `rasterize`.
-            layers: see `rasterize`.
-            choose: fragments → the cells (L, C) int32, flat indices of cells in the grid.
-
-        Returns:
-            Fragments (K, H, W), the cells that were chosen, and their fragments (1, L, C).
-        """
-        fragments = self.rasterize(prepared, camera, size, layers, "back")
-        cells = choose(fragments)
-        if not cells.size:
-            return fragments, cells, _no_fragments((1, *cells.shape))
-        return fragments, cells, self.rasterize_cells(prepared, camera, size, 1, "front", cells)
 
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
         """See `Sampler`: the proxy of a part, and what is prepared of it."""
@@ -296,18 +270,10 @@ class TriangleSampler(Sampler):
             covered = fragments.triangle_ids >= 0
             return covered if needed is None else needed(covered, fragments.depth)
 
-        kept = behind = None
-        with self._keeper.lock:
-            found = entry or self._entry(surface, inputs, camera, shape.view)
-            given = found.prepared, camera, shape.view, grid[0], cull
-            if not len(found.proxy.faces):
-                fragments = _no_fragments(grid)
-                behind = Exits(np.zeros((1, 0), np.int32), _no_fragments((1, 1, 0)), np.zeros((1, 1, 0), bool))
-            elif exits:
-                fragments, kept, behind = self._with_exits(found, camera, grid, keep)
-            else:
-                fragments = self.rasterize(*given) if cells is None else self.rasterize_cells(*given, cells)
-                check_fragments(fragments, grid, len(found.proxy.faces), self)
+        asked = keep if exits else None
+        found, fragments, kept, behind = self._fragments(
+            surface, cull, inputs, camera, shape.view, grid, entry, cells, asked
+        )
         covered = fragments.triangle_ids >= 0
         if not moves:
             kept = keep(fragments) if kept is None else kept
@@ -325,7 +291,7 @@ class TriangleSampler(Sampler):
                 pieces = checked_pieces(surface, found.proxy) if kept[1:].any() else np.zeros(1, np.int16)
                 sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
             if not surface.refines:
-                lifted = lift(fragments, found.proxy, shape.capacity, kept, size, behind if exits else None)
+                lifted = lift(fragments, found.proxy, shape.capacity, kept, size, behind)
                 return replace(lifted, facing=sides, settled=settled)
             lifted = lift(fragments, found.proxy, None, kept)
             samples, _ = refined(surface, inputs, lifted, camera, tables, shape.view, cells)
@@ -339,22 +305,48 @@ class TriangleSampler(Sampler):
             kept = needed(left, settled.depth)
         return repack(settled, kept, shape.capacity)
 
-    def _with_exits(
-        self, entry: Entry, camera: Camera, grid: tuple[int, int, int], keep: Callable[[Fragments], np.ndarray]
-    ) -> tuple[Fragments, np.ndarray, Exits]:
-        """Fragments of a culled part, which of them to keep, and its exits beside outlines."""
-        kept: list[np.ndarray] = []
-        count = len(entry.proxy.faces)
+    def _fragments(
+        self,
+        surface: TriangleSurface,
+        cull: str,
+        inputs: Tree,
+        camera: Camera,
+        view: tuple[int, int],
+        grid: tuple[int, int, int],
+        entry: Entry | None,
+        cells: np.ndarray | None,
+        keep: Callable[[Fragments], np.ndarray] | None,
+    ) -> tuple[Entry, Fragments, np.ndarray | None, Exits | None]:
+        """What is prepared of a surface, and the fragments (K, ·, ·) of a grid of the size `view`, or of some cells.
 
-        def beside(fragments: Fragments) -> np.ndarray:
-            check_fragments(fragments, grid, count, self)
-            kept.append(keep(fragments))
-            return beside_outlines(kept[0])
+        With what says which of them to `keep` also that, and the exits beside outlines.
+        """
 
-        fragments, cells, backs = self.rasterize_with_backs(entry.prepared, camera, grid[1:], grid[0], beside)
-        if cells.size:
-            check_fragments(backs, (1, *cells.shape), count, self)
-        return fragments, kept[0], Exits.of(fragments, cells, backs)
+        def drawn(found: Entry) -> Fragments:
+            if not len(found.proxy.faces):
+                return _no_fragments(grid)
+            given = found.prepared, camera, view, grid[0], cull
+            fragments = self.rasterize(*given) if cells is None else self.rasterize_cells(*given, cells)
+            check_fragments(fragments, grid, len(found.proxy.faces), self)
+            return fragments
+
+        def all_of(found: Entry) -> tuple[Entry, Fragments, np.ndarray | None, Exits | None]:
+            fragments = drawn(found)
+            if keep is None:
+                return found, fragments, None, None
+            kept = keep(fragments)
+            beside = beside_outlines(kept)
+            backs = _no_fragments((1, *beside.shape))
+            if beside.size:
+                backs = self.rasterize_cells(found.prepared, camera, view, 1, "front", beside)
+                check_fragments(backs, (1, *beside.shape), len(found.proxy.faces), self)
+            return found, fragments, kept, Exits.of(fragments, beside, backs)
+
+        with self._keeper.lock:
+            found = entry or self._entry(surface, inputs, camera, view)
+            if self.follows or not self.concurrent:
+                return all_of(found)
+        return all_of(found)
 
 
 class _Shape(NamedTuple):

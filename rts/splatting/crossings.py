@@ -103,17 +103,15 @@ def motion(kernel: Kernel, layers: Layers, lines: Lines) -> Array:
     return xp.where(target[..., None], mixed - stopped(mixed), 0.0)
 
 
-def targets(layers: Layers, shift: dict[Steps, Array]) -> Lines:
+def targets(layers: Layers, shift: dict[Steps, Array], crosses: dict[Steps, Array]) -> Lines:
     """The targets whose derivative in positions follows a line.
 
     Args:
         layers: the samples, of at least two layers.
         shift: for each offset (u, v) from source to target, the targets' number s; 0 at empty targets.
+        crosses: see `pairs`.
     """
-    xp = layers.xp
-    two = layers.at(layers.covered[1], 0, 0)
-    z = [stopped(xp.where(two, layers.target[k], 0.0)) for k in (0, 1)]
-    crosses = pairs(z[0], z[1], two, stopped(layers.extent))
+    xp, (z, two) = layers.xp, _depths(layers)
     # By the step from the target to the source.
     swapped = dict(crosses)
     same = {m: ~crosses[m] & (shift[opposite(m)] == 0) & layers.covers(*opposite(m)) for m in AROUND}
@@ -138,6 +136,12 @@ def targets(layers: Layers, shift: dict[Steps, Array]) -> Lines:
     # Weights may vanish, of samples that are not where they were cast.
     a, b = lines.sums(lambda u, v: stopped(layers.color(0, u, v)[..., 4:] * layers.weight(0, u, v)[..., None]))
     return lines._replace(target=target & (a[..., 0] > 0) & (b[..., 0] > 0))
+
+
+def pairs_of(layers: Layers) -> dict[Steps, Array]:
+    """`pairs` of samples of at least two layers."""
+    z, two = _depths(layers)
+    return pairs(z[0], z[1], two, stopped(layers.extent))
 
 
 def pairs(z0: Array, z1: Array, two: Array, extent: Array | float) -> dict[Steps, Array]:
@@ -185,6 +189,12 @@ def ahead(cells: Array, steps: Steps, value: float) -> Array:
             both = cells[tuple(cut)], xp.full_like(cells[tuple(end)], value)
             cells = xp.concat(both if step > 0 else both[::-1], axis=axis)
     return cells
+
+
+def _depths(layers: Layers) -> tuple[list[Array], Array]:
+    """Depths (H, W) of the first two layers without derivative, and where there are both."""
+    two = layers.at(layers.covered[1], 0, 0)
+    return [stopped(layers.xp.where(two, layers.target[k], 0.0)) for k in (0, 1)], two
 
 
 def _ratio(z0: Array, z1: Array, two: Array, least: Array | float, m: Steps) -> Array:

@@ -41,16 +41,20 @@ HALF = 0.5
 """β of the line, and −β of the chord."""
 
 
-def gains(kernel: Kernel, layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tuple[Array, Array]:
+def gains(
+    kernel: Kernel, layers: Layers, shift: dict[Steps, Array], part: Array | None, crossed: Array | None = None
+) -> tuple[Array, Array]:
     """What moving outlines add to the coverage by moving samples: zeros with derivatives (H, W).
 
-    Fronts of sources move as their outlines; at the surface of a covered target all move as the target's.
+    Fronts of sources move as their outlines; at the surface of a covered target those of its part move as the target's.
+    Those of other parts, too, where the target lies beside a line of crossing: else there may be a gap between.
 
     Args:
         kernel: the splatter.
         layers: its samples.
         shift: for each offset (u, v) from source to target, the targets' number s; 0 at empty targets.
-        part: (K, H, W), the part of each sample, or None.
+        part: (K, H, W), the part of each sample, or None where all may be of one.
+        crossed: (H, W), the cells beside lines where surfaces cross, or None where these are not known.
 
     Returns:
         The gains in front, and at the surface.
@@ -59,12 +63,16 @@ def gains(kernel: Kernel, layers: Layers, shift: dict[Steps, Array], part: Array
     outline = outline_motion(layers, shift, part, motion)
     around = bordered(xp.permute_dims(outline, (2, 0, 1)), 0)
     around = xp.permute_dims(around, (1, 2, 0))
+    parts = None if part is None else bordered(part[:1, :, :])[0]
     offsets = xp.stack(kernel.offsets(layers.position[0]), axis=-1)
     front, surface = 0.0, 0.0
     for n, s in shift.items():
         own = layers.at(offsets, *n)
-        joined = (layers.covers(0, 0) & (s == 0))[..., None]
-        change = xp.where(joined, outline, layers.at(around, *n)) - layers.at(motion, *n)
+        joined = layers.covers(0, 0) & (s == 0)
+        if parts is not None:
+            same = layers.at(parts, *n) == layers.at(parts, 0, 0)
+            joined = joined & (same if crossed is None else same | crossed)
+        change = xp.where(joined[..., None], outline, layers.at(around, *n)) - layers.at(motion, *n)
         gain = kernel.weight(own + kernel.gamma * change, *n) - kernel.weight(own, *n)
         front = front + xp.where(layers.covers(*n) & (s > 0), gain, 0.0)
         surface = surface + xp.where(layers.covers(*n) & (s == 0), gain, 0.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,7 +74,10 @@ class Visible(Kernel):
         for n, s in shift.items():
             m = xp.where(shown[n] & (-s < m), -s, m)
         differentiates = engine_of(splats.positions).differentiates
-        lines = crossings.targets(layers, shift) if self.crossings and none > 1 and differentiates else None
+        lines, crossed = None, None
+        if self.crossings and none > 1 and differentiates:
+            pairs = crossings.pairs_of(layers)
+            lines, crossed = crossings.targets(layers, shift, pairs), functools.reduce(operator.or_, pairs.values())
         still = None if lines is None else lines.target
         revealed = sum(xp.where(m == k, z, 0.0) for k, z in enumerate(layers.target))
 
@@ -87,7 +92,7 @@ class Visible(Kernel):
                 behind = behind + xp.where((hidden == k)[..., None], given, 0.0)
         colors = [normalised(b, xp) for b in (front, surface, behind)]
         if self.rims and differentiates:
-            gains = rims.gains(self, layers, shift, splats.part)
+            gains = rims.gains(self, layers, shift, splats.part, crossed)
             for i, (total, gain) in enumerate(zip((front, surface), gains, strict=True)):
                 colors[i] = colors[i] + rims.spread(total, gain if still is None else xp.where(still, 0.0, gain))
         image = over(colors[0], over(*colors[1:]))

@@ -48,13 +48,18 @@ class ShaderConformance(Conformance):
     # ------------------------------------------------------------------------------------------- values
 
     def test_it_gives_a_premultiplied_color_for_each_sample(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """Colours are (N, 4) in the G-buffer's dtype, within [0, 1], and none is above alpha."""
+        """Colours are (N, 4) in the G-buffer's dtype, within [0, 1], and none is above alpha.
+
+        Of a shader with other `channels` it is (N, C + 1), and only alpha is within [0, 1].
+        """
         rgba = _shaded(shader, theta, gbuffer)
-        claim(rgba.shape == (ROWS, 4), f"the shader returned {rgba.shape}; expected {(ROWS, 4)}")
+        expected = ROWS, _instance(shader).channels + 1
+        claim(rgba.shape == expected, f"the shader returned {rgba.shape}; expected {expected}")
         claim(rgba.dtype == np.float32, f"the shader returned {rgba.dtype} for float32; expected float32")
+        rgba = rgba if expected[1] == 4 else rgba[:, -1:]
         low, high = rgba.min(), rgba.max()
         claim(low >= -TOLERANCE and high <= 1 + TOLERANCE, f"colours run from {low:.3g} to {high:.3g}; expected 0 to 1")
-        above = (rgba[:, :3] - rgba[:, 3:]).max()
+        above = (rgba[:, :-1] - rgba[:, -1:]).max(initial=0)
         claim(above <= TOLERANCE, f"a colour exceeds its alpha by {above:.3g}; multiply colours by alpha")
 
     def test_samples_are_shaded_one_by_one(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
@@ -70,7 +75,7 @@ class ShaderConformance(Conformance):
         """A shader that promises to be opaque has alpha 1, exactly."""
         if not _instance(shader).opaque:
             pytest.skip("the shader does not promise to be opaque")
-        alpha = _shaded(shader, theta, gbuffer)[:, 3]
+        alpha = _shaded(shader, theta, gbuffer)[:, -1]
         claim((alpha == 1).all(), f"the shader promises to be opaque; alpha is {alpha.min():.3g} somewhere")
 
     def test_it_reads_what_it_says(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
@@ -102,7 +107,7 @@ class ShaderConformance(Conformance):
         values = [v.astype(np.float64) for v in values]
         if not values:
             pytest.skip("the shader is given no θ")
-        weights = np.random.default_rng(0).standard_normal((ROWS, 4))
+        weights = np.random.default_rng(0).standard_normal((ROWS, _instance(shader).channels + 1))
         wide = map_leaves(lambda x: np.asarray(x, np.float64), gbuffer)
 
         def value(x: list) -> float:
@@ -131,7 +136,8 @@ class ShaderConformance(Conformance):
         def f(x: list) -> Any:
             return _call(shader, join(x), chosen)
 
-        found = derivatives.derivatives(chosen, f, values, derivatives.directions(values), np.ones((ROWS, 4)))
+        ones = np.ones((ROWS, _instance(shader).channels + 1))
+        found = derivatives.derivatives(chosen, f, values, derivatives.directions(values), ones)
         claim_finite(found, f"in {engine}, the colour of awkward samples or its derivative")
 
     # ------------------------------------------------------------------------------------------- errors

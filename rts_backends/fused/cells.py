@@ -20,7 +20,7 @@ from rts.splatting.layers import OFFSETS, check_rows
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only
 from rts_backends.fused import choices as listing
-from rts_backends.fused import crossings, mixed, outlines, stencil
+from rts_backends.fused import crossing_pairs, crossings, mixed, outlines, stencil
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
 from rts_backends.fused.survey import BLOCK, FLAT, collect, paint, survey
@@ -222,19 +222,26 @@ class Cells:
         if len(found.columns):
             rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
             arrays = self.positions, self.rgba, self.row, *self._numbers
-            decide = self.part, self.exits, kind.type(choices.extent), rules
+            decide = self.part, self.exits, kind.type(choices.extent), rules, self._pairs
             listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
             given = *arrays, *decide, *listed, ends, marks
             parallel(outlines.fill, height, *given, found, work=150 * len(found.columns))
         return found
 
     @cached_property
+    def _pairs(self) -> np.ndarray:
+        """Bits (H, W) of pairs beside lines of crossing (`crossing_pairs.py`); no rows where there are none."""
+        if not self.crosses:
+            return read_only(np.empty((0, self.row.shape[2]), np.uint8))
+        return crossing_pairs.pairs(self.positions, self.row, self.positions.dtype.type(self.choices.extent))
+
+    @cached_property
     def crossings(self) -> Crossings:
         """The targets whose derivative is that of a line where surfaces cross."""
-        if not self.crosses:
+        if not len(self._pairs):
             return crossings.nothing(self.row.shape[1], self.positions.dtype)
         arrays = self.positions, self.rgba, self.row, *self._numbers
-        return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent))
+        return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent), self._pairs)
 
     @cached_property
     def drawn(self) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 from rts.compiling import compiled, kernel
 from rts.splatting import crossings as specification
 from rts.splatting.kernel import TIE
-from rts.threads import parallel
+from rts.threads import parallel, read_only
 
 BORDER = 3
 """Rows around those of arrays of depths (2, ·, W), and rows and columns around those of their gaps (·, ·): so far from
@@ -45,15 +45,32 @@ class Rules(NamedTuple):
 def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np.ndarray) -> None:
     """Mark in `kept` (K, H, W) what `rts.splatting.crossings.sheets` keeps."""
     _, height, width = covered.shape
-    bits, some = no_pairs(height, width)
+    bits, some = _no_pairs(height, width)
     parallel(_find_in_depths, height, covered, depth, Rules.of(extent), bits, some, work=3 * covered[0].size)
     if some.any():
         _keep(covered, bits, some, specification.KEPT, kept)
 
 
-def no_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+def _no_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     """No pairs: bits (H, W) of the steps from each cell to the other of a pair, and whether there are any in a row."""
     return np.zeros((height, width), np.uint8), np.zeros(height, np.bool_)
+
+
+def pairs(positions: np.ndarray, row: np.ndarray, extent: np.floating) -> np.ndarray:
+    """Bits (H, W) uint8 of the steps from each cell to the other of a pair; no rows where there are no pairs.
+
+    Args:
+        positions: (N, 3).
+        row: (K, H, W).
+        extent: of the depths, the camera's included.
+    """
+    _, height, width = row.shape
+    if len(row) > 1 and (row[1] >= 0).any():
+        bits, some = _no_pairs(height, width)
+        parallel(find_in_cells, height, positions, row, Rules.of(extent), bits, some, work=3 * row[0].size)
+        if some.any():
+            return read_only(bits)
+    return read_only(np.empty((0, width), np.uint8))
 
 
 @kernel
@@ -259,6 +276,19 @@ def _ratio(z, gap, rules, y, x, v, u):
     change = change0 + change1 if before and after else two * min(change0, change1)
     direct = direct0 + direct1 if before and after else two * min(direct0, direct1)
     return change / total if change < rules.direct * direct else infinity
+
+
+@compiled
+def steps(bits, y, x):
+    """The steps from a cell to the others of its pairs."""
+    height, found = len(bits), 0
+    for i in range(4):
+        u, v = STEPS[i, 0], STEPS[i, 1]
+        if bits[y, x] >> i & 1:
+            found |= 1 << (3 * (v + 1) + u + 1)
+        if 0 <= y - v < height and 0 <= x - u and bits[y - v, x - u] >> i & 1:
+            found |= 1 << (3 * (1 - v) + 1 - u)
+    return found
 
 
 @kernel

@@ -12,7 +12,7 @@ import numpy as np
 
 from rts.compiling import compiled, kernel
 from rts.threads import parallel
-from rts_backends.fused.crossing_pairs import BORDER, STEPS, Rules, find_in_cells, gather, has_two, no_pairs
+from rts_backends.fused.crossing_pairs import BORDER, Rules, gather, has_two, steps
 from rts_backends.fused.mixed import splat, tint_of
 from rts_backends.fused.survey import FLAT
 
@@ -56,23 +56,18 @@ def _empty(offsets: np.ndarray, kind: np.dtype) -> Crossings:
     return Crossings(offsets, *listed, *arrays)
 
 
-def listed(arrays: tuple, choices: Any, extent: np.floating) -> Crossings:
+def listed(arrays: tuple, choices: Any, extent: np.floating, bits: np.ndarray) -> Crossings:
     """The targets beside lines.
 
     Args:
         arrays: positions (N, 3), rgba (N, 4), row (K, H, W), and the splatter's scale, peak and gamma.
         choices: see `rts_backends.fused.cells.Choices`.
         extent: of the depths, the camera's included.
+        bits: the pairs of `crossing_pairs.py`.
     """
     positions, _, row = arrays[:3]
-    _, height, width = row.shape
-    kind = positions.dtype
-    if len(row) < 2 or not (row[1] >= 0).any():
-        return nothing(height, kind)
-    rules, bits, some = Rules.of(extent), *no_pairs(height, width)
-    parallel(find_in_cells, height, positions, row, rules, bits, some, work=3 * row[0].size)
-    if not some.any():
-        return nothing(height, kind)
+    height, width = bits.shape
+    kind, rules, some = positions.dtype, Rules.of(extent), bits.any(axis=1)
     rows = height + 2 * BORDER
     z, gap = np.empty((2, rows, width), kind), np.empty((rows, width + 2 * BORDER), kind)
     parallel(gather, rows, positions, row, some, z, gap, work=row[0].size)
@@ -97,26 +92,13 @@ def _list(start, stop, bits, some, states, row, mixed, firsts, columns, ranges, 
             continue
         m = firsts[y]
         for x in range(width):
-            found = 0 if states[y, x] == FLAT else _steps(bits, y, x)
+            found = 0 if states[y, x] == FLAT else steps(bits, y, x)
             if not found:
                 continue
             m = _place(columns, m, mixed, y, x)
             if _decide(sheets, slopes, row, mixed, ranges, m, z, gap, rules, found, y, x):
                 around[y, x] = found
                 counts[y] += 1
-
-
-@compiled
-def _steps(bits, y, x):
-    """The steps from a cell to the others of its pairs."""
-    height, found = len(bits), 0
-    for i in range(4):
-        u, v = STEPS[i, 0], STEPS[i, 1]
-        if bits[y, x] >> i & 1:
-            found |= 1 << (3 * (v + 1) + u + 1)
-        if 0 <= y - v < height and 0 <= x - u and bits[y - v, x - u] >> i & 1:
-            found |= 1 << (3 * (1 - v) + 1 - u)
-    return found
 
 
 @compiled

@@ -12,12 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.compiling import compiled, kernel
+from rts_backends.fused.crossing_pairs import steps
 from rts_backends.fused.mixed import splat
 from rts_backends.fused.survey import FLAT
 
 NOTHING, FRONT, JOINED, SURFACE = 0, 1, 2, 3
 """What a source gives to a target: nothing, or coverage of the buffer in front as its outline moves; of that at the
-surface as the target's outline moves; of that at the surface, over nothing, as its own does."""
+surface as the target's outline moves; of that at the surface, over nothing or another part, as its own does."""
 
 LISTED, BESIDE = 1, 2
 """Marks of targets that are listed, and of those whose outline matters to listed ones beside them."""
@@ -250,6 +251,7 @@ def fill(
     exits,
     extent,
     rules,
+    crossed,
     mixed,
     ranges,
     sums,
@@ -273,6 +275,7 @@ def fill(
         exits: (H, W), where rays leave the part of the front, or no rows.
         extent: of the depths.
         rules: numbers of the rules.
+        crossed: (H, W) uint8, the pairs of `crossing_pairs.py`, or no rows.
         mixed: (H, W), see `rts_backends.fused.cells.Choices`, as `ranges` and `sums`.
         ranges: (M, 9, 3, 2).
         sums: (M, 3, 5).
@@ -304,6 +307,8 @@ def fill(
                 m += 1
             else:
                 _change(gives, changes, d, own)
+            if covered and len(part) and not (len(crossed) and steps(crossed, y, x)):
+                _part(gives, d, part, ends, y, x)
             d += 1
 
 
@@ -364,6 +369,15 @@ def _list(gives, changes, choice, total, row, y, x):
             gives[n] = FRONT
         elif surface and choice[n, 1, 0] == 0 and choice[n, 1, 1] == 1:
             gives[n] = JOINED if row[0, y, x] >= 0 else SURFACE
+
+
+@compiled
+def _part(gives, d, part, ends, y, x):
+    """Sources of other parts than the target's move as their own outlines, if any: there may be a gap between."""
+    for n in range(9):
+        py, px = y + 1 - n // 3, x + 1 - n % 3
+        if gives[d, n] == JOINED and part[0, py, px] != part[0, y, x]:
+            gives[d, n] = SURFACE if ends[py, px] else NOTHING
 
 
 @compiled

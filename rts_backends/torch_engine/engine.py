@@ -215,6 +215,14 @@ class TorchEngine(Engine):
                 torch.cuda.synchronize(device)
         return x
 
+    def concurrent(self) -> bool:
+        """Whether no transform looks on: these belong to a thread."""
+        return not transformed()
+
+    def split(self, x: torch.Tensor, sizes: Sequence[int]) -> Sequence[torch.Tensor]:
+        """By `torch.split`, whose derivative is one array for all pieces."""
+        return torch.split(x, list(sizes))
+
     def value_and_grad(self, f: Callable) -> Callable:
         """By autograd on detached leaves; entries that `f` does not use get a zero gradient."""
 

@@ -17,7 +17,7 @@ import numpy as np
 from rts.arguments import quoted
 from rts.arrays import kind_of
 from rts.camera import Camera
-from rts.checks import check_scene, check_size
+from rts.checks import check_colors, check_scene, check_size
 from rts.diagnostics.comparison import builtin
 from rts.diagnostics.comparison.scene import Scene, check_directions, moving, parts_of
 from rts.diagnostics.comparison.settings import engines
@@ -218,7 +218,7 @@ def checked(found: Any, name: str) -> tuple[list[Part], Camera]:
     if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Camera)):
         raise InputError(f"{name} gave {kind_of(found)}; expected (parts, camera)")
     parts, camera = found
-    check_scene(parts, camera)
+    check_colors(check_scene(parts, camera)[0][0].shader.channels)
     return parts_of(found), camera
 
 

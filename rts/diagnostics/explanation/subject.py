@@ -12,7 +12,7 @@ import numpy as np
 
 from rts.arrays import kind_of
 from rts.camera import Camera
-from rts.checks import check_scene, check_splatter
+from rts.checks import check_colors, check_scene, check_splatter
 from rts.diagnostics.explanation.fineness import Fineness, fineness
 from rts.diagnostics.steps import pixel_step
 from rts.engines import Engine, is_constant, namespace
@@ -101,6 +101,7 @@ class Subject:
         """The image of parts and a camera; a NumPy one becomes a constant of the engine."""
         parts, camera = found if change is None else change(listed_parts(found[0]), found[1])
         image = render(parts, camera, size or self.size, **{**self.options, **options})
+        check_colors(image.shape[-1] - 1)
         return image if self.engine.owns(image) else self.engine.constant(image, next(leaves(self.parameters)))
 
     def image(self, parameters: Tree, change: Change | None = None, **options: Any) -> Array:

@@ -1,7 +1,9 @@
-"""Tiles: the fine cells that active pixels need, laid out side by side as one picture that any splatter can take.
+"""Strips: the fine cells that active pixels need, laid out side by side as one picture that any splatter can take.
 
-A tile holds a square of pixels and an apron of fine cells around it, so that no splat crosses from one tile to another.
-Cells that no active pixel needs are empty. A cell that two tiles show is sampled, evaluated and shaded once.
+The image is cut into strips of a few lines of pixels. Where a strip has active pixels it has runs of columns, with an
+apron of fine cells around each, so that no splat crosses from one run to another. Runs are laid side by side, and fill
+lines of the layout. Cells that no active pixel needs are empty. A cell that two runs show is sampled, evaluated and
+shaded once.
 """
 
 from __future__ import annotations
@@ -21,15 +23,15 @@ from rts.records import ArraySpec, Fine, Sampled, Samples
 from rts.threads import parallel, read_only
 from rts.trees import Array
 
-TILE = 32
-"""Fine cells along each side of a tile with its apron, about: with fewer there are more of aprons, with more, more of
-empty cells. Compiled splatters take as many columns at a time."""
+STRIP = 16
+"""Lines of fine cells in a strip without its apron, about: with fewer there are more of aprons, with more, more of
+empty cells."""
 
 LINE = 256
 """Fine cells that are sampled, in a line of their list."""
 
 FILLED = 1 / 3
-"""Share of a tile's cells that are needed, about, where shapes have to be known beforehand."""
+"""Share of a strip's cells that are needed, about, where shapes have to be known beforehand."""
 
 
 class Grid(NamedTuple):
@@ -52,33 +54,43 @@ class Grid(NamedTuple):
         return height * self.side + 2 * self.apron, width * self.side + 2 * self.apron
 
     @property
-    def tile(self) -> int:
-        """Pixels along each side of a tile."""
-        return max(-(-self.apron // self.side), (TILE - 2 * self.apron) // self.side, 1)
+    def high(self) -> int:
+        """Pixels from top to bottom of a strip."""
+        return max(1, STRIP // self.side)
 
     @property
-    def tiles(self) -> tuple[int, int]:
-        """Lines and columns of tiles that make the image."""
-        return -(-self.size[0] // self.tile), -(-self.size[1] // self.tile)
+    def strips(self) -> int:
+        """Strips that make the image."""
+        return -(-self.size[0] // self.high)
+
+    @property
+    def gap(self) -> int:
+        """Pixels whose place the aprons of a run take, on its left and right together."""
+        return -(-2 * self.apron // self.side)
 
     @property
     def pitch(self) -> int:
-        """Fine cells from one tile of a layout to the next: whole pixels."""
-        return -(-(self.tile * self.side + 2 * self.apron) // self.side) * self.side
+        """Pixels whose height a line of a layout takes, with aprons."""
+        return self.high + self.gap
 
     def room(self, capacity: int | None, layers: int) -> Room:
         """Room for the worst case, or for so many rows."""
-        cells, (down, across) = self.fine[0] * self.fine[1], self.tiles
+        cells, columns = self.fine[0] * self.fine[1], self.strips * (self.size[1] + self.gap)
         if capacity is None:
-            return Room(down * across, cells)
-        each = FILLED * (self.tile * self.side) ** 2
-        return Room(min(down * across, math.ceil(capacity / layers / each)), min(cells, max(1, capacity // layers)))
+            return Room(columns, cells)
+        each = FILLED * self.high * self.side**2
+        return Room(min(columns, math.ceil(capacity / layers / each)), min(cells, max(1, capacity // layers)))
 
 
 class Room(NamedTuple):
-    """How many tiles, and fine cells to sample, there is room for."""
+    """How much there is room for.
 
-    tiles: int
+    Attributes:
+        columns: columns of strips, a pixel wide, those that aprons take included.
+        cells: fine cells to sample.
+    """
+
+    columns: int
     cells: int
 
 
@@ -91,12 +103,12 @@ def rounded(count: int) -> int:
 
 
 class Layout(NamedTuple):
-    """Fine cells in tiles.
+    """Fine cells in strips.
 
     Attributes:
         cells: (L, LINE) int32, the cells to sample, as flat indices in the grid with its apron; −1 for none.
         place: (h, w) int32, which of these each place of the layout shows, or −1.
-        kinds: (h, w) uint8, bits of `tiles_kernels`.
+        kinds: (h, w) uint8, bits of `strips_kernels`.
         pixel: (H, W) int32, where in the layout, in pixels, an active pixel is; −1 for pixels that are not active.
         coarse: (H', W') bool, with the apron, the pixels of the image that are not active.
         dropped: () int32, pixels that there was no room for.
@@ -112,7 +124,7 @@ class Layout(NamedTuple):
     @staticmethod
     def specs(grid: Grid, room: Room) -> tuple[ArraySpec, ...]:
         """Shapes and dtypes of the arrays."""
-        place = _shape(grid, room)
+        place = _shape(grid, *_lines(grid, room.columns))
         lines = -(-room.cells // LINE), LINE
         coarse = tuple(n + 2 * grid.apron for n in grid.size)
         kinds = np.int32, np.int32, np.uint8, np.int32, np.bool_, np.int32
@@ -120,60 +132,85 @@ class Layout(NamedTuple):
         return tuple(itertools.starmap(ArraySpec, zip(shapes, kinds, strict=True)))
 
 
-def _shape(grid: Grid, room: Room) -> tuple[int, int]:
+def _lines(grid: Grid, columns: int) -> tuple[int, int]:
+    """How many lines of a layout, and of how many columns, about square, have room for runs of so many in all."""
+    # Where a line ends, up to `gap` columns stay empty, and a run that is cut has aprons once more.
+    across = max(math.isqrt(columns * grid.pitch), 3 * grid.gap + 1)
+    return -(-columns // (across - 2 * grid.gap)), across
+
+
+def _shape(grid: Grid, lines: int, across: int) -> tuple[int, int]:
     """Height and width of a layout."""
-    across = _across(room)
-    return -(-room.tiles // across) * grid.pitch + 2 * grid.apron, across * grid.pitch + 2 * grid.apron
+    pixels = (lines - 1) * grid.pitch + grid.high, across - grid.gap
+    return pixels[0] * grid.side + 2 * grid.apron, pixels[1] * grid.side + 2 * grid.apron
 
 
-def _across(room: Room) -> int:
-    return max(1, math.isqrt(room.tiles))
-
-
-def needed_room(active: np.ndarray, grid: Grid) -> Room:
-    """Room for all of some pixels (H, W) bool; of cells it is a bound."""
-    tiles = int(_in_tiles(active, grid).sum())
-    each = (grid.side + 2 * grid.apron) ** 2
-    return Room(
-        max(1, tiles), max(1, min(int(active.sum()) * each, tiles * (grid.tile * grid.side + 2 * grid.apron) ** 2))
-    )
-
-
-def _in_tiles(active: np.ndarray, grid: Grid) -> np.ndarray:
-    """Which tiles hold any of some pixels."""
-    down, across = grid.tiles
-    wide = np.zeros((down * grid.tile, across * grid.tile), bool)
-    wide[: grid.size[0], : grid.size[1]] = active
-    return np.asarray(wide.reshape(down, grid.tile, across, grid.tile).any(axis=(1, 3)))
-
-
-def lay_out(active: np.ndarray, grid: Grid, room: Room, lines_of: Callable[[int], int] | None = None) -> Layout:
-    """The fine cells that active pixels (H, W) bool need, in tiles, as far as there is room.
+def lay_out(
+    active: np.ndarray, grid: Grid, room: Room | None = None, sizes_of: Callable[[int], int] | None = None
+) -> Layout:
+    """The fine cells that active pixels (H, W) bool need, in strips, as far as there is room.
 
     Args:
         active: the pixels.
         grid: the sizes.
-        room: for how much; it decides the shapes.
-        lines_of: how many lines the list of cells is to have if so many are needed; None for those of `room`.
+        room: for how much; None for all.
+        sizes_of: where shapes follow from what is needed, how many columns, and lines of cells, to allot for a number
+            that is needed. None where they follow from `room`.
     """
-    from rts.sampling import tiles_kernels
+    from rts.sampling import strips_kernels
 
-    (lines, *_), shape = Layout.specs(grid, room), _shape(grid, room)
-    cells = np.full(lines.shape, -1, np.int32)
+    marks = read_only(active).view(np.uint8)
+    runs = strips_kernels.find(marks, grid.high, grid.gap)
+    columns = max(1, int(runs[:, 2].sum()) + grid.gap * len(runs))
+    lines, across = _lines(grid, (sizes_of or int)(columns) if room is None else room.columns)
+    pieces = strips_kernels.split(runs, grid.gap, lines, across)
+    if room is None and sizes_of is int:
+        lines = int(pieces[:, 3].max(initial=0)) + 1
+    sizes = grid.side, grid.apron, grid.high, grid.gap
+    pieces, counts = _fitting(marks, pieces, grid, None if room is None else room.cells)
+    total = int(counts.sum())
+    allotted = -(-max(1, total) // LINE)
+    allotted = -(-room.cells // LINE) if sizes_of is None and room is not None else (sizes_of or int)(allotted)
+    shape = _shape(grid, lines, across)
+    cells, pixel = np.empty(allotted * LINE, np.int32), np.full(grid.size, -1, np.int32)
+    cells[total:] = -1
     place, kinds = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8)
-    pixel = np.full(grid.size, -1, np.int32)
-    corners = np.argwhere(_in_tiles(active, grid))[: room.tiles]
-    (down, across), inner = grid.tiles, grid.tile * grid.side
-    numbers = np.zeros((down + 2, across + 2, inner, inner), np.int32)
-    sizes = grid.side, grid.tile, grid.apron, _across(room), grid.pitch, room.cells
-    _, count = tiles_kernels.fill(active, corners, *sizes, numbers, cells.reshape(-1), place, kinds, pixel)
-    if lines_of is not None:
-        cells = cells[: lines_of(max(1, -(-count // LINE)))]
-    coarse, left = np.pad(pixel < 0, grid.apron), active.sum() - (pixel >= 0).sum()
-    return Layout(cells, place, kinds, pixel, coarse, np.asarray(left, np.int32))
+    given = marks, pieces, _firsts(pieces, grid), *sizes, np.cumsum(counts) - counts, cells, place, kinds
+    parallel(strips_kernels.fill, len(counts), *given, work=4 * place.size)
+    strips_kernels.number(marks, pieces, grid.high, grid.pitch, across - grid.gap, pixel)
+    left = np.count_nonzero(active) - np.count_nonzero(pixel >= 0)
+    coarse = np.ones([n + 2 * grid.apron for n in grid.size], bool)
+    inner = tuple(slice(grid.apron, grid.apron + n) for n in grid.size)
+    np.less(pixel, 0, out=coarse[inner])
+    return Layout(cells.reshape(-1, LINE), place, kinds, pixel, coarse, np.asarray(left, np.int32))
 
 
-class InTiles(Needed):
+def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: Grid, most: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """The first pieces, as many as have no more cells than there is room for; and their cells in each line."""
+    from rts.sampling import strips_kernels
+
+    def counted(n: int) -> np.ndarray:
+        counts = np.zeros(grid.fine[0], np.int64)
+        given = marks, pieces[:n], _firsts(pieces[:n], grid), grid.side, grid.apron, grid.high, grid.gap
+        parallel(strips_kernels.count, len(counts), *given, grid.fine[1], counts, work=2000 * len(counts))
+        return counts
+
+    counts = counted(len(pieces))
+    if most is None or counts.sum() <= most:
+        return pieces, counts
+    low, high = 0, len(pieces)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (middle, high) if counted(middle).sum() <= most else (low, middle)
+    return pieces[:low], counted(low)
+
+
+def _firsts(pieces: np.ndarray, grid: Grid) -> np.ndarray:
+    """Where the pieces of each strip begin, and where the last one's end."""
+    return np.searchsorted(pieces[:, 0], np.arange(grid.strips + 1))
+
+
+class InStrips(Needed):
     """Says which samples of listed cells can reach active pixels: asks what decides for images, of the layout."""
 
     def __init__(self, needed: AnyNeeded, layout: Layout):
@@ -182,16 +219,17 @@ class InTiles(Needed):
 
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `Needed`; (K, L, LINE)."""
-        from rts.sampling import tiles_kernels
+        from rts.sampling import strips_kernels
 
         layers, place = len(covered), self._layout.place
         lists = [read_only(x).reshape(layers, -1) for x in (covered, depth)]
         laid, deep = np.empty((layers, *place.shape), bool), np.empty((layers, *place.shape), depth.dtype)
-        parallel(tiles_kernels.gather, layers * len(place), *lists, place, laid, deep, work=2 * laid.size)
+        parallel(strips_kernels.gather, layers * len(place), *lists, place, laid, deep, work=2 * laid.size)
         kept, found = self._needed(laid, deep), np.zeros((layers, covered[0].size), bool)
         if kept is laid:
             return covered
-        tiles_kernels.scatter(kept, self._layout.kinds, place, found)
+        given = kept[1:], self._layout.kinds, place, found[1:]
+        parallel(strips_kernels.scatter, (layers - 1) * len(place), *given, work=laid[1:].size)
         found = found.reshape(covered.shape) & covered
         found[0] = covered[0]
         return found
@@ -241,18 +279,18 @@ def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
 def _arranged(
     row: np.ndarray, place: np.ndarray, cells: np.ndarray, sizes: Sequence[int], width: int
 ) -> tuple[np.ndarray, ...]:
-    """What `tiles_kernels.arrange` fills; there is always at least one splat."""
-    from rts.sampling import tiles_kernels
+    """What `strips_kernels.arrange` fills; there is always at least one splat."""
+    from rts.sampling import strips_kernels
 
     row, place, cells = (read_only(x, np.int32) for x in (row, place, cells))
     row, cells, lines = row.reshape(len(row), -1), cells.reshape(-1), len(row) * len(place)
     counts = np.empty(lines, np.int64)
-    parallel(tiles_kernels.count, lines, row, place, counts, work=len(row) * place.size)
+    parallel(strips_kernels.count_samples, lines, row, place, counts, work=len(row) * place.size)
     offsets, total = np.cumsum(counts) - counts, int(counts.sum())
     index, shift = np.zeros(max(1, total), np.int32), np.zeros((max(1, total), 3), np.float32)
     laid, part = (np.empty((len(row), *place.shape), np.int32) for _ in range(2))
     given = row, place, cells, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part
-    parallel(tiles_kernels.arrange, lines, *given, work=2 * laid.size)
+    parallel(strips_kernels.arrange, lines, *given, work=2 * laid.size)
     return index, shift, laid, part
 
 

@@ -1,0 +1,49 @@
+"""Images of any number of channels, by splatters that make images of three."""
+
+from __future__ import annotations
+
+from rts.arrays import described, shape_of
+from rts.engines import namespace
+from rts.errors import InputError
+from rts.interfaces import Splatter
+from rts.records import Splats
+from rts.trees import Array
+
+GROUP = 3
+"""Channels besides alpha that a splatter is given at once."""
+
+
+def cropped_image(splatter: Splatter, splats: Splats) -> Array:
+    """The image (h, w, C + 1) of splats without their border.
+
+    No channel has an effect on another, and alpha on all. So the splatter makes an image of each three channels and
+    alpha, filled up with zeros; alpha is that of the first.
+
+    Args:
+        splatter: a splatter.
+        splats: shaded samples; `rgba` is (N, C + 1), alpha last.
+
+    Raises:
+        InputError: the splatter gave an image of another shape.
+    """
+    rgba = splats.rgba
+    count = shape_of(rgba)[1] - 1
+    if count == GROUP:
+        return _cropped(splatter, splats)
+    xp, alpha, images = namespace(rgba), rgba[:, count:], []
+    for first in range(0, count, GROUP):
+        channels = rgba[:, first : min(first + GROUP, count)]
+        missing = [xp.zeros_like(alpha)] * (GROUP - shape_of(channels)[1])
+        images.append(_cropped(splatter, splats.replace(rgba=xp.concat([channels, *missing, alpha], axis=1))))
+    left = count - GROUP * (len(images) - 1)
+    alpha = images[0][..., GROUP:]
+    return xp.concat([*(image[..., :GROUP] for image in images[:-1]), images[-1][..., :left], alpha], axis=-1)
+
+
+def _cropped(splatter: Splatter, splats: Splats) -> Array:
+    """The image (h, w, 4) of splats (N, 4) without their border."""
+    image = splatter.cropped(splats)
+    expected = *(n - 2 * splats.border for n in splats.row.shape[1:]), GROUP + 1
+    if shape_of(image) != expected:
+        raise InputError(f"the image of {splatter!r} {described(image)}; expected {expected} without the border")
+    return image

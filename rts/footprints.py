@@ -1,0 +1,84 @@
+"""How uv changes from sample to sample: the footprint of a cell on the texture, from the surface's own derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from rts.camera import Camera
+from rts.engines import Engine, constants, namespace, stopped
+from rts.errors import InputError
+from rts.interfaces import Surface
+from rts.operations.linear import affine_map
+from rts.records import Samples
+from rts.trees import Array, Tree
+
+FOOTPRINT = "uv_footprint"
+"""The entry of the G-buffer."""
+LEAST = 1e-30
+"""What is less cannot be divided by."""
+
+
+def uv_footprint(
+    surface: Surface,
+    theta: Mapping[str, Tree],
+    samples: Samples,
+    gbuffer: Mapping[str, Array],
+    camera: Camera,
+    grid: tuple[int, int],
+    engine: Engine,
+    like: Array | None,
+) -> Array:
+    """∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y (N, 4) for one cell to the right and one cell down; without derivative.
+
+    It is the derivative on the tangent plane of each sample, so that it looks at no other sample: outlines and seams of
+    uv have no effect. The surface is evaluated at parameters beside the sample's, `Surface.param_step` away; the
+    projection is differentiated exactly.
+
+    Args:
+        surface: a surface of two parameters a sample.
+        theta: the entries that it reads.
+        samples: the samples.
+        gbuffer: "position" (N, 3), local space, and "uv" (N, 2) of the samples.
+        camera: of the grid, in the surface's local space.
+        grid: (height, width) of it.
+        engine: the engine to compute with.
+        like: an array that sets dtype and device of its constants.
+
+    Raises:
+        InputError: samples have not two parameters.
+    """
+    if samples.params.shape[-1] != 2:
+        raise InputError(
+            f"{surface!r} has {samples.params.shape[-1]} parameters a sample; expected two: without them "
+            f"{FOOTPRINT!r}, which mipmaps need, is not known"
+        )
+    given = theta, camera, gbuffer["position"], gbuffer["uv"], samples.params
+    theta, camera, position, uv, params = (stopped(constants(x, engine, like)) for x in given)
+    xp = namespace(position)
+    rows = camera.pixel_rows(grid)[:3, :]
+    pixel = affine_map(rows, position)
+    linear = xp.concat([rows[:, :3], xp.zeros_like(rows[:, 3:])], axis=1)
+    moves, changes = [], []
+    for i in range(2):
+        axis = engine.constant(surface.param_step * np.eye(2)[i : i + 1], params)
+        # Towards the middle, so that the sample stays on its patch.
+        steps = xp.where(params < 0.5, axis, -axis)
+        beside = surface.evaluate(theta, replace(samples, params=params + steps))
+        side = affine_map(linear, beside["position"] - position)
+        # The derivative of (p₀, p₁) / p₂.
+        moves.append((side[:, :2] * pixel[:, 2:3] - pixel[:, :2] * side[:, 2:3]) / _safe(pixel[:, 2:3] ** 2))
+        changes.append(beside["uv"] - uv)
+    (ax, ay), (bx, by) = ((m[:, 0:1], m[:, 1:2]) for m in moves)
+    # Edge-on the determinant is zero: uv changes beyond all bounds.
+    determinant = _safe(ax * by - ay * bx)
+    along_x = changes[0] * by - changes[1] * ay
+    along_y = changes[1] * ax - changes[0] * bx
+    return xp.astype(xp.concat([along_x, along_y], axis=1) / determinant, uv.dtype)
+
+
+def _safe(x: Array) -> Array:
+    xp = namespace(x)
+    return xp.where(xp.abs(x) < LEAST, LEAST, x)

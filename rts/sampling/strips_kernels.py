@@ -1,0 +1,275 @@
+"""Fine cells of active pixels laid out in strips, and samples put into them. Compiled.
+
+A piece is a run of a strip's columns, or a part of one that has its own place in the layout: (strip, first column,
+number of columns, line, place in the line), of pixels. Its apron on the left begins at its place; it is as wide as that
+on the right, and both together, in whole pixels, are the `gap`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.compiling import compiled, kernel
+
+WANTED, NEAR = 1, 2
+"""Bits of cells: inside of an active pixel, and within two cells of one."""
+
+NEEDED = 4
+"""Bit of cells in an active pixel or its apron."""
+
+
+@kernel
+def find(active, high, gap):
+    """Runs (R, 3) int32 of columns of strips: strip, first column, number; those that aprons would join are one.
+
+    Args:
+        active: (H, W) uint8.
+        high: pixels from top to bottom of a strip.
+        gap: pixels that aprons take.
+    """
+    height, width = active.shape
+    strips, found = (height + high - 1) // high, 0
+    runs, some = np.empty((strips * (width // (gap + 2) + 1), 3), np.int32), np.empty(width, np.uint8)
+    for strip in range(strips):
+        some[:] = 0
+        for y in range(strip * high, min(height, (strip + 1) * high)):
+            _unite(some, active[y])
+        last = -1
+        for x in range(width):
+            if some[x]:
+                if last < 0 or x - last > gap + 1:
+                    runs[found, 0], runs[found, 1] = strip, x
+                    found += 1
+                last = x
+                runs[found - 1, 2] = x + 1 - runs[found - 1, 1]
+    return runs[:found]
+
+
+@compiled
+def _unite(some, active):
+    for x in range(len(some)):
+        some[x] |= active[x]
+
+
+@kernel
+def split(runs, gap, lines, across):
+    """Pieces (P, 5) int32 of runs that fit into so many lines of so many columns; what finds no room is left out."""
+    pieces = np.empty((len(runs) + lines, 5), np.int32)
+    found, line, at = 0, 0, 0
+    for r in range(len(runs)):
+        strip, first, left = runs[r]
+        while left > 0:
+            fits = min(left, across - at - gap)
+            if fits < 1:
+                line, at = line + 1, 0
+                if line == lines:
+                    return pieces[:found]
+                continue
+            piece = pieces[found]
+            piece[0], piece[1], piece[2], piece[3], piece[4] = strip, first, fits, line, at
+            found, at, first, left = found + 1, at + fits + gap, first + fits, left - fits
+    return pieces[:found]
+
+
+@kernel
+def number(active, pieces, high, pitch, across, pixel):
+    """Fill in where in the layout (in pixels, `across` in a line, lines of pieces `pitch` apart) active pixels are."""
+    height, _ = active.shape
+    for strip, first, columns, line, at in pieces:
+        for y in range(strip * high, min(height, (strip + 1) * high)):
+            start = (line * pitch + y - strip * high) * across + at
+            for j in range(columns):
+                if active[y, first + j]:
+                    pixel[y, first + j] = start + j
+
+
+@compiled
+def _needs(needs, active, line, strip, first, columns, side, apron, high):
+    """Bits of what the columns of a piece need of a line of cells of the grid; whether they need any."""
+    needs[:columns] = 0
+    top, bottom = strip * high, min(len(active), (strip + 1) * high)
+    any_needed = False
+    for y in range(max(top, (line - 2 * apron) // side), min(bottom, line // side + 1)):
+        v = line - y * side - apron
+        bits = np.uint8(NEEDED)
+        if -2 <= v < side + 2:
+            bits |= np.uint8(NEAR)
+        if 0 <= v < side:
+            bits |= np.uint8(WANTED)
+        any_needed |= _join(needs, active[y, first : first + columns], bits)
+    return any_needed
+
+
+@compiled
+def _join(needs, active, bits):
+    some = np.uint8(0)
+    for j in range(len(active)):
+        needs[j] |= bits * active[j]
+        some |= active[j]
+    return some != 0
+
+
+@kernel
+def count(start, stop, active, pieces, firsts, side, apron, high, gap, width, counts):
+    """Count the cells of lines [start, stop) of the grid that active pixels need: counts (H',).
+
+    Args:
+        start: first line.
+        stop: end of the lines.
+        active: (H, W) uint8.
+        pieces: (P, 5).
+        firsts: (S + 1,), where the pieces of each strip begin.
+        side: s, cells along each side of a pixel.
+        apron: cells around active pixels that are needed.
+        high: pixels from top to bottom of a strip.
+        gap: pixels that aprons take.
+        width: of the grid.
+        counts: to be filled.
+    """
+    needs, seen = np.empty(active.shape[1], np.uint8), np.zeros(width, np.uint8)
+    for line in range(start, stop):
+        found, (begin, end) = 0, _strips(line, side, apron, high, len(firsts) - 1)
+        for p in range(firsts[begin], firsts[end]):
+            strip, first, columns = pieces[p, 0], pieces[p, 1], pieces[p, 2]
+            if not _needs(needs, active, line, strip, first, columns, side, apron, high):
+                continue
+            until = 0
+            for j in range(columns + gap):
+                if j < columns and needs[j]:
+                    until = j * side + side + 2 * apron
+                for u in range((first + j) * side, first * side + min(j * side + side, until)):
+                    found += seen[u] == 0
+                    seen[u] = 1
+        counts[line] = found
+        for p in range(firsts[begin], firsts[end]):
+            seen[pieces[p, 1] * side : (pieces[p, 1] + pieces[p, 2]) * side + 2 * apron] = 0
+
+
+@compiled
+def _strips(line, side, apron, high, strips):
+    """First and end of the strips that may need a line of cells of the grid."""
+    return max(0, (line - 2 * apron) // (high * side)), min(strips, line // (high * side) + 1)
+
+
+@kernel
+def fill(start, stop, active, pieces, firsts, side, apron, high, gap, offsets, cells, place, kinds):
+    """Lay out the cells of lines [start, stop) of the grid that active pixels need.
+
+    Args:
+        start: first line.
+        stop: end of the lines.
+        active: (H, W) uint8.
+        pieces: (P, 5).
+        firsts: (S + 1,), where the pieces of each strip begin.
+        side: s, cells along each side of a pixel.
+        apron: cells around active pixels that are needed.
+        high: pixels from top to bottom of a strip.
+        gap: pixels that aprons take.
+        offsets: (H',), how many cells the lines before each have.
+        cells: (M,) int32, to be filled: flat index of each cell in the grid, which has the apron, too.
+        place: (h, w) int32, −1, to be filled: which of the cells each place of the layout holds.
+        kinds: (h, w) uint8 zeros, to be filled with bits.
+    """
+    width = active.shape[1] * side + 2 * apron
+    needs, numbers = np.empty(active.shape[1], np.uint8), np.full(width, -1, np.int32)
+    for line in range(start, stop):
+        n, (begin, end) = offsets[line], _strips(line, side, apron, high, len(firsts) - 1)
+        for p in range(firsts[begin], firsts[end]):
+            strip, first, columns = pieces[p, 0], pieces[p, 1], pieces[p, 2]
+            if not _needs(needs, active, line, strip, first, columns, side, apron, high):
+                continue
+            down, over = pieces[p, 3] * (high + gap) * side + line - strip * high * side, pieces[p, 4] * side
+            until = 0
+            for j in range(columns + gap):
+                if j < columns and needs[j]:
+                    until = j * side + side + 2 * apron
+                for u in range(j * side, min(j * side + side, until)):
+                    x = first * side + u
+                    if numbers[x] < 0:
+                        numbers[x], cells[n] = n, line * width + x
+                        n += 1
+                    place[down, over + u] = numbers[x]
+            _tell(kinds[down, over : over + columns * side + 2 * apron], needs, columns, side, apron)
+        for p in range(firsts[begin], firsts[end]):
+            numbers[pieces[p, 1] * side : (pieces[p, 1] + pieces[p, 2]) * side + 2 * apron] = -1
+
+
+@compiled
+def _tell(kinds, needs, columns, side, apron):
+    """Bits of a line of cells of a piece, from what its columns need."""
+    around = min(apron, 2)
+    for j in range(columns):
+        if needs[j] & NEAR:
+            for u in range(j * side + apron - around, (j + 1) * side + apron + around):
+                kinds[u] |= np.uint8(NEAR)
+        if needs[j] & WANTED:
+            for u in range(j * side + apron, (j + 1) * side + apron):
+                kinds[u] |= np.uint8(WANTED)
+
+
+@kernel
+def count_samples(start, stop, row, place, counts):
+    """Count the samples of lines [start, stop) of a layout, counted over layers: counts (K · h,)."""
+    height = len(place)
+    for line in range(start, stop):
+        k, found = line // height, 0
+        for m in place[line % height]:
+            found += m >= 0 and row[k, m] >= 0
+        counts[line] = found
+
+
+@kernel
+def arrange(start, stop, row, place, cells, firsts, width, offsets, index, shift, laid, part):
+    """Put samples into lines [start, stop) of a layout, counted over layers.
+
+    Args:
+        start: first line.
+        stop: end of the lines.
+        row: (K, M) int32, the sample of each cell.
+        place: (h, w).
+        cells: (M,), the flat index of each cell in the grid.
+        firsts: (P − 1,) the first row of each part but the first.
+        width: of the grid.
+        offsets: (K · h,), the number of the first splat of each line.
+        index: (N,) int32, to be filled: the sample of each splat.
+        shift: (N, 3) float32, to be filled: from the grid to the layout.
+        laid: (K, h, w) int32, to be filled: the splat of each place.
+        part: (K, h, w) int32, to be filled: its part.
+    """
+    height = len(place)
+    for line in range(start, stop):
+        k, y, n = line // height, line % height, offsets[line]
+        for x in range(place.shape[1]):
+            m = place[y, x]
+            i = row[k, m] if m >= 0 else -1
+            laid[k, y, x], part[k, y, x] = -1, -1
+            if i < 0:
+                continue
+            index[n], laid[k, y, x], part[k, y, x] = i, n, 0
+            for first in firsts:
+                part[k, y, x] += i >= first
+            shift[n, 0], shift[n, 1], shift[n, 2] = x - cells[m] % width, y - cells[m] // width, 0
+            n += 1
+
+
+@kernel
+def gather(start, stop, covered, depth, place, laid, deep):
+    """What of (K, M) cells is covered, and how deep, in lines [start, stop) of a layout, counted over layers."""
+    height = len(place)
+    for line in range(start, stop):
+        k, y = line // height, line % height
+        for x in range(place.shape[1]):
+            m = place[y, x]
+            laid[k, y, x] = m >= 0 and covered[k, m]
+            deep[k, y, x] = depth[k, m] if m >= 0 else 0
+
+
+@kernel
+def scatter(start, stop, kept, kinds, place, found):
+    """Mark the (K, M) cells that are kept (K, h, w) near wanted ones, in lines [start, stop) counted over layers."""
+    height = len(place)
+    for line in range(start, stop):
+        k, y = line // height, line % height
+        for x in range(place.shape[1]):
+            if kept[k, y, x] and kinds[y, x] & NEAR:
+                found[k, place[y, x]] = True

@@ -1,0 +1,291 @@
+"""Mipmaps: pyramids, footprints of uv and what they make of textures, by closed form and against brute force."""
+
+import numpy as np
+import pytest
+from helpers import (
+    ALL,
+    DIFFERENTIABLE,
+    FRONT,
+    SIZE,
+    arrays,
+    finite_difference,
+    gradient,
+    mesh_part,
+    quad,
+    rigid,
+    show,
+    to_numpy,
+)
+
+import rts
+from rts import Camera, GBuffer
+from rts.errors import InputError
+from rts.footprints import uv_footprint
+from rts.shading import Textured
+from rts.textures import level_of, pyramid, sample_texture
+
+pytestmark = pytest.mark.rendering
+
+RNG = np.random.default_rng(0)
+CORNERS = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+EYE = Camera.look_at((0.4, 0.7, 4), (0, 0, 0), fov_y=50, aspect=1.2)
+
+
+def footprint_of_u(theta, gbuffer, camera):
+    """∂u/∂x and ∂u/∂y as red and green."""
+    f = gbuffer["uv_footprint"]
+    xp = rts.namespace(f)
+    one = xp.ones_like(f[:, :1])
+    return xp.concat([xp.abs(f[:, 0:1]), xp.abs(f[:, 2:3]), 0 * one, one], axis=1)
+
+
+def uv_colors(theta, gbuffer, camera):
+    uv = gbuffer["uv"]
+    xp = rts.namespace(uv)
+    return xp.concat([uv, 0 * uv[:, :1], xp.ones_like(uv[:, :1])], axis=1)
+
+
+def floor(texture, repeats, **options):
+    """A floor below the eye, the texture repeated."""
+    vertices = np.array([(-8, -1, 4), (8, -1, 4), (8, -1, -40), (-8, -1, -40)], np.float32)
+    theta = {"texture": texture, "uv": CORNERS * np.array(repeats, np.float32)}
+    return mesh_part((vertices, np.array([(0, 1, 2), (0, 2, 3)])), theta=theta, **options)
+
+
+# -------------------------------------------------------------------------------------------------- the pyramid
+
+
+@pytest.mark.parametrize(
+    "target, size", [*((t, (5, 7)) for t in ALL), *(("numpy", size) for size in ((8, 4), (1, 6), (3, 1), (1, 1)))]
+)
+def test_each_level_averages_equal_areas_of_the_one_before(target, size):
+    texture = RNG.random((*size, 3))
+    levels = [to_numpy(x) for x in pyramid(arrays(target, texture))]
+    assert [x.shape[:2] for x in levels][-1] == (1, 1)
+    np.testing.assert_allclose(levels[0], texture, atol=1e-6)
+    for above, below in zip(levels, levels[1:], strict=False):
+        (h, w), (m, n) = above.shape[:2], below.shape[:2]
+        assert (m, n) == (max(h // 2, 1), max(w // 2, 1))
+        fine = above.repeat(m, axis=0).repeat(n, axis=1)  # (h m, w n): whole numbers of both.
+        np.testing.assert_allclose(below, fine.reshape(m, h, n, w, 3).mean(axis=(1, 3)), atol=1e-6)
+
+
+def test_the_level_is_the_logarithm_of_the_longer_side_in_texels():
+    footprint = np.array(
+        [(1 / 16, 0, 0, 1 / 8), (3 / 16, 4 / 8, 0, 0), (0, 0, 0, 0), (9, 0, 0, 9), (0, np.inf, 0, 0), (0, np.nan, 0, 0)]
+    )
+    expected = [0, np.log2(5), 0, 4, 4, 0]
+    np.testing.assert_allclose(level_of(footprint, (8, 16)), expected)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_lookup_is_linear_between_levels(target):
+    texture, uv = RNG.random((6, 5, 3)), RNG.uniform(-1, 2, (20, 2))
+    for level in (0, 0.25, 1, 1.75, 2, 7):
+        footprint = np.tile([2**level / 5, 0, 0, 0], (20, 1))
+        finer, share = (min(int(level), 1), min(level, 2) - min(int(level), 1))
+        a, b = (sample_texture(x, uv) for x in pyramid(texture)[finer : finer + 2])
+        given = arrays(target, (texture, uv, footprint))
+        found = to_numpy(sample_texture(given[0], given[1], "repeat", given[2]))
+        np.testing.assert_allclose(found, a + share * (b - a), atol=2e-5)
+
+
+@pytest.mark.parametrize("wrap", ["repeat", "mirror", "clamp"])
+def test_wrap_modes_hold_in_every_level(wrap):
+    texture, uv, coarse = RNG.random((8, 8, 3)), RNG.uniform(-2, 3, (50, 2)), np.full((50, 4), 1 / 4)
+    coarse[:, 1:] = 0  # Level 1.
+    np.testing.assert_allclose(
+        sample_texture(texture, uv, wrap, coarse), sample_texture(pyramid(texture)[1], uv, wrap), atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_gradients_in_texture_and_uv_are_finite_differences(target):
+    given = {"texture": RNG.random((5, 6, 3)), "uv": RNG.uniform(0, 1, (7, 2))}
+    footprint, weights = RNG.uniform(0, 0.7, (7, 4)), RNG.standard_normal((7, 3))
+
+    def f(x, footprint=footprint, weights=weights):
+        return (sample_texture(x["texture"], x["uv"], "repeat", footprint) * weights).sum()
+
+    on = arrays(target, (footprint, weights))
+    found = gradient(target, lambda x: f(x, *on), arrays(target, given))
+    expected = finite_difference(f, given)
+    for name in given:
+        np.testing.assert_allclose(found[name], expected[name], atol=2e-4 * np.abs(expected[name]).max())
+
+
+# ------------------------------------------------------------------------------------------------ the footprint
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_parallel_to_the_image_it_is_texture_over_pixels(target):
+    part = mesh_part(quad(-2.4, 2.4, -2, 2), theta={"uv": CORNERS * 3}, shader=footprint_of_u)
+    image = show(arrays(target, part), arrays(target, FRONT), splatter="none")
+    np.testing.assert_allclose(image[..., 0], 3 / 24, rtol=1e-4)
+    np.testing.assert_allclose(image[..., 1], 0, atol=1e-5)
+
+
+def test_in_perspective_it_is_the_derivative_of_uv_on_the_plane():
+    part = floor(np.ones((2, 2, 3)), (1, 1), shader=footprint_of_u)
+    turned = part.replace(theta={**part.theta, "uv": part.theta["uv"][:, ::-1].copy()})
+    found = np.concatenate([show(p, EYE, splatter="none")[..., :2] for p in (part, turned)], axis=-1)
+    step = 1e-4
+    shifts: list = [(0, 0), (0, step), (step, 0)]
+    rays = [EYE.window(SIZE, shift, SIZE).rays(SIZE) for shift in shifts]
+    points = [r.origins + ((-1 - r.origins[..., 1]) / r.directions[..., 1])[..., None] * r.directions for r in rays]
+    uv = [np.stack([(p[..., 0] + 8) / 16, (4 - p[..., 2]) / 44], axis=-1) for p in points]
+    along_x, along_y = ((x - uv[0]) / step for x in uv[1:])
+    seen = found.any(axis=-1)
+    expected = np.stack([along_x[..., 0], along_y[..., 0], along_x[..., 1], along_y[..., 1]], axis=-1)
+    assert seen.sum() > 200
+    np.testing.assert_allclose(found[seen], np.abs(expected[seen]), rtol=2e-3, atol=2e-5)
+
+
+def test_a_transform_moves_it_as_moved_vertices_do():
+    transform = rigid((1, 2, 0), 50, (0.1, 0.2, -0.3))
+    transform[:3, :3] *= 1.5
+    vertices, faces = quad()
+    theta = {"uv": CORNERS}
+    one = show(mesh_part((vertices, faces), theta=theta, shader=footprint_of_u, transform=transform), EYE)
+    there = (vertices @ transform[:3, :3].T + transform[:3, 3]).astype(np.float32)
+    np.testing.assert_allclose(one, show(mesh_part((there, faces), theta=theta, shader=footprint_of_u), EYE), atol=1e-4)
+
+
+def surfaces():
+    yield "bspline", lambda: (rts.plugin("surfaces", "bspline")((4, 4), "clamped"), "points", (4, 4))
+    yield "bezier", lambda: (rts.plugin("surfaces", "bezier")(np.arange(16).reshape(1, 16)), "points", (16,))
+    yield "subdivision", lambda: (rts.plugin("surfaces", "subdivision")(cage()), "vertices", (16,))
+    yield (
+        "subdivision of triangles",
+        lambda: (
+            rts.plugin("surfaces", "subdivision")(
+                [t for a, b, c, d in cage() for t in ((a, b, c), (a, c, d))], scheme="loop"
+            ),
+            "vertices",
+            (16,),
+        ),
+    )
+
+
+def cage():
+    return [(4 * i + j, 4 * i + j + 4, 4 * i + j + 5, 4 * i + j + 1) for i in range(3) for j in range(3)]
+
+
+@pytest.mark.parametrize("make", [pytest.param(f, id=name) for name, f in surfaces()])
+def test_on_curved_surfaces_it_is_what_uv_changes_by_from_pixel_to_pixel(make):
+    try:
+        surface, name, shape = make()
+    except rts.PluginError as error:
+        pytest.skip(str(error))
+    x, y = np.meshgrid(np.linspace(-2, 2, 4), np.linspace(-2, 2, 4), indexing="ij")
+    points = np.stack([x, y, 0.3 * x * y - 0.2 * x * x], axis=-1).astype(np.float32)
+    uv = (points[..., :2] + 0.1 * points[..., 1::-1] ** 2).astype(np.float32)
+    part = rts.Part(surface, {name: points.reshape(*shape, 3), "uv": uv.reshape(*shape, 2)}, uv_colors)
+    size = (40, 48)
+    at = show(part, EYE, size, splatter="none")
+    found = show(part.replace(shader=footprint_of_u), EYE, size, splatter="none")[..., :2]
+    expected = np.abs(np.stack([np.gradient(at[..., 0], axis=1), np.gradient(at[..., 0], axis=0)], axis=-1))
+    inner = at[..., 3] > 0
+    for axis in (0, 1):
+        inner &= np.roll(inner, 1, axis) & np.roll(inner, -1, axis)
+    inner[[0, -1]] = inner[:, [0, -1]] = False
+    assert inner.sum() > 300
+    assert np.abs(found - expected)[inner].max() < 0.02 * expected[inner].max()
+
+
+def test_more_samples_have_smaller_footprints():
+    vertices, faces = quad(-1.5, 1.5, -1.2, 1.2)
+    part = mesh_part((vertices, faces), theta={"uv": CORNERS}, shader=footprint_of_u)
+    coarse, fine, adaptive = (
+        show(part, FRONT, splatter="none", supersample=s)[..., 0] for s in (1, 4, rts.Adaptive(4))
+    )
+    inside = coarse > 0
+    step = 1 / 3 * 4 / 20
+    np.testing.assert_allclose(coarse[inside], step, rtol=1e-4)
+    deep = inside.copy()
+    for axis in (0, 1):
+        for shift in (-1, 1):
+            deep &= np.roll(inside, shift, axis)
+    np.testing.assert_allclose(fine[deep], step / 4, rtol=1e-4)
+    near_outline = np.isclose(adaptive, step / 4, rtol=1e-3)
+    assert (near_outline | np.isclose(adaptive, step, rtol=1e-3))[deep].all()
+    assert near_outline[deep].any() and not near_outline[10, 12]
+
+
+# -------------------------------------------------------------------------------------------------- the images
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_a_texture_of_4_x_4_texels_a_pixel_is_averaged_exactly(target):
+    texture = RNG.random((80, 96, 3))
+    theta = {"texture": texture, "uv": CORNERS}
+    part = mesh_part(quad(-2.4, 2.4, -2, 2), theta=theta, shader=Textured(mip=True))
+    found = show(arrays(target, part), arrays(target, FRONT), splatter="none")[..., :3]
+    # Sixteen samples a pixel lie on the centres of its texels.
+    brute = show(part.replace(shader="textured"), FRONT, splatter="none", supersample=4)[..., :3]
+    np.testing.assert_allclose(brute, texture.reshape(20, 4, 24, 4, 3).mean(axis=(1, 3)), atol=1e-4)
+    np.testing.assert_allclose(found, brute, atol=1e-3)
+
+
+def test_a_checker_floor_is_nearer_to_its_average():
+    checker = (np.indices((32, 32)).sum(axis=0) % 2)[..., None] * np.ones(3, np.float32)
+    size = (40, 48)
+    plain, mip = (floor(checker, (2, 5.5), shader=Textured(mip=m)) for m in (False, True))
+    brute = show(plain, EYE, size, splatter="none", supersample=16)
+    error = [np.sqrt(np.mean((show(p, EYE, size, splatter="none") - brute)[..., :3] ** 2)) for p in (plain, mip)]
+    assert error[1] < 0.6 * error[0]
+    # With 2 x 2 samples a pixel less of it is averaged twice.
+    finer = show(mip, EYE, size, splatter="none", supersample=2)
+    assert np.sqrt(np.mean((finer - brute)[..., :3] ** 2)) < 0.6 * error[1]
+
+
+def test_a_texture_of_one_colour_stays_as_it_is():
+    part = floor(np.full((7, 5, 3), 0.25, np.float32), (9, 30), shader=Textured(mip=True, wrap="mirror"))
+    image = show(part, EYE, splatter="none")
+    assert np.abs(image[image[..., 3] > 0] - (0.25, 0.25, 0.25, 1)).max() < 1e-6
+
+
+def test_outlines_and_seams_of_uv_have_no_effect():
+    vertices, faces = quad(-2.4, 2.4, -2, 2)
+    seam = CORNERS[faces.reshape(-1)].copy()
+    seam[3:] += 7  # The second triangle repeats the texture elsewhere.
+    texture, indices = RNG.random((20, 24, 3)), {"uv": np.arange(6).reshape(2, 3)}
+    part = mesh_part((vertices, faces), theta={"texture": texture, "uv": seam}, indices=indices)
+    image = show(part.replace(shader=Textured(mip=True)), FRONT, splatter="none")
+    np.testing.assert_allclose(image[..., :3], texture, atol=1e-3)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_the_gradient_of_an_image_reaches_the_texture(target):
+    texture = RNG.random((12, 9, 3))
+    part = floor(texture, (3, 9), shader=Textured(mip=True))
+    weights = RNG.standard_normal((*SIZE, 4))
+    theta, camera, on = arrays(target, (part.theta, EYE, weights))
+    sampled = rts.sample(part.replace(theta=theta), camera, SIZE)
+
+    def f(texture, part=part, sampled=sampled, camera=camera, weights=on):
+        return (rts.render_samples(sampled, part.replace(theta={**theta, "texture": texture}), camera) * weights).sum()
+
+    found = gradient(target, f, theta["texture"])
+    # The image is linear in the texture.
+    at, along = arrays(target, (texture, RNG.standard_normal(texture.shape)))
+    change = float(to_numpy(f(at + along))) - float(to_numpy(f(at)))
+    assert abs(change) > 0.5 and abs(np.sum(found * to_numpy(along)) - change) < 2e-3 * abs(change)
+
+
+# ------------------------------------------------------------------------------------------------------ errors
+
+
+def test_a_shader_called_without_footprints_says_so():
+    gbuffer = GBuffer(position=np.zeros((1, 3)), uv=np.zeros((1, 2)))
+    with pytest.raises(InputError, match="'uv_footprint'"):
+        Textured(mip=True)({"texture": np.ones((2, 2, 3))}, gbuffer, FRONT)
+
+
+def test_surfaces_of_other_parameters_are_refused():
+    vertices, faces = quad()
+    one, three = np.zeros((1, 3), np.int32), np.zeros((1, 3), np.float32)
+    samples = rts.Samples(one, three, np.zeros((1, 1, 1), np.int32), np.ones((1, 1, 1)), np.int32(0))
+    surface = mesh_part((vertices, faces)).surface
+    with pytest.raises(InputError, match="3 parameters a sample"):
+        uv_footprint(surface, {}, samples, {}, FRONT, SIZE, rts.engine_of(three), None)
