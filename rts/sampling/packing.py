@@ -55,7 +55,8 @@ def lift(
     if exits is not None:
         found = np.full(kept[0].shape, -1, np.int32)
         found.reshape(-1)[exits.cells[0]] = packed[5][0, 0]
-    return Samples(*packed[:4], np.asarray(max(0, packed[4] - len(packed[0])), np.int32), exit=found)
+    ids, params, row, depth, total = packed[:5]
+    return Samples(ids, params, row, depth, np.asarray(max(0, total - len(ids)), np.int32), exit=found)
 
 
 def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
