@@ -46,10 +46,11 @@ def to_splats(
     if not engine.owns(sampled.row):
         sampled = constants(sampled, engine, like if engine.differentiates else None)
     positions, rgba = _shown(sampled.samples, sampled.row, parts, camera, wide, engine, like, evaluated)
-    cells = sampled.row, sampled.part, sampled.facing, sampled.settled
+    cells = sampled.row, sampled.part, sampled.facing, sampled.settled, sampled.exit
     if not engine.owns(rgba):
         cells = constants(cells, *suiting(positions, rgba))
-    return Splats(positions, rgba, *cells, border=apron)
+    *cells, exits = cells
+    return Splats(positions, rgba, *cells, exit=exits, border=apron)
 
 
 def to_fine_splats(

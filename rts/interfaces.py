@@ -337,6 +337,8 @@ class Sampler(Plugin):
             the samples are then (K, L, C). Without it all cells are sampled, and those that are not listed left out.
         tells_facing: whether `sample` also takes the keyword `facing`: whether to find `Samples.facing`, which is of
             interest in cells with hidden samples, and beside them.
+        tells_exits: whether `sample` also takes the keyword `exits`: whether to find `Samples.exit` of parts that are
+            culled, which is of interest in cells at outlines, and beside them.
         concurrent: whether several threads may call `sample` at once, so that `rts.render_views` takes views at once.
     """
 
@@ -344,6 +346,7 @@ class Sampler(Plugin):
     prunes: bool = False
     takes_cells: bool = False
     tells_facing: bool = False
+    tells_exits: bool = False
     concurrent: bool = False
 
     @abc.abstractmethod
@@ -428,6 +431,7 @@ class Splatter(Plugin):
         layers: how many layers it looks at, from the front; None for all that there are.
         reach: how many cells away from its own, along either axis, a sample may have an effect.
         reads_facing: whether it reads `Splats.facing`, which is found only then.
+        reads_exits: whether it reads `Splats.exit`, which is found only then.
         prunes: whether it says which samples it needs; True in a class with its own `needed`.
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
         averages: whether its normal equations may be asked for with a target of fewer pixels than there are cells.
@@ -442,6 +446,7 @@ class Splatter(Plugin):
     layers: int | None = None
     reach: int = 1
     reads_facing: bool = False
+    reads_exits: bool = False
     prunes: bool = False
     sums_products: bool = False
     averages: bool = False

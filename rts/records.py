@@ -117,6 +117,8 @@ class Samples:
             it is seen from behind; 0 where that is not known or not of interest. Pieces are consistently oriented: what
             is seen from opposite sides in two neighbouring cells is not one sheet. Numbers are larger by `MORE` where
             all K layers are covered, in the last of them. None where nothing is told.
+        exit: (H, W) int32, the sample where the ray leaves the closed part behind its front, or −1: a row of its own,
+            which `row` does not name, in cells at outlines and beside them. None where nothing is told.
     """
 
     ids: Array
@@ -131,6 +133,7 @@ class Samples:
     by_sample: tuple[str, ...] = ()
     settled: Array | None = None
     facing: Array | None = None
+    exit: Array | None = None
 
 
 @record(static=("supersample", "apron"))
@@ -194,6 +197,8 @@ class Sampled:
         settled: (H, W) bool, see `Splats`; None where no samples were left out for it.
         facing: (K, H, W) int16, as in `Samples`; pieces of different parts have different numbers. None where nothing
             is told.
+        exit: (H, W) int32, as in `Samples`, of the part that is seen, counted over all parts in order. None where
+            nothing is told.
     """
 
     samples: tuple[Samples, ...]
@@ -205,6 +210,7 @@ class Sampled:
     fine: Fine | None = None
     settled: Array | None = None
     facing: Array | None = None
+    exit: Array | None = None
 
     @property
     def part(self) -> Array:
@@ -239,6 +245,8 @@ class Splats:
         sentinel: () float, the depth that stands for empty layers, beyond all samples; None for one of the scene's
             scale.
         wanted: (H, W) bool, the targets that are looked at; others may have any finite colour. None for all.
+        exit: (H, W) int32, the sample where the ray leaves the part of the cell's front, or −1; or None. It is not
+            seen: it only says how outlines move. See `Samples`.
         border: cells at each side that splat into the image but are no part of it.
     """
 
@@ -250,6 +258,7 @@ class Splats:
     settled: Array | None = None
     sentinel: Array | None = None
     wanted: Array | None = None
+    exit: Array | None = None
     border: int = 0
 
     def replace(self, **changes: Any) -> Splats:

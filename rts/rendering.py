@@ -276,7 +276,8 @@ def _narrowed(sampled: Sampled, cells: int) -> Sampled:
     fine = sampled.fine  # Its own apron may be wider than is needed.
     fine = None if fine is None else replace(fine, coarse=fine.coarse[rows, columns])
     facing = None if sampled.facing is None else sampled.facing[:, rows, columns]
-    known = {"fine": fine, "facing": facing, "settled": settled}
+    exits = None if sampled.exit is None else sampled.exit[rows, columns]
+    known = {"fine": fine, "facing": facing, "settled": settled, "exit": exits}
     return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, **known)
 
 

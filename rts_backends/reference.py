@@ -19,6 +19,8 @@ class Reference(TriangleSampler):
     ratio g₁ × g₂ : g₂ × g₀ : g₀ × g₁. This needs no division by w, hence no clipping.
     """
 
+    tells_exits = True
+
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         height, width = size
@@ -28,8 +30,8 @@ class Reference(TriangleSampler):
         corners, depth = clip[prepared.faces], -in_camera[prepared.faces, 2]
 
         first, last, kept = _pixel_boxes(corners, size)
-        if cull == "back":
-            kept &= _faces_viewer(in_camera[prepared.faces], camera)
+        if cull != "none":
+            kept &= _faces_viewer(in_camera[prepared.faces], camera) == (cull == "back")
         found = []
         counts = np.where(kept, (last - first + 1).clip(0).prod(axis=1), 0)
         for chunk in _chunks(counts):

@@ -290,7 +290,7 @@ class ImageResiduals(Residuals):
                 **fields._asdict(),
             )
 
-        known = {"row": sampled.row, "part": sampled.part, "facing": sampled.facing, "settled": sampled.settled}
+        known = {name: getattr(sampled, name) for name in ("row", "part", "facing", "settled", "exit")}
         if sampled.fine is None:
             return swept(partial(to_splats, sampled), fields, **known)
         # A pixel counts on one of the grids alone.

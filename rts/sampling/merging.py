@@ -20,7 +20,8 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         overflow = overflow + s.overflow
     if len(samples) == 1:
         only = samples[0]
-        return Sampled(tuple(samples), only.row, only.depth, overflow, facing=only.facing, settled=only.settled)
+        told = {name: getattr(only, name) for name in ("facing", "settled", "exit")}
+        return Sampled(tuple(samples), only.row, only.depth, overflow, **told)
     given = [*(s.row for s in samples), *(s.depth for s in samples)]
     if any(s.facing is not None for s in samples):
         given += [_nothing_told(s.row) if s.facing is None else s.facing for s in samples]
@@ -28,10 +29,13 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
     on_host, elsewhere = (partial(f, layers, sizes) for f in (_interleaved_on_the_host, _interleaved))
     part, row, depth, *facing = engine_of(given).by_host(on_host, elsewhere, *given)
     xp, start = namespace(row), 0
+    exits, left = xp.full_like(row[0], -1), None
     for i, s in enumerate(samples):
         row = xp.where(part == i, row + start, row) if start else row
+        if s.exit is not None:
+            left = exits = xp.where((part[0] == i) & (s.exit >= 0), s.exit + start, exits)
         start += s.ids.shape[0]
-    return Sampled(tuple(samples), row, depth, overflow, facing=facing[0] if facing else None)
+    return Sampled(tuple(samples), row, depth, overflow, facing=facing[0] if facing else None, exit=left)
 
 
 def _nothing_told(row: Array) -> Array:

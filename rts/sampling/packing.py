@@ -8,6 +8,7 @@ import numpy as np
 
 from rts.errors import InputError
 from rts.records import Fragments, Proxy, Samples
+from rts.sampling.exits import Exits
 
 FAR = 20
 """How many times larger than the farthest depth coordinates may be, so that depths, computed of them in float32, differ
@@ -30,13 +31,15 @@ def lift(
     capacity: int | None = None,
     kept: np.ndarray | None = None,
     size: float | None = None,
+    exits: Exits | None = None,
 ) -> Samples:
     """Packed samples from fragments: the triangle's ids, and its corner parameters interpolated.
 
     Samples are numbered layer by layer, each in rows and columns of the image. There is always at least one row, so
     that what follows stays connected to θ; a row that no cell refers to has no effect. `kept` (K, H, W) bool says which
     of the covered cells to take, None for all; all are taken, too, where depths are too rough to tell (`too_far`).
-    `size` is that of the largest coordinate, if it is known.
+    `size` is that of the largest coordinate, if it is known. `exits` come last, as many as there is room for, in as
+    many rows as there are cells and layers at most.
     """
     from rts.sampling import packing_kernels
 
@@ -46,8 +49,14 @@ def lift(
         kept = fragments.triangle_ids >= 0
     table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
-    ids, params, row, depth, total = packing_kernels.pack(fragments, kept, table, corner_params, capacity or 0)
-    return Samples(ids, params, row, depth, np.asarray(max(0, total - len(ids)), np.int32))
+    beside = () if exits is None else ((exits.fragments, exits.there),)
+    packed = packing_kernels.pack(fragments, kept, table, corner_params, capacity or 0, *beside)
+    found = None
+    if exits is not None:
+        found = np.full(kept[0].shape, -1, np.int32)
+        found.reshape(-1)[exits.cells[0]] = packed[5][0, 0]
+    ids, params, row, depth, total = packed[:5]
+    return Samples(ids, params, row, depth, np.asarray(max(0, total - len(ids)), np.int32), exit=found)
 
 
 def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:

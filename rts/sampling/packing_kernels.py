@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 
 from rts.compiling import kernel
@@ -10,8 +12,13 @@ from rts.threads import parallel
 
 
 def pack(
-    fragments: Fragments, kept: np.ndarray, table: np.ndarray, corner_params: np.ndarray | None, capacity: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, int]:
+    fragments: Fragments,
+    kept: np.ndarray,
+    table: np.ndarray,
+    corner_params: np.ndarray | None,
+    capacity: int,
+    *more: tuple[Fragments, np.ndarray],
+) -> tuple[Any, ...]:
     """Ids (N, I), params (N, P), row and depth (K, H, W) of some cells, layer by layer; and how many there are in all.
 
     Args:
@@ -20,28 +27,49 @@ def pack(
         table: (T, I) int32, ids of each triangle.
         corner_params: (T, 3, P) float32, or None for the barycentrics themselves.
         capacity: rows to allot, or 0 for as many as are covered, at least one.
+        *more: further fragments, and which of them to take, for rows behind all others, at most K · H · W in all. Their
+            row is returned last; they do not count in how many there are.
     """
-    layers, height, width = kept.shape
-    lines = layers * height
-    triangle_ids = np.ascontiguousarray(fragments.triangle_ids, np.int32).reshape(lines, width)
-    barycentrics = np.ascontiguousarray(fragments.barycentrics, np.float32).reshape(lines, width, 2)
-    depths = np.ascontiguousarray(fragments.depth, np.float32).reshape(lines, width)
-    kept = np.ascontiguousarray(kept).reshape(lines, width)
-    counts = np.zeros(lines, np.int64)
-    parallel(_count, lines, kept, counts, work=kept.size // 8)
-    offsets = np.cumsum(counts) - counts
-    total = int(counts.sum())
-    rows = capacity or max(1, total)
-    make = np.zeros if rows > total else np.empty
+    grids = [_Lines.of(*given) for given in ((fragments, kept), *more)]
+    total, room = int(grids[0].counts.sum()), capacity or max(1, grids[0].kept.size)
+    found = min(room, sum(int(grid.counts.sum()) for grid in grids))
+    rows = capacity or max(1, found)
+    make = np.zeros if rows > found else np.empty
     ids = make((rows, table.shape[1]), np.int32)
     params = make((rows, 2 if corner_params is None else corner_params.shape[2]), np.float32)
-    row, depth = np.empty((lines, width), np.int32), np.empty((lines, width), np.float32)
     # Without any, the barycentrics themselves are taken.
     corners = np.empty((0, 3, 0), np.float32) if corner_params is None else corner_params
-    given = kept, triangle_ids, barycentrics, depths, table, corners, offsets
-    parallel(_pack, lines, *given, ids, params, row, depth, work=2 * kept.size)
-    shape = layers, height, width
-    return ids, params, row.reshape(shape), depth.reshape(shape), total
+    first, places = 0, []
+    for grid in grids:
+        row, depth = np.empty(grid.kept.shape, np.int32), np.empty(grid.kept.shape, np.float32)
+        offsets = first + np.cumsum(grid.counts) - grid.counts
+        given = grid.kept, grid.triangle_ids, grid.barycentrics, grid.depths, table, corners, offsets
+        parallel(_pack, len(row), *given, ids, params, row, depth, work=2 * row.size)
+        first += int(grid.counts.sum())
+        places.append((row.reshape(grid.shape), depth.reshape(grid.shape)))
+    return ids, params, *places[0], total, *(row for row, _ in places[1:])
+
+
+class _Lines(NamedTuple):
+    """Fragments as lines of cells, which of them to take, and how many of each line."""
+
+    kept: np.ndarray
+    triangle_ids: np.ndarray
+    barycentrics: np.ndarray
+    depths: np.ndarray
+    counts: np.ndarray
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def of(cls, fragments: Fragments, kept: np.ndarray) -> _Lines:
+        layers, height, width = kept.shape
+        lines = layers * height
+        triangle_ids = np.ascontiguousarray(fragments.triangle_ids, np.int32).reshape(lines, width)
+        barycentrics = np.ascontiguousarray(fragments.barycentrics, np.float32).reshape(lines, width, 2)
+        depths = np.ascontiguousarray(fragments.depth, np.float32).reshape(lines, width)
+        taken, counts = np.ascontiguousarray(kept).reshape(lines, width), np.zeros(lines, np.int64)
+        parallel(_count, lines, taken, counts, work=kept.size // 8)
+        return cls(taken, triangle_ids, barycentrics, depths, counts, (layers, height, width))
 
 
 @kernel

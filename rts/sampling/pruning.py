@@ -16,6 +16,7 @@ from rts.errors import InputError, LayersWarning, warn
 from rts.interfaces import AnyNeeded, CheckedPart, Needed, Splatter, TriangleSurface
 from rts.operations.operation import known_value
 from rts.records import ArraySpec, Sampled, Samples
+from rts.sampling.exits import beside_outlines
 from rts.sampling.packing import largest, too_far
 from rts.trees import leaves
 
@@ -197,31 +198,43 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
     sizes = [s.ids.shape[0] for s in sampled.samples]
     offsets = np.cumsum([0, *sizes])
 
-    def host(row: np.ndarray, depth: np.ndarray, *own_rows: np.ndarray) -> tuple[np.ndarray, ...]:
+    def host(row: np.ndarray, depth: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
         if row.max(initial=-1) >= offsets[-1]:
             raise InputError(f"row refers to sample {row.max()} of {offsets[-1]}; sample this scene anew")
         used = np.zeros(offsets[-1], bool)
-        used[row[needed(row >= 0, depth)]] = True
+        kept = needed(row >= 0, depth)
+        used[row[kept]] = True
+        own_rows, exits = rest[: len(sizes)], rest[len(sizes) :]
+        if exits:
+            near = np.full(exits[0].size, -1, np.int32)
+            cells = beside_outlines(kept)[0]
+            near[cells] = exits[0].reshape(-1)[cells]
+            used[near[near >= 0]] = True
+            exits = (near.reshape(exits[0].shape),)
         # The order stays, so that neighbours in the image stay neighbours in memory.
         indices = [np.flatnonzero(used[a:b]).astype(np.int32) for a, b in itertools.pairwise(offsets)]
         numbers = [np.where(used[a:b], np.cumsum(used[a:b]) - 1, -1) for a, b in itertools.pairwise(offsets)]
-        rows = zip((np.concatenate(numbers), *numbers), (row, *own_rows), strict=True)
+        every = np.concatenate(numbers)
+        rows = zip((every, *numbers, *[every] * len(exits)), (row, *own_rows, *exits), strict=True)
         renumbered = [np.where(r >= 0, n[r], -1).astype(np.int32) for n, r in rows]
         return *renumbered, *(i if len(i) else np.zeros(1, np.int32) for i in indices)
 
-    rows = sampled.row, *(s.row for s in sampled.samples)
+    rows = sampled.row, *(s.row for s in sampled.samples), *([] if sampled.exit is None else [sampled.exit])
     shapes = [ArraySpec(tuple(r.shape), np.int32) for r in rows]
     packed = [ArraySpec((n,), np.int32, packed=True) for n in sizes]
     found = engine_of(sampled).call_host(host, (*shapes, *packed), rows[0], sampled.depth, *rows[1:])
-    row, own_rows, indices = found[0], found[1 : len(rows)], found[len(rows) :]
+    row, own_rows, indices = found[0], found[1 : 1 + len(sizes)], found[len(rows) :]
+    exits = None if sampled.exit is None else found[1 + len(sizes)]
     samples = [_selected(*z) for z in zip(sampled.samples, own_rows, indices, strict=True)]
     xp, part = namespace(row), sampled.part
     # Row numbers are within parts up to here, since an engine may have padded what comes before.
     start = 0
     for i, index in enumerate(indices):
         row = xp.where((row >= 0) & (part == i), row + start, row)
+        exits = None if exits is None else xp.where((exits >= 0) & (part[0] == i), exits + start, exits)
         start += index.shape[0]
-    return replace(sampled, samples=tuple(samples), row=row, depth=xp.where(row >= 0, sampled.depth, 0.0))
+    depth = xp.where(row >= 0, sampled.depth, 0.0)
+    return replace(sampled, samples=tuple(samples), row=row, depth=depth, exit=exits)
 
 
 def _selected(samples: Samples, row: Any, index: Any) -> Samples:
@@ -237,4 +250,5 @@ def _selected(samples: Samples, row: Any, index: Any) -> Samples:
         gbuffer=None if gbuffer is None else {k: xp.take(v, index, axis=0) for k, v in gbuffer.items()},
         row=row,
         depth=xp.where(row >= 0, samples.depth, 0.0),
+        exit=None,
     )

@@ -152,7 +152,9 @@ def sampled_scene(
     sizes = [entry.size if isinstance(entry, Entry) else None for entry in scene.entries]
     needed = None if splatter is None else needed_by(splatter, scene.parts, sizes, settles)
     wide = _widened(scene, camera, (height, width), apron)
-    taken = partial(_taken, scene, wide, capacity=capacity, facing=_reads_facing(splatter))
+    reader = splatter or Visible()
+    exits = reader.reads_exits and scene.suited[0].differentiates
+    taken = partial(_taken, scene, wide, capacity=capacity, facing=reader.reads_facing, exits=exits)
     sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)
     return replace(sampled, supersample=side, apron=apron)
 
@@ -182,6 +184,7 @@ def _taken(
     capacity: int | None,
     cells: Array | None = None,
     facing: bool = False,
+    exits: bool = False,
 ) -> Sampled:
     """The samples of a grid of cells, or of those that are listed; less what is not needed."""
     samples, pruned, listed = [], False, {} if cells is None else {"cells": cells}
@@ -191,6 +194,8 @@ def _taken(
         seen = wide.camera.within(part.transform)
         if facing and chosen.tells_facing:
             known["facing"] = True
+        if exits and chosen.tells_exits:
+            known["exits"] = True
         if cells is not None and not chosen.takes_cells:
             samples.append(at_cells(chosen.sample(part, seen, wide.grid, count, **known), cells, capacity))
             continue
@@ -220,7 +225,7 @@ def fine_scene(
     wide = _widened(scene, camera, (grid.side * size[0], grid.side * size[1]), grid.apron)
     needed = None if splatter is None else needed_by(splatter, scene.parts)
     where = Where(adaptive, adaptive.dilates(scene.parts), colors)
-    take = partial(_taken, scene, wide, facing=_reads_facing(splatter))
+    take = partial(_taken, scene, wide, facing=(splatter or Visible()).reads_facing)
     return fine_samples(coarse, grid, where, take, needed, layers, capacity)
 
 
@@ -231,8 +236,3 @@ def apron_of(splatter: Splatter | None) -> int:
     `Visible`, which reaches farthest of the built-in ones.
     """
     return (Visible if splatter is None else splatter).reach + 1
-
-
-def _reads_facing(splatter: Splatter | None) -> bool:
-    """Whether to tell which sides of surfaces are seen; None stands for `Visible`."""
-    return (Visible if splatter is None else splatter).reads_facing

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple, Self
 
@@ -16,6 +16,7 @@ from rts.errors import InputError
 from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSurface, as_surface
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
+from rts.sampling.exits import Exits, beside_outlines
 from rts.sampling.facing import facing as facing_of
 from rts.sampling.packing import largest, lift, repack
 from rts.sampling.settling import on_surface, refined
@@ -35,6 +36,7 @@ class TriangleSampler(Sampler):
     Attributes:
         builds: whether something is worth building once for a proxy; True in a class with its own `prepare`.
         follows: whether what was prepared can follow moved vertices; True in a class with its own `update`.
+        tells_exits: whether `rasterize` knows cull="front", too.
         concurrent: whether several threads may call `rasterize` at once; those of a sampler that `follows` wait for one
             another in any case.
     """
@@ -77,7 +79,8 @@ class TriangleSampler(Sampler):
             camera: NumPy float64 matrices; world is the proxy's local space.
             size: (height, width).
             layers: K.
-            cull: "none", or "back": ignore triangles whose normal (counter-clockwise winding) faces away.
+            cull: "none", or "back": ignore triangles whose normal (counter-clockwise winding) faces away; and where a
+                class `tells_exits`, "front": ignore the others.
 
         Returns:
             Fragments, front to back in each pixel; no layer follows an empty one.
@@ -160,6 +163,7 @@ class TriangleSampler(Sampler):
         entry: Entry | None = None,
         cells: Array | None = None,
         facing: bool = False,
+        exits: bool = False,
     ) -> Samples:
         """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
 
@@ -173,6 +177,7 @@ class TriangleSampler(Sampler):
             entry: what `hold` gave, to be used without a look at the surface's inputs.
             cells: as in `rts.Sampler`.
             facing: as in `rts.Sampler`; surfaces that move samples off their triangles tell nothing.
+            exits: as in `rts.Sampler`; surfaces with a `refine` tell nothing, nor do lists of cells.
 
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
@@ -182,6 +187,7 @@ class TriangleSampler(Sampler):
         shape = _Shape(layers, size if cells is None else tuple(cells.shape), capacity, size)
         tells = facing and layers > 1 and part.cull == "none" and surface.tells_pieces
         tells = tells and not (surface.refines and surface.refine_moves)
+        exits = exits and part.cull == "back" and cells is None and not surface.refines
         listed = [] if cells is None else [cells]
         inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
         reads = {name: theta[name] for name in surface.reads(theta)}
@@ -201,7 +207,7 @@ class TriangleSampler(Sampler):
             host_inputs = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
             host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
             host_camera = check_camera(host_camera, *rest[: len(transform)])
-            given = shape, tables, wanted, entry, host_cells, tells
+            given = shape, tables, wanted, entry, host_cells, tells, exits
             found = self._found(surface, part.cull, host_inputs, host_camera, *given)
             gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
             return (
@@ -212,15 +218,17 @@ class TriangleSampler(Sampler):
                 found.overflow,
                 *([found.facing] if tells else []),
                 *([found.settled] if settles else []),
+                *([found.exit] if exits else []),
                 *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
                 *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
             )
 
         sides = [ArraySpec((layers, *shape.size), np.int16)] if tells else []
         amid = [ArraySpec(size, np.bool_)] if settles else []
-        specs = *shape.specs(surface.sample_widths), *sides, *amid, *tables.values(), *attributes.values()
+        behind = [ArraySpec(size, np.int32)] if exits else []
+        specs = *shape.specs(surface.sample_widths), *sides, *amid, *behind, *tables.values(), *attributes.values()
         results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *listed, *leaves(inputs))
-        first = 5 + len(sides) + len(amid)
+        first = 5 + len(sides) + len(amid) + len(behind)
         rest = first + len(tables)
         return Samples(
             *results[:5],
@@ -230,7 +238,8 @@ class TriangleSampler(Sampler):
             centered=surface.centered,
             by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
             facing=results[5] if tells else None,
-            settled=results[first - 1] if settles else None,
+            settled=results[5 + len(sides)] if settles else None,
+            exit=results[first - 1] if exits else None,
         )
 
     def _found(
@@ -245,15 +254,29 @@ class TriangleSampler(Sampler):
         entry: Entry | None,
         cells: np.ndarray | None,
         tells: bool,
+        exits: bool,
     ) -> Samples:
-        """The samples that are to be kept, on the host; if it `tells`, with what faces the viewer."""
+        """The samples that are to be kept, on the host.
+
+        With what faces the viewer, if it `tells`, and with `exits`.
+        """
         # Of tables there is but one set, so that no samples can be added later.
         more = surface.refines and surface.refine_moves and not tables
         grid = max(shape.layers + 1, LEAST_LAYERS) if more else shape.layers, *shape.size
-        found, fragments = self._fragments(surface, cull, inputs, camera, shape.view, grid, entry, cells)
+        moves = surface.refines and surface.refine_moves
+
+        def keep(fragments: Fragments) -> np.ndarray:
+            """Which of the fragments, where nothing moves them any more, are samples."""
+            covered = fragments.triangle_ids >= 0
+            return covered if needed is None else needed(covered, fragments.depth)
+
+        asked = keep if exits else None
+        found, fragments, kept, behind = self._fragments(
+            surface, cull, inputs, camera, shape.view, grid, entry, cells, asked
+        )
         covered = fragments.triangle_ids >= 0
-        if not (surface.refines and surface.refine_moves):
-            kept = covered if needed is None else needed(covered, fragments.depth)
+        if not moves:
+            kept = keep(fragments) if kept is None else kept
             settled, size = None, found.size
             if needed is not None and not surface.refines:
                 if size is None:
@@ -268,7 +291,7 @@ class TriangleSampler(Sampler):
                 pieces = checked_pieces(surface, found.proxy) if kept[1:].any() else np.zeros(1, np.int16)
                 sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
             if not surface.refines:
-                lifted = lift(fragments, found.proxy, shape.capacity, kept, size)
+                lifted = lift(fragments, found.proxy, shape.capacity, kept, size, behind)
                 return replace(lifted, facing=sides, settled=settled)
             lifted = lift(fragments, found.proxy, None, kept)
             samples, _ = refined(surface, inputs, lifted, camera, tables, shape.view, cells)
@@ -292,8 +315,12 @@ class TriangleSampler(Sampler):
         grid: tuple[int, int, int],
         entry: Entry | None,
         cells: np.ndarray | None,
-    ) -> tuple[Entry, Fragments]:
-        """What is prepared of a surface, and the fragments (K, ·, ·) of a grid of the size `view`, or of some cells."""
+        keep: Callable[[Fragments], np.ndarray] | None,
+    ) -> tuple[Entry, Fragments, np.ndarray | None, Exits | None]:
+        """What is prepared of a surface, and the fragments (K, ·, ·) of a grid of the size `view`, or of some cells.
+
+        With what says which of them to `keep` also that, and the exits beside outlines.
+        """
 
         def drawn(found: Entry) -> Fragments:
             if not len(found.proxy.faces):
@@ -303,11 +330,23 @@ class TriangleSampler(Sampler):
             check_fragments(fragments, grid, len(found.proxy.faces), self)
             return fragments
 
+        def all_of(found: Entry) -> tuple[Entry, Fragments, np.ndarray | None, Exits | None]:
+            fragments = drawn(found)
+            if keep is None:
+                return found, fragments, None, None
+            kept = keep(fragments)
+            beside = beside_outlines(kept)
+            backs = _no_fragments((1, *beside.shape))
+            if beside.size:
+                backs = self.rasterize_cells(found.prepared, camera, view, 1, "front", beside)
+                check_fragments(backs, (1, *beside.shape), len(found.proxy.faces), self)
+            return found, fragments, kept, Exits.of(fragments, beside, backs)
+
         with self._keeper.lock:
             found = entry or self._entry(surface, inputs, camera, view)
             if self.follows or not self.concurrent:
-                return found, drawn(found)
-        return found, drawn(found)
+                return all_of(found)
+        return all_of(found)
 
 
 class _Shape(NamedTuple):

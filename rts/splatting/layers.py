@@ -51,10 +51,9 @@ class Depths:
         self._front = bordered(front[0])[0], bordered(front[1])[0] >= 0
         self.target = self.source(0, 0)
 
-    @property
-    def gap(self) -> Array:
-        """How far the second layer lies behind the first (h, w), with the border."""
-        return self._depth[1] - self._depth[0]
+    def behind(self, depth: Array) -> Array:
+        """How far depths (h, w), with the border, lie behind the fronts."""
+        return depth - self._depth[0]
 
     def front(self, u: int, v: int) -> tuple[Array, Array]:
         """Depth of the front from whose cell (u, v) leads to each target, up to two cells away, and if there is one."""
@@ -115,7 +114,12 @@ class Depths:
 
 
 class Layers(Depths):
-    """`Depths` with weights and colours."""
+    """`Depths` with weights and colours.
+
+    Attributes:
+        position: of each layer (h, w, 3), of any value where it is not covered.
+        exit: the cells with an exit (h, w), and its position (h, w, 3), see `Splats`; or None.
+    """
 
     def __init__(self, weights: Callable[[Array], Any], splats: Splats, facing: Array | None = None):
         """Layers of packed samples; `weights` is that of `rts.splatting.Kernel`, `facing` of the splats or None."""
@@ -123,6 +127,11 @@ class Layers(Depths):
         cells = bordered(splats.row)
         every = [cells[k] for k in range(splats.row.shape[0])]
         self.position = [unpack(splats.positions, c) for c in every]
+        self.exit: tuple[Array, Array] | None = None
+        if splats.exit is not None:
+            check_rows(splats.exit, splats.positions.shape[0])
+            exits = bordered(splats.exit[None])[0]
+            self.exit = exits >= 0, unpack(splats.positions, exits)
         told = None if facing is None else list(bordered(facing, 0))
         super().__init__([p[..., 2] for p in self.position], cells >= 0, told)
         self._color = [_weighted(unpack(splats.rgba, c), (c >= 0)[..., None]) for c in every]

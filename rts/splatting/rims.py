@@ -10,8 +10,9 @@ its eight neighbours. One is off where p + n is empty or not paired front to fro
 not, and p₁ = p − n is covered; deep where p₂ = p − 2n continues the surface, too, and the depths of the three fall off
 as those of a smooth rim do. In order:
 
-- Chord: p has a second layer of the same part, and the square of the gap between its two layers runs to zero along a
-  usable direction. The partner is that layer, β = −½: the middle of a quadric's chord moves as its rim does.
+- Chord: p has an exit, where the ray leaves the closed part that it met, or else a second layer of the same part; and
+  the square of the gap behind its front runs to zero along a usable direction. The partner is that exit or layer,
+  β = −½: the middle of a quadric's chord moves as its rim does.
 - Root: there is a deep direction. The partner is p₁. On a rim depth is z − k √e, with e the distance to the outline in
   steps of n; with r = (z(p) − z(p₁)) / (z(p₁) − z(p₂)) then √e / (√(1 + e) − √e) = (1 + 2r − r²) / 2r (r − 1) = β.
 - Line: there is a usable direction. The partner is p₁, β = ½: an edge lies half a pixel beyond its samples, on average.
@@ -21,7 +22,7 @@ Of several directions the one is taken that points most along the sum of all tha
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -58,7 +59,7 @@ def gains(
     Returns:
         The gains in front, and at the surface.
     """
-    xp, motion = layers.xp, _motions(layers)
+    xp, motion = layers.xp, _motion(layers, layers.position[0], layers.covered[0])
     outline = outline_motion(layers, shift, part, motion)
     around = bordered(xp.permute_dims(outline, (2, 0, 1)), 0)
     around = xp.permute_dims(around, (1, 2, 0))
@@ -71,7 +72,7 @@ def gains(
         if parts is not None:
             same = layers.at(parts, *n) == layers.at(parts, 0, 0)
             joined = joined & (same if crossed is None else same | crossed)
-        change = xp.where(joined[..., None], outline, layers.at(around, *n)) - layers.at(motion[0], *n)
+        change = xp.where(joined[..., None], outline, layers.at(around, *n)) - layers.at(motion, *n)
         gain = kernel.weight(own + kernel.gamma * change, *n) - kernel.weight(own, *n)
         front = front + xp.where(layers.covers(*n) & (s > 0), gain, 0.0)
         surface = surface + xp.where(layers.covers(*n) & (s == 0), gain, 0.0)
@@ -90,27 +91,45 @@ def spread(total: Array, gain: Array) -> Array:
     return (xp.where(partial, gain, 0.0) / xp.where(partial, weight, 1.0))[..., None] * total[..., :4]
 
 
-def outline_motion(layers: Layers, shift: dict[Steps, Array], part: Array | None, motion: list[Array]) -> Array:
+class Back(NamedTuple):
+    """What may be the other ends of chords.
+
+    Attributes:
+        own: (H, W) bool, cells whose chord may end there.
+        covered: (h, w) bool, cells that have one, with a border of one cell.
+        gap: (h, w), how far it lies behind the front, without derivative.
+        position: (h, w, 3).
+    """
+
+    own: Array
+    covered: Array
+    gap: Array
+    position: Array
+
+
+def outline_motion(layers: Layers, shift: dict[Steps, Array], part: Array | None, motion: Array) -> Array:
     """P̂ without its value (H, W, 2): zeros, with the derivative of the outline beside each cell.
 
     Args:
         layers: the samples.
         shift: see `gains`.
         part: see `gains`.
-        motion: the motions of samples of each layer (h, w, 2), zeros with derivatives, with a border of one cell.
+        motion: of the fronts (h, w, 2), zeros with derivatives, with a border of one cell.
     """
-    xp, own = layers.xp, layers.at(motion[0], 0, 0)
+    xp, own = layers.xp, layers.at(motion, 0, 0)
     chord, beta, inward = rules(layers, shift, part)
-    partner = sum(xp.where((inward == i)[..., None], layers.at(motion[0], *n), 0.0) for i, n in enumerate(AROUND))
-    if len(motion) > 1:
-        partner = xp.where(chord[..., None], layers.at(motion[1], 0, 0), partner)
+    partner = sum(xp.where((inward == i)[..., None], layers.at(motion, *n), 0.0) for i, n in enumerate(AROUND))
+    for i, back in enumerate(_backs(layers, part)):
+        end = layers.at(_motion(layers, back.position, back.covered), 0, 0)
+        partner = xp.where((chord == i)[..., None], end, partner)
     return own + beta[..., None] * (own - partner)
 
 
 def rules(layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tuple[Array, Array, Array]:
-    """Whether a cell's partner is its own second layer, β, and the direction n from its partner's cell, (H, W) each.
+    """Which end of a chord is a cell's partner, β, and the direction n from its partner's cell, (H, W) each.
 
-    The direction is a place in AROUND, −1 where there is no partner or it is in the cell itself.
+    The first is a place among `_backs`, −1 where there is no chord. The direction is a place in AROUND, −1 where there
+    is no partner or it is in the cell itself.
     """
     xp, (z, _) = layers.xp, layers.front(0, 0)
     z = stopped(z)
@@ -128,8 +147,10 @@ def rules(layers: Layers, shift: dict[Steps, Array], part: Array | None) -> tupl
         take = usable[n] & ((rim & ~deep) | ((rim == deep) & (score > best)))
         best, inward, deep = xp.where(take, score, best), xp.where(take, i, inward), deep | (take & rim)
         beta = xp.where(take, xp.where(rim, _root(xp.where(rim, ratio, 2.0), xp), HALF), beta)
-    chord = _chord(layers, usable, part)
-    return chord, xp.where(chord, -HALF, beta), xp.where(chord, -1, inward)
+    chord = xp.full_like(inward, -1)
+    for i, back in enumerate(_backs(layers, part)):
+        chord = xp.where(_closes(layers, usable, back), i, chord)
+    return chord, xp.where(chord >= 0, -HALF, beta), xp.where(chord >= 0, -1, inward)
 
 
 def chords(covered: np.ndarray) -> np.ndarray:
@@ -138,13 +159,10 @@ def chords(covered: np.ndarray) -> np.ndarray:
     return covered & dilated(ring) & (np.arange(len(covered)) == 1)[:, None, None]
 
 
-def _motions(layers: Layers) -> list[Array]:
-    """Positions in x and y of the first two layers less their value: (h, w, 2) each, with the border."""
-    found = []
-    for k, position in enumerate(layers.position[:2]):
-        xy = position[..., :2]
-        found.append(layers.xp.where(layers.covered[k][..., None], xy - stopped(xy), 0.0))
-    return found
+def _motion(layers: Layers, position: Array, covered: Array) -> Array:
+    """Positions (h, w, 3) in x and y less their value (h, w, 2), zero where nothing is covered (h, w)."""
+    xy = position[..., :2]
+    return layers.xp.where(covered[..., None], xy - stopped(xy), 0.0)
 
 
 def _off(layers: Layers, shift: dict[Steps, Array]) -> dict[Steps, Array]:
@@ -175,13 +193,24 @@ def _root(ratio: Array, xp: Any) -> Array:
     return xp.clip((1 + 2 * ratio - ratio * ratio) / (2 * ratio * (ratio - 1)), 0.0, LARGEST)
 
 
-def _chord(layers: Layers, usable: dict[Steps, Array], part: Array | None) -> Array:
-    """Where a cell's first two layers are of one part and close along a usable direction."""
-    if part is None or len(layers.position) < 2:
-        return layers.covers(0, 0) & False
-    both, gap = layers.covered[1], stopped(layers.gap)
-    own, closes = layers.at(gap, 0, 0), False
+def _backs(layers: Layers, part: Array | None) -> list[Back]:
+    """The ends of chords: exits, and in cells without one the second layer of the front's part."""
+    found = []
+    if layers.exit is not None:
+        covered, position = layers.exit
+        found.append(Back(layers.at(covered, 0, 0), covered, stopped(layers.behind(position[..., 2])), position))
+    if part is not None and len(layers.position) > 1:
+        covered, position = layers.covered[1], layers.position[1]
+        own = layers.at(covered, 0, 0) & (part[0] == part[1])
+        own = own & ~found[0].own if found else own
+        found.append(Back(own, covered, stopped(layers.behind(position[..., 2])), position))
+    return found
+
+
+def _closes(layers: Layers, usable: dict[Steps, Array], back: Back) -> Array:
+    """Where fronts and what lies behind them close along a usable direction."""
+    gap, found = layers.at(back.gap, 0, 0), False
     for n in AROUND:
-        inner = layers.at(gap, *n)
-        closes = closes | (usable[n] & layers.at(both, *n) & (CONVERGING * own * own <= inner * inner))
-    return closes & layers.at(both, 0, 0) & (part[0] == part[1])
+        inner = layers.at(back.gap, *n)
+        found = found | (usable[n] & layers.at(back.covered, *n) & (CONVERGING * gap * gap <= inner * inner))
+    return found & back.own

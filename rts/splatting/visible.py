@@ -42,6 +42,8 @@ class Visible(Kernel):
             otherwise as the samples beside them, which hardly do. The image is the same.
         reads_facing: whether layers that show opposite sides of one sheet are kept from pairing, where samplers tell
             sides (`Splats.facing`); otherwise depths alone decide.
+        exits: whether outlines of culled parts move as the middles of their chords, where samplers tell where these end
+            (`Splats.exit`); otherwise fronts alone decide. The image is the same.
     """
 
     epsilon: float = 1e-3
@@ -49,11 +51,18 @@ class Visible(Kernel):
     rims: bool = True
     crossings: bool = True
     reads_facing: bool = True
+    exits: bool = True
     reach = 3  # Depths three cells away may decide how an outline or a line of crossing moves.
+
+    @property
+    def reads_exits(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
+        """See `rts.Splatter`."""
+        return self.rims and self.exits
 
     def accumulate(self, splats: Splats) -> Array:
         """See `Kernel`."""
         row = splats.row
+        splats = splats if self.reads_exits else splats.replace(exit=None)
         layers = Layers(self.weights, splats, splats.facing if self.reads_facing else None)
         xp, shift = layers.xp, {}
         for n in NEIGHBOURS:

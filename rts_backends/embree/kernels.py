@@ -35,9 +35,9 @@ REACH = 1.01
 """Square of the radius of the sphere that rays start on, in units of the object's."""
 
 # Per ray: hits so far, pixel x, y, sign of determinants to keep, slack of depths and of the ray's end, depth where the
-# ray starts, and the depths between which no plane clips.
-COUNT, PIXEL_X, PIXEL_Y, KEEP, DEPTH_SLACK, REACH_SLACK, START, NEAREST, FARTHEST = range(9)
-HEADER = 9
+# ray starts, the depths between which no plane clips, and the sign of what normals to leave out have along the ray.
+COUNT, PIXEL_X, PIXEL_Y, KEEP, DEPTH_SLACK, REACH_SLACK, START, NEAREST, FARTHEST, LEFT_OUT = range(10)
+HEADER = 10
 
 
 def _intrinsic(definition: Callable[..., tuple]) -> Callable[..., Any]:
@@ -155,7 +155,7 @@ def _keep_nearest(arguments):
         step = ray[4] * ray[4] + ray[5] * ray[5] + ray[6] * ray[6]
         within = u > margin and v > margin and u + v < 1 - margin
         exact = not (within and along * along > GRAZING * GRAZING * normal * step)
-        if not exact and state[KEEP] != 0 and along > 0:
+        if not exact and state[LEFT_OUT] * along > 0:
             return
     if exact:
         t = owners[cover]
@@ -177,8 +177,8 @@ def keep_nearest_address() -> int:
 
 @kernel(error_model="numpy")
 def cast(
-    first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep, vertices, faces,
-    owners, margins, width, height, cells, triangle_ids, barycentrics, depths_out,
+    first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep, left_out,
+    vertices, faces, owners, margins, width, height, cells, triangle_ids, barycentrics, depths_out,
 ):  # fmt: skip
     """Fill the fragment arrays for tiles of pixels, or for pieces of a list of them.
 
@@ -194,6 +194,7 @@ def cast(
         object_sphere: (4,) centre and radius; the scene is the object moved and scaled to the unit sphere.
         planes: (4,) depths outside of which near or far plane clips, and between which neither does.
         keep: sign of the determinants to keep, or 0.
+        left_out: 1 to leave out what is seen from behind, −1 what is seen from the front, or 0.
         vertices: (V, 3) of the proxy.
         faces: (T, 3).
         owners: (M,) of `Covers`.
@@ -232,7 +233,7 @@ def cast(
     radius = object_sphere[3]
     slack = SLACK * radius
     state[KEEP], state[DEPTH_SLACK], state[REACH_SLACK] = keep, slack, REACH_SLACK_SHARE * radius
-    state[NEAREST], state[FARTHEST] = planes[2] + slack, planes[3] - slack
+    state[NEAREST], state[FARTHEST], state[LEFT_OUT] = planes[2] + slack, planes[3] - slack, left_out
     for tile in range(first, last):
         pixels = _pixels(tile, across, width, height, cells, at, columns, lines)
         for p in range(pixels):

@@ -50,6 +50,8 @@ class Structure:
 class Embree(TriangleSampler):
     """K nearest hits a pixel by an intersection filter, decided in float64 as the rasterizer decides."""
 
+    tells_exits = True
+
     def prepare(self, proxy: Proxy) -> Structure:
         """Build the acceleration structure."""
         check_faces(proxy)
@@ -100,6 +102,7 @@ def _cast(
         prepared.sphere,
         _planes(camera.projection),
         facing(camera, cull),
+        {"back": 1.0, "front": -1.0, "none": 0.0}[cull],
         prepared.proxy.vertices,
         prepared.proxy.faces,
         prepared.covers.owners,

@@ -86,6 +86,8 @@ class Cells:
         facing: (K, H, W) integers, which piece shows which side; None, or no layers, where that is not told.
         wanted: (H, W) bool, the targets to fill, others may be anything; None, or no rows, for all.
         settled: (H, W) bool, targets that show the colour of all samples, whatever moves; None, or no rows, for none.
+        exits: (H, W) integers, the sample where the ray leaves the part of the front, or −1; None, or no rows, where
+            that is not told.
 
     Raises:
         InputError: shapes that do not fit, or `row` refers to a sample that is not there.
@@ -102,6 +104,7 @@ class Cells:
         facing: np.ndarray | None = None,
         wanted: np.ndarray | None = None,
         settled: np.ndarray | None = None,
+        exits: np.ndarray | None = None,
     ):
         if positions.shape[1:] != (3,) or rgba.shape != (len(positions), 4):
             given = f"{positions.shape} and {rgba.shape}"
@@ -109,8 +112,11 @@ class Cells:
         row = row[:1] if settings.kind == "single" else row
         if choices is None:
             check_rows(row, len(positions))
+            if exits is not None:
+                check_rows(exits, len(positions))
         self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
+        self.exits = read_only(np.empty((0, row.shape[2])) if exits is None else exits, np.int32)
         self.facing = read_only(self.row[:0] if facing is None else facing, np.int16)
         self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
         self.settled = read_only(np.empty((0, row.shape[2])) if settled is None else settled, np.bool_)
@@ -215,10 +221,11 @@ class Cells:
         )
         if len(found.columns):
             rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
-            arrays = self.positions, self.rgba, self.row, *self._numbers, self.part, kind.type(choices.extent), rules
-            arrays += (self._pairs,)
+            arrays = self.positions, self.rgba, self.row, *self._numbers
+            decide = self.part, self.exits, kind.type(choices.extent), rules, self._pairs
             listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
-            parallel(outlines.fill, height, *arrays, *listed, ends, marks, found, work=150 * len(found.columns))
+            given = *arrays, *decide, *listed, ends, marks
+            parallel(outlines.fill, height, *given, found, work=150 * len(found.columns))
         return found
 
     @cached_property
@@ -324,12 +331,14 @@ class Cells:
 
     def _vjp_of_repeated(self, g: np.ndarray, *results: np.ndarray | None) -> None:
         """`vjp` with a copy of the sample for each cell, whose gradients are then added in the order of the cells."""
-        covered = self.row >= 0
-        index = self.row[covered]
-        own = np.full(self.row.shape, -1, np.int32)
-        own[covered] = np.arange(len(index), dtype=np.int32)
+        covered, leaves = self.row >= 0, self.exits >= 0
+        index = np.concatenate([self.row[covered], self.exits[leaves]])
+        own, exits = np.full(self.row.shape, -1, np.int32), np.full(self.exits.shape, -1, np.int32)
+        number = np.arange(len(index), dtype=np.int32)
+        own[covered], exits[leaves] = np.split(number, [np.count_nonzero(covered)])
         copy = object.__new__(Cells)
-        copy.__dict__.update(self.__dict__, choices=self.choices._replace(repeated=False), row=read_only(own))
+        copy.__dict__.update(self.__dict__, choices=self.choices._replace(repeated=False))
+        copy.row, copy.exits = read_only(own), read_only(exits)
         copy.__dict__.pop("outlines", None)  # They name samples.
         copy.__dict__.pop("crossings", None)
         copy.positions, copy.rgba = read_only(self.positions[index]), read_only(self.rgba[index])

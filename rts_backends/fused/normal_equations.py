@@ -57,10 +57,10 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
     Args:
         settings: the splatter, as numbers.
         engine: the engine of the arrays.
-        *given: positions, rgba, row, part, facing, wanted, settled and the arguments of `normal_equations` from
+        *given: positions, rgba, row, part, facing, wanted, settled, exit and the arguments of `normal_equations` from
             `t_positions`, arrays or None.
     """
-    positions, rgba, row, _, _, _, _, t_positions, _, target = given[:10]
+    positions, rgba, row, _, _, _, _, _, t_positions, _, target = given[:11]
     kind = {32: np.float32, 64: np.float64}.get(engine.namespace.finfo(positions.dtype).bits)
     there = [x for x in given if x is not None]
     if kind is None or rgba.dtype != positions.dtype or not engine.on_host(*there):
@@ -72,9 +72,11 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
     def host(*arrays: Any) -> tuple[np.ndarray, ...]:
         it = iter(arrays)
         whole: list[Any] = [next(it) if there else None for there in present]
-        positions, rgba, row, part, facing, wanted, settled, *rest = whole
-        used = max(1, int(row.max(initial=-1)) + 1)  # Under `jit` many more rows may be allotted.
-        cells = Cells(settings, positions[:used], rgba[:used], row, None, part, facing, wanted, settled)
+        positions, rgba, row, *known = whole[:8]
+        rest, exits = whole[8:], known[-1]
+        used = int(row.max(initial=0)) if exits is None else int(max(row.max(initial=0), exits.max(initial=0)))
+        used += 1  # Under `jit` many more rows may be allotted.
+        cells = Cells(settings, positions[:used], rgba[:used], row, None, *known)
         return tuple(np.asarray(x, kind) for x in normal_equations(cells, *rest))
 
     count = t_positions.shape[0]

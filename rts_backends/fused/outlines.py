@@ -178,13 +178,15 @@ def _ends_before_others(choice, row, y, x):
 
 
 @compiled
-def _rule(positions, row, part, ends, y, x, extent, rules):
+def _rule(positions, row, part, exits, ends, y, x, extent, rules):
     """β and the partner's sample of a cell whose front ends somewhere."""
     one, two, bits = positions.dtype.type(1), positions.dtype.type(2), np.int64(ends[y, x])
     beta, partner, best, deep, steepest = positions.dtype.type(0), -1, -1000, False, two
     along_x, along_y, left = ALONG[bits, 0], ALONG[bits, 1], bits & ~OPPOSITE[bits]
-    paired = len(part) > 1 and part[0, y, x] == part[1, y, x]
-    own = _gap(positions, row, y, x) if paired else beta
+    leaves = len(exits) > 0 and exits[y, x] >= 0
+    paired = leaves or (len(part) > 1 and part[0, y, x] == part[1, y, x])
+    back = exits if leaves else row[-1 if len(row) < 2 else 1]
+    own = _gap(positions, row, back, y, x) if paired else beta
     while left:
         n = LOWEST[left]
         left &= left - 1
@@ -193,9 +195,9 @@ def _rule(positions, row, part, ends, y, x, extent, rules):
         if not _covered(row, py, px):
             continue
         if paired:
-            inner = _gap(positions, row, py, px)
+            inner = _gap(positions, row, back, py, px)
             if rules.converging * own * own <= inner * inner:
-                return -rules.half, row[1, y, x]
+                return -rules.half, back[y, x]
         along = u * along_x + v * along_y
         score = along * abs(along) * (3 - abs(u) - abs(v))
         if deep and score <= best:
@@ -218,9 +220,9 @@ def _covered(row, y, x):
 
 
 @compiled
-def _gap(positions, row, y, x):
-    """How far the second layer of a covered cell lies behind the first; NaN, which compares as false, without one."""
-    i, j = row[0, y, x], row[1, y, x]
+def _gap(positions, row, back, y, x):
+    """How far the other end of a chord lies behind the front of a cell; NaN, which compares as false, without one."""
+    i, j = row[0, y, x], back[y, x]
     return positions[j, 2] - positions[i, 2] if j >= 0 else positions.dtype.type(np.nan)
 
 
@@ -246,6 +248,7 @@ def fill(
     peak,
     gamma,
     part,
+    exits,
     extent,
     rules,
     crossed,
@@ -269,6 +272,7 @@ def fill(
         peak: of the weights, along one axis.
         gamma: the calibration.
         part: (K, H, W), the part of each sample, or no layers.
+        exits: (H, W), where rays leave the part of the front, or no rows.
         extent: of the depths.
         rules: numbers of the rules.
         crossed: (H, W) uint8, the pairs of `crossing_pairs.py`, or no rows.
@@ -291,7 +295,7 @@ def fill(
             if covered:
                 beta[y, x] = positions.dtype.type(0)
                 if ends[y, x]:
-                    beta[y, x], partner[y, x] = _rule(positions, row, part, ends, y, x, extent, rules)
+                    beta[y, x], partner[y, x] = _rule(positions, row, part, exits, ends, y, x, extent, rules)
             if marks[y, x] == BESIDE:
                 m += mixed[y, x]
                 continue

@@ -45,12 +45,15 @@ class _Fused(splatting.Kernel):
         facing = self._facing(splats)
         facing = splats.row[:0, :, :] if facing is None else facing
         none = splats.row[0, :0, :]
-        wanted, settled = (none if x is None else x for x in (splats.wanted, splats.settled))
-        given = splats.positions, splats.rgba, splats.row, part, facing, wanted, settled
+        known = splats.wanted, splats.settled, self._exits(splats)
+        given = splats.positions, splats.rgba, splats.row, part, facing, *(none if x is None else x for x in known)
         return IMAGE(*given, settings=self._settings(border))
 
     def _facing(self, splats: Splats) -> Array | None:
         return splats.facing if self.reads_facing else None
+
+    def _exits(self, splats: Splats) -> Array | None:
+        return splats.exit if self.reads_exits else None
 
     def _settings(self, border: int) -> Settings:
         return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border)
@@ -70,7 +73,7 @@ class _Fused(splatting.Kernel):
         from rts_backends.fused import normal_equations
 
         own = splats.positions, splats.rgba, splats.row, splats.part, self._facing(splats)
-        own += splats.wanted, splats.settled
+        own += splats.wanted, splats.settled, self._exits(splats)
         given = *own, t_positions, t_rgba, target, weights, background
         return normal_equations.equations(self._settings(splats.border), engine_of(given), *given)
 
@@ -117,13 +120,14 @@ def _specification(
     facing: Array,
     wanted: Array,
     settled: Array,
+    exits: Array,
     *,
     settings: Settings,
 ) -> Array:
     given = settings.sigma, settings.epsilon, settings.gamma
     options = {"rims": settings.rims, "crossings": settings.crossings} if settings.kind == "visible" else {}
-    part, facing, settled = (x if x.shape[0] else None for x in (part, facing, settled))
-    splats = Splats(positions, rgba, row, part, facing, settled)
+    part, facing, settled, exits = (x if x.shape[0] else None for x in (part, facing, settled, exits))
+    splats = Splats(positions, rgba, row, part, facing, settled, exit=exits)
     return without_border(_SPECIFICATIONS[settings.kind](*given, **options).image(splats), settings.border)
 
 
@@ -135,6 +139,7 @@ def _shape(
     facing: tuple,
     wanted: tuple,
     settled: tuple,
+    exits: tuple,
     *,
     settings: Settings,
 ) -> tuple[int, ...]:
@@ -142,8 +147,8 @@ def _shape(
 
 
 def _cells(settings: Settings, operands: Arrays, kept: Choices | None) -> Cells:
-    positions, rgba, row, part, facing, wanted, settled = operands
-    return Cells(settings, positions, rgba, row, kept, part, facing, wanted, settled)
+    positions, rgba, row, *known = operands
+    return Cells(settings, positions, rgba, row, kept, *known)
 
 
 def _forward(operands: Arrays, out: np.ndarray, *, settings: Settings) -> Choices | None:
@@ -163,14 +168,14 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings,
 
 
 def _used(operands: Arrays) -> int:
-    return max(1, int(operands[2].max(initial=0)) + 1)
+    return max(1, int(operands[2].max(initial=0)) + 1, int(operands[-1].max(initial=0)) + 1)
 
 
 _OPTIONS: dict[str, Any] = {"differentiable": 2, "packed": (0, 1), "used": _used, "even": (1,)}
 IMAGE = Operation(
     "rts.image",
     _specification,
-    (2, 2, 3, 3, 3, 2, 2),
+    (2, 2, 3, 3, 3, 2, 2, 2),
     _shape,
     _forward,
     _push,
@@ -179,6 +184,7 @@ IMAGE = Operation(
     sweeps=True,
     **_OPTIONS,
 )
-"""The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled, without a border.
+"""The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled and exit, without
+a border.
 
-The last three are those of `rts.Splats`; (0, H, W) and (0, W) where they are not known."""
+The last five are those of `rts.Splats`; (0, H, W) and (0, W) where they are not known."""

@@ -1,0 +1,45 @@
+"""Where rays leave the closed parts that they met: what tells splatters how outlines of culled parts move."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.records import Fragments
+from rts.threads import read_only
+
+
+class Exits(NamedTuple):
+    """Some cells, and where rays leave the part in them.
+
+    Attributes:
+        cells: (1, M) int32, flat indices of cells in the grid.
+        fragments: (1, 1, M), what is seen from behind in them.
+        there: (1, 1, M) bool, whether the ray leaves there.
+    """
+
+    cells: np.ndarray
+    fragments: Fragments
+    there: np.ndarray
+
+    @classmethod
+    def of(cls, fragments: Fragments, cells: np.ndarray, backs: Fragments) -> Exits:
+        """The exits among backs (1, 1, M), those that do not lie before the fronts of fragments (K, H, W)."""
+        front = fragments.depth[0].reshape(-1)[cells]
+        return cls(cells, backs, (backs.triangle_ids >= 0) & (backs.depth >= front))
+
+
+def beside_outlines(kept: np.ndarray) -> np.ndarray:
+    """Cells (1, M) int32 of fronts that may end beside them, and of fronts beside those, as flat indices.
+
+    Fronts end before nothing, and where hidden layers are in play.
+
+    Args:
+        kept: (K, H, W) bool, the samples that splatters need.
+    """
+    from rts.sampling import exits_kernels
+
+    cells = np.empty(kept[0].size, np.int32)
+    count = exits_kernels.find(read_only(kept), cells)
+    return cells[None, :count]
