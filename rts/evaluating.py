@@ -168,6 +168,7 @@ def _joined(views: Sequence[Samples]) -> Samples:
         tables={name: xp.concat([s.tables[name] for s in views]) for name in views[0].tables},
         facing=None,
         settled=None,
+        exit=None,
     )
 
 

@@ -37,7 +37,9 @@ def scene(shader="lambert"):
 
 
 SCENES = pytest.mark.parametrize(
-    "parts", [scene(), scene()[0], scene("silhouette")[0]], ids=["three", "lambert", "silhouette"]
+    "parts",
+    [scene(), scene()[0], scene("silhouette")[0], scene("silhouette")[0].replace(cull="back")],
+    ids=["three", "lambert", "silhouette", "culled"],
 )
 
 

@@ -50,23 +50,30 @@ class Picture(NamedTuple):
         corners = np.stack([across * self.view[1], down * self.view[0], 0 * down], axis=1).astype(np.float32)
         positions = xp.concat([splats.positions for splats in views])
         first = np.cumsum([0, *counts[:-1]], dtype=np.int32)[:, None, None, None]
-        row = xp.stack([splats.row for splats in views])
         inside = np.zeros((self.views, 1, *self.view), bool)
         inside[:, :, border : self.view[0] - border, border : self.view[1] - border] = True
 
-        def told(name: str, empty: int | bool) -> Array | None:
+        def told(name: str, empty: int | bool, rows: bool = False) -> Array | None:
+            """A field of splats: rows of samples are counted over all views."""
             given = [getattr(splats, name) for splats in views]
-            return None if given[0] is None else self._laid_out(xp.stack(given), empty)
+            if given[0] is None:
+                return None
+            grids = xp.stack(given)
+            several = len(grids.shape) == 4
+            grids = grids if several else grids[:, None, ...]
+            grids = xp.where(grids >= 0, grids + engine.constant(first, positions), grids) if rows else grids
+            found = self._laid_out(grids, empty)
+            return found if several else found[0, ...]
 
-        settled = [splats.settled for splats in views if splats.settled is not None]
         return Splats(
             positions + engine.constant(np.repeat(corners, counts, axis=0), positions),
             xp.concat([splats.rgba for splats in views]),
-            self._laid_out(xp.where(row >= 0, row + engine.constant(first, positions), row), -1),
+            told("row", -1, rows=True),
             told("part", -1),
             told("facing", 0),
-            self._laid_out(xp.stack(settled)[:, None, ...], False)[0, ...] if settled else None,
+            told("settled", False),
             wanted=self._laid_out(engine.constant(inside, positions), False)[0, ...],
+            exit=told("exit", -1, rows=True),
         )
 
     def _laid_out(self, views: Array, empty: int | bool) -> Array:
