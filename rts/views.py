@@ -53,7 +53,7 @@ def render_views(
         splatter: as in `render`.
         layers: as in `render`.
         supersample: as in `render`.
-        background: as in `render`, of every view; or (B, H, W, 3 or 4).
+        background: as in `render`, of every view; or (B, H, W, ·), one for each.
         capacity: as in `render`; of each view.
         engine: as in `render`.
 

@@ -83,7 +83,7 @@ def test_masks_are_dilated_for_shaders_of_more_than_one_colour_a_part():
 
 def test_cells_amid_one_colour_are_no_outlines_though_their_samples_are_left_out():
     vertices, faces = icosphere(3)
-    part, adaptive = rts.Part(MESH(faces), {"vertices": vertices}), Adaptive(4)
+    part, adaptive = rts.Part(MESH(faces), {"vertices": vertices}, cull="back"), Adaptive(4)
     whole, settled = (
         rts.sample(part, CAMERA, (48, 48), supersample=adaptive, splatter="visible", settles=s) for s in (False, True)
     )

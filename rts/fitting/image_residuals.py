@@ -378,16 +378,15 @@ def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tupl
 
 def _are_cameras(given: Any) -> TypeGuard[Cameras]:
     """Whether it is a camera, or a list of some."""
-    if isinstance(given, (list, tuple)):
-        return len(given) > 0 and all(isinstance(camera, Camera) for camera in given)
-    return isinstance(given, Camera)
+    listed: list[Any] = list(given) if isinstance(given, (list, tuple)) else [given]
+    return len(listed) > 0 and all(isinstance(camera, Camera) for camera in listed)
 
 
 def _view_count(target: Any, size: tuple[int, int]) -> int | None:
     """How many views a target is of; None for one, without an axis of its own."""
     if isinstance(target, (list, tuple)):
         return len(target) if any(shape_of(x)[:2] == size for x in target) else None
-    shape = shape_of(target)
+    shape: Any = shape_of(target)
     return shape[0] if len(shape) > 3 or (shape[1:3] == size and shape[:2] != size) else None
 
 

@@ -72,8 +72,8 @@ def fine_samples(
     sizes, engine = [s.ids.shape[-2] for s in coarse.samples], engine_of(coarse)
     most, told = planned(layers), [coarse.row, coarse.depth, *([] if coarse.settled is None else [coarse.settled])]
     find = partial(active, sizes=sizes, apron=coarse.apron, where=where)
-    given = [engine.known(x) for x in told]
-    if given[0] is None or given[1] is None or given[0].ndim != 3:
+    given = [value for x in told if (value := engine.known(x)) is not None]
+    if len(given) < len(told) or given[0].ndim != 3:
         room = grid.room(capacity, most)
         check_memory(1, room.cells, most, capacity, gradient=engine.differentiates)
 
