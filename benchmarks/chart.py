@@ -25,7 +25,7 @@ from rts.diagnostics.comparison.compare import file_name
 from rts.diagnostics.comparison.front import LEVELS, best_within, timed
 from rts.diagnostics.comparison.page import write_page
 from rts.diagnostics.comparison.scene import MODES
-from rts.diagnostics.comparison.style import label
+from rts.diagnostics.comparison.style import label, samples_label, side_length
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -111,11 +111,11 @@ def advice(comparisons: Sequence[Mapping], mode: str, level: float) -> str:
         return "none"
     enough = [key for key in known if 4 * len(within[key]) >= 3 * len(scenes)]
     if enough:
-        best = min(enough, key=lambda key: (key[2], key[1], -len(within[key])))
+        best = min(enough, key=lambda key: (side_length(key[2]), key[1], -len(within[key])))
     else:
         best = max(known, key=lambda key: (len(within[key]), -statistics.median(times[key].values())))
     splatter, layers, supersample = best
-    asked = f"`{splatter}`, K = {layers}, {supersample} × {supersample}"
+    asked = f"`{splatter}`, K = {layers}, {samples_label(supersample)}"
     return f"{asked}: {len(within[best])} of {len(scenes)}, {statistics.median(times[best].values()):.3g} ms"
 
 

@@ -391,7 +391,7 @@ class Shader(Plugin):
 
     Attributes:
         opaque: a promise that alpha is 1.
-        uniform: a promise that all samples of a part have one colour.
+        uniform: a promise that all samples of a part have one colour, through whatever camera.
         reads: the entries of the G-buffer that it needs besides position; None for all.
         channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
     """

@@ -117,8 +117,16 @@ class Unlit(Shader):
         position = gbuffer["position"]
         xp = namespace(position)
         if "texture" in theta and "uv" in gbuffer:
-            footprint = gbuffer[FOOTPRINT] if self.mip else None
-            base = sample_texture(theta["texture"], gbuffer["uv"], self.wrap, footprint)
+            footprint, texture = gbuffer[FOOTPRINT] if self.mip else None, theta["texture"]
+            # What is averaged is what is seen: transparent texels count by their alpha.
+            weighed = self.mip and not self.opaque and shape_of(texture)[-1] == 4
+            texture = (
+                xp.concat([texture[..., :3] * texture[..., 3:], texture[..., 3:]], axis=-1) if weighed else texture
+            )
+            base = sample_texture(texture, gbuffer["uv"], self.wrap, footprint)
+            if weighed:
+                alpha = base[:, 3:]
+                base = xp.concat([base[:, :3] / xp.where(alpha > 0, alpha, 1.0), alpha], axis=1)
         elif "color" in gbuffer:
             base = gbuffer["color"]
         else:

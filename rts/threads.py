@@ -142,11 +142,16 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
         return
     tasks = min(count, threads * TASKS_PER_THREAD)
     bounds = [count * i // tasks for i in range(tasks + 1)]
-    numbers = itertools.count()
+    numbers, failed = itertools.count(), False
 
     def share() -> None:
-        while (task := next(numbers)) < tasks:
-            kernel(bounds[task], bounds[task + 1], *args)
+        nonlocal failed
+        try:
+            while not failed and (task := next(numbers)) < tasks:
+                kernel(bounds[task], bounds[task + 1], *args)
+        except BaseException:
+            failed = True  # What has not begun is left, by all.
+            raise
 
     # The caller works too. A helper that has not woken by the time all is begun is not waited for.
     jobs: list[_Job] = []
@@ -166,9 +171,9 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
 
 
 def each(f: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
-    """The results of a function for each of some items, on all cores; the loops inside of it share those that are left.
+    """The results of a function for each of some items, on all cores; loops inside of it take what cores are idle then.
 
-    Where it fails for several items, the error is that of the first.
+    Where it fails for several items, the error is that of the first; items after it may be left out.
 
     Args:
         f: a function that several threads may call at once.
@@ -176,13 +181,18 @@ def each(f: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
     """
     found: list[Any] = [None] * len(items)
     errors: dict[int, Exception] = {}
+    first = len(items)
 
     def some(start: int, stop: int) -> None:
+        nonlocal first
         for i in range(start, stop):
+            if i > first:
+                return
             try:
                 found[i] = f(items[i])
             except Exception as error:
                 errors[i] = error
+                first = min(first, i)
 
     parallel(some, len(items))
     if errors:

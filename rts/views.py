@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any, Literal
 
+import numpy as np
+
 from rts.arrays import described, shape_of
 from rts.camera import Camera
 from rts.channels import cropped_image
@@ -42,8 +44,9 @@ def render_views(
     """Render several views of a scene; they are those of a loop of `render`, but for rounding.
 
     NumPy scenes are rendered a view to each core. With torch views are sampled so, and the surface is evaluated once
-    for the samples of all: what it computes of the whole of θ, such as smooth normals, serves all views. In programs
-    of jax, and wherever a sampler is not `concurrent`, one view follows the other.
+    for the samples of all: what it computes of the whole of θ, such as smooth normals, serves all views. With jax, with
+    `layers="auto"`, under `torch.func`, in bands, and wherever a sampler is not `concurrent`, one view follows the
+    other. With torch memory is that of all views at once, with a gradient or without.
 
     Args:
         parts: as in `render`.
@@ -100,7 +103,10 @@ def _images(
     if not _concurrent(scenes[0]) or options["layers"] == "auto":  # The latter may warn, which is for this thread.
         return [draw(scene) for scene in scenes]
     if not suited[0].differentiates:
-        return each(draw, scenes)
+        # A shader may close over arrays of an engine whose transforms belong to this thread.
+        image = draw(scenes[0])
+        rest = scenes[1:]
+        return [image, *(each(draw, rest) if type(image) is np.ndarray else map(draw, rest))]
     supersample: Any = options["supersample"]
     whole = len(bands_of(*size, options["layers"], supersample)) == 1
     if not whole or (isinstance(supersample, Adaptive) and supersample.contrast is not None):
@@ -135,4 +141,7 @@ def _side_by_side(splats: Sequence[Splats], splatter: Splatter, side: int) -> li
 def _concurrent(scene: Scene) -> bool:
     """Whether several threads may sample the scene at once."""
     chosen = (suited_sampler(s, part, scene.camera) for s, part in zip(scene.samplers, scene.parts, strict=True))
-    return scene.suited[0].concurrent() and all(sampler.concurrent for sampler in chosen)
+    engine, like = scene.suited
+    # On devices work is queued by thread.
+    on_host = like is None or engine.on_host(like)
+    return on_host and engine.concurrent() and all(sampler.concurrent for sampler in chosen)

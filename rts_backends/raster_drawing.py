@@ -94,7 +94,8 @@ def _draw(band, given, end, shift, nearest, triangle_ids, barycentrics):
     entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
     numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
     most, top = 4 * BLOCK, band * BAND_ROWS
-    hits = np.empty((most + nearest.shape[2], 2), np.int32)
+    # What is left from a row, four of each small triangle, and one more row.
+    hits = np.empty((2 * most + nearest.shape[2], 2), np.int32)
     drawn = top, shift, entries, numbers, clips, nearest, triangle_ids, barycentrics
     for start in range(offsets[band], offsets[band + 1], BLOCK):
         block = items[start : min(offsets[band + 1], start + BLOCK)]

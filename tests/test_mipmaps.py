@@ -227,6 +227,16 @@ def test_a_texture_of_4_x_4_texels_a_pixel_is_averaged_exactly(target):
     np.testing.assert_allclose(found, brute, atol=1e-3)
 
 
+@pytest.mark.parametrize("target", ALL)
+def test_transparent_texels_count_by_their_alpha(target):
+    # Half of the texels are white, the others black and not there: what is seen is half white.
+    texture = np.where((np.indices((80, 96)).sum(axis=0) % 2)[..., None], 0.0, np.ones(4))
+    part = mesh_part(quad(-2.4, 2.4, -2, 2), theta={"texture": texture, "uv": CORNERS})
+    part = part.replace(shader=Textured(mip=True, opaque=False))
+    found = show(arrays(target, part), arrays(target, FRONT), splatter="none")
+    np.testing.assert_allclose(found, 0.5, atol=1e-5)
+
+
 def test_a_checker_floor_is_nearer_to_its_average():
     checker = (np.indices((32, 32)).sum(axis=0) % 2)[..., None] * np.ones(3, np.float32)
     size = (40, 48)

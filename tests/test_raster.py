@@ -389,6 +389,20 @@ def test_no_small_triangle_is_lost_to_rounding_on_screen(size):
         assert len(np.unique(found.triangle_ids)) > 150
 
 
+def test_large_triangles_and_many_small_ones_in_one_band_lose_nothing():
+    # More hits at once than a row and a block of small triangles have: those of the large one are kept till the end.
+    size, count = (16, 40), 63
+    large = np.array([(0.0, 0.0), (31.0, 0.0), (0.0, 400.0)])
+    corners = np.array([(0.3, 0.3), (1.7, 0.4), (1.0, 1.7)]) + np.indices((9, 7)).reshape(2, -1).T[:, None] * 2
+    flat = np.concatenate([large[None], corners]).reshape(-1, 2)
+    depth = np.repeat([0.5, *np.linspace(-0.5, 0.4, count)], 3)[:, None]
+    vertices = np.concatenate([flat * (1, -1), depth], -1).astype(np.float32)
+    faces = np.arange(3 * (count + 1), dtype=np.int32).reshape(-1, 3)
+    found, expected = (rasterize(name, vertices, faces, pixels(size), size, 3) for name in ("raster", "reference"))
+    np.testing.assert_array_equal(found.triangle_ids, expected.triangle_ids)
+    assert len(np.unique(found.triangle_ids)) == count + 2
+
+
 @pytest.mark.parametrize("x", [-1000.0, -9.0, 1000.0])
 def test_a_corner_far_outside_does_not_bend_a_thin_triangle(x):
     # At the pixel on the border its edges are 0.04 apart around the centre; its third corner is one row lower.

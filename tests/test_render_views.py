@@ -104,6 +104,39 @@ def test_derivatives_along_cameras_and_poses_are_those_of_a_loop_but_for_roundin
         torch.testing.assert_close(a, b, rtol=0, atol=1e-6 * float(b.abs().max()))
 
 
+def test_near_views_move_outlines_as_alone_beside_far_ones():
+    torch = pytest.importorskip("torch")
+    cameras = [Camera.look_at(np.array(EYES[0]) * k, (0, 0, 0), fov_y=45 / k, far=5000) for k in (1, 300)]
+    found, parts = [], [part.replace(shader="silhouette") for part in scene()[:2]]
+    for together in (True, False):
+        pose = torch.tensor([0.1, 0.2, 0.0, 0.0, 0.1, 0.0], requires_grad=True)
+        moved = [parts[0].replace(transform=rts.rigid(pose)), parts[1].replace(shader="normals")]
+        if together:
+            images = rts.render_views(moved, cameras, SIZE)
+        else:
+            images = torch.stack([rts.render(moved, camera, SIZE) for camera in cameras])
+        found.append(torch.autograd.grad((images[0] * torch.tensor(WEIGHTS[0])).sum(), pose)[0])
+    assert found[1].abs().max() > 0.5
+    torch.testing.assert_close(*found, rtol=0, atol=1e-4 * float(found[1].abs().max()))
+
+
+def test_numpy_scenes_whose_shaders_hold_traced_arrays_are_differentiated():
+    jax = pytest.importorskip("jax")
+
+    def loss(w):
+        def shader(theta, gbuffer, camera):
+            return jax.numpy.concatenate(
+                [w * gbuffer["position"], jax.numpy.ones_like(gbuffer["position"][:, :1])], axis=1
+            )
+
+        return (rts.render_views(scene()[0].replace(shader=shader), CAMERAS, SIZE) * WEIGHTS).sum()
+
+    w = jax.numpy.ones(3)
+    found, step = jax.grad(loss)(w), 2.0
+    expected = [(loss(w + step * d) - loss(w - step * d)) / (2 * step) for d in np.eye(3, dtype=np.float32)]
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-2)
+
+
 def test_a_compiled_program_renders_views_and_takes_capacity():
     jax = pytest.importorskip("jax")
     part = mesh_part(icosphere(1), shader="normals")

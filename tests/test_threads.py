@@ -169,6 +169,42 @@ def test_an_error_in_a_helper_reaches_the_caller_and_the_helper_lives_on(monkeyp
     assert sorted(seen) == [(0, 2), (2, 4), (4, 6), (6, 9)] and helpers.count == 1
 
 
+@pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
+def test_after_an_error_what_has_not_begun_is_left(monkeypatch, helpers, error):
+    from rts import threads
+
+    monkeypatch.setenv("RTS_NUM_THREADS", "2")
+    monkeypatch.setattr(threads, "TASKS_PER_THREAD", 20)
+    caller, both, seen = threading.get_ident(), threading.Barrier(2), []
+
+    def kernel(start, stop):
+        seen.append(start)
+        if len(seen) <= 2:
+            both.wait(30)  # Both have begun.
+        if threading.get_ident() == caller:
+            raise error
+        time.sleep(0.01)
+
+    with pytest.raises(error):
+        threads.parallel(kernel, 40)
+    assert len(seen) < 10
+
+
+def test_of_several_items_that_fail_the_error_is_that_of_the_first(monkeypatch, helpers):
+    from rts import threads
+
+    monkeypatch.setenv("RTS_NUM_THREADS", "2")
+
+    def fail(i):
+        if i > 5:
+            raise ValueError(str(i))
+        return i
+
+    with pytest.raises(ValueError, match="^6$"):
+        threads.each(fail, range(40))
+    assert threads.each(fail, range(6)) == list(range(6))
+
+
 # --------------------------------------------------------------------------------------------------- forks
 
 FORK = """

@@ -111,7 +111,8 @@ class ImageResiduals(Residuals):
         self._full, self._sigma = self.size, 0.0
         self._view: int | None = None
         self._views: list[ImageResiduals] = []
-        if (count := _view_count(target, self.size)) is None:
+        several = isinstance(camera, (list, tuple)) or (camera is not None and camera.is_stacked)
+        if (count := _view_count(target, self.size, several)) is None:
             self._take(target, weights)
             return
         for b, (own, factors) in enumerate(zip(target, _of_views(weights, count), strict=True)):
@@ -382,12 +383,12 @@ def _are_cameras(given: Any) -> TypeGuard[Cameras]:
     return len(listed) > 0 and all(isinstance(camera, Camera) for camera in listed)
 
 
-def _view_count(target: Any, size: tuple[int, int]) -> int | None:
-    """How many views a target is of; None for one, without an axis of its own."""
+def _view_count(target: Any, size: tuple[int, int], several: bool) -> int | None:
+    """How many views a target is of; None for one, without an axis of its own. There may be `several` cameras."""
     if isinstance(target, (list, tuple)):
         return len(target) if any(shape_of(x)[:2] == size for x in target) else None
     shape: Any = shape_of(target)
-    return shape[0] if len(shape) > 3 or (shape[1:3] == size and shape[:2] != size) else None
+    return shape[0] if len(shape) > 3 or (shape[1:3] == size and (several or shape[:2] != size)) else None
 
 
 def _of_views(weights: Any, count: int) -> Sequence[Any]:

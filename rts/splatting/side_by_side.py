@@ -1,6 +1,7 @@
 """Splats of several views side by side in one picture, so that one splat serves them all.
 
-Each view keeps the apron that it was sampled with, so no splat of another reaches its image.
+Each view keeps the apron that it was sampled with, so no splat of another reaches its image. What splatters decide by
+depths they decide in terms of the largest: of each view it is brought between 1 and 2, by a power of two.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.engines import engine_of, namespace
+from rts.engines import engine_of, namespace, value_of
 from rts.records import Splats
 from rts.trees import Array
 
@@ -48,7 +49,7 @@ class Picture(NamedTuple):
         counts = [splats.positions.shape[0] for splats in views]
         down, across = np.divmod(np.arange(self.views), self.across)
         corners = np.stack([across * self.view[1], down * self.view[0], 0 * down], axis=1).astype(np.float32)
-        positions = xp.concat([splats.positions for splats in views])
+        positions = xp.concat([splats.positions * _scale(splats) for splats in views])
         first = np.cumsum([0, *counts[:-1]], dtype=np.int32)[:, None, None, None]
         inside = np.zeros((self.views, 1, *self.view), bool)
         inside[:, :, border : self.view[0] - border, border : self.view[1] - border] = True
@@ -91,6 +92,14 @@ class Picture(NamedTuple):
         inner = grid[:, border : height - border, :, border : width - border, :]
         views = xp.permute_dims(inner, (0, 2, 1, 3, 4))
         return xp.reshape(views, (-1, *views.shape[2:]))[: self.views, ...]
+
+
+def _scale(splats: Splats) -> Array:
+    """Factors (1, 3) of positions, which bring the largest depth between 1 and 2."""
+    xp, positions = namespace(splats.positions), splats.positions
+    most = value_of(xp.max(xp.abs(positions[:, 2]))) if positions.shape[0] else None
+    known = most is not None and np.isfinite(most) and most > 0
+    return engine_of(positions).constant(np.array([[1, 1, 2.0 ** (1 - np.frexp(most)[1]) if known else 1]]), positions)
 
 
 def at_once(view: tuple[int, int]) -> int:

@@ -109,11 +109,13 @@ class Cells:
         if positions.shape[1:] != (3,) or rgba.shape != (len(positions), 4):
             given = f"{positions.shape} and {rgba.shape}"
             raise InputError(f"positions and rgba have shapes {given}; expected (N, 3) and (N, 4)")
-        row = row[:1] if settings.kind == "single" else row
+        shape, row = row.shape, row[:1] if settings.kind == "single" else row
         if choices is None:
             check_rows(row, len(positions))
             if exits is not None:
                 check_rows(exits, len(positions))
+            _check_grids(shape, part=part, facing=facing)
+            _check_grids(shape[1:], exit=exits, wanted=wanted, settled=settled)
         self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
         self.exits = read_only(np.empty((0, row.shape[2])) if exits is None else exits, np.int32)
@@ -347,6 +349,13 @@ class Cells:
         for result, values in zip(results, found, strict=True):
             if result is not None and values is not None:
                 np.add.at(result, index, values)
+
+
+def _check_grids(shape: tuple[int, ...], **given: np.ndarray | None) -> None:
+    """Refuse what is told of cells in another shape; None, or nothing at all, is told of none."""
+    for name, x in given.items():
+        if x is not None and len(x) and x.shape != shape:
+            raise InputError(f"{name} has shape {x.shape}; expected {shape}, as row says")
 
 
 @lru_cache

@@ -216,8 +216,8 @@ class TorchEngine(Engine):
         return x
 
     def concurrent(self) -> bool:
-        """Whether no transform looks on: these belong to a thread."""
-        return not transformed()
+        """Whether neither a transform nor inference mode is on: these belong to a thread."""
+        return not transformed() and not torch.is_inference_mode_enabled()
 
     def split(self, x: torch.Tensor, sizes: Sequence[int]) -> Sequence[torch.Tensor]:
         """By `torch.split`, whose derivative is one array for all pieces."""
