@@ -1,4 +1,7 @@
-"""Fits with and without `rims` of `visible`: whether outlines that move as outlines do find more, or break something.
+"""Fits by `visible` with outlines that move as outlines do, or not: whether they find more, or break something.
+
+*Samples*: outlines move as the samples inside of them; *fronts*: as fronts alone tell; *visible*: also by where rays
+leave culled bodies, the default.
 
 *Poses* are those of `pose_recovery`, and those of a vase, which looks the same however it is turned about its axis: its
 angle is that of the axis. *Vertices*: a sphere becomes the bunny, every vertex free, by Adam, from eight shaded
@@ -7,7 +10,7 @@ mean over points of each of the distance to the other, in thousandths of the bun
 elsewhere.
 
     python -m benchmarks.outline_fits -o out/outline_fits
-    python -m benchmarks.outline_fits --only poses --meshes bunny --seeds 3
+    python -m benchmarks.outline_fits --only poses --meshes bunny --seeds 3 --cull back --motions fronts visible
 """
 
 from __future__ import annotations
@@ -29,7 +32,8 @@ from benchmarks.pose_recovery import DIAMETER, MESHES, VIEWS, Task, eye, line
 from benchmarks.report import table
 from rts.diagnostics.comparison.builtin import VASE_HEIGHTS, VASE_RADII
 
-RIMS = (False, True)
+MOTIONS: dict[str, dict] = {"samples": {"rims": False}, "fronts": {"exits": False}, "visible": {}}
+"""Options of the splatter."""
 TILT = (0.45, 0.3)
 """Turns of the vase about x and y, radians."""
 SIZE, STEPS, RATE = (128, 128), 250, 0.01
@@ -39,9 +43,9 @@ square of pixels."""
 COLOR = (0.85, 0.75, 0.6)
 
 
-def visible(rims: bool) -> Any:
-    """The splatter."""
-    return rts.plugin("rts.splatters", "visible")(rims=rims)
+def visible(motion: str) -> Any:
+    """The splatter whose outlines move so."""
+    return rts.plugin("rts.splatters", "visible")(**MOTIONS[motion])
 
 
 # ------------------------------------------------------------------------------------------------------------ poses
@@ -88,20 +92,20 @@ def poses(args: argparse.Namespace) -> Iterator[tuple[str, list[dict]]]:
     surface = rts.plugin("rts.surfaces", "mesh")
     for name in args.meshes:
         vertices, faces = vase() if name == "vase" else mesh(name)
-        part = rts.Part(surface(faces), {"vertices": vertices.astype(np.float32)}, "silhouette")
+        part = rts.Part(surface(faces), {"vertices": vertices.astype(np.float32)}, "silhouette", cull=args.cull)
         views = [camera(eye(*angles)) for angles in VIEWS]
-        tasks = {rims: Task(part, views, "torch", visible(rims), args.layers) for rims in RIMS}
+        tasks = {motion: Task(part, views, "torch", visible(motion), args.layers) for motion in args.motions}
         for method in args.methods:
-            runs: dict[bool, list[dict]] = {rims: [] for rims in RIMS}
+            runs: dict[str, list[dict]] = {motion: [] for motion in tasks}
             for seed in track(range(args.seeds), description=f"{name}, {method}", transient=True):
-                for rims, task in tasks.items():
-                    runs[rims].append(task.run(seed, method))
-            for rims, rows in runs.items():
+                for motion, task in tasks.items():
+                    runs[motion].append(task.run(seed, method))
+            for motion, rows in runs.items():
                 if name == "vase":
                     for row in rows:
                         row["angle"] = between_axes(np.array(row["pose"]))
                         row["outcome"] = pose_recovery.outcome(row)
-                yield line(name, "rims" if rims else "samples", method, rows), rows
+                yield line(name, motion, method, rows), rows
 
 
 # --------------------------------------------------------------------------------------------------------- vertices
@@ -135,7 +139,7 @@ def chamfer(a: tuple, b: tuple) -> float:
     return float(1e3 * np.mean(distances) / DIAMETER)
 
 
-def fitted(rims: bool, cull: str, weight: float, targets: list[np.ndarray], views: list[rts.Camera]) -> np.ndarray:
+def fitted(motion: str, cull: str, weight: float, targets: list[np.ndarray], views: list[rts.Camera]) -> np.ndarray:
     """Vertices (V, 3) after Adam."""
     import torch
 
@@ -148,8 +152,8 @@ def fitted(rims: bool, cull: str, weight: float, targets: list[np.ndarray], view
     vertices = torch.tensor(start, dtype=torch.float32, requires_grad=True)
     optimizer = torch.optim.Adam([vertices], lr=RATE)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: 1 - 0.9 * step / STEPS)
-    goals, splatter = [torch.tensor(t, dtype=torch.float32) for t in targets], visible(rims)
-    for _ in track(range(STEPS), description=f"vertices, {cull}, {weight:g}, {rims}", transient=True):
+    goals, splatter = [torch.tensor(t, dtype=torch.float32) for t in targets], visible(motion)
+    for _ in track(range(STEPS), description=f"vertices, {cull}, {weight:g}, {motion}", transient=True):
         optimizer.zero_grad()
         loss = weight * energy(vertices) / (energy.terms * edge**2)
         for view, goal in zip(views, goals, strict=True):
@@ -174,14 +178,18 @@ def vertices(args: argparse.Namespace) -> Iterator[tuple[list[str], dict, np.nda
     ball = surface(sphere()[1])
     for cull in LAYERS:
         for weight in args.weights:
-            for rims in RIMS:
-                at = fitted(rims, cull, weight, pictures, training)
+            for motion in args.motions:
+                at = fitted(motion, cull, weight, pictures, training)
                 part = shaded(ball, at, "none")
                 seen = [supersampled(part, v, SIZE, 4) for v in held_out]
                 error = float(np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(seen, others, strict=True)])))
                 distance = chamfer((at, sphere()[1]), (found, faces))
-                cells = [cull, f"{weight:g}", "rims" if rims else "samples", f"{distance:.3f}", f"{error:.4f}"]
-                yield cells, {"cull": cull, "weight": weight, "rims": rims, "chamfer": distance, "rms": error}, seen[0]
+                cells = [cull, f"{weight:g}", motion, f"{distance:.3f}", f"{error:.4f}"]
+                yield (
+                    cells,
+                    {"cull": cull, "weight": weight, "motion": motion, "chamfer": distance, "rms": error},
+                    seen[0],
+                )
 
 
 def strip(pictures: list[np.ndarray], path: Path) -> None:
@@ -201,6 +209,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--methods", nargs="+", default=["adam", "lm"])
     parser.add_argument("--layers", type=int, default=1, help="K of the poses")
+    parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=list(MOTIONS))
+    parser.add_argument("--cull", choices=LAYERS, default="none", help="of the poses")
     parser.add_argument("--weights", nargs="+", type=float, default=list(WEIGHTS), help="of the Laplacian energy")
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
