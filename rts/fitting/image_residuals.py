@@ -111,7 +111,7 @@ class ImageResiduals(Residuals):
         self._full, self._sigma = self.size, 0.0
         self._view: int | None = None
         self._views: list[ImageResiduals] = []
-        several = isinstance(camera, (list, tuple)) or (camera is not None and camera.is_stacked)
+        several = camera is not None and (not isinstance(camera, Camera) or camera.is_stacked)
         if (count := _view_count(target, self.size, several)) is None:
             self._take(target, weights)
             return

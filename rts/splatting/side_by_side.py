@@ -96,10 +96,11 @@ class Picture(NamedTuple):
 
 def _scale(splats: Splats) -> Array:
     """Factors (1, 3) of positions, which bring the largest depth between 1 and 2."""
-    xp, positions = namespace(splats.positions), splats.positions
+    xp, positions, factor = namespace(splats.positions), splats.positions, 1.0
     most = value_of(xp.max(xp.abs(positions[:, 2]))) if positions.shape[0] else None
-    known = most is not None and np.isfinite(most) and most > 0
-    return engine_of(positions).constant(np.array([[1, 1, 2.0 ** (1 - np.frexp(most)[1]) if known else 1]]), positions)
+    if most is not None and np.isfinite(most) and most > 0:
+        factor = 2.0 ** (1 - np.frexp(most)[1])
+    return engine_of(positions).constant(np.array([[1.0, 1.0, factor]]), positions)
 
 
 def at_once(view: tuple[int, int]) -> int:
