@@ -93,7 +93,7 @@ TASKS: dict[str, Callable[[], Callable[[], object]]] = {
 
 
 def seconds(task: str) -> list[float]:
-    """Of the imports, the first call and the second."""
+    """What the imports take, the first call and the second."""
     times = [time.perf_counter()]
     call = TASKS[task]()
     times.append(time.perf_counter())
