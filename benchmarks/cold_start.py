@@ -105,11 +105,10 @@ def seconds(task: str) -> list[float]:
 
 def measured(task: str, kernels: str, tree: Path) -> list[float]:
     """`seconds` of a process that keeps compiled kernels in a folder, by the packages of a tree."""
-    path = os.pathsep.join([str(tree), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "NUMBA_CACHE_DIR": kernels, "PYTHONPATH": path}
+    environment = {**os.environ, "NUMBA_CACHE_DIR": kernels}
     command = f"import runpy; print(__import__('json').dumps(runpy.run_path({str(SELF)!r})['seconds']({task!r})))"
     done = subprocess.run(
-        [sys.executable, "-c", command], cwd=SELF.parents[1], env=environment, check=True, stdout=subprocess.PIPE
+        [sys.executable, "-c", command], cwd=tree, env=environment, check=True, stdout=subprocess.PIPE
     )
     return json.loads(done.stdout.splitlines()[-1])
 
