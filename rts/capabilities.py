@@ -13,7 +13,9 @@ METHODS: Mapping[str, Mapping[str, str]] = {
 VARIABLES: Mapping[str, Mapping[str, Any]] = {
     "rts.engines": {"differentiates": True},
     "rts.surfaces": {"refines": False, "depends_on_view": False},
-    "rts.samplers": dict.fromkeys(("culls", "prunes", "takes_cells", "tells_facing", "tells_exits"), False),
+    "rts.samplers": dict.fromkeys(
+        ("culls", "prunes", "takes_cells", "tells_facing", "tells_exits", "concurrent"), False
+    ),
     "rts.shaders": {"opaque": False, "uniform": False, "reads": None},
     "rts.splatters": {"layers": None, "reach": 1, "reads_facing": False, "prunes": False, "sums_products": False},
 }

@@ -333,8 +333,8 @@ class Sampler(Plugin):
         prunes: whether `sample` also takes the keyword `needed`, which says which samples to keep: a `Needed`, a
             function of its signature, or None for all.
         takes_cells: whether `sample` also takes the keyword `cells`, (L, C) int32: the only cells of the grid to
-            sample, as flat indices, or −1 for none; an array of the part's engine, perhaps traced. `row` and `depth` of
-            the samples are then (K, L, C). Without it all cells are sampled, and those that are not listed left out.
+            sample, as flat indices, none twice, or −1 for none; an array of the part's engine, perhaps traced. `row`
+            and `depth` of the samples are then (K, L, C). Without it all cells are sampled, and others left out.
         tells_facing: whether `sample` also takes the keyword `facing`: whether to find `Samples.facing`, which is of
             interest in cells with hidden samples, and beside them.
         tells_exits: whether `sample` also takes the keyword `exits`: whether to find `Samples.exit` of parts that are

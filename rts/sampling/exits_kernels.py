@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
+from rts.sampling.windows_kernels import add, spread
 
 
 @kernel
@@ -20,19 +21,16 @@ def find(kept, cells):
         if y < height:
             _add_empty(level[1:-1], kept[0, y])
             for k in range(1, layers):
-                _add(level[1:-1], kept[k, y])
+                add(level[1:-1], kept[k, y])
         beside = near[(y + 2) % 3]
         beside[:] = 0
         if 0 < y <= height:
-            _spread(beside[1:-1], ends[(y + 1) % 3], ends[(y + 2) % 3], level, kept[0, y - 1])
-        if y > 1 and _spread(wide, near[y % 3], near[(y + 1) % 3], beside, kept[0, y - 2]):
+            _beside(beside[1:-1], ends[(y + 1) % 3], ends[(y + 2) % 3], level, kept[0, y - 1])
+        if y > 1 and _beside(wide, near[y % 3], near[(y + 1) % 3], beside, kept[0, y - 2]):
             for x in range(width):
                 cells[count] = (y - 2) * width + x
                 count += wide[x]
     return count
-
-
-# Rows are handed over one by one, which the compiler needs to see that they do not overlap.
 
 
 @compiled
@@ -42,17 +40,11 @@ def _add_empty(level, covered):
 
 
 @compiled
-def _add(level, marks):
-    for x in range(len(marks)):
-        level[x] |= np.uint8(marks[x])
-
-
-@compiled
-def _spread(found, above, level, below, where):
+def _beside(found, above, level, below, where):
     """Mark the cells of a row that have a mark in their 3 × 3 window, among those that count; whether there is any."""
+    spread(found, above, level, below)
     some = np.uint8(0)
     for x in range(len(found)):
-        around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
-        found[x] = (around | below[x] | below[x + 1] | below[x + 2]) & np.uint8(where[x])
+        found[x] &= np.uint8(where[x])
         some |= found[x]
     return some != 0

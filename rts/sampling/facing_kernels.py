@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
+from rts.sampling.windows_kernels import add, spread
 
 
 @kernel
@@ -17,10 +18,10 @@ def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eye, listed, 
         level[:] = 0
         if 0 <= y < height:
             for k in range(1, layers):
-                _add(level[1:-1], kept[k, y])
+                add(level[1:-1], kept[k, y])
         if y <= start:
             continue
-        _spread(near, hidden[(y + 1) % 3], hidden[(y + 2) % 3], level)
+        spread(near, hidden[(y + 1) % 3], hidden[(y + 2) % 3], level)
         for x in range(width):
             if listed or near[x]:
                 for k in range(layers):
@@ -30,22 +31,6 @@ def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eye, listed, 
                         if piece > 0 and k == layers - 1:
                             piece += more
                         found[k, y - 1, x] = piece if _front(vertices, faces, t, eye) else -piece
-
-
-# Rows are handed over one by one, which the compiler needs to see that they do not overlap.
-
-
-@compiled
-def _add(level, kept):
-    for x in range(len(kept)):
-        level[x] |= np.uint8(kept[x])
-
-
-@compiled
-def _spread(near, above, level, below):
-    for x in range(len(near)):
-        around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
-        near[x] = around | below[x] | below[x + 1] | below[x + 2]
 
 
 @compiled

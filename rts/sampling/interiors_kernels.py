@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
+from rts.sampling.windows_kernels import add
 from rts.threads import parallel
 
 LONG = 2
@@ -58,7 +59,7 @@ def _settle(start, stop, covered, depth, kept, reach, found, near, extremes):
         if 0 <= y < height:
             _load(loose[r, middle], covered[0, y])
             for k in range(1, layers):
-                _add(loose[r, middle], kept[k, y])
+                add(loose[r, middle], kept[k, y])
     for r in range(rows - 2):
         _unite(column, loose[r], loose[r + 1], loose[r + 2])
         _unite(nine, column, column[1:], column[2:])
@@ -94,12 +95,6 @@ def _drop(start, stop, near, kept):
 def _load(loose, covered):
     for x in range(len(loose)):
         loose[x] = np.uint8(1) - np.uint8(covered[x])
-
-
-@compiled
-def _add(loose, kept):
-    for x in range(len(loose)):
-        loose[x] |= np.uint8(kept[x])
 
 
 @compiled

@@ -97,7 +97,7 @@ class TriangleSampler(Sampler):
             size: see `rasterize`.
             layers: see `rasterize`.
             cull: see `rasterize`.
-            cells: (L, C) int32, flat indices of cells in the grid, or −1 for none.
+            cells: (L, C) int32, flat indices of cells in the grid, none of them twice, or −1 for none.
 
         Returns:
             Fragments, (K, L, C).

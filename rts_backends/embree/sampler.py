@@ -75,7 +75,7 @@ class Embree(TriangleSampler):
         self, prepared: Structure, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
     ) -> Fragments:
         """See `TriangleSampler.rasterize_cells`: a ray for each of these cells."""
-        if isinstance(prepared.scene, embreex_fallback.Scene):
+        if isinstance(prepared.scene, embreex_fallback.Scene) or not cells.size:
             return super().rasterize_cells(prepared, camera, size, layers, cull, cells)
         flat = np.ascontiguousarray(cells, np.int32).reshape(-1)
         return _cast(prepared, camera, size, cull, flat, (layers, *cells.shape))
