@@ -305,7 +305,9 @@ class Needed(Plugin):
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Which samples to keep, (K, H, W) bool, where covered (K, H, W) bool lie at depth (K, H, W)."""
 
-    def settled(self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float) -> np.ndarray:
+    def settled(
+        self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float, wanted: np.ndarray | None = None
+    ) -> np.ndarray:
         """Cells (H, W) bool whose colour is known without samples; those that only such cells need leave `kept`.
 
         Args:
@@ -313,6 +315,7 @@ class Needed(Plugin):
             depth: (K, H, W) float.
             kept: (K, H, W) bool, what `__call__` gave; changed in place.
             size: of the largest coordinate.
+            wanted: (H, W) bool, the cells that are looked at; None for all.
         """
         raise NotImplementedError
 

@@ -157,6 +157,7 @@ class Fine:
         supersample: s; each active pixel has s² cells.
         apron: cells around active pixels, and around the layout.
         facing: (K, h, w) int16, as in `Sampled`, or None.
+        settled: (h, w) bool, see `Splats`; None where no samples were left out for it.
     """
 
     samples: tuple[Samples, ...]
@@ -171,6 +172,7 @@ class Fine:
     supersample: int
     apron: int
     facing: Array | None = None
+    settled: Array | None = None
 
     @property
     def wanted(self) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.checks import check_memory
 from rts.engines import engine_of
-from rts.interfaces import AnyNeeded
+from rts.interfaces import Needed
 from rts.records import Fine, Sampled
 from rts.sampling.adaptive import Adaptive, contrasts, outlines
 from rts.sampling.pruning import as_needed, planned
@@ -54,7 +54,7 @@ def fine_samples(
     grid: Grid,
     where: Where,
     take: Callable[..., Sampled],
-    needed: AnyNeeded | None,
+    needed: Needed | None,
     layers: int | Literal["auto"],
     capacity: int | None,
 ) -> Fine:

@@ -143,7 +143,7 @@ def sampled_scene(
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, capacity=capacity)
     if isinstance(supersample, Adaptive):
         coarse = sampled_scene(scene, camera, size, supersample=1, settles=settles, **options)
-        fine = fine_scene(scene, camera, size, coarse, adaptive=supersample, **options)
+        fine = fine_scene(scene, camera, size, coarse, adaptive=supersample, settles=settles, **options)
         return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)
     side = int(supersample)
     height, width = side * size[0], side * size[1]
@@ -219,11 +219,12 @@ def fine_scene(
     layers: int | Literal["auto"],
     capacity: int | None,
     colors: np.ndarray | None = None,
+    settles: bool = False,
 ) -> Fine:
     """Fine samples where outlines are; `colors` (N, 4) of the coarse ones are to look for contrast."""
     grid = Grid(size, adaptive.samples, apron_of(splatter))
     wide = _widened(scene, camera, (grid.side * size[0], grid.side * size[1]), grid.apron)
-    needed = None if splatter is None else needed_by(splatter, scene.parts)
+    needed = None if splatter is None else needed_by(splatter, scene.parts, settles=settles)
     where = Where(adaptive, adaptive.dilates(scene.parts), colors)
     take = partial(_taken, scene, wide, facing=(splatter or Visible()).reads_facing)
     return fine_samples(coarse, grid, where, take, needed, layers, capacity)

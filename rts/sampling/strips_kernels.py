@@ -266,10 +266,15 @@ def gather(start, stop, covered, depth, place, laid, deep):
 
 @kernel
 def scatter(start, stop, kept, kinds, place, found):
-    """Mark the (K, M) cells that are kept (K, h, w) near wanted ones, in lines [start, stop) counted over layers."""
+    """Mark the (K, M) cells that are kept (K, h, w), in lines [start, stop) of a layout, counted over layers.
+
+    Where there are kinds, what is not near wanted cells is not kept.
+    """
     height = len(place)
     for line in range(start, stop):
         k, y = line // height, line % height
         for x in range(place.shape[1]):
-            if kept[k, y, x] and kinds[y, x] & NEAR:
-                found[k, place[y, x]] = True
+            if kept[k, y, x]:
+                kept[k, y, x] = len(kinds) == 0 or kinds[y, x] & NEAR != 0
+                if kept[k, y, x]:
+                    found[k, place[y, x]] = True

@@ -196,7 +196,7 @@ class TriangleSampler(Sampler):
         shader = adapted(part.shader, Shader)
         asked = None if shader is None else shader.reads
         wanted: Needed | None = None if needed is None else adapted(needed, Needed)
-        settles = wanted is not None and wanted.settles and cells is None and not surface.refines
+        settles = wanted is not None and wanted.settles and not surface.refines
         attributes = _attribute_specs(surface, asked, host_theta, shape, like)
 
         transform = [] if part.transform is None else [part.transform]
@@ -224,7 +224,7 @@ class TriangleSampler(Sampler):
             )
 
         sides = [ArraySpec((layers, *shape.size), np.int16)] if tells else []
-        amid = [ArraySpec(size, np.bool_)] if settles else []
+        amid = [ArraySpec(shape.size, np.bool_)] if settles else []
         behind = [ArraySpec(size, np.int32)] if exits else []
         specs = *shape.specs(surface.sample_widths), *sides, *amid, *behind, *tables.values(), *attributes.values()
         results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *listed, *leaves(inputs))
@@ -283,7 +283,7 @@ class TriangleSampler(Sampler):
                     # Vertices that were looked at as a part of θ need not be looked at again.
                     read = any(np.may_share_memory(x, found.proxy.vertices) for x in leaves(inputs))
                     size = needed.size if read and needed.size is not None else largest(found.proxy.vertices)
-                if needed.settles and cells is None:
+                if needed.settles:
                     settled = needed.settled(covered, fragments.depth, kept, size)
             sides = None
             if tells:

@@ -120,8 +120,11 @@ class Cells:
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
         self.exits = read_only(np.empty((0, row.shape[2])) if exits is None else exits, np.int32)
         self.facing = read_only(self.row[:0] if facing is None else facing, np.int16)
-        self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
         self.settled = read_only(np.empty((0, row.shape[2])) if settled is None else settled, np.bool_)
+        self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
+        if self._wanted is not None and len(self.settled):
+            # Beside settled targets those that nobody looks at may lack their samples, and seem to end there.
+            self._wanted = self._wanted & ~self.settled
         self.visible, self.border = settings.kind == "visible", settings.border
         self.rims = self.visible and settings.rims
         self.crosses = self.visible and settings.crossings
