@@ -33,7 +33,7 @@ from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.emptiness import why_empty
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.pruning import planned
-from rts.sampling.scenes import Scene, apron_of, fine_scene, sampled_scene
+from rts.sampling.scenes import Scene, apron_of, sampled_scene, with_fine
 from rts.trees import Array
 
 BAND = 2**20
@@ -207,8 +207,8 @@ def _of_contrast(
             f"contrast of Adaptive is {supersample.contrast}, and colours are traced; give None: what is sampled "
             f"cannot depend on values that are not known yet"
         )
-    fine = fine_scene(scene, scene.camera, size, coarse, adaptive=supersample, colors=colors, **options)
-    return splatted(replace(coarse, fine=fine), scene, scene.camera, suited, splatter, splats)
+    sampled = with_fine(scene, scene.camera, size, coarse, adaptive=supersample, colors=colors, **options)
+    return splatted(sampled, scene, scene.camera, suited, splatter, splats)
 
 
 @uncompiled
