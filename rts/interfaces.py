@@ -441,6 +441,7 @@ class Splatter(Plugin):
         settles: whether it reads `Splats.settled`: where all nine samples around a cell are fronts of one opaque
             colour, on cells' centres, and no hidden one beside them is `needed`, the cell has that colour, whatever
             moves by little; and samples farther than `reach` from all other cells need not be there.
+        follows_outlines: whether hidden samples have no effect on cells at which `rts.Adaptive` sees no outline.
     """
 
     FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}
@@ -454,6 +455,7 @@ class Splatter(Plugin):
     sums_products: bool = False
     averages: bool = False
     settles: bool = False
+    follows_outlines: bool = False
 
     @abc.abstractmethod
     def image(self, splats: Splats) -> Array:

@@ -136,7 +136,7 @@ class Samples:
     exit: Array | None = None
 
 
-@record(static=("supersample", "apron"))
+@record(static=("supersample", "apron", "flat"))
 class Fine:
     """The fine samples of an adaptively sampled scene: cells of active pixels and an apron around them, in strips.
 
@@ -158,6 +158,8 @@ class Fine:
         apron: cells around active pixels, and around the layout.
         facing: (K, h, w) int16, as in `Sampled`, or None.
         settled: (h, w) bool, see `Splats`; None where no samples were left out for it.
+        flat: whether all pixels that are not active show the one colour of all samples, or nothing, as
+            `Sampled.settled` says; their samples were left out.
     """
 
     samples: tuple[Samples, ...]
@@ -173,6 +175,7 @@ class Fine:
     apron: int
     facing: Array | None = None
     settled: Array | None = None
+    flat: bool = False
 
     @property
     def wanted(self) -> Array:

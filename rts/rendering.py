@@ -299,15 +299,26 @@ def splatted(
         splatter: a splatter.
         splats: of the samples, but for the fine ones, if they are known.
     """
-    if splats is None:
+    fine = sampled.fine
+    if splats is None and (fine is None or not fine.flat):
         splats = to_splats(sampled, scene.parts, scene.camera, window, *suited)
-    if sampled.fine is None:
+    if fine is None:
         image = cropped_image(splatter, splats)
         return image if sampled.supersample == 1 else averaged(image, sampled.supersample)
-    coarse = constants(sampled.fine.coarse, *suiting(splats.rgba))
-    image = cropped_image(splatter, splats.replace(wanted=coarse))
-    finer = cropped_image(splatter, to_fine_splats(sampled.fine, scene.parts, scene.camera, *suited))
-    return with_inset(image, finer, constants(sampled.fine.pixel, engine_of(image), image), sampled.fine.supersample)
+    finer = to_fine_splats(fine, scene.parts, scene.camera, *suited)
+    if splats is None:
+        image = _painted(sampled, finer.rgba[0, ...])
+    else:
+        image = cropped_image(splatter, splats.replace(wanted=constants(fine.coarse, *suiting(splats.rgba))))
+    finer = cropped_image(splatter, finer)
+    return with_inset(image, finer, constants(fine.pixel, engine_of(image), image), fine.supersample)
+
+
+def _painted(sampled: Sampled, color: Array) -> Array:
+    """The image (H, W, C) of settled cells, which show a colour (C,), and others, which show nothing."""
+    rows, columns = (slice(sampled.apron, n - sampled.apron) for n in sampled.row.shape[1:])
+    settled = constants(sampled.settled, *suiting(color))[rows, columns]
+    return namespace(color).where(settled[..., None], color, namespace(color).zeros_like(color))
 
 
 def bands_of(

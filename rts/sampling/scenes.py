@@ -17,7 +17,7 @@ from rts.interfaces import AnyNeeded, CheckedPart, Part, Splatter
 from rts.records import Sampled
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.cache import Entry
-from rts.sampling.fine import Where, fine_samples
+from rts.sampling.fine import Where, fine_samples, without_samples
 from rts.sampling.merging import merge
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.pruning import Everything, as_needed, needed_by, planned, prune
@@ -242,7 +242,9 @@ def with_fine(
     needed = None if splatter is None else needed_by(splatter, scene.parts, settles=settles)
     where = Where(adaptive, adaptive.dilates(scene.parts), colors)
     take = partial(_taken, scene, wide, facing=(splatter or Visible()).reads_facing)
-    fine = fine_samples(coarse, grid, where, take, needed, layers, capacity)
+    flat = coarse.settled is not None and splatter is not None and splatter.follows_outlines
+    fine = fine_samples(coarse, grid, where, take, needed, layers, capacity, flat)
+    coarse = without_samples(coarse) if fine.flat else coarse
     return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)
 
 
