@@ -158,8 +158,8 @@ class Fine:
         apron: cells around active pixels, and around the layout.
         facing: (K, h, w) int16, as in `Sampled`, or None.
         settled: (h, w) bool, see `Splats`; None where no samples were left out for it.
-        flat: whether all pixels that are not active show the one colour of all samples, or nothing, as
-            `Sampled.settled` says; their samples were left out.
+        flat: whether all pixels that are not active show the one colour of all samples where anything is, whatever
+            moves, so that nothing has to be splatted there.
     """
 
     samples: tuple[Samples, ...]

@@ -207,7 +207,8 @@ def _of_contrast(
             f"contrast of Adaptive is {supersample.contrast}, and colours are traced; give None: what is sampled "
             f"cannot depend on values that are not known yet"
         )
-    sampled = with_fine(scene, scene.camera, size, coarse, adaptive=supersample, colors=colors, **options)
+    options |= {"adaptive": supersample, "colors": colors, "needed": scene.needed_by(splatter)}
+    sampled = with_fine(scene, scene.camera, size, coarse, **options)
     return splatted(sampled, scene, scene.camera, suited, splatter, splats)
 
 
@@ -315,10 +316,11 @@ def splatted(
 
 
 def _painted(sampled: Sampled, color: Array) -> Array:
-    """The image (H, W, C) of settled cells, which show a colour (C,), and others, which show nothing."""
+    """The image (H, W, C) of cells that show a colour (C,) where anything is."""
     rows, columns = (slice(sampled.apron, n - sampled.apron) for n in sampled.row.shape[1:])
-    settled = constants(sampled.settled, *suiting(color))[rows, columns]
-    return namespace(color).where(settled[..., None], color, namespace(color).zeros_like(color))
+    covered = (sampled.row[0, rows, columns] >= 0) | sampled.settled[rows, columns]
+    there = constants(covered, *suiting(color))[..., None]
+    return namespace(color).astype(there, color.dtype) * color
 
 
 def bands_of(

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from rts.checks import check_memory
-from rts.engines import engine_of, namespace
+from rts.engines import engine_of
 from rts.interfaces import Needed
 from rts.records import Fine, Sampled
 from rts.sampling.adaptive import Adaptive, contrasts, outlines
@@ -96,27 +96,3 @@ def fine_samples(
     taken = partial(take, capacity=allotted, cells=layout.cells)
     sampled = taken(layers, known) if layers != "auto" else as_needed(taken, known)
     return replace(arranged(sampled, layout, grid), flat=flat)
-
-
-def without_samples(coarse: Sampled) -> Sampled:
-    """Coarse samples of one colour less those of pixels that are not active: there fronts go on all around, or none.
-
-    What is covered is settled, and one sample, which no cell refers to, tells the colour.
-    """
-    (whole,), xp = coarse.samples, namespace(coarse.row)
-    row = xp.full_like(coarse.row[:1, ...], -1)
-    depth = xp.zeros_like(coarse.depth[:1, ...])
-    own = replace(
-        whole,
-        ids=whole.ids[:1, ...],
-        params=whole.params[:1, ...],
-        row=row,
-        depth=depth,
-        tables={name: x[:1, ...] if name in whole.by_sample else x for name, x in whole.tables.items()},
-        gbuffer=None if whole.gbuffer is None else {name: x[:1, ...] for name, x in whole.gbuffer.items()},
-        facing=None,
-        settled=None,
-        exit=None,
-    )
-    settled = coarse.settled | (coarse.row[0, ...] >= 0)
-    return replace(coarse, samples=(own,), row=row, depth=depth, settled=settled, facing=None, exit=None)

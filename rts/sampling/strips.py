@@ -285,10 +285,9 @@ def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
     specs += [ArraySpec(laid[1:], np.bool_) for _ in amid]
 
     def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray, *known: np.ndarray) -> tuple[np.ndarray, ...]:
-        sides, settled = known[: len(told)], known[len(told) :]
-        found = [np.where(place >= 0, x.reshape(layers, -1)[:, place], 0).astype(np.int16) for x in sides]
-        found += [(place >= 0) & x.reshape(-1)[place] for x in settled]
-        return *_arranged(row, place, cells, sizes, grid.fine[1]), *found
+        sides = [np.where(place >= 0, x.reshape(layers, -1)[:, place], 0).astype(np.int16) for x in known[: len(told)]]
+        *found, settled = _arranged(row, place, cells, sizes, grid.fine[1], *known[len(told) :])
+        return *found, *sides, *([settled] if amid else [])
 
     given = sampled.row, layout.place, layout.cells, *told, *amid
     index, shift, row, part, *known = engine.call_host(host, tuple(specs), *given)
@@ -310,21 +309,28 @@ def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
 
 
 def _arranged(
-    row: np.ndarray, place: np.ndarray, cells: np.ndarray, sizes: Sequence[int], width: int
+    row: np.ndarray,
+    place: np.ndarray,
+    cells: np.ndarray,
+    sizes: Sequence[int],
+    width: int,
+    settled: np.ndarray | None = None,
 ) -> tuple[np.ndarray, ...]:
     """What `strips_kernels.arrange` fills; there is always at least one splat."""
     from rts.sampling import strips_kernels
 
     row, place, cells = (read_only(x, np.int32) for x in (row, place, cells))
+    amid = read_only(np.empty(0, bool) if settled is None else settled.reshape(-1))
     row, cells, lines = row.reshape(len(row), -1), cells.reshape(-1), len(row) * len(place)
     counts = np.empty(lines, np.int64)
     parallel(strips_kernels.count_samples, lines, row, place, counts, work=len(row) * place.size)
     offsets, total = np.cumsum(counts) - counts, int(counts.sum())
     index, shift = np.zeros(max(1, total), np.int32), np.zeros((max(1, total), 3), np.float32)
     laid, part = (np.empty((len(row), *place.shape), np.int32) for _ in range(2))
-    given = row, place, cells, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part
+    shown = np.empty(place.shape if len(amid) else (0, 0), bool)
+    given = row, place, cells, amid, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part, shown
     parallel(strips_kernels.arrange, lines, *given, work=2 * laid.size)
-    return index, shift, laid, part
+    return index, shift, laid, part, shown
 
 
 def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
