@@ -291,6 +291,8 @@ class TriangleSampler(Sampler):
                 pieces = checked_pieces(surface, found.proxy) if kept[1:].any() else np.zeros(1, np.int16)
                 sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
             if not surface.refines:
+                if size is not None and needed is not None and needed.size is not None and size <= needed.size:
+                    size = 0.0  # Where numbers of this size are too large all is kept already.
                 lifted = lift(fragments, found.proxy, shape.capacity, kept, size, behind)
                 return replace(lifted, facing=sides, settled=settled)
             lifted = lift(fragments, found.proxy, None, kept)

@@ -23,7 +23,7 @@ from rts_backends.fused import blocks, crossing_pairs, crossings, mixed, outline
 from rts_backends.fused import choices as listing
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
-from rts_backends.fused.survey import EMPTY, SETTLED, collect, paint, survey
+from rts_backends.fused.survey import SETTLED, collect, paint, survey
 
 
 class Settings(NamedTuple):
@@ -177,7 +177,7 @@ class Cells:
         repeated = int(np.count_nonzero(seen)) != int(counts.sum())
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
         if self._wanted is not None:
-            states[(self._wanted == 0) & (states != SETTLED)] = EMPTY
+            states *= self._wanted | self.settled if len(self.settled) else self._wanted
         least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
         # See `rts.splatting.layers`: nothing is nearer to what is beyond everything than to a front.
         extent = largest - least
