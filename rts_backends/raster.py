@@ -107,10 +107,10 @@ class Raster(TriangleSampler):
         if cells is None:
             parallel(draw, bands, *given, tuple(fragments))
         else:
-            if (absent := cells < 0).any():
-                for x, nothing in zip(fragments, (-1, 0, 0), strict=True):
-                    x[:, absent] = nothing
             flat = tuple(x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments)
+            absent = np.flatnonzero(cells.reshape(-1) < 0)
+            for x, nothing in zip(flat, (-1, 0, 0), strict=True):
+                x[:, absent] = nothing
             parallel(draw_cells, bands, *given, blocks.table, blocks.numbers, flat)
         scratch[1].append((screen, listed))
         return fragments
