@@ -301,9 +301,10 @@ def splatted(
         splats: of the samples, but for the fine ones, if they are known.
     """
     fine = sampled.fine
-    if splats is None and (fine is None or not fine.flat):
-        splats = to_splats(sampled, scene.parts, scene.camera, window, *suited)
+    if fine is None or not fine.flat:
+        splats = splats or to_splats(sampled, scene.parts, scene.camera, window, *suited)
     if fine is None:
+        assert splats is not None
         image = cropped_image(splatter, splats)
         return image if sampled.supersample == 1 else averaged(image, sampled.supersample)
     finer = to_fine_splats(fine, scene.parts, scene.camera, *suited)
@@ -318,6 +319,7 @@ def splatted(
 def _painted(sampled: Sampled, color: Array) -> Array:
     """The image (H, W, C) of cells that show a colour (C,) where anything is."""
     rows, columns = (slice(sampled.apron, n - sampled.apron) for n in sampled.row.shape[1:])
+    assert sampled.settled is not None
     covered = (sampled.row[0, rows, columns] >= 0) | sampled.settled[rows, columns]
     there = constants(covered, *suiting(color))[..., None]
     return namespace(color).astype(there, color.dtype) * color

@@ -18,7 +18,7 @@ import numpy as np
 
 from rts.adapting import adapted
 from rts.engines import Engine, constants, engine_of, namespace
-from rts.interfaces import AnyNeeded, Needed
+from rts.interfaces import Needed
 from rts.records import ArraySpec, Fine, Sampled, Samples
 from rts.threads import parallel, read_only
 from rts.trees import Array

@@ -23,7 +23,7 @@ from rts_backends.fused import blocks, crossing_pairs, crossings, mixed, outline
 from rts_backends.fused import choices as listing
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
-from rts_backends.fused.survey import SETTLED, collect, paint, survey
+from rts_backends.fused.survey import collect, paint, survey
 
 
 class Settings(NamedTuple):
