@@ -107,7 +107,8 @@ def test_so_are_those_of_active_pixels(name, splatter):
         (image * weights).sum().backward()
         results.append((image.detach().numpy(), vertices.grad.numpy(), color.grad.numpy()))
         counts.append(len(sampled.fine.samples[0].ids))
-    assert sampled.fine.settled.any() and counts[1] < counts[0]
+    assert sampled.fine.settled.any()
+    assert counts[1] < counts[0] or splatter == "multi"  # Hidden samples that count are everywhere, then.
     for whole, settled in zip(*results, strict=True):
         np.testing.assert_allclose(settled, whole, rtol=0, atol=1e-10 * max(1, np.abs(whole).max()))
 
