@@ -19,11 +19,11 @@ from rts.splatting.kernel import LEAST_EPSILON
 from rts.splatting.layers import OFFSETS, check_rows
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only
-from rts_backends.fused import blocks, crossing_pairs, crossings, mixed, outlines, stencil
 from rts_backends.fused import choices as listing
+from rts_backends.fused import crossing_pairs, crossings, mixed, outlines, stencil
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
-from rts_backends.fused.survey import collect, paint, survey
+from rts_backends.fused.survey import BLOCK, collect, paint, survey
 
 
 class Settings(NamedTuple):
@@ -59,7 +59,6 @@ class Choices(NamedTuple):
             (u + 1) lies at −(u, v), and the buffers are in front, at the surface, behind.
         sums: (M, 3, 5), of each buffer the colours over the weight, taken as at least one, and the weight.
         states: (H, W) uint8, states of targets (`survey.py`); mixed ones are EMPTY here.
-        live: (H, B) uint8, the blocks of columns near which there are samples (`blocks.py`).
         repeated: whether a sample stands in several cells, which would add to its gradient at the same time.
         extent: of the depths, the camera's included.
     """
@@ -70,7 +69,6 @@ class Choices(NamedTuple):
     ranges: np.ndarray
     sums: np.ndarray
     states: np.ndarray
-    live: np.ndarray
     repeated: bool
     extent: float
 
@@ -165,15 +163,15 @@ class Cells:
         """What is decided for each target."""
         layers, height, width = self.row.shape
         count, kind = len(self.positions), self.positions.dtype
-        live = blocks.live(self.row)
         # The codes of targets that are not settled, and that are.
         states = self.settled.astype(np.uint8) if len(self.settled) else np.zeros((height, width), np.uint8)
-        hidden, seen, counts = np.zeros_like(live), np.zeros(count, np.uint8), np.zeros(height, np.int64)
+        hidden, seen = np.zeros((height, -(-width // BLOCK)), np.uint8), np.zeros(count, np.uint8)
+        counts = np.zeros(height, np.int64)
         depths = np.zeros((height, 2), kind)
         fronts = self.visible or layers == 1
         noted = states, hidden, depths, seen, counts
-        given = self.positions, self.rgba, self.row, live, fronts, self._reach
-        parallel(survey, height, *given, *noted, work=2 * blocks.BLOCK * np.count_nonzero(live))
+        given = self.positions, self.rgba, self.row, fronts, self._reach
+        parallel(survey, height, *given, *noted, work=2 * self.row.size)
         repeated = int(np.count_nonzero(seen)) != int(counts.sum())
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
         if self._wanted is not None:
@@ -201,17 +199,17 @@ class Cells:
             given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states
             arrays = self.positions, self.rgba, self.row, *self._numbers
             parallel(listing.choose, height, *arrays, *given, work=500 * len(columns))
-        return Choices(marks, offsets, columns, ranges, sums, states, live, repeated, extent)
+        return Choices(marks, offsets, columns, ranges, sums, states, repeated, extent)
 
     @cached_property
     def outlines(self) -> Outlines:
         """How outlines move, and what that changes; nothing without rims."""
         _, height, width = self.row.shape
         choices, kind, counts = self.choices, self.positions.dtype, np.zeros(height, np.int64)
-        ends, marks = np.zeros((height, width), np.uint16), np.zeros((height, width), np.uint8)
+        ends, marks = np.empty((height, width), np.uint16), np.empty((height, width), np.uint8)
         if self.rims:
             listed = choices.mixed, choices.offsets, choices.columns, choices.ranges
-            given = self.positions, self.row, choices.live, self._reach, choices.states, *listed, ends, marks, counts
+            given = self.positions, self.row, self._reach, choices.states, *listed, ends, marks, counts
             parallel(outlines.find, height, *given, work=2 * self.row[0].size)
             if self._wanted is not None:
                 found, marks = marks, np.empty_like(marks)
@@ -230,7 +228,7 @@ class Cells:
             rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
             arrays = self.positions, self.rgba, self.row, *self._numbers
             decide = self.part, self.exits, kind.type(choices.extent), rules, self._pairs
-            listed = choices.live, choices.mixed, choices.ranges, choices.sums, choices.offsets
+            listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
             given = *arrays, *decide, *listed, ends, marks
             parallel(outlines.fill, height, *given, found, work=150 * len(found.columns))
         return found

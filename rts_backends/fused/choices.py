@@ -12,9 +12,8 @@ import numpy as np
 
 from rts.compiling import compiled, kernel
 from rts.records import MORE
-from rts_backends.fused.blocks import BLOCK
 from rts_backends.fused.mixed import sums_of
-from rts_backends.fused.survey import BUSY, EMPTY
+from rts_backends.fused.survey import BLOCK, BUSY, EMPTY
 
 
 @compiled

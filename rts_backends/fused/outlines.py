@@ -2,8 +2,8 @@
 
 With v̂ the motion of the outline beside a cell, and v that of its front, what a source of weight w adds to the
 derivative of a target is ∂w · (v̂ − v) times the change of the target's colour with the coverage of one buffer. Only
-targets count that a buffer covers in part. The gradient adds up in one order: every
-other band of rows, and then those between.
+targets count that a buffer covers in part. The gradient adds up in one order: every other band of rows, and then those
+between.
 """
 
 from __future__ import annotations
@@ -14,11 +14,9 @@ import numpy as np
 
 from rts.compiling import compiled, kernel
 from rts.threads import parallel
-from rts_backends.fused.blocks import BLOCK, run
 from rts_backends.fused.crossing_pairs import steps
 from rts_backends.fused.mixed import splat
 from rts_backends.fused.survey import BUSY, SETTLED
-from rts_backends.fused.survey import EMPTY as UNTOUCHED
 
 BAND = 16
 """Rows whose gradients are added up by one thread, more than samples of which one target knows are apart."""
@@ -64,7 +62,7 @@ class Outlines(NamedTuple):
 
 
 @kernel
-def find(start, stop, positions, row, live, reach, states, mixed, offsets, columns, ranges, ends, marks, counts):
+def find(start, stop, positions, row, reach, states, mixed, offsets, columns, ranges, ends, marks, counts):
     """Find where fronts end in rows [start, stop), and mark targets that may be covered in part.
 
     Args:
@@ -72,15 +70,14 @@ def find(start, stop, positions, row, live, reach, states, mixed, offsets, colum
         stop: end of the rows.
         positions: (N, 3).
         row: (K, H, W).
-        live: (H, B), see `blocks.py`; in other blocks nothing ends, and nothing is marked.
         reach: pixels that a sample may lie off its cell's centre, so that weights are sure to add up to one.
         states: (H, W) of `survey.py`.
         mixed: (H, W), see `rts_backends.fused.cells.Choices`, as `offsets`, `columns` and `ranges`.
         offsets: (H + 1,).
         columns: (M,).
         ranges: (M, 9, 3, 2).
-        ends: (H, W) uint16 zeros, to be filled: bit 3 (v + 1) + (u + 1) where a front ends towards (u, v).
-        marks: (H, W) uint8 zeros, to be filled.
+        ends: (H, W) uint16, to be filled: bit 3 (v + 1) + (u + 1) where a front ends towards (u, v).
+        marks: (H, W) uint8, to be filled.
         counts: (H,) zeros, to be filled with the number of marks.
     """
     _, height, width = row.shape
@@ -89,21 +86,17 @@ def find(start, stop, positions, row, live, reach, states, mixed, offsets, colum
     for y in range(start, stop):
         for v in range(3):
             if y == start or v == 2:
-                _look(cells[(y + v) % 3], positions, row[0], live, states, y + v - 1, reach)
+                _look(cells[(y + v) % 3], positions, row[0], states, y + v - 1, reach)
         above, level, below = cells[y % 3], cells[(y + 1) % 3], cells[(y + 2) % 3]
-        b = 0
-        while b < live.shape[1]:
-            first, b = run(live[y], b)
-            left, right = first * BLOCK, min(b * BLOCK, width)
-            for x in range(left, right):
-                around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
-                around |= below[x] | below[x + 1] | below[x + 2]
-                marks[y, x] = np.uint8((around & COVERED != 0) & (around & LOOSE != 0)) | mixed[y, x]
-                ends[y, x] = np.uint16(around & EMPTY)
-            for x in range(left, right):
-                counts[y] += marks[y, x]
-                if ends[y, x]:
-                    ends[y, x] = _ends_before_nothing(above, level, below, x) if level[x + 1] & COVERED else 0
+        for x in range(width):
+            around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
+            around |= below[x] | below[x + 1] | below[x + 2]
+            marks[y, x] = np.uint8((around & COVERED != 0) & (around & LOOSE != 0)) | mixed[y, x]
+            ends[y, x] = np.uint16(around & EMPTY)
+        for x in range(width):
+            counts[y] += marks[y, x]
+            if ends[y, x]:
+                ends[y, x] = _ends_before_nothing(above, level, below, x) if level[x + 1] & COVERED else 0
         for d in range(offsets[y], offsets[y + 1]):
             ends[y, columns[d]] |= _ends_before_others(ranges[d], row, y, columns[d])
 
@@ -145,27 +138,24 @@ EMPTY, COVERED, LOOSE = np.uint8(1), np.uint8(2), np.uint8(4)
 
 
 @compiled
-def _look(cells, positions, row, live, states, y, reach):
+def _look(cells, positions, row, states, y, reach):
     """Bits of a row of cells, and of one cell at each side."""
     height, width = row.shape
     half = positions.dtype.type(0.5)
     cells[:] = LOOSE
     if not 0 <= y < height:
         return
+    middle = positions.dtype.type(y) + half
     for x in range(width):
-        cells[x + 1] = EMPTY | LOOSE if states[y, x] == UNTOUCHED else COVERED
-    middle, b = positions.dtype.type(y) + half, 0
-    while b < live.shape[1]:
-        first, b = run(live[y], b)
-        for x in range(first * BLOCK, min(b * BLOCK, width)):
-            if SETTLED <= states[y, x] < BUSY:
-                continue
-            i = row[y, x]
-            if i < 0:
-                cells[x + 1] = EMPTY | LOOSE
-                continue
-            off = max(abs(positions[i, 0] - (positions.dtype.type(x) + half)), abs(positions[i, 1] - middle))
-            cells[x + 1] = COVERED if off <= reach else COVERED | LOOSE
+        if SETTLED <= states[y, x] < BUSY:
+            cells[x + 1] = COVERED
+            continue
+        i = row[y, x]
+        if i < 0:
+            cells[x + 1] = EMPTY | LOOSE
+            continue
+        off = max(abs(positions[i, 0] - (positions.dtype.type(x) + half)), abs(positions[i, 1] - middle))
+        cells[x + 1] = COVERED if off <= reach else COVERED | LOOSE
 
 
 @compiled
@@ -267,7 +257,6 @@ def fill(
     extent,
     rules,
     crossed,
-    live,
     mixed,
     ranges,
     sums,
@@ -292,7 +281,6 @@ def fill(
         extent: of the depths.
         rules: numbers of the rules.
         crossed: (H, W) uint8, the pairs of `crossing_pairs.py`, or no rows.
-        live: (H, B), see `blocks.py`; in other blocks nothing is marked.
         mixed: (H, W), see `rts_backends.fused.cells.Choices`, as `ranges` and `sums`.
         ranges: (M, 9, 3, 2).
         sums: (M, 3, 5).
@@ -303,32 +291,30 @@ def fill(
     """
     beta, partner, offsets, columns, gives, slopes, changes = found
     for y in range(start, stop):
-        d, m, b = offsets[y], firsts[y], 0
-        while b < live.shape[1]:
-            first, b = run(live[y], b)
-            for x in range(first * BLOCK, min(b * BLOCK, marks.shape[1])):
-                if not marks[y, x]:
-                    m += mixed[y, x]
-                    continue
-                covered = row[0, y, x] >= 0
-                if covered:
-                    beta[y, x] = positions.dtype.type(0)
-                    if ends[y, x]:
-                        beta[y, x], partner[y, x] = _rule(positions, row, part, exits, ends, y, x, extent, rules)
-                if marks[y, x] == BESIDE:
-                    m += mixed[y, x]
-                    continue
-                columns[d] = x
-                given = JOINED if covered else SURFACE
-                own = _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, peak, gamma, given)
-                if mixed[y, x]:
-                    _list(gives[d], changes[d], ranges[m], sums[m], row, y, x)
-                    m += 1
-                else:
-                    _change(gives, changes, d, own)
-                if covered and len(part) and not (len(crossed) and steps(crossed, y, x)):
-                    _part(gives, d, part, ends, y, x)
-                d += 1
+        d, m = offsets[y], firsts[y]
+        for x in range(marks.shape[1]):
+            if not marks[y, x]:
+                m += mixed[y, x]
+                continue
+            covered = row[0, y, x] >= 0
+            if covered:
+                beta[y, x] = positions.dtype.type(0)
+                if ends[y, x]:
+                    beta[y, x], partner[y, x] = _rule(positions, row, part, exits, ends, y, x, extent, rules)
+            if marks[y, x] == BESIDE:
+                m += mixed[y, x]
+                continue
+            columns[d] = x
+            given = JOINED if covered else SURFACE
+            own = _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, peak, gamma, given)
+            if mixed[y, x]:
+                _list(gives[d], changes[d], ranges[m], sums[m], row, y, x)
+                m += 1
+            else:
+                _change(gives, changes, d, own)
+            if covered and len(part) and not (len(crossed) and steps(crossed, y, x)):
+                _part(gives, d, part, ends, y, x)
+            d += 1
 
 
 # Not handed views of single targets, since to make and to count these takes as long as the work.

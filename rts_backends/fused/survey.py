@@ -5,15 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
-from rts_backends.fused.blocks import BLOCK, run
+
+BLOCK = 32
+"""Columns that share a note of whether hidden layers are near."""
 
 EMPTY, SETTLED, FLAT, BUSY = 0, 1, 2, 3
-"""Targets that no splat reaches, that are told to be of the colour of all, that are amid splats of one colour, and all
+"""Targets that no splat reaches, that are told to show the colour of all, that are amid splats of one colour, and all
 others."""
 
 
 @kernel
-def survey(start, stop, positions, rgba, row, live, fronts, reach, states, hidden, depths, seen, counts):
+def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, depths, seen, counts):
     """Find the states of the targets of rows [start, stop), and fill the other arrays that describe the cells.
 
     Args:
@@ -22,7 +24,6 @@ def survey(start, stop, positions, rgba, row, live, fronts, reach, states, hidde
         positions: (N, 3).
         rgba: (N, 4).
         row: (K, H, W).
-        live: (H, B), see `blocks.py`; what lies in other blocks stays as it is.
         fronts: whether only front layers count; otherwise those behind must be hidden by opaque ones.
         reach: pixels that a sample may lie off its cell's centre, so that the weights are sure to add up to one.
         states: (H, W) uint8, EMPTY or SETTLED, to be filled where they are EMPTY.
@@ -38,32 +39,23 @@ def survey(start, stop, positions, rgba, row, live, fronts, reach, states, hidde
     for y in range(start - 1, stop + 1):
         now, before = (y + 3) % 3, (y + 2) % 3
         covered[now], calm[now], joins[now] = 0, 0, 0
-        first, b = 0, 0 if 0 <= y < height else live.shape[1]
-        while b < live.shape[1]:
-            first, b = run(live[y], b)
-            left, right = first * BLOCK, min(b * BLOCK, width)
-            own, cells_there = slice(left, right), slice(left, right + 2)
-            above = row[0, max(y - 1, 0), own]
-            to = covered[now, cells_there], calm[now, cells_there], joins[now, cells_there]
-            _inspect(positions, rgba, row[0, y, own], above, left, y, fronts, reach, *to)
+        if 0 <= y < height:
+            above = row[0, max(y - 1, 0)]
+            _inspect(positions, rgba, row[0, y], above, y, fronts, reach, covered[now], calm[now], joins[now])
             for k in range(len(row)):
                 if k > 0 and not fronts:
-                    _cover(to[0], row[k, y, own])
+                    _cover(covered[now], row[k, y])
                 if start <= y < stop:
-                    counts[y] += _note(row[k, y, own], left, width, positions, k > 0, hidden[y], depths[y], seen)
-        b = 0 if y > start else live.shape[1]
-        while b < live.shape[1]:
-            first, b = run(live[y - 1], b)
-            left, right = first * BLOCK, min(b * BLOCK, width)
-            at, top = slice(left, right + 2), (y + 1) % 3
-            runs = calm[top, at], calm[before, at], calm[now, at]
-            own = states[y - 1, left:right]
-            _decide(own, covered[0, at], covered[1, at], covered[2, at], *runs, joins[before, at], joins[now, at])
+                    counts[y] += _note(row[k, y], positions, k > 0, hidden[y], depths[y], seen)
+        if y > start:
+            first = (y + 1) % 3
+            runs = calm[first], calm[before], calm[now]
+            _decide(states[y - 1], covered[0], covered[1], covered[2], *runs, joins[before], joins[now])
 
 
 @compiled
-def _inspect(positions, rgba, cells, above, left, y, fronts, reach, covered, calm, joins):
-    """Fill what is to be known of cells of a row from column `left` on; places are one to the right of the cells'."""
+def _inspect(positions, rgba, cells, above, y, fronts, reach, covered, calm, joins):
+    """Fill what is to be known of a row of cells; places are one to the right of the cells'."""
     kind = positions.dtype.type
     half, opaque, last, run = kind(0.5), kind(1), -1, 0
     for x in range(len(cells)):
@@ -72,7 +64,7 @@ def _inspect(positions, rgba, cells, above, left, y, fronts, reach, covered, cal
             run = 0
             continue
         covered[x + 1] = 1
-        centered = (abs(positions[i, 0] - (kind(left + x) + half)) <= reach) & (
+        centered = (abs(positions[i, 0] - (kind(x) + half)) <= reach) & (
             abs(positions[i, 1] - (kind(y) + half)) <= reach
         )
         if not (centered and (fronts or rgba[i, 3] == opaque)):
@@ -102,9 +94,9 @@ def _cover(covered, cells):
 
 
 @compiled
-def _note(cells, left, width, positions, behind, hidden, depths, seen):
-    """Take note of cells of a layer's row, from column `left` on; returns how many are covered."""
-    count = 0
+def _note(cells, positions, behind, hidden, depths, seen):
+    """Take note of a row of a layer; returns how many of its cells are covered."""
+    count, last = 0, len(cells) - 1
     least, largest = depths[0], depths[1]
     for x in range(len(cells)):
         i = cells[x]
@@ -113,7 +105,7 @@ def _note(cells, left, width, positions, behind, hidden, depths, seen):
             seen[i] = 1
             least, largest = min(least, positions[i, 2]), max(largest, positions[i, 2])
             if behind:
-                hidden[max(left + x - 1, 0) // BLOCK] = hidden[min(left + x + 1, width - 1) // BLOCK] = 1
+                hidden[max(x - 1, 0) // BLOCK] = hidden[min(x + 1, last) // BLOCK] = 1
     depths[0], depths[1] = least, largest
     return count
 
