@@ -95,7 +95,9 @@ def _draw(band, given, end, shift, nearest, triangle_ids, barycentrics):
     numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
     most, top = 4 * BLOCK, band * BAND_ROWS
     # What is left from a row, four of each small triangle, and one more row.
-    hits = np.empty((2 * most + nearest.shape[2], 2), np.int32)
+    room = 2 * most + nearest.shape[2]
+    hits, sure = np.empty((room, 2), np.int32), np.empty(room, np.bool_)
+    met = sure, np.empty(room), np.empty((2, room), np.float32)
     drawn = top, shift, entries, numbers, clips, nearest, triangle_ids, barycentrics
     for start in range(offsets[band], offsets[band + 1], BLOCK):
         block = items[start : min(offsets[band + 1], start + BLOCK)]
@@ -122,9 +124,9 @@ def _draw(band, given, end, shift, nearest, triangle_ids, barycentrics):
                     found += (ea >= 0) & (eb >= 0) & (ec >= 0)
                 place += 1
                 if found > most - 4:
-                    _insert(hits[: _asked(hits, found, top, bits)], drawn)
+                    _insert(hits[: _asked(hits, found, top, bits)], met, drawn)
                     found = 0
-        _insert(hits[: _asked(hits, found, top, bits)], drawn)
+        _insert(hits[: _asked(hits, found, top, bits)], met, drawn)
 
 
 @compiled
@@ -212,33 +214,48 @@ def _cover(count, entries, numbers, covers):
 
 
 @compiled(error_model="numpy")
-def _insert(hits, drawn):
+def _insert(hits, met, drawn):
     """Insert the block's triangles into the layers of pixels; hits (n, 2) are triangle and row of the band, column."""
     top, shift, entries, numbers, clips, nearest, triangle_ids, barycentrics = drawn
+    sure, depths, within = met
+    _meet(hits, np.uint32(top), numbers, clips, sure, depths, within)
     for h in range(len(hits)):
         place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
         b, row = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS)
         j = row + np.uint32(shift)
-        found, z, p, q = _met(b, i + 0.5, row + np.uint32(top) + 0.5, numbers, clips)
-        if found:
-            _put(z, entries[0, b], p, q, nearest[:, row, i], triangle_ids[:, j, i], barycentrics[:, j, i])
+        if sure[h] or _covers(b, i + 0.5, row + np.uint32(top) + 0.5, numbers, clips):
+            p, q = within[0, h], within[1, h]
+            _put(depths[h], entries[0, b], p, q, nearest[:, row, i], triangle_ids[:, j, i], barycentrics[:, j, i])
 
 
-@compiled(inline="always", error_model="numpy")
-def _met(b, x, y, numbers, clips):
-    """Whether triangle b of a block covers a point; and its depth and first two barycentrics there."""
-    xa, ya, wa = numbers[0, b], numbers[1, b], numbers[2, b]
-    xb, yb, wb = numbers[3, b], numbers[4, b], numbers[5, b]
-    xc, yc, wc = numbers[6, b], numbers[7, b], numbers[8, b]
-    ea, eb, ec = xa * x + (ya * y + wa), xb * x + (yb * y + wb), xc * x + (yc * y + wc)
-    found = True
+@compiled(error_model="numpy")
+def _meet(hits, top, numbers, clips, sure, depths, within):
+    """Fill in of each hit the depth (n,), the first two barycentrics (2, n), and whether it is surely one."""
+    for h in range(len(hits)):
+        place, x = np.uint32(hits[h, 0]), np.uint32(hits[h, 1]) + 0.5
+        b, y = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS) + top + 0.5
+        ea = numbers[0, b] * x + (numbers[1, b] * y + numbers[2, b])
+        eb = numbers[3, b] * x + (numbers[4, b] * y + numbers[5, b])
+        ec = numbers[6, b] * x + (numbers[7, b] * y + numbers[8, b])
+        total = ea + eb + ec
+        scale = 1 / total
+        depths[h] = (ea * numbers[9, b] + eb * numbers[10, b] + ec * numbers[11, b]) / total
+        within[0, h], within[1, h] = ea * scale, eb * scale
+        sure[h] = (ea > 0) & (eb > 0) & (ec > 0) & ~clips[b]
+
+
+@compiled
+def _covers(b, x, y, numbers, clips):
+    """Whether triangle b of a block covers a point that may lie on its edges, or where it is clipped."""
+    xa, ya, xb, yb, xc, yc = numbers[0, b], numbers[1, b], numbers[3, b], numbers[4, b], numbers[6, b], numbers[7, b]
+    ea, eb, ec = (
+        xa * x + (ya * y + numbers[2, b]),
+        xb * x + (yb * y + numbers[5, b]),
+        xc * x + (yc * y + numbers[8, b]),
+    )
     # Top and left edges own the pixels exactly on them (y points down).
-    if min(ea, eb, ec) == 0:
-        found = not ((ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc)))
-    total = ea + eb + ec
-    found = found and total > 0 and not (clips[b] and _outside(numbers, b, ea, eb, ec))
-    z, scale = (ea * numbers[9, b] + eb * numbers[10, b] + ec * numbers[11, b]) / total, 1 / total
-    return found, z, np.float32(ea * scale), np.float32(eb * scale)
+    lost = (ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc))
+    return not lost and ea + eb + ec > 0 and not (clips[b] and _outside(numbers, b, ea, eb, ec))
 
 
 @compiled(inline="always")
