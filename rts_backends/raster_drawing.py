@@ -225,7 +225,7 @@ def _insert(hits, met, drawn):
         j = row + np.uint32(shift)
         if sure[h] or _covers(b, i + 0.5, row + np.uint32(top) + 0.5, numbers, clips):
             p, q = within[0, h], within[1, h]
-            _put(depths[h], entries[0, b], p, q, nearest[:, row, i], triangle_ids[:, j, i], barycentrics[:, j, i])
+            _put(depths[h], entries[0, b], p, q, row, j, i, nearest, triangle_ids, barycentrics)
 
 
 @compiled(error_model="numpy")
@@ -259,15 +259,15 @@ def _covers(b, x, y, numbers, clips):
 
 
 @compiled(inline="always")
-def _put(z, t, p, q, nearest, triangle_ids, barycentrics):
-    """Put a hit into the layers (K,) of a cell: behind what is as near, before what is farther."""
-    moved = z  # A branch would be foreseen every other time.
+def _put(z, t, p, q, row, j, i, nearest, triangle_ids, barycentrics):
+    """Put a hit into the layers of a cell, at its row of `nearest` and of the rest: behind what is as near."""
     for k in range(len(nearest)):
-        old, old_t, old_p, old_q = nearest[k], triangle_ids[k], barycentrics[k, 0], barycentrics[k, 1]
-        before = z < old
-        nearest[k], triangle_ids[k] = moved if before else old, t if before else old_t
-        barycentrics[k, 0], barycentrics[k, 1] = p if before else old_p, q if before else old_q
-        moved, t = old if before else moved, old_t if before else t
+        old, old_t = nearest[k, row, i], triangle_ids[k, j, i]
+        old_p, old_q = barycentrics[k, j, i, 0], barycentrics[k, j, i, 1]
+        before = z < old  # A branch would be foreseen every other time.
+        nearest[k, row, i], triangle_ids[k, j, i] = z if before else old, t if before else old_t
+        barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = p if before else old_p, q if before else old_q
+        z, t = old if before else z, old_t if before else t
         p, q = old_p if before else p, old_q if before else q
 
 
