@@ -12,7 +12,6 @@ that they compile to vector instructions and no jump is mispredicted; what is ra
 
 from __future__ import annotations
 
-import math
 from typing import Any, Self
 
 import numpy as np
@@ -31,10 +30,9 @@ LONG_BLOCK = 256
 """The block for loops that keep little of each triangle or vertex."""
 
 LIMIT = np.float32(2**15 - 2)
-"""Steps from the middle of the image, outside of it; a position beyond is put there.
+"""Steps from the middle of the image to two pixels outside of it; a position beyond is put there.
 
-Positions on screen take 16 bits, so that those of a million triangles stay in caches. A pixel has 2ⁿ steps, so that
-whole numbers tell which pixels' centres are between two positions.
+Positions on screen take 16 bits, so that those of a million triangles stay in caches.
 """
 
 SIXTEEN, LOWER = np.int32(16), np.int32(2**16 - 1)
@@ -90,16 +88,14 @@ class Raster(TriangleSampler):
             screen, listed = scratch[1].pop()
         except IndexError:
             screen, listed = np.empty(len(vertices), np.int32), np.empty((len(faces), LISTED), np.int32)
-        # As many as there is room for, the last two beyond all centres.
-        shift = math.floor(math.log2((2 * float(LIMIT) - 4) / max(max(size) - 1, 1)))
-        step = 2.0**-shift
+        step = (max(size) / 2 + 2) / float(LIMIT)
         to_steps = np.diag([1 / step, 1 / step, 1, 1])
         to_steps[:2, 3] = -width / 2 / step, -height / 2 / step
         parallel(_project, len(vertices), vertices, to_steps @ matrix, screen, work=4 * len(vertices))
         chunks, bands = -(-len(faces) // CHUNK), -(-height // BAND_ROWS)
         spans, counts = np.empty((chunks, 2), np.int64), np.zeros((chunks, bands), np.int64)
         blocks = Blocks.everything() if cells is None else Blocks.of(cells, size)
-        given = vertices, faces, screen, matrix, height, width, shift, step, keep, blocks.bits
+        given = vertices, faces, screen, matrix, height, width, step, keep, blocks.bits
         parallel(_select, chunks, *given, listed, spans, counts, work=10 * len(faces))
         offsets = np.append(0, np.cumsum(counts.sum(axis=0)))
         places = offsets[:-1] + np.cumsum(counts, axis=0) - counts
@@ -145,13 +141,11 @@ def _project(start, stop, vertices, m, screen):
 
 
 @kernel(error_model="numpy")
-def _select(
-    first, last, vertices, faces, screen, matrix, height, width, shift, step, keep, bits, listed, spans, counts
-):
+def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, bits, listed, spans, counts):
     """List the triangles that may cover a pixel's centre, of those that `bits` of `Blocks` tell; and count them.
 
     Chunks of one call follow on each other in the list; `spans` (chunks, 2) says where each begins and ends, `counts`
-    (chunks, bands) how many of its triangles touch a band of rows; threads write to no memory that is beside.
+    (chunks, bands) how many of its triangles touch a band of rows, so that threads do not write side by side.
     """
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
@@ -167,20 +161,15 @@ def _select(
             block = faces[start : min(end, start + LONG_BLOCK)]
             for b in range(len(block)):
                 xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
-            _hold(len(block), xy, near, height, width, shift)
-            count = _listed(len(block), near, chosen)
-            for n in range(count):
-                b = chosen[n]
-                xy[0, n], xy[1, n], xy[2, n] = xy[0, b], xy[1, b], xy[2, b]
-            for n in range(count):
-                xa, ya = np.float32(np.int16(xy[0, n])), np.float32(np.int16(xy[0, n] >> SIXTEEN))
-                xb, yb = np.float32(np.int16(xy[1, n])), np.float32(np.int16(xy[1, n] >> SIXTEEN))
-                xc, yc = np.float32(np.int16(xy[2, n])), np.float32(np.int16(xy[2, n] >> SIXTEEN))
+            for b in range(len(block)):
+                xa, ya = np.float32(np.int16(xy[0, b])), np.float32(np.int16(xy[0, b] >> SIXTEEN))
+                xb, yb = np.float32(np.int16(xy[1, b])), np.float32(np.int16(xy[1, b] >> SIXTEEN))
+                xc, yc = np.float32(np.int16(xy[2, b])), np.float32(np.int16(xy[2, b] >> SIXTEEN))
                 x0, x1, y0, y1 = min(xa, xb, xc), max(xa, xb, xc), min(ya, yb, yc), max(ya, yb, yc)
                 i0, i1, j0, j1 = _centres(
                     x0 * step + middle, x1 * step + middle, y0 * step + center, y1 * step + center, height, width, step
                 )
-                box[0, n], box[1, n], box[2, n], box[3, n] = i0, i1, j0, j1
+                box[0, b], box[1, b], box[2, b], box[3, b] = i0, i1, j0, j1
                 # Where there is one centre, most triangles whose box holds it do not. Half of a mesh faces away.
                 x, y = (i0 + half - middle) / step, (j0 + half - center) / step
                 ax, ay, bx, by, cx, cy = xa - x, ya - y, xb - x, yb - y, xc - x, yc - y
@@ -190,15 +179,16 @@ def _select(
                 bound = more * (x1 - x0 + y1 - y0 + four)
                 away = (ea + eb + ec) * sign < -(bound + bound)
                 placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
-                clips[n] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)
+                clips[b] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)
                 missed = ((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound) & (i0 == i1) & (j0 == j1)) | away
-                near[n] = clips[n] | ((i0 <= i1) & (j0 <= j1) & ~(placed & missed))
-            for n in range(count):
-                if not near[n]:
-                    continue
-                b = chosen[n]
-                i0, i1, j0, j1 = box[0, n], box[1, n], box[2, n], box[3, n]
-                if clips[n]:
+                near[b] = clips[b] | ((i0 <= i1) & (j0 <= j1) & ~(placed & missed))
+            count = 0
+            for b in range(len(block)):
+                chosen[count] = b
+                count += near[b]
+            for b in chosen[:count]:
+                i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
+                if clips[b]:
                     for c in range(3):
                         to_corner(matrix, vertices, block[b, c], corners, c)
                     x0, x1, y0, y1 = _clipped_box(corners, width, height)
@@ -214,35 +204,6 @@ def _select(
                 for band in range(int(j0) // BAND_ROWS, int(j1) // BAND_ROWS + 1):
                     counts[chunk, band] += 1
         spans[chunk, 1] = found
-
-
-@compiled(inline="always")
-def _hold(count, xy, near, height, width, shift):
-    """Whether the boxes of triangles with corners `xy` (3, ·) may hold a pixel's centre, or are clipped."""
-    # From the middle to the centre nearest to it; where a pixel has no two steps, all are near.
-    bits = np.int32(max(shift, 0))
-    half = np.int32(1) << bits >> np.int32(1)
-    right, below = half * np.int32(1 - width % 2), half * np.int32(1 - height % 2)
-    one, two, before, beyond = np.int32(1), np.int32(2), np.int32(BEFORE), np.int32(BEYOND)
-    for b in range(count):
-        a, c, d = xy[0, b], xy[1, b], xy[2, b]
-        xa, xb, xc = a << SIXTEEN >> SIXTEEN, c << SIXTEEN >> SIXTEEN, d << SIXTEEN >> SIXTEEN
-        ya, yb, yc = a >> SIXTEEN, c >> SIXTEEN, d >> SIXTEEN
-        x0, x1, y0, y1 = min(xa, xb, xc), max(xa, xb, xc), min(ya, yb, yc), max(ya, yb, yc)
-        holds = (x1 + one - right >> bits != x0 - two - right >> bits) & (
-            y1 + one - below >> bits != y0 - two - below >> bits
-        )
-        near[b] = holds | ((x1 == before) & (x0 < before)) | ((x0 == beyond) & (x1 > beyond))
-
-
-@compiled(inline="always")
-def _listed(count, near, chosen):
-    """List the triangles that are near; how many there are."""
-    found = 0
-    for b in range(count):
-        chosen[found] = b
-        found += near[b]
-    return found
 
 
 @compiled
