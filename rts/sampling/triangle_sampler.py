@@ -17,8 +17,9 @@ from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSur
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines
+from rts.sampling.extremes import largest
 from rts.sampling.facing import facing as facing_of
-from rts.sampling.packing import largest, lift, repack
+from rts.sampling.packing import lift, repack
 from rts.sampling.settling import on_surface, refined
 from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
