@@ -37,10 +37,9 @@ class Blocks(NamedTuple):
         count = _fill(np.ascontiguousarray(cells, np.int32).reshape(-1), width, table, numbers, bits)
         return cls(table, numbers[:count], bits)
 
-    @classmethod
-    def everything(cls) -> Blocks:
-        """What stands for all cells: no blocks, and no bits."""
-        return cls(np.empty((0, 0), np.int32), np.empty((0, SIDE, SIDE), np.int32), np.empty((0, 0), np.uint16))
+
+EVERYTHING = Blocks(np.empty((0, 0), np.int32), np.empty((0, SIDE, SIDE), np.int32), np.empty((0, 0), np.uint16))
+"""What stands for all cells: no blocks, and no bits."""
 
 
 @kernel

@@ -10,6 +10,7 @@ import numpy as np
 
 from rts.compiling import compiled, kernel
 from rts_backends import raster_cells
+from rts_backends.raster_cells import touches
 from rts_backends.triangles import owns
 
 BAND_ROWS = raster_cells.SIDE
@@ -23,16 +24,21 @@ NUMBERS = 18
 
 
 @kernel(error_model="numpy")
-def draw(first, last, offsets, items, listed, vertices, matrix, view_depth, keep, bits, fragments):
-    """Fill the three fragment arrays, band by band; `bits` are those of `Blocks` for all cells."""
+def draw(first, last, listed, vertices, matrix, view_depth, bits, fragments):
+    """Fill the three fragment arrays, band by band.
+
+    `listed` is the sign of determinants to draw, where the items of each band begin, these, and what is known of each
+    triangle; `bits` are those of `Blocks` for all cells.
+    """
     triangle_ids, barycentrics, depths = fragments
     layers, height, width = triangle_ids.shape
     nearest = np.empty((layers, BAND_ROWS, width))
-    given = offsets, items, listed, vertices, matrix, view_depth, keep, bits
+    keep, offsets, items, rows = listed
+    given = rows, vertices, matrix, view_depth, keep, bits
     for band in range(first, last):
         top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
         nearest[:], triangle_ids[:, top:end], barycentrics[:, top:end] = np.inf, -1, 0
-        _draw(band, given, end, top, nearest, triangle_ids, barycentrics)
+        _draw(items[offsets[band] : offsets[band + 1]], given, top, end, top, nearest, triangle_ids, barycentrics)
         for k in range(layers):
             for j in range(top, end):
                 for i in range(width):
@@ -41,9 +47,7 @@ def draw(first, last, offsets, items, listed, vertices, matrix, view_depth, keep
 
 
 @kernel(error_model="numpy")
-def draw_cells(
-    first, last, offsets, items, listed, vertices, matrix, view_depth, keep, bits, table, numbers, fragments
-):
+def draw_cells(first, last, listed, vertices, matrix, view_depth, bits, table, numbers, fragments):
     """As `draw`, of some cells: arrays (K, M) are of their list; `bits`, `table` and `numbers` are those of `Blocks`.
 
     Each band is drawn as a picture, of which only what is near such cells is touched.
@@ -52,14 +56,16 @@ def draw_cells(
     layers, height, width = len(triangle_ids), len(bits), table.shape[1] * BAND_ROWS
     nearest, drawn = np.empty((layers, BAND_ROWS, width)), np.empty((layers, BAND_ROWS, width), np.int32)
     within = np.empty((layers, BAND_ROWS, width, 2), np.float32)
-    given = offsets, items, listed, vertices, matrix, view_depth, keep, bits
+    keep, offsets, items, rows = listed
+    given = rows, vertices, matrix, view_depth, keep, bits
     for band in range(first, last):
         top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
         for j in range(top, end):
             for column in range(table.shape[1]):
                 if bits[j, column] != 0:
                     _clear(column * BAND_ROWS, nearest[:, j - top], drawn[:, j - top], within[:, j - top])
-        _draw(band, given, end, 0, nearest, drawn, within)
+        here = items[offsets[band] : offsets[band + 1]]
+        _draw(here[: _touching(here, rows, top, end, bits)], given, top, end, 0, nearest, drawn, within)
         for j in range(top, end):
             for column in range(table.shape[1]):
                 if bits[j, column] == 0:
@@ -76,6 +82,17 @@ def draw_cells(
 
 
 @compiled
+def _touching(items, rows, top, end, bits):
+    """Put those triangles of a band first that touch cells which are asked for; how many there are."""
+    count = 0
+    for n in items:
+        j0, j1 = max(rows[n, 6], top), min(rows[n, 7], end - 1)
+        items[count] = n
+        count += touches(bits, np.uint32(rows[n, 4]), np.uint32(rows[n, 5]), np.uint32(j0), np.uint32(j1))
+    return count
+
+
+@compiled
 def _clear(first, nearest, triangle_ids, barycentrics):
     """Empty the layers (K, W) of as many cells of a row as a block has."""
     for k in range(len(nearest)):
@@ -85,23 +102,23 @@ def _clear(first, nearest, triangle_ids, barycentrics):
 
 
 @compiled(error_model="numpy")
-def _draw(band, given, end, shift, nearest, triangle_ids, barycentrics):
-    """Insert the triangles of a band, whose last row is the one before `end`, into layers of pixels.
+def _draw(items, given, top, end, shift, nearest, triangle_ids, barycentrics):
+    """Insert the triangles of a band of rows from `top` to the one before `end` into layers of pixels.
 
     Arrays (K, ·, ·) begin with row `shift` of the band's; `nearest` with its first.
     """
-    offsets, items, listed, vertices, matrix, view_depth, keep, bits = given
+    rows, vertices, matrix, view_depth, keep, bits = given
     entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
     numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
-    most, top = 4 * BLOCK, band * BAND_ROWS
+    most = 4 * BLOCK
     # What is left from a row, four of each small triangle, and one more row.
     room = 2 * most + nearest.shape[2]
     hits, sure = np.empty((room, 2), np.int32), np.empty(room, np.bool_)
     met = sure, np.empty(room), np.empty((2, room), np.float32)
     drawn = top, shift, entries, numbers, clips, nearest, triangle_ids, barycentrics
-    for start in range(offsets[band], offsets[band + 1], BLOCK):
-        block = items[start : min(offsets[band + 1], start + BLOCK)]
-        _gather(block, listed, vertices, entries, points)
+    for start in range(0, len(items), BLOCK):
+        block = items[start : start + BLOCK]
+        _gather(block, rows, vertices, entries, points)
         _set_up(len(block), points, matrix, view_depth, keep, top, end - 1, entries, numbers, clips)
         _cover(len(block), entries, numbers, covers)
         found = 0
@@ -146,14 +163,14 @@ def _asked(hits, found, top, bits):
 
 
 @compiled(inline="always")
-def _gather(block, listed, vertices, entries, points):
+def _gather(block, rows, vertices, entries, points):
     """What is listed of the triangles (LISTED, BLOCK), and their corners (3, 3, BLOCK).
 
     The loops are so short that the processor overlaps their waits for memory.
     """
     for b in range(len(block)):
         for r in range(LISTED):
-            entries[r, b] = listed[block[b], r]
+            entries[r, b] = rows[block[b], r]
     for b in range(len(block)):
         for c in range(3):
             v = np.uint32(entries[1 + c, b])

@@ -109,6 +109,35 @@ class TriangleSampler(Sampler):
         ids = np.where(there, whole.triangle_ids.reshape(layers, -1)[:, at], -1)
         return Fragments(ids, whole.barycentrics.reshape(layers, -1, 2)[:, at], whole.depth.reshape(layers, -1)[:, at])
 
+    def rasterize_exits(
+        self,
+        prepared: Any,
+        camera: Camera,
+        size: tuple[int, int],
+        layers: int,
+        beside: Callable[[Fragments], np.ndarray],
+    ) -> tuple[Fragments, np.ndarray, Fragments]:
+        """`rasterize` with cull="back", and what is seen from behind in some cells; where a class `tells_exits`.
+
+        The default calls `rasterize` and `rasterize_cells`, which look at all triangles anew.
+
+        Args:
+            prepared: see `rasterize`.
+            camera: see `rasterize`.
+            size: see `rasterize`.
+            layers: see `rasterize`.
+            beside: gives the cells (1, M) int32, flat indices in the grid, of the fragments (K, H, W).
+
+        Returns:
+            Fragments (K, H, W), the cells, and the fragments (1, 1, M) of cull="front" in these.
+        """
+        fragments = self.rasterize(prepared, camera, size, layers, "back")
+        cells = beside(fragments)
+        backs = _no_fragments((1, *cells.shape))
+        if cells.size:
+            backs = self.rasterize_cells(prepared, camera, size, 1, "front", cells)
+        return fragments, cells, backs
+
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
         """See `Sampler`: the proxy of a part, and what is prepared of it."""
         surface = _of_triangles(part.surface)
@@ -332,16 +361,19 @@ class TriangleSampler(Sampler):
             return fragments
 
         def all_of(found: Entry) -> tuple[Entry, Fragments, np.ndarray | None, Exits | None]:
-            fragments = drawn(found)
-            if keep is None:
-                return found, fragments, None, None
-            kept = keep(fragments)
-            beside = beside_outlines(kept)
-            backs = _no_fragments((1, *beside.shape))
-            if beside.size:
-                backs = self.rasterize_cells(found.prepared, camera, view, 1, "front", beside)
-                check_fragments(backs, (1, *beside.shape), len(found.proxy.faces), self)
-            return found, fragments, kept, Exits.of(fragments, beside, backs)
+            if keep is None or not (count := len(found.proxy.faces)):
+                return found, drawn(found), None, None if keep is None else Exits.none()
+            kept = None
+
+            def beside(fragments: Fragments) -> np.ndarray:
+                nonlocal kept
+                check_fragments(fragments, grid, count, self)
+                kept = keep(fragments)
+                return beside_outlines(kept)
+
+            fragments, asked, backs = self.rasterize_exits(found.prepared, camera, view, grid[0], beside)
+            check_fragments(backs, (1, *asked.shape), count, self)
+            return found, fragments, kept, Exits.of(fragments, asked, backs)
 
         with self._keeper.lock:
             found = entry or self._entry(surface, inputs, camera, view)
