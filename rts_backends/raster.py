@@ -23,7 +23,7 @@ from rts.compiling import compiled, kernel
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel, read_only
-from rts_backends.raster_cells import EVERYTHING, Blocks, touches
+from rts_backends.raster_cells import EVERYTHING, Blocks, touching
 from rts_backends.raster_drawing import BAND_ROWS, LISTED, draw, draw_cells
 from rts_backends.triangles import facing, pixel_matrix, to_corner
 
@@ -267,18 +267,20 @@ def _list(chunk, start, block, near, box, clips, chosen, given, found, made):
     for b in range(len(block)):
         chosen[count] = b
         count += near[b]
+    left = 0
     for b in chosen[:count]:
-        i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
         if clips[b]:
             corners = np.empty((3, 4))
             for c in range(3):
                 to_corner(matrix, vertices, block[b, c], corners, c)
             x0, x1, y0, y1 = _clipped_box(corners, width, height)
-            i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
-            if i0 > i1 or j0 > j1:
-                continue
-        if len(bits) > 0 and not touches(bits, np.uint32(i0), np.uint32(i1), np.uint32(j0), np.uint32(j1)):
-            continue
+            box[0, b], box[1, b], box[2, b], box[3, b] = _centres(x0, x1, y0, y1, height, width, step)
+        chosen[left] = b
+        left += (box[0, b] <= box[1, b]) & (box[2, b] <= box[3, b])
+    if len(bits) > 0:
+        left = touching(chosen[:left], box, 0, height, bits)
+    for b in chosen[:left]:
+        i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
         listed[found, 0] = start + b
         listed[found, 1], listed[found, 2], listed[found, 3] = block[b, 0], block[b, 1], block[b, 2]
         listed[found, 4], listed[found, 5], listed[found, 6], listed[found, 7] = i0, i1, j0, j1

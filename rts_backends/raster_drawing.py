@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.compiling import compiled, kernel
 from rts_backends import raster_cells
-from rts_backends.raster_cells import touches
+from rts_backends.raster_cells import touching
 from rts_backends.triangles import owns
 
 BAND_ROWS = raster_cells.SIDE
@@ -65,7 +65,8 @@ def draw_cells(first, last, listed, vertices, matrix, view_depth, bits, table, n
                 if bits[j, column] != 0:
                     _clear(column * BAND_ROWS, nearest[:, j - top], drawn[:, j - top], within[:, j - top])
         here = items[offsets[band] : offsets[band + 1]]
-        _draw(here[: _touching(here, rows, top, end, bits)], given, top, end, 0, nearest, drawn, within)
+        here = here[: touching(here, rows[:, 4:].T, top, end, bits)]
+        _draw(here, given, top, end, 0, nearest, drawn, within)
         for j in range(top, end):
             for column in range(table.shape[1]):
                 if bits[j, column] == 0:
@@ -79,17 +80,6 @@ def draw_cells(first, last, listed, vertices, matrix, view_depth, bits, table, n
                         triangle_ids[k, m], depths[k, m] = drawn[k, j - top, i], z if z < np.inf else 0.0
                         barycentrics[k, m, 0] = within[k, j - top, i, 0]
                         barycentrics[k, m, 1] = within[k, j - top, i, 1]
-
-
-@compiled
-def _touching(items, rows, top, end, bits):
-    """Put those triangles of a band first that touch cells which are asked for; how many there are."""
-    count = 0
-    for n in items:
-        j0, j1 = max(rows[n, 6], top), min(rows[n, 7], end - 1)
-        items[count] = n
-        count += touches(bits, np.uint32(rows[n, 4]), np.uint32(rows[n, 5]), np.uint32(j0), np.uint32(j1))
-    return count
 
 
 @compiled
