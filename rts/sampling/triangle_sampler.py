@@ -363,12 +363,12 @@ class TriangleSampler(Sampler):
         def all_of(found: Entry) -> tuple[Entry, Fragments, np.ndarray | None, Exits | None]:
             if keep is None or not (count := len(found.proxy.faces)):
                 return found, drawn(found), None, None if keep is None else Exits.none()
-            kept = None
+            wanted, kept = keep, None
 
             def beside(fragments: Fragments) -> np.ndarray:
                 nonlocal kept
                 check_fragments(fragments, grid, count, self)
-                kept = keep(fragments)
+                kept = wanted(fragments)
                 return beside_outlines(kept)
 
             fragments, asked, backs = self.rasterize_exits(found.prepared, camera, view, grid[0], beside)
