@@ -24,13 +24,6 @@ class Exits(NamedTuple):
     there: np.ndarray
 
     @classmethod
-    def none(cls) -> Exits:
-        """No exits, in no cells."""
-        shape = 1, 1, 0
-        nothing = Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
-        return cls(np.empty((1, 0), np.int32), nothing, np.empty(shape, np.bool_))
-
-    @classmethod
     def of(cls, fragments: Fragments, cells: np.ndarray, backs: Fragments) -> Exits:
         """The exits among backs (1, 1, M), those that do not lie before the fronts of fragments (K, H, W)."""
         front = fragments.depth[0].reshape(-1)[cells]

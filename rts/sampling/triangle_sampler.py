@@ -361,8 +361,12 @@ class TriangleSampler(Sampler):
             return fragments
 
         def all_of(found: Entry) -> tuple[Entry, Fragments, np.ndarray | None, Exits | None]:
-            if keep is None or not (count := len(found.proxy.faces)):
-                return found, drawn(found), None, None if keep is None else Exits.none()
+            if keep is None:
+                return found, drawn(found), None, None
+            if not (count := len(found.proxy.faces)):
+                fragments = drawn(found)
+                nowhere = np.empty((1, 0), np.int32)
+                return found, fragments, None, Exits.of(fragments, nowhere, _no_fragments((1, 1, 0)))
             wanted, kept = keep, None
 
             def beside(fragments: Fragments) -> np.ndarray:
@@ -372,7 +376,8 @@ class TriangleSampler(Sampler):
                 return beside_outlines(kept)
 
             fragments, asked, backs = self.rasterize_exits(found.prepared, camera, view, grid[0], beside)
-            check_fragments(backs, (1, *asked.shape), count, self)
+            if asked.size:
+                check_fragments(backs, (1, *asked.shape), count, self)
             return found, fragments, kept, Exits.of(fragments, asked, backs)
 
         with self._keeper.lock:
