@@ -218,11 +218,8 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
     """
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
-    chosen, other = np.empty(LONG_BLOCK, np.uint32), np.empty(LONG_BLOCK, np.bool_)
-    step, sign = np.float32(step), np.float32(keep)
-    more = np.float32(1.25)
-    middle, center, half, four = np.float32(width / 2), np.float32(height / 2), np.float32(0.5), np.float32(4)
-    given = vertices, matrix, height, width, step, bits
+    chosen, sign = np.empty(LONG_BLOCK, np.uint32), np.float32(keep)
+    step, given = np.float32(step), (vertices, matrix, height, width, np.float32(step), bits)
     found = opposite = first * CHUNK
     for chunk in range(first, last):
         fronts[1][chunk, 0], backs[1][chunk, 0] = found, opposite
@@ -231,33 +228,40 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
             block = faces[start : min(end, start + LONG_BLOCK)]
             for b in range(len(block)):
                 xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
-            for b in range(len(block)):
-                xa, ya = np.float32(np.int16(xy[0, b])), np.float32(np.int16(xy[0, b] >> SIXTEEN))
-                xb, yb = np.float32(np.int16(xy[1, b])), np.float32(np.int16(xy[1, b] >> SIXTEEN))
-                xc, yc = np.float32(np.int16(xy[2, b])), np.float32(np.int16(xy[2, b] >> SIXTEEN))
-                x0, x1, y0, y1 = min(xa, xb, xc), max(xa, xb, xc), min(ya, yb, yc), max(ya, yb, yc)
-                i0, i1, j0, j1 = _centres(
-                    x0 * step + middle, x1 * step + middle, y0 * step + center, y1 * step + center, height, width, step
-                )
-                box[0, b], box[1, b], box[2, b], box[3, b] = i0, i1, j0, j1
-                # Where there is one centre, most triangles whose box holds it do not. Half of a mesh faces away.
-                x, y = (i0 + half - middle) / step, (j0 + half - center) / step
-                ax, ay, bx, by, cx, cy = xa - x, ya - y, xb - x, yb - y, xc - x, yc - y
-                ea, eb, ec = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
-                # Rounding changes coordinates by half a step at most, so these by the sum of the box's sides and 2.5,
-                # and their sum by twice that. The rest is for the centre, which is rounded to a hundredth.
-                bound = more * (x1 - x0 + y1 - y0 + four)
-                area = (ea + eb + ec) * sign
-                placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
-                clips[b] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)
-                missed = (min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound) & (i0 == i1) & (j0 == j1)
-                holds = (i0 <= i1) & (j0 <= j1)
-                near[b] = clips[b] | (holds & ~(placed & (missed | (area < -(bound + bound)))))
-                other[b] = clips[b] | (holds & ~(placed & (missed | (area > bound + bound))))
+            _look(len(block), xy, height, width, step, sign, box, clips, near)
             found = _list(chunk, start, block, near, box, clips, chosen, given, found, fronts)
             if len(backs[0]) > 0:
-                opposite = _list(chunk, start, block, other, box, clips, chosen, given, opposite, backs)
+                _look(len(block), xy, height, width, step, -sign, box, clips, near)
+                opposite = _list(chunk, start, block, near, box, clips, chosen, given, opposite, backs)
         fronts[1][chunk, 1], backs[1][chunk, 1] = found, opposite
+
+
+@compiled(inline="always", error_model="numpy")
+def _look(count, xy, height, width, step, sign, box, clips, near):
+    """Fill in the box of pixels of each triangle, whether it is clipped, and whether it may cover a pixel's centre."""
+    more, half, four = np.float32(1.25), np.float32(0.5), np.float32(4)
+    middle, center = np.float32(width / 2), np.float32(height / 2)
+    for b in range(count):
+        xa, ya = np.float32(np.int16(xy[0, b])), np.float32(np.int16(xy[0, b] >> SIXTEEN))
+        xb, yb = np.float32(np.int16(xy[1, b])), np.float32(np.int16(xy[1, b] >> SIXTEEN))
+        xc, yc = np.float32(np.int16(xy[2, b])), np.float32(np.int16(xy[2, b] >> SIXTEEN))
+        x0, x1, y0, y1 = min(xa, xb, xc), max(xa, xb, xc), min(ya, yb, yc), max(ya, yb, yc)
+        i0, i1, j0, j1 = _centres(
+            x0 * step + middle, x1 * step + middle, y0 * step + center, y1 * step + center, height, width, step
+        )
+        box[0, b], box[1, b], box[2, b], box[3, b] = i0, i1, j0, j1
+        # Where there is one centre, most triangles whose box holds it do not. Half of a mesh faces away.
+        x, y = (i0 + half - middle) / step, (j0 + half - center) / step
+        ax, ay, bx, by, cx, cy = xa - x, ya - y, xb - x, yb - y, xc - x, yc - y
+        ea, eb, ec = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
+        # Rounding changes coordinates by half a step at most, so these by the sum of the box's sides and 2.5,
+        # and their sum by twice that. The rest is for the centre, which is rounded to a hundredth.
+        bound = more * (x1 - x0 + y1 - y0 + four)
+        away = (ea + eb + ec) * sign < -(bound + bound)
+        placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
+        clips[b] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)
+        missed = ((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound) & (i0 == i1) & (j0 == j1)) | away
+        near[b] = clips[b] | ((i0 <= i1) & (j0 <= j1) & ~(placed & missed))
 
 
 @compiled
@@ -269,20 +273,21 @@ def _list(chunk, start, block, near, box, clips, chosen, given, found, made):
     for b in range(len(block)):
         chosen[count] = b
         count += near[b]
-    left = 0
+    if len(bits) > 0:
+        for b in chosen[:count]:
+            if clips[b]:  # Where it is comes below.
+                box[0, b], box[1, b], box[2, b], box[3, b] = 0, width - 1, 0, height - 1
+        count = touching(chosen[:count], box, 0, height, bits)
     for b in chosen[:count]:
+        i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
         if clips[b]:
             corners = np.empty((3, 4))
             for c in range(3):
                 to_corner(matrix, vertices, block[b, c], corners, c)
             x0, x1, y0, y1 = _clipped_box(corners, width, height)
-            box[0, b], box[1, b], box[2, b], box[3, b] = _centres(x0, x1, y0, y1, height, width, step)
-        chosen[left] = b
-        left += (box[0, b] <= box[1, b]) & (box[2, b] <= box[3, b])
-    if len(bits) > 0:
-        left = touching(chosen[:left], box, 0, height, bits)
-    for b in chosen[:left]:
-        i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
+            i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
+            if i0 > i1 or j0 > j1:
+                continue
         listed[found, 0] = start + b
         listed[found, 1], listed[found, 2], listed[found, 3] = block[b, 0], block[b, 1], block[b, 2]
         listed[found, 4], listed[found, 5], listed[found, 6], listed[found, 7] = i0, i1, j0, j1
