@@ -264,7 +264,7 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
         near[b] = clips[b] | ((i0 <= i1) & (j0 <= j1) & ~(placed & missed))
 
 
-@compiled
+@compiled(inline="always")
 def _list(chunk, start, block, near, box, clips, chosen, given, found, made):
     """List the triangles of a block that are near, from a place on; what comes after is the next place."""
     vertices, matrix, height, width, step, bits = given
