@@ -162,10 +162,10 @@ class _Seen:
     def draw_cells(self, listed: _List, layers: int, cells: np.ndarray, blocks: Blocks) -> Fragments:
         """Fragments (layers, L, C) of some cells, which the blocks are of."""
         fragments = _empty((layers, *cells.shape))
-        if (absent := cells < 0).any():
-            for x, nothing in zip(fragments, (-1, 0, 0), strict=True):
-                x[:, absent] = nothing
         flat = tuple(x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments)
+        absent = np.flatnonzero(cells.reshape(-1) < 0)
+        for x, nothing in zip(flat, (-1, 0, 0), strict=True):
+            x[:, absent] = nothing
         given = self.vertices, self.matrix, self.depth_row, blocks.bits, blocks.table, blocks.numbers
         parallel(draw_cells, len(listed.offsets) - 1, listed, *given, flat)
         return fragments

@@ -61,7 +61,8 @@ def test_one_look_at_all_triangles_finds_what_two_find(eye):
     vertices, faces = BALL
     raster = rts.plugin("rts.samplers", "raster")()
     heap = np.concatenate([0.3 * vertices + shift for shift in ((0, 0, 0), (0.4, 0.3, 0.1), (-0.3, 0.1, 0.5))])
-    mesh = rts.Proxy(heap.astype(np.float32), np.concatenate([faces + k * len(vertices) for k in range(3)]).astype(np.int32))
+    all_faces = np.concatenate([faces + k * len(vertices) for k in range(3)])
+    mesh = rts.Proxy(heap.astype(np.float32), all_faces.astype(np.int32))
     camera = rts.Camera.look_at(eye, (0, 0, 0), fov_y=40, near=0.3).for_size((SIZE, SIZE))
     camera = camera.map(lambda m: np.asarray(m, np.float64))
     given = mesh, camera, (SIZE, SIZE), 2, lambda fragments: beside_outlines(fragments.triangle_ids >= 0)

@@ -226,7 +226,7 @@ class TriangleSampler(Sampler):
         shader = adapted(part.shader, Shader)
         asked = None if shader is None else shader.reads
         wanted: Needed | None = None if needed is None else adapted(needed, Needed)
-        settles = wanted is not None and wanted.settles and cells is None and not surface.refines
+        settles = wanted is not None and wanted.settles and not surface.refines
         attributes = _attribute_specs(surface, asked, host_theta, shape, like)
 
         transform = [] if part.transform is None else [part.transform]
@@ -254,7 +254,7 @@ class TriangleSampler(Sampler):
             )
 
         sides = [ArraySpec((layers, *shape.size), np.int16)] if tells else []
-        amid = [ArraySpec(size, np.bool_)] if settles else []
+        amid = [ArraySpec(shape.size, np.bool_)] if settles else []
         behind = [ArraySpec(size, np.int32)] if exits else []
         specs = *shape.specs(surface.sample_widths), *sides, *amid, *behind, *tables.values(), *attributes.values()
         results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *listed, *leaves(inputs))
@@ -313,7 +313,7 @@ class TriangleSampler(Sampler):
                     # Vertices that were looked at as a part of θ need not be looked at again.
                     read = any(np.may_share_memory(x, found.proxy.vertices) for x in leaves(inputs))
                     size = needed.size if read and needed.size is not None else largest(found.proxy.vertices)
-                if needed.settles and cells is None:
+                if needed.settles:
                     settled = needed.settled(covered, fragments.depth, kept, size)
             sides = None
             if tells:
@@ -321,6 +321,8 @@ class TriangleSampler(Sampler):
                 pieces = checked_pieces(surface, found.proxy) if kept[1:].any() else np.zeros(1, np.int16)
                 sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
             if not surface.refines:
+                if size is not None and needed is not None and needed.size is not None and size <= needed.size:
+                    size = 0.0  # Where numbers of this size are too large all is kept already.
                 lifted = lift(fragments, found.proxy, shape.capacity, kept, size, behind)
                 return replace(lifted, facing=sides, settled=settled)
             lifted = lift(fragments, found.proxy, None, kept)

@@ -19,11 +19,11 @@ from rts.splatting.kernel import LEAST_EPSILON
 from rts.splatting.layers import OFFSETS, check_rows
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only
+from rts_backends.fused import blocks, crossing_pairs, crossings, mixed, outlines, stencil
 from rts_backends.fused import choices as listing
-from rts_backends.fused import crossing_pairs, crossings, mixed, outlines, stencil
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
-from rts_backends.fused.survey import BLOCK, FLAT, collect, paint, survey
+from rts_backends.fused.survey import collect, paint, survey
 
 
 class Settings(NamedTuple):
@@ -59,6 +59,7 @@ class Choices(NamedTuple):
             (u + 1) lies at −(u, v), and the buffers are in front, at the surface, behind.
         sums: (M, 3, 5), of each buffer the colours over the weight, taken as at least one, and the weight.
         states: (H, W) uint8, states of targets (`survey.py`); mixed ones are EMPTY here.
+        live: (H, B) uint8, the blocks of columns near which there are samples (`blocks.py`).
         repeated: whether a sample stands in several cells, which would add to its gradient at the same time.
         extent: of the depths, the camera's included.
     """
@@ -69,6 +70,7 @@ class Choices(NamedTuple):
     ranges: np.ndarray
     sums: np.ndarray
     states: np.ndarray
+    live: np.ndarray
     repeated: bool
     extent: float
 
@@ -120,8 +122,11 @@ class Cells:
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
         self.exits = read_only(np.empty((0, row.shape[2])) if exits is None else exits, np.int32)
         self.facing = read_only(self.row[:0] if facing is None else facing, np.int16)
-        self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
         self.settled = read_only(np.empty((0, row.shape[2])) if settled is None else settled, np.bool_)
+        self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
+        if self._wanted is not None and len(self.settled):
+            # Beside settled targets those that nobody looks at may lack their samples, and seem to end there.
+            self._wanted = self._wanted & ~self.settled
         self.visible, self.border = settings.kind == "visible", settings.border
         self.rims = self.visible and settings.rims
         self.crosses = self.visible and settings.crossings
@@ -160,19 +165,19 @@ class Cells:
         """What is decided for each target."""
         layers, height, width = self.row.shape
         count, kind = len(self.positions), self.positions.dtype
-        states, counts = np.empty((height, width), np.uint8), np.zeros(height, np.int64)
-        hidden, seen = np.zeros((height, -(-width // BLOCK)), np.uint8), np.zeros(count, np.uint8)
+        live = blocks.live(self.row)
+        # The codes of targets that are not settled, and that are.
+        states = self.settled.astype(np.uint8) if len(self.settled) else np.zeros((height, width), np.uint8)
+        hidden, seen, counts = np.zeros_like(live), np.zeros(count, np.uint8), np.zeros(height, np.int64)
         depths = np.zeros((height, 2), kind)
         fronts = self.visible or layers == 1
         noted = states, hidden, depths, seen, counts
-        given = self.positions, self.rgba, self.row, fronts, self._reach
-        parallel(survey, height, *given, *noted, work=2 * self.row.size)
+        given = self.positions, self.rgba, self.row, live, fronts, self._reach
+        parallel(survey, height, *given, *noted, work=2 * blocks.BLOCK * np.count_nonzero(live))
         repeated = int(np.count_nonzero(seen)) != int(counts.sum())
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
         if self._wanted is not None:
-            states *= self._wanted
-        if len(self.settled):
-            states[self.settled] = FLAT
+            states *= self._wanted | self.settled if len(self.settled) else self._wanted
         least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
         # See `rts.splatting.layers`: nothing is nearer to what is beyond everything than to a front.
         extent = largest - least
@@ -196,17 +201,17 @@ class Cells:
             given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states
             arrays = self.positions, self.rgba, self.row, *self._numbers
             parallel(listing.choose, height, *arrays, *given, work=500 * len(columns))
-        return Choices(marks, offsets, columns, ranges, sums, states, repeated, extent)
+        return Choices(marks, offsets, columns, ranges, sums, states, live, repeated, extent)
 
     @cached_property
     def outlines(self) -> Outlines:
         """How outlines move, and what that changes; nothing without rims."""
         _, height, width = self.row.shape
         choices, kind, counts = self.choices, self.positions.dtype, np.zeros(height, np.int64)
-        ends, marks = np.empty((height, width), np.uint16), np.empty((height, width), np.uint8)
+        ends, marks = np.zeros((height, width), np.uint16), np.zeros((height, width), np.uint8)
         if self.rims:
             listed = choices.mixed, choices.offsets, choices.columns, choices.ranges
-            given = self.positions, self.row, self._reach, choices.states, *listed, ends, marks, counts
+            given = self.positions, self.row, choices.live, self._reach, choices.states, *listed, ends, marks, counts
             parallel(outlines.find, height, *given, work=2 * self.row[0].size)
             if self._wanted is not None:
                 found, marks = marks, np.empty_like(marks)
@@ -225,7 +230,7 @@ class Cells:
             rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
             arrays = self.positions, self.rgba, self.row, *self._numbers
             decide = self.part, self.exits, kind.type(choices.extent), rules, self._pairs
-            listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
+            listed = choices.live, choices.mixed, choices.ranges, choices.sums, choices.offsets
             given = *arrays, *decide, *listed, ends, marks
             parallel(outlines.fill, height, *given, found, work=150 * len(found.columns))
         return found
@@ -245,21 +250,13 @@ class Cells:
         arrays = self.positions, self.rgba, self.row, *self._numbers
         return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent), self._pairs)
 
-    @cached_property
-    def drawn(self) -> np.ndarray:
-        """(H, W) uint8, states of targets that are drawn from their sources: settled ones are EMPTY."""
-        states = self.choices.states
-        return states * ~self.settled if len(self.settled) else states
-
     def image(self, out: np.ndarray) -> None:
         """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""
         if out.size:
-            given = *self.plain_arguments, self.drawn, self.border
+            given = *self.plain_arguments, self.choices.states, self.border
             parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
             if len(self.choices.columns):
                 parallel(mixed.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10)
-            if len(self.settled):
-                parallel(paint, len(out), self.settled, self.border, self.rgba[:1], out[None], work=out.size // 8)
 
     def vjp(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
         """Fill the gradients of positions (N, 3) and rgba (N, 4), zeros or None, from the image's (H, W, 4)."""
@@ -288,7 +285,7 @@ class Cells:
             own = g.copy()
             crossings.hide(self.crossings, self.border, own)
             own = read_only(own)
-        plain = *self.plain_arguments, self.drawn, self.border
+        plain = *self.plain_arguments, self.choices.states, self.border
         parallel(stencil.pull, height, *plain, own, *found, work=self._plain_work)
         if crossed:
             self._pull_mixed(own, found[0], found[1][:0])
@@ -316,7 +313,7 @@ class Cells:
             read_only(np.empty((len(out), 0, size), out.dtype) if t is None else t)
             for t, size in ((t_positions, 3), (t_rgba, 4))
         )
-        parallel(stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.drawn, self.border, out)
+        parallel(stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.choices.states, self.border, out)
         if len(self.choices.columns):
             given = *self.mixed_arguments, self.choices.sums, tangents, self.border
             parallel(mixed.push, out.shape[1], *given, out, work=self._mixed_work * len(out))

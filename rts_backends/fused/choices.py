@@ -12,8 +12,9 @@ import numpy as np
 
 from rts.compiling import compiled, kernel
 from rts.records import MORE
+from rts_backends.fused.blocks import BLOCK
 from rts_backends.fused.mixed import sums_of
-from rts_backends.fused.survey import BLOCK, BUSY, EMPTY
+from rts_backends.fused.survey import BUSY, EMPTY
 
 
 @compiled
@@ -169,7 +170,7 @@ def choose(
     shift = np.empty(9, np.int64)
     for y in range(start, stop):
         d = offsets[y]
-        for x in range(width):
+        for x in range(width if d < offsets[y + 1] else 0):
             if not mixed[y, x]:
                 continue
             columns[d], states[y, x] = x, EMPTY

@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
+from rts_backends.fused.blocks import BLOCK, run
 
-BLOCK = 32
-"""Columns that share a note of whether hidden layers are near."""
-
-EMPTY, FLAT, BUSY = 0, 1, 2
-"""Targets that no splat reaches, that are amid splats of one colour, and all others."""
+EMPTY, SETTLED, FLAT, BUSY = 0, 1, 2, 3
+"""Targets that no splat reaches, that are told to be of the colour of all, that are amid splats of one colour, and all
+others."""
 
 
 @kernel
-def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, depths, seen, counts):
+def survey(start, stop, positions, rgba, row, live, fronts, reach, states, hidden, depths, seen, counts):
     """Find the states of the targets of rows [start, stop), and fill the other arrays that describe the cells.
 
     Args:
@@ -23,9 +22,10 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, dep
         positions: (N, 3).
         rgba: (N, 4).
         row: (K, H, W).
+        live: (H, B), see `blocks.py`; what lies in other blocks stays as it is.
         fronts: whether only front layers count; otherwise those behind must be hidden by opaque ones.
         reach: pixels that a sample may lie off its cell's centre, so that the weights are sure to add up to one.
-        states: (H, W) uint8, to be filled.
+        states: (H, W) uint8, EMPTY or SETTLED, to be filled where they are EMPTY.
         hidden: (H, B) uint8, zeros, to be marked: the blocks of columns in or beside which hidden layers are covered.
         depths: (H, 2) zeros, for the least and the largest depth of each row, and zero.
         seen: (N,) uint8, zeros, to be marked: samples that some cell refers to.
@@ -38,23 +38,32 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, dep
     for y in range(start - 1, stop + 1):
         now, before = (y + 3) % 3, (y + 2) % 3
         covered[now], calm[now], joins[now] = 0, 0, 0
-        if 0 <= y < height:
-            above = row[0, max(y - 1, 0)]
-            _inspect(positions, rgba, row[0, y], above, y, fronts, reach, covered[now], calm[now], joins[now])
+        first, b = 0, 0 if 0 <= y < height else live.shape[1]
+        while b < live.shape[1]:
+            first, b = run(live[y], b)
+            left, right = first * BLOCK, min(b * BLOCK, width)
+            own, cells_there = slice(left, right), slice(left, right + 2)
+            above = row[0, max(y - 1, 0), own]
+            to = covered[now, cells_there], calm[now, cells_there], joins[now, cells_there]
+            _inspect(positions, rgba, row[0, y, own], above, left, y, fronts, reach, *to)
             for k in range(len(row)):
                 if k > 0 and not fronts:
-                    _cover(covered[now], row[k, y])
+                    _cover(to[0], row[k, y, own])
                 if start <= y < stop:
-                    counts[y] += _note(row[k, y], positions, k > 0, hidden[y], depths[y], seen)
-        if y > start:
-            first = (y + 1) % 3
-            runs = calm[first], calm[before], calm[now]
-            _decide(states[y - 1], covered[0], covered[1], covered[2], *runs, joins[before], joins[now])
+                    counts[y] += _note(row[k, y, own], left, width, positions, k > 0, hidden[y], depths[y], seen)
+        b = 0 if y > start else live.shape[1]
+        while b < live.shape[1]:
+            first, b = run(live[y - 1], b)
+            left, right = first * BLOCK, min(b * BLOCK, width)
+            at, top = slice(left, right + 2), (y + 1) % 3
+            runs = calm[top, at], calm[before, at], calm[now, at]
+            own = states[y - 1, left:right]
+            _decide(own, covered[0, at], covered[1, at], covered[2, at], *runs, joins[before, at], joins[now, at])
 
 
 @compiled
-def _inspect(positions, rgba, cells, above, y, fronts, reach, covered, calm, joins):
-    """Fill what is to be known of a row of cells; places are one to the right of the cells'."""
+def _inspect(positions, rgba, cells, above, left, y, fronts, reach, covered, calm, joins):
+    """Fill what is to be known of cells of a row from column `left` on; places are one to the right of the cells'."""
     kind = positions.dtype.type
     half, opaque, last, run = kind(0.5), kind(1), -1, 0
     for x in range(len(cells)):
@@ -63,7 +72,7 @@ def _inspect(positions, rgba, cells, above, y, fronts, reach, covered, calm, joi
             run = 0
             continue
         covered[x + 1] = 1
-        centered = (abs(positions[i, 0] - (kind(x) + half)) <= reach) & (
+        centered = (abs(positions[i, 0] - (kind(left + x) + half)) <= reach) & (
             abs(positions[i, 1] - (kind(y) + half)) <= reach
         )
         if not (centered and (fronts or rgba[i, 3] == opaque)):
@@ -93,9 +102,9 @@ def _cover(covered, cells):
 
 
 @compiled
-def _note(cells, positions, behind, hidden, depths, seen):
-    """Take note of a row of a layer; returns how many of its cells are covered."""
-    count, last = 0, len(cells) - 1
+def _note(cells, left, width, positions, behind, hidden, depths, seen):
+    """Take note of cells of a layer's row, from column `left` on; returns how many are covered."""
+    count = 0
     least, largest = depths[0], depths[1]
     for x in range(len(cells)):
         i = cells[x]
@@ -104,7 +113,7 @@ def _note(cells, positions, behind, hidden, depths, seen):
             seen[i] = 1
             least, largest = min(least, positions[i, 2]), max(largest, positions[i, 2])
             if behind:
-                hidden[max(x - 1, 0) // BLOCK] = hidden[min(x + 1, last) // BLOCK] = 1
+                hidden[max(left + x - 1, 0) // BLOCK] = hidden[min(left + x + 1, width - 1) // BLOCK] = 1
     depths[0], depths[1] = least, largest
     return count
 
@@ -115,7 +124,7 @@ def _decide(states, covered0, covered1, covered2, calm0, calm1, calm2, joins1, j
         some = covered0[x] | covered0[x + 1] | covered0[x + 2] | covered1[x] | covered1[x + 1] | covered1[x + 2]
         some |= covered2[x] | covered2[x + 1] | covered2[x + 2]
         flat = calm0[x + 1] & calm1[x + 1] & calm2[x + 1] & joins1[x + 1] & joins2[x + 1]
-        states[x] = (some << 1) - flat
+        states[x] = SETTLED if states[x] == SETTLED else (some << 1 | some) - flat
 
 
 @kernel
