@@ -17,7 +17,8 @@ from rts.interfaces import AnyNeeded, CheckedPart, Needed, Splatter, TriangleSur
 from rts.operations.operation import known_value
 from rts.records import ArraySpec, Sampled, Samples
 from rts.sampling.exits import beside_outlines
-from rts.sampling.packing import largest, too_far
+from rts.sampling.extremes import largest
+from rts.sampling.packing import too_far
 from rts.trees import leaves
 
 LAYER_LIMIT = 8

@@ -17,8 +17,9 @@ from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSur
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines
+from rts.sampling.extremes import largest
 from rts.sampling.facing import facing as facing_of
-from rts.sampling.packing import largest, lift, repack
+from rts.sampling.packing import lift, repack
 from rts.sampling.settling import on_surface, refined
 from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
@@ -107,6 +108,35 @@ class TriangleSampler(Sampler):
         at = np.where(there, cells, 0)
         ids = np.where(there, whole.triangle_ids.reshape(layers, -1)[:, at], -1)
         return Fragments(ids, whole.barycentrics.reshape(layers, -1, 2)[:, at], whole.depth.reshape(layers, -1)[:, at])
+
+    def rasterize_exits(
+        self,
+        prepared: Any,
+        camera: Camera,
+        size: tuple[int, int],
+        layers: int,
+        beside: Callable[[Fragments], np.ndarray],
+    ) -> tuple[Fragments, np.ndarray, Fragments]:
+        """`rasterize` with cull="back", and what is seen from behind in some cells; where a class `tells_exits`.
+
+        The default calls `rasterize` and `rasterize_cells`, which look at all triangles anew.
+
+        Args:
+            prepared: see `rasterize`.
+            camera: see `rasterize`.
+            size: see `rasterize`.
+            layers: see `rasterize`.
+            beside: gives the cells (1, M) int32, flat indices in the grid, of the fragments (K, H, W).
+
+        Returns:
+            Fragments (K, H, W), the cells, and the fragments (1, 1, M) of cull="front" in these.
+        """
+        fragments = self.rasterize(prepared, camera, size, layers, "back")
+        cells = beside(fragments)
+        backs = _no_fragments((1, *cells.shape))
+        if cells.size:
+            backs = self.rasterize_cells(prepared, camera, size, 1, "front", cells)
+        return fragments, cells, backs
 
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
         """See `Sampler`: the proxy of a part, and what is prepared of it."""
@@ -333,16 +363,24 @@ class TriangleSampler(Sampler):
             return fragments
 
         def all_of(found: Entry) -> tuple[Entry, Fragments, np.ndarray | None, Exits | None]:
-            fragments = drawn(found)
             if keep is None:
-                return found, fragments, None, None
-            kept = keep(fragments)
-            beside = beside_outlines(kept)
-            backs = _no_fragments((1, *beside.shape))
-            if beside.size:
-                backs = self.rasterize_cells(found.prepared, camera, view, 1, "front", beside)
-                check_fragments(backs, (1, *beside.shape), len(found.proxy.faces), self)
-            return found, fragments, kept, Exits.of(fragments, beside, backs)
+                return found, drawn(found), None, None
+            if not (count := len(found.proxy.faces)):
+                fragments = drawn(found)
+                nowhere = np.empty((1, 0), np.int32)
+                return found, fragments, None, Exits.of(fragments, nowhere, _no_fragments((1, 1, 0)))
+            wanted, kept = keep, None
+
+            def beside(fragments: Fragments) -> np.ndarray:
+                nonlocal kept
+                check_fragments(fragments, grid, count, self)
+                kept = wanted(fragments)
+                return beside_outlines(kept)
+
+            fragments, asked, backs = self.rasterize_exits(found.prepared, camera, view, grid[0], beside)
+            if asked.size:
+                check_fragments(backs, (1, *asked.shape), count, self)
+            return found, fragments, kept, Exits.of(fragments, asked, backs)
 
         with self._keeper.lock:
             found = entry or self._entry(surface, inputs, camera, view)
