@@ -1,0 +1,124 @@
+"""Which kernels ordinary calls need, found by such calls on small pictures, which Python interprets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from rts import compiling, registry
+from rts.camera import Camera
+from rts.checks import check_splatter
+from rts.compiling import Need
+from rts.engines import engine_named
+from rts.evaluating import to_splats
+from rts.interfaces import Part
+from rts.operations.operation import Operation
+from rts.operations.rigid import rigid
+from rts.rendering import render
+from rts.sampling.adaptive import Adaptive
+from rts.sampling.scenes import Scene, sample
+from rts.threads import read_only
+
+SIZE = (8, 10)
+
+
+def routes() -> Iterator[dict[int, Need]]:
+    """What each kind of call needs, by number, in the order in which it needs it; more ordinary kinds come first."""
+    for kind, count in ROUTES:
+        with compiling.interpreting() as needs, np.errstate(all="ignore"):
+            kind(_parts()[:count])
+        yield needs
+
+
+def _camera() -> Camera:
+    return Camera.look_at((0.3, 0.8, 3), (0, 0, 0), fov_y=40)
+
+
+def _parts() -> list[Part]:
+    """Two octahedra that pass through one another, so that all that splatters distinguish is there."""
+    corners = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
+    faces = [(0, 1, 2), (1, 3, 2), (3, 4, 2), (4, 0, 2), (1, 0, 5), (3, 1, 5), (4, 3, 5), (0, 4, 5)]
+    surface = registry.plugin("rts.surfaces", "mesh")(np.array(faces))
+    color = np.array([0.2, 0.5, 0.8], np.float32)
+    theta = [{"vertices": corners * 0.9, "color": color}, {"vertices": corners[:, ::-1] * 0.7 + 0.3, "color": color}]
+    return [Part(surface, each, shader) for each, shader in zip(theta, ("lambert", "silhouette"), strict=True)]
+
+
+@dataclass
+class _Tape:
+    """What operations have been called with, while NumPy stands for an engine that differentiates."""
+
+    pushes: bool
+    calls: list[tuple[Operation, Sequence[np.ndarray], Any, dict]] = field(default_factory=list)
+
+    def apply(self, operation: Operation, operands: Sequence[np.ndarray], params: Any) -> np.ndarray:
+        """The value; the derivative along a direction too, if it pushes."""
+        # Constants have the dtype of what is differentiated.
+        operands = [read_only(x, np.float32 if x.dtype == np.float64 else None) for x in operands]
+        value, kept = operation.value_on_host(operands, dict(params))
+        self.calls.append((operation, operands, kept, dict(params)))
+        if self.pushes:
+            tangents = [read_only(np.zeros((1, *x.shape), x.dtype)) for x in operands[: operation.differentiable]]
+            operation.push_on_host(operands, tangents, np.empty((1, *value.shape), value.dtype), kept, dict(params))
+        return value
+
+    def pull(self) -> None:
+        """Go back through all calls, as for a gradient."""
+        for operation, operands, kept, params in reversed(self.calls):
+            g = read_only(np.zeros(operation.shape(*(x.shape for x in operands), **params), operands[0].dtype))
+            results = [np.zeros(x.shape, x.dtype) for x in operands[: operation.differentiable]]
+            operation.pull_on_host(operands, g, results, kept, params)
+
+
+@contextmanager
+def _differentiating(pushes: bool = False) -> Iterator[_Tape]:
+    """Have NumPy stand for an engine that differentiates."""
+    engine, tape = engine_named("numpy"), _Tape(pushes)
+    engine.__dict__.update(differentiates=True, apply=tape.apply)
+    try:
+        yield tape
+    finally:
+        del engine.__dict__["differentiates"], engine.__dict__["apply"]
+
+
+def _render(parts: list[Part]) -> None:
+    render(parts, _camera(), SIZE)
+
+
+def _gradient_of_vertices(parts: list[Part]) -> None:
+    with _differentiating() as tape:
+        _render(parts)
+        tape.pull()
+
+
+def _gradient_of_pose(parts: list[Part]) -> None:
+    with _differentiating() as tape:
+        _render(_posed(parts))
+        tape.pull()
+
+
+def _posed(parts: list[Part]) -> list[Part]:
+    return [part.replace(transform=rigid(np.zeros(6, np.float32))) for part in parts]
+
+
+def _least_squares(parts: list[Part]) -> None:
+    with _differentiating(pushes=True):
+        parts = _posed(parts)
+        splatter, camera = check_splatter("auto"), _camera().for_size(SIZE)
+        sampled = sample(parts, camera, SIZE, splatter=splatter, settles=True)
+        scene = Scene.of(parts, camera, "auto", None).at(SIZE)
+        splats = to_splats(sampled, scene.parts, camera, camera, *scene.suited)
+        t_positions, t_rgba = (np.zeros((1, *x.shape), x.dtype) for x in (splats.positions, splats.rgba))
+        splatter.normal_equations(splats, t_positions, t_rgba, np.zeros((*SIZE, 4), np.float32))
+
+
+def _adaptive(parts: list[Part]) -> None:
+    render(parts, _camera(), SIZE, supersample=Adaptive(2))
+
+
+_KINDS = _render, _gradient_of_vertices, _gradient_of_pose, _least_squares, _adaptive
+ROUTES = tuple((kind, count) for count in (1, 2) for kind in _KINDS)
