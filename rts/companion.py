@@ -16,12 +16,15 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from rts.threads import thread_count
+
+if TYPE_CHECKING:
+    from rts.compiling import Need
 
 try:
     import fcntl
@@ -54,7 +57,7 @@ def end(key: int) -> None:
 
 def _may_start() -> bool:
     return (
-        fcntl is not None
+        SHARED
         and os.environ.get(SWITCH) != "0"
         and thread_count() > 1
         # Where others do the same work, there are no idle cores.
@@ -71,6 +74,10 @@ def _started() -> _Companion | bool:
         return _Companion()
     except (OSError, RuntimeError):  # No more processes, files, or threads; or the interpreter is about to end.
         return False
+
+
+SHARED = fcntl is not None
+"""Whether processes can tell one another what they compile."""
 
 
 class Claims:
@@ -98,12 +105,12 @@ class Claims:
             fcntl.lockf(self.file, fcntl.LOCK_UN, 1, key)
 
 
-def process(claims: Claims, everything: bool = False, **options: Any) -> subprocess.Popen:
+def process(claims: Claims | None, everything: bool = False, **options: Any) -> subprocess.Popen:
     """Start a process that compiles: what it is told is missing, and what goes with it, or everything.
 
     It ends when its standard input does.
     """
-    number = claims.file.fileno()
+    number = -1 if claims is None else claims.file.fileno()
     command = [sys.executable, "-P", "-c", f"from rts.companion import serve; serve({number}, {everything})"]
     own = {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "RTS_NUM_THREADS": "1", SWITCH: "0"}
     return subprocess.Popen(
@@ -111,7 +118,7 @@ def process(claims: Claims, everything: bool = False, **options: Any) -> subproc
         env=os.environ | own,
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
-        pass_fds=[number],
+        pass_fds=[] if claims is None else [number],
         start_new_session=True,  # What interrupts this process is not for it.
         **options,
     )
@@ -122,44 +129,41 @@ class _Companion:
 
     def __init__(self) -> None:
         self.claims = Claims(tempfile.TemporaryFile(buffering=0))
-        self._process = process(self.claims, stderr=open("/tmp/cold/err.txt","w"), bufsize=0)
+        self._start()
         atexit.register(self.stop)
         os.register_at_fork(after_in_child=self._forget)
 
     def begin(self, key: int) -> bool:
         """See `begin`."""
-        stdin = self._process.stdin
-        assert stdin is not None
-        try:
-            if not stdin.closed:
-                stdin.write(b"%d\n" % key)
-        except OSError:  # It has ended.
+        if self._process.poll() == 0:  # It had nothing to do for long.
             self.stop()
+            self._start()
+        with contextlib.suppress(OSError):  # Where it has failed, this process is alone.
+            self._to.write(b"%d\n" % key)
         if not self.claims.take(key):
             self.claims.wait(key)
         return True  # It may have been done before it was asked for.
 
     def stop(self) -> None:
         """End it, at once."""
-        stdin = self._process.stdin
-        assert stdin is not None
-        if stdin.closed:
-            return
-        stdin.close()
+        self._to.close()
         try:
             self._process.wait(2)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
 
+    def _start(self) -> None:
+        self._process = process(self.claims, stderr=subprocess.DEVNULL, bufsize=0)
+        assert self._process.stdin is not None
+        self._to = self._process.stdin
+
     def _forget(self) -> None:
         """In a fork of this process: the companion is not its own."""
         global _state
         _state = False
         atexit.unregister(self.stop)
-        stdin = self._process.stdin
-        assert stdin is not None
-        stdin.close()
+        self._to.close()
         self._process.returncode = 0  # Not to be waited for.
 
 
@@ -170,18 +174,19 @@ def serve(number: int, everything: bool) -> None:
     """Compile, one kernel after another, until there is nothing more to do or the standard input ends.
 
     Args:
-        number: of the file of the claims.
+        number: of the file of the claims; −1 if there is none.
         everything: whether to compile all that is known, and let errors through; else what goes with the kernels
             whose numbers come in.
     """
     missed: SimpleQueue[int] = SimpleQueue()
     threading.Thread(target=_listen, args=(missed,), daemon=True).start()
-    claims = Claims(os.fdopen(number, "r+b", buffering=0))
+    claims = None if number < 0 else Claims(os.fdopen(number, "r+b", buffering=0))
     for key, need in _all() if everything else _asked(missed):
-        if claims.take(key):
+        if claims is None or claims.take(key):
             with contextlib.nullcontext() if everything else contextlib.suppress(Exception):
                 need.kernel.compile(need.types)
-            claims.drop(key)
+            if claims is not None:
+                claims.drop(key)
 
 
 def _listen(missed: SimpleQueue[int]) -> None:
@@ -194,7 +199,8 @@ def _listen(missed: SimpleQueue[int]) -> None:
         os._exit(1)
 
 
-def _all() -> Iterator[tuple[int, Any]]:
+def _all() -> Iterator[tuple[int, Need]]:
+    """All that is known, by number, once."""
     from rts import rehearsal
 
     done: set[int] = set()
@@ -203,38 +209,47 @@ def _all() -> Iterator[tuple[int, Any]]:
         done |= route.keys()
 
 
-def _asked(missed: SimpleQueue[int]) -> Iterator[tuple[int, Any]]:
-    """What to compile next, with its number: of the first route that has all that was missed, from its end."""
+def _asked(missed: SimpleQueue[int]) -> Iterator[tuple[int, Need]]:
+    """What to compile next, by number, as long as something is missed now and then."""
     from rts import rehearsal
 
-    ahead, known = rehearsal.routes(), []
-    seen: list[int] = []
-    done: set[int] = set()
-    idle = False
+    ahead = rehearsal.routes()
+    known, seen, done = [next(ahead)], [missed.get()], set[int]()
     while True:
-        try:
+        with contextlib.suppress(Empty):
             while True:
-                seen.append(missed.get(timeout=PATIENCE) if idle else missed.get_nowait())
-                idle = False
-        except Empty:
-            if idle:
-                return
-        route = _route(seen, known, ahead)
-        key = next((key for key in reversed(route) if key not in done and key not in seen), None)
-        if key is None:
-            idle = True
+                seen.append(missed.get_nowait())
+        if not known[0].keys() >= set(seen):
+            known.extend(ahead)
+        key, need = following(known, seen, done)
+        if need is not None:
+            done.add(key)
+            yield key, need
             continue
-        done.add(key)
-        yield key, route[key]
+        try:
+            seen.append(missed.get(timeout=PATIENCE))
+        except Empty:
+            return
 
 
-def _route(seen: list[int], known: list[dict[int, Any]], ahead: Iterator[dict[int, Any]]) -> dict[int, Any]:
-    """The first of all routes that has all that was seen, or else most; `known` grows as `ahead` is walked."""
-    for route in known:
-        if route.keys() >= set(seen):
-            return route
-    for route in ahead:
-        known.append(route)
-        if route.keys() >= set(seen):
-            return route
-    return max(known, key=lambda route: len(route.keys() & set(seen)))
+def following(routes: Sequence[dict[int, Need]], seen: Sequence[int], done: Container[int]) -> tuple[int, Need | None]:
+    """What a process will need last of what nobody has begun to compile; (0, None) if there is nothing.
+
+    Args:
+        routes: what each kind of call needs, in this order. Where it may be the first, it is taken to be; of the others
+            those that may be first have what they share compiled first.
+        seen: what that process has missed, in this order, and compiles itself.
+        done: what need not be compiled again.
+    """
+    told = [key for key in seen if any(key in route for route in routes)]
+    if not told:
+        return 0, None
+    # What was missed last is of the call that is going on.
+    known = [sum(key in route for key in told) if told[-1] in route else -1 for route in routes]
+    route, *others = (route for route, count in zip(routes, known, strict=True) if count == max(known))
+    ways = [route] if route is routes[0] else [{k: route[k] for k in route if all(k in r for r in others)}, route]
+    for way in ways:
+        for key in reversed(way):
+            if key not in seen and key not in done:
+                return key, way[key]
+    return 0, None
