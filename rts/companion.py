@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import multiprocessing
+import itertools
 import os
 import subprocess
 import sys
 import tempfile
 import threading
+import zlib
 from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -26,10 +27,8 @@ from rts.threads import thread_count
 if TYPE_CHECKING:
     from rts.compiling import Need
 
-try:
+if sys.platform != "win32":  # There each process compiles for itself.
     import fcntl
-except ImportError:  # Not on Windows; there each process compiles for itself.
-    fcntl = None
 
 SWITCH = "RTS_COMPILE_AHEAD"
 """The environment variable that, if it is 0, keeps this process from starting a companion."""
@@ -37,8 +36,29 @@ SWITCH = "RTS_COMPILE_AHEAD"
 PATIENCE = 30.0
 """Seconds after which a companion without anything to do ends."""
 
+SHARED = sys.platform != "win32"
+"""Whether processes can tell one another what they compile."""
+
+LEAST_SQUARES = "least squares"
+"""A kind of call that can be expected."""
+
 _state: _Companion | None | bool = None
 """The companion of this process; None before one was needed, False where there is none."""
+
+_expected: list[str] = []
+
+
+def number(name: str) -> int:
+    """A number for a name, the same in all processes."""
+    return zlib.crc32(name.encode())
+
+
+def expect(kind: str) -> None:
+    """Say what kind of call is going on, where its first kernels do not tell."""
+    if kind not in _expected:
+        _expected.append(kind)
+        if isinstance(_state, _Companion):
+            _state.tell(number(kind))
 
 
 def begin(key: int) -> bool:
@@ -62,11 +82,17 @@ def _may_start() -> bool:
         and thread_count() > 1
         # Where others do the same work, there are no idle cores.
         and "PYTEST_XDIST_WORKER" not in os.environ
-        and multiprocessing.parent_process() is None
+        and not _is_child()
         # Elsewhere the program is not Python: one that embeds it, or that was packed with it.
         and not getattr(sys, "frozen", False)
         and Path(sys.executable or "").name.lower().startswith(("python", "pypy"))
     )
+
+
+def _is_child() -> bool:
+    """Whether multiprocessing has started this process; it is imported there."""
+    module = sys.modules.get("multiprocessing.process")
+    return module is not None and module.parent_process() is not None
 
 
 def _started() -> _Companion | bool:
@@ -74,10 +100,6 @@ def _started() -> _Companion | bool:
         return _Companion()
     except (OSError, RuntimeError):  # No more processes, files, or threads; or the interpreter is about to end.
         return False
-
-
-SHARED = fcntl is not None
-"""Whether processes can tell one another what they compile."""
 
 
 class Claims:
@@ -110,15 +132,15 @@ def process(claims: Claims | None, everything: bool = False, **options: Any) -> 
 
     It ends when its standard input does.
     """
-    number = -1 if claims is None else claims.file.fileno()
-    command = [sys.executable, "-P", "-c", f"from rts.companion import serve; serve({number}, {everything})"]
+    descriptor = -1 if claims is None else claims.file.fileno()
+    command = [sys.executable, "-P", "-c", f"from rts.companion import serve; serve({descriptor}, {everything})"]
     own = {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "RTS_NUM_THREADS": "1", SWITCH: "0"}
     return subprocess.Popen(
         command,
         env=os.environ | own,
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
-        pass_fds=[] if claims is None else [number],
+        pass_fds=[] if claims is None else [descriptor],
         start_new_session=True,  # What interrupts this process is not for it.
         **options,
     )
@@ -138,11 +160,15 @@ class _Companion:
         if self._process.poll() == 0:  # It had nothing to do for long.
             self.stop()
             self._start()
-        with contextlib.suppress(OSError):  # Where it has failed, this process is alone.
-            self._to.write(b"%d\n" % key)
+        self.tell(key)
         if not self.claims.take(key):
             self.claims.wait(key)
         return True  # It may have been done before it was asked for.
+
+    def tell(self, key: int) -> None:
+        """Hand it a number; where it has failed, this process is alone."""
+        with contextlib.suppress(OSError):
+            self._to.write(b"%d\n" % key)
 
     def stop(self) -> None:
         """End it, at once."""
@@ -157,6 +183,8 @@ class _Companion:
         self._process = process(self.claims, stderr=subprocess.DEVNULL, bufsize=0)
         assert self._process.stdin is not None
         self._to = self._process.stdin
+        for kind in _expected:
+            self.tell(number(kind))
 
     def _forget(self) -> None:
         """In a fork of this process: the companion is not its own."""
@@ -170,17 +198,17 @@ class _Companion:
 # ------------------------------------------------------------------------------------------- within the other process
 
 
-def serve(number: int, everything: bool) -> None:
+def serve(descriptor: int, everything: bool) -> None:
     """Compile, one kernel after another, until there is nothing more to do or the standard input ends.
 
     Args:
-        number: of the file of the claims; −1 if there is none.
+        descriptor: of the file of the claims; −1 if there is none.
         everything: whether to compile all that is known, and let errors through; else what goes with the kernels
             whose numbers come in.
     """
     missed: SimpleQueue[int] = SimpleQueue()
     threading.Thread(target=_listen, args=(missed,), daemon=True).start()
-    claims = None if number < 0 else Claims(os.fdopen(number, "r+b", buffering=0))
+    claims = None if descriptor < 0 else Claims(os.fdopen(descriptor, "r+b", buffering=0))
     for key, need in _all() if everything else _asked(missed):
         if claims is None or claims.take(key):
             with contextlib.nullcontext() if everything else contextlib.suppress(Exception):
@@ -204,8 +232,8 @@ def _all() -> Iterator[tuple[int, Need]]:
     from rts import rehearsal
 
     done: set[int] = set()
-    for route in rehearsal.routes():
-        yield from ((key, need) for key, need in route.items() if key not in done)
+    for route in itertools.chain.from_iterable(rehearsal.routes()):
+        yield from ((key, need) for key, need in route.items() if need is not None and key not in done)
         done |= route.keys()
 
 
@@ -214,13 +242,13 @@ def _asked(missed: SimpleQueue[int]) -> Iterator[tuple[int, Need]]:
     from rts import rehearsal
 
     ahead = rehearsal.routes()
-    known, seen, done = [next(ahead)], [missed.get()], set[int]()
+    known, seen, done = next(ahead), [missed.get()], set[int]()
     while True:
         with contextlib.suppress(Empty):
             while True:
                 seen.append(missed.get_nowait())
-        if not known[0].keys() >= set(seen):
-            known.extend(ahead)
+        while not any(route.keys() >= set(seen) for route in known) and (more := next(ahead, None)):
+            known += more
         key, need = following(known, seen, done)
         if need is not None:
             done.add(key)
@@ -232,7 +260,9 @@ def _asked(missed: SimpleQueue[int]) -> Iterator[tuple[int, Need]]:
             return
 
 
-def following(routes: Sequence[dict[int, Need]], seen: Sequence[int], done: Container[int]) -> tuple[int, Need | None]:
+def following(
+    routes: Sequence[dict[int, Need | None]], seen: Sequence[int], done: Container[int]
+) -> tuple[int, Need | None]:
     """What a process will need last of what nobody has begun to compile; (0, None) if there is nothing.
 
     Args:
@@ -250,6 +280,6 @@ def following(routes: Sequence[dict[int, Need]], seen: Sequence[int], done: Cont
     ways = [route] if route is routes[0] else [{k: route[k] for k in route if all(k in r for r in others)}, route]
     for way in ways:
         for key in reversed(way):
-            if key not in seen and key not in done:
+            if key not in seen and key not in done and way[key] is not None:
                 return key, way[key]
     return 0, None

@@ -12,7 +12,6 @@ import gc
 import sys
 import threading
 import time
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -39,7 +38,7 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
 
     def decorate(function: Callable) -> Any:
         made = numba.njit(**options)(function)
-        if isinstance(made, Dispatcher):  # It is the function itself where compilation is switched off.
+        if made is not function:  # As it is where compilation is switched off.
             made._cache = _Cache(function)
         return _interpreted(made)
 
@@ -77,7 +76,7 @@ class _Cache(FunctionCache):
 
 def _key(function: Callable, types: Any) -> int:
     """A number for a function and the types of its arguments, the same in all processes."""
-    return zlib.crc32(f"{function.__module__}.{function.__qualname__} {types}".encode())
+    return companion.number(f"{function.__module__}.{function.__qualname__} {types}")
 
 
 # ------------------------------------------------------------------------------------- what would have to be compiled
@@ -124,7 +123,7 @@ def _interpreted(made: Any) -> Any:
         needs.setdefault(_key(function, types), Need(made, types))
         return function(*args)
 
-    stand_in = noted if isinstance(made._cache, _Cache) else function
+    stand_in = noted if isinstance(getattr(made, "_cache", None), _Cache) else function
     _stand_ins[stand_in] = made
     return stand_in
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rts import compiling, registry
+from rts import companion, compiling, registry
 from rts.camera import Camera
 from rts.checks import check_splatter
 from rts.compiling import Need
@@ -23,15 +23,25 @@ from rts.sampling.adaptive import Adaptive
 from rts.sampling.scenes import Scene, sample
 from rts.threads import read_only
 
-SIZE = (8, 10)
+SIZES = {1: (8, 10), 2: (24, 32)}
+"""Of pictures of one part and of two, which are to cross; Python takes a tenth of a second, and one."""
 
 
-def routes() -> Iterator[dict[int, Need]]:
-    """What each kind of call needs, by number, in the order in which it needs it; more ordinary kinds come first."""
-    for kind, count in ROUTES:
-        with compiling.interpreting() as needs, np.errstate(all="ignore"):
-            kind(_parts()[:count])
-        yield needs
+def routes() -> Iterator[list[dict[int, Need | None]]]:
+    """What kinds of calls need, by number, in the order in which they need it; ordinary kinds first, a few at a time.
+
+    Those that `companion.expect` knows have the number of their name, too, of no kernel.
+    """
+    yield [_route(_render, 1)]
+    yield [_route(kind, 1) for kind in KINDS[1:]]
+    yield [_route(kind, 2) for kind in KINDS]
+
+
+def _route(kind: Callable[[list[Part], tuple[int, int]], None], count: int) -> dict[int, Need | None]:
+    with compiling.interpreting() as needs, np.errstate(all="ignore"):
+        kind(_parts()[:count], SIZES[count])
+    name = {companion.number(companion.LEAST_SQUARES): None} if kind is _least_squares else {}
+    return {**name, **needs}
 
 
 def _camera() -> Camera:
@@ -77,7 +87,8 @@ class _Tape:
 @contextmanager
 def _differentiating(pushes: bool = False) -> Iterator[_Tape]:
     """Have NumPy stand for an engine that differentiates."""
-    engine, tape = engine_named("numpy"), _Tape(pushes)
+    engine: Any = engine_named("numpy")
+    tape = _Tape(pushes)
     engine.__dict__.update(differentiates=True, apply=tape.apply)
     try:
         yield tape
@@ -85,40 +96,39 @@ def _differentiating(pushes: bool = False) -> Iterator[_Tape]:
         del engine.__dict__["differentiates"], engine.__dict__["apply"]
 
 
-def _render(parts: list[Part]) -> None:
-    render(parts, _camera(), SIZE)
+def _render(parts: list[Part], size: tuple[int, int]) -> None:
+    render(parts, _camera(), size)
 
 
-def _gradient_of_vertices(parts: list[Part]) -> None:
+def _gradient_of_vertices(parts: list[Part], size: tuple[int, int]) -> None:
     with _differentiating() as tape:
-        _render(parts)
+        _render(parts, size)
         tape.pull()
 
 
-def _gradient_of_pose(parts: list[Part]) -> None:
+def _gradient_of_pose(parts: list[Part], size: tuple[int, int]) -> None:
     with _differentiating() as tape:
-        _render(_posed(parts))
+        _render(_posed(parts), size)
         tape.pull()
+
+
+def _least_squares(parts: list[Part], size: tuple[int, int]) -> None:
+    with _differentiating(pushes=True):
+        splatter, camera = check_splatter("auto"), _camera().for_size(size)
+        parts = _posed(parts)
+        sampled = sample(parts, camera, size, splatter=splatter, settles=True)
+        scene = Scene.of(parts, camera, "auto", None).at(size)
+        splats = to_splats(sampled, scene.parts, camera, camera, *scene.suited)
+        t_positions, t_rgba = (np.zeros((1, *x.shape), x.dtype) for x in (splats.positions, splats.rgba))
+        splatter.normal_equations(splats, t_positions, t_rgba, np.zeros((*size, 4), np.float32))
+
+
+def _adaptive(parts: list[Part], size: tuple[int, int]) -> None:
+    render(parts, _camera(), size, supersample=Adaptive(2))
 
 
 def _posed(parts: list[Part]) -> list[Part]:
     return [part.replace(transform=rigid(np.zeros(6, np.float32))) for part in parts]
 
 
-def _least_squares(parts: list[Part]) -> None:
-    with _differentiating(pushes=True):
-        parts = _posed(parts)
-        splatter, camera = check_splatter("auto"), _camera().for_size(SIZE)
-        sampled = sample(parts, camera, SIZE, splatter=splatter, settles=True)
-        scene = Scene.of(parts, camera, "auto", None).at(SIZE)
-        splats = to_splats(sampled, scene.parts, camera, camera, *scene.suited)
-        t_positions, t_rgba = (np.zeros((1, *x.shape), x.dtype) for x in (splats.positions, splats.rgba))
-        splatter.normal_equations(splats, t_positions, t_rgba, np.zeros((*SIZE, 4), np.float32))
-
-
-def _adaptive(parts: list[Part]) -> None:
-    render(parts, _camera(), SIZE, supersample=Adaptive(2))
-
-
-_KINDS = _render, _gradient_of_vertices, _gradient_of_pose, _least_squares, _adaptive
-ROUTES = tuple((kind, count) for count in (1, 2) for kind in _KINDS)
+KINDS = _render, _gradient_of_vertices, _gradient_of_pose, _least_squares, _adaptive

@@ -9,6 +9,7 @@ from __future__ import annotations
 import subprocess
 import tempfile
 import time
+from contextlib import ExitStack
 
 import numpy as np
 
@@ -39,13 +40,17 @@ def warmup(processes: int | None = None) -> float:
     if not isinstance(count, (int, np.integer)) or isinstance(count, bool) or count < 1:
         raise InputError(f"processes is {quoted(processes)}; expected a positive integer, or None")
     start = time.perf_counter()
-    with tempfile.TemporaryFile() as file:
+    with ExitStack() as stack:
+        file = stack.enter_context(tempfile.TemporaryFile())
         claims = companion.Claims(file) if companion.SHARED else None
-        count = count if companion.SHARED else 1
-        begun = [companion.process(claims, everything=True, stderr=subprocess.PIPE) for _ in range(count)]
-        errors = [process.stderr.read().decode(errors="replace") for process in begun]
-        for process, error in zip(begun, errors, strict=True):
+        # They end when this is left, whatever happens: so do their standard inputs.
+        begun = [
+            stack.enter_context(companion.process(claims, everything=True, stderr=subprocess.PIPE))
+            for _ in range(count if companion.SHARED else 1)
+        ]
+        for process in begun:
+            said = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
             if process.wait():
-                said = error.strip().splitlines() or [f"exit code {process.returncode}"]
-                raise RtsError(f"could not compile kernels: {said[-1]}")
+                said = said or f"exit code {process.returncode}"
+                raise RtsError(f"could not compile kernels: {said.splitlines()[-1]}")
     return time.perf_counter() - start
