@@ -151,7 +151,11 @@ class _Companion:
 
     def __init__(self) -> None:
         self.claims = Claims(tempfile.TemporaryFile(buffering=0))
-        self._start()
+        try:
+            self._start()
+        except BaseException:
+            self.claims.file.close()
+            raise
         atexit.register(self.stop)
         os.register_at_fork(after_in_child=self._forget)
 

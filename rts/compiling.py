@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numba
 from numba.core import event
@@ -37,7 +37,7 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
     options |= {"nogil": True, "no_cfunc_wrapper": True}
 
     def decorate(function: Callable) -> Any:
-        made = numba.njit(**options)(function)
+        made = cast(Any, numba.njit(**options)(function))
         if made is not function:  # As it is where compilation is switched off.
             made._cache = _Cache(function)
         return _interpreted(made)
