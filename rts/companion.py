@@ -1,7 +1,7 @@
 """A companion: a process that compiles kernels beside this one, from the last that this one will need on.
 
 numba's compiler has one lock a process. So where kernels are not on disk, the first that is missing starts another
-process, which finds out what such a call needs (`rts.rehearsal`), begins at the end of it, and goes on until the two
+process (`rts.accompanying`), which finds out what such a call needs, begins at the end of it, and goes on until the two
 meet. This process tells which kernels it misses; who compiles which is settled by locks on single bytes of a nameless
 file. Nothing waits for the companion but a kernel that it is about to finish, and it ends with this process.
 """
@@ -10,31 +10,21 @@ from __future__ import annotations
 
 import atexit
 import contextlib
-import itertools
 import os
 import subprocess
 import sys
 import tempfile
-import threading
 import zlib
-from collections.abc import Container, Iterator, Sequence
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 from rts.threads import thread_count
-
-if TYPE_CHECKING:
-    from rts.compiling import Need
 
 if sys.platform != "win32":  # There each process compiles for itself.
     import fcntl
 
 SWITCH = "RTS_COMPILE_AHEAD"
 """The environment variable that, if it is 0, keeps this process from starting a companion."""
-
-PATIENCE = 30.0
-"""Seconds after which a companion without anything to do ends."""
 
 SHARED = sys.platform != "win32"
 """Whether processes can tell one another what they compile."""
@@ -133,7 +123,7 @@ def process(claims: Claims | None, everything: bool = False, **options: Any) -> 
     It ends when its standard input does.
     """
     descriptor = -1 if claims is None else claims.file.fileno()
-    command = [sys.executable, "-P", "-c", f"from rts.companion import serve; serve({descriptor}, {everything})"]
+    command = [sys.executable, "-P", "-c", f"from rts.accompanying import serve; serve({descriptor}, {everything})"]
     own = {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "RTS_NUM_THREADS": "1", SWITCH: "0"}
     return subprocess.Popen(
         command,
@@ -197,93 +187,3 @@ class _Companion:
         atexit.unregister(self.stop)
         self._to.close()
         self._process.returncode = 0  # Not to be waited for.
-
-
-# ------------------------------------------------------------------------------------------- within the other process
-
-
-def serve(descriptor: int, everything: bool) -> None:
-    """Compile, one kernel after another, until there is nothing more to do or the standard input ends.
-
-    Args:
-        descriptor: of the file of the claims; −1 if there is none.
-        everything: whether to compile all that is known, and let errors through; else what goes with the kernels
-            whose numbers come in.
-    """
-    missed: SimpleQueue[int] = SimpleQueue()
-    threading.Thread(target=_listen, args=(missed,), daemon=True).start()
-    claims = None if descriptor < 0 else Claims(os.fdopen(descriptor, "r+b", buffering=0))
-    for key, need in _all() if everything else _asked(missed):
-        if claims is None or claims.take(key):
-            with contextlib.nullcontext() if everything else contextlib.suppress(Exception):
-                need.kernel.compile(need.types)
-            if claims is not None:
-                claims.drop(key)
-
-
-def _listen(missed: SimpleQueue[int]) -> None:
-    from rts.compiling import saving
-
-    # Without a buffer, whose lock a thread that waits would hold as the interpreter ends.
-    for line in os.fdopen(sys.stdin.fileno(), "rb", buffering=0, closefd=False):
-        missed.put(int(line))
-    with saving:
-        os._exit(1)
-
-
-def _all() -> Iterator[tuple[int, Need]]:
-    """All that is known, by number, once."""
-    from rts import rehearsal
-
-    done: set[int] = set()
-    for route in itertools.chain.from_iterable(rehearsal.routes()):
-        yield from ((key, need) for key, need in route.items() if need is not None and key not in done)
-        done |= route.keys()
-
-
-def _asked(missed: SimpleQueue[int]) -> Iterator[tuple[int, Need]]:
-    """What to compile next, by number, as long as something is missed now and then."""
-    from rts import rehearsal
-
-    ahead = rehearsal.routes()
-    known, seen, done = next(ahead), [missed.get()], set[int]()
-    while True:
-        with contextlib.suppress(Empty):
-            while True:
-                seen.append(missed.get_nowait())
-        while not any(route.keys() >= set(seen) for route in known) and (more := next(ahead, None)):
-            known += more
-        key, need = following(known, seen, done)
-        if need is not None:
-            done.add(key)
-            yield key, need
-            continue
-        try:
-            seen.append(missed.get(timeout=PATIENCE))
-        except Empty:
-            return
-
-
-def following(
-    routes: Sequence[dict[int, Need | None]], seen: Sequence[int], done: Container[int]
-) -> tuple[int, Need | None]:
-    """What a process will need last of what nobody has begun to compile; (0, None) if there is nothing.
-
-    Args:
-        routes: what each kind of call needs, in this order. Where it may be the first, it is taken to be; of the others
-            those that may be first have what they share compiled first.
-        seen: what that process has missed, in this order, and compiles itself.
-        done: what need not be compiled again.
-    """
-    told = [key for key in seen if any(key in route for route in routes)]
-    if not told:
-        return 0, None
-    # What was missed last is of the call that is going on.
-    known = [sum(key in route for key in told) if told[-1] in route else -1 for route in routes]
-    route, *others = (route for route, count in zip(routes, known, strict=True) if count == max(known))
-    ways = [route] if route is routes[0] else [{k: route[k] for k in route if all(k in r for r in others)}, route]
-    for way in ways:
-        for key in reversed(way):
-            if key not in seen and key not in done and way[key] is not None:
-                return key, way[key]
-    return 0, None

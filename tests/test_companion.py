@@ -11,7 +11,7 @@ import time
 import pytest
 
 pytest.importorskip("numba")
-from rts import companion
+from rts import accompanying, companion
 from rts.compiling import Need
 
 pytestmark = pytest.mark.core
@@ -108,7 +108,7 @@ PICTURE, GRADIENT, POSE, FIT = map(route, ("abcd", "abcdef", "rabcdgh", "rabcij"
     ],
 )
 def test_what_will_be_needed_last_is_compiled_first(seen, done, expected):
-    key, need = companion.following([PICTURE, GRADIENT, POSE, FIT], [*map(ord, seen)], {*map(ord, done)})
+    key, need = accompanying.following([PICTURE, GRADIENT, POSE, FIT], [*map(ord, seen)], {*map(ord, done)})
     assert (need.kernel if need else None) == expected
     assert key == (ord(expected) if expected else 0)
 
@@ -116,8 +116,8 @@ def test_what_will_be_needed_last_is_compiled_first(seen, done, expected):
 def test_an_expected_kind_of_call_counts_as_a_kernel_but_is_none():
     name = companion.number(companion.LEAST_SQUARES)
     fit = {name: None, **FIT}
-    assert companion.following([PICTURE, POSE, fit], [name], set())[1].kernel == "j"
-    assert companion.following([PICTURE, POSE, fit], [ord("r")], {*FIT, *POSE}) == (0, None)
+    assert accompanying.following([PICTURE, POSE, fit], [name], set())[1].kernel == "j"
+    assert accompanying.following([PICTURE, POSE, fit], [ord("r")], {*FIT, *POSE}) == (0, None)
 
 
 CLAIM = """
@@ -174,7 +174,7 @@ def test_no_child_of_multiprocessing_and_no_program_but_python_starts_it(monkeyp
 FIRST_KERNEL = """
 import os, sys
 import numpy as np
-from rts import companion
+from rts import accompanying, companion
 from rts.operations import take
 
 def gradient():
