@@ -9,10 +9,13 @@ import sys
 import threading
 from collections.abc import Container, Iterator, Sequence
 from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING
 
 from rts import rehearsal
 from rts.companion import Claims
-from rts.compiling import Need, saving
+
+if TYPE_CHECKING:
+    from rts.compiling import Need
 
 PATIENCE = 30.0
 """Seconds after which a companion without anything to do ends."""
@@ -38,6 +41,8 @@ def serve(descriptor: int, everything: bool) -> None:
 
 
 def _listen(missed: SimpleQueue[int]) -> None:
+    from rts.compiling import saving
+
     # Without a buffer, whose lock a thread that waits would hold as the interpreter ends.
     for line in os.fdopen(sys.stdin.fileno(), "rb", buffering=0, closefd=False):
         missed.put(int(line))

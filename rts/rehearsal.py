@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rts import companion, compiling, registry
+from rts import companion, registry
 from rts.camera import Camera
 from rts.checks import check_splatter
-from rts.compiling import Need
 from rts.engines import engine_named
 from rts.evaluating import to_splats
 from rts.interfaces import Part
@@ -22,6 +21,9 @@ from rts.rendering import render
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.scenes import Scene, sample
 from rts.threads import read_only
+
+if TYPE_CHECKING:
+    from rts.compiling import Need
 
 SIZES = {1: (8, 10), 2: (24, 32)}
 """Of pictures of one part and of two, which are to cross; Python takes a tenth of a second, and one."""
@@ -38,6 +40,8 @@ def routes() -> Iterator[list[dict[int, Need | None]]]:
 
 
 def _route(kind: Callable[[list[Part], tuple[int, int]], None], count: int) -> dict[int, Need | None]:
+    from rts import compiling
+
     with compiling.interpreting() as needs, np.errstate(all="ignore"):
         kind(_parts()[:count], SIZES[count])
     name = {companion.number(companion.LEAST_SQUARES): None} if kind is _least_squares else {}
