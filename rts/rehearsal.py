@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rts.compiling import Need
 
 SIZES = {1: (8, 10), 2: (24, 32)}
-"""Of pictures of one part and of two, which are to cross; Python takes a tenth of a second, and one."""
+"""Sizes of pictures of one part and of two, which are to cross; Python takes a tenth of a second, and one."""
 
 
 def routes() -> Iterator[list[dict[int, Need | None]]]:
