@@ -62,11 +62,11 @@ def to_fine_splats(
     if not engine.owns(fine.row):
         fine = constants(fine, engine, like if engine.differentiates else None)
     positions, rgba = _shown(fine.samples, fine.index, parts, camera, wide, engine, like)
-    arrays = fine.index, fine.shift, fine.row, fine.part, fine.facing, fine.wanted
-    index, shift, row, part, facing, wanted = constants(arrays, *suiting(positions, rgba))
+    arrays = fine.index, fine.shift, fine.row, fine.part, fine.facing, fine.settled, fine.wanted
+    index, shift, row, part, facing, settled, wanted = constants(arrays, *suiting(positions, rgba))
     xp = namespace(positions)
     moved = take(positions, index) + xp.astype(shift, positions.dtype)
-    return Splats(moved, take(rgba, index), row, part, facing, wanted=wanted, border=fine.apron)
+    return Splats(moved, take(rgba, index), row, part, facing, settled, wanted=wanted, border=fine.apron)
 
 
 def _shown(

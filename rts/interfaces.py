@@ -305,7 +305,9 @@ class Needed(Plugin):
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Which samples to keep, (K, H, W) bool, where covered (K, H, W) bool lie at depth (K, H, W)."""
 
-    def settled(self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float) -> np.ndarray:
+    def settled(
+        self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float, wanted: np.ndarray | None = None
+    ) -> np.ndarray:
         """Cells (H, W) bool whose colour is known without samples; those that only such cells need leave `kept`.
 
         Args:
@@ -313,6 +315,7 @@ class Needed(Plugin):
             depth: (K, H, W) float.
             kept: (K, H, W) bool, what `__call__` gave; changed in place.
             size: of the largest coordinate.
+            wanted: (H, W) bool, the cells that are looked at; None for all.
         """
         raise NotImplementedError
 
@@ -438,6 +441,7 @@ class Splatter(Plugin):
         settles: whether it reads `Splats.settled`: where all nine samples around a cell are fronts of one opaque
             colour, on cells' centres, and no hidden one beside them is `needed`, the cell has that colour, whatever
             moves by little; and samples farther than `reach` from all other cells need not be there.
+        follows_outlines: whether hidden samples have no effect on cells at which `rts.Adaptive` sees no outline.
     """
 
     FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}
@@ -451,6 +455,7 @@ class Splatter(Plugin):
     sums_products: bool = False
     averages: bool = False
     settles: bool = False
+    follows_outlines: bool = False
 
     @abc.abstractmethod
     def image(self, splats: Splats) -> Array:

@@ -136,7 +136,7 @@ class Samples:
     exit: Array | None = None
 
 
-@record(static=("supersample", "apron"))
+@record(static=("supersample", "apron", "flat"))
 class Fine:
     """The fine samples of an adaptively sampled scene: cells of active pixels and an apron around them, in strips.
 
@@ -157,6 +157,9 @@ class Fine:
         supersample: s; each active pixel has s² cells.
         apron: cells around active pixels, and around the layout.
         facing: (K, h, w) int16, as in `Sampled`, or None.
+        settled: (h, w) bool, see `Splats`; None where no samples were left out for it.
+        flat: whether all pixels that are not active show the one colour of all samples where anything is, whatever
+            moves, so that nothing has to be splatted there.
     """
 
     samples: tuple[Samples, ...]
@@ -171,6 +174,8 @@ class Fine:
     supersample: int
     apron: int
     facing: Array | None = None
+    settled: Array | None = None
+    flat: bool = False
 
     @property
     def wanted(self) -> Array:

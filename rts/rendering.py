@@ -33,7 +33,7 @@ from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.emptiness import why_empty
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.pruning import planned
-from rts.sampling.scenes import Scene, apron_of, fine_scene, sampled_scene
+from rts.sampling.scenes import Scene, apron_of, sampled_scene, with_fine
 from rts.trees import Array
 
 BAND = 2**20
@@ -207,8 +207,9 @@ def _of_contrast(
             f"contrast of Adaptive is {supersample.contrast}, and colours are traced; give None: what is sampled "
             f"cannot depend on values that are not known yet"
         )
-    fine = fine_scene(scene, scene.camera, size, coarse, adaptive=supersample, colors=colors, **options)
-    return splatted(replace(coarse, fine=fine), scene, scene.camera, suited, splatter, splats)
+    options |= {"adaptive": supersample, "colors": colors, "needed": scene.needed_by(splatter)}
+    sampled = with_fine(scene, scene.camera, size, coarse, **options)
+    return splatted(sampled, scene, scene.camera, suited, splatter, splats)
 
 
 @uncompiled
@@ -299,15 +300,29 @@ def splatted(
         splatter: a splatter.
         splats: of the samples, but for the fine ones, if they are known.
     """
-    if splats is None:
-        splats = to_splats(sampled, scene.parts, scene.camera, window, *suited)
-    if sampled.fine is None:
+    fine = sampled.fine
+    if fine is None or not fine.flat:
+        splats = splats or to_splats(sampled, scene.parts, scene.camera, window, *suited)
+    if fine is None:
+        assert splats is not None
         image = cropped_image(splatter, splats)
         return image if sampled.supersample == 1 else averaged(image, sampled.supersample)
-    coarse = constants(sampled.fine.coarse, *suiting(splats.rgba))
-    image = cropped_image(splatter, splats.replace(wanted=coarse))
-    finer = cropped_image(splatter, to_fine_splats(sampled.fine, scene.parts, scene.camera, *suited))
-    return with_inset(image, finer, constants(sampled.fine.pixel, engine_of(image), image), sampled.fine.supersample)
+    finer = to_fine_splats(fine, scene.parts, scene.camera, *suited)
+    if splats is None:
+        image = _painted(sampled, finer.rgba[0, ...])
+    else:
+        image = cropped_image(splatter, splats.replace(wanted=constants(fine.coarse, *suiting(splats.rgba))))
+    finer = cropped_image(splatter, finer)
+    return with_inset(image, finer, constants(fine.pixel, engine_of(image), image), fine.supersample)
+
+
+def _painted(sampled: Sampled, color: Array) -> Array:
+    """The image (H, W, C) of cells that show a colour (C,) where anything is."""
+    rows, columns = (slice(sampled.apron, n - sampled.apron) for n in sampled.row.shape[1:])
+    assert sampled.settled is not None
+    covered = (sampled.row[0, rows, columns] >= 0) | sampled.settled[rows, columns]
+    there = constants(covered, *suiting(color))[..., None]
+    return namespace(color).astype(there, color.dtype) * color
 
 
 def bands_of(

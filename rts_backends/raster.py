@@ -12,7 +12,9 @@ that they compile to vector instructions and no jump is mispredicted; what is ra
 
 from __future__ import annotations
 
-from typing import Any, Self
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 
@@ -21,7 +23,7 @@ from rts.compiling import compiled, kernel
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel, read_only
-from rts_backends.raster_cells import Blocks, touches
+from rts_backends.raster_cells import EVERYTHING, Blocks, touching
 from rts_backends.raster_drawing import BAND_ROWS, LISTED, draw, draw_cells
 from rts_backends.triangles import facing, pixel_matrix, to_corner
 
@@ -56,64 +58,130 @@ class Raster(TriangleSampler):
 
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
-        return self._drawn(prepared, camera, size, layers, cull, None)
+        with self._seen(prepared, camera, size) as mesh:
+            listed, _ = mesh.select(facing(camera, cull))
+            return mesh.draw(listed, layers)
 
     def rasterize_cells(
         self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
     ) -> Fragments:
-        """See `TriangleSampler.rasterize_cells`: triangles that touch no block of these cells are passed over."""
-        return self._drawn(prepared, camera, size, layers, cull, cells)
+        """See `TriangleSampler.rasterize_cells`: triangles that touch none of these cells are passed over."""
+        with self._seen(prepared, camera, size) as mesh:
+            blocks = Blocks.of(cells, size)
+            listed, _ = mesh.select(facing(camera, cull), blocks)
+            return mesh.draw_cells(listed, layers, cells, blocks)
 
-    def _drawn(
-        self,
-        prepared: Proxy,
-        camera: Camera,
-        size: tuple[int, int],
-        layers: int,
-        cull: str,
-        cells: np.ndarray | None,
-    ) -> Fragments:
-        """Fragments of all cells, or of some."""
-        height, width = size
-        # With unsigned indices compiled code need not look for negative ones, which count from the end.
-        vertices, faces = read_only(prepared.vertices), read_only(prepared.faces, np.int32).view(np.uint32)
-        matrix, keep = pixel_matrix(camera, size), facing(camera, cull)
-        # Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
-        # room for every vertex and triangle, but only what is used is ever touched.
-        key = len(vertices), len(faces)
+    def rasterize_exits(
+        self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
+    ) -> tuple[Fragments, np.ndarray, Fragments]:
+        """See `TriangleSampler.rasterize_exits`: all triangles are looked at once, for both."""
+        if type(self).rasterize is not Raster.rasterize:
+            return super().rasterize_exits(prepared, camera, size, layers, beside)
+        with self._seen(prepared, camera, size) as mesh:
+            fronts, backs = mesh.select(facing(camera, "back"), both=True)
+            fragments = mesh.draw(fronts, layers)
+            cells = beside(fragments)
+            return fragments, cells, mesh.draw_cells(backs, 1, cells, Blocks.of(cells, size))
+
+    @contextmanager
+    def _seen(self, prepared: Proxy, camera: Camera, size: tuple[int, int]) -> Iterator[_Seen]:
+        """A mesh as a camera sees it, in scratch memory.
+
+        Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
+        room for every vertex and triangle, but only what is used is ever touched.
+        """
+        key = len(prepared.vertices), len(prepared.faces)
         scratch = self._scratch
         if scratch[0] != key:
             scratch = self._scratch = key, []
         try:
-            screen, listed = scratch[1].pop()
+            memory = scratch[1].pop()
         except IndexError:
-            screen, listed = np.empty(len(vertices), np.int32), np.empty((len(faces), LISTED), np.int32)
-        step = (max(size) / 2 + 2) / float(LIMIT)
-        to_steps = np.diag([1 / step, 1 / step, 1, 1])
-        to_steps[:2, 3] = -width / 2 / step, -height / 2 / step
-        parallel(_project, len(vertices), vertices, to_steps @ matrix, screen, work=4 * len(vertices))
-        chunks, bands = -(-len(faces) // CHUNK), -(-height // BAND_ROWS)
-        spans, counts = np.empty((chunks, 2), np.int64), np.zeros((bands, chunks), np.int64)
-        blocks = Blocks.everything() if cells is None else Blocks.of(cells, size)
-        given = vertices, faces, screen, matrix, height, width, step, keep, blocks.bits
-        parallel(_select, chunks, *given, listed, spans, counts, work=10 * len(faces))
-        offsets = np.append(0, np.cumsum(counts.sum(axis=1)))
-        places = offsets[:-1, None] + np.cumsum(counts, axis=1) - counts
-        items = np.empty(offsets[-1], np.uint32)
-        parallel(_sort, chunks, listed, spans, places, items, work=8 * len(items))
-        shape = layers, *(size if cells is None else cells.shape)
-        fragments = Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
-        given = offsets, items, listed, vertices, matrix, -camera.view[2], keep, blocks.bits
-        if cells is None:
-            parallel(draw, bands, *given, tuple(fragments))
-        else:
-            if (absent := cells < 0).any():
-                for x, nothing in zip(fragments, (-1, 0, 0), strict=True):
-                    x[:, absent] = nothing
-            flat = tuple(x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments)
-            parallel(draw_cells, bands, *given, blocks.table, blocks.numbers, flat)
-        scratch[1].append((screen, listed))
+            memory = np.empty(key[0], np.int32), *(np.empty((key[1], LISTED), np.int32) for _ in range(2))
+        yield _Seen(prepared, camera, size, *memory)
+        scratch[1].append(memory)
+
+
+class _List(NamedTuple):
+    """Triangles that may cover a pixel's centre, as `draw` takes them.
+
+    Attributes:
+        keep: sign of the determinants of those to draw, or 0.
+        offsets: (bands + 1,), where the items of each band of rows begin.
+        items: uint32, places in `rows`, in the order of the triangles.
+        rows: (T, LISTED) int32, what is known of a triangle.
+    """
+
+    keep: float
+    offsets: np.ndarray
+    items: np.ndarray
+    rows: np.ndarray
+
+
+class _Seen:
+    """A mesh as a camera sees it.
+
+    Args:
+        mesh: the mesh.
+        camera: the camera.
+        size: (height, width).
+        screen: (V,) int32, memory for positions on screen.
+        listed: (T, LISTED) int32, memory for a list of triangles.
+        behind: memory for a list of those that face the other way.
+    """
+
+    def __init__(self, mesh: Proxy, camera: Camera, size: tuple[int, int], screen: Any, listed: Any, behind: Any):
+        # With unsigned indices compiled code need not look for negative ones, which count from the end.
+        self.vertices, self.faces = read_only(mesh.vertices), read_only(mesh.faces, np.int32).view(np.uint32)
+        self.matrix, self.depth_row, self.size = pixel_matrix(camera, size), -camera.view[2], size
+        self.screen, self.listed, self.behind = screen, listed, behind
+        self.step = (max(size) / 2 + 2) / float(LIMIT)
+        to_steps = np.diag([1 / self.step, 1 / self.step, 1, 1])
+        to_steps[:2, 3] = -size[1] / 2 / self.step, -size[0] / 2 / self.step
+        count = len(self.vertices)
+        parallel(_project, count, self.vertices, to_steps @ self.matrix, screen, work=4 * count)
+
+    def select(self, keep: float, blocks: Blocks = EVERYTHING, both: bool = False) -> tuple[_List, _List]:
+        """The triangles that may cover cells of some blocks; and those that face the other way, if asked for `both`."""
+        chunks, bands = -(-len(self.faces) // CHUNK), -(-self.size[0] // BAND_ROWS)
+        # Threads do not write side by side.
+        spans, counts = np.empty((2, chunks, 2), np.int64), np.zeros((2, chunks, bands), np.int64)
+        lists = (self.listed, spans[0], counts[0]), (self.behind if both else self.behind[:0], spans[1], counts[1])
+        given = self.vertices, self.faces, self.screen, self.matrix, *self.size, self.step, keep, blocks.bits
+        parallel(_select, chunks, *given, *lists, work=10 * len(self.faces))
+        fronts, backs = (_sorted(sign, *made) for sign, made in zip((keep, -keep), lists, strict=True))
+        return fronts, backs
+
+    def draw(self, listed: _List, layers: int) -> Fragments:
+        """Fragments (layers, H, W)."""
+        fragments = _empty((layers, *self.size))
+        given = self.vertices, self.matrix, self.depth_row, EVERYTHING.bits
+        parallel(draw, len(listed.offsets) - 1, listed, *given, tuple(fragments))
         return fragments
+
+    def draw_cells(self, listed: _List, layers: int, cells: np.ndarray, blocks: Blocks) -> Fragments:
+        """Fragments (layers, L, C) of some cells, which the blocks are of."""
+        fragments = _empty((layers, *cells.shape))
+        flat = tuple(x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments)
+        absent = np.flatnonzero(cells.reshape(-1) < 0)
+        for x, nothing in zip(flat, (-1, 0, 0), strict=True):
+            x[:, absent] = nothing
+        given = self.vertices, self.matrix, self.depth_row, blocks.bits, blocks.table, blocks.numbers
+        parallel(draw_cells, len(listed.offsets) - 1, listed, *given, flat)
+        return fragments
+
+
+def _empty(shape: tuple[int, ...]) -> Fragments:
+    return Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
+
+
+def _sorted(keep: float, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> _List:
+    """A list that `_select` made, sorted by bands of rows."""
+    offsets = np.append(0, np.cumsum(counts.sum(axis=0)))
+    places, items = offsets[:-1] + np.cumsum(counts, axis=0) - counts, np.empty(offsets[-1], np.uint32)
+    if len(items):
+        parallel(_sort, len(spans), rows, spans, places, items, work=8 * len(items))
+    return _List(keep, offsets, items, rows)
 
 
 @kernel(error_model="numpy")
@@ -141,69 +209,92 @@ def _project(start, stop, vertices, m, screen):
 
 
 @kernel(error_model="numpy")
-def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, bits, listed, spans, counts):
+def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, bits, fronts, backs):
     """List the triangles that may cover a pixel's centre, of those that `bits` of `Blocks` tell; and count them.
 
-    Chunks of one call follow on each other in the list; `spans` (chunks, 2) says where each begins and ends, `counts`
-    (bands, chunks) how many of its triangles touch a band of rows.
+    A list is what is known of triangles (T, LISTED), where each chunk begins and ends in it (chunks, 2), and how many
+    of a chunk touch a band of rows (chunks, bands). Chunks of one call follow on each other. Of `backs`, if there is
+    room, are those that may face the other way.
     """
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
-    chosen, corners = np.empty(LONG_BLOCK, np.uint32), np.empty((3, 4))
-    step, sign = np.float32(step), np.float32(keep)
-    more = np.float32(1.25)
-    middle, center, half, four = np.float32(width / 2), np.float32(height / 2), np.float32(0.5), np.float32(4)
-    found = first * CHUNK
+    chosen, sign = np.empty(LONG_BLOCK, np.uint32), np.float32(keep)
+    step, given = np.float32(step), (vertices, matrix, height, width, np.float32(step), bits)
+    found = opposite = first * CHUNK
     for chunk in range(first, last):
-        spans[chunk, 0] = found
+        fronts[1][chunk, 0], backs[1][chunk, 0] = found, opposite
         end = min(len(faces), (chunk + 1) * CHUNK)
         for start in range(chunk * CHUNK, end, LONG_BLOCK):
             block = faces[start : min(end, start + LONG_BLOCK)]
             for b in range(len(block)):
                 xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
-            for b in range(len(block)):
-                xa, ya = np.float32(np.int16(xy[0, b])), np.float32(np.int16(xy[0, b] >> SIXTEEN))
-                xb, yb = np.float32(np.int16(xy[1, b])), np.float32(np.int16(xy[1, b] >> SIXTEEN))
-                xc, yc = np.float32(np.int16(xy[2, b])), np.float32(np.int16(xy[2, b] >> SIXTEEN))
-                x0, x1, y0, y1 = min(xa, xb, xc), max(xa, xb, xc), min(ya, yb, yc), max(ya, yb, yc)
-                i0, i1, j0, j1 = _centres(
-                    x0 * step + middle, x1 * step + middle, y0 * step + center, y1 * step + center, height, width, step
-                )
-                box[0, b], box[1, b], box[2, b], box[3, b] = i0, i1, j0, j1
-                # Where there is one centre, most triangles whose box holds it do not. Half of a mesh faces away.
-                x, y = (i0 + half - middle) / step, (j0 + half - center) / step
-                ax, ay, bx, by, cx, cy = xa - x, ya - y, xb - x, yb - y, xc - x, yc - y
-                ea, eb, ec = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
-                # Rounding changes coordinates by half a step at most, so these by the sum of the box's sides and 2.5,
-                # and their sum by twice that. The rest is for the centre, which is rounded to a hundredth.
-                bound = more * (x1 - x0 + y1 - y0 + four)
-                away = (ea + eb + ec) * sign < -(bound + bound)
-                placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
-                clips[b] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)
-                missed = ((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound) & (i0 == i1) & (j0 == j1)) | away
-                near[b] = clips[b] | ((i0 <= i1) & (j0 <= j1) & ~(placed & missed))
-            count = 0
-            for b in range(len(block)):
-                chosen[count] = b
-                count += near[b]
-            for b in chosen[:count]:
-                i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
-                if clips[b]:
-                    for c in range(3):
-                        to_corner(matrix, vertices, block[b, c], corners, c)
-                    x0, x1, y0, y1 = _clipped_box(corners, width, height)
-                    i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
-                    if i0 > i1 or j0 > j1:
-                        continue
-                if len(bits) > 0 and not touches(bits, np.uint32(i0), np.uint32(i1), np.uint32(j0), np.uint32(j1)):
-                    continue
-                listed[found, 0] = start + b
-                listed[found, 1], listed[found, 2], listed[found, 3] = block[b, 0], block[b, 1], block[b, 2]
-                listed[found, 4], listed[found, 5], listed[found, 6], listed[found, 7] = i0, i1, j0, j1
-                found += 1
-                for band in range(int(j0) // BAND_ROWS, int(j1) // BAND_ROWS + 1):
-                    counts[band, chunk] += 1
-        spans[chunk, 1] = found
+            _look(len(block), xy, height, width, step, sign, box, clips, near)
+            found = _list(chunk, start, block, near, box, clips, chosen, given, found, fronts)
+            if len(backs[0]) > 0:
+                _look(len(block), xy, height, width, step, -sign, box, clips, near)
+                opposite = _list(chunk, start, block, near, box, clips, chosen, given, opposite, backs)
+        fronts[1][chunk, 1], backs[1][chunk, 1] = found, opposite
+
+
+@compiled(inline="always", error_model="numpy")
+def _look(count, xy, height, width, step, sign, box, clips, near):
+    """Fill in the box of pixels of each triangle, whether it is clipped, and whether it may cover a pixel's centre."""
+    more, half, four = np.float32(1.25), np.float32(0.5), np.float32(4)
+    middle, center = np.float32(width / 2), np.float32(height / 2)
+    for b in range(count):
+        xa, ya = np.float32(np.int16(xy[0, b])), np.float32(np.int16(xy[0, b] >> SIXTEEN))
+        xb, yb = np.float32(np.int16(xy[1, b])), np.float32(np.int16(xy[1, b] >> SIXTEEN))
+        xc, yc = np.float32(np.int16(xy[2, b])), np.float32(np.int16(xy[2, b] >> SIXTEEN))
+        x0, x1, y0, y1 = min(xa, xb, xc), max(xa, xb, xc), min(ya, yb, yc), max(ya, yb, yc)
+        i0, i1, j0, j1 = _centres(
+            x0 * step + middle, x1 * step + middle, y0 * step + center, y1 * step + center, height, width, step
+        )
+        box[0, b], box[1, b], box[2, b], box[3, b] = i0, i1, j0, j1
+        # Where there is one centre, most triangles whose box holds it do not. Half of a mesh faces away.
+        x, y = (i0 + half - middle) / step, (j0 + half - center) / step
+        ax, ay, bx, by, cx, cy = xa - x, ya - y, xb - x, yb - y, xc - x, yc - y
+        ea, eb, ec = bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx
+        # Rounding changes coordinates by half a step at most, so these by the sum of the box's sides and 2.5,
+        # and their sum by twice that. The rest is for the centre, which is rounded to a hundredth.
+        bound = more * (x1 - x0 + y1 - y0 + four)
+        away = (ea + eb + ec) * sign < -(bound + bound)
+        placed = (min(x0, y0) > -LIMIT) & (max(x1, y1) < LIMIT)
+        clips[b] = ((x1 == BEFORE) | (x0 == BEYOND)) & (x0 < BEFORE) & (x1 > BEYOND)
+        missed = ((min(ea, eb, ec) < -bound) & (max(ea, eb, ec) > bound) & (i0 == i1) & (j0 == j1)) | away
+        near[b] = clips[b] | ((i0 <= i1) & (j0 <= j1) & ~(placed & missed))
+
+
+@compiled(inline="always")
+def _list(chunk, start, block, near, box, clips, chosen, given, found, made):
+    """List the triangles of a block that are near, from a place on; what comes after is the next place."""
+    vertices, matrix, height, width, step, bits = given
+    listed, _, counts = made
+    count = 0
+    for b in range(len(block)):
+        chosen[count] = b
+        count += near[b]
+    if len(bits) > 0:
+        for b in chosen[:count]:
+            if clips[b]:  # Where it is comes below.
+                box[0, b], box[1, b], box[2, b], box[3, b] = 0, width - 1, 0, height - 1
+        count = touching(chosen[:count], box, 0, height, bits)
+    for b in chosen[:count]:
+        i0, i1, j0, j1 = box[0, b], box[1, b], box[2, b], box[3, b]
+        if clips[b]:
+            corners = np.empty((3, 4))
+            for c in range(3):
+                to_corner(matrix, vertices, block[b, c], corners, c)
+            x0, x1, y0, y1 = _clipped_box(corners, width, height)
+            i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
+            if i0 > i1 or j0 > j1:
+                continue
+        listed[found, 0] = start + b
+        listed[found, 1], listed[found, 2], listed[found, 3] = block[b, 0], block[b, 1], block[b, 2]
+        listed[found, 4], listed[found, 5], listed[found, 6], listed[found, 7] = i0, i1, j0, j1
+        found += 1
+        for band in range(int(j0) // BAND_ROWS, int(j1) // BAND_ROWS + 1):
+            counts[chunk, band] += 1
+    return found
 
 
 @compiled
@@ -237,9 +328,9 @@ def _clipped_box(corners, width, height):
 
 @kernel
 def _sort(first, last, listed, spans, places, items):
-    """Sort the list by bands: write where each band's triangles are, in order, from `places` (bands, chunks) on."""
+    """Sort the list by bands: write where each band's triangles are, in order, from `places` (chunks, bands) on."""
     for chunk in range(first, last):
         for n in range(spans[chunk, 0], spans[chunk, 1]):
             for band in range(listed[n, 6] // BAND_ROWS, listed[n, 7] // BAND_ROWS + 1):
-                items[places[band, chunk]] = n
-                places[band, chunk] += 1
+                items[places[chunk, band]] = n
+                places[chunk, band] += 1

@@ -37,10 +37,9 @@ class Blocks(NamedTuple):
         count = _fill(np.ascontiguousarray(cells, np.int32).reshape(-1), width, table, numbers, bits)
         return cls(table, numbers[:count], bits)
 
-    @classmethod
-    def everything(cls) -> Blocks:
-        """What stands for all cells: no blocks, and no bits."""
-        return cls(np.empty((0, 0), np.int32), np.empty((0, SIDE, SIDE), np.int32), np.empty((0, 0), np.uint16))
+
+EVERYTHING = Blocks(np.empty((0, 0), np.int32), np.empty((0, SIDE, SIDE), np.int32), np.empty((0, 0), np.uint16))
+"""What stands for all cells: no blocks, and no bits."""
 
 
 @kernel
@@ -66,14 +65,37 @@ def _fill(cells, width, table, numbers, bits):
 
 
 @compiled
-def touches(bits, left, right, top, bottom):
-    """Whether a box of cells, of which the first and last columns and rows are given, holds any that are asked for."""
-    side = np.uint32(SIDE)
-    i0, i1 = left // side, right // side
-    begin, end = ALL << left % side & ALL, ALL >> (side - np.uint32(1) - right % side)
-    for y in range(top, bottom + np.uint32(1)):
-        for i in range(i0, i1 + np.uint32(1)):
-            mask = (begin if i == i0 else ALL) & (end if i == i1 else ALL)
-            if bits[y, i] & mask != 0:
-                return True
-    return False
+def touching(places, box, begin, end, bits):
+    """Put those places first whose boxes hold cells that are asked for in some lines; how many there are.
+
+    `box` has the first and last column, and the first and last row, of each box (4, ·). All is in one loop, since
+    compiled code counts references to arrays that it hands on.
+    """
+    count, side, one, three = 0, np.uint32(SIDE), np.uint32(1), np.uint32(3)
+    for h in range(len(places)):
+        n = places[h]
+        left, right = np.uint32(box[0, n]), np.uint32(box[1, n])
+        top = np.uint32(max(np.int32(box[2, n]), np.int32(begin)))
+        bottom = np.uint32(min(np.int32(box[3, n]), np.int32(end - 1)))
+        # In two words of four lines at most. Branches would be foreseen every other time.
+        first, last, below, above = left // side, right // side, min(top + one, bottom), max(bottom, top + one) - one
+        low = bits[top, first] | bits[below, first] | bits[above, first] | bits[bottom, first]
+        high = bits[top, last] | bits[below, last] | bits[above, last] | bits[bottom, last]
+        some = (np.uint32(low) | np.uint32(high) << side) >> left % side & (np.uint32(2) << right - left) - one
+        if (right - left >= side) | (bottom - top > three):
+            some = _some(bits, left, right, top, bottom)
+        places[count] = n
+        count += some != 0
+    return count
+
+
+@compiled
+def _some(bits, left, right, top, bottom):
+    """Cells that are asked for in lines of a box, as bits."""
+    side, one, some = np.uint32(SIDE), np.uint32(1), np.uint32(0)
+    first, last = left // side, right // side
+    for y in range(top, bottom + one):
+        for i in range(first, last + one):
+            begun = ALL << left % side & ALL if i == first else ALL
+            some |= bits[y, i] & begun & (ALL >> (side - one - right % side) if i == last else ALL)
+    return some

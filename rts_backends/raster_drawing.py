@@ -10,6 +10,7 @@ import numpy as np
 
 from rts.compiling import compiled, kernel
 from rts_backends import raster_cells
+from rts_backends.raster_cells import touching
 from rts_backends.triangles import owns
 
 BAND_ROWS = raster_cells.SIDE
@@ -23,16 +24,21 @@ NUMBERS = 18
 
 
 @kernel(error_model="numpy")
-def draw(first, last, offsets, items, listed, vertices, matrix, view_depth, keep, bits, fragments):
-    """Fill the three fragment arrays, band by band; `bits` are those of `Blocks` for all cells."""
+def draw(first, last, listed, vertices, matrix, view_depth, bits, fragments):
+    """Fill the three fragment arrays, band by band.
+
+    `listed` is the sign of determinants to draw, where the items of each band begin, these, and what is known of each
+    triangle; `bits` are those of `Blocks` for all cells.
+    """
     triangle_ids, barycentrics, depths = fragments
     layers, height, width = triangle_ids.shape
     nearest = np.empty((layers, BAND_ROWS, width))
-    given = offsets, items, listed, vertices, matrix, view_depth, keep, bits
+    keep, offsets, items, rows = listed
+    given = rows, vertices, matrix, view_depth, keep, bits
     for band in range(first, last):
         top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
         nearest[:], triangle_ids[:, top:end], barycentrics[:, top:end] = np.inf, -1, 0
-        _draw(band, given, end, top, nearest, triangle_ids, barycentrics)
+        _draw(items[offsets[band] : offsets[band + 1]], given, top, end, top, nearest, triangle_ids, barycentrics)
         for k in range(layers):
             for j in range(top, end):
                 for i in range(width):
@@ -41,9 +47,7 @@ def draw(first, last, offsets, items, listed, vertices, matrix, view_depth, keep
 
 
 @kernel(error_model="numpy")
-def draw_cells(
-    first, last, offsets, items, listed, vertices, matrix, view_depth, keep, bits, table, numbers, fragments
-):
+def draw_cells(first, last, listed, vertices, matrix, view_depth, bits, table, numbers, fragments):
     """As `draw`, of some cells: arrays (K, M) are of their list; `bits`, `table` and `numbers` are those of `Blocks`.
 
     Each band is drawn as a picture, of which only what is near such cells is touched.
@@ -52,14 +56,17 @@ def draw_cells(
     layers, height, width = len(triangle_ids), len(bits), table.shape[1] * BAND_ROWS
     nearest, drawn = np.empty((layers, BAND_ROWS, width)), np.empty((layers, BAND_ROWS, width), np.int32)
     within = np.empty((layers, BAND_ROWS, width, 2), np.float32)
-    given = offsets, items, listed, vertices, matrix, view_depth, keep, bits
+    keep, offsets, items, rows = listed
+    given = rows, vertices, matrix, view_depth, keep, bits
     for band in range(first, last):
         top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
         for j in range(top, end):
             for column in range(table.shape[1]):
                 if bits[j, column] != 0:
                     _clear(column * BAND_ROWS, nearest[:, j - top], drawn[:, j - top], within[:, j - top])
-        _draw(band, given, end, 0, nearest, drawn, within)
+        here = items[offsets[band] : offsets[band + 1]]
+        here = here[: touching(here, rows[:, 4:].T, top, end, bits)]
+        _draw(here, given, top, end, 0, nearest, drawn, within)
         for j in range(top, end):
             for column in range(table.shape[1]):
                 if bits[j, column] == 0:
@@ -85,21 +92,23 @@ def _clear(first, nearest, triangle_ids, barycentrics):
 
 
 @compiled(error_model="numpy")
-def _draw(band, given, end, shift, nearest, triangle_ids, barycentrics):
-    """Insert the triangles of a band, whose last row is the one before `end`, into layers of pixels.
+def _draw(items, given, top, end, shift, nearest, triangle_ids, barycentrics):
+    """Insert the triangles of a band of rows from `top` to the one before `end` into layers of pixels.
 
     Arrays (K, ·, ·) begin with row `shift` of the band's; `nearest` with its first.
     """
-    offsets, items, listed, vertices, matrix, view_depth, keep, bits = given
+    rows, vertices, matrix, view_depth, keep, bits = given
     entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
     numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
-    most, top = 4 * BLOCK, band * BAND_ROWS
+    most = 4 * BLOCK
     # What is left from a row, four of each small triangle, and one more row.
-    hits = np.empty((2 * most + nearest.shape[2], 2), np.int32)
+    room = 2 * most + nearest.shape[2]
+    hits, sure = np.empty((room, 2), np.int32), np.empty(room, np.bool_)
+    met = sure, np.empty(room), np.empty((2, room), np.float32)
     drawn = top, shift, entries, numbers, clips, nearest, triangle_ids, barycentrics
-    for start in range(offsets[band], offsets[band + 1], BLOCK):
-        block = items[start : min(offsets[band + 1], start + BLOCK)]
-        _gather(block, listed, vertices, entries, points)
+    for start in range(0, len(items), BLOCK):
+        block = items[start : start + BLOCK]
+        _gather(block, rows, vertices, entries, points)
         _set_up(len(block), points, matrix, view_depth, keep, top, end - 1, entries, numbers, clips)
         _cover(len(block), entries, numbers, covers)
         found = 0
@@ -122,9 +131,9 @@ def _draw(band, given, end, shift, nearest, triangle_ids, barycentrics):
                     found += (ea >= 0) & (eb >= 0) & (ec >= 0)
                 place += 1
                 if found > most - 4:
-                    _insert(hits[: _asked(hits, found, top, bits)], drawn)
+                    _insert(hits[: _asked(hits, found, top, bits)], met, drawn)
                     found = 0
-        _insert(hits[: _asked(hits, found, top, bits)], drawn)
+        _insert(hits[: _asked(hits, found, top, bits)], met, drawn)
 
 
 @compiled
@@ -144,14 +153,14 @@ def _asked(hits, found, top, bits):
 
 
 @compiled(inline="always")
-def _gather(block, listed, vertices, entries, points):
+def _gather(block, rows, vertices, entries, points):
     """What is listed of the triangles (LISTED, BLOCK), and their corners (3, 3, BLOCK).
 
     The loops are so short that the processor overlaps their waits for memory.
     """
     for b in range(len(block)):
         for r in range(LISTED):
-            entries[r, b] = listed[block[b], r]
+            entries[r, b] = rows[block[b], r]
     for b in range(len(block)):
         for c in range(3):
             v = np.uint32(entries[1 + c, b])
@@ -212,44 +221,60 @@ def _cover(count, entries, numbers, covers):
 
 
 @compiled(error_model="numpy")
-def _insert(hits, drawn):
+def _insert(hits, met, drawn):
     """Insert the block's triangles into the layers of pixels; hits (n, 2) are triangle and row of the band, column."""
     top, shift, entries, numbers, clips, nearest, triangle_ids, barycentrics = drawn
+    sure, depths, within = met
+    _meet(hits, np.uint32(top), numbers, clips, sure, depths, within)
     for h in range(len(hits)):
         place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
         b, row = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS)
         j = row + np.uint32(shift)
-        found, z, p, q = _met(b, i + 0.5, row + np.uint32(top) + 0.5, numbers, clips)
-        if found:
-            _put(z, entries[0, b], p, q, nearest[:, row, i], triangle_ids[:, j, i], barycentrics[:, j, i])
+        if sure[h] or _covers(b, i + 0.5, row + np.uint32(top) + 0.5, numbers, clips):
+            p, q = within[0, h], within[1, h]
+            _put(depths[h], entries[0, b], p, q, row, j, i, nearest, triangle_ids, barycentrics)
 
 
-@compiled(inline="always", error_model="numpy")
-def _met(b, x, y, numbers, clips):
-    """Whether triangle b of a block covers a point; and its depth and first two barycentrics there."""
-    xa, ya, wa = numbers[0, b], numbers[1, b], numbers[2, b]
-    xb, yb, wb = numbers[3, b], numbers[4, b], numbers[5, b]
-    xc, yc, wc = numbers[6, b], numbers[7, b], numbers[8, b]
-    ea, eb, ec = xa * x + (ya * y + wa), xb * x + (yb * y + wb), xc * x + (yc * y + wc)
-    found = True
+@compiled(error_model="numpy")
+def _meet(hits, top, numbers, clips, sure, depths, within):
+    """Fill in of each hit the depth (n,), the first two barycentrics (2, n), and whether it is surely one."""
+    for h in range(len(hits)):
+        place, x = np.uint32(hits[h, 0]), np.uint32(hits[h, 1]) + 0.5
+        b, y = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS) + top + 0.5
+        ea = numbers[0, b] * x + (numbers[1, b] * y + numbers[2, b])
+        eb = numbers[3, b] * x + (numbers[4, b] * y + numbers[5, b])
+        ec = numbers[6, b] * x + (numbers[7, b] * y + numbers[8, b])
+        total = ea + eb + ec
+        scale = 1 / total
+        depths[h] = (ea * numbers[9, b] + eb * numbers[10, b] + ec * numbers[11, b]) / total
+        within[0, h], within[1, h] = ea * scale, eb * scale
+        sure[h] = (ea > 0) & (eb > 0) & (ec > 0) & ~clips[b]
+
+
+@compiled
+def _covers(b, x, y, numbers, clips):
+    """Whether triangle b of a block covers a point that may lie on its edges, or where it is clipped."""
+    xa, ya, xb, yb, xc, yc = numbers[0, b], numbers[1, b], numbers[3, b], numbers[4, b], numbers[6, b], numbers[7, b]
+    ea, eb, ec = (
+        xa * x + (ya * y + numbers[2, b]),
+        xb * x + (yb * y + numbers[5, b]),
+        xc * x + (yc * y + numbers[8, b]),
+    )
     # Top and left edges own the pixels exactly on them (y points down).
-    if min(ea, eb, ec) == 0:
-        found = not ((ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc)))
-    total = ea + eb + ec
-    found = found and total > 0 and not (clips[b] and _outside(numbers, b, ea, eb, ec))
-    z, scale = (ea * numbers[9, b] + eb * numbers[10, b] + ec * numbers[11, b]) / total, 1 / total
-    return found, z, np.float32(ea * scale), np.float32(eb * scale)
+    lost = (ea == 0 and not owns(xa, ya)) or (eb == 0 and not owns(xb, yb)) or (ec == 0 and not owns(xc, yc))
+    return not lost and ea + eb + ec > 0 and not (clips[b] and _outside(numbers, b, ea, eb, ec))
 
 
 @compiled(inline="always")
-def _put(z, t, p, q, nearest, triangle_ids, barycentrics):
-    """Put a hit into the layers (K,) of a cell: behind what is as near, before what is farther."""
-    moved = z  # A branch would be foreseen every other time.
+def _put(z, t, p, q, row, j, i, nearest, triangle_ids, barycentrics):
+    """Put a hit into the layers of a cell, at its row of `nearest` and of the rest: behind what is as near."""
+    moved = z
     for k in range(len(nearest)):
-        old, old_t, old_p, old_q = nearest[k], triangle_ids[k], barycentrics[k, 0], barycentrics[k, 1]
-        before = z < old
-        nearest[k], triangle_ids[k] = moved if before else old, t if before else old_t
-        barycentrics[k, 0], barycentrics[k, 1] = p if before else old_p, q if before else old_q
+        old, old_t = nearest[k, row, i], triangle_ids[k, j, i]
+        old_p, old_q = barycentrics[k, j, i, 0], barycentrics[k, j, i, 1]
+        before = z < old  # A branch would be foreseen every other time.
+        nearest[k, row, i], triangle_ids[k, j, i] = moved if before else old, t if before else old_t
+        barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = p if before else old_p, q if before else old_q
         moved, t = old if before else moved, old_t if before else t
         p, q = old_p if before else p, old_q if before else q
 

@@ -456,6 +456,24 @@ class Misplaced(type(rts.plugin("samplers", "raster")())):
         return super().sample(*args, **listed, **options)
 
 
+class OddExits(type(rts.plugin("samplers", "raster")())):
+    """Tells exits that are altered."""
+
+    def __init__(self, alter):
+        self.alter = alter
+
+    def sample(self, *args, **options):
+        found = super().sample(*args, **options)
+        return found if found.exit is None else replace(found, exit=self.alter(found))
+
+
+def turned_about(x):
+    """Numbers in the reverse order, where there are any."""
+    found = x.copy()
+    found[x >= 0] = x[x >= 0][::-1]
+    return found
+
+
 SAMPLERS = {
     "samples_lie_on_the_centres_of_their_pixels": {
         "rows upside down": OddRaster(lambda f, _: Fragments(*(x[:, ::-1] for x in f))),
@@ -467,6 +485,12 @@ SAMPLERS = {
         "depth of another scale": OddRaster(lambda f, _: f._replace(depth=f.depth * np.float32(1.1))),
     },
     "it_leaves_out_what_is_not_needed": {"keeps everything": Hoarder()},
+    "exits_lie_on_the_part_behind_its_front": {
+        "fronts": OddExits(lambda found: found.row[0]),
+        "none": OddExits(lambda found: np.full_like(found.exit, -1)),
+        "others' exits": OddExits(lambda found: turned_about(found.exit)),
+        "everywhere": OddExits(lambda found: np.maximum(found.exit, found.exit.max())),
+    },
     "listed_cells_are_those_of_the_whole_grid": {"those beside them": Misplaced()},
     "it_agrees_with_the_reference": {
         "nothing culled": OddRaster(cull="none"),

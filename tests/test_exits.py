@@ -56,6 +56,22 @@ def test_rays_leave_a_ball_behind_its_front(sampler):
     assert (np.sort(leaves[there]) == np.arange(there.sum()) + row.max() + 1).all()
 
 
+@pytest.mark.parametrize("eye", [(0, 0, 4), (0.9, 0.5, 0.2)], ids=["outside", "inside"])
+def test_one_look_at_all_triangles_finds_what_two_find(eye):
+    vertices, faces = BALL
+    raster = rts.plugin("rts.samplers", "raster")()
+    heap = np.concatenate([0.3 * vertices + shift for shift in ((0, 0, 0), (0.4, 0.3, 0.1), (-0.3, 0.1, 0.5))])
+    all_faces = np.concatenate([faces + k * len(vertices) for k in range(3)])
+    mesh = rts.Proxy(heap.astype(np.float32), all_faces.astype(np.int32))
+    camera = rts.Camera.look_at(eye, (0, 0, 0), fov_y=40, near=0.3).for_size((SIZE, SIZE))
+    camera = camera.map(lambda m: np.asarray(m, np.float64))
+    given = mesh, camera, (SIZE, SIZE), 2, lambda fragments: beside_outlines(fragments.triangle_ids >= 0)
+    found, expected = raster.rasterize_exits(*given), rts.TriangleSampler.rasterize_exits(raster, *given)
+    assert (found[2].triangle_ids >= 0).sum() > 50
+    for a, b in zip((*found[0], found[1], *found[2]), (*expected[0], expected[1], *expected[2]), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 @pytest.mark.parametrize("layers", [1, 2, 3])
 def test_cells_beside_outlines_are_those_of_the_definition(layers):
     rng = np.random.default_rng(layers)

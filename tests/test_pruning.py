@@ -11,6 +11,7 @@ import rts
 from rts import splatting
 from rts.records import ArraySpec
 from rts.sampling import pruning
+from rts.sampling.extremes import largest
 from rts.sampling.scenes import sample
 from rts.trees import map_leaves
 
@@ -352,3 +353,13 @@ def test_nothing_that_counts_is_dropped_far_off_the_origin_inside_jit():
     (whole, every), (pruned, kept) = (jax.jit(lambda v, s=s: image(v, s))(vertices) for s in (None, "visible"))
     np.testing.assert_allclose(pruned, whole, rtol=0, atol=1e-6)
     assert every == kept
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_largest_number_of_an_array_is_that_of_its_sizes(dtype):
+    x = np.random.default_rng(0).normal(size=(20_000, 3)).astype(dtype)
+    x[12_345, 1] = -77
+    assert largest(x) == largest(x[:, ::-1]) == 77
+    assert largest(x[:0]) == 0
+    assert largest(np.append(x, dtype(-np.inf))) == np.inf
+    assert np.isnan(largest(np.append(x, dtype(-np.nan))))

@@ -76,6 +76,61 @@ def test_settled_cells_are_amid_fronts_and_what_is_left_out_is_far_from_all_othe
         np.testing.assert_array_equal(kept, left)
 
 
+@pytest.mark.parametrize("reach", [1, 4])
+def test_only_cells_that_are_wanted_need_samples(reach):
+    rng = np.random.default_rng(reach)
+    for shape in ((30, 41), (1, 9), (70, 3)):
+        covered = ~dilated(rng.random(shape) < 0.01)[None]
+        wanted, depth = dilated(rng.random(shape) < 0.01), rng.random((1, *shape)).astype(np.float32)
+        kept, expected = covered.copy(), ~dilated(np.pad(~covered[0], 1, constant_values=True))[1:-1, 1:-1]
+        loose = np.pad(wanted & ~expected, 9)
+        for _ in range(reach):
+            loose = dilated(loose)
+        left = covered & loose[9:-9, 9:-9]
+        left.flat[np.where(covered, depth, -1).argmax()] = covered.any()
+        np.testing.assert_array_equal(settle(covered, depth, kept, reach, wanted), expected)
+        np.testing.assert_array_equal(kept, left)
+
+
+@pytest.mark.parametrize("name", ["box before a card", "spheres that cross"])
+@pytest.mark.parametrize("splatter", ["single", "multi", "visible", splatting.Visible()])
+def test_so_are_those_of_active_pixels(name, splatter):
+    import torch
+
+    results, counts = [], []
+    for settles in (False, True):
+        vertices = torch.tensor(SCENES[name][0], dtype=torch.float64, requires_grad=True)
+        color = torch.tensor([0.3, 0.6, 0.2], dtype=torch.float64, requires_grad=True)
+        part = part_of(vertices, name, color)
+        image, sampled = sampled_image(part, settles, splatter, supersample=rts.Adaptive(4))
+        weights = torch.from_numpy(np.random.default_rng(2).normal(size=(*SIZE, 4)))
+        (image * weights).sum().backward()
+        results.append((image.detach().numpy(), vertices.grad.numpy(), color.grad.numpy()))
+        counts.append(len(sampled.fine.samples[0].ids))
+    assert sampled.fine.settled.any()
+    assert counts[1] < counts[0] or splatter == "multi"  # Hidden samples that count are everywhere, then.
+    for whole, settled in zip(*results, strict=True):
+        np.testing.assert_allclose(settled, whole, rtol=0, atol=1e-10 * max(1, np.abs(whole).max()))
+
+
+def test_pixels_that_are_not_active_are_flat_where_hidden_samples_have_no_effect_on_them():
+    part = part_of(SCENES["sphere"][0], "sphere")
+    cases = {
+        "visible": {},
+        "single": {},
+        "multi": {"splatter": "multi"},
+        "no room": {"capacity": 1500},
+        "two": {"parts": [part, part]},
+        "shaded": {"parts": part.replace(shader="normals")},
+    }
+    flat = {}
+    for case, given in cases.items():
+        options = {"splatter": case if case == "single" else "visible", "supersample": rts.Adaptive(4), **given}
+        sampled = sample(options.pop("parts", part), CAMERA, SIZE, settles=True, **options)
+        flat[case] = sampled.fine.flat
+    assert flat == {case: case in ("visible", "single") for case in cases}
+
+
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 @pytest.mark.parametrize("splatter", ["single", "multi", "visible"])
 @pytest.mark.parametrize("name", ["sphere", "box before a card"])
@@ -123,7 +178,7 @@ def test_the_specification_agrees(name, make):
         np.testing.assert_allclose(settled, whole, rtol=0, atol=1e-10 * max(1, np.abs(whole).max()))
 
 
-@pytest.mark.parametrize("supersample", [1, 2])
+@pytest.mark.parametrize("supersample", [1, 2, rts.Adaptive(3)])
 @pytest.mark.parametrize("color", [None, "free"])
 def test_normal_equations_are_those_of_all_samples(color, supersample, monkeypatch):
     import torch

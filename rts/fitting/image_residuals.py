@@ -299,7 +299,7 @@ class ImageResiduals(Residuals):
         # A pixel counts on one of the grids alone.
         fine = sampled.fine
         coarse, finer = _split(fields, constants(fine.pixel, engine, vector), fine)
-        placed = {"row": fine.row, "part": fine.part, "facing": fine.facing, "wanted": fine.wanted}
+        placed = {name: getattr(fine, name) for name in ("row", "part", "facing", "settled", "wanted")}
         found = (
             swept(partial(to_splats, sampled), coarse, **known, wanted=fine.coarse),
             swept(lambda parts, camera, _, *suited: to_fine_splats(fine, parts, camera, *suited), finer, **placed),

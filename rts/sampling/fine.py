@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Literal, NamedTuple
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from rts.checks import check_memory
 from rts.engines import engine_of
-from rts.interfaces import AnyNeeded
+from rts.interfaces import Needed
 from rts.records import Fine, Sampled
 from rts.sampling.adaptive import Adaptive, contrasts, outlines
 from rts.sampling.pruning import as_needed, planned
@@ -54,9 +55,10 @@ def fine_samples(
     grid: Grid,
     where: Where,
     take: Callable[..., Sampled],
-    needed: AnyNeeded | None,
+    needed: Needed | None,
     layers: int | Literal["auto"],
     capacity: int | None,
+    flat: bool,
 ) -> Fine:
     """Fine samples of active pixels and their apron, in strips.
 
@@ -68,6 +70,7 @@ def fine_samples(
         needed: says which samples of an image the splatter needs; None for all.
         layers: K, or "auto".
         capacity: rows to allot, or None for as many as there are, or could be.
+        flat: whether the samples of pixels that are not active are fronts of one colour alone, if any is settled.
     """
     sizes, engine = [s.ids.shape[-2] for s in coarse.samples], engine_of(coarse)
     most, told = planned(layers), [coarse.row, coarse.depth, *([] if coarse.settled is None else [coarse.settled])]
@@ -81,7 +84,7 @@ def fine_samples(
             return tuple(lay_out(find(*given), grid, room))
 
         layout = Layout(*engine.call_host(laid_out, Layout.specs(grid, room), *told))
-        known, allotted = None, most * room.cells
+        known, allotted, flat = None, most * room.cells, False
     else:
         pixels, few = find(*given), engine.padded(coarse.row)
         room = None if capacity is None else grid.room(capacity, most)
@@ -89,6 +92,7 @@ def fine_samples(
         check_memory(1, host.cells.size, most, capacity, gradient=engine.differentiates)
         layout, allotted = of_engine(host, engine, coarse.depth), None
         known = None if needed is None else InStrips(needed, host)
+        flat = flat and bool(given[-1].any()) and not host.dropped
     taken = partial(take, capacity=allotted, cells=layout.cells)
     sampled = taken(layers, known) if layers != "auto" else as_needed(taken, known)
-    return arranged(sampled, layout, grid)
+    return replace(arranged(sampled, layout, grid), flat=flat)

@@ -12,23 +12,28 @@ LONG = 2
 """Nanoseconds that a cell of a layer takes."""
 
 
-def settle(covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, reach: int) -> np.ndarray:
+def settle(
+    covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, reach: int, wanted: np.ndarray | None = None
+) -> np.ndarray:
     """Cells (H, W) bool amid nine fronts and no hidden sample that is kept; other samples are left out.
 
-    Those stay that are within reach of a cell that is not settled. So do the nearest and the farthest, since the depth
-    of what is empty goes by them.
+    Those stay that are within reach of a cell that is wanted and not settled. So do the nearest and the farthest, since
+    the depth of what is empty goes by them.
 
     Args:
         covered: (K, H, W) bool.
         depth: (K, H, W) float, of one dtype.
         kept: (K, H, W) bool, samples that are needed where colours differ; changed in place.
         reach: cells.
+        wanted: (H, W) bool, the cells that are looked at; None for all, and those beyond the border.
     """
     layers, height, width = covered.shape
+    wanted = np.empty((0, width), np.bool_) if wanted is None else np.ascontiguousarray(wanted)
     covered, depth = np.ascontiguousarray(covered), np.ascontiguousarray(depth)
     found, near = np.empty((height, width), np.bool_), np.empty((height, width), np.bool_)
     extremes = np.zeros((2, height), depth.dtype)
-    parallel(_settle, height, covered, depth, kept, reach, found, near, extremes, work=LONG * covered.size)
+    given = covered, depth, kept, wanted, reach, found, near, extremes
+    parallel(_settle, height, *given, work=LONG * covered.size)
     least, largest = extremes[0].min(initial=0), extremes[1].max(initial=0)
     farthest = [_place(extremes[i], x, depth, kept) for i, x in enumerate((least, largest)) if x]
     parallel(_drop, height, near, kept, work=covered.size // 8)
@@ -45,7 +50,7 @@ def _place(extremes: np.ndarray, depth: np.floating, depths: np.ndarray, kept: n
 
 
 @kernel
-def _settle(start, stop, covered, depth, kept, reach, found, near, extremes):
+def _settle(start, stop, covered, depth, kept, wanted, reach, found, near, extremes):
     """Fill rows [start, stop) of what is found, of cells near any that are not, and of extremes of the depths."""
     layers, height, width = covered.shape
     around = reach + 1
@@ -53,6 +58,7 @@ def _settle(start, stop, covered, depth, kept, reach, found, near, extremes):
     # A border of cells that are not amid fronts, as nothing is known there.
     loose, middle = np.ones((rows, width + 2 * around), np.uint8), slice(around, around + width)
     wide, far = np.ones((rows, width), np.uint8), 2 * around - 2
+    step = 1 if len(wanted) > 0 else 3
     column, nine = np.empty(width + 2 * around, np.uint8), np.empty(width + 2 * around - 2, np.uint8)
     for r in range(rows):
         y = start - around + r
@@ -66,14 +72,20 @@ def _settle(start, stop, covered, depth, kept, reach, found, near, extremes):
         y = start - around + r + 1
         if start <= y < stop:
             _reverse(found[y], nine[around - 1 :])
-        # What is wider is united of threes.
-        _unite(wide[r], nine, nine[min(3, far) :], nine[far:])
-        for v in range(6, far, 3):
+        if len(wanted) > 0:
+            nine[: around - 1], nine[around - 1 + width :] = 0, 0
+            if 0 <= y < height:
+                _mask(nine[around - 1 : around - 1 + width], wanted[y])
+            else:
+                nine[:] = 0
+        # What is wider is united of threes, unless some of these do not count.
+        _unite(wide[r], nine, nine[min(step, far) :], nine[far:])
+        for v in range(2 * step, far, step):
             _join(wide[r], nine[v:])
     for y in range(start, stop):
         r = y - start
-        _near(near[y], wide[r], wide[r + min(3, far)], wide[r + far])
-        for v in range(6, far, 3):
+        _near(near[y], wide[r], wide[r + min(step, far)], wide[r + far])
+        for v in range(2 * step, far, step):
             _join(near[y], wide[r + v])
         for k in range(layers):
             low, high = bounds(depth[k, y], kept[k, y])

@@ -9,15 +9,11 @@ import numpy as np
 from rts.errors import InputError
 from rts.records import Fragments, Proxy, Samples
 from rts.sampling.exits import Exits
+from rts.sampling.extremes import largest
 
 FAR = 20
 """How many times larger than the farthest depth coordinates may be, so that depths, computed of them in float32, differ
 from those that were sampled by less than splatters allow for."""
-
-
-def largest(x: np.ndarray) -> float:
-    """The largest size of a number in an array; 0 for none."""
-    return float(max(x.max(initial=0), -x.min(initial=0)))
 
 
 def too_far(size: float, depth: np.ndarray) -> bool:

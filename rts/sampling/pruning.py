@@ -17,7 +17,8 @@ from rts.interfaces import AnyNeeded, CheckedPart, Needed, Splatter, TriangleSur
 from rts.operations.operation import known_value
 from rts.records import ArraySpec, Sampled, Samples
 from rts.sampling.exits import beside_outlines
-from rts.sampling.packing import largest, too_far
+from rts.sampling.extremes import largest
+from rts.sampling.packing import too_far
 from rts.trees import leaves
 
 LAYER_LIMIT = 8
@@ -97,13 +98,17 @@ class _BySplatter(Needed):
             )
         return kept & covered
 
-    def settled(self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float) -> np.ndarray:
+    def settled(
+        self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float, wanted: np.ndarray | None = None
+    ) -> np.ndarray:
         """See `Needed`."""
         if too_far(max(size, self.size or 0.0), depth):
             return np.zeros(covered.shape[1:], bool)
         from rts.sampling import interiors_kernels
 
-        return interiors_kernels.settle(covered, depth, kept, self._splatter.reach)
+        # Beside cells that are not wanted, what decides for others is not settled, and may look at one cell more.
+        reach = self._splatter.reach + (wanted is not None)
+        return interiors_kernels.settle(covered, depth, kept, reach, wanted)
 
 
 class Inspection(Needed):
@@ -135,10 +140,12 @@ class Inspection(Needed):
             self.most = int(np.flatnonzero(counted).max()) + 1
         return kept
 
-    def settled(self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float) -> np.ndarray:
+    def settled(
+        self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float, wanted: np.ndarray | None = None
+    ) -> np.ndarray:
         """See `Needed`."""
         assert self._needed is not None
-        return self._needed.settled(covered, depth, kept, size)
+        return self._needed.settled(covered, depth, kept, size, wanted)
 
     def ran_out(self, cells: int) -> None:
         """See `Needed`."""

@@ -13,8 +13,8 @@ from rts.camera import Camera
 from rts.checks import check_memory, check_ratio, check_sampler, check_scene, check_size, check_splatter, suited_sampler
 from rts.engines import Engine, constants, is_traced, suiting_scene, uncompiled
 from rts.errors import InputError
-from rts.interfaces import AnyNeeded, CheckedPart, Part, Splatter
-from rts.records import Fine, Sampled
+from rts.interfaces import AnyNeeded, CheckedPart, Needed, Part, Splatter
+from rts.records import Sampled
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.cache import Entry
 from rts.sampling.fine import Where, fine_samples
@@ -119,6 +119,11 @@ class Scene(NamedTuple):
         check_ratio(self.camera, size)
         return self._replace(camera=self.camera.for_size(size))
 
+    def needed_by(self, splatter: Splatter | None, settles: bool = False) -> Needed | None:
+        """What says which samples a splatter needs; None to keep all. See `rts.sampling.pruning.needed_by`."""
+        sizes = [entry.size if isinstance(entry, Entry) else None for entry in self.entries]
+        return None if splatter is None else needed_by(splatter, self.parts, sizes, settles)
+
     def suiting(self, *others: Tree) -> tuple[Engine, Array | None]:
         """As `suited`, with further arrays in the scene."""
         engine, like = suiting_scene(self.parts, self.camera, *others)
@@ -141,19 +146,33 @@ def sampled_scene(
     See `sample`; where `settles`, samples that only cells of one colour need may be left out.
     """
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, capacity=capacity)
-    if isinstance(supersample, Adaptive):
-        coarse = sampled_scene(scene, camera, size, supersample=1, settles=settles, **options)
-        fine = fine_scene(scene, camera, size, coarse, adaptive=supersample, **options)
-        return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)
-    side = int(supersample)
+    needed = scene.needed_by(splatter, settles)
+    if not isinstance(supersample, Adaptive):
+        return _on_one_grid(scene, camera, size, int(supersample), needed=needed, **options)
+    # Outlines move on the fine grid alone, unless there is no room for some.
+    coarse = _on_one_grid(scene, camera, size, needed=needed, exits=capacity is not None, **options)
+    return with_fine(scene, camera, size, coarse, adaptive=supersample, needed=needed, **options)
+
+
+def _on_one_grid(
+    scene: Scene,
+    camera: Camera,
+    size: tuple[int, int],
+    side: int = 1,
+    *,
+    splatter: Splatter | None,
+    layers: int | Literal["auto"],
+    capacity: int | None,
+    needed: Needed | None,
+    exits: bool = True,
+) -> Sampled:
+    """The samples of side² cells a pixel; with exits where somebody reads them, if asked for."""
     height, width = side * size[0], side * size[1]
     check_memory(height, width, planned(layers), capacity, gradient=scene.suited[0].differentiates)
     apron = apron_of(splatter)
-    sizes = [entry.size if isinstance(entry, Entry) else None for entry in scene.entries]
-    needed = None if splatter is None else needed_by(splatter, scene.parts, sizes, settles)
     wide = _widened(scene, camera, (height, width), apron)
     reader = splatter or Visible()
-    exits = reader.reads_exits and scene.suited[0].differentiates
+    exits = exits and reader.reads_exits and scene.suited[0].differentiates
     taken = partial(_taken, scene, wide, capacity=capacity, facing=reader.reads_facing, exits=exits)
     sampled = taken(layers, needed) if layers != "auto" else as_needed(taken, needed)
     return replace(sampled, supersample=side, apron=apron)
@@ -208,7 +227,7 @@ def _taken(
     return sampled if needed is None or pruned or is_traced(sampled.row) else prune(sampled, needed)
 
 
-def fine_scene(
+def with_fine(
     scene: Scene,
     camera: Camera,
     size: tuple[int, int],
@@ -218,15 +237,17 @@ def fine_scene(
     splatter: Splatter | None,
     layers: int | Literal["auto"],
     capacity: int | None,
+    needed: Needed | None,
     colors: np.ndarray | None = None,
-) -> Fine:
-    """Fine samples where outlines are; `colors` (N, 4) of the coarse ones are to look for contrast."""
+) -> Sampled:
+    """Coarse samples, and fine ones where outlines are; `colors` (N, 4) of the coarse ones are to look for contrast."""
     grid = Grid(size, adaptive.samples, apron_of(splatter))
     wide = _widened(scene, camera, (grid.side * size[0], grid.side * size[1]), grid.apron)
-    needed = None if splatter is None else needed_by(splatter, scene.parts)
     where = Where(adaptive, adaptive.dilates(scene.parts), colors)
     take = partial(_taken, scene, wide, facing=(splatter or Visible()).reads_facing)
-    return fine_samples(coarse, grid, where, take, needed, layers, capacity)
+    flat = coarse.settled is not None and splatter is not None and splatter.follows_outlines
+    fine = fine_samples(coarse, grid, where, take, needed, layers, capacity, flat)
+    return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)
 
 
 def apron_of(splatter: Splatter | None) -> int:

@@ -18,7 +18,7 @@ import numpy as np
 
 from rts.adapting import adapted
 from rts.engines import Engine, constants, engine_of, namespace
-from rts.interfaces import AnyNeeded, Needed
+from rts.interfaces import Needed
 from rts.records import ArraySpec, Fine, Sampled, Samples
 from rts.threads import parallel, read_only
 from rts.trees import Array
@@ -213,9 +213,12 @@ def _firsts(pieces: np.ndarray, grid: Grid) -> np.ndarray:
 class InStrips(Needed):
     """Says which samples of listed cells can reach active pixels: asks what decides for images, of the layout."""
 
-    def __init__(self, needed: AnyNeeded, layout: Layout):
+    _shown: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+    def __init__(self, needed: Needed, layout: Layout):
         """`layout` is on the host."""
         self._needed, self._layout = needed, layout
+        self.settles, self.size = needed.settles, needed.size
 
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `Needed`; (K, L, LINE)."""
@@ -225,13 +228,38 @@ class InStrips(Needed):
         lists = [read_only(x).reshape(layers, -1) for x in (covered, depth)]
         laid, deep = np.empty((layers, *place.shape), bool), np.empty((layers, *place.shape), depth.dtype)
         parallel(strips_kernels.gather, layers * len(place), *lists, place, laid, deep, work=2 * laid.size)
-        kept, found = self._needed(laid, deep), np.zeros((layers, covered[0].size), bool)
+        kept = self._needed(laid, deep)
+        self._shown = laid, deep, kept
         if kept is laid:
             return covered
-        given = kept[1:], self._layout.kinds, place, found[1:]
-        parallel(strips_kernels.scatter, (layers - 1) * len(place), *given, work=laid[1:].size)
-        found = found.reshape(covered.shape) & covered
-        found[0] = covered[0]
+        return np.concatenate([covered[:1], self._listed(kept[1:], covered[1:], self._layout.kinds)])
+
+    def settled(
+        self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float, wanted: np.ndarray | None = None
+    ) -> np.ndarray:
+        """See `Needed`; (L, LINE), of the samples that were asked about last. Active pixels alone are wanted."""
+        from rts.sampling import strips_kernels
+
+        laid, deep, left = self._shown
+        left = left.copy() if left is laid else left
+        wanted = (self._layout.kinds & strips_kernels.WANTED) > 0
+        found = self._needed.settled(laid, deep, left, size, wanted)
+        kept &= self._listed(left, kept)
+        # The places beside a wanted one are the cells that lie beside it, those beside others may not be.
+        return self._listed((found & wanted)[None], covered[:1])[0]
+
+    def _listed(self, marks: np.ndarray, among: np.ndarray, kinds: np.ndarray | None = None) -> np.ndarray:
+        """Those of listed cells (K, L, LINE) that have marks (K, h, w) in the layout; with `kinds`, near wanted ones.
+
+        Other marks are then taken away.
+        """
+        from rts.sampling import strips_kernels
+
+        found, place = np.zeros((len(among), among[0].size), bool), self._layout.place
+        given = marks, np.empty((0, 0), np.uint8) if kinds is None else kinds, place, found
+        parallel(strips_kernels.scatter, len(marks) * len(place), *given, work=marks.size)
+        found = found.reshape(among.shape)
+        found &= among
         return found
 
     def ran_out(self, cells: int) -> None:
@@ -253,13 +281,16 @@ def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
     ]
     told = [] if sampled.facing is None else [sampled.facing]
     specs += [ArraySpec(laid, np.int16) for _ in told]
+    amid = [] if sampled.settled is None else [sampled.settled]
+    specs += [ArraySpec(laid[1:], np.bool_) for _ in amid]
 
-    def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray, *told: np.ndarray) -> tuple[np.ndarray, ...]:
-        found = (np.where(place >= 0, x.reshape(layers, -1)[:, place], 0).astype(np.int16) for x in told)
-        return *_arranged(row, place, cells, sizes, grid.fine[1]), *found
+    def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray, *known: np.ndarray) -> tuple[np.ndarray, ...]:
+        sides = [np.where(place >= 0, x.reshape(layers, -1)[:, place], 0).astype(np.int16) for x in known[: len(told)]]
+        *found, settled = _arranged(row, place, cells, sizes, grid.fine[1], *known[len(told) :])
+        return *found, *sides, *([settled] if amid else [])
 
-    given = sampled.row, layout.place, layout.cells, *told
-    index, shift, row, part, *facing = engine.call_host(host, tuple(specs), *given)
+    given = sampled.row, layout.place, layout.cells, *told, *amid
+    index, shift, row, part, *known = engine.call_host(host, tuple(specs), *given)
     return Fine(
         sampled.samples,
         index,
@@ -272,26 +303,34 @@ def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
         sampled.overflow + layout.dropped,
         supersample=grid.side,
         apron=grid.apron,
-        facing=facing[0] if facing else None,
+        facing=known[0] if told else None,
+        settled=known[-1] if amid else None,
     )
 
 
 def _arranged(
-    row: np.ndarray, place: np.ndarray, cells: np.ndarray, sizes: Sequence[int], width: int
+    row: np.ndarray,
+    place: np.ndarray,
+    cells: np.ndarray,
+    sizes: Sequence[int],
+    width: int,
+    settled: np.ndarray | None = None,
 ) -> tuple[np.ndarray, ...]:
     """What `strips_kernels.arrange` fills; there is always at least one splat."""
     from rts.sampling import strips_kernels
 
     row, place, cells = (read_only(x, np.int32) for x in (row, place, cells))
+    amid = read_only(np.empty(0, bool) if settled is None else settled.reshape(-1))
     row, cells, lines = row.reshape(len(row), -1), cells.reshape(-1), len(row) * len(place)
     counts = np.empty(lines, np.int64)
     parallel(strips_kernels.count_samples, lines, row, place, counts, work=len(row) * place.size)
     offsets, total = np.cumsum(counts) - counts, int(counts.sum())
     index, shift = np.zeros(max(1, total), np.int32), np.zeros((max(1, total), 3), np.float32)
     laid, part = (np.empty((len(row), *place.shape), np.int32) for _ in range(2))
-    given = row, place, cells, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part
+    shown = np.empty(place.shape if len(amid) else (0, 0), bool)
+    given = row, place, cells, amid, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part, shown
     parallel(strips_kernels.arrange, lines, *given, work=2 * laid.size)
-    return index, shift, laid, part
+    return index, shift, laid, part, shown
 
 
 def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:

@@ -219,7 +219,7 @@ def count_samples(start, stop, row, place, counts):
 
 
 @kernel
-def arrange(start, stop, row, place, cells, firsts, width, offsets, index, shift, laid, part):
+def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, index, shift, laid, part, shown):
     """Put samples into lines [start, stop) of a layout, counted over layers.
 
     Args:
@@ -228,6 +228,7 @@ def arrange(start, stop, row, place, cells, firsts, width, offsets, index, shift
         row: (K, M) int32, the sample of each cell.
         place: (h, w).
         cells: (M,), the flat index of each cell in the grid.
+        settled: (M,) bool, or nothing.
         firsts: (P − 1,) the first row of each part but the first.
         width: of the grid.
         offsets: (K · h,), the number of the first splat of each line.
@@ -235,10 +236,15 @@ def arrange(start, stop, row, place, cells, firsts, width, offsets, index, shift
         shift: (N, 3) float32, to be filled: from the grid to the layout.
         laid: (K, h, w) int32, to be filled: the splat of each place.
         part: (K, h, w) int32, to be filled: its part.
+        shown: (h, w) bool, to be filled with what is settled; no rows for nothing.
     """
     height = len(place)
     for line in range(start, stop):
         k, y, n = line // height, line % height, offsets[line]
+        if k == 0 and len(shown) > 0:
+            for x in range(place.shape[1]):
+                m = place[y, x]
+                shown[y, x] = m >= 0 and settled[m]
         for x in range(place.shape[1]):
             m = place[y, x]
             i = row[k, m] if m >= 0 else -1
@@ -266,10 +272,15 @@ def gather(start, stop, covered, depth, place, laid, deep):
 
 @kernel
 def scatter(start, stop, kept, kinds, place, found):
-    """Mark the (K, M) cells that are kept (K, h, w) near wanted ones, in lines [start, stop) counted over layers."""
+    """Mark the (K, M) cells that are kept (K, h, w), in lines [start, stop) of a layout, counted over layers.
+
+    Where there are kinds, what is not near wanted cells is not kept.
+    """
     height = len(place)
     for line in range(start, stop):
         k, y = line // height, line % height
         for x in range(place.shape[1]):
-            if kept[k, y, x] and kinds[y, x] & NEAR:
-                found[k, place[y, x]] = True
+            if kept[k, y, x]:
+                kept[k, y, x] = len(kinds) == 0 or kinds[y, x] & NEAR != 0
+                if kept[k, y, x]:
+                    found[k, place[y, x]] = True

@@ -17,8 +17,9 @@ from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSur
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines
+from rts.sampling.extremes import largest
 from rts.sampling.facing import facing as facing_of
-from rts.sampling.packing import largest, lift, repack
+from rts.sampling.packing import lift, repack
 from rts.sampling.settling import on_surface, refined
 from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
@@ -108,6 +109,35 @@ class TriangleSampler(Sampler):
         ids = np.where(there, whole.triangle_ids.reshape(layers, -1)[:, at], -1)
         return Fragments(ids, whole.barycentrics.reshape(layers, -1, 2)[:, at], whole.depth.reshape(layers, -1)[:, at])
 
+    def rasterize_exits(
+        self,
+        prepared: Any,
+        camera: Camera,
+        size: tuple[int, int],
+        layers: int,
+        beside: Callable[[Fragments], np.ndarray],
+    ) -> tuple[Fragments, np.ndarray, Fragments]:
+        """`rasterize` with cull="back", and what is seen from behind in some cells; where a class `tells_exits`.
+
+        The default calls `rasterize` and `rasterize_cells`, which look at all triangles anew.
+
+        Args:
+            prepared: see `rasterize`.
+            camera: see `rasterize`.
+            size: see `rasterize`.
+            layers: see `rasterize`.
+            beside: gives the cells (1, M) int32, flat indices in the grid, of the fragments (K, H, W).
+
+        Returns:
+            Fragments (K, H, W), the cells, and the fragments (1, 1, M) of cull="front" in these.
+        """
+        fragments = self.rasterize(prepared, camera, size, layers, "back")
+        cells = beside(fragments)
+        backs = _no_fragments((1, *cells.shape))
+        if cells.size:
+            backs = self.rasterize_cells(prepared, camera, size, 1, "front", cells)
+        return fragments, cells, backs
+
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Entry:
         """See `Sampler`: the proxy of a part, and what is prepared of it."""
         surface = _of_triangles(part.surface)
@@ -196,7 +226,7 @@ class TriangleSampler(Sampler):
         shader = adapted(part.shader, Shader)
         asked = None if shader is None else shader.reads
         wanted: Needed | None = None if needed is None else adapted(needed, Needed)
-        settles = wanted is not None and wanted.settles and cells is None and not surface.refines
+        settles = wanted is not None and wanted.settles and not surface.refines
         attributes = _attribute_specs(surface, asked, host_theta, shape, like)
 
         transform = [] if part.transform is None else [part.transform]
@@ -224,7 +254,7 @@ class TriangleSampler(Sampler):
             )
 
         sides = [ArraySpec((layers, *shape.size), np.int16)] if tells else []
-        amid = [ArraySpec(size, np.bool_)] if settles else []
+        amid = [ArraySpec(shape.size, np.bool_)] if settles else []
         behind = [ArraySpec(size, np.int32)] if exits else []
         specs = *shape.specs(surface.sample_widths), *sides, *amid, *behind, *tables.values(), *attributes.values()
         results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *listed, *leaves(inputs))
@@ -283,7 +313,7 @@ class TriangleSampler(Sampler):
                     # Vertices that were looked at as a part of θ need not be looked at again.
                     read = any(np.may_share_memory(x, found.proxy.vertices) for x in leaves(inputs))
                     size = needed.size if read and needed.size is not None else largest(found.proxy.vertices)
-                if needed.settles and cells is None:
+                if needed.settles:
                     settled = needed.settled(covered, fragments.depth, kept, size)
             sides = None
             if tells:
@@ -291,6 +321,8 @@ class TriangleSampler(Sampler):
                 pieces = checked_pieces(surface, found.proxy) if kept[1:].any() else np.zeros(1, np.int16)
                 sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
             if not surface.refines:
+                if size is not None and needed is not None and needed.size is not None and size <= needed.size:
+                    size = 0.0  # Where numbers of this size are too large all is kept already.
                 lifted = lift(fragments, found.proxy, shape.capacity, kept, size, behind)
                 return replace(lifted, facing=sides, settled=settled)
             lifted = lift(fragments, found.proxy, None, kept)
@@ -331,16 +363,24 @@ class TriangleSampler(Sampler):
             return fragments
 
         def all_of(found: Entry) -> tuple[Entry, Fragments, np.ndarray | None, Exits | None]:
-            fragments = drawn(found)
             if keep is None:
-                return found, fragments, None, None
-            kept = keep(fragments)
-            beside = beside_outlines(kept)
-            backs = _no_fragments((1, *beside.shape))
-            if beside.size:
-                backs = self.rasterize_cells(found.prepared, camera, view, 1, "front", beside)
-                check_fragments(backs, (1, *beside.shape), len(found.proxy.faces), self)
-            return found, fragments, kept, Exits.of(fragments, beside, backs)
+                return found, drawn(found), None, None
+            if not (count := len(found.proxy.faces)):
+                fragments = drawn(found)
+                nowhere = np.empty((1, 0), np.int32)
+                return found, fragments, None, Exits.of(fragments, nowhere, _no_fragments((1, 1, 0)))
+            wanted, kept = keep, None
+
+            def beside(fragments: Fragments) -> np.ndarray:
+                nonlocal kept
+                check_fragments(fragments, grid, count, self)
+                kept = wanted(fragments)
+                return beside_outlines(kept)
+
+            fragments, asked, backs = self.rasterize_exits(found.prepared, camera, view, grid[0], beside)
+            if asked.size:
+                check_fragments(backs, (1, *asked.shape), count, self)
+            return found, fragments, kept, Exits.of(fragments, asked, backs)
 
         with self._keeper.lock:
             found = entry or self._entry(surface, inputs, camera, view)

@@ -13,6 +13,7 @@ from rts.camera import Camera
 from rts.errors import InputError
 from rts.interfaces import TriangleSurface
 from rts.records import Fragments, Proxy, Samples
+from rts.sampling.extremes import largest
 from rts.topology import extent
 from rts.trees import Tree
 
@@ -182,7 +183,7 @@ def _check_invertible(camera: Camera) -> None:
 def check_proxy(proxy: Proxy, surface: Any) -> None:
     """Refuse vertices that are NaN or infinite."""
     vertices = proxy.vertices
-    if len(vertices) and not (np.isfinite(vertices.min()) and np.isfinite(vertices.max())):
+    if not np.isfinite(largest(vertices)):
         bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
         raise InputError(
             f"{len(bad)} of the {len(vertices)} vertices of {surface!r} are NaN or infinite, the first is vertex "

@@ -51,6 +51,7 @@ class Plain(Splatter):
 class Single(Kernel):
     """One layer, occlusion ignored (paper eq. 1–3): only the front layer of `row` is splatted."""
 
+    follows_outlines = True
     layers = 1
 
     def accumulate(self, splats: Splats) -> Array:

@@ -52,6 +52,7 @@ class Visible(Kernel):
     crossings: bool = True
     reads_facing: bool = True
     exits: bool = True
+    follows_outlines = True
     reach = 3  # Depths three cells away may decide how an outline or a line of crossing moves.
 
     @property

@@ -204,6 +204,32 @@ class SamplerConformance(Conformance):
             near = np.abs(np.asarray(found.depth).reshape(row.shape) - depth) <= 1e-5 * np.abs(depth)
             claim((near | ~covered).all(), f"part {index}: depths are not those of the cells in the whole grid")
 
+    def test_exits_lie_on_the_part_behind_its_front(self, sampler: Any, parts: list[Part]) -> None:
+        """A sampler that tells exits names rows of their own, which lie on the ray where it meets the part again."""
+        chosen = check_sampler(sampler)
+        if not chosen.tells_exits:
+            pytest.skip("the sampler does not tell exits")
+        asked: dict[str, Any] = {"exits": True}
+        for index, part in enumerate(map(scenes.checked, parts)):
+            if part.cull != "back":
+                continue
+            camera = scenes.CAMERA.within(part.transform)
+            found = chosen.sample(part, camera, scenes.SIZE, 1, **asked)
+            exits, row = np.asarray(found.exit), np.asarray(found.row)
+            there = exits >= 0
+            claim(exits.shape == row.shape[1:], f"part {index}: exit has shape {exits.shape}")
+            claim(there.any(), f"part {index}: no cell has an exit")
+            claim((row[0] >= 0)[there].all(), f"part {index}: there is an exit where the part is not seen")
+            claim(not np.isin(exits[there], row).any(), f"part {index}: exits are named by row, too")
+            whole = chosen.sample(part.replace(cull="none"), camera, scenes.SIZE, 8)
+            points = np.asarray(part.surface.evaluate(part.theta, found)["position"])[exits[there]]
+            depth = np.asarray(camera.project(points, scenes.SIZE))[:, 2]
+            layers, covered = np.asarray(whole.depth)[:, there], np.asarray(whole.row)[:, there] >= 0
+            met = ((np.abs(layers - depth) <= 1e-4 * np.abs(depth)) & covered).any(axis=0)
+            claim(met.all(), f"part {index}: {np.sum(~met)} exits lie where the rays do not meet the part")
+            behind = depth >= np.asarray(found.depth)[0][there] * (1 - 1e-5)
+            claim(behind.all(), f"part {index}: {np.sum(~behind)} exits lie before the front")
+
     def test_what_it_cannot_sample_is_refused_in_one_line(self, sampler: Any) -> None:
         """A surface with neither triangles nor an intersection is an `rts.InputError` that says what to do."""
         part = Part(Elsewhere(), {"center": np.zeros(3, np.float32)})

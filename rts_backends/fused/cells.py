@@ -23,7 +23,7 @@ from rts_backends.fused import choices as listing
 from rts_backends.fused import crossing_pairs, crossings, mixed, outlines, stencil
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
-from rts_backends.fused.survey import BLOCK, FLAT, collect, paint, survey
+from rts_backends.fused.survey import BLOCK, collect, paint, survey
 
 
 class Settings(NamedTuple):
@@ -120,8 +120,11 @@ class Cells:
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
         self.exits = read_only(np.empty((0, row.shape[2])) if exits is None else exits, np.int32)
         self.facing = read_only(self.row[:0] if facing is None else facing, np.int16)
-        self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
         self.settled = read_only(np.empty((0, row.shape[2])) if settled is None else settled, np.bool_)
+        self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
+        if self._wanted is not None and len(self.settled):
+            # Beside settled targets those that nobody looks at may lack their samples, and seem to end there.
+            self._wanted = self._wanted & ~self.settled
         self.visible, self.border = settings.kind == "visible", settings.border
         self.rims = self.visible and settings.rims
         self.crosses = self.visible and settings.crossings
@@ -160,8 +163,10 @@ class Cells:
         """What is decided for each target."""
         layers, height, width = self.row.shape
         count, kind = len(self.positions), self.positions.dtype
-        states, counts = np.empty((height, width), np.uint8), np.zeros(height, np.int64)
+        # The codes of targets that are not settled, and that are.
+        states = self.settled.astype(np.uint8) if len(self.settled) else np.zeros((height, width), np.uint8)
         hidden, seen = np.zeros((height, -(-width // BLOCK)), np.uint8), np.zeros(count, np.uint8)
+        counts = np.zeros(height, np.int64)
         depths = np.zeros((height, 2), kind)
         fronts = self.visible or layers == 1
         noted = states, hidden, depths, seen, counts
@@ -170,9 +175,7 @@ class Cells:
         repeated = int(np.count_nonzero(seen)) != int(counts.sum())
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
         if self._wanted is not None:
-            states *= self._wanted
-        if len(self.settled):
-            states[self.settled] = FLAT
+            states *= self._wanted | self.settled if len(self.settled) else self._wanted
         least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
         # See `rts.splatting.layers`: nothing is nearer to what is beyond everything than to a front.
         extent = largest - least
@@ -245,21 +248,13 @@ class Cells:
         arrays = self.positions, self.rgba, self.row, *self._numbers
         return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent), self._pairs)
 
-    @cached_property
-    def drawn(self) -> np.ndarray:
-        """(H, W) uint8, states of targets that are drawn from their sources: settled ones are EMPTY."""
-        states = self.choices.states
-        return states * ~self.settled if len(self.settled) else states
-
     def image(self, out: np.ndarray) -> None:
         """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""
         if out.size:
-            given = *self.plain_arguments, self.drawn, self.border
+            given = *self.plain_arguments, self.choices.states, self.border
             parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
             if len(self.choices.columns):
                 parallel(mixed.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10)
-            if len(self.settled):
-                parallel(paint, len(out), self.settled, self.border, self.rgba[:1], out[None], work=out.size // 8)
 
     def vjp(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
         """Fill the gradients of positions (N, 3) and rgba (N, 4), zeros or None, from the image's (H, W, 4)."""
@@ -288,7 +283,7 @@ class Cells:
             own = g.copy()
             crossings.hide(self.crossings, self.border, own)
             own = read_only(own)
-        plain = *self.plain_arguments, self.drawn, self.border
+        plain = *self.plain_arguments, self.choices.states, self.border
         parallel(stencil.pull, height, *plain, own, *found, work=self._plain_work)
         if crossed:
             self._pull_mixed(own, found[0], found[1][:0])
@@ -316,7 +311,7 @@ class Cells:
             read_only(np.empty((len(out), 0, size), out.dtype) if t is None else t)
             for t, size in ((t_positions, 3), (t_rgba, 4))
         )
-        parallel(stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.drawn, self.border, out)
+        parallel(stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.choices.states, self.border, out)
         if len(self.choices.columns):
             given = *self.mixed_arguments, self.choices.sums, tangents, self.border
             parallel(mixed.push, out.shape[1], *given, out, work=self._mixed_work * len(out))

@@ -169,7 +169,7 @@ def choose(
     shift = np.empty(9, np.int64)
     for y in range(start, stop):
         d = offsets[y]
-        for x in range(width):
+        for x in range(width if d < offsets[y + 1] else 0):
             if not mixed[y, x]:
                 continue
             columns[d], states[y, x] = x, EMPTY

@@ -14,7 +14,7 @@ from rts.compiling import compiled, kernel
 from rts.threads import parallel
 from rts_backends.fused.crossing_pairs import BORDER, Rules, gather, has_two, steps
 from rts_backends.fused.mixed import splat, tint_of
-from rts_backends.fused.survey import FLAT
+from rts_backends.fused.survey import BUSY, SETTLED
 
 NEITHER, SHEET_A, SHEET_B = 2, 0, 1
 """What a source is: of neither sheet, or of one."""
@@ -92,7 +92,7 @@ def _list(start, stop, bits, some, states, row, mixed, firsts, columns, ranges, 
             continue
         m = firsts[y]
         for x in range(width):
-            found = 0 if states[y, x] == FLAT else steps(bits, y, x)
+            found = 0 if SETTLED <= states[y, x] < BUSY else steps(bits, y, x)
             if not found:
                 continue
             m = _place(columns, m, mixed, y, x)

@@ -109,8 +109,7 @@ def normal_equations(
     fields = (read_only(np.empty((0, 0, 0)) if x is None else x, dtype) for x in (target, weights, background))
     bands, fine = -(-len(target) // BAND), _cells_a_pixel(cells.row.shape, cells.border, target.shape)
     sums = np.zeros((bands, count + 1, count + 1))
-    plain, choices = cells.plain_arguments, cells.choices._replace(states=cells.drawn)
-    drawn = plain, cells.row, choices, cells.outlines, cells.crossings, cells.settled
+    drawn = cells.plain_arguments, cells.row, cells.choices, cells.outlines, cells.crossings, cells.settled
     given = *drawn, tangents, tuple(fields), cells.border, fine
     parallel(_accumulate, bands, ALPHA if target.shape[2] == 1 else COLORS, *given, sums)
     total = sums.sum(axis=0) / max(target.size, 1)

@@ -2,7 +2,8 @@
 
 With v̂ the motion of the outline beside a cell, and v that of its front, what a source of weight w adds to the
 derivative of a target is ∂w · (v̂ − v) times the change of the target's colour with the coverage of one buffer. Only
-targets count that a buffer covers in part. They are few: the gradient adds up in their order, on one thread.
+targets count that a buffer covers in part. The gradient adds up in one order: every other band of rows, and then those
+between.
 """
 
 from __future__ import annotations
@@ -12,9 +13,13 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.compiling import compiled, kernel
+from rts.threads import parallel
 from rts_backends.fused.crossing_pairs import steps
 from rts_backends.fused.mixed import splat
-from rts_backends.fused.survey import FLAT
+from rts_backends.fused.survey import BUSY, SETTLED
+
+BAND = 16
+"""Rows whose gradients are added up by one thread, more than samples of which one target knows are apart."""
 
 NOTHING, FRONT, JOINED, SURFACE = 0, 1, 2, 3
 """What a source gives to a target: nothing, or coverage of the buffer in front as its outline moves; of that at the
@@ -142,7 +147,7 @@ def _look(cells, positions, row, states, y, reach):
         return
     middle = positions.dtype.type(y) + half
     for x in range(width):
-        if states[y, x] == FLAT:
+        if SETTLED <= states[y, x] < BUSY:
             cells[x + 1] = COVERED
             continue
         i = row[y, x]
@@ -424,12 +429,27 @@ def push(start, stop, row, outlines, t_positions, border, out):
                     out[t, y - border, x, c] += change
 
 
+def pull(row: np.ndarray, outlines: Outlines, border: int, g: np.ndarray, g_positions: np.ndarray) -> None:
+    """Add to the gradients of positions (N, 3) what outlines give, from that of the image (H, W, 4)."""
+    bands = -(-len(g) // BAND)
+    for first in range(2):
+        given = row, outlines, border, g, first, g_positions
+        parallel(_pull, (bands + 1 - first) // 2, *given, work=20 * len(outlines.columns))
+
+
 @kernel
-def pull(row, outlines, border, g, g_positions):
-    """Add to the gradients of positions (N, 3) what outlines give, from that of the image."""
-    height, width, _ = g.shape
-    zero = g_positions.dtype.type(0)
-    for y in range(border, height + border):
+def _pull(start, stop, row, outlines, border, g, first, g_positions):
+    """`pull` of every other band of rows, from band `first` on: these have no sample in common."""
+    width, zero = g.shape[1], g_positions.dtype.type(0)
+    for band in range(start, stop):
+        top = (2 * band + first) * BAND
+        _pull_rows(border + top, border + min(top + BAND, len(g)), row, outlines, border, g, width, zero, g_positions)
+
+
+@compiled
+def _pull_rows(top, bottom, row, outlines, border, g, width, zero, g_positions):
+    """`pull` of some rows."""
+    for y in range(top, bottom):
         for d in range(outlines.offsets[y], outlines.offsets[y + 1]):
             x = outlines.columns[d]
             if not 0 <= x - border < width:

@@ -25,7 +25,7 @@ from rts_backends.fused.rows import (
     store,
     tile,
 )
-from rts_backends.fused.survey import BUSY, FLAT
+from rts_backends.fused.survey import BUSY, FLAT, SETTLED
 
 COLORS, ALPHA = (0,) * 5, (0,) * 2
 """The planes of a tangent that count, as tuples whose length compiled code knows: all five, or alpha and the weight."""
@@ -62,22 +62,23 @@ def forward(start, stop, positions, rgba, row, scale, peak, gamma, states, borde
                 normalised_sums(total, sources, layers, y + border, count)
                 composite(total, layers, count)
                 store(image, y, left, total, count)
+                most = SETTLED
             else:
+                image[y, left : left + count] = image.dtype.type(0)
+                most = FLAT
+            if busy(states, y + border, left + border, count, SETTLED):
                 at = left + border
                 own = image[y, left : left + count]
-                _copy(own, rgba, row[0, y + border, at : at + count], states[y + border, at : at + count])
+                _copy(own, rgba, row[0, y + border, at : at + count], states[y + border, at : at + count], most)
 
 
 @compiled
-def _copy(image, rgba, cells, states):
-    """Fill a row without busy targets: the colour of targets that are FLAT, and zeros."""
+def _copy(image, rgba, cells, states, most):
+    """Give targets of a row that are amid one colour this colour: those of states up to `most`."""
     for x in range(len(image)):
-        if states[x] == FLAT:
-            i = cells[x]
+        if SETTLED <= states[x] <= most:
+            i = max(cells[x], 0)  # Without a sample any colour will do.
             image[x, 0], image[x, 1], image[x, 2], image[x, 3] = rgba[i, 0], rgba[i, 1], rgba[i, 2], rgba[i, 3]
-        else:
-            for c in range(4):
-                image[x, c] = image.dtype.type(0)
 
 
 @compiled

@@ -9,8 +9,9 @@ from rts.compiling import compiled, kernel
 BLOCK = 32
 """Columns that share a note of whether hidden layers are near."""
 
-EMPTY, FLAT, BUSY = 0, 1, 2
-"""Targets that no splat reaches, that are amid splats of one colour, and all others."""
+EMPTY, SETTLED, FLAT, BUSY = 0, 1, 2, 3
+"""Targets that no splat reaches, that are told to show the colour of all, that are amid splats of one colour, and all
+others."""
 
 
 @kernel
@@ -25,7 +26,7 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, dep
         row: (K, H, W).
         fronts: whether only front layers count; otherwise those behind must be hidden by opaque ones.
         reach: pixels that a sample may lie off its cell's centre, so that the weights are sure to add up to one.
-        states: (H, W) uint8, to be filled.
+        states: (H, W) uint8, EMPTY or SETTLED, to be filled where they are EMPTY.
         hidden: (H, B) uint8, zeros, to be marked: the blocks of columns in or beside which hidden layers are covered.
         depths: (H, 2) zeros, for the least and the largest depth of each row, and zero.
         seen: (N,) uint8, zeros, to be marked: samples that some cell refers to.
@@ -115,7 +116,7 @@ def _decide(states, covered0, covered1, covered2, calm0, calm1, calm2, joins1, j
         some = covered0[x] | covered0[x + 1] | covered0[x + 2] | covered1[x] | covered1[x + 1] | covered1[x + 2]
         some |= covered2[x] | covered2[x + 1] | covered2[x + 2]
         flat = calm0[x + 1] & calm1[x + 1] & calm2[x + 1] & joins1[x + 1] & joins2[x + 1]
-        states[x] = (some << 1) - flat
+        states[x] = SETTLED if states[x] == SETTLED else (some << 1 | some) - flat
 
 
 @kernel
