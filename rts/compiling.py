@@ -2,59 +2,194 @@
 
 Kernels are kept on disk; helpers are not, since a helper that is loaded is not inlined. numba makes of every function
 two wrappers beside its code, one for Python and one for C. Here each has the wrappers that something calls, which
-shortens compilation by a fifth. Where much has to be compiled, a terminal is told.
+shortens compilation by a fifth. What is not on disk is compiled here and, meanwhile, in another process
+(`rts.companion`). Where much has to be compiled, a terminal is told.
 """
 
 from __future__ import annotations
 
+import gc
 import sys
+import threading
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple, cast
 
 import numba
 from numba.core import event
+from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
+
+from rts import companion
 
 TOLD_AFTER = 1.0
 """Seconds of compilation after which a terminal is told of it."""
 
 PACKAGES = ("rts", "rts_backends", "rts_surfaces")
 
+saving = threading.RLock()
+"""Held while a kernel is written to disk."""
+
 
 def kernel(function: Callable | None = None, **options: Any) -> Any:
     """Compile a loop that Python calls, without the interpreter lock, and keep it on disk; `options` are numba's."""
-    options |= {"nogil": True, "cache": True, "no_cfunc_wrapper": True}
-    decorate = numba.njit(**options)
+    options |= {"nogil": True, "no_cfunc_wrapper": True}
+
+    def decorate(function: Callable) -> Any:
+        made = cast(Any, numba.njit(**options)(function))
+        if made is not function:  # As it is where compilation is switched off.
+            made._cache = _Cache(function)
+        return _interpreted(made)
+
     return decorate if function is None else decorate(function)
 
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
     """Compile a function that only compiled loops call; Python cannot. `options` are numba's."""
     options |= {"nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    decorate = numba.njit(**options)
+
+    def decorate(function: Callable) -> Any:
+        return _interpreted(numba.njit(**options)(function))
+
     return decorate if function is None else decorate(function)
 
 
-class _Progress(event.Listener):
+class _Cache(FunctionCache):
+    """A kernel's compiled code on disk, which another process may be about to write."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """What is on disk; None if it is to be compiled here."""
+        found = super().load_overload(sig, target_context)
+        if found is None and companion.begin(key := _key(self._py_func, sig)):
+            found = super().load_overload(sig, target_context)
+            if found is not None:
+                companion.end(key)
+        return found
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Write what has been compiled."""
+        with saving:
+            super().save_overload(sig, data)
+        companion.end(_key(self._py_func, sig))
+
+
+def _key(function: Callable, types: Any) -> int:
+    """A number for a function and the types of its arguments, the same in all processes."""
+    return companion.number(f"{function.__module__}.{function.__qualname__} {types}")
+
+
+# ------------------------------------------------------------------------------------- what would have to be compiled
+
+
+class Need(NamedTuple):
+    """A kernel, and the types of arguments that it is called with."""
+
+    kernel: Any
+    types: tuple
+
+
+_needs: dict[int, Need] | None = None
+_stand_ins: dict[Any, Any] = {}
+
+
+@contextmanager
+def interpreting() -> Iterator[dict[int, Need]]:
+    """Have Python interpret all kernels and helpers, which takes long but for the smallest pictures.
+
+    Yields:
+        What calls would have had compiled, in the order of the first calls; filled as they come. For a process that
+        does nothing else.
+    """
+    global _needs
+    _needs = needs = {}
+    _exchange({x: _interpreted(x) for x in _globals() if isinstance(x, Dispatcher)})
+    try:
+        yield needs
+    finally:
+        _needs = None
+        _exchange(_stand_ins)
+        _stand_ins.clear()
+
+
+def _interpreted(made: Any) -> Any:
+    """What stands for a compiled function: itself, or what Python runs if all are interpreted."""
+    if _needs is None or not isinstance(made, Dispatcher):
+        return made
+    needs, function = _needs, made.py_func
+
+    def noted(*args: Any) -> Any:
+        types = tuple(map(made.typeof_pyval, args))
+        needs.setdefault(_key(function, types), Need(made, types))
+        return function(*args)
+
+    stand_in = noted if isinstance(getattr(made, "_cache", None), _Cache) else function
+    _stand_ins[stand_in] = made
+    return stand_in
+
+
+def _globals() -> list[Any]:
+    return [x for module in _modules() for x in vars(module).values()]
+
+
+def _exchange(others: dict[Any, Any]) -> None:
+    """Put others in place of globals of our modules."""
+    for module in _modules():
+        for name, value in list(vars(module).items()):
+            if callable(value) and value.__hash__ is not None and value in others:
+                setattr(module, name, others[value])
+
+
+def _modules() -> list[Any]:
+    return [module for name, module in list(sys.modules.items()) if name.partition(".")[0] in PACKAGES]
+
+
+# ------------------------------------------------------------------------------------------------- while it goes on
+
+
+class _Outermost(event.Listener):
+    """Listens to what numba compiles, but for what is compiled within; the lock of the compiler is held."""
+
+    def __init__(self) -> None:
+        self._depth = 0
+
+    def on_start(self, event: Any) -> None:
+        """Go deeper."""
+        if self._depth == 0:
+            self.begun(_is_ours(event.data["dispatcher"]))
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        """Come back."""
+        self._depth -= 1
+        if self._depth == 0:
+            self.ended(_is_ours(event.data["dispatcher"]))
+
+    def begun(self, ours: bool) -> None:
+        """Compilation of a function, ours or not, begins."""
+
+    def ended(self, ours: bool) -> None:
+        """It is done."""
+
+
+class _Progress(_Outermost):
     """Lines on a terminal while kernels are compiled: how many, in which time; nothing where they are on disk.
 
     Each comes after twice the time of the one before, and is whole, since nobody knows which kernel is the last.
     """
 
     def __init__(self) -> None:
+        super().__init__()
         self.count, self.seconds = 0, 0.0
-        self._depth, self._since, self._next = 0, 0.0, TOLD_AFTER
+        self._since, self._next = 0.0, TOLD_AFTER
 
-    def on_start(self, event: Any) -> None:
-        """Begin to count time, or go deeper; the lock of the compiler is held."""
-        if self._depth == 0:
-            self._since = time.perf_counter()
-        self._depth += 1
+    def begun(self, ours: bool) -> None:
+        """Begin to count time."""
+        self._since = time.perf_counter()
 
-    def on_end(self, event: Any) -> None:
+    def ended(self, ours: bool) -> None:
         """Count a kernel that is done, and tell of it."""
-        self._depth -= 1
-        if self._depth == 0 and _is_ours(event.data["dispatcher"]):
+        if ours:
             self.count, self.seconds = self.count + 1, self.seconds + time.perf_counter() - self._since
             stream = sys.stderr
             if self.seconds > self._next and stream is not None and stream.isatty():
@@ -63,9 +198,29 @@ class _Progress(event.Listener):
                 stream.flush()
 
 
+class _NoCollection(_Outermost):
+    """No garbage is collected while a kernel is compiled, which makes many objects: that takes a tenth of the time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._paused = False
+
+    def begun(self, ours: bool) -> None:
+        """Stop, if it is on."""
+        self._paused = ours and gc.isenabled()
+        if self._paused:
+            gc.disable()
+
+    def ended(self, ours: bool) -> None:
+        """Go on."""
+        if self._paused:
+            gc.enable()
+
+
 def _is_ours(dispatcher: Any) -> bool:
     module = getattr(getattr(dispatcher, "py_func", None), "__module__", None) or ""
     return module.partition(".")[0] in PACKAGES
 
 
 event.register("numba:compile", _Progress())
+event.register("numba:compile", _NoCollection())

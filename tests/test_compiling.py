@@ -1,5 +1,6 @@
 """What is compiled, and when: few kernels, each once; a line on terminals alone."""
 
+import gc
 import io
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import pytest
 import rts
 
 pytest.importorskip("numba")
-from rts import compiling, warming
+from rts import companion, compiling
 
 pytestmark = pytest.mark.core
 
@@ -79,20 +80,31 @@ def test_a_terminal_is_told_of_what_takes_long(stream, told, monkeypatch):
     assert stream.getvalue().splitlines() == (lines if told else [])
 
 
-def test_warmup_does_every_task_in_a_process_and_says_what_failed(monkeypatch):
+def test_no_garbage_is_collected_while_our_kernels_are_compiled():
+    ours, theirs = (type("", (), {"data": {"dispatcher": type("", (), {"py_func": f})}}) for f in (rts.render, np.dot))
+    listener = compiling._NoCollection()
+    for event, paused in ((ours, True), (theirs, False)):
+        listener.on_start(event)
+        listener.on_start(ours)
+        listener.on_end(ours)
+        assert gc.isenabled() is not paused
+        listener.on_end(event)
+        assert gc.isenabled()
+
+
+def test_warmup_has_as_many_processes_share_the_work_and_says_what_failed(monkeypatch):
     given = []
 
-    def run(command, **options):
-        given.append((command[2], options["env"]["RTS_NUM_THREADS"]))
-        failed = "fitting" in command[2]
-        return subprocess.CompletedProcess(
-            command, int(failed), "", "Traceback\nMemoryError: no more" if failed else ""
-        )
+    def process(claims, everything, **options):
+        given.append((claims.file.fileno(), everything))
+        said = "raise MemoryError('no more')" if len(given) == 3 else ""
+        return subprocess.Popen([sys.executable, "-c", said], **options)
 
-    monkeypatch.setattr(warming.subprocess, "run", run)
-    with pytest.raises(rts.RtsError, match="could not compile what fitting needs: MemoryError: no more"):
+    monkeypatch.setattr(companion, "process", process)
+    assert rts.warmup(2) < 60
+    assert given[0] == given[1] and given[0][1]
+    with pytest.raises(rts.RtsError, match="could not compile kernels: MemoryError: no more"):
         rts.warmup(1)
-    assert [code.partition("[")[2] for code, _ in given] == [f"{name!r}]()" for name in warming.TASKS]
 
 
 @pytest.mark.parametrize("processes", [0, -1, 1.5, "two", True])

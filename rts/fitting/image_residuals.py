@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple, TypeGuard
 
 import numpy as np
 
+from rts import companion
 from rts.arguments import quoted
 from rts.arrays import described, from_numbers, is_finite, kind_of, shape_of
 from rts.camera import Camera
@@ -235,6 +236,7 @@ class ImageResiduals(Residuals):
             and (self.supersample == 1 or splatter.averages)
             and not (isinstance(self.supersample, Adaptive) and self.supersample.contrast is not None)
         ):
+            companion.expect(companion.LEAST_SQUARES)
             found = self._swept(splatter, parameters, engine)
         return normal_equations(self, parameters, engine) if found is None else found
 

@@ -74,7 +74,9 @@ def _push(start, stop, m, points, turn, move, out):
 def _pull(start, stop, m, points, g, sums, g_points):
     zero, one = points.dtype.type(0), points.dtype.type(1)
     for chunk in range(start, stop):
-        total = np.zeros((4, 4))
+        # Not an array that is assigned: for that numba compiles an error that tells shapes, which takes a second.
+        total = sums[chunk]
+        total[:] = 0
         for n in range(chunk * CHUNK, min(len(points), (chunk + 1) * CHUNK)):
             if g[n, 0] == 0 and g[n, 1] == 0 and g[n, 2] == 0:  # Common: the interior of a silhouette.
                 if len(g_points):
@@ -95,4 +97,3 @@ def _pull(start, stop, m, points, g, sums, g_points):
             if len(g_points):
                 for i in range(3):
                     g_points[n, i] = a * m[0, i] + b * m[1, i] + c * m[2, i] + d * m[3, i]
-        sums[chunk] = total

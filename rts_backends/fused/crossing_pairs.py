@@ -125,7 +125,8 @@ def _find_in_depths(start, stop, covered, depth, rules, bits, some):
             gap[at] = np.inf
             if 0 <= y < height and _any(covered[1, y]):
                 there = True
-                z[0, at], z[1, at] = depth[0, y], depth[1, y]
+                _copy(z[0, at], depth[0, y])
+                _copy(z[1, at], depth[1, y])
                 _subtract(gap[at, BORDER:-BORDER], covered[0, y], covered[1, y], depth[0, y], depth[1, y])
         if there:
             _find(top, bottom, z, gap, most, rules, bits, some)
@@ -156,6 +157,13 @@ def _load_cells(z, gap, positions, row, y):
                 gap[x + BORDER] = positions[j, 2] - positions[i, 2]
                 found = True
     return found
+
+
+@compiled
+def _copy(to, given):
+    # A loop, since for arrays that are assigned numba compiles an error that tells their shapes, which takes a second.
+    for x in range(len(to)):
+        to[x] = given[x]
 
 
 @compiled

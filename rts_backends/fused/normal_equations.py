@@ -307,7 +307,9 @@ def _multiply(sums, products, change, value, fields, y, left, count, changing):
         for n in range(0 if changing else many, many + 1):
             to = products[n, own : own + count]
             if n < many:
-                to[:] = change[n, p : p + count]
+                # A loop, since for arrays that are assigned numba compiles an error that tells their shapes: a second.
+                for j in range(count):
+                    to[j] = change[n, p + j]
                 if len(background) > 0:
                     for j in range(count):
                         to[j] -= change[n, OPACITY + j] * background[y, left + j, first + c]

@@ -1,0 +1,189 @@
+"""A companion: a process that compiles kernels beside this one, from the last that this one will need on.
+
+numba's compiler has one lock a process. So where kernels are not on disk, the first that is missing starts another
+process (`rts.accompanying`), which finds out what such a call needs, begins at the end of it, and goes on until the two
+meet. This process tells which kernels it misses; who compiles which is settled by locks on single bytes of a nameless
+file. Nothing waits for the companion but a kernel that it is about to finish, and it ends with this process.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import subprocess
+import sys
+import tempfile
+import zlib
+from pathlib import Path
+from typing import IO, Any
+
+from rts.threads import thread_count
+
+if sys.platform != "win32":  # There each process compiles for itself.
+    import fcntl
+
+SWITCH = "RTS_COMPILE_AHEAD"
+"""The environment variable that, if it is 0, keeps this process from starting a companion."""
+
+SHARED = sys.platform != "win32"
+"""Whether processes can tell one another what they compile."""
+
+LEAST_SQUARES = "least squares"
+"""A kind of call that can be expected."""
+
+_state: _Companion | None | bool = None
+"""The companion of this process; None before one was needed, False where there is none."""
+
+_expected: list[str] = []
+
+
+def number(name: str) -> int:
+    """A number for a name, the same in all processes."""
+    return zlib.crc32(name.encode())
+
+
+def expect(kind: str) -> None:
+    """Say what kind of call is going on, where its first kernels do not tell."""
+    if kind not in _expected:
+        _expected.append(kind)
+        if isinstance(_state, _Companion):
+            _state.tell(number(kind))
+
+
+def begin(key: int) -> bool:
+    """Say that a kernel is missing on disk; whether another process has compiled it meanwhile, perhaps."""
+    global _state
+    if _state is None:
+        _state = _started() if _may_start() else False
+    return isinstance(_state, _Companion) and _state.begin(key)
+
+
+def end(key: int) -> None:
+    """Say that a kernel is on disk now."""
+    if isinstance(_state, _Companion):
+        _state.claims.drop(key)
+
+
+def _may_start() -> bool:
+    return (
+        SHARED
+        and os.environ.get(SWITCH) != "0"
+        and thread_count() > 1
+        # Where others do the same work, there are no idle cores.
+        and "PYTEST_XDIST_WORKER" not in os.environ
+        and not _is_child()
+        # Elsewhere the program is not Python: one that embeds it, or that was packed with it.
+        and not getattr(sys, "frozen", False)
+        and Path(sys.executable or "").name.lower().startswith(("python", "pypy"))
+    )
+
+
+def _is_child() -> bool:
+    """Whether multiprocessing has started this process; it is imported there."""
+    module = sys.modules.get("multiprocessing.process")
+    return module is not None and module.parent_process() is not None
+
+
+def _started() -> _Companion | bool:
+    try:
+        return _Companion()
+    except (OSError, RuntimeError):  # No more processes, files, or threads; or the interpreter is about to end.
+        return False
+
+
+class Claims:
+    """Which kernel each of several processes compiles: locks on bytes of a file, which end with their process."""
+
+    def __init__(self, file: IO[bytes]):
+        self.file = file
+
+    def take(self, key: int) -> bool:
+        """Claim a kernel, unless another process has it."""
+        try:
+            fcntl.lockf(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, key)
+        except OSError:
+            return False
+        return True
+
+    def wait(self, key: int) -> None:
+        """Claim a kernel, once nobody else has it."""
+        with contextlib.suppress(OSError):
+            fcntl.lockf(self.file, fcntl.LOCK_EX, 1, key)
+
+    def drop(self, key: int) -> None:
+        """Give a claim back, if there is one."""
+        with contextlib.suppress(OSError):
+            fcntl.lockf(self.file, fcntl.LOCK_UN, 1, key)
+
+
+def process(claims: Claims | None, everything: bool = False, **options: Any) -> subprocess.Popen:
+    """Start a process that compiles: what it is told is missing, and what goes with it, or everything.
+
+    It ends when its standard input does.
+    """
+    descriptor = -1 if claims is None else claims.file.fileno()
+    command = [sys.executable, "-P", "-c", f"from rts.accompanying import serve; serve({descriptor}, {everything})"]
+    own = {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "RTS_NUM_THREADS": "1", SWITCH: "0"}
+    return subprocess.Popen(
+        command,
+        env=os.environ | own,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        pass_fds=[] if claims is None else [descriptor],
+        start_new_session=True,  # What interrupts this process is not for it.
+        **options,
+    )
+
+
+class _Companion:
+    """The other process, as this one sees it."""
+
+    def __init__(self) -> None:
+        self.claims = Claims(tempfile.TemporaryFile(buffering=0))
+        try:
+            self._start()
+        except BaseException:
+            self.claims.file.close()
+            raise
+        atexit.register(self.stop)
+        os.register_at_fork(after_in_child=self._forget)
+
+    def begin(self, key: int) -> bool:
+        """See `begin`."""
+        if self._process.poll() == 0:  # It had nothing to do for long.
+            self.stop()
+            self._start()
+        self.tell(key)
+        if not self.claims.take(key):
+            self.claims.wait(key)
+        return True  # It may have been done before it was asked for.
+
+    def tell(self, key: int) -> None:
+        """Hand it a number; where it has failed, this process is alone."""
+        with contextlib.suppress(OSError):
+            self._to.write(b"%d\n" % key)
+
+    def stop(self) -> None:
+        """End it, at once."""
+        self._to.close()
+        try:
+            self._process.wait(2)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    def _start(self) -> None:
+        self._process = process(self.claims, stderr=subprocess.DEVNULL, bufsize=0)
+        assert self._process.stdin is not None
+        self._to = self._process.stdin
+        for kind in _expected:
+            self.tell(number(kind))
+
+    def _forget(self) -> None:
+        """In a fork of this process: the companion is not its own."""
+        global _state
+        _state = False
+        atexit.unregister(self.stop)
+        self._to.close()
+        self._process.returncode = 0  # Not to be waited for.

@@ -1,0 +1,226 @@
+"""The process that compiles beside another: what it finds out, in which order it goes, when it starts and ends."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+
+import pytest
+
+pytest.importorskip("numba")
+from rts import accompanying, companion
+from rts.compiling import Need
+
+pytestmark = pytest.mark.core
+
+ORDINARY_CALLS = """
+import json, sys
+import numpy as np
+import torch
+from numba.core.dispatcher import Dispatcher
+import rts
+from rts import compiling, rehearsal
+
+def compiled():
+    found = {id(x): x for x in compiling._globals() if isinstance(x, Dispatcher)}
+    kept = [x for x in found.values() if isinstance(x._cache, compiling._Cache)]
+    return {compiling._key(x.py_func, sig): f"{x.__name__} {sig}" for x in kept for sig in x.overloads}
+
+# A ball, coarsely, since outlines and hidden layers are what most kernels are for.
+y, x = np.mgrid[:7, :12]
+up, round = np.pi * y.ravel() / 6, np.pi * x.ravel() / 6
+vertices = np.stack([np.sin(up) * np.cos(round), np.cos(up), np.sin(up) * np.sin(round)], 1).astype(np.float32)
+a, b = (12 * y[:-1] + x[:-1]).ravel(), (12 * y[:-1] + (x[:-1] + 1) % 12).ravel()
+faces = np.concatenate([np.stack([a, b, a + 12], 1), np.stack([b, b + 12, a + 12], 1)])
+part = rts.Part(rts.plugin("surfaces", "mesh")(faces), {"vertices": vertices}, "lambert")
+camera, size = rts.Camera.look_at((0, 0.5, 3), (0, 0, 0)), (40, 40)
+
+def picture():
+    rts.render(part, camera, size)
+
+def gradient():
+    vertices = torch.tensor(part.theta["vertices"], requires_grad=True)
+    rts.render(part.replace(theta={"vertices": vertices}), camera, size).square().sum().backward()
+
+def least_squares():
+    posed = lambda pose: part.replace(transform=rts.rigid(pose))
+    residuals = rts.ImageResiduals(posed, camera, size, np.zeros((*size, 4), np.float32))
+    rts.fit(residuals, torch.full((6,), 0.01), method="lm", steps=1)
+
+needed = []
+for call in (picture, gradient, least_squares):
+    call()
+    needed.append(compiled())
+before = compiled()
+batches = rehearsal.routes()
+routes = next(batches) + next(batches)
+assert compiled() == before  # Nothing was compiled for it, and all is back in its place.
+picture()
+route = {name: {k for k, need in routes[i].items() if need} for name, i in (("picture", 0), ("gradient", 1), ("lm", 3))}
+print(json.dumps({
+    "picture missing": [needed[0][k] for k in needed[0].keys() - route["picture"]],
+    "picture superfluous": len(route["picture"] - needed[0].keys()),
+    "gradient missing": [needed[1][k] for k in needed[1].keys() - route["gradient"]],
+    "gradient superfluous": len(route["gradient"] - needed[1].keys()),
+    "missing": [needed[2][k] for k in needed[2].keys() - route["gradient"] - route["lm"]],
+}))
+"""
+
+
+def test_a_rehearsal_finds_what_ordinary_calls_need():
+    """In the very types; of the gradient little more, which would be compiled in vain."""
+    pytest.importorskip("torch")
+    done = subprocess.run([sys.executable, "-c", ORDINARY_CALLS], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found == {
+        "picture missing": [],
+        "picture superfluous": 0,
+        "gradient missing": [],
+        "gradient superfluous": pytest.approx(0, abs=2),
+        "missing": [],
+    }
+
+
+def route(letters):
+    return {ord(x): Need(x, ()) for x in letters}
+
+
+PICTURE, GRADIENT, POSE, FIT = map(route, ("abcd", "abcdef", "rabcdgh", "rabcij"))
+
+
+@pytest.mark.parametrize(
+    ("seen", "done", "expected"),
+    [
+        ("a", "", "d"),  # From the end of the most ordinary call.
+        ("ab", "d", "c"),
+        ("ab", "dc", None),
+        ("abe", "dc", "f"),
+        ("r", "", "c"),  # Either of two: what they share,
+        ("r", "abc", "h"),  # and then what the first needs.
+        ("ri", "", "j"),
+        ("abei", "cdf", "j"),  # A call after another.
+        ("x", "", None),
+        ("xa", "", "d"),
+    ],
+)
+def test_what_will_be_needed_last_is_compiled_first(seen, done, expected):
+    key, need = accompanying.following([PICTURE, GRADIENT, POSE, FIT], [*map(ord, seen)], {*map(ord, done)})
+    assert (need.kernel if need else None) == expected
+    assert key == (ord(expected) if expected else 0)
+
+
+def test_an_expected_kind_of_call_counts_as_a_kernel_but_is_none():
+    name = companion.number(companion.LEAST_SQUARES)
+    fit = {name: None, **FIT}
+    assert accompanying.following([PICTURE, POSE, fit], [name], set())[1].kernel == "j"
+    assert accompanying.following([PICTURE, POSE, fit], [ord("r")], {*FIT, *POSE}) == (0, None)
+
+
+CLAIM = """
+import os, sys
+from rts.companion import Claims
+claims = Claims(os.fdopen(int(sys.argv[1]), "r+b", buffering=0))
+print(claims.take(1), claims.take(2), flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.mark.skipif(not companion.SHARED, reason="no locks that end with their process")
+def test_a_claim_keeps_others_off_until_it_is_dropped_or_its_process_ends():
+    with tempfile.TemporaryFile(buffering=0) as file:
+        claims = companion.Claims(file)
+        assert claims.take(1)
+        number = file.fileno()
+        command = [sys.executable, "-c", CLAIM, str(number)]
+        with subprocess.Popen(command, pass_fds=[number], stdin=-1, stdout=-1, text=True) as other:
+            assert other.stdout.readline() == "False True\n"
+            assert claims.take(3) and not claims.take(2)
+            other.kill()
+            claims.wait(2)
+        claims.drop(2)
+        assert claims.take(2)
+
+
+@pytest.fixture
+def willing(monkeypatch):
+    """A process that may start a companion, whatever runs these tests."""
+    monkeypatch.delenv("PYTEST_XDIST_WORKER", raising=False)
+    monkeypatch.delenv(companion.SWITCH, raising=False)
+    monkeypatch.setenv("RTS_NUM_THREADS", "2")
+    assert companion._may_start() is companion.SHARED
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [(companion.SWITCH, "0"), ("RTS_NUM_THREADS", "1"), ("PYTEST_XDIST_WORKER", "gw0")]
+)
+def test_a_variable_keeps_it_from_starting(name, value, monkeypatch, willing):
+    monkeypatch.setenv(name, value)
+    assert not companion._may_start()
+
+
+def test_no_child_of_multiprocessing_and_no_program_but_python_starts_it(monkeypatch, willing):
+    with monkeypatch.context() as m:
+        m.setattr("multiprocessing.process.parent_process", lambda: "its parent")
+        assert not companion._may_start()
+    for executable in ("/usr/bin/uwsgi", "", None):
+        monkeypatch.setattr(sys, "executable", executable)
+        assert not companion._may_start()
+
+
+FIRST_KERNEL = """
+import os, sys
+import numpy as np
+from rts import accompanying, companion
+from rts.operations import take
+
+def gradient():
+    take.TAKE.pull([np.zeros((2, 3), np.float32), np.zeros(4, np.int32)], np.zeros((4, 3), np.float32), [out])
+
+out = np.zeros((2, 3), np.float32)
+gradient()
+process = companion._state._process
+if (child := os.fork()) == 0:
+    sys.exit()
+os.waitpid(child, 0)
+assert process.poll() is None  # It is not the fork's to end.
+print(process.pid, flush=True)
+if sys.argv[1] == "killed":
+    os.kill(os.getpid(), 9)
+"""
+
+
+@pytest.mark.skipif(not companion.SHARED, reason="there is no companion")
+@pytest.mark.parametrize("how", ["ends", "killed"])
+def test_it_starts_with_the_first_kernel_that_is_missing_and_ends_with_its_process(how, tmp_path, willing):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-W", "error::ResourceWarning", "-c", FIRST_KERNEL, how]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == (-signal.SIGKILL if how == "killed" else 0) and not done.stderr, done.stderr
+    end = time.monotonic() + 20
+    while is_running(int(done.stdout)) and how == "killed" and time.monotonic() < end:
+        time.sleep(0.05)
+    assert not is_running(int(done.stdout))
+
+
+def is_running(pid):
+    try:
+        os.kill(pid, 0)
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_a_companion_that_cannot_start_is_done_without(monkeypatch, willing):
+    def no_more(*args, **options):
+        raise BlockingIOError("no more processes")
+
+    monkeypatch.setattr(companion, "_state", None)
+    monkeypatch.setattr(companion.subprocess, "Popen", no_more)
+    assert not companion.begin(7)
+    assert companion._state is False
+    companion.end(7)
