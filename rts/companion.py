@@ -3,7 +3,7 @@
 numba's compiler has one lock a process. So where kernels are not on disk, the first that is missing starts another
 process (`rts.accompanying`), which finds out what such a call needs, begins at the end of it, and goes on until the two
 meet. This process tells which kernels it misses; who compiles which is settled by locks on single bytes of a nameless
-file. Nothing waits for the companion but a kernel that it is about to finish, and it ends with this process.
+file. Nothing waits for the companion but a kernel that it has begun, and it ends with this process.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import os
+import socket
 import subprocess
 import sys
 import tempfile
@@ -56,6 +57,8 @@ def begin(key: int) -> bool:
     global _state
     if _state is None:
         _state = _started() if _may_start() else False
+    if isinstance(_state, _Companion) and not _state.goes_on():
+        _state = False
     return isinstance(_state, _Companion) and _state.begin(key)
 
 
@@ -102,8 +105,10 @@ class Claims:
         """Claim a kernel, unless another process has it."""
         try:
             fcntl.lockf(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, key)
-        except OSError:
+        except (BlockingIOError, PermissionError):
             return False
+        except OSError:  # Where files have no locks, each compiles for itself.
+            return True
         return True
 
     def wait(self, key: int) -> None:
@@ -117,18 +122,22 @@ class Claims:
             fcntl.lockf(self.file, fcntl.LOCK_UN, 1, key)
 
 
-def process(claims: Claims | None, everything: bool = False, **options: Any) -> subprocess.Popen:
-    """Start a process that compiles: what it is told is missing, and what goes with it, or everything.
+def process(claims: Claims | None, everything: bool = False, stdin: Any = subprocess.PIPE, **options: Any) -> Any:
+    """Start a process (`subprocess.Popen`) that compiles: what it is told is missing, and what goes with it, or all.
 
     It ends when its standard input does.
     """
     descriptor = -1 if claims is None else claims.file.fileno()
     command = [sys.executable, "-P", "-c", f"from rts.accompanying import serve; serve({descriptor}, {everything})"]
-    own = {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p), "RTS_NUM_THREADS": "1", SWITCH: "0"}
+    # An empty entry of the path is the working directory.
+    path = [p or os.getcwd() for p in sys.path if isinstance(p, str)]
+    own = {"PYTHONPATH": os.pathsep.join(path), "RTS_NUM_THREADS": "1", SWITCH: "0"}
+    if kept := getattr(getattr(sys.modules.get("numba"), "config", None), "CACHE_DIR", ""):
+        own["NUMBA_CACHE_DIR"] = str(kept)
     return subprocess.Popen(
         command,
         env=os.environ | own,
-        stdin=subprocess.PIPE,
+        stdin=stdin,
         stdout=subprocess.DEVNULL,
         pass_fds=[] if claims is None else [descriptor],
         start_new_session=True,  # What interrupts this process is not for it.
@@ -146,14 +155,23 @@ class _Companion:
         except BaseException:
             self.claims.file.close()
             raise
-        atexit.register(self.stop)
+        atexit.register(self._end)
         os.register_at_fork(after_in_child=self._forget)
+
+    def goes_on(self) -> bool:
+        """Whether there is one, again if it has ended since it had nothing to do for long."""
+        if self._process.poll() != 0:
+            return True
+        self.stop()
+        try:
+            self._start()
+        except (OSError, RuntimeError):
+            atexit.unregister(self._end)
+            return False
+        return True
 
     def begin(self, key: int) -> bool:
         """See `begin`."""
-        if self._process.poll() == 0:  # It had nothing to do for long.
-            self.stop()
-            self._start()
         self.tell(key)
         if not self.claims.take(key):
             self.claims.wait(key)
@@ -162,7 +180,8 @@ class _Companion:
     def tell(self, key: int) -> None:
         """Hand it a number; where it has failed, this process is alone."""
         with contextlib.suppress(OSError):
-            self._to.write(b"%d\n" % key)
+            # A program that lets broken pipes end it is not to be ended by this one.
+            self._to.send(b"%d\n" % key, getattr(socket, "MSG_NOSIGNAL", 0))
 
     def stop(self) -> None:
         """End it, at once."""
@@ -174,16 +193,27 @@ class _Companion:
             self._process.wait()
 
     def _start(self) -> None:
-        self._process = process(self.claims, stderr=subprocess.DEVNULL, bufsize=0)
-        assert self._process.stdin is not None
-        self._to = self._process.stdin
+        self._to, end = socket.socketpair()
+        try:
+            with end:
+                self._process = process(self.claims, stdin=end.fileno(), stderr=subprocess.DEVNULL)
+        except BaseException:
+            self._to.close()
+            raise
+        self._to.settimeout(1)  # It reads whatever comes, unless it hangs.
         for kind in _expected:
             self.tell(number(kind))
+
+    def _end(self) -> None:
+        """At the end of this process, after which some thread or handler may miss a kernel yet."""
+        global _state
+        _state = False
+        self.stop()
 
     def _forget(self) -> None:
         """In a fork of this process: the companion is not its own."""
         global _state
         _state = False
-        atexit.unregister(self.stop)
+        atexit.unregister(self._end)
         self._to.close()
         self._process.returncode = 0  # Not to be waited for.

@@ -44,7 +44,7 @@ def _route(kind: Callable[[list[Part], tuple[int, int]], None], count: int) -> d
 
     with compiling.interpreting() as needs, np.errstate(all="ignore"):
         kind(_parts()[:count], SIZES[count])
-    name = {companion.number(companion.LEAST_SQUARES): None} if kind is _least_squares else {}
+    name = {companion.number(companion.LEAST_SQUARES): None} if kind in LEAST_SQUARES else {}
     return {**name, **needs}
 
 
@@ -116,15 +116,26 @@ def _gradient_of_pose(parts: list[Part], size: tuple[int, int]) -> None:
         tape.pull()
 
 
-def _least_squares(parts: list[Part], size: tuple[int, int]) -> None:
+def _gradient_of_silhouette(parts: list[Part], size: tuple[int, int]) -> None:
+    _gradient_of_pose(_dark(parts), size)
+
+
+def _least_squares_of_silhouette(parts: list[Part], size: tuple[int, int]) -> None:
+    for splatter, layers in (("auto", 2), ("single", 1)):
+        _least_squares(_dark(parts), size, splatter, layers, channels=1)
+
+
+def _least_squares(
+    parts: list[Part], size: tuple[int, int], splatter: Any = "auto", layers: int = 2, channels: int = 4
+) -> None:
     with _differentiating(pushes=True):
-        splatter, camera = check_splatter("auto"), _camera().for_size(size)
+        splatter, camera = check_splatter(splatter), _camera().for_size(size)
         parts = _posed(parts)
-        sampled = sample(parts, camera, size, splatter=splatter, settles=True)
+        sampled = sample(parts, camera, size, splatter=splatter, layers=layers, settles=True)
         scene = Scene.of(parts, camera, "auto", None).at(size)
         splats = to_splats(sampled, scene.parts, camera, camera, *scene.suited)
         t_positions, t_rgba = (np.zeros((1, *x.shape), x.dtype) for x in (splats.positions, splats.rgba))
-        splatter.normal_equations(splats, t_positions, t_rgba, np.zeros((*size, 4), np.float32))
+        splatter.normal_equations(splats, t_positions, t_rgba, np.zeros((*size, channels), np.float32))
 
 
 def _adaptive(parts: list[Part], size: tuple[int, int]) -> None:
@@ -135,4 +146,17 @@ def _posed(parts: list[Part]) -> list[Part]:
     return [part.replace(transform=rigid(np.zeros(6, np.float32))) for part in parts]
 
 
-KINDS = _render, _gradient_of_vertices, _gradient_of_pose, _least_squares, _adaptive
+def _dark(parts: list[Part]) -> list[Part]:
+    return [part.replace(shader="silhouette") for part in parts]
+
+
+KINDS = (
+    _render,
+    _gradient_of_vertices,
+    _gradient_of_pose,
+    _least_squares,
+    _adaptive,
+    _gradient_of_silhouette,
+    _least_squares_of_silhouette,
+)
+LEAST_SQUARES = _least_squares, _least_squares_of_silhouette

@@ -18,6 +18,9 @@ from rts.arguments import quoted
 from rts.errors import InputError, RtsError
 from rts.threads import thread_count
 
+MOST = 8
+"""Processes that are used unless more are asked for: there are some sixty kernels."""
+
 
 def warmup(processes: int | None = None) -> float:
     """Compile ahead what ordinary renders and fits of meshes use, and keep it on disk.
@@ -26,8 +29,8 @@ def warmup(processes: int | None = None) -> float:
     Where all is compiled it takes seconds. Kernels are for float32, and for derivatives as well.
 
     Args:
-        processes: how many to use at once; None for as many as there are cores for this process. One where the system
-            is Windows.
+        processes: how many to use at once; None for as many as there are cores for this process, 8 at most. One where
+            the system is Windows.
 
     Returns:
         Seconds that it took.
@@ -36,7 +39,7 @@ def warmup(processes: int | None = None) -> float:
         InputError: `processes` is no positive integer.
         RtsError: a process failed; what it said last is in the message.
     """
-    count = thread_count() if processes is None else processes
+    count = min(thread_count(), MOST) if processes is None else processes
     if not isinstance(count, (int, np.integer)) or isinstance(count, bool) or count < 1:
         raise InputError(f"processes is {quoted(processes)}; expected a positive integer, or None")
     start = time.perf_counter()

@@ -50,8 +50,14 @@ def least_squares():
     residuals = rts.ImageResiduals(posed, camera, size, np.zeros((*size, 4), np.float32))
     rts.fit(residuals, torch.full((6,), 0.01), method="lm", steps=1)
 
+def fit_of_silhouette():
+    posed = lambda pose: part.replace(transform=rts.rigid(pose), shader="silhouette")
+    given = dict(layers=1, splatter="single")
+    residuals = rts.ImageResiduals(posed, camera, size, np.zeros((*size, 1), np.float32), **given)
+    rts.fit(residuals, torch.full((6,), 0.01), method="lm", steps=1)
+
 needed = []
-for call in (picture, gradient, least_squares):
+for call in (picture, gradient, least_squares, fit_of_silhouette):
     call()
     needed.append(compiled())
 before = compiled()
@@ -59,13 +65,16 @@ batches = rehearsal.routes()
 routes = next(batches) + next(batches)
 assert compiled() == before  # Nothing was compiled for it, and all is back in its place.
 picture()
-route = {name: {k for k, need in routes[i].items() if need} for name, i in (("picture", 0), ("gradient", 1), ("lm", 3))}
+kinds = ("picture", 0), ("gradient", 1), ("lm", 3), ("silhouette", 6)
+route = {name: {k for k, need in routes[i].items() if need} for name, i in kinds}
+known = route["gradient"] | route["lm"]
 print(json.dumps({
     "picture missing": [needed[0][k] for k in needed[0].keys() - route["picture"]],
     "picture superfluous": len(route["picture"] - needed[0].keys()),
     "gradient missing": [needed[1][k] for k in needed[1].keys() - route["gradient"]],
     "gradient superfluous": len(route["gradient"] - needed[1].keys()),
-    "missing": [needed[2][k] for k in needed[2].keys() - route["gradient"] - route["lm"]],
+    "missing": [needed[2][k] for k in needed[2].keys() - known],
+    "silhouette missing": [needed[3][k] for k in needed[3].keys() - known - route["silhouette"]],
 }))
 """
 
@@ -82,6 +91,7 @@ def test_a_rehearsal_finds_what_ordinary_calls_need():
         "gradient missing": [],
         "gradient superfluous": pytest.approx(0, abs=2),
         "missing": [],
+        "silhouette missing": [],
     }
 
 
@@ -213,6 +223,73 @@ def is_running(pid):
             return file.read().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+MISSED = """
+import sys, time
+from pathlib import Path
+import numpy as np
+from rts.threads import read_only
+from rts_backends import raster
+
+def kept():
+    return {path.name for path in Path(sys.argv[1]).rglob("*.nbc")}
+
+raster._project(0, 0, read_only(np.zeros((1, 3), np.float32)), np.eye(4), np.zeros(1, np.int32))
+own, end = kept(), time.monotonic() + 100
+while kept() == own and time.monotonic() < end:
+    time.sleep(0.05)
+print(sorted(kept() - own), flush=True)
+"""
+
+
+@pytest.mark.skipif(not companion.SHARED, reason="there is no companion")
+def test_it_compiles_what_nobody_has_asked_for_yet(tmp_path, willing):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", MISSED, str(tmp_path)], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0 and "nbc" in done.stdout, done.stderr + done.stdout
+
+
+BROKEN_PIPE = """
+import os, signal, sys
+from pathlib import Path
+from rts import companion
+
+signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+sys.path.append(Path("of no importance"))
+assert companion.begin(7)
+companion.end(7)
+process = companion._state._process
+os.kill(process.pid, 9)
+process.wait()
+for _ in range(3):
+    assert companion.begin(8)  # Alone.
+    companion.end(8)
+process.returncode = 0  # As if it had ended for want of work: another is started.
+assert companion.begin(9) and companion._state._process.pid != process.pid
+companion.end(9)
+companion._state._process.kill()
+companion._state._process.wait()
+companion._state._process.returncode = 0
+
+def no_more(*args, **options):
+    raise BlockingIOError("no more processes")
+
+companion.subprocess.Popen = no_more
+assert not companion.begin(10) and companion._state is False
+companion.expect(companion.LEAST_SQUARES)
+companion.end(10)
+print("alive")
+"""
+
+
+@pytest.mark.skipif(not companion.SHARED, reason="there is no companion")
+def test_a_companion_that_dies_harms_nobody(tmp_path, willing):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", BROKEN_PIPE], env=environment, capture_output=True, text=True)
+    assert done.stdout == "alive\n", (done.returncode, done.stderr)
 
 
 def test_a_companion_that_cannot_start_is_done_without(monkeypatch, willing):
