@@ -440,8 +440,10 @@ class Splatter(Plugin):
         averages: whether its normal equations may be asked for with a target of fewer pixels than there are cells.
         settles: whether it reads `Splats.settled`: where all nine samples around a cell are fronts of one opaque
             colour, on cells' centres, and no hidden one beside them is `needed`, the cell has that colour, whatever
-            moves by little; and samples farther than `reach` from all other cells need not be there.
-        follows_outlines: whether hidden samples have no effect on cells at which `rts.Adaptive` sees no outline.
+            moves by little; and samples farther than `reach` from all other cells need not be there: where
+            `Splats.wanted` is told, those farther than one cell more from the others of them.
+        follows_outlines: whether, of samples of one colour, cells whose nine neighbours are fronts show this colour and
+            those that have none show nothing, where `rts.Adaptive` sees no outline: hidden samples have no effect.
     """
 
     FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}

@@ -75,7 +75,8 @@ class Raster(TriangleSampler):
         self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
     ) -> tuple[Fragments, np.ndarray, Fragments]:
         """See `TriangleSampler.rasterize_exits`: all triangles are looked at once, for both."""
-        if type(self).rasterize is not Raster.rasterize:
+        kind = type(self)
+        if (kind.rasterize, kind.rasterize_cells) != (Raster.rasterize, Raster.rasterize_cells):
             return super().rasterize_exits(prepared, camera, size, layers, beside)
         with self._seen(prepared, camera, size) as mesh:
             fronts, backs = mesh.select(facing(camera, "back"), both=True)

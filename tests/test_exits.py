@@ -9,6 +9,8 @@ from rts import splatting
 from rts.sampling.exits import beside_outlines
 from rts.splatting.layers import dilated
 from rts_backends.fused import splatters as fused
+from rts_backends.fused.cells import Cells
+from rts_backends.raster import Raster
 
 pytestmark = pytest.mark.sampling
 
@@ -160,6 +162,40 @@ def test_the_compiled_splatter_changes_as_the_specification(parts, layers):
     off = change(image(fused.Visible(exits=False), "torch-cpu", parts, layers=layers), "torch-cpu")
     np.testing.assert_array_equal(off[0], found[0])
     assert np.abs(off[1] - found[1]).max() > 0.1
+
+
+def test_exits_that_cells_share_add_up_in_one_order(monkeypatch):
+    """As on one thread, to the bit; no sampler of the library gives any."""
+    rng, shape = np.random.default_rng(0), (90, 60)
+    covered = np.indices(shape).sum(axis=0) % 9 < 5
+    row = np.where(covered, np.cumsum(covered.ravel()).reshape(shape) - 1, -1).astype(np.int32)[None]
+    y, x = np.nonzero(covered)
+    positions = np.stack([x + 0.5, y + 0.5, 1 + 0.5 * (np.indices(shape).sum(axis=0)[covered] % 9 % 4 == 0)], axis=1)
+    positions = np.concatenate([positions, [[30, 45, 2.0]]])
+    exits, g = np.where(covered, len(y), -1).astype(np.int32), rng.normal(size=(*shape, 4))
+    settings, part = fused.Visible()._settings(0), np.where(row >= 0, 0, -1)
+    found = []
+    for threads in (1, 2, 2, 2):
+        monkeypatch.setenv("RTS_NUM_THREADS", str(threads))
+        cells = Cells(settings, positions, np.ones((len(positions), 4)), row, part=part, exits=exits)
+        assert cells.choices.repeated
+        found.append(np.zeros_like(positions))
+        cells.vjp(g, found[-1], None)
+        np.testing.assert_array_equal(found[-1], found[0])
+    assert np.abs(found[0][-1, :2]).min() > 0
+
+
+@pytest.mark.parametrize("method", ["rasterize", "rasterize_cells"])
+def test_exits_are_found_by_a_method_that_a_subclass_overrides(method):
+    called = []
+
+    def noted(self, *args):
+        called.append(args[4])
+        return getattr(Raster, method)(self, *args)
+
+    own = type("Own", (Raster,), {method: noted})()
+    np.testing.assert_array_equal(sampled(ball(), sampler=own, layers=1).exit, sampled(ball(), layers=1).exit)
+    assert called == ["back" if method == "rasterize" else "front"]
 
 
 def test_pruned_scenes_of_several_parts_keep_their_exits():

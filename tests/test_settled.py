@@ -11,6 +11,7 @@ from rts import splatting
 from rts.sampling.interiors_kernels import settle
 from rts.sampling.scenes import sample
 from rts.splatting.layers import dilated
+from rts_backends.fused import splatters as fused
 
 pytestmark = pytest.mark.sampling
 
@@ -280,3 +281,19 @@ def test_what_has_no_cotangent_is_not_pulled_and_what_has_no_weight_not_swept(ki
     ]
     for masked, every in zip(*found, strict=True):
         np.testing.assert_allclose(masked, every, rtol=1e-9, atol=1e-15)
+
+
+def test_a_class_with_its_own_sums_says_anew_whether_it_follows_outlines():
+    class Wide(splatting.Single):
+        def accumulate(self, splats):
+            return super().accumulate(splats)
+
+    class Sharp(Wide):
+        follows_outlines = True
+
+        def accumulate(self, splats):
+            return super().accumulate(splats)
+
+    kinds = splatting.Single, fused.Single, splatting.Visible, fused.Visible, Sharp
+    assert all(kind().follows_outlines for kind in kinds)
+    assert not any(kind().follows_outlines for kind in (Wide, splatting.Multi, fused.Multi))

@@ -57,6 +57,8 @@ class Kernel(Splatter):
         super().__init_subclass__(**options)
         if "image" in vars(cls):
             cls._knows_settled = "_knows_settled" in vars(cls)
+        if vars(cls).keys() & {"image", "accumulate"} and "follows_outlines" not in vars(cls):
+            cls.follows_outlines = False  # What a class inherits it may not do.
 
     def __post_init__(self):
         if not (is_real(self.sigma) and LEAST_SIGMA <= self.sigma <= LARGEST_SIGMA):

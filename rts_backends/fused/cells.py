@@ -59,7 +59,7 @@ class Choices(NamedTuple):
             (u + 1) lies at −(u, v), and the buffers are in front, at the surface, behind.
         sums: (M, 3, 5), of each buffer the colours over the weight, taken as at least one, and the weight.
         states: (H, W) uint8, states of targets (`survey.py`); mixed ones are EMPTY here.
-        repeated: whether a sample stands in several cells, which would add to its gradient at the same time.
+        repeated: whether several cells name a sample, and would add to its gradient at the same time.
         extent: of the depths, the camera's included.
     """
 
@@ -172,7 +172,9 @@ class Cells:
         noted = states, hidden, depths, seen, counts
         given = self.positions, self.rgba, self.row, fronts, self._reach
         parallel(survey, height, *given, *noted, work=2 * self.row.size)
-        repeated = int(np.count_nonzero(seen)) != int(counts.sum())
+        leaves = self.exits[self.exits >= 0]
+        seen[leaves] = 1
+        repeated = int(np.count_nonzero(seen)) != int(counts.sum()) + len(leaves)
         marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
         if self._wanted is not None:
             states *= self._wanted | self.settled if len(self.settled) else self._wanted

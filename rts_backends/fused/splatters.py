@@ -90,6 +90,7 @@ class Single(_Fused, splatting.Single):
     """`rts.splatting.Single`, compiled."""
 
     kind = "single"
+    follows_outlines = True
 
 
 class Multi(_Fused, splatting.Multi):
@@ -102,6 +103,7 @@ class Visible(_Fused, splatting.Visible):
     """`rts.splatting.Visible`, compiled."""
 
     kind = "visible"
+    follows_outlines = True
 
     def _settings(self, border: int) -> Settings:
         return super()._settings(border)._replace(rims=self.rims, crossings=self.crossings)
