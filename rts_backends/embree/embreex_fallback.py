@@ -81,7 +81,7 @@ class Scene:
 
         count = size[0] * size[1]
         ids, found = np.full((count, layers), -1, np.int32), np.zeros((count, layers, 3))
-        last, step = np.full(count, -1, np.int32), np.empty(count)
+        last, step = np.full(count, -1, np.int32), np.zeros(count)
         scene = pixel_matrix(camera, size), -camera.view[2], facing(camera, cull), proxy.vertices, proxy.faces
         live = np.flatnonzero((square > 0) & (reach < stop))
         while len(live):
