@@ -488,6 +488,7 @@ SAMPLERS = {
     "exits_lie_on_the_part_behind_its_front": {
         "fronts": OddExits(lambda found: found.row[0]),
         "none": OddExits(lambda found: np.full_like(found.exit, -1)),
+        "nothing told": OddExits(lambda found: None),
         "others' exits": OddExits(lambda found: turned_about(found.exit)),
         "everywhere": OddExits(lambda found: np.maximum(found.exit, found.exit.max())),
     },

@@ -217,6 +217,8 @@ class SamplerConformance(Conformance):
             camera = scenes.CAMERA.within(part.transform)
             found = chosen.sample(part, camera, scenes.SIZE, 1, **asked)
             if found.exit is None:
+                moves = not isinstance(part.surface, TriangleSurface) or part.surface.refines
+                claim(moves, f"part {index}: nothing is told of exits, though its surface moves no samples")
                 continue
             exits, row = np.asarray(found.exit), np.asarray(found.row)
             there = exits >= 0
