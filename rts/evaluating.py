@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
+
+import numpy as np
 
 from rts.arrays import described, shape_of
 from rts.camera import Camera
@@ -18,6 +21,7 @@ from rts.operations.linear import affine_map
 from rts.operations.take import take
 from rts.records import Fine, Sampled, Samples, Splats
 from rts.sampling.scenes import Wide
+from rts.sampling.several import Views, in_one_table
 from rts.trees import Array, Tree
 
 
@@ -28,7 +32,6 @@ def to_splats(
     window: Camera,
     engine: Engine,
     like: Array | None,
-    evaluated: Sequence[GBuffer] | None = None,
 ) -> Splats:
     """Evaluate, shade and project samples: what splatters take, with the apron as border. Fine ones are left out.
 
@@ -39,18 +42,81 @@ def to_splats(
         window: the camera of the samples.
         engine: the engine to compute with.
         like: an array that sets dtype and device of its constants and of the splats.
-        evaluated: what `evaluated_together` gave for these samples, if they have been evaluated.
     """
     grid, apron = tuple(sampled.row.shape[1:]), sampled.apron
     wide = Wide(window.with_apron((grid[0] - 2 * apron, grid[1] - 2 * apron), apron), grid)
     if not engine.owns(sampled.row):
         sampled = constants(sampled, engine, like if engine.differentiates else None)
-    positions, rgba = _shown(sampled.samples, sampled.row, parts, camera, wide, engine, like, evaluated)
+    positions, rgba = _together(*_shown(sampled.samples, sampled.row, parts, camera, wide, engine, like))
+    return _splats(sampled, positions, rgba, engine).replace(border=apron)
+
+
+def views_to_splats(
+    pictures: Sequence[Views],
+    parts: Sequence[CheckedPart],
+    cameras: Sequence[Camera],
+    engine: Engine,
+    like: Array | None,
+) -> list[Splats]:
+    """The splats of pictures of several views: those of a picture have no border, but cells that are wanted.
+
+    A surface is asked once, for the samples of all views: what it computes of the whole of θ serves them all. Shaders
+    are asked for the samples of each view.
+
+    Args:
+        pictures: the samples of the views; pictures are of one size.
+        parts: checked parts.
+        cameras: the camera of each view, in order, which shaders see.
+        engine: the engine to compute with.
+        like: an array that sets dtype and device of its constants and of the splats.
+    """
+    sampled = [picture.sampled for picture in pictures]
+    if not engine.owns(sampled[0].row):
+        sampled = constants(sampled, engine, like if engine.differentiates else None)
+    by_part = []
+    for index, part in enumerate(parts):
+        whole = in_one_table([own.samples[index] for own in sampled])
+        gbuffer = _evaluate(part, part.surface.reads(part.theta), whole, engine, like)
+        by_part.append(_apart(whole, gbuffer, np.concatenate([p.counts[index] for p in pictures]).tolist(), engine))
+    by_view, shown, made = iter(zip(cameras, *by_part, strict=True)), [], []
+    for picture, own in zip(pictures, sampled, strict=True):
+        view, border = picture.picture.view, own.apron
+        size = view[0] - 2 * border, view[1] - 2 * border
+        shown = []
+        for camera, *tables in itertools.islice(by_view, picture.picture.views):
+            wide = Wide(camera.with_apron(size, border), view)
+            samples, evaluated = zip(*tables, strict=True)
+            # All rows are used.
+            every = np.arange(sum(s.ids.shape[0] for s in samples), dtype=np.int32)[None, None]
+            shown.append(_shown(samples, every, parts, camera, wide, engine, like, evaluated))
+        by_kind = [list(zip(*kind, strict=True)) for kind in zip(*shown, strict=True)]
+        positions, rgba = _together(*([x for of_part in kind for x in of_part] for kind in by_kind))
+        positions = _placed(positions, picture, [[p.shape[0] for p in of_part] for of_part in by_kind[0]])
+        wanted = engine_of(positions).constant(picture.picture.inside(border), positions)
+        made.append(_splats(own, positions, rgba, engine).replace(wanted=wanted))
+    return made
+
+
+def _placed(positions: Array, views: Views, counts: Sequence[Sequence[int]]) -> Array:
+    """Positions (N, 3) in a picture of views, from those in views; of each part and view there are so many."""
+    engine, every = engine_of(positions), np.ravel(counts)
+    corners = np.tile(views.picture.corners(), (len(counts), 1))
+    shift = np.zeros((len(corners), 3), np.float32)
+    shift[:, :2] = corners
+    if views.scales is not None:
+        factors = np.ones((len(corners), 3))
+        factors[:, 2] = np.tile(views.scales, len(counts))
+        positions = positions * engine.constant(np.repeat(factors, every, axis=0), positions)
+    return positions + engine.constant(np.repeat(shift, every, axis=0), positions)
+
+
+def _splats(sampled: Sampled, positions: Array, rgba: Array, engine: Engine) -> Splats:
+    """The splats of samples whose positions and colours are known."""
     cells = sampled.row, sampled.part, sampled.facing, sampled.settled, sampled.exit
     if not engine.owns(rgba):
         cells = constants(cells, *suiting(positions, rgba))
     *cells, exits = cells
-    return Splats(positions, rgba, *cells, exit=exits, border=apron)
+    return Splats(positions, rgba, *cells, exit=exits)
 
 
 def to_fine_splats(
@@ -61,7 +127,7 @@ def to_fine_splats(
     wide = Wide(camera.with_apron(size, fine.apron), tuple(n + 2 * fine.apron for n in size))
     if not engine.owns(fine.row):
         fine = constants(fine, engine, like if engine.differentiates else None)
-    positions, rgba = _shown(fine.samples, fine.index, parts, camera, wide, engine, like)
+    positions, rgba = _together(*_shown(fine.samples, fine.index, parts, camera, wide, engine, like))
     arrays = fine.index, fine.shift, fine.row, fine.part, fine.facing, fine.settled, fine.wanted
     index, shift, row, part, facing, settled, wanted = constants(arrays, *suiting(positions, rgba))
     xp = namespace(positions)
@@ -78,8 +144,8 @@ def _shown(
     engine: Engine,
     like: Array | None,
     evaluated: Sequence[GBuffer] | None = None,
-) -> tuple[Array, Array]:
-    """Positions (N, 3) in a grid and colours (N, C + 1) of the samples of all parts, in order.
+) -> tuple[list[Array], list[Array]]:
+    """Positions (N, 3) in a grid and colours (N, C + 1) of the samples of each part.
 
     Args:
         sampled: the samples of each part.
@@ -116,70 +182,25 @@ def _shown(
     if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
         # A shader may close over arrays of an engine that the scene has none of.
         positions, colors = constants((positions, colors), *suiting(positions, colors))
-    if len(parts) == 1:
-        return positions[0], colors[0]
-    xp = namespace(positions[0])
-    return xp.concat(positions), xp.concat(colors)
+    return positions, colors
 
 
-def evaluated_together(
-    views: Sequence[Sampled], parts: Sequence[CheckedPart], engine: Engine, like: Array | None
-) -> list[Sequence[GBuffer] | None]:
-    """The G-buffers of all parts at the samples of each of several views, in local space; None where they stay apart.
-
-    A surface is asked once, for the samples of all views: what it computes of the whole of θ serves them all.
-
-    Args:
-        views: the samples of each view, in arrays of the engine.
-        parts: checked parts.
-        engine: the engine to compute with.
-        like: an array that sets dtype and device of its constants.
-    """
-    if not all(_can_be_joined(view, engine) for view in views):
-        return [None] * len(views)
-    found = []
-    for index, part in enumerate(parts):
-        own = [view.samples[index] for view in views]
-        whole = _evaluate(part, part.surface.reads(part.theta), _joined(own), engine, like)
-        found.append(_apart(whole, [samples.ids.shape[0] for samples in own], engine))
-    return list(zip(*found, strict=True))
+def _together(*kinds: Sequence[Array]) -> list[Array]:
+    """One array of each kind, positions and colours, from several."""
+    return [arrays[0] if len(arrays) == 1 else namespace(arrays[0]).concat(list(arrays)) for arrays in kinds]
 
 
-def _can_be_joined(view: Sampled, engine: Engine) -> bool:
-    """Whether samples can stand in one table with those of other views: all rows are used, and no table is shared."""
-    if not engine.owns(view.row) or engine.padded(view.row):
-        return False
-    return all(s.gbuffer is None and set(s.by_sample) == set(s.tables) for s in view.samples)
-
-
-def _joined(views: Sequence[Samples]) -> Samples:
-    """The samples of a part in several views as those of one, whose grids lie one above the other."""
-    xp, first, rows = namespace(views[0].row), 0, []
-    for samples in views:
-        rows.append(xp.where(samples.row >= 0, samples.row + first, samples.row))
-        first += samples.ids.shape[0]
-    return replace(
-        views[0],
-        ids=xp.concat([s.ids for s in views]),
-        params=xp.concat([s.params for s in views]),
-        row=xp.concat(rows, axis=1),
-        depth=xp.concat([s.depth for s in views], axis=1),
-        overflow=sum(s.overflow for s in views),
-        tables={name: xp.concat([s.tables[name] for s in views]) for name in views[0].tables},
-        facing=None,
-        settled=None,
-        exit=None,
-    )
-
-
-def _apart(gbuffer: GBuffer, sizes: Sequence[int], engine: Engine) -> list[GBuffer]:
-    """The G-buffers of several views, of so many samples each, from one of them all."""
+def _apart(samples: Samples, gbuffer: GBuffer, sizes: Sequence[int], engine: Engine) -> list[tuple[Samples, GBuffer]]:
+    """The samples of several views, of so many rows each, and their G-buffers, from those of them all."""
     split = cache(lambda name: engine.split(gbuffer[name], sizes))
+    rows = [engine.split(x, sizes) for x in (samples.ids, samples.params, *samples.tables.values())]
     views = []
-    for b in range(len(sizes)):
-        views.append(GBuffer(position=split("position")[b]))
+    for b, (ids, params, *tables) in enumerate(zip(*rows, strict=True)):
+        own = GBuffer(position=split("position")[b])
         for name in set(gbuffer) - {"position"}:
-            views[b].defer(name, lambda name=name, b=b: split(name)[b])
+            own.defer(name, lambda name=name, b=b: split(name)[b])
+        tables = dict(zip(samples.tables, tables, strict=True))
+        views.append((replace(samples, ids=ids, params=params, tables=tables, gbuffer=None), own))
     return views
 
 

@@ -14,14 +14,14 @@ from rts.channels import cropped_image
 from rts.checks import check_background, check_cameras, check_size, check_splatter, suited_sampler
 from rts.engines import Engine, is_constant, namespace, suiting_scene, uncompiled
 from rts.errors import InputError
-from rts.evaluating import evaluated_together, to_splats
+from rts.evaluating import views_to_splats
 from rts.interfaces import Part, Splatter
 from rts.operations.inset import averaged
-from rts.records import Splats
-from rts.rendering import bands_of, image_of, over_background, seen, splatted
+from rts.rendering import bands_of, image_of, over_background, seen
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.prepared import PreparedParts
-from rts.sampling.scenes import Scene, sampled_scene
+from rts.sampling.scenes import Scene, apron_of, sampled_scene
+from rts.sampling.several import laid_side_by_side, sampled_as_one
 from rts.splatting.side_by_side import Picture, at_once
 from rts.threads import each
 from rts.trees import Array
@@ -82,8 +82,9 @@ def render_views(
         splatter=check_splatter(splatter), layers=layers, supersample=supersample, capacity=capacity
     )
     images = _images(scenes, size, suited, **options)
-    images = [seen(image, own, f"view {b}") for b, (image, own) in enumerate(zip(images, scenes, strict=True))]
-    return over_background(namespace(*images).stack(images), background)
+    for b, own in enumerate(scenes):
+        seen(images[b], own, f"view {b}")
+    return over_background(images, background)
 
 
 def _check_backgrounds(background: Any, count: int, size: tuple[int, int], channels: int) -> Array | None:
@@ -97,45 +98,62 @@ def _check_backgrounds(background: Any, count: int, size: tuple[int, int], chann
 
 def _images(
     scenes: Sequence[Scene], size: tuple[int, int], suited: tuple[Engine, Array | None], **options: Any
-) -> list[Array]:
-    """The images of several views of one scene, over nothing."""
+) -> Array:
+    """The images (B, H, W, C + 1) of several views of one scene, over nothing."""
     draw = partial(image_of, size=size, suited=suited, **options)
-    if not _concurrent(scenes[0]) or options["layers"] == "auto":  # The latter may warn, which is for this thread.
-        return [draw(scene) for scene in scenes]
-    if not suited[0].differentiates:
+    images = _as_pictures(scenes, size, suited, **options) if _concurrent(scenes[0]) else None
+    if images is not None:
+        return images
+    if not _concurrent(scenes[0]) or suited[0].differentiates or options["layers"] == "auto":
+        images = [draw(scene) for scene in scenes]  # Where layers are "auto" it may warn, which is for this thread.
+    else:
         # A shader may close over arrays of an engine whose transforms belong to this thread.
-        image = draw(scenes[0])
-        rest = scenes[1:]
-        return [image, *(each(draw, rest) if type(image) is np.ndarray else map(draw, rest))]
-    supersample: Any = options["supersample"]
-    whole = len(bands_of(*size, options["layers"], supersample)) == 1
-    if not whole or (isinstance(supersample, Adaptive) and supersample.contrast is not None):
-        return [draw(scene) for scene in scenes]
+        images, rest = [draw(scenes[0])], scenes[1:]
+        images += each(draw, rest) if type(images[0]) is np.ndarray else map(draw, rest)
+    return namespace(*images).stack(images)
 
-    views = each(lambda own: sampled_scene(own, own.camera, size, settles=True, **options), scenes)
-    evaluated = evaluated_together(views, scenes[0].parts, *suited)
-    splats = [
-        to_splats(sampled, own.parts, own.camera, own.camera, *suited, known)
-        for own, sampled, known in zip(scenes, views, evaluated, strict=True)
-    ]
-    splatter = options["splatter"]
-    if evaluated[0] is None or views[0].fine is not None:
-        shown = zip(scenes, views, splats, strict=True)
-        return [splatted(sampled, own, own.camera, suited, splatter, given) for own, sampled, given in shown]
-    most = at_once(splats[0].row.shape[1:])
+
+def _as_pictures(
+    scenes: Sequence[Scene],
+    size: tuple[int, int],
+    suited: tuple[Engine, Array | None],
+    *,
+    splatter: Splatter,
+    layers: int | Literal["auto"],
+    supersample: int | Adaptive,
+    capacity: int | None,
+) -> Array | None:
+    """The images of views that lie side by side in pictures; None where they cannot, or were none the faster for it."""
+    if isinstance(supersample, Adaptive) or layers == "auto" or len(bands_of(*size, layers, supersample)) > 1:
+        return None
+    view = tuple(supersample * n + 2 * apron_of(splatter) for n in size)
+    count = -(-len(scenes) // at_once(view))
+    most = -(-len(scenes) // count)
+    if most == 1 and not scenes[0].suited[0].differentiates:
+        return None
+    place = Picture.of(most, view)
+    firsts = range(0, len(scenes), most)
+    several = [scenes[first : first + most] for first in firsts]
+    pictures = []
+    if most > 1 and capacity is None:
+        given = size, supersample, layers, splatter
+        pictures = [sampled_as_one(own, place._replace(views=len(own)), *given) for own in several]
+    if None in pictures or not pictures:
+        options: dict[str, Any] = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
+        views = each(lambda own: sampled_scene(own, own.camera, size, settles=True, **options), scenes)
+        pictures = [laid_side_by_side(views[first : first + most], place) for first in firsts]
+    found = [picture for picture in pictures if picture is not None]
+    if len(found) < len(pictures):
+        return None
     images = []
-    for first in range(0, len(splats), most):
-        images += _side_by_side(splats[first : first + most], splatter, int(options["supersample"]))
-    return images
-
-
-def _side_by_side(splats: Sequence[Splats], splatter: Splatter, side: int) -> list[Array]:
-    """The images of several views, by one splat."""
-    picture = Picture.of(len(splats), splats[0].row.shape[1:])
-    cells = picture.apart(cropped_image(splatter, picture.joined(splats)), splats[0].border)
-    xp, (count, height, width, channels) = namespace(cells), cells.shape
-    image = cells if side == 1 else averaged(xp.reshape(cells, (count * height, width, channels)), side)
-    return list(xp.unstack(xp.reshape(image, (count, height // side, width // side, channels))))
+    cameras = [scene.camera for scene in scenes]
+    for views, splats in zip(found, views_to_splats(found, scenes[0].parts, cameras, *suited), strict=True):
+        cells = views.picture.apart(cropped_image(splatter, splats), views.sampled.apron)
+        xp, (number, height, width, channels) = namespace(cells), cells.shape
+        if supersample > 1:
+            cells = averaged(xp.reshape(cells, (number * height, width, channels)), supersample)
+        images.append(xp.reshape(cells, (number, *size, channels)))
+    return images[0] if len(images) == 1 else namespace(*images).concat(images)
 
 
 def _concurrent(scene: Scene) -> bool:

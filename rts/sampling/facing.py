@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from rts.camera import Camera
@@ -28,6 +30,19 @@ def facing(
         camera: host matrices.
         listed: whether the cells are those of a list, so that what lies side by side in it may not do so in the image.
     """
+    return facing_of_views(fragments, kept, proxy, pieces, [camera], kept.shape[1:], listed)
+
+
+def facing_of_views(
+    fragments: Fragments,
+    kept: np.ndarray,
+    proxy: Proxy,
+    pieces: np.ndarray,
+    cameras: Sequence[Camera],
+    view: tuple[int, ...],
+    listed: bool = False,
+) -> np.ndarray:
+    """As `facing`, of views (height, width) that lie side by side, line after line; each has a camera."""
     from rts.sampling import facing_kernels
 
     found = np.zeros(kept.shape, np.int16)
@@ -35,7 +50,8 @@ def facing(
     if behind:
         given = (np.ascontiguousarray(x) for x in (kept, fragments.triangle_ids))
         triangles = read_only(proxy.vertices), read_only(proxy.faces, np.int32), read_only(pieces, np.int16)
-        arrays = *given, *triangles, eye(camera), listed, MORE
+        eyes = np.stack([eye(camera) for camera in cameras])
+        arrays = *given, *triangles, eyes, *view, listed, MORE
         parallel(facing_kernels.fill, kept.shape[1], *arrays, found, work=kept[0].size + 100 * behind)
     return found
 

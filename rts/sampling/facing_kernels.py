@@ -9,9 +9,13 @@ from rts.sampling.windows_kernels import add, spread
 
 
 @kernel
-def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eye, listed, more, found):
-    """Fill lines [start, stop) of `found` (K, H, W) int16, zeros; see `rts.sampling.facing`."""
+def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eyes, rows, columns, listed, more, found):
+    """Fill lines [start, stop) of `found` (K, H, W) int16, zeros; see `rts.sampling.facing`.
+
+    `eyes` (B, 4) are those of views of so many rows and columns of cells, which lie side by side, line after line.
+    """
     layers, height, width = kept.shape
+    across = width // columns
     hidden, near = np.zeros((3, width + 2), np.uint8), np.empty(width, np.uint8)
     for y in range(start - 1, stop + 1):
         level = hidden[(y + 3) % 3]
@@ -30,6 +34,7 @@ def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eye, listed, 
                         piece = pieces[t] if len(pieces) > 1 else pieces[0]
                         if piece > 0 and k == layers - 1:
                             piece += more
+                        eye = eyes[(y - 1) // rows * across + x // columns]
                         found[k, y - 1, x] = piece if _front(vertices, faces, t, eye) else -piece
 
 

@@ -28,6 +28,7 @@ def lift(
     kept: np.ndarray | None = None,
     size: float | None = None,
     exits: Exits | None = None,
+    views: tuple[int, int] = (1, 1),
 ) -> Samples:
     """Packed samples from fragments: the triangle's ids, and its corner parameters interpolated.
 
@@ -46,7 +47,7 @@ def lift(
     table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
     beside = () if exits is None else ((exits.fragments, exits.there),)
-    packed = packing_kernels.pack(fragments, kept, table, corner_params, capacity or 0, *beside)
+    packed = packing_kernels.pack(fragments, kept, table, corner_params, capacity or 0, *beside, views=views)
     found = None
     if exits is not None:
         found = np.full(kept[0].shape, -1, np.int32)

@@ -18,6 +18,7 @@ def pack(
     corner_params: np.ndarray | None,
     capacity: int,
     *more: tuple[Fragments, np.ndarray],
+    views: tuple[int, int] = (1, 1),
 ) -> tuple[Any, ...]:
     """Ids (N, I), params (N, P), row and depth (K, H, W) of some cells, layer by layer; and how many there are in all.
 
@@ -29,8 +30,9 @@ def pack(
         capacity: rows to allot, or 0 for as many as are covered, at least one.
         *more: further fragments, and which of them to take, for rows behind all others, at most K · H · W in all. Their
             row is returned last; they do not count in how many there are.
+        views: how many views the grid is of, down and across; each is packed by itself, one after the other.
     """
-    grids = [_Lines.of(*given) for given in ((fragments, kept), *more)]
+    grids = [_Lines.of(fragments, kept, views), *(_Lines.of(*given) for given in more)]
     total, room = int(grids[0].counts.sum()), capacity or max(1, grids[0].kept.size)
     found = min(room, sum(int(grid.counts.sum()) for grid in grids))
     rows = capacity or max(1, found)
@@ -42,7 +44,7 @@ def pack(
     first, places = 0, []
     for grid in grids:
         row, depth = np.empty(grid.kept.shape, np.int32), np.empty(grid.kept.shape, np.float32)
-        offsets = first + np.cumsum(grid.counts) - grid.counts
+        offsets = first + grid.offsets()
         given = grid.kept, grid.triangle_ids, grid.barycentrics, grid.depths, table, corners, offsets
         parallel(_pack, len(row), *given, ids, params, row, depth, work=2 * row.size)
         first += int(grid.counts.sum())
@@ -51,7 +53,7 @@ def pack(
 
 
 class _Lines(NamedTuple):
-    """Fragments as lines of cells, which of them to take, and how many of each line."""
+    """Fragments as lines of cells of a view, which of them to take, and how many of each line."""
 
     kept: np.ndarray
     triangle_ids: np.ndarray
@@ -59,17 +61,25 @@ class _Lines(NamedTuple):
     depths: np.ndarray
     counts: np.ndarray
     shape: tuple[int, int, int]
+    views: tuple[int, int]
 
     @classmethod
-    def of(cls, fragments: Fragments, kept: np.ndarray) -> _Lines:
-        layers, height, width = kept.shape
-        lines = layers * height
+    def of(cls, fragments: Fragments, kept: np.ndarray, views: tuple[int, int] = (1, 1)) -> _Lines:
+        shape, across = kept.shape, views[1]
+        lines, width = shape[0] * shape[1] * across, shape[2] // across
         triangle_ids = np.ascontiguousarray(fragments.triangle_ids, np.int32).reshape(lines, width)
         barycentrics = np.ascontiguousarray(fragments.barycentrics, np.float32).reshape(lines, width, 2)
         depths = np.ascontiguousarray(fragments.depth, np.float32).reshape(lines, width)
         taken, counts = np.ascontiguousarray(kept).reshape(lines, width), np.zeros(lines, np.int64)
         parallel(_count, lines, taken, counts, work=kept.size // 8)
-        return cls(taken, triangle_ids, barycentrics, depths, counts, (layers, height, width))
+        return cls(taken, triangle_ids, barycentrics, depths, counts, shape, views)
+
+    def offsets(self) -> np.ndarray:
+        """How many cells are taken before each line: views one after the other, each layer by layer."""
+        (layers, height, _), (down, across) = self.shape, self.views
+        counts = self.counts.reshape(layers, down, height // down, across).transpose(1, 3, 0, 2)
+        before = (np.cumsum(counts) - counts.reshape(-1)).reshape(counts.shape)
+        return np.ascontiguousarray(before.transpose(2, 0, 3, 1)).reshape(-1)
 
 
 @kernel

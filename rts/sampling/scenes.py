@@ -170,7 +170,7 @@ def _on_one_grid(
     height, width = side * size[0], side * size[1]
     check_memory(height, width, planned(layers), capacity, gradient=scene.suited[0].differentiates)
     apron = apron_of(splatter)
-    wide = _widened(scene, camera, (height, width), apron)
+    wide = widened(scene, camera, (height, width), apron)
     reader = splatter or Visible()
     exits = exits and reader.reads_exits and scene.suited[0].differentiates
     taken = partial(_taken, scene, wide, capacity=capacity, facing=reader.reads_facing, exits=exits)
@@ -185,7 +185,7 @@ class Wide(NamedTuple):
     grid: tuple[int, int]
 
 
-def _widened(scene: Scene, camera: Camera, size: tuple[int, int], apron: int) -> Wide:
+def widened(scene: Scene, camera: Camera, size: tuple[int, int], apron: int) -> Wide:
     """The grid of an image of cells (height, width) with an apron."""
     # Every part is sampled by the one engine, and by the very views that samples are projected with.
     wide = camera.with_apron(size, apron)
@@ -242,7 +242,7 @@ def with_fine(
 ) -> Sampled:
     """Coarse samples, and fine ones where outlines are; `colors` (N, 4) of the coarse ones are to look for contrast."""
     grid = Grid(size, adaptive.samples, apron_of(splatter))
-    wide = _widened(scene, camera, (grid.side * size[0], grid.side * size[1]), grid.apron)
+    wide = widened(scene, camera, (grid.side * size[0], grid.side * size[1]), grid.apron)
     where = Where(adaptive, adaptive.dilates(scene.parts), colors)
     take = partial(_taken, scene, wide, facing=(splatter or Visible()).reads_facing)
     flat = coarse.settled is not None and splatter is not None and splatter.follows_outlines

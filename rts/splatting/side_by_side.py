@@ -1,19 +1,18 @@
-"""Splats of several views side by side in one picture, so that one splat serves them all.
+"""Where several views lie side by side in one picture, so that one splat serves them all.
 
 Each view keeps the apron that it was sampled with, so no splat of another reaches its image. What splatters decide by
-depths they decide in terms of the largest: of each view it is brought between 1 and 2, by a power of two.
+depths they decide in terms of the largest: where those of views differ much, they are brought between 1 and 2, by
+powers of two.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from rts.engines import engine_of, namespace, value_of
-from rts.records import Splats
+from rts.engines import namespace
 from rts.trees import Array
 
 SIDE = 1024
@@ -26,64 +25,53 @@ class Picture(NamedTuple):
     Attributes:
         views: B, the number of views.
         view: height and width of each, in cells, with its apron.
+        down: lines of views.
         across: views in a line.
     """
 
     views: int
     view: tuple[int, int]
+    down: int
     across: int
 
     @classmethod
     def of(cls, count: int, view: tuple[int, int]) -> Picture:
         """A picture of so many views, about as high as wide."""
-        return cls(count, view, min(count, max(1, round(math.sqrt(count * view[0] / view[1])))))
+        across = min(count, max(1, round(math.sqrt(count * view[0] / view[1]))))
+        return cls(count, view, -(-count // across), across)
 
     @property
-    def down(self) -> int:
-        """Lines of views."""
-        return -(-self.views // self.across)
+    def size(self) -> tuple[int, int]:
+        """(height, width) in cells."""
+        return self.down * self.view[0], self.across * self.view[1]
 
-    def joined(self, views: Sequence[Splats]) -> Splats:
-        """The splats of views that tell alike, as those of the picture: it has no border, but cells that are wanted."""
-        xp, engine, border = namespace(views[0].positions), engine_of(views[0].positions), views[0].border
-        counts = [splats.positions.shape[0] for splats in views]
+    def places(self) -> list[tuple[slice, slice]]:
+        """Lines and columns of cells of each view."""
+        (height, width), found = self.view, []
+        for y, x in np.ndindex(self.down, self.across):
+            found.append((slice(y * height, (y + 1) * height), slice(x * width, (x + 1) * width)))
+        return found[: self.views]
+
+    def corners(self) -> np.ndarray:
+        """(B, 2) the column and the line of the first cell of each view."""
         down, across = np.divmod(np.arange(self.views), self.across)
-        corners = np.stack([across * self.view[1], down * self.view[0], 0 * down], axis=1).astype(np.float32)
-        positions = xp.concat([splats.positions * _scale(splats) for splats in views])
-        first = np.cumsum([0, *counts[:-1]], dtype=np.int32)[:, None, None, None]
-        inside = np.zeros((self.views, 1, *self.view), bool)
-        inside[:, :, border : self.view[0] - border, border : self.view[1] - border] = True
+        return np.stack([across * self.view[1], down * self.view[0]], axis=1)
 
-        def told(name: str, empty: int | bool, rows: bool = False) -> Array | None:
-            """A field of splats: rows of samples are counted over all views."""
-            given = [getattr(splats, name) for splats in views]
-            if given[0] is None:
-                return None
-            grids = xp.stack(given)
-            several = len(grids.shape) == 4
-            grids = grids if several else grids[:, None, ...]
-            grids = xp.where(grids >= 0, grids + engine.constant(first, positions), grids) if rows else grids
-            found = self._laid_out(grids, empty)
-            return found if several else found[0, ...]
+    def inside(self, border: int) -> np.ndarray:
+        """(height, width) bool, the cells of views without a border of so many."""
+        (height, width), inside = self.view, np.zeros((self.down, self.view[0], self.across, self.view[1]), bool)
+        inside[:, border : height - border, :, border : width - border] = True
+        for y, x in list(np.ndindex(self.down, self.across))[self.views :]:
+            inside[y, :, x] = False
+        return inside.reshape(self.size)
 
-        return Splats(
-            positions + engine.constant(np.repeat(corners, counts, axis=0), positions),
-            xp.concat([splats.rgba for splats in views]),
-            told("row", -1, rows=True),
-            told("part", -1),
-            told("facing", 0),
-            told("settled", False),
-            wanted=self._laid_out(engine.constant(inside, positions), False)[0, ...],
-            exit=told("exit", -1, rows=True),
-        )
-
-    def _laid_out(self, views: Array, empty: int | bool) -> Array:
+    def laid_out(self, views: Array, empty: int | bool) -> Array:
         """The picture (K, height, width) of arrays (B, K, h, w) of the views; `empty` is where there is none."""
         xp, (height, width), nowhere = namespace(views), self.view, self.down * self.across - self.views
         if nowhere:
             views = xp.concat([views, *[xp.full_like(views[:1, ...], empty)] * nowhere])
         grid = xp.reshape(views, (self.down, self.across, -1, height, width))
-        return xp.reshape(xp.permute_dims(grid, (2, 0, 3, 1, 4)), (-1, self.down * height, self.across * width))
+        return xp.reshape(xp.permute_dims(grid, (2, 0, 3, 1, 4)), (-1, *self.size))
 
     def apart(self, image: Array, border: int) -> Array:
         """The views (B, h, w, C) of an image (height, width, C) of the picture, without their borders."""
@@ -94,13 +82,13 @@ class Picture(NamedTuple):
         return xp.reshape(views, (-1, *views.shape[2:]))[: self.views, ...]
 
 
-def _scale(splats: Splats) -> Array:
-    """Factors (1, 3) of positions, which bring the largest depth between 1 and 2."""
-    xp, positions, factor = namespace(splats.positions), splats.positions, 1.0
-    most = value_of(xp.max(xp.abs(positions[:, 2]))) if positions.shape[0] else None
-    if most is not None and np.isfinite(most) and most > 0:
-        factor = 2.0 ** (1 - np.frexp(most)[1])
-    return engine_of(positions).constant(np.array([[1.0, 1.0, factor]]), positions)
+def depth_scales(largest: np.ndarray) -> np.ndarray | None:
+    """(B,) factors that bring the largest depth (B,) of each view between 1 and 2; None where one serves them all."""
+    known = np.isfinite(largest) & (largest > 0)
+    powers = np.frexp(np.where(known, largest, 1.0))[1]
+    if not known.any() or (powers[known] == powers[known][0]).all():
+        return None
+    return np.where(known, np.ldexp(1.0, 1 - powers), 1.0)
 
 
 def at_once(view: tuple[int, int]) -> int:
