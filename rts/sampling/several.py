@@ -18,7 +18,7 @@ from rts.adapting import adapted
 from rts.camera import Camera
 from rts.checks import check_memory, suited_sampler
 from rts.engines import engine_of, is_constant, namespace, stopped, suiting, value_of
-from rts.interfaces import AnyNeeded, CheckedPart, Needed, Shader, Splatter, TriangleSurface
+from rts.interfaces import CheckedPart, Needed, Shader, Splatter, TriangleSurface
 from rts.records import ArraySpec, Fragments, Sampled, Samples
 from rts.sampling.cache import Entry
 from rts.sampling.extremes import largest
@@ -30,7 +30,6 @@ from rts.sampling.scenes import Scene, Wide, apron_of, widened
 from rts.sampling.triangle_sampler import TriangleSampler, _attribute_specs, _Shape
 from rts.sampling.validation import check_camera, check_fragments, checked_pieces
 from rts.splatting.side_by_side import Picture, depth_scales
-from rts.splatting.visible import Visible
 from rts.threads import each
 from rts.trees import Array, leaves, map_leaves
 
@@ -71,7 +70,9 @@ def sampled_as_one(
     first, height, width = scenes[0], side * size[0], side * size[1]
     samplers = [suited_sampler(s, part, first.camera) for s, part in zip(first.samplers, first.parts, strict=True)]
     derives = first.suited[0].differentiates
-    if not all(_is_plain(*given, derives and splatter.reads_exits) for given in zip(samplers, first.parts, strict=True)):
+    if not all(
+        _is_plain(*given, derives and splatter.reads_exits) for given in zip(samplers, first.parts, strict=True)
+    ):
         return None
     needed = first.needed_by(splatter, settles=True)
     if needed is not None and needed.size is None:
