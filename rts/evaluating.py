@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
@@ -18,6 +17,7 @@ from rts.footprints import FOOTPRINT, uv_footprint
 from rts.gbuffer import GBuffer
 from rts.interfaces import CheckedPart
 from rts.operations.linear import affine_map
+from rts.operations.projection import projective_map_of_views
 from rts.operations.take import take
 from rts.records import Fine, Sampled, Samples, Splats
 from rts.sampling.scenes import Wide
@@ -73,38 +73,39 @@ def views_to_splats(
     sampled = [picture.sampled for picture in pictures]
     if not engine.owns(sampled[0].row):
         sampled = constants(sampled, engine, like if engine.differentiates else None)
-    by_part = []
-    for index, part in enumerate(parts):
-        whole = in_one_table([own.samples[index] for own in sampled])
-        gbuffer = _evaluate(part, part.surface.reads(part.theta), whole, engine, like)
-        by_part.append(_apart(whole, gbuffer, np.concatenate([p.counts[index] for p in pictures]).tolist(), engine))
-    by_view, shown, made = iter(zip(cameras, *by_part, strict=True)), [], []
-    for picture, own in zip(pictures, sampled, strict=True):
-        view, border = picture.picture.view, own.apron
-        size = view[0] - 2 * border, view[1] - 2 * border
-        shown = []
-        for camera, *tables in itertools.islice(by_view, picture.picture.views):
-            wide = Wide(camera.with_apron(size, border), view)
-            samples, evaluated = zip(*tables, strict=True)
-            # All rows are used.
-            every = np.arange(sum(s.ids.shape[0] for s in samples), dtype=np.int32)[None, None]
-            shown.append(_shown(samples, every, parts, camera, wide, engine, like, evaluated))
-        by_kind = [list(zip(*kind, strict=True)) for kind in zip(*shown, strict=True)]
-        positions, rgba = _together(*([x for of_part in kind for x in of_part] for kind in by_kind))
-        positions = _placed(positions, picture, [[p.shape[0] for p in of_part] for of_part in by_kind[0]])
+    counts = [np.concatenate([p.counts[index] for p in pictures]) for index in range(len(parts))]
+    grid, border = pictures[0].picture.view, sampled[0].apron
+    wides = [Wide(c.with_apron((grid[0] - 2 * border, grid[1] - 2 * border), border), grid) for c in cameras]
+    shown = [
+        _shown_in_views(index, part, [own.samples[index] for own in sampled], own, cameras, wides, engine, like)
+        for index, (part, own) in enumerate(zip(parts, counts, strict=True))
+    ]
+    made, start = [], 0
+    for picture, whole in zip(pictures, sampled, strict=True):
+        here = slice(start, start := start + picture.picture.views)
+        of_parts = [_of_views(tables, own, here) for tables, own in zip(shown, counts, strict=True)]
+        positions, rgba = _together(*zip(*of_parts, strict=True))
+        positions = _placed(positions, picture, [n[here] for n in counts])
         wanted = engine_of(positions).constant(picture.picture.inside(border), positions)
-        made.append(_splats(own, positions, rgba, engine).replace(wanted=wanted))
+        made.append(_splats(whole, positions, rgba, engine).replace(wanted=wanted))
     return made
 
 
-def _placed(positions: Array, views: Views, counts: Sequence[Sequence[int]]) -> Array:
-    """Positions (N, 3) in a picture of views, from those in views; of each part and view there are so many."""
-    engine, every = engine_of(positions), np.ravel(counts)
-    corners = np.tile(views.picture.corners(), (len(counts), 1))
-    shift = np.zeros((len(corners), 3), np.float32)
-    shift[:, :2] = corners
+def _of_views(tables: Sequence[Array], counts: np.ndarray, views: slice) -> Sequence[Array]:
+    """The rows of some views of tables in which there are so many of each view."""
+    if views == slice(0, len(counts)):
+        return tables
+    first, rows = int(counts[: views.start].sum()), int(counts[views].sum())
+    return [x[first : first + rows, ...] for x in tables]
+
+
+def _placed(positions: Array, views: Views, counts: Sequence[np.ndarray]) -> Array:
+    """Positions (N, 3) in a picture of views, from those in views; of each part there are so many (B,) in each."""
+    engine, every = engine_of(positions), np.concatenate(counts)
+    shift = np.zeros((len(every), 3), np.float32)
+    shift[:, :2] = np.tile(views.picture.corners(), (len(counts), 1))
     if views.scales is not None:
-        factors = np.ones((len(corners), 3))
+        factors = np.ones((len(every), 3))
         factors[:, 2] = np.tile(views.scales, len(counts))
         positions = positions * engine.constant(np.repeat(factors, every, axis=0), positions)
     return positions + engine.constant(np.repeat(shift, every, axis=0), positions)
@@ -143,7 +144,6 @@ def _shown(
     wide: Wide,
     engine: Engine,
     like: Array | None,
-    evaluated: Sequence[GBuffer] | None = None,
 ) -> tuple[list[Array], list[Array]]:
     """Positions (N, 3) in a grid and colours (N, C + 1) of the samples of each part.
 
@@ -155,7 +155,6 @@ def _shown(
         wide: the grid, and its camera.
         engine: the engine to compute with.
         like: an array that sets dtype and device of its constants and of what is returned.
-        evaluated: the G-buffer of each part, if it is known.
     """
     dtype = like
     if not engine.differentiates:
@@ -164,17 +163,10 @@ def _shown(
     camera = constants(camera, engine, like)
     positions, colors, first = [], [], 0
     for index, (part, samples) in enumerate(zip(parts, sampled, strict=True)):
-        transform = constants(part.transform, engine, like)
-        reads = part.surface.reads(part.theta)
-        local = _evaluate(part, reads, samples, engine, like) if evaluated is None else evaluated[index]
+        theta, transform = _theta_of(part, engine, like), constants(part.transform, engine, like)
+        local = _evaluate(part, part.surface.reads(part.theta), samples, engine, like)
         own = seen.within(transform)
-        if "uv" in local and FOOTPRINT not in local:
-            given = part.surface, {k: part.theta[k] for k in reads}, samples, local, own, wide.grid, engine, like
-            local.defer(FOOTPRINT, partial(uv_footprint, *given))
-        theta = {k: v if k in reads else constants(v, engine, like) for k, v in part.theta.items()}
-        world = _to_world(_readable(local, samples, engine), transform)
-        rgba = _shaded(part, theta, world, camera)
-        check_shaded(rgba, local["position"].shape[0], part.shader)
+        world, rgba = _colored(part, theta, transform, samples, local, camera, own, wide.grid, engine, like)
         positions.append(constants(own.project(local["position"], wide.grid), engine, dtype))
         check_splats(index, part, world, positions[-1], rgba, row, first)
         colors.append(constants(rgba, engine, dtype))
@@ -183,6 +175,92 @@ def _shown(
         # A shader may close over arrays of an engine that the scene has none of.
         positions, colors = constants((positions, colors), *suiting(positions, colors))
     return positions, colors
+
+
+def _shown_in_views(
+    index: int,
+    part: CheckedPart,
+    sampled: Sequence[Samples],
+    counts: np.ndarray,
+    cameras: Sequence[Camera],
+    wides: Sequence[Wide],
+    engine: Engine,
+    like: Array | None,
+) -> tuple[Array, Array]:
+    """Positions (N, 3) and colours (N, C + 1) of the samples of a part in several views, each in its own grid.
+
+    Args:
+        index: the part's.
+        part: the part.
+        sampled: its samples, views one after the other.
+        counts: (B,) how many are those of each view.
+        cameras: of the whole image of each view.
+        wides: the grid of each view, and its camera.
+        engine: the engine to compute with.
+        like: as in `_shown`.
+    """
+    dtype = like
+    if not engine.differentiates:
+        like = None
+    whole, sizes, grid = in_one_table(sampled), counts.tolist(), wides[0].grid
+    theta, transform = _theta_of(part, engine, like), constants(part.transform, engine, like)
+    gbuffer = _evaluate(part, part.surface.reads(part.theta), whole, engine, like)
+    seen = [w.camera.replace(view=constants(w.camera.view, engine, like)).within(transform) for w in wides]
+    colors = []
+    for camera, own, (samples, local) in zip(cameras, seen, _apart(whole, gbuffer, sizes, engine), strict=True):
+        given = samples, local, constants(camera, engine, like), own, grid, engine, like
+        colors.append(constants(_colored(part, theta, transform, *given)[1], engine, dtype))
+    rows = namespace(seen[0].view).stack([own.pixel_rows(grid) for own in seen])
+    rows, points = constants((rows, gbuffer["position"]), *suiting(rows, gbuffer["position"]))
+    positions = constants(projective_map_of_views(rows, points, sizes), engine, dtype)
+    if engine_of(colors) is not engine:
+        positions, colors = constants((positions, colors), *suiting(colors))
+    (rgba,) = _together(colors)
+    # All rows are used.
+    every = np.arange(sum(sizes), dtype=np.int32)[None, None]
+    check_splats(index, part, gbuffer, positions, rgba, every, 0)
+    return positions, rgba
+
+
+def _theta_of(part: CheckedPart, engine: Engine, like: Array | None) -> dict[str, Tree]:
+    """The θ that a part's shader sees."""
+    reads = part.surface.reads(part.theta)
+    return {k: v if k in reads else constants(v, engine, like) for k, v in part.theta.items()}
+
+
+def _colored(
+    part: CheckedPart,
+    theta: Mapping[str, Tree],
+    transform: Array | None,
+    samples: Samples,
+    local: GBuffer,
+    camera: Camera,
+    own: Camera,
+    grid: tuple[int, int],
+    engine: Engine,
+    like: Array | None,
+) -> tuple[GBuffer, Array]:
+    """What the shader of a part reads, in world space, and the colours (N, C + 1) that it gives.
+
+    Args:
+        part: the part.
+        theta: what `_theta_of` gave.
+        transform: the part's.
+        samples: the samples, in one view.
+        local: their G-buffer, in local space.
+        camera: of the whole image.
+        own: that of the grid in the part's local space.
+        grid: height and width in cells.
+        engine: the engine to compute with.
+        like: an array that sets dtype and device of its constants.
+    """
+    if "uv" in local and FOOTPRINT not in local:
+        read = {k: part.theta[k] for k in part.surface.reads(part.theta)}
+        local.defer(FOOTPRINT, partial(uv_footprint, part.surface, read, samples, local, own, grid, engine, like))
+    world = _to_world(_readable(local, samples, engine), transform)
+    rgba = _shaded(part, theta, world, camera)
+    check_shaded(rgba, local["position"].shape[0], part.shader)
+    return world, rgba
 
 
 def _together(*kinds: Sequence[Array]) -> list[Array]:

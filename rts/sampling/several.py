@@ -1,7 +1,7 @@
 """Several views of a scene, sampled side by side in one picture.
 
-What is decided cell by cell, which samples splatters need, which side of a surface is seen, and where each sample stands
-in the table, is decided for all views by one pass over the picture. So Python's share is paid once, and threads have
+What is decided cell by cell is decided for all views by one pass over the picture: which samples splatters need, which
+side of a surface is seen, and where each sample stands in the table. So Python's share is paid once, and threads have
 long loops. Only the triangles are drawn view by view.
 """
 
@@ -198,20 +198,19 @@ def _of_part(
             alone = sampler.follows or not sampler.concurrent
             fragments = _drawn(sampler, known, own, picture, layers, part.cull) if alone else None
         fragments = fragments or _drawn(sampler, known, own, picture, layers, part.cull)
-        kept, settled, proxy = fragments.triangle_ids >= 0, None, known.proxy
+        covered, settled, sides = fragments.triangle_ids >= 0, None, None
+        kept = covered.copy()
         if pruning is not None:
-            kept = pruning(kept, fragments.depth, known.size or largest(proxy.vertices))
-            settled = pruning.settled(fragments.triangle_ids >= 0, kept) if settles else None
-        sides = None
+            kept = pruning(kept, fragments.depth, known.size or largest(known.proxy.vertices))
+            settled = pruning.settled(covered, kept) if settles else None
         if tells:
-            pieces = checked_pieces(surface, proxy) if kept[1:].any() else np.zeros(1, np.int16)
-            sides = facing_of_views(fragments, kept, proxy, pieces, own, picture.view)
-        found = lift(fragments, proxy, None, kept, 0.0, views=(picture.down, picture.across))
+            pieces = checked_pieces(surface, known.proxy) if kept[1:].any() else np.zeros(1, np.int16)
+            sides = facing_of_views(fragments, kept, known.proxy, pieces, own, picture.view)
+        found = lift(fragments, known.proxy, None, kept, 0.0, views=(picture.down, picture.across))
         gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
         return (
             *(found.ids, found.params, found.row, found.depth, found.overflow),
-            *([sides] if tells else []),
-            *([settled] if settles else []),
+            *(x for x in (sides, settled) if x is not None),
             *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
         )
 
@@ -235,12 +234,11 @@ def _drawn(
     sampler: TriangleSampler, known: Entry, cameras: Sequence[Camera], picture: Picture, layers: int, cull: str
 ) -> Fragments:
     """The fragments (K, height, width) of the picture: views on all cores, if the sampler is `concurrent`."""
-    shape, faces = (layers, *picture.size), len(known.proxy.faces)
-    whole = len(cameras) == picture.down * picture.across and faces > 0
-    ids = np.empty(shape, np.int32) if whole else np.full(shape, -1, np.int32)
-    barycentrics = (np.empty if whole else np.zeros)((*shape, 2), np.float32)
-    depth = (np.empty if whole else np.zeros)(shape, np.float32)
-    found, places = Fragments(ids, barycentrics, depth), picture.places()
+    shape, faces, places = (layers, *picture.size), len(known.proxy.faces), picture.places()
+    found = Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
+    if not faces or len(places) < picture.down * picture.across:
+        for x, nothing in zip(found, (-1, 0, 0), strict=True):
+            x[...] = nothing
     if not faces:
         return found
 
