@@ -1,22 +1,19 @@
-"""Memory that is kept for the next call."""
+"""Memory that arrays leave behind, kept for the next ones.
+
+glibc, the C library of most Linux systems, gives memory at the end of its heap back when more than a limit is free. An
+iteration of a fit frees all its arrays and allocates them again: at 512 × 512 pixels the system then clears a thousand
+pages each time, a sixth of the iteration. The limit follows the largest array that was ever freed, up to 64 MiB;
+elsewhere nothing changes.
+"""
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 
-LARGEST = 31 << 20
-"""Bytes of the largest block that glibc may keep; of twice as many free ones it gives none back."""
+LARGEST = (32 << 20) - (1 << 16)
+"""Bytes of the largest array that glibc takes as an example, less some for what it notes beside it."""
 
 
-@functools.cache
-def keep_memory() -> None:
-    """Have the allocator keep what is freed, for the next arrays of some megabytes; done once.
-
-    By default glibc hands a few megabytes that are free back to the system, which gives them again as pages that are
-    cleared one by one: longer than it takes to fill them. What it keeps grows with the largest block that was ever
-    freed (`M_MMAP_THRESHOLD` in mallopt(3)), so one is freed that nobody touched. Where the environment sets a
-    threshold, or with another allocator, it has no effect.
-    """
+def keep_freed() -> None:
+    """Let up to 64 MiB of freed memory stay with the process; the array that this takes is never touched."""
     np.empty(LARGEST, np.uint8)

@@ -16,7 +16,6 @@ from rts.engines import Engine, is_constant, namespace, suiting_scene, uncompile
 from rts.errors import InputError
 from rts.evaluating import views_to_splats
 from rts.interfaces import Part, Splatter
-from rts.memory import keep_memory
 from rts.operations.inset import averaged
 from rts.rendering import bands_of, image_of, over_background, seen
 from rts.sampling.adaptive import Adaptive, finest
@@ -132,7 +131,6 @@ def _as_pictures(
     most = -(-len(scenes) // count)
     if most == 1 and not scenes[0].suited[0].differentiates:
         return None
-    keep_memory()
     place = Picture.of(most, view)
     firsts = range(0, len(scenes), most)
     several = [scenes[first : first + most] for first in firsts]
