@@ -3,6 +3,8 @@
 import json
 import math
 import random
+import sys
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -571,6 +573,24 @@ class TestTune:
         tuned = tune(scene("translation"), tolerance=0.5, budget_s=1e-6, **options)
         assert tuned.reasons[-1] == "the budget was spent before all settings were looked at"
         assert tuned.error <= 0.5
+
+    @pytest.mark.parametrize("tolerance, samples", [(1e9, [4]), (1e-9, [4, 8])])
+    def test_truth(self, modelled, tmp_path, monkeypatch, tolerance, samples):
+        """It takes as many samples as it needs to be much more accurate than the tolerance; what is left is told."""
+        monkeypatch.setattr(sys.modules[tune.__module__], "TRUTH_SAMPLES", (4, 8))
+        made = []
+        true = measure.truth
+        monkeypatch.setattr(
+            measure, "truth", lambda *given, **options: made.append(options["samples"]) or true(*given, **options)
+        )
+        options = dict(splatters=["single"], samplers=["raster"], truths=tmp_path, progress=False)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ToleranceWarning)
+            for seconds, expected in ((1e-9, [4]), (60.0, samples)):  # Nothing is refined without time for it.
+                made.clear()
+                found = tune(scene("translation"), tolerance=tolerance, budget_s=seconds, **options)
+                assert made == expected
+                assert ("the truth itself" in found.reasons[-1]) == (tolerance < 1)
 
 
 # --------------------------------------------------------------------------------------------------------- misuse

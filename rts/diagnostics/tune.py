@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from rts.arguments import check_positive, quoted
 from rts.checks import is_count, is_real
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.measure import TOGETHER, Measurements
-from rts.diagnostics.comparison.progress import phases
+from rts.diagnostics.comparison.progress import Phase, phases
 from rts.diagnostics.comparison.scene import SceneFunction, parts_of
 from rts.diagnostics.comparison.search import SUPERSAMPLE, Search
 from rts.diagnostics.comparison.settings import usable
@@ -24,6 +24,10 @@ from rts.files.paths import output_folder
 from rts.interfaces import Part
 from rts.trees import Tree
 
+TRUTH_SAMPLES = (4, 8, SAMPLES)
+"""Samples of truths, along each side of a pixel: more where the error of the truth itself is too large."""
+TRUE = 0.3
+"""What the error of a truth may be, as a share of the tolerance, which it makes larger by a twentieth."""
 SAMPLED = 1.0
 """Seconds that a sampler may take, for 512² pixels or fewer."""
 
@@ -64,7 +68,7 @@ def tune(
     splatters: Sequence[str] | None = None,
     surface: str = "mesh",
     truths: Path | str | None = None,
-    truth_samples: int = SAMPLES,
+    truth_samples: int | None = None,
     progress: bool | None = None,
 ) -> Tuned:
     """Find the cheapest settings whose derivatives are accurate enough.
@@ -80,8 +84,8 @@ def tune(
         scene: as in `rts.diagnostics.compare`.
         parameters: of the scene's function: where derivatives are taken.
         tolerance: the largest error of the derivatives along any mode, such as 0.05.
-        budget_s: seconds of measuring, after which the best so far is taken; the truth, which is made once and kept,
-            does not count.
+        budget_s: seconds of measuring, after which the best so far is taken. The truth, which is made before and kept,
+            is not refined when that would take longer than half of it.
         directions: as in `compare`.
         size: (height, width); None for the scene's own. Errors and times are those of this size.
         modes: as in `compare`.
@@ -91,6 +95,8 @@ def tune(
         surface: the kind of surface that reads a model.
         truths: the folder of truths; None for the folder of caches.
         truth_samples: of the truth, along each side of a pixel; fewer are faster, and leave a larger error of its own.
+            None for 4, 8 or 16, of each mode as few as make that error, which is measured, less than a third of the
+            tolerance. Where that takes too long, or 16 do not, a reason says so.
         progress: whether to show progress; None for where standard error is a terminal.
 
     Raises:
@@ -102,7 +108,7 @@ def tune(
     if not (is_real(tolerance) and 0 < tolerance < math.inf):
         raise InputError(f"tolerance is {quoted(tolerance)}; expected a share of the derivative, such as 0.05")
     check_positive("budget_s", budget_s)
-    if not is_count(truth_samples):
+    if truth_samples is not None and not is_count(truth_samples):
         raise InputError(f"truth_samples is {quoted(truth_samples)}; expected an integer of at least 1")
     found = some_modes(scene_of(scene, parameters, directions, size, surface=surface), modes)
     kept = None if truths is None else output_folder(truths)
@@ -114,21 +120,49 @@ def tune(
         Journal(),
         used[:1],
         truths=kept,
-        samples=truth_samples,
+        samples=truth_samples or TRUTH_SAMPLES[0],
         together=True,
         count_at=SUPERSAMPLE[-1],
         slowest=SAMPLED * max(1.0, math.prod(found.size) / 512**2),
     )
     measured.leave_out_what_rests()
     with phases(progress) as phase:
-        measured.truths(phase("truth", 4 * measured.samples**2 * len(measured.scene.directions)))
+        _make_truths(measured, tolerance, budget_s / 2, phase, TRUTH_SAMPLES[1:] if truth_samples is None else ())
         deadline = time.perf_counter() + budget_s
         suited = measured.samplers(possible)
         if not suited:
             raise InputError(f"no sampler suits {found.name!r}: {'; '.join(measured.left_out)}")
         search = Search(measured, measured.kinds(suited), tolerance, deadline, phase)
         chosen, reasons, error, seconds = search.run(named)
+    reasons += _told_of_truths(measured, tolerance)
     at = measured.forms(TOGETHER)[chosen.rate].at
     own = None if measured.scene.separate else measured.engine
     parts = stopped(parts_of(at(measured.scene.moved(next(iter(measured.scene.directions)), 0.0, own))))
     return Tuned(parts, chosen.options, chosen.rate, reasons, at, error, seconds)
+
+
+def _make_truths(measured: Measurements, tolerance: float, seconds: float, phase: Phase, finer: Sequence[int]) -> None:
+    """Make the truths; those that are too rough anew, of more samples, if that takes no longer than some seconds."""
+
+    def told(modes: Sequence[str], samples: int) -> Callable[[], None]:
+        return phase(f"truth, {samples} × {samples}", 4 * samples**2 * len(modes))
+
+    start = time.perf_counter()
+    measured.truths(told(list(measured.scene.directions), measured.samples))
+    made, count = measured.samples, len(measured.scene.directions)
+    for samples in finer:
+        rough, now = measured.rough(TRUE * tolerance), time.perf_counter()
+        each = (now - start) / (count * made**2)
+        if not rough or each * len(rough) * samples**2 > seconds:
+            return
+        start, made, count = now, samples, len(rough)
+        measured.refine_truths(rough, samples, told(rough, samples))
+
+
+def _told_of_truths(measured: Measurements, tolerance: float) -> list[str]:
+    """What to say where errors are measured against a truth that is too rough for the tolerance."""
+    rough = measured.rough(TRUE * tolerance)
+    if not rough:
+        return []
+    most = max(measured.truth(mode).error for mode in rough)
+    return [f"the truth itself is known to {100 * most:.2g} % along {', '.join(rough)}"]

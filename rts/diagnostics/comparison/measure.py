@@ -51,7 +51,7 @@ class Measurements:
         journal: where measurements are kept.
         engines: those that have derivatives; errors are measured with the first.
         truths: the folder of truths; None for that of caches.
-        samples: of the truth, the square root of their number a pixel.
+        samples: of the truth, the square root of their number a pixel, where `refine_truths` takes no others.
         together: whether the parameters of all modes are differentiated at once.
         count_at: samples along each side of a pixel with which layers are counted, once for all settings of a splatter;
             None to count them with those of each setting.
@@ -77,6 +77,7 @@ class Measurements:
         self.engine, self.count_at, self.slowest = engines[0], count_at, slowest
         self.left_out: list[str] = []
         self._truths: dict[str, Truth] = {}
+        self._truth_samples: dict[str, int] = {}
         self._forms: dict[str, dict[str, Form]] = {}
         self._pixels: dict[str, float] = {}
         self._states: dict[str, tuple[str, ...]] = {}
@@ -143,6 +144,18 @@ class Measurements:
 
         self._keep(changes)
 
+    def rough(self, error: float) -> list[str]:
+        """The modes whose truth has an error of its own that is larger."""
+        return [mode for mode in self.scene.directions if self.truth(mode).error > error]
+
+    def refine_truths(self, modes: Sequence[str], samples: int, done: Done) -> None:
+        """Make the truths of some modes anew, of `samples`² a pixel."""
+        for mode in modes:
+            self._truth_samples[mode] = samples
+            self._truths.pop(mode, None)
+            self._states.pop(mode, None)
+            self.truth(mode, done)
+
     def _keep(self, check: Callable[[str], Any]) -> None:
         """Go on with the modes that a check does not refuse."""
         kept, why = [], []
@@ -170,7 +183,8 @@ class Measurements:
     def truth(self, mode: str, done: Done = lambda: None) -> Truth:
         """How the image truly changes along a mode; see `truth`."""
         if mode not in self._truths:
-            options: dict[str, Any] = dict(samples=self.samples, engine=self._still, folder=self.folder, done=done)
+            samples = self._truth_samples.get(mode, self.samples)
+            options: dict[str, Any] = dict(samples=samples, engine=self._still, folder=self.folder, done=done)
             self._truths[mode] = truth(self.scene, mode, self.pixel(mode), **options)
         return self._truths[mode]
 
@@ -185,7 +199,8 @@ class Measurements:
             step = STEP * self.pixel(mode)
             moved = [self.scene.at(self.scene.moved(mode, by, self._still)) for by in (-step / 2, step / 2)]
             own = [state_key(parts_of(found), found[1], self.scene.size) for found in moved]
-            true = truth_key(self.scene, mode, step, self.samples, self._still)
+            samples = self._truth_samples.get(mode, self.samples)
+            true = truth_key(self.scene, mode, step, samples, self._still)
             self._states[mode] = (*own, true, library_key())
         return self._states[mode]
 

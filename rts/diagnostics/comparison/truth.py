@@ -24,12 +24,14 @@ from rts.engines import Engine, engine_of
 from rts.errors import InputError
 from rts.files.paths import cache_folder, output_folder, own_folder, writing
 from rts.interfaces import Part
-from rts.rendering import render
+from rts.views import render_views
 
 SAMPLES = 16
 """Points a pixel, along x and along y."""
 STEP = 0.25
 """Length of the difference, pixels."""
+AT_ONCE = 8
+"""Points of all pixels that are rendered by one call."""
 
 
 class Truth(NamedTuple):
@@ -70,16 +72,21 @@ def area_image(
         points: of the pixel's centre, x right and y down, pixels.
         done: called after each point.
     """
-    total, layers = np.zeros((*size, 4)), layers_of(parts, camera)
-    for dx, dy in points:
+    total, layers, seen = np.zeros((*size, 4)), layers_of(parts, camera), camera.for_size(size)
+    projection = np.asarray(engine_of(seen.projection).to_numpy(seen.projection), np.float64)
+
+    def through(point: np.ndarray) -> Camera:
         shift = np.eye(4)
         # Moving the image by −dx pixels puts the point at +dx under the pixel's centre.
-        shift[0, 3], shift[1, 3] = -2 * dx / size[1], 2 * dy / size[0]
-        moved = camera.for_size(size)
-        projection = np.asarray(engine_of(moved.projection).to_numpy(moved.projection), np.float64)
-        image = render(parts, moved.replace(projection=shift @ projection), size, splatter="none", layers=layers)
-        total += engine_of(image).to_numpy(image)
-        done()
+        shift[0, 3], shift[1, 3] = -2 * point[0] / size[1], 2 * point[1] / size[0]
+        return seen.replace(projection=shift @ projection)
+
+    for first in range(0, len(points), AT_ONCE):
+        cameras = [through(point) for point in points[first : first + AT_ONCE]]
+        images = render_views(parts, cameras, size, splatter="none", layers=layers)
+        total += engine_of(images).to_numpy(images).sum(axis=0)
+        for _ in cameras:
+            done()
     return total / len(points)
 
 
