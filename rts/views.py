@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -17,14 +17,17 @@ from rts.errors import InputError
 from rts.evaluating import views_to_splats
 from rts.interfaces import Part, Splatter
 from rts.operations.inset import averaged
-from rts.rendering import bands_of, image_of, over_background, seen
+from rts.records import Sampled
+from rts.rendering import bands_of, image_of, over_background, seen, splatted
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.scenes import Scene, apron_of, sampled_scene
-from rts.sampling.several import laid_side_by_side, sampled_as_one
+from rts.sampling.several import Sampling, Views, laid_side_by_side, sampled_as_one, sampled_at_once
 from rts.splatting.side_by_side import Picture, at_once
 from rts.threads import each
 from rts.trees import Array
+
+_T = TypeVar("_T")
 
 
 @uncompiled
@@ -97,23 +100,6 @@ def _check_backgrounds(background: Any, count: int, size: tuple[int, int], chann
 
 
 def _images(
-    scenes: Sequence[Scene], size: tuple[int, int], suited: tuple[Engine, Array | None], **options: Any
-) -> Array:
-    """The images (B, H, W, C + 1) of several views of one scene, over nothing."""
-    draw = partial(image_of, size=size, suited=suited, **options)
-    images = _as_pictures(scenes, size, suited, **options) if _concurrent(scenes[0]) else None
-    if images is not None:
-        return images
-    if not _concurrent(scenes[0]) or suited[0].differentiates or options["layers"] == "auto":
-        images = [draw(scene) for scene in scenes]  # Where layers are "auto" it may warn, which is for this thread.
-    else:
-        # A shader may close over arrays of an engine whose transforms belong to this thread.
-        images, rest = [draw(scenes[0])], scenes[1:]
-        images += each(draw, rest) if type(images[0]) is np.ndarray else map(draw, rest)
-    return namespace(*images).stack(images)
-
-
-def _as_pictures(
     scenes: Sequence[Scene],
     size: tuple[int, int],
     suited: tuple[Engine, Array | None],
@@ -122,37 +108,71 @@ def _as_pictures(
     layers: int | Literal["auto"],
     supersample: int | Adaptive,
     capacity: int | None,
-) -> Array | None:
-    """The images of views that lie side by side in pictures; None where they cannot, or were none the faster for it."""
-    if isinstance(supersample, Adaptive) or layers == "auto" or len(bands_of(*size, layers, supersample)) > 1:
-        return None
-    view = tuple(supersample * n + 2 * apron_of(splatter) for n in size)
-    count = -(-len(scenes) // at_once(view))
-    most = -(-len(scenes) // count)
-    if most == 1 and not scenes[0].suited[0].differentiates:
-        return None
-    place = Picture.of(most, view)
-    firsts = range(0, len(scenes), most)
-    several = [scenes[first : first + most] for first in firsts]
-    pictures = []
-    if most > 1 and capacity is None:
-        given = size, supersample, layers, splatter
-        pictures = [sampled_as_one(own, place._replace(views=len(own)), *given) for own in several]
-    if None in pictures or not pictures:
-        options: dict[str, Any] = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
+) -> Array:
+    """The images (B, H, W, C + 1) of several views of one scene, over nothing."""
+    options: dict[str, Any] = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
+    draw, (engine, like) = partial(image_of, size=size, suited=suited, **options), scenes[0].suited
+    several = layers != "auto" and _concurrent(
+        scenes[0]
+    )  # Where layers are "auto" it may warn, which is for this thread.
+    whole = layers != "auto" and len(bands_of(*size, layers, supersample)) == 1
+    if whole and not isinstance(supersample, Adaptive):
+        view = supersample * size[0] + 2 * apron_of(splatter), supersample * size[1] + 2 * apron_of(splatter)
+        chunks = _chunks(scenes, at_once(view))
+        place = Picture.of(len(chunks[0]), view)
+        given = [
+            Sampling(own, place._replace(views=len(own)), size, supersample, layers, splatter, capacity)
+            for own in chunks
+        ]
+        if place.views > 1 and all(own.possible for own in given):
+            if engine.padded(like):
+                views = [view for own in given for view in sampled_at_once(own)]
+                return _one_by_one(scenes, views, suited, splatter)
+            if capacity is None and engine.concurrent() and engine.on_host(like):
+                return _as_pictures([sampled_as_one(own) for own in given], scenes, suited, splatter)
+        if several and suited[0].differentiates:
+            views = each(lambda own: sampled_scene(own, own.camera, size, settles=True, **options), scenes)
+            pictures = [laid_side_by_side(own, place._replace(views=len(own))) for own in _chunks(views, place.views)]
+            found = [picture for picture in pictures if picture is not None]
+            if len(found) == len(pictures):
+                return _as_pictures(found, scenes, suited, splatter)
+            return _one_by_one(scenes, views, suited, splatter)
+    elif whole and several and suited[0].differentiates and supersample.contrast is None:
         views = each(lambda own: sampled_scene(own, own.camera, size, settles=True, **options), scenes)
-        pictures = [laid_side_by_side(views[first : first + most], place) for first in firsts]
-    found = [picture for picture in pictures if picture is not None]
-    if len(found) < len(pictures):
-        return None
-    images = []
-    cameras = [scene.camera for scene in scenes]
-    for views, splats in zip(found, views_to_splats(found, scenes[0].parts, cameras, *suited), strict=True):
+        return _one_by_one(scenes, views, suited, splatter)
+    images = [draw(scene) for scene in (scenes[:1] if several and not suited[0].differentiates else scenes)]
+    if len(images) < len(scenes):
+        # A shader may close over arrays of an engine whose transforms belong to this thread.
+        images += each(draw, scenes[1:]) if type(images[0]) is np.ndarray else map(draw, scenes[1:])
+    return namespace(*images).stack(images)
+
+
+def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:
+    """Views in as few groups as there are with so many at most, which are about as large as one another."""
+    count = -(-len(views) // most)
+    size = -(-len(views) // count)
+    return [views[first : first + size] for first in range(0, len(views), size)]
+
+
+def _one_by_one(
+    scenes: Sequence[Scene], views: Sequence[Sampled], suited: tuple[Engine, Array | None], splatter: Splatter
+) -> Array:
+    """The images (B, H, W, C + 1) of views that were sampled, each by a splat of its own."""
+    images = [splatted(own, scene, scene.camera, suited, splatter) for own, scene in zip(views, scenes, strict=True)]
+    return namespace(*images).stack(images)
+
+
+def _as_pictures(
+    pictures: Sequence[Views], scenes: Sequence[Scene], suited: tuple[Engine, Array | None], splatter: Splatter
+) -> Array:
+    """The images (B, H, W, C + 1) of views that were sampled, by a splat of each picture."""
+    images, cameras = [], [scene.camera for scene in scenes]
+    for views, splats in zip(pictures, views_to_splats(pictures, scenes[0].parts, cameras, *suited), strict=True):
         cells = views.picture.apart(cropped_image(splatter, splats), views.sampled.apron)
-        xp, (number, height, width, channels) = namespace(cells), cells.shape
-        if supersample > 1:
-            cells = averaged(xp.reshape(cells, (number * height, width, channels)), supersample)
-        images.append(xp.reshape(cells, (number, *size, channels)))
+        xp, (count, height, width, channels), side = namespace(cells), cells.shape, views.sampled.supersample
+        if side > 1:
+            cells = averaged(xp.reshape(cells, (count * height, width, channels)), side)
+        images.append(xp.reshape(cells, (count, height // side, width // side, channels)))
     return images[0] if len(images) == 1 else namespace(*images).concat(images)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from rts.adapting import adapted
 from rts.camera import Camera
 from rts.checks import check_memory, suited_sampler
-from rts.engines import engine_of, is_constant, namespace, stopped, suiting, value_of
+from rts.engines import engine_of, is_constant, is_traced, namespace, stopped, suiting, value_of
 from rts.interfaces import CheckedPart, Needed, Shader, Splatter, TriangleSurface
 from rts.records import ArraySpec, Fragments, Sampled, Samples
 from rts.sampling.cache import Entry
@@ -26,7 +26,7 @@ from rts.sampling.facing import facing_of_views
 from rts.sampling.merging import merge
 from rts.sampling.packing import FAR, lift
 from rts.sampling.pruning import prune
-from rts.sampling.scenes import Scene, Wide, apron_of, widened
+from rts.sampling.scenes import Scene, apron_of, widened
 from rts.sampling.triangle_sampler import TriangleSampler, _attribute_specs, _Shape
 from rts.sampling.validation import check_camera, check_fragments, checked_pieces
 from rts.splatting.side_by_side import Picture, depth_scales
@@ -51,46 +51,181 @@ class Views(NamedTuple):
     scales: np.ndarray | None
 
 
-def sampled_as_one(
-    scenes: Sequence[Scene], picture: Picture, size: tuple[int, int], side: int, layers: int, splatter: Splatter
-) -> Views | None:
-    """The views of a scene, sampled as one picture; None where they have to be sampled one by one.
+class Sampling(NamedTuple):
+    """How views are to be sampled as one picture.
 
-    One by one are sampled surfaces that refine their samples, intersect rays or have other triangles for each view,
-    parts with exits, and what a sampler with a `sample` of its own samples.
-
-    Args:
-        scenes: the scene with the camera of each view, for images of the size; values of its arrays are known.
+    Attributes:
+        scenes: the scene with the camera of each view, for images of the size.
         picture: where the views are to be.
         size: (height, width) of each view, pixels.
         side: cells along each side of a pixel.
         layers: K.
         splatter: the splatter that samples are for.
+        capacity: as in `rts.render`, of each view.
     """
-    first, height, width = scenes[0], side * size[0], side * size[1]
-    samplers = [suited_sampler(s, part, first.camera) for s, part in zip(first.samplers, first.parts, strict=True)]
-    derives = first.suited[0].differentiates
-    if not all(
-        _is_plain(*given, derives and splatter.reads_exits) for given in zip(samplers, first.parts, strict=True)
-    ):
-        return None
-    needed = first.needed_by(splatter, settles=True)
-    if needed is not None and needed.size is None:
-        return None
-    check_memory(height, width, layers, None, gradient=derives)
-    apron = apron_of(splatter)
-    wides = [widened(scene, scene.camera, (height, width), apron) for scene in scenes]
-    pruning = None if needed is None else _Pruning(needed, picture)
-    found = []
-    for part, sampler, entry in zip(first.parts, samplers, first.entries, strict=True):
-        here = pruning if len(first.parts) == 1 else None
-        found.append(_of_part(part, sampler, entry, wides, picture, layers, here, splatter.reads_facing))
-    sampled = merge(found, layers)
-    if pruning is not None and len(first.parts) > 1:
+
+    scenes: Sequence[Scene]
+    picture: Picture
+    size: tuple[int, int]
+    side: int
+    layers: int
+    splatter: Splatter
+    capacity: int | None = None
+
+    @property
+    def possible(self) -> bool:
+        """Whether views can be sampled so, and not one by one.
+
+        One by one are sampled surfaces that refine their samples, intersect rays or have other triangles for each view,
+        parts with exits, and what a sampler with a `sample` of its own samples.
+        """
+        exits = self.scenes[0].suited[0].differentiates and self.splatter.reads_exits
+        return all(_is_plain(sampler, part, exits) for part, sampler, _ in self.parts())
+
+    def parts(self) -> list[tuple[CheckedPart, Any, Any]]:
+        """Each part, its sampler, and what that has prepared."""
+        first = self.scenes[0]
+        chosen = [suited_sampler(s, part, first.camera) for s, part in zip(first.samplers, first.parts, strict=True)]
+        return list(zip(first.parts, chosen, first.entries, strict=True))
+
+    def needed(self) -> Needed | None:
+        """What says which samples of a view the splatter needs."""
+        height, width = (self.side * n for n in self.size)
+        first = self.scenes[0]
+        check_memory(height, width, self.layers, self.capacity, gradient=first.suited[0].differentiates)
+        return first.needed_by(self.splatter, settles=True)
+
+    def of_part(
+        self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None, pruning: _Pruning | None, apart: bool
+    ) -> list[Samples]:
+        """The samples of a part in all views, or of each `apart`, less what is not needed; by one call to the host."""
+        apron, cells = apron_of(self.splatter), (self.side * self.size[0], self.side * self.size[1])
+        wides = [widened(scene, scene.camera, cells, apron) for scene in self.scenes]
+        cameras = [stopped(wide.camera.within(part.transform)) for wide in wides]
+        surface, theta, picture, layers = part.surface, part.theta, self.picture, self.layers
+        engine, like = suiting(theta, cameras)
+        tells = self.splatter.reads_facing and layers > 1 and part.cull == "none" and surface.tells_pieces
+        settles = pruning is not None and pruning.settles
+        inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
+        reads = {name: theta[name] for name in surface.reads(theta)}
+        host_theta = reads if engine.differentiates and is_constant(reads) else None
+        shader = adapted(part.shader, Shader)
+        asked = None if shader is None else shader.reads
+        grid = picture.view if apart else picture.size
+        shape = _Shape(layers, grid, self.capacity, grid)
+        attributes = _attribute_specs(surface, asked, host_theta, shape, like)
+        transform = [] if part.transform is None else [part.transform]
+
+        def host(*arrays: np.ndarray) -> tuple[Any, ...]:
+            it = iter(arrays)
+            own = [Camera(*(np.asarray(next(it), np.float64) for _ in range(2))) for _ in cameras]
+            moved = [next(it) for _ in transform]
+            own = [check_camera(camera, *moved) for camera in own]
+            given = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
+            with sampler._keeper.lock:
+                known = entry or sampler._entry(surface, given, own[0], picture.view)
+                alone = sampler.follows or not sampler.concurrent
+                fragments = _drawn(sampler, known, own, picture, layers, part.cull) if alone else None
+            fragments = fragments or _drawn(sampler, known, own, picture, layers, part.cull)
+            covered, settled, sides = fragments.triangle_ids >= 0, None, None
+            kept = covered.copy()
+            if pruning is not None:
+                kept = pruning(kept, fragments.depth, known.size or largest(known.proxy.vertices))
+                settled = pruning.settled(covered, kept) if settles else None
+            if tells:
+                pieces = checked_pieces(surface, known.proxy) if kept[1:].any() else np.zeros(1, np.int16)
+                sides = facing_of_views(fragments, kept, known.proxy, pieces, own, picture.view)
+            found = lift(fragments, known.proxy, None, kept, 0.0, views=(picture.down, picture.across))
+            gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
+            grids = [x for x in (sides, settled) if x is not None]
+            tables = [found.ids, found.params, *(np.asarray(gbuffer[n], spec.dtype) for n, spec in attributes.items())]
+            views = [(tables, found.row, found.depth, found.overflow, grids)]
+            if apart:
+                views = _cut(tables, found.row, found.depth, grids, picture, self.capacity)
+            return tuple(x for rows, *cells, told in views for x in (*rows[:2], *cells, *told, *rows[2:]))
+
+        sides = [ArraySpec((layers, *grid), np.int16)] if tells else []
+        amid = [ArraySpec(grid, np.bool_)] if settles else []
+        specs = *shape.specs(surface.sample_widths), *sides, *amid, *attributes.values()
+        matrices = [m for camera in cameras for m in (camera.view, camera.projection)]
+        count = picture.views if apart else 1
+        results = engine.call_host(host, specs * count, *matrices, *transform, *leaves(inputs))
+        rest = 5 + len(sides) + len(amid)
+        return [
+            Samples(
+                *own[:5],
+                gbuffer=dict(zip(attributes, own[rest:], strict=True)) if host_theta is not None else None,
+                asked=asked,
+                centered=surface.centered,
+                facing=own[5] if tells else None,
+                settled=own[rest - 1] if settles else None,
+            )
+            for own in (results[i : i + len(specs)] for i in range(0, len(results), len(specs)))
+        ]
+
+
+def sampled_as_one(given: Sampling) -> Views:
+    """The views of a scene, sampled as one picture; values of its arrays are known."""
+    needed = given.needed()
+    pruning, parts = None if needed is None else _Pruning(needed, given.picture), given.parts()
+    found = [given.of_part(*part, pruning if len(parts) == 1 else None, apart=False)[0] for part in parts]
+    sampled = merge(found, given.layers)
+    if pruning is not None and len(parts) > 1:
         sampled = prune(sampled, pruning)
-    scales = _scales_of(sampled.depth, picture) if pruning is None else pruning.scales
-    counts = tuple(_counts(samples.row, samples.ids.shape[0], picture) for samples in sampled.samples)
-    return Views(replace(sampled, supersample=side, apron=apron), picture, counts, scales)
+    scales = _scales_of(sampled.depth, given.picture) if pruning is None else pruning.scales
+    counts = tuple(_counts(samples.row, samples.ids.shape[0], given.picture) for samples in sampled.samples)
+    sampled = replace(sampled, supersample=given.side, apron=apron_of(given.splatter))
+    return Views(sampled, given.picture, counts, scales)
+
+
+def sampled_at_once(given: Sampling) -> list[Sampled]:
+    """The views of a scene, sampled as one picture and taken apart: each in tables of its own, as if sampled alone."""
+    needed = given.needed()
+    pruning, parts = None if needed is None else _Pruning(needed, given.picture), given.parts()
+    found = [given.of_part(*part, pruning if len(parts) == 1 else None, apart=True) for part in parts]
+    views = []
+    for samples in zip(*found, strict=True):
+        sampled = merge(samples, given.layers)
+        if needed is not None and len(parts) > 1 and not is_traced(sampled.row):
+            sampled = prune(sampled, needed)
+        views.append(replace(sampled, supersample=given.side, apron=apron_of(given.splatter)))
+    return views
+
+
+def _cut(
+    tables: Sequence[np.ndarray],
+    row: np.ndarray,
+    depth: np.ndarray,
+    grids: Sequence[np.ndarray],
+    picture: Picture,
+    capacity: int | None,
+) -> list[tuple[Any, ...]]:
+    """Of each view its tables, `row`, `depth`, what did not fit into the capacity, and further grids.
+
+    Args:
+        tables: (N, ·), views one after the other.
+        row: (K, height, width) int32.
+        depth: (K, height, width) float32.
+        grids: (..., height, width).
+        picture: where the views are.
+        capacity: rows to allot in each table; None for as many as there are, at least one.
+    """
+    views, first = [], 0
+    for (lines, columns), count in zip(picture.places(), _counts(row, len(tables[0]), picture).tolist(), strict=True):
+        own, there = row[:, lines, columns] - np.int32(first), depth[:, lines, columns]
+        room = max(1, count) if capacity is None else capacity
+        taken = min(count, room)
+        here = (own >= 0) & (own < room) & (row[:, lines, columns] >= 0)
+        cut = []
+        for table in tables:
+            rows = np.zeros((room, *table.shape[1:]), table.dtype)
+            rows[:taken] = table[first : first + taken]
+            cut.append(rows)
+        over = np.asarray(count - taken, np.int32)
+        told = [np.ascontiguousarray(x[..., lines, columns]) for x in grids]
+        views.append((cut, np.where(here, own, np.int32(-1)), np.where(here, there, np.float32(0)), over, told))
+        first += count
+    return views
 
 
 def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | None:
@@ -162,74 +297,6 @@ def _is_plain(sampler: Any, part: CheckedPart, exits: bool) -> bool:
     return not (exits and part.cull == "back" and sampler.tells_exits)
 
 
-def _of_part(
-    part: CheckedPart,
-    sampler: TriangleSampler,
-    entry: Entry | None,
-    wides: Sequence[Wide],
-    picture: Picture,
-    layers: int,
-    pruning: _Pruning | None,
-    facing: bool,
-) -> Samples:
-    """The samples of a part in all views, less those that are not needed; by one call to the host."""
-    surface, theta = part.surface, part.theta
-    cameras = [stopped(wide.camera.within(part.transform)) for wide in wides]
-    engine, like = suiting(theta, cameras)
-    tells = facing and layers > 1 and part.cull == "none" and surface.tells_pieces
-    settles = pruning is not None and pruning.settles
-    inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
-    reads = {name: theta[name] for name in surface.reads(theta)}
-    host_theta = reads if engine.differentiates and is_constant(reads) else None
-    shader = adapted(part.shader, Shader)
-    asked = None if shader is None else shader.reads
-    shape = _Shape(layers, picture.size, None, picture.size)
-    attributes = _attribute_specs(surface, asked, host_theta, shape, like)
-    transform = [] if part.transform is None else [part.transform]
-
-    def host(*arrays: np.ndarray) -> tuple[Any, ...]:
-        it = iter(arrays)
-        own = [Camera(*(np.asarray(next(it), np.float64) for _ in range(2))) for _ in cameras]
-        moved = [next(it) for _ in transform]
-        own = [check_camera(camera, *moved) for camera in own]
-        given = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
-        with sampler._keeper.lock:
-            known = entry or sampler._entry(surface, given, own[0], picture.view)
-            alone = sampler.follows or not sampler.concurrent
-            fragments = _drawn(sampler, known, own, picture, layers, part.cull) if alone else None
-        fragments = fragments or _drawn(sampler, known, own, picture, layers, part.cull)
-        covered, settled, sides = fragments.triangle_ids >= 0, None, None
-        kept = covered.copy()
-        if pruning is not None:
-            kept = pruning(kept, fragments.depth, known.size or largest(known.proxy.vertices))
-            settled = pruning.settled(covered, kept) if settles else None
-        if tells:
-            pieces = checked_pieces(surface, known.proxy) if kept[1:].any() else np.zeros(1, np.int16)
-            sides = facing_of_views(fragments, kept, known.proxy, pieces, own, picture.view)
-        found = lift(fragments, known.proxy, None, kept, 0.0, views=(picture.down, picture.across))
-        gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
-        return (
-            *(found.ids, found.params, found.row, found.depth, found.overflow),
-            *(x for x in (sides, settled) if x is not None),
-            *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
-        )
-
-    sides = [ArraySpec((layers, *picture.size), np.int16)] if tells else []
-    amid = [ArraySpec(picture.size, np.bool_)] if settles else []
-    specs = *shape.specs(surface.sample_widths), *sides, *amid, *attributes.values()
-    matrices = [m for camera in cameras for m in (camera.view, camera.projection)]
-    results = engine.call_host(host, specs, *matrices, *transform, *leaves(inputs))
-    rest = 5 + len(sides) + len(amid)
-    return Samples(
-        *results[:5],
-        gbuffer=dict(zip(attributes, results[rest:], strict=True)) if host_theta is not None else None,
-        asked=asked,
-        centered=surface.centered,
-        facing=results[5] if tells else None,
-        settled=results[rest - 1] if settles else None,
-    )
-
-
 def _drawn(
     sampler: TriangleSampler, known: Entry, cameras: Sequence[Camera], picture: Picture, layers: int, cull: str
 ) -> Fragments:
@@ -270,7 +337,7 @@ class _Pruning:
 
     def __init__(self, needed: Needed, picture: Picture):
         self.settles, self.scales = needed.settles, None
-        self._size, self._picture = needed.size or 0.0, picture
+        self._size, self._picture = needed.size or 0.0, picture  # Where it is traced, that of the triangles is told.
         self._near = copy.copy(needed)
         self._near.size = 0.0  # Whether numbers are too large is decided here: depths are in other units.
         self._depth: np.ndarray | None = None
