@@ -73,42 +73,44 @@ def views_to_splats(
     sampled = [picture.sampled for picture in pictures]
     if not engine.owns(sampled[0].row):
         sampled = constants(sampled, engine, like if engine.differentiates else None)
-    counts = [np.concatenate([p.counts[index] for p in pictures]) for index in range(len(parts))]
     grid, border = pictures[0].picture.view, sampled[0].apron
     wides = [Wide(c.with_apron((grid[0] - 2 * border, grid[1] - 2 * border), border), grid) for c in cameras]
     shown = [
-        _shown_in_views(index, part, [own.samples[index] for own in sampled], own, cameras, wides, engine, like)
-        for index, (part, own) in enumerate(zip(parts, counts, strict=True))
+        _shown_in_views(index, part, pictures, sampled, cameras, wides, engine, like)
+        for index, part in enumerate(parts)
     ]
     made, start = [], 0
     for picture, whole in zip(pictures, sampled, strict=True):
         here = slice(start, start := start + picture.picture.views)
-        of_parts = [_of_views(tables, own, here) for tables, own in zip(shown, counts, strict=True)]
+        of_parts = [_of_views(tables, pictures, index, here) for index, tables in enumerate(shown)]
         positions, rgba = _together(*zip(*of_parts, strict=True))
-        positions = _placed(positions, picture, [n[here] for n in counts])
         wanted = engine_of(positions).constant(picture.picture.inside(border), positions)
         made.append(_splats(whole, positions, rgba, engine).replace(wanted=wanted))
     return made
 
 
-def _of_views(tables: Sequence[Array], counts: np.ndarray, views: slice) -> Sequence[Array]:
-    """The rows of some views of tables in which there are so many of each view."""
-    if views == slice(0, len(counts)):
+def _of_views(tables: Sequence[Array], pictures: Sequence[Views], part: int, views: slice) -> Sequence[Array]:
+    """The rows of some views in tables of a part in all pictures."""
+    if len(pictures) == 1:
         return tables
+    counts = _counts_of(pictures, part)
+    assert counts is not None
     first, rows = int(counts[: views.start].sum()), int(counts[views].sum())
     return [x[first : first + rows, ...] for x in tables]
 
 
-def _placed(positions: Array, views: Views, counts: Sequence[np.ndarray]) -> Array:
-    """Positions (N, 3) in a picture of views, from those in views; of each part there are so many (B,) in each."""
-    engine, every = engine_of(positions), np.concatenate(counts)
-    shift = np.zeros((len(every), 3), np.float32)
-    shift[:, :2] = np.tile(views.picture.corners(), (len(counts), 1))
-    if views.scales is not None:
-        factors = np.ones((len(every), 3))
-        factors[:, 2] = np.tile(views.scales, len(counts))
-        positions = positions * engine.constant(np.repeat(factors, every, axis=0), positions)
-    return positions + engine.constant(np.repeat(shift, every, axis=0), positions)
+def _counts_of(pictures: Sequence[Views], part: int) -> np.ndarray | None:
+    """(B,) how many samples of a part there are in each view of all pictures; None where that is not known."""
+    known = [picture.counts[part] for picture in pictures if picture.counts is not None]
+    return np.concatenate(known) if len(known) == len(pictures) else None
+
+
+def _places_of(pictures: Sequence[Views], engine: Engine, like: Array) -> Array:
+    """(B, 3) of each view what is added to columns and lines in its picture, and by what depth is multiplied."""
+    corners = np.concatenate([picture.picture.corners() for picture in pictures]).astype(np.float32)
+    scales = [constants(picture.scales, engine, like) for picture in pictures]
+    xp = namespace(*scales)
+    return xp.concat([constants(corners, engine, like), xp.concat(scales)[:, None]], axis=1)
 
 
 def _splats(sampled: Sampled, positions: Array, rgba: Array, engine: Engine) -> Splats:
@@ -180,20 +182,20 @@ def _shown(
 def _shown_in_views(
     index: int,
     part: CheckedPart,
-    sampled: Sequence[Samples],
-    counts: np.ndarray,
+    pictures: Sequence[Views],
+    sampled: Sequence[Sampled],
     cameras: Sequence[Camera],
     wides: Sequence[Wide],
     engine: Engine,
     like: Array | None,
 ) -> tuple[Array, Array]:
-    """Positions (N, 3) and colours (N, C + 1) of the samples of a part in several views, each in its own grid.
+    """Positions (N, 3) in their pictures and colours (N, C + 1) of the samples of a part in several views.
 
     Args:
         index: the part's.
-        part: the part.
-        sampled: its samples, views one after the other.
-        counts: (B,) how many are those of each view.
+        part: the part; `uniform`, where the number of samples in each view is not known.
+        pictures: the views.
+        sampled: their samples, in arrays of the engine.
         cameras: of the whole image of each view.
         wides: the grid of each view, and its camera.
         engine: the engine to compute with.
@@ -202,22 +204,36 @@ def _shown_in_views(
     dtype = like
     if not engine.differentiates:
         like = None
-    whole, sizes, grid = in_one_table(sampled), counts.tolist(), wides[0].grid
+    whole, counts, grid = (
+        in_one_table([own.samples[index] for own in sampled]),
+        _counts_of(pictures, index),
+        wides[0].grid,
+    )
     theta, transform = _theta_of(part, engine, like), constants(part.transform, engine, like)
     gbuffer = _evaluate(part, part.surface.reads(part.theta), whole, engine, like)
     seen = [w.camera.replace(view=constants(w.camera.view, engine, like)).within(transform) for w in wides]
+    shaded = [(whole, gbuffer)]
+    if not part.shader.uniform:
+        assert counts is not None
+        shaded = _apart(whole, gbuffer, counts.tolist(), engine)
     colors = []
-    for camera, own, (samples, local) in zip(cameras, seen, _apart(whole, gbuffer, sizes, engine), strict=True):
+    for camera, own, (samples, local) in zip(cameras, seen, shaded, strict=False):
         given = samples, local, constants(camera, engine, like), own, grid, engine, like
         colors.append(constants(_colored(part, theta, transform, *given)[1], engine, dtype))
+    (rgba,) = _together(colors)
     rows = namespace(seen[0].view).stack([own.pixel_rows(grid) for own in seen])
     rows, points = constants((rows, gbuffer["position"]), *suiting(rows, gbuffer["position"]))
-    positions = constants(projective_map_of_views(rows, points, sizes), engine, dtype)
-    if engine_of(colors) is not engine:
-        positions, colors = constants((positions, colors), *suiting(colors))
-    (rgba,) = _together(colors)
-    # All rows are used.
-    every = np.arange(sum(sizes), dtype=np.int32)[None, None]
+    view, first = [], 0
+    for picture in pictures:
+        view.append(picture.view[index] + first if first else picture.view[index])
+        first += picture.picture.views
+    (view,) = _together([constants(own, engine, like) for own in view])
+    places = _places_of(pictures, engine_of(points), points)
+    positions = constants(projective_map_of_views(rows, points, view, places), engine, dtype)
+    if engine_of(rgba) is not engine:
+        positions, rgba = constants((positions, rgba), *suiting(rgba))
+    # Where rows are not used, values are not looked at.
+    every = np.arange(gbuffer["position"].shape[0], dtype=np.int32)[None, None] if counts is not None else whole.row
     check_splats(index, part, gbuffer, positions, rgba, every, 0)
     return positions, rgba
 

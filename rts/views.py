@@ -22,7 +22,7 @@ from rts.rendering import bands_of, image_of, over_background, seen, splatted
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.scenes import Scene, apron_of, sampled_scene
-from rts.sampling.several import Sampling, Views, laid_side_by_side, sampled_as_one, sampled_at_once
+from rts.sampling.several import Sampling, Views, laid_side_by_side, sampled_as_one
 from rts.splatting.side_by_side import Picture, at_once
 from rts.threads import each
 from rts.trees import Array
@@ -121,14 +121,14 @@ def _images(
         chunks = _chunks(scenes, at_once(view))
         place = Picture.of(len(chunks[0]), view)
         given = [
-            Sampling(own, place._replace(views=len(own)), size, supersample, layers, splatter, capacity)
+            Sampling(own, place._replace(views=len(own)), size, supersample, int(layers), splatter, capacity)
             for own in chunks
         ]
         if place.views > 1 and all(own.possible for own in given):
-            if engine.padded(like):
-                views = [view for own in given for view in sampled_at_once(own)]
-                return _one_by_one(scenes, views, suited, splatter)
-            if capacity is None and engine.concurrent() and engine.on_host(like):
+            # Of padded rows it is not known which are those of a view, so that shaders must not see the camera.
+            alike = len(given) == len(scenes[0].parts) == 1 and scenes[0].parts[0].shader.uniform
+            known = capacity is None and engine.concurrent() and engine.on_host(like)
+            if alike if engine.padded(like) else known:
                 return _as_pictures([sampled_as_one(own) for own in given], scenes, suited, splatter)
         if several and suited[0].differentiates:
             views = each(lambda own: sampled_scene(own, own.camera, size, settles=True, **options), scenes)
@@ -137,7 +137,7 @@ def _images(
             if len(found) == len(pictures):
                 return _as_pictures(found, scenes, suited, splatter)
             return _one_by_one(scenes, views, suited, splatter)
-    elif whole and several and suited[0].differentiates and supersample.contrast is None:
+    elif isinstance(supersample, Adaptive) and several and suited[0].differentiates and supersample.contrast is None:
         views = each(lambda own: sampled_scene(own, own.camera, size, settles=True, **options), scenes)
         return _one_by_one(scenes, views, suited, splatter)
     images = [draw(scene) for scene in (scenes[:1] if several and not suited[0].differentiates else scenes)]

@@ -8,7 +8,7 @@ import rts
 from rts.operations.combine import COMBINE, combine, interpolate
 from rts.operations.inset import with_inset
 from rts.operations.linear import affine_map, matmul
-from rts.operations.projection import projective_map
+from rts.operations.projection import projective_map, projective_map_of_views
 from rts.operations.take import take
 
 pytestmark = pytest.mark.engines
@@ -411,3 +411,34 @@ def test_the_gradient_of_numpy_suits_scenes_of_any_size():
         points = size * np.array([[0.6, 0.8, 0.0]])
         found = rts.gradient(lambda p: np.sqrt((p * p).sum(-1)), points)
         np.testing.assert_allclose(found, [[0.6, 0.8, 0.0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_points_of_views_are_projected_by_the_rows_of_each_and_put_in_place(target):
+    generator = np.random.default_rng(5)
+    rows, points = generator.normal(size=(3, 4, 4)), generator.normal(size=(7, 3))
+    rows[:, 2, 3] += 4
+    view = np.array([1, 1, 1, 3, 3, 0, 0], np.int32)  # Nothing is seen in the second, and two rows are not used.
+    places = np.array([[0, 0, 1], [9, 9, 9], [20, 10, 0.5]])
+    found = to_numpy(projective_map_of_views(*arrays(target, (rows, points)), *arrays(target, (view, places))))
+    for n, b in enumerate(view[:5] - 1):
+        (expected,) = to_numpy(projective_map(rows[b], points[n : n + 1]))
+        expected = expected * [1, 1, places[b, 2]] + [*places[b, :2], 0]
+        np.testing.assert_allclose(found[n], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_their_derivatives_are_those_of_differences_to_second_order():
+    torch = pytest.importorskip("torch")
+    generator = torch.Generator().manual_seed(5)
+    rows = torch.randn((3, 4, 4), dtype=torch.float64, generator=generator)
+    rows[:, 2, 3] += 4
+    points = torch.randn((5, 3), dtype=torch.float64, generator=generator)
+    view = torch.tensor([1, 1, 1, 3, 3], dtype=torch.int32)
+    places = torch.tensor([[0, 0, 1], [9, 9, 9], [20, 10, 0.5]], dtype=torch.float64)
+    given = rows.requires_grad_(True), points.requires_grad_(True)
+
+    def projected(r, p):
+        return projective_map_of_views(r, p, view, places)
+
+    assert torch.autograd.gradcheck(projected, given, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(projected, given)

@@ -157,6 +157,85 @@ def test_a_compiled_program_renders_views_and_takes_capacity():
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
 
 
+@pytest.mark.parametrize("capacity", [None, 700])
+def test_compiled_silhouettes_are_those_of_a_loop(capacity):
+    """Of one part of one colour jax samples and splats all views together."""
+    jax = pytest.importorskip("jax")
+    part, options = mesh_part(icosphere(1), shader="silhouette"), {"capacity": capacity}
+
+    def images(vertices, together):
+        moved = part.replace(theta={"vertices": vertices})
+        if together:
+            return rts.render_views(moved, CAMERAS, SIZE, **options)
+        return jax.numpy.stack([rts.render(moved, camera, SIZE, **options) for camera in CAMERAS])
+
+    vertices = jax.numpy.asarray(part.theta["vertices"])
+    found, expected = (
+        jax.jit(jax.value_and_grad(lambda v, t=t: (images(v, t) * WEIGHTS).sum()))(vertices) for t in (True, False)
+    )
+    np.testing.assert_allclose(found[0], expected[0], rtol=1e-4)
+    assert np.abs(expected[1]).max() > 0.5
+    np.testing.assert_allclose(found[1], expected[1], atol=1e-4 * float(np.abs(expected[1]).max()))
+
+
+def test_what_does_not_fit_is_left_out_of_its_own_view():
+    jax = pytest.importorskip("jax")
+    part = mesh_part(icosphere(1), shader="silhouette")
+    cameras = [CAMERAS[0], *(Camera.look_at(np.array(eye) * 2, (0, 0, 0), fov_y=45) for eye in EYES[1:])]
+
+    def images(vertices):
+        return rts.render_views(part.replace(theta={"vertices": vertices}), cameras, SIZE, capacity=90)
+
+    found = np.asarray(jax.jit(images)(jax.numpy.asarray(part.theta["vertices"])))
+    whole = looped(part, cameras)
+    assert 0.1 < found[0, ..., 3].sum() / whole[0, ..., 3].sum() < 0.9
+    np.testing.assert_allclose(found[1:], whole[1:], atol=2e-5)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_silhouettes_through_poses_cameras_and_batches_are_those_of_a_loop(target):
+    part = arrays(target, mesh_part(icosphere(1), shader="silhouette"))
+    stacked = arrays(target, Camera.stack([camera.for_size(SIZE) for camera in CAMERAS]))
+    expected = np.stack([to_numpy(rts.render(part, camera, SIZE)) for camera in stacked.unstack()])
+    np.testing.assert_allclose(to_numpy(rts.render_views(part, stacked, SIZE)), expected, atol=2e-5)
+
+    vmap = pytest.importorskip("torch").vmap if target != "jax" else pytest.importorskip("jax").vmap
+    vertices = to_numpy(part.theta["vertices"])
+    several = arrays(target, np.stack([vertices, 0.7 * vertices]))
+    together = vmap(lambda v: rts.render_views(part.replace(theta={"vertices": v}), stacked, SIZE))(several)
+    np.testing.assert_allclose(to_numpy(together)[0], expected, atol=2e-5)
+
+
+def test_views_are_the_same_on_any_number_of_threads_and_in_any_company(monkeypatch):
+    found = []
+    for threads in ("1", "2", "2"):
+        monkeypatch.setenv("RTS_NUM_THREADS", threads)
+        found.append(rts.render_views(scene(), CAMERAS, SIZE))
+    for other in found[1:]:
+        np.testing.assert_array_equal(found[0], other)
+    # A view that is empty, and another that is far, are none of the others' business.
+    away = Camera.look_at((0, 0, 3), (0, 0, 6), fov_y=45)
+    far = Camera.look_at(np.array(EYES[0]) * 300, (0, 0, 0), fov_y=0.15, far=5000)
+    with pytest.warns(EmptyImageWarning, match="view 1"):
+        more = rts.render_views(scene(), [CAMERAS[0], away, far, *CAMERAS[1:]], SIZE)
+    np.testing.assert_allclose(more[[0, 3, 4]], found[0], rtol=0, atol=1e-5)
+
+
+def test_several_culled_parts_with_hidden_layers_move_as_in_a_loop():
+    torch = pytest.importorskip("torch")
+    found = []
+    for together in (True, False):
+        leaves = [torch.tensor(part.theta["vertices"], requires_grad=True) for part in scene()]
+        moved = [p.replace(theta={**p.theta, "vertices": v}, cull="back") for p, v in zip(scene(), leaves, strict=True)]
+        if together:
+            images = rts.render_views(moved, CAMERAS, SIZE)
+        else:
+            images = torch.stack([rts.render(moved, camera, SIZE) for camera in CAMERAS])
+        found.append(torch.autograd.grad((images * torch.tensor(WEIGHTS)).sum(), leaves))
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-4 * float(b.abs().max()))
+
+
 @pytest.mark.parametrize("name", ["isosurface", "sdf"])
 @pytest.mark.parametrize("target", ["numpy", *TORCH])
 def test_surfaces_that_refine_or_intersect_rays_are_rendered_as_by_a_loop(name, target):

@@ -46,7 +46,7 @@ def images(parts: Any, side: int, together: bool) -> Any:
     if together:
         return rts.render_views(parts, cameras(), size)
     found = [rts.render(parts, camera, size) for camera in cameras()]
-    return rts.engines.namespace(*found).stack(found)
+    return rts.namespace(*found).stack(found)
 
 
 def call_of(kind: str, part: rts.Part, side: int, together: bool) -> Callable[[], object]:

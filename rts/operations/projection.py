@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
-from rts.engines import engine_of, namespace
+from rts.engines import namespace
 from rts.errors import InputError
 from rts.operations.linear import is_plain_product, specified_affine_map
 from rts.operations.operation import Arrays, Operation, Some
@@ -25,14 +25,28 @@ def projective_map(rows: Array, points: Array) -> Array:
     return PROJECTION(rows, points)
 
 
-def projective_map_of_views(rows: Array, points: Array, counts: Sequence[int]) -> Array:
-    """As `projective_map`, of points (N, 3) of B views, one after the other, so many each, by rows (B, 4, 4)."""
-    if is_plain_product(rows[0, ...], points):
-        ends = np.cumsum(counts).tolist()
-        own = [points[end - n : end, :] for end, n in zip(ends, counts, strict=True)]
-        return namespace(points).concat([_specification(rows[b, ...], x) for b, x in enumerate(own)])
-    view = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-    return VIEWS(rows, points, engine_of(points).constant(view))
+def projective_map_of_views(rows: Array, points: Array, view: Array, places: Array) -> Array:
+    """As `projective_map`, of points (N, 3) of several views, put where each view has its place in a picture.
+
+    Args:
+        rows: (B, 4, 4), those of each view.
+        points: (N, 3), views one after the other.
+        view: (N,) int32, the number of each point's view, from 1 on; 0 behind all others for rows that are not used.
+        places: (B, 3) of each view what is added to the first and to the second, and by what depth is multiplied.
+    """
+    if not is_plain_product(rows[0, ...], points):
+        return VIEWS(rows, points, view, places)
+    xp, found = namespace(points), []
+    for b, own in _ranges(view, len(rows)):
+        shown = _specification(rows[b, ...], points[own, :])
+        found.append(xp.concat([shown[:, :2] + places[b, :2], shown[:, 2:] * places[b, 2]], axis=1))
+    return xp.concat(found)
+
+
+def _ranges(view: np.ndarray, count: int) -> Iterator[tuple[int, slice]]:
+    """Of so many views their numbers, from 0 on, and where their points are."""
+    ends = np.searchsorted(view[: np.count_nonzero(view)], np.arange(1, count + 2))
+    return enumerate(itertools.starmap(slice, itertools.pairwise(ends.tolist())))
 
 
 def _specification(rows: Array, points: Array) -> Array:
@@ -91,29 +105,28 @@ PROJECTION = Operation(
 )
 
 
-def _specification_of_views(rows: Array, points: Array, view: Array) -> Array:
-    xp = namespace(points)
-    rows, points = xp.take(rows, view, axis=0), points[:, None, :]
+def _specification_of_views(rows: Array, points: Array, view: Array, places: Array) -> Array:
+    xp, index = namespace(points), view - namespace(view).astype(view > 0, view.dtype)
+    rows, places, points = xp.take(rows, index, axis=0), xp.take(places, index, axis=0), points[:, None, :]
     x, y, divisor, depth = xp.unstack(xp.sum(rows[..., :3] * points, axis=-1) + rows[..., 3], axis=1)
     safe = xp.where(divisor == 0, xp.ones_like(divisor), divisor)
-    return xp.stack([x / safe, y / safe, depth], axis=1)
+    return xp.stack([x / safe + places[:, 0], y / safe + places[:, 1], depth * places[:, 2]], axis=1)
 
 
-def _shape_of_views(rows: tuple[int, ...], points: tuple[int, ...], view: tuple[int, ...]) -> tuple[int, ...]:
+def _shape_of_views(rows: tuple, points: tuple[int, ...], view: tuple, places: tuple) -> tuple[int, ...]:
     return points
 
 
-def _each_view(operands: Arrays) -> Iterator[tuple[int, slice, Arrays]]:
-    """Of each view its number, where its points are, and the operands of its projection."""
-    rows, points, view = operands
-    if rows.shape[1:] != (4, 4) or points.shape != (len(view), 3):
+def _each_view(operands: Arrays) -> Iterator[tuple[int, slice, Arrays, np.ndarray]]:
+    """Of each view its number, where its points are, the operands of its projection, and its place."""
+    rows, points, view, places = operands
+    if rows.shape[1:] != (4, 4) or points.shape != (len(view), 3) or places.shape != (len(rows), 3):
+        shapes = ", ".join(str(x.shape) for x in operands)
         raise InputError(
-            f"rows, points and view have shapes {rows.shape}, {points.shape} and {view.shape}; expected (B, 4, 4), "
-            f"(N, 3) and (N,)"
+            f"rows, points, view and places have shapes {shapes}; expected (B, 4, 4), (N, 3), (N,) and (B, 3)"
         )
-    ends = np.searchsorted(view, np.arange(len(rows) + 1))
-    for b, own in enumerate(itertools.starmap(slice, itertools.pairwise(ends.tolist()))):
-        yield b, own, (rows[b], points[own])
+    for b, own in _ranges(view, len(rows)):
+        yield b, own, (rows[b], points[own]), places[b]
 
 
 def _at(x: np.ndarray | None, place: int | slice) -> np.ndarray | None:
@@ -121,28 +134,42 @@ def _at(x: np.ndarray | None, place: int | slice) -> np.ndarray | None:
 
 
 def _forward_of_views(operands: Arrays, out: np.ndarray) -> None:
-    for _, own, given in _each_view(operands):
-        _forward(given, out[own])
+    out[np.count_nonzero(operands[2]) :] = 0
+    for _, own, given, place in _each_view(operands):
+        found = out[own]
+        _forward(given, found)
+        found[:, :2] += place[:2]
+        found[:, 2] *= place[2]
 
 
 def _push_of_views(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
-    for b, own, given in _each_view(operands):
+    out[np.count_nonzero(operands[2]) :] = 0
+    for b, own, given, place in _each_view(operands):
         _push(given, [_at(tangents[0], b), _at(tangents[1], own)], out[own])
+        out[own, 2] *= place[2]
 
 
 def _pull_of_views(operands: Arrays, g: np.ndarray, results: Some) -> None:
-    for b, own, given in _each_view(operands):
-        _pull(given, g[own], [_at(results[0], b), _at(results[1], own)])
+    for b, own, given, place in _each_view(operands):
+        gradient = g[own] if place[2] == 1 else g[own] * np.array([1, 1, place[2]], g.dtype)
+        _pull(given, gradient, [_at(results[0], b), _at(results[1], own)])
+
+
+def _used_of_views(operands: Arrays) -> int:
+    return int(np.count_nonzero(operands[2]))
 
 
 VIEWS = Operation(
     "rts.projection_of_views",
     _specification_of_views,
-    ranks=(3, 2, 1),
+    ranks=(3, 2, 1, 2),
     shape=_shape_of_views,
     forward=_forward_of_views,
     push=_push_of_views,
     pull=_pull_of_views,
     differentiable=2,
+    packed=(1, 2),
+    packed_result=True,
+    used=_used_of_views,
 )
-"""Points (N, 3) of views, one after the other, by the rows (B, 4, 4) of each; the last operand (N,) says whose."""
+"""See `projective_map_of_views`."""

@@ -17,7 +17,7 @@ import numpy as np
 from rts.adapting import adapted
 from rts.camera import Camera
 from rts.checks import check_memory, suited_sampler
-from rts.engines import engine_of, is_constant, is_traced, namespace, stopped, suiting, value_of
+from rts.engines import engine_of, is_constant, namespace, stopped, suiting, value_of
 from rts.interfaces import CheckedPart, Needed, Shader, Splatter, TriangleSurface
 from rts.records import ArraySpec, Fragments, Sampled, Samples
 from rts.sampling.cache import Entry
@@ -41,14 +41,16 @@ class Views(NamedTuple):
         sampled: the samples; the grid is that of the picture, and the apron that of each view. In the table of a part
             those of one view stand together, in the order of the views.
         picture: where the views are.
-        counts: of each part (B,), how many rows are those of a view.
-        scales: (B,) factors of depths, by which splatters are to compare them; None where depths are as they are.
+        view: of each part (N,) int32, the number of each row's view, from 1 on; 0 for rows that are not used.
+        counts: of each part (B,), how many rows are those of a view; None where that is not known yet.
+        scales: (B,) factors of depths, by which splatters are to compare them.
     """
 
     sampled: Sampled
     picture: Picture
-    counts: tuple[np.ndarray, ...]
-    scales: np.ndarray | None
+    view: tuple[Array, ...]
+    counts: tuple[np.ndarray, ...] | None
+    scales: Array
 
 
 class Sampling(NamedTuple):
@@ -82,7 +84,7 @@ class Sampling(NamedTuple):
         exits = self.scenes[0].suited[0].differentiates and self.splatter.reads_exits
         return all(_is_plain(sampler, part, exits) for part, sampler, _ in self.parts())
 
-    def parts(self) -> list[tuple[CheckedPart, Any, Any]]:
+    def parts(self) -> list[tuple[Any, Any, Any]]:
         """Each part, its sampler, and what that has prepared."""
         first = self.scenes[0]
         chosen = [suited_sampler(s, part, first.camera) for s, part in zip(first.samplers, first.parts, strict=True)]
@@ -96,29 +98,33 @@ class Sampling(NamedTuple):
         return first.needed_by(self.splatter, settles=True)
 
     def of_part(
-        self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None, pruning: _Pruning | None, apart: bool
-    ) -> list[Samples]:
-        """The samples of a part in all views, or of each `apart`, less what is not needed; by one call to the host."""
+        self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None, pruning: _Pruning
+    ) -> tuple[Samples, Array, Array]:
+        """The samples of a part in all views, less what is not needed, by one call to the host; and of `Views`.
+
+        Returns:
+            Samples, `view` and `scales`.
+        """
         apron, cells = apron_of(self.splatter), (self.side * self.size[0], self.side * self.size[1])
         wides = [widened(scene, scene.camera, cells, apron) for scene in self.scenes]
         cameras = [stopped(wide.camera.within(part.transform)) for wide in wides]
         surface, theta, picture, layers = part.surface, part.theta, self.picture, self.layers
+        assert isinstance(surface, TriangleSurface)
         engine, like = suiting(theta, cameras)
         tells = self.splatter.reads_facing and layers > 1 and part.cull == "none" and surface.tells_pieces
-        settles = pruning is not None and pruning.settles
         inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
         reads = {name: theta[name] for name in surface.reads(theta)}
         host_theta = reads if engine.differentiates and is_constant(reads) else None
         shader = adapted(part.shader, Shader)
         asked = None if shader is None else shader.reads
-        grid = picture.view if apart else picture.size
-        shape = _Shape(layers, grid, self.capacity, grid)
+        capacity = None if self.capacity is None else picture.views * self.capacity
+        shape = _Shape(layers, picture.size, capacity, picture.size)
         attributes = _attribute_specs(surface, asked, host_theta, shape, like)
         transform = [] if part.transform is None else [part.transform]
 
         def host(*arrays: np.ndarray) -> tuple[Any, ...]:
             it = iter(arrays)
-            own = [Camera(*(np.asarray(next(it), np.float64) for _ in range(2))) for _ in cameras]
+            own = [Camera(np.asarray(next(it), np.float64), np.asarray(next(it), np.float64)) for _ in cameras]
             moved = [next(it) for _ in transform]
             own = [check_camera(camera, *moved) for camera in own]
             given = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
@@ -127,105 +133,78 @@ class Sampling(NamedTuple):
                 alone = sampler.follows or not sampler.concurrent
                 fragments = _drawn(sampler, known, own, picture, layers, part.cull) if alone else None
             fragments = fragments or _drawn(sampler, known, own, picture, layers, part.cull)
-            covered, settled, sides = fragments.triangle_ids >= 0, None, None
-            kept = covered.copy()
-            if pruning is not None:
-                kept = pruning(kept, fragments.depth, known.size or largest(known.proxy.vertices))
-                settled = pruning.settled(covered, kept) if settles else None
+            size = known.size or largest(known.proxy.vertices)
+            kept, settled, scales = pruning.asked(fragments, size)
+            sides = []
             if tells:
                 pieces = checked_pieces(surface, known.proxy) if kept[1:].any() else np.zeros(1, np.int16)
-                sides = facing_of_views(fragments, kept, known.proxy, pieces, own, picture.view)
-            found = lift(fragments, known.proxy, None, kept, 0.0, views=(picture.down, picture.across))
+                sides = [facing_of_views(fragments, kept, known.proxy, pieces, own, picture.view)]
+            over = 0 if self.capacity is None else _leave_out(kept, picture, self.capacity)
+            found = lift(fragments, known.proxy, capacity, kept, 0.0, views=(picture.down, picture.across))
+            counts = _counts(found.row, len(found.ids) if capacity is None else 0, picture)
+            view = np.zeros(len(found.ids), np.int32)
+            view[: counts.sum()] = np.repeat(np.arange(1, picture.views + 1), counts)
             gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
-            grids = [x for x in (sides, settled) if x is not None]
-            tables = [found.ids, found.params, *(np.asarray(gbuffer[n], spec.dtype) for n, spec in attributes.items())]
-            views = [(tables, found.row, found.depth, found.overflow, grids)]
-            if apart:
-                views = _cut(tables, found.row, found.depth, grids, picture, self.capacity)
-            return tuple(x for rows, *cells, told in views for x in (*rows[:2], *cells, *told, *rows[2:]))
-
-        sides = [ArraySpec((layers, *grid), np.int16)] if tells else []
-        amid = [ArraySpec(grid, np.bool_)] if settles else []
-        specs = *shape.specs(surface.sample_widths), *sides, *amid, *attributes.values()
-        matrices = [m for camera in cameras for m in (camera.view, camera.projection)]
-        count = picture.views if apart else 1
-        results = engine.call_host(host, specs * count, *matrices, *transform, *leaves(inputs))
-        rest = 5 + len(sides) + len(amid)
-        return [
-            Samples(
-                *own[:5],
-                gbuffer=dict(zip(attributes, own[rest:], strict=True)) if host_theta is not None else None,
-                asked=asked,
-                centered=surface.centered,
-                facing=own[5] if tells else None,
-                settled=own[rest - 1] if settles else None,
+            return (
+                *(found.ids, found.params, found.row, found.depth, np.asarray(over, np.int32), view, scales),
+                *(*sides, *settled),
+                *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
             )
-            for own in (results[i : i + len(specs)] for i in range(0, len(results), len(specs)))
-        ]
+
+        marks = shape.row_spec(np.int32), ArraySpec((picture.views,), np.float32)
+        sides = [ArraySpec((layers, *picture.size), np.int16)] if tells else []
+        amid = [ArraySpec(picture.size, np.bool_)] if pruning.settles else []
+        specs = *shape.specs(surface.sample_widths), *marks, *sides, *amid, *attributes.values()
+        matrices = [m for camera in cameras for m in (camera.view, camera.projection)]
+        results = engine.call_host(host, specs, *matrices, *transform, *leaves(inputs))
+        rest = 7 + len(sides) + len(amid)
+        samples = Samples(
+            *results[:5],
+            gbuffer=dict(zip(attributes, results[rest:], strict=True)) if host_theta is not None else None,
+            asked=asked,
+            centered=surface.centered,
+            facing=results[7] if tells else None,
+            settled=results[rest - 1] if amid else None,
+        )
+        return samples, results[5], results[6]
 
 
 def sampled_as_one(given: Sampling) -> Views:
-    """The views of a scene, sampled as one picture; values of its arrays are known."""
-    needed = given.needed()
-    pruning, parts = None if needed is None else _Pruning(needed, given.picture), given.parts()
-    found = [given.of_part(*part, pruning if len(parts) == 1 else None, apart=False)[0] for part in parts]
-    sampled = merge(found, given.layers)
-    if pruning is not None and len(parts) > 1:
-        sampled = prune(sampled, pruning)
-    scales = _scales_of(sampled.depth, given.picture) if pruning is None else pruning.scales
-    counts = tuple(_counts(samples.row, samples.ids.shape[0], given.picture) for samples in sampled.samples)
+    """The views of a scene, sampled as one picture. Of several parts values must be known."""
+    needed, parts, picture = given.needed(), given.parts(), given.picture
+    pruning = _Pruning(needed, picture)
+    found = [given.of_part(*part, pruning if len(parts) == 1 else _Pruning(None, picture)) for part in parts]
+    sampled, scales = merge([samples for samples, _, _ in found], given.layers), found[0][2]
+    if len(parts) > 1:
+        scales = _scales_of(sampled.depth, picture)
+        sampled = sampled if needed is None else prune(sampled, pruning)
     sampled = replace(sampled, supersample=given.side, apron=apron_of(given.splatter))
-    return Views(sampled, given.picture, counts, scales)
+    if engine_of(sampled.row).padded(sampled.row):
+        return Views(sampled, picture, tuple(view for _, view, _ in found), None, scales)
+    counts = tuple(_counts(value_of(s.row), s.ids.shape[0], picture) for s in sampled.samples)
+    return _with_counts(sampled, picture, scales, counts)
 
 
-def sampled_at_once(given: Sampling) -> list[Sampled]:
-    """The views of a scene, sampled as one picture and taken apart: each in tables of its own, as if sampled alone."""
-    needed = given.needed()
-    pruning, parts = None if needed is None else _Pruning(needed, given.picture), given.parts()
-    found = [given.of_part(*part, pruning if len(parts) == 1 else None, apart=True) for part in parts]
-    views = []
-    for samples in zip(*found, strict=True):
-        sampled = merge(samples, given.layers)
-        if needed is not None and len(parts) > 1 and not is_traced(sampled.row):
-            sampled = prune(sampled, needed)
-        views.append(replace(sampled, supersample=given.side, apron=apron_of(given.splatter)))
-    return views
+def _with_counts(sampled: Sampled, picture: Picture, scales: Array, counts: tuple[np.ndarray, ...]) -> Views:
+    """Views whose samples are known, and all used."""
+    constant = engine_of(sampled.row).constant
+    view = [np.repeat(np.arange(1, picture.views + 1, dtype=np.int32), own) for own in counts]
+    return Views(sampled, picture, tuple(constant(own) for own in view), counts, scales)
 
 
-def _cut(
-    tables: Sequence[np.ndarray],
-    row: np.ndarray,
-    depth: np.ndarray,
-    grids: Sequence[np.ndarray],
-    picture: Picture,
-    capacity: int | None,
-) -> list[tuple[Any, ...]]:
-    """Of each view its tables, `row`, `depth`, what did not fit into the capacity, and further grids.
+def _leave_out(kept: np.ndarray, picture: Picture, capacity: int) -> int:
+    """Leave out what does not fit into so many rows for each view, deepest layers first; how many that are.
 
-    Args:
-        tables: (N, ·), views one after the other.
-        row: (K, height, width) int32.
-        depth: (K, height, width) float32.
-        grids: (..., height, width).
-        picture: where the views are.
-        capacity: rows to allot in each table; None for as many as there are, at least one.
+    `kept` (K, height, width) is changed in place.
     """
-    views, first = [], 0
-    for (lines, columns), count in zip(picture.places(), _counts(row, len(tables[0]), picture).tolist(), strict=True):
-        own, there = row[:, lines, columns] - np.int32(first), depth[:, lines, columns]
-        room = max(1, count) if capacity is None else capacity
-        taken = min(count, room)
-        here = (own >= 0) & (own < room) & (row[:, lines, columns] >= 0)
-        cut = []
-        for table in tables:
-            rows = np.zeros((room, *table.shape[1:]), table.dtype)
-            rows[:taken] = table[first : first + taken]
-            cut.append(rows)
-        over = np.asarray(count - taken, np.int32)
-        told = [np.ascontiguousarray(x[..., lines, columns]) for x in grids]
-        views.append((cut, np.where(here, own, np.int32(-1)), np.where(here, there, np.float32(0)), over, told))
-        first += count
-    return views
+    over = 0
+    for lines, columns in picture.places():
+        own = kept[:, lines, columns]
+        count = int(np.count_nonzero(own))
+        if count > capacity:
+            own[own] = np.arange(count) < capacity
+            over += count - capacity
+    return over
 
 
 def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | None:
@@ -243,10 +222,11 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
 
     def laid_out(grids: Sequence[Array | None], empty: int | bool, shift: np.ndarray | None = None) -> Array | None:
         """One grid of those of all views; `shift` (B, parts) is added to rows of each part."""
-        if grids[0] is None:
+        known = [grid for grid in grids if grid is not None]
+        if not known:
             return None
-        several = len(grids[0].shape) == 3
-        stacked = xp.stack([x if several else x[None, ...] for x in grids])
+        several = len(known[0].shape) == 3
+        stacked = xp.stack([x if several else x[None, ...] for x in known])
         if shift is not None:
             whose = xp.stack([x if several else x[:1, ...] for x in part])
             given = stacked
@@ -271,7 +251,7 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
         facing=laid_out([view.facing for view in views], 0),
         exit=laid_out([view.exit for view in views], -1, shifts),
     )
-    return Views(sampled, picture, tuple(counts.T), _scales_of(sampled.depth, picture))
+    return _with_counts(sampled, picture, _scales_of(sampled.depth, picture), tuple(counts.T))
 
 
 def in_one_table(samples: Sequence[Samples]) -> Samples:
@@ -327,36 +307,50 @@ class _Pruning:
     """Which samples of several views a splatter needs.
 
     Args:
-        needed: says so of one view.
+        needed: says so of one view; None for all.
         picture: where the views are.
-
-    Attributes:
-        settles: see `Needed`.
-        scales: after a call, `depth_scales` of the depths that were given.
     """
 
-    def __init__(self, needed: Needed, picture: Picture):
-        self.settles, self.scales = needed.settles, None
-        self._size, self._picture = needed.size or 0.0, picture  # Where it is traced, that of the triangles is told.
+    def __init__(self, needed: Needed | None, picture: Picture):
+        self.settles = needed is not None and needed.settles
+        # Where it is traced, that of the triangles is known on the host.
+        self._size, self._picture = 0.0 if needed is None else needed.size or 0.0, picture
         self._near = copy.copy(needed)
-        self._near.size = 0.0  # Whether numbers are too large is decided here: depths are in other units.
-        self._depth: np.ndarray | None = None
+        if self._near is not None:
+            self._near.size = 0.0  # Whether numbers are too large is decided here: depths are in other units.
 
-    def __call__(self, covered: np.ndarray, depth: np.ndarray, size: float = 0.0) -> np.ndarray:
-        """Samples (K, height, width) bool that are needed, of those that are covered; coordinates are of a `size`."""
+    def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """See `Needed`."""
+        return self._asked(covered, depth, 0.0)[0]
+
+    def asked(self, fragments: Fragments, size: float) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+        """Which fragments (K, height, width) are needed; `Needed.settled`, if it `settles`; and scales of depths (B,).
+
+        Args:
+            fragments: of the picture.
+            size: of the largest coordinate.
+        """
+        covered = fragments.triangle_ids >= 0
+        kept, depth, scales = self._asked(covered, fragments.depth, size)
+        if not self.settles:
+            return kept, [], scales
+        if depth is None:
+            return kept, [np.zeros(covered.shape[1:], bool)], scales
+        assert self._near is not None
+        return kept, [self._near.settled(covered, depth, kept, 0.0)], scales
+
+    def _asked(
+        self, covered: np.ndarray, depth: np.ndarray, size: float
+    ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+        """What is needed, depths of a like scale or None where numbers are too large to tell, and scales."""
         far = _largest(depth, self._picture)
-        self.scales = depth_scales(far)
-        self._depth = depth if self.scales is None else depth * self._factors(self.scales, depth.dtype)
-        if max(size, self._size) > FAR * far[far > 0].min(initial=np.inf):
-            self._depth = None
-            return covered
-        return self._near(covered, self._depth)
-
-    def settled(self, covered: np.ndarray, kept: np.ndarray) -> np.ndarray:
-        """(height, width) bool as `Needed.settled`, after a call; `kept` is changed in place."""
-        if self._depth is None:
-            return np.zeros(covered.shape[1:], bool)
-        return self._near.settled(covered, self._depth, kept, 0.0)
+        scales = depth_scales(far)
+        if self._near is None or max(size, self._size) > FAR * far[far > 0].min(initial=np.inf):
+            return covered.copy(), None, scales
+        if (scales != 1).any():
+            depth = depth * self._factors(scales, depth.dtype)
+        kept = self._near(covered, depth)
+        return kept.copy() if kept is covered else kept, depth, scales
 
     def _factors(self, scales: np.ndarray, dtype: Any) -> np.ndarray:
         """(height, width) the factor of each cell."""
@@ -373,18 +367,18 @@ def _largest(depth: np.ndarray, picture: Picture) -> np.ndarray:
     return grid.max(axis=(0, 2, 4), initial=0).reshape(-1)[: picture.views]
 
 
-def _scales_of(depth: Array, picture: Picture) -> np.ndarray | None:
-    """The `depth_scales` of the depths of views; None where they are not known."""
+def _scales_of(depth: Array, picture: Picture) -> np.ndarray:
+    """The `depth_scales` of the depths (K, height, width) of views, which are known."""
     known = value_of(depth)
-    return None if known is None else depth_scales(_largest(known, picture))
-
-
-def _counts(row: Array, rows: int, picture: Picture) -> np.ndarray:
-    """(B,) how many rows of a table are those of a view, of which each stands in one cell."""
-    known = value_of(row)
     assert known is not None
-    layers, (height, width) = len(known), picture.view
-    grid = (known >= 0).reshape(layers, picture.down, height, picture.across, width)
+    return depth_scales(_largest(known, picture))
+
+
+def _counts(row: np.ndarray | None, rows: int, picture: Picture) -> np.ndarray:
+    """(B,) how many rows of a table of at least so many are those of a view, of which each stands in one cell."""
+    assert row is not None
+    layers, (height, width) = len(row), picture.view
+    grid = (row >= 0).reshape(layers, picture.down, height, picture.across, width)
     counts = grid.sum(axis=(0, 2, 4)).reshape(-1)[: picture.views]
-    counts[0] += rows - counts.sum()  # Where nothing is seen there is a row nevertheless.
+    counts[0] += max(0, rows - counts.sum())  # Where nothing is seen there is a row nevertheless.
     return counts

@@ -82,13 +82,13 @@ class Picture(NamedTuple):
         return xp.reshape(views, (-1, *views.shape[2:]))[: self.views, ...]
 
 
-def depth_scales(largest: np.ndarray) -> np.ndarray | None:
-    """(B,) factors that bring the largest depth (B,) of each view between 1 and 2; None where one serves them all."""
+def depth_scales(largest: np.ndarray) -> np.ndarray:
+    """(B,) float32 factors that bring the largest depth (B,) of each view between 1 and 2; ones where one would do."""
     known = np.isfinite(largest) & (largest > 0)
     powers = np.frexp(np.where(known, largest, 1.0))[1]
     if not known.any() or (powers[known] == powers[known][0]).all():
-        return None
-    return np.where(known, np.ldexp(1.0, 1 - powers), 1.0)
+        return np.ones(len(largest), np.float32)
+    return np.where(known, np.ldexp(1.0, 1 - powers), 1.0).astype(np.float32)
 
 
 def at_once(view: tuple[int, int]) -> int:
