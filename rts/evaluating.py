@@ -22,6 +22,7 @@ from rts.operations.take import take
 from rts.records import Fine, Sampled, Samples, Splats
 from rts.sampling.scenes import Wide
 from rts.sampling.several import Views, in_one_table
+from rts.threads import each
 from rts.trees import Array, Tree
 
 
@@ -216,10 +217,15 @@ def _shown_in_views(
     if not part.shader.uniform:
         assert counts is not None
         shaded = _apart(whole, gbuffer, counts.tolist(), engine)
-    colors = []
-    for camera, own, (samples, local) in zip(cameras, seen, shaded, strict=False):
-        given = samples, local, constants(camera, engine, like), own, grid, engine, like
-        colors.append(constants(_colored(part, theta, transform, *given)[1], engine, dtype))
+
+    def colored(given: tuple) -> Array:
+        camera, own, (samples, local) = given
+        known = samples, local, constants(camera, engine, like), own, grid, engine, like
+        return constants(_colored(part, theta, transform, *known)[1], engine, dtype)
+
+    views = list(zip(cameras, seen, shaded, strict=False))
+    colors = [colored(views[0])]
+    colors += each(colored, views[1:]) if type(colors[0]) is np.ndarray and len(views) > 1 else map(colored, views[1:])
     (rgba,) = _together(colors)
     rows = namespace(seen[0].view).stack([own.pixel_rows(grid) for own in seen])
     rows, points = constants((rows, gbuffer["position"]), *suiting(rows, gbuffer["position"]))
