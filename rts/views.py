@@ -46,10 +46,11 @@ def render_views(
 ) -> Array:
     """Render several views of a scene; they are those of a loop of `render`, but for rounding.
 
-    NumPy scenes are rendered a view to each core. With torch views are sampled so, and the surface is evaluated once
-    for the samples of all: what it computes of the whole of θ, such as smooth normals, serves all views. With jax, with
-    `layers="auto"`, under `torch.func`, in bands, and wherever a sampler is not `concurrent`, one view follows the
-    other. With torch memory is that of all views at once, with a gradient or without.
+    Views lie side by side in one picture, of 1024² cells at most: Python's share of the work is paid once for all, what
+    the surface computes of the whole of θ, such as smooth normals, serves them all, and one splat does. With jax, and
+    under `torch.func`, that is so for one part of one colour (`Shader.uniform`), such as a silhouette; else one view
+    follows the other, as with `layers="auto"` and in bands. NumPy views that are too large for a picture are rendered
+    one on each core. With torch memory is that of all views at once, with a gradient or without.
 
     Args:
         parts: as in `render`.
