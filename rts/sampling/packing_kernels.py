@@ -82,6 +82,14 @@ class _Lines(NamedTuple):
         return np.ascontiguousarray(before.transpose(2, 0, 3, 1)).reshape(-1)
 
 
+def count_in_views(kept: np.ndarray, views: tuple[int, int]) -> np.ndarray:
+    """How many cells (K, H, W) bool are taken in each of the views of a grid, so many down and across."""
+    layers, height, width = kept.shape
+    lines, counts = kept.reshape(-1, width // views[1]), np.zeros(layers * height * views[1], np.int64)
+    parallel(_count, len(lines), np.ascontiguousarray(lines), counts, work=kept.size // 8)
+    return counts.reshape(layers, views[0], -1, views[1]).sum(axis=(0, 2)).reshape(-1)
+
+
 @kernel
 def _count(start, stop, kept, counts):
     for y in range(start, stop):

@@ -181,6 +181,10 @@ def sampled_as_one(given: Sampling) -> Views:
     sampled = replace(sampled, supersample=given.side, apron=apron_of(given.splatter))
     if engine_of(sampled.row).padded(sampled.row):
         return Views(sampled, picture, tuple(view for _, view, _ in found), None, scales)
+    if len(parts) == 1:
+        view = found[0][1]
+        counts = np.bincount(engine_of(view).to_numpy(view), minlength=picture.views + 1)[1:]
+        return Views(sampled, picture, (view,), (counts,), scales)
     counts = tuple(_counts(value_of(s.row), s.ids.shape[0], picture) for s in sampled.samples)
     return _with_counts(sampled, picture, scales, counts)
 
@@ -363,8 +367,9 @@ class _Pruning:
 def _largest(depth: np.ndarray, picture: Picture) -> np.ndarray:
     """(B,) the largest depth of each view, of depths (K, height, width) of the picture."""
     layers, (height, width) = len(depth), picture.view
-    grid = np.abs(depth).reshape(layers, picture.down, height, picture.across, width)
-    return grid.max(axis=(0, 2, 4), initial=0).reshape(-1)[: picture.views]
+    lines = depth.reshape(-1, width)
+    sizes = np.maximum(lines.max(axis=1, initial=0), -lines.min(axis=1, initial=0))
+    return sizes.reshape(layers, picture.down, height, -1).max(axis=(0, 2)).reshape(-1)[: picture.views]
 
 
 def _scales_of(depth: Array, picture: Picture) -> np.ndarray:
@@ -376,9 +381,9 @@ def _scales_of(depth: Array, picture: Picture) -> np.ndarray:
 
 def _counts(row: np.ndarray | None, rows: int, picture: Picture) -> np.ndarray:
     """(B,) how many rows of a table of at least so many are those of a view, of which each stands in one cell."""
+    from rts.sampling import packing_kernels
+
     assert row is not None
-    layers, (height, width) = len(row), picture.view
-    grid = (row >= 0).reshape(layers, picture.down, height, picture.across, width)
-    counts = grid.sum(axis=(0, 2, 4)).reshape(-1)[: picture.views]
+    counts = packing_kernels.count_in_views(row >= 0, (picture.down, picture.across))[: picture.views]
     counts[0] += max(0, rows - counts.sum())  # Where nothing is seen there is a row nevertheless.
     return counts
