@@ -111,6 +111,9 @@ def _shown(
         check_shaded(rgba, local["position"].shape[0], part.shader)
         positions.append(constants(own.project(local["position"], wide.grid), engine, dtype))
         check_splats(index, part, world, positions[-1], rgba, row, first)
+        if not part.shader.uniform:
+            shade = partial(_colors, part, theta, transform, camera)
+            rgba = engine.by_rows_in_use(shade, local.computed, samples.row, rgba)
         colors.append(constants(rgba, engine, dtype))
         first += samples.ids.shape[-2]
     if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
@@ -194,6 +197,17 @@ def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, came
                 "engine='torch'), or 'jax'."
             )
         raise
+
+
+def _colors(
+    part: CheckedPart,
+    theta: Mapping[str, Tree],
+    transform: Array | None,
+    camera: Camera,
+    attributes: Mapping[str, Array],
+) -> Array:
+    """What the shader of a part returns for attributes in local space."""
+    return _shaded(part, theta, _to_world(GBuffer(attributes), transform), camera)
 
 
 def _evaluate(part: CheckedPart, reads: Sequence[str], samples: Samples, engine: Engine, like: Array | None) -> GBuffer:
