@@ -1,18 +1,18 @@
 """Functions of packed rows, computed on about as many of the allotted rows as are in use.
 
 A compiled program allots rows for the worst case, and learns how many are in use when it runs. Here it takes a piece of
-so many rows at a time, in a loop that ends with those in use.
+some thousand rows at a time, in a loop that ends with those in use.
 
 There are three primitives, as of operations: the value, its pushforward and its pullback. jax cannot pull back through
 a loop of a length that it does not know; here derivatives are taken within each piece, for which the value is computed
-once more. Derivatives of derivatives are those of the function of all rows.
+once more. Their own derivatives are those of loops over all rows, whose length jax knows.
 """
 
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,21 +26,11 @@ LEAST = 1 << 15
 """Rows, below which all are computed: a loop would take as long as it saves."""
 
 PIECE = 1 << 12
-"""Rows of a piece: so many that a call of XLA's is worth it, and so few that intermediate arrays stay in caches."""
+"""Rows of a piece: so many that calls of XLA's are worth it, and so few that intermediate arrays stay in caches."""
 
-
-class _Program(NamedTuple):
-    """A function of rows (n, ·), which also takes what it closes over.
-
-    Attributes:
-        rows: n.
-        jaxpr: arrays (n, ·) → (n, ·).
-        closed: where among the operands the arrays are that it closes over.
-    """
-
-    rows: int
-    jaxpr: Jaxpr
-    closed: tuple[int, ...]
+NUMBERS_A_ROW = 16
+"""How many numbers a function may close over for each row of a piece. Gradients of these are as large as they are, and
+are made for each piece: of a texture pieces have to be larger."""
 
 
 def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array]) -> jax.Array | None:
@@ -52,203 +42,186 @@ def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array
         rows: arrays (N, ·).
 
     Returns:
-        The value, or None where the whole of it may as well be computed: of few rows; of a function that does not read
-        them, or that has effects, which must happen once.
+        The value, or None where the whole of it may as well be computed: of few rows; of a function that closes over
+        much, that does not read rows, or that has effects, which must happen once.
     """
-    count = rows[0].shape[0]
-    if count < LEAST:
-        return None
-    closed: list[Any] = []
-    programs = []
-    for n in (min(PIECE, count), count):
-        traced = jax.make_jaxpr(f)(*(jax.ShapeDtypeStruct((n, *x.shape[1:]), x.dtype) for x in rows))
-        if traced.effects:
+    count, size = rows[0].shape[0], PIECE
+    while count >= max(LEAST, 2 * size):
+        traced = jax.make_jaxpr(f)(*(jax.ShapeDtypeStruct((size, *x.shape[1:]), x.dtype) for x in rows))
+        jaxpr, closed = _of_rows_alone(traced.jaxpr, traced.consts)
+        if traced.effects or variables(jaxpr.eqns, jaxpr.outvars).keys().isdisjoint(jaxpr.invars):
             return None
-        jaxpr, consts = _of_rows_alone(traced.jaxpr, traced.consts)
-        if variables(jaxpr.eqns, jaxpr.outvars).keys().isdisjoint(jaxpr.invars):
-            return None
-        programs.append(_Program(n, jaxpr, tuple(_places(consts, closed))))
-    return _value.bind(used, used, *closed, *rows, programs=tuple(programs))[0]
+        least = sum(x.size for x in closed if isinstance(x, Tracer)) // NUMBERS_A_ROW
+        if least <= size:
+            return _value.bind(used, used, *closed, *rows, jaxpr=jaxpr)[0]
+        size = least
+    return None
 
 
 def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any]]:
     """A function without what does not depend on its arguments, which is computed here, and what it now closes over."""
     varying, before, rest = set(jaxpr.invars), [], []
     for equation in jaxpr.eqns:
-        if variables([equation]).keys().isdisjoint(varying):
-            before.append(equation)
-        else:
+        # Numbers spread over the rows of a piece are no less to keep than to make.
+        if equation.primitive.name in _SPREADING or not variables([equation]).keys().isdisjoint(varying):
             rest.append(equation)
             varying.update(equation.outvars)
+        else:
+            before.append(equation)
     read = variables(rest, jaxpr.outvars)
     known = [*jaxpr.constvars, *(x for equation in before for x in equation.outvars)]
     known = [x for x in known if x in read]
-    first = jaxpr.replace(invars=[], outvars=known, eqns=before, debug_info=jaxpr.debug_info.with_unknown_names())
-    found = eval_jaxpr(first, consts)
+    names = jaxpr.debug_info.with_unknown_names()
+    found = eval_jaxpr(jaxpr.replace(invars=[], outvars=known, eqns=before, debug_info=names), consts)
     return jaxpr.replace(constvars=known, eqns=rest), found
 
 
-def _places(arrays: Sequence[Any], known: list[Any]) -> Iterator[int]:
-    """Where each of some arrays is in a list, to which those are added that are not."""
-    for x in arrays:
-        at = next((i for i, other in enumerate(known) if other is x), len(known))
-        if at == len(known):
-            known.append(x)
-        yield at
-
+_SPREADING = {"broadcast_in_dim", "iota"}
 
 # --------------------------------------------------------------------------------------------------- three functions
 
 
-class _Pieces(NamedTuple):
+class _Pieces:
     """How a function of rows is computed.
 
-    Attributes:
-        program: the function of a piece.
-        total: the number of all rows.
-        most: how many rows are in use, at most.
-        used: how many are.
-        closed: arrays that the program closes over.
-        rows: arrays (N, ·).
+    Args:
+        jaxpr: arrays (n, ·) → (n, ·), the function of a piece.
+        operands: arrays that it closes over, and arrays (N, ·).
+        most: how many rows are in use, at most; None to go through all.
+        used: how many rows are in use.
     """
 
-    program: _Program
-    total: int
-    most: Any
-    used: Any
-    closed: Sequence[Any]
-    rows: Sequence[Any]
+    def __init__(self, jaxpr: Jaxpr, operands: Sequence[Any], most: Any, used: Any):
+        self._jaxpr, self._most, self._used = jaxpr, most, used
+        self.fixed = len(operands) - len(jaxpr.invars)
+        self._closed, self._rows = operands[: self.fixed], operands[self.fixed :]
+        self._total, self._size = self._rows[0].shape[0], jaxpr.invars[0].aval.shape[0]
+
+    def zeros(self) -> jax.Array:
+        """Zeros in the shape of the value."""
+        out: Any = self._jaxpr.outvars[0].aval
+        return jnp.zeros((self._total, *out.shape[1:]), out.dtype)
 
     def repeat(self, step: Callable[[Any, Any, Any], Any], state: Any) -> Any:
-        """Do `state = step(start, first, state)` for the pieces in use: rows from `start`, new ones from `first` on."""
-        size = self.program.rows
-        if size == self.total:
-            return step(0, 0, state)
+        """Do `state = step(start, first, state)` for each piece: rows from `start`, new ones from `first` on."""
+        size = self._size
 
         def body(i: Any, state: Any) -> Any:
-            return step(jnp.minimum(i * size, self.total - size), i * size, state)
+            return step(jnp.minimum(i * size, self._total - size), i * size, state)
 
-        count = (self.most + (size - 1)) // size
-        if isinstance(count, Tracer):
+        count = -(-(self._total if self._most is None else self._most) // size)
+        if self._most is None or isinstance(count, Tracer):
             return jax.lax.fori_loop(0, count, body, state)
-        for i in range(int(count)):
+        for i in range(int(count)):  # jax would compile a loop anew whenever it is called.
             state = body(i, state)
         return state
 
     def cut(self, x: Any, start: Any) -> Any:
         """The rows of a piece."""
-        size = self.program.rows
-        return x if size == self.total else jax.lax.dynamic_slice_in_dim(x, start, size)
+        return jax.lax.dynamic_slice_in_dim(x, start, self._size)
+
+    def among(self, x: Any, there: jax.Array, other: Any) -> Any:
+        """The rows of a piece that are there, and others."""
+        return jnp.where(there.reshape(-1, *[1] * (x.ndim - 1)), x, other)
+
+    def index(self, start: Any) -> jax.Array:
+        """The number of each row of a piece."""
+        return start + jnp.arange(self._size)
 
     def varying(self, start: Any, wanted: Sequence[bool]) -> tuple[Callable[..., jax.Array], list[Any]]:
         """The value of a piece as a function of those operands that are wanted, closed ones and pieces, and these."""
-        operands = [*self.closed, *(self.cut(x, start) for x in self.rows)]
-        there = start + jnp.arange(self.program.rows) < self.used
+        operands = [*self._closed, *(self.cut(x, start) for x in self._rows)]
+        there = self.index(start) < self._used
 
         def function(*varied: Any) -> jax.Array:
             it = iter(varied)
             given = [next(it) if wish else x for x, wish in zip(operands, wanted, strict=True)]
             own = []
-            for x, whole in zip(given[len(self.closed) :], self.rows, strict=True):
+            for x, whole in zip(given[self.fixed :], self._rows, strict=True):
                 # What is not in use may hold values at which there are no derivatives.
-                other = jnp.where(self.used > 0, jax.lax.stop_gradient(whole[:1]), jnp.ones((), x.dtype))
-                own.append(jnp.where(there.reshape(-1, *[1] * (x.ndim - 1)), x, other))
-            return eval_jaxpr(self.program.jaxpr, [given[i] for i in self.program.closed], *own)[0]
+                other = jnp.where(self._used > 0, jax.lax.stop_gradient(whole[:1]), jnp.ones((), x.dtype))
+                own.append(self.among(x, there, other))
+            return eval_jaxpr(self._jaxpr, given[: self.fixed], *own)[0]
 
         return function, [x for x, wish in zip(operands, wanted, strict=True) if wish]
 
 
-def _pieces(most: Any, used: Any, operands: Sequence[Any], programs: Sequence[_Program], few: int) -> _Pieces:
-    """How a function of operands is computed: by the program of a piece, or that of all rows."""
-    last = len(operands) - len(programs[0].jaxpr.invars)
-    return _Pieces(programs[few], programs[1].rows, most, used, operands[:last], operands[last:])
-
-
-def _computed(most: Any, used: Any, *operands: Any, programs: Sequence[_Program], few: int = 0) -> list[jax.Array]:
-    pieces = _pieces(most, used, operands, programs, few)
+def _computed(most: Any, used: Any, *operands: Any, jaxpr: Jaxpr) -> list[jax.Array]:
+    pieces = _Pieces(jaxpr, operands, most, used)
 
     def step(start: Any, first: Any, out: jax.Array) -> jax.Array:
         function, _ = pieces.varying(start, [False] * len(operands))
         return jax.lax.dynamic_update_slice_in_dim(out, summed_by_columns(function)(), start, 0)
 
-    return [pieces.repeat(step, jnp.zeros(*_result(programs)))]
+    return [pieces.repeat(step, pieces.zeros())]
 
 
-def _pushed(
-    most: Any, used: Any, *given: Any, programs: Sequence[_Program], wanted: tuple[bool, ...], few: int = 0
-) -> list[jax.Array]:
+def _pushed(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, wanted: tuple[bool, ...]) -> list[jax.Array]:
     """The derivative along tangents of those operands that are wanted, which follow the operands."""
     operands, tangents = given[: len(wanted)], given[len(wanted) :]
-    pieces = _pieces(most, used, operands, programs, few)
-    fixed = sum(wanted[: len(pieces.closed)])
+    pieces = _Pieces(jaxpr, operands, most, used)
+    fixed = sum(wanted[: pieces.fixed])
 
     def step(start: Any, first: Any, out: jax.Array) -> jax.Array:
         function, varied = pieces.varying(start, wanted)
         along = *tangents[:fixed], *(pieces.cut(t, start) for t in tangents[fixed:])
-        pushed = summed_by_columns(lambda: jax.jvp(function, tuple(varied), along)[1])()
-        return jax.lax.dynamic_update_slice_in_dim(out, pushed, start, 0)
+        push = summed_by_columns(lambda *along: jax.jvp(function, tuple(varied), along)[1])
+        return jax.lax.dynamic_update_slice_in_dim(out, push(*along), start, 0)
 
-    return [pieces.repeat(step, jnp.zeros(*_result(programs)))]
+    return [pieces.repeat(step, pieces.zeros())]
 
 
-def _pulled(
-    most: Any, used: Any, *given: Any, programs: Sequence[_Program], wanted: tuple[bool, ...], few: int = 0
-) -> list[jax.Array]:
+def _pulled(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, wanted: tuple[bool, ...]) -> list[jax.Array]:
     """The gradients of those operands that are wanted; that of the value follows the operands."""
     *operands, g = given
-    pieces = _pieces(most, used, operands, programs, few)
-    fixed = sum(wanted[: len(pieces.closed)])
+    pieces = _Pieces(jaxpr, operands, most, used)
+    fixed = sum(wanted[: pieces.fixed])
 
     def step(start: Any, first: Any, found: list[jax.Array]) -> list[jax.Array]:
         function, varied = pieces.varying(start, wanted)
-        fresh = start + jnp.arange(pieces.program.rows) >= first  # The others were in the piece before.
-        own = jnp.where(fresh.reshape(-1, *[1] * (g.ndim - 1)), pieces.cut(g, start), 0)
+        # The last piece may begin with rows of the one before.
+        own = pieces.among(pieces.cut(g, start), pieces.index(start) >= first, 0)
         gradients = summed_by_columns(lambda g: jax.vjp(function, *varied)[1](g))(own)
         sums = [a + b for a, b in zip(found[:fixed], gradients[:fixed], strict=True)]
-        for total, x in zip(found[fixed:], gradients[fixed:], strict=True):
-            sums.append(jax.lax.dynamic_update_slice_in_dim(total, pieces.cut(total, start) + x, start, 0))
+        for whole, x in zip(found[fixed:], gradients[fixed:], strict=True):
+            sums.append(jax.lax.dynamic_update_slice_in_dim(whole, pieces.cut(whole, start) + x, start, 0))
         return sums
 
     return pieces.repeat(step, [jnp.zeros_like(x) for x, wish in zip(operands, wanted, strict=True) if wish])
 
 
-def _result(programs: Sequence[_Program]) -> tuple[tuple[int, ...], Any]:
-    """Shape and dtype of the value."""
-    aval = programs[1].jaxpr.outvars[0].aval
-    return aval.shape, aval.dtype
-
-
 # --------------------------------------------------------------------------------------------------- as primitives
 
 
-def _primitive(name: str, function: Callable, shapes: Callable) -> Primitive:
-    """A primitive of one of the functions, whose first operands say how many rows are in use, at most and truly.
+def _primitive(name: str, function: Callable, results: Callable) -> Primitive:
+    """A primitive of one of the functions, whose first operands say how many rows are in use: at most, and each item.
 
     Args:
         name: its name.
         function: computes it.
-        shapes: operands but for the first two, and parameters → the results' shapes and dtypes.
+        results: shapes and dtypes of the operands after these, and parameters → those of the results.
     """
     made = Primitive(f"rts_rows_in_use_{name}")
     made.multiple_results = True
     made.def_impl(function)
-    made.def_abstract_eval(lambda most, used, *avals, **params: shapes(*avals, **params))
+    made.def_abstract_eval(lambda most, used, *avals, **params: results(*avals, **params))
     mlir.register_lowering(made, mlir.lower_fun(function, multiple_results=True))
 
     def batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, list[int]]:
-        # One loop serves all items, as long as the longest; rows that are not in use are harmless.
+        # One loop serves all items, as long as the longest.
         most = operands[0] if dims[0] is None else jnp.max(operands[0])
         found = jax.vmap(functools.partial(function, most, **params), tuple(dims[1:]))(*operands[1:])
         return found, [0] * len(found)
 
     def along(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[list, list]:
         present = _present(tangents)
+        varied, moves = (tuple(x for x, t in zip(xs, present, strict=True) if t) for xs in (primals, tangents))
 
         def whole(*varied: Any) -> list[jax.Array]:
             it = iter(varied)
-            return function(*(next(it) if t else x for x, t in zip(primals, present, strict=True)), few=1, **params)
+            _, *given = (next(it) if t else x for x, t in zip(primals, present, strict=True))
+            return function(None, *given, **params)
 
-        varied, moves = (tuple(x for x, t in zip(xs, present, strict=True) if t) for xs in (primals, tangents))
         return made.bind(*primals, **params), jax.jvp(whole, varied, moves)[1]
 
     batching.primitive_batchers[made] = batched
@@ -261,17 +234,18 @@ def _present(tangents: Sequence[Any]) -> tuple[bool, ...]:
     return tuple(type(t) is not ad.Zero and t.dtype != jax.dtypes.float0 for t in tangents)
 
 
-def _rows(*avals: Any, programs: Sequence[_Program], **_: Any) -> list[ShapedArray]:
-    return [ShapedArray(*_result(programs))]
+def _like_value(*avals: Any, jaxpr: Jaxpr, **_: Any) -> list[ShapedArray]:
+    rows, out = avals[len(jaxpr.constvars)], jaxpr.outvars[0].aval
+    return [ShapedArray((rows.shape[0], *out.shape[1:]), out.dtype)]
 
 
-def _operands(*avals: Any, wanted: tuple[bool, ...], **_: Any) -> list[ShapedArray]:
+def _like_operands(*avals: Any, wanted: tuple[bool, ...], **_: Any) -> list[ShapedArray]:
     return [ShapedArray(x.shape, x.dtype) for x, wish in zip(avals, wanted, strict=False) if wish]
 
 
-_value = _primitive("value", _computed, _rows)
-_push = _primitive("push", _pushed, _rows)
-_pull = _primitive("pull", _pulled, _operands)
+_value = _primitive("value", _computed, _like_value)
+_push = _primitive("push", _pushed, _like_value)
+_pull = _primitive("pull", _pulled, _like_operands)
 
 
 def _value_jvp(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[list, list]:
