@@ -32,7 +32,7 @@ class Swept(NamedTuple):
 
 
 def difference(image: Array, target: Array, weights: Array | None, background: Array | None) -> Array:
-    """weight · (image − target), (H, W, C), of an image (H, W, 4) over a background (H, W, 4), if there is one."""
+    """Weight · (image − target), (H, W, C), of an image (H, W, 4) over a background (H, W, 4), if there is one."""
     if background is not None:
         image = image + (1 - image[..., 3:]) * background
     count = target.shape[2]
