@@ -74,16 +74,17 @@ def _forward(operands: Arrays, out: np.ndarray, *, settings: Settings) -> Swept:
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, settings: Settings, kept: Swept | None) -> None:
     swept = kept or _swept(operands, settings)[0]
-    cells = _cells(operands, settings, swept.choices)
     images = np.empty((len(out), *swept.cotangents.shape), swept.cotangents.dtype)
-    cells.jvp(*tangents, images)
+    t_positions, t_rgba = tangents
+    _cells(operands, settings, swept.choices).jvp(t_positions, t_rgba, images)
     # Targets that nobody looks at hold anything.
     out[:] = [np.where(swept.cotangents != 0, image * swept.cotangents, 0).sum(dtype=np.float64) for image in images]
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings, kept: Swept | None) -> None:
     swept = kept or _swept(operands, settings)[0]
-    _cells(operands, settings, swept.choices).vjp(swept.cotangents, *results)
+    g_positions, g_rgba = results
+    _cells(operands, settings, swept.choices).vjp(swept.cotangents, g_positions, g_rgba)
     if g != 1:
         for x in results:
             if x is not None:

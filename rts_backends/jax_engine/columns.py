@@ -68,5 +68,6 @@ def _is_short(equation: JaxprEqn) -> bool:
     """Whether a sum is along the last axis alone, of few numbers, beside a longer one."""
     if equation.primitive.name != "reduce_sum":
         return False
-    shape = equation.invars[0].aval.shape
+    aval: Any = equation.invars[0].aval
+    shape = aval.shape
     return equation.params["axes"] == (len(shape) - 1,) and len(shape) > 1 and 0 < shape[-1] <= SHORT < shape[0]

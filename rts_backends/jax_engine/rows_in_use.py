@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -95,7 +95,8 @@ class _Pieces:
         self._jaxpr, self._most, self._used = jaxpr, most, used
         self.fixed = len(operands) - len(jaxpr.invars)
         self._closed, self._rows = operands[: self.fixed], operands[self.fixed :]
-        self._total, self._size = self._rows[0].shape[0], jaxpr.invars[0].aval.shape[0]
+        first: Any = jaxpr.invars[0].aval
+        self._total, self._size = self._rows[0].shape[0], first.shape[0]
 
     def zeros(self) -> jax.Array:
         """Zeros in the shape of the value."""
@@ -235,7 +236,7 @@ def _present(tangents: Sequence[Any]) -> tuple[bool, ...]:
 
 
 def _like_value(*avals: Any, jaxpr: Jaxpr, **_: Any) -> list[ShapedArray]:
-    rows, out = avals[len(jaxpr.constvars)], jaxpr.outvars[0].aval
+    rows, out = avals[len(jaxpr.constvars)], cast(Any, jaxpr.outvars[0].aval)
     return [ShapedArray((rows.shape[0], *out.shape[1:]), out.dtype)]
 
 
