@@ -164,13 +164,13 @@ class JaxEngine(Engine):
     def by_rows_in_use(
         self, f: Callable[[dict[str, jax.Array]], jax.Array], rows: Mapping[str, jax.Array], row: jax.Array, whole: Any
     ) -> jax.Array:
-        """See `Engine.by_rows_in_use`: in a traced program a choice between a few numbers of rows."""
-        if not isinstance(row, Tracer) or not rows:
+        """See `Engine.by_rows_in_use`: in a traced program piece after piece. Other devices take all at once."""
+        if not isinstance(row, Tracer) or jax.default_backend() != "cpu":
             return whole
         used = jnp.max(row) + 1
 
         def few(*own: jax.Array) -> jax.Array:
-            # Small pieces, for which a call to the host would take longer than array code.
+            # In small pieces a call to the host takes longer than array code that treats each row by itself.
             with operations.by_specification():
                 return f(dict(zip(rows, own, strict=True)))
 

@@ -28,16 +28,15 @@ LEAST = 1 << 15
 PIECE = 1 << 12
 """Rows of a piece: so many that calls of XLA's are worth it, and so few that intermediate arrays stay in caches."""
 
-NUMBERS_A_ROW = 16
-"""How many numbers a function may close over for each row of a piece. Gradients of these are as large as they are, and
-are made for each piece: of a texture pieces have to be larger."""
+CLOSED = 1 << 16
+"""The most numbers that a function may close over, and have gradients, which are as large as they are for each piece."""
 
 
 def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array]) -> jax.Array | None:
     """The value (N, ·) of a function that treats each row by itself; anything in rows that are not in use.
 
     Args:
-        f: arrays (n, ·), for some n up to N → (n, ·).
+        f: arrays (n, ·) → (n, ·), for any n.
         used: how many rows are in use, () int32.
         rows: arrays (N, ·).
 
@@ -45,17 +44,17 @@ def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array
         The value, or None where the whole of it may as well be computed: of few rows; of a function that closes over
         much, that does not read rows, or that has effects, which must happen once.
     """
-    count, size = rows[0].shape[0], PIECE
-    while count >= max(LEAST, 2 * size):
-        traced = jax.make_jaxpr(f)(*(jax.ShapeDtypeStruct((size, *x.shape[1:]), x.dtype) for x in rows))
-        jaxpr, closed = _of_rows_alone(traced.jaxpr, traced.consts)
-        if traced.effects or variables(jaxpr.eqns, jaxpr.outvars).keys().isdisjoint(jaxpr.invars):
-            return None
-        least = sum(x.size for x in closed if isinstance(x, Tracer)) // NUMBERS_A_ROW
-        if least <= size:
-            return _value.bind(used, used, *closed, *rows, jaxpr=jaxpr)[0]
-        size = least
-    return None
+    if rows[0].shape[0] < max(LEAST, PIECE):
+        return None
+    traced = jax.make_jaxpr(f)(*(jax.ShapeDtypeStruct((PIECE, *x.shape[1:]), x.dtype) for x in rows))
+    if traced.effects:
+        return None
+    jaxpr, closed = _of_rows_alone(traced.jaxpr, traced.consts)
+    if variables(jaxpr.eqns, jaxpr.outvars).keys().isdisjoint(jaxpr.invars):
+        return None
+    if sum(x.size for x in closed if isinstance(x, Tracer)) > CLOSED:
+        return None
+    return _value.bind(used, used, *closed, *rows, jaxpr=jaxpr)[0]
 
 
 def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any]]:
