@@ -29,7 +29,7 @@ PIECE = 1 << 12
 """Rows of a piece: so many that calls of XLA's are worth it, and so few that intermediate arrays stay in caches."""
 
 CLOSED = 1 << 16
-"""The most numbers that a function may close over, and have gradients, which are as large as they are for each piece."""
+"""The most numbers that a function may close over: their gradients are as large as they are, for each piece."""
 
 
 def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array]) -> jax.Array | None:
