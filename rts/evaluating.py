@@ -15,7 +15,7 @@ from rts.footprints import FOOTPRINT, uv_footprint
 from rts.gbuffer import GBuffer
 from rts.interfaces import CheckedPart
 from rts.operations.linear import affine_map
-from rts.operations.take import take
+from rts.operations.take import take, take_shifted
 from rts.records import Fine, Sampled, Samples, Splats
 from rts.sampling.scenes import Wide
 from rts.trees import Array, Tree
@@ -64,8 +64,7 @@ def to_fine_splats(
     positions, rgba = _shown(fine.samples, fine.index, parts, camera, wide, engine, like)
     arrays = fine.index, fine.shift, fine.row, fine.part, fine.facing, fine.settled, fine.wanted
     index, shift, row, part, facing, settled, wanted = constants(arrays, *suiting(positions, rgba))
-    xp = namespace(positions)
-    moved = take(positions, index) + xp.astype(shift, positions.dtype)
+    moved = take_shifted(positions, index, namespace(positions).astype(shift, positions.dtype))
     return Splats(moved, take(rgba, index), row, part, facing, settled, wanted=wanted, border=fine.apron)
 
 

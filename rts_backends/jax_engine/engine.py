@@ -170,7 +170,7 @@ class JaxEngine(Engine):
         used = jnp.max(row) + 1
 
         def few(*own: jax.Array) -> jax.Array:
-            # In small pieces a call to the host takes longer than array code that treats each row by itself.
+            # Of small pieces array code takes less time than a call to the host.
             with operations.by_specification():
                 return f(dict(zip(rows, own, strict=True)))
 

@@ -56,7 +56,7 @@ def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[s
 
 def fits(operation: Operation, operands: Sequence[jax.Array]) -> bool:
     """Whether kernels may compute it: dtypes are theirs; on what device arrays are, a traced function cannot know."""
-    return not (_specifying.get() and operation.packed_result) and operation.fits([x.dtype for x in operands])
+    return not _specifying.get() and operation.fits([x.dtype for x in operands])
 
 
 _specifying = contextvars.ContextVar("rts_specifying", default=False)
@@ -64,7 +64,7 @@ _specifying = contextvars.ContextVar("rts_specifying", default=False)
 
 @contextlib.contextmanager
 def by_specification() -> Iterator[None]:
-    """Within it no operation of rows alone `fits`; those that look rows up do, or add to them backwards."""
+    """Within it no operation `fits`."""
     token = _specifying.set(True)
     try:
         yield
