@@ -22,14 +22,18 @@ from rts.camera import Camera
 from rts.compiling import compiled, kernel
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
+from rts.sampling.validation import check_faces
 from rts.threads import parallel, read_only
 from rts_backends.raster_cells import EVERYTHING, Blocks, touching
+from rts_backends.raster_clusters import BACKS, FRONTS, SIZE, Clusters
 from rts_backends.raster_drawing import BAND_ROWS, LISTED, draw, draw_cells
 from rts_backends.triangles import facing, pixel_matrix, to_corner
 
-CHUNK = 1 << 11
-LONG_BLOCK = 256
+LONG_BLOCK = SIZE
 """The block for loops that keep little of each triangle or vertex."""
+
+PER_CHUNK = 8
+CHUNK = PER_CHUNK * LONG_BLOCK
 
 LIMIT = np.float32(2**15 - 2)
 """Steps from the middle of the image to two pixels outside of it; a position beyond is put there.
@@ -38,6 +42,11 @@ Positions on screen take 16 bits, so that those of a million triangles stay in c
 """
 
 SIXTEEN, LOWER = np.int32(16), np.int32(2**16 - 1)
+
+MANY = 2048
+"""Triangles from which on they are put in clusters."""
+
+ALL_IN_ORDER = read_only(np.empty(0, np.int32))
 
 BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 """In place of a position: before the near plane (or NaN), beyond the far plane."""
@@ -56,36 +65,51 @@ class Raster(TriangleSampler):
         self._scratch = (), []  # Of one size alone; whoever draws takes his out, so threads never share.
         return self
 
-    def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
+    def arrange(self, proxy: Proxy) -> Proxy | Clusters:
+        """See `TriangleSampler.arrange`: triangles in clusters, if there are many."""
+        check_faces(proxy)
+        return proxy if len(proxy.faces) < MANY else Clusters.of(proxy)
+
+    def rasterize(
+        self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, cull: str
+    ) -> Fragments:
         """See `TriangleSampler.rasterize`."""
-        with self._seen(prepared, camera, size) as mesh:
-            listed, _ = mesh.select(facing(camera, cull))
+        with self._seen(prepared, camera, size, facing(camera, cull)) as mesh:
+            listed, _ = mesh.select()
             return mesh.draw(listed, layers)
 
     def rasterize_cells(
-        self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
+        self,
+        prepared: Proxy | Clusters,
+        camera: Camera,
+        size: tuple[int, int],
+        layers: int,
+        cull: str,
+        cells: np.ndarray,
     ) -> Fragments:
         """See `TriangleSampler.rasterize_cells`: triangles that touch none of these cells are passed over."""
-        with self._seen(prepared, camera, size) as mesh:
+        with self._seen(prepared, camera, size, facing(camera, cull)) as mesh:
             blocks = Blocks.of(cells, size)
-            listed, _ = mesh.select(facing(camera, cull), blocks)
+            listed, _ = mesh.select(blocks)
             return mesh.draw_cells(listed, layers, cells, blocks)
 
     def rasterize_exits(
-        self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
+        self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
     ) -> tuple[Fragments, np.ndarray, Fragments]:
         """See `TriangleSampler.rasterize_exits`: all triangles are looked at once, for both."""
         kind = type(self)
         if (kind.rasterize, kind.rasterize_cells) != (Raster.rasterize, Raster.rasterize_cells):
             return super().rasterize_exits(prepared, camera, size, layers, beside)
-        with self._seen(prepared, camera, size) as mesh:
-            fronts, backs = mesh.select(facing(camera, "back"), both=True)
+        with self._seen(prepared, camera, size, facing(camera, "back"), both=True) as mesh:
+            fronts, backs = mesh.select()
             fragments = mesh.draw(fronts, layers)
             cells = beside(fragments)
             return fragments, cells, mesh.draw_cells(backs, 1, cells, Blocks.of(cells, size))
 
     @contextmanager
-    def _seen(self, prepared: Proxy, camera: Camera, size: tuple[int, int]) -> Iterator[_Seen]:
+    def _seen(
+        self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], keep: float, both: bool = False
+    ) -> Iterator[_Seen]:
         """A mesh as a camera sees it, in scratch memory.
 
         Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
@@ -99,7 +123,7 @@ class Raster(TriangleSampler):
             memory = scratch[1].pop()
         except IndexError:
             memory = np.empty(key[0], np.int32), *(np.empty((key[1], LISTED), np.int32) for _ in range(2))
-        yield _Seen(prepared, camera, size, *memory)
+        yield _Seen(prepared, camera, size, keep, both, *memory)
         scratch[1].append(memory)
 
 
@@ -126,31 +150,50 @@ class _Seen:
         mesh: the mesh.
         camera: the camera.
         size: (height, width).
+        keep: sign of the determinants of triangles to draw, or 0.
+        both: whether those that face the other way are asked for, too.
         screen: (V,) int32, memory for positions on screen.
         listed: (T, LISTED) int32, memory for a list of triangles.
         behind: memory for a list of those that face the other way.
     """
 
-    def __init__(self, mesh: Proxy, camera: Camera, size: tuple[int, int], screen: Any, listed: Any, behind: Any):
+    def __init__(
+        self,
+        mesh: Proxy | Clusters,
+        camera: Camera,
+        size: tuple[int, int],
+        keep: float,
+        both: bool,
+        screen: np.ndarray,
+        listed: np.ndarray,
+        behind: np.ndarray,
+    ):
         # With unsigned indices compiled code need not look for negative ones, which count from the end.
         self.vertices, self.faces = read_only(mesh.vertices), read_only(mesh.faces, np.int32).view(np.uint32)
-        self.matrix, self.depth_row, self.size = pixel_matrix(camera, size), -camera.view[2], size
-        self.screen, self.listed, self.behind = screen, listed, behind
+        self.matrix, self.depth_row, self.size, self.keep = pixel_matrix(camera, size), -camera.view[2], size, keep
+        self.screen, self.listed, self.behind = screen, listed, behind if both else behind[:0]
         self.step = (max(size) / 2 + 2) / float(LIMIT)
+        if isinstance(mesh, Clusters):
+            self.order = mesh.order
+            self.blocks, self.sides, used = mesh.seen(self.matrix, size, keep, both)
+        else:
+            self.order = ALL_IN_ORDER
+            self.blocks, used = (np.arange(-(-len(x) // SIZE), dtype=np.int32) for x in (self.faces, self.vertices))
+            self.sides = np.full(len(self.blocks), FRONTS | BACKS, np.uint8)
         to_steps = np.diag([1 / self.step, 1 / self.step, 1, 1])
         to_steps[:2, 3] = -size[1] / 2 / self.step, -size[0] / 2 / self.step
-        count = len(self.vertices)
-        parallel(_project, count, self.vertices, to_steps @ self.matrix, screen, work=4 * count)
+        parallel(_project, len(used), used, self.vertices, to_steps @ self.matrix, screen, work=4 * SIZE * len(used))
 
-    def select(self, keep: float, blocks: Blocks = EVERYTHING, both: bool = False) -> tuple[_List, _List]:
-        """The triangles that may cover cells of some blocks; and those that face the other way, if asked for `both`."""
-        chunks, bands = -(-len(self.faces) // CHUNK), -(-self.size[0] // BAND_ROWS)
+    def select(self, blocks: Blocks = EVERYTHING) -> tuple[_List, _List]:
+        """The triangles that may cover cells of some blocks; and those that face the other way, if asked for."""
+        chunks, bands = -(-len(self.blocks) // PER_CHUNK), -(-self.size[0] // BAND_ROWS)
         # Threads do not write side by side.
         spans, counts = np.empty((2, chunks, 2), np.int64), np.zeros((2, chunks, bands), np.int64)
-        lists = (self.listed, spans[0], counts[0]), (self.behind if both else self.behind[:0], spans[1], counts[1])
-        given = self.vertices, self.faces, self.screen, self.matrix, *self.size, self.step, keep, blocks.bits
-        parallel(_select, chunks, *given, *lists, work=10 * len(self.faces))
-        fronts, backs = (_sorted(sign, *made) for sign, made in zip((keep, -keep), lists, strict=True))
+        lists = (self.listed, spans[0], counts[0]), (self.behind, spans[1], counts[1])
+        triangles = self.blocks, self.sides, self.faces, self.order
+        given = *triangles, self.vertices, self.screen, self.matrix, *self.size, self.step, self.keep, blocks.bits
+        parallel(_select, chunks, *given, *lists, work=10 * SIZE * len(self.blocks))
+        fronts, backs = (_sorted(sign, *made) for sign, made in zip((self.keep, -self.keep), lists, strict=True))
         return fronts, backs
 
     def draw(self, listed: _List, layers: int) -> Fragments:
@@ -186,11 +229,14 @@ def _sorted(keep: float, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray
 
 
 @kernel(error_model="numpy")
-def _project(start, stop, vertices, m, screen):
-    """Positions (V,) on screen, in steps from the image's middle: columns in the lower 16 bits, rows in the others."""
+def _project(first, last, used, vertices, m, screen):
+    """Positions (V,) on screen, in steps from the image's middle: columns in the lower 16 bits, rows in the others.
+
+    They are filled in for some blocks of vertices.
+    """
     points, pixels = np.empty((3, LONG_BLOCK), np.float32), np.empty((2, LONG_BLOCK), np.int32)
-    for first in range(start, stop, LONG_BLOCK):
-        block = slice(first, min(stop, first + LONG_BLOCK))
+    for n in used[first:last]:
+        block = slice(n * LONG_BLOCK, min(len(vertices), (n + 1) * LONG_BLOCK))
         read, written = vertices[block], screen[block]
         for v in range(len(read)):
             points[0, v], points[1, v], points[2, v] = read[v, 0], read[v, 1], read[v, 2]
@@ -210,8 +256,27 @@ def _project(start, stop, vertices, m, screen):
 
 
 @kernel(error_model="numpy")
-def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, bits, fronts, backs):
+def _select(
+    first,
+    last,
+    blocks,
+    sides,
+    faces,
+    order,
+    vertices,
+    screen,
+    matrix,
+    height,
+    width,
+    step,
+    keep,
+    bits,
+    fronts,
+    backs,
+):
     """List the triangles that may cover a pixel's centre, of those that `bits` of `Blocks` tell; and count them.
+
+    Looked at are some blocks of triangles, of which `sides` tell as bits which they may hold: FRONTS, BACKS.
 
     A list is what is known of triangles (T, LISTED), where each chunk begins and ends in it (chunks, 2), and how many
     of a chunk touch a band of rows (chunks, bands). Chunks of one call follow on each other. Of `backs`, if there is
@@ -220,18 +285,19 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
     chosen, sign = np.empty(LONG_BLOCK, np.uint32), np.float32(keep)
-    step, given = np.float32(step), (vertices, matrix, height, width, np.float32(step), bits)
+    step, given = np.float32(step), (order, vertices, matrix, height, width, np.float32(step), bits)
     found = opposite = first * CHUNK
     for chunk in range(first, last):
         fronts[1][chunk, 0], backs[1][chunk, 0] = found, opposite
-        end = min(len(faces), (chunk + 1) * CHUNK)
-        for start in range(chunk * CHUNK, end, LONG_BLOCK):
-            block = faces[start : min(end, start + LONG_BLOCK)]
+        for n in range(chunk * PER_CHUNK, min(len(blocks), (chunk + 1) * PER_CHUNK)):
+            start, some = blocks[n] * LONG_BLOCK, sides[n]
+            block = faces[start : min(len(faces), start + LONG_BLOCK)]
             for b in range(len(block)):
                 xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
-            _look(len(block), xy, height, width, step, sign, box, clips, near)
-            found = _list(chunk, start, block, near, box, clips, chosen, given, found, fronts)
-            if len(backs[0]) > 0:
+            if some & FRONTS:
+                _look(len(block), xy, height, width, step, sign, box, clips, near)
+                found = _list(chunk, start, block, near, box, clips, chosen, given, found, fronts)
+            if some & BACKS and len(backs[0]) > 0:
                 _look(len(block), xy, height, width, step, -sign, box, clips, near)
                 opposite = _list(chunk, start, block, near, box, clips, chosen, given, opposite, backs)
         fronts[1][chunk, 1], backs[1][chunk, 1] = found, opposite
@@ -268,7 +334,7 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
 @compiled(inline="always")
 def _list(chunk, start, block, near, box, clips, chosen, given, found, made):
     """List the triangles of a block that are near, from a place on; what comes after is the next place."""
-    vertices, matrix, height, width, step, bits = given
+    order, vertices, matrix, height, width, step, bits = given
     listed, _, counts = made
     count = 0
     for b in range(len(block)):
@@ -289,7 +355,7 @@ def _list(chunk, start, block, near, box, clips, chosen, given, found, made):
             i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
             if i0 > i1 or j0 > j1:
                 continue
-        listed[found, 0] = start + b
+        listed[found, 0] = order[start + b] if len(order) > 0 else start + b
         listed[found, 1], listed[found, 2], listed[found, 3] = block[b, 0], block[b, 1], block[b, 2]
         listed[found, 4], listed[found, 5], listed[found, 6], listed[found, 7] = i0, i1, j0, j1
         found += 1

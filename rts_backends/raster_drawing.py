@@ -268,11 +268,13 @@ def _covers(b, x, y, numbers, clips):
 @compiled(inline="always")
 def _put(z, t, p, q, row, j, i, nearest, triangle_ids, barycentrics):
     """Put a hit into the layers of a cell, at its row of `nearest` and of the rest: behind what is as near."""
-    moved = z
+    moved, own = z, t
     for k in range(len(nearest)):
         old, old_t = nearest[k, row, i], triangle_ids[k, j, i]
         old_p, old_q = barycentrics[k, j, i, 0], barycentrics[k, j, i, 1]
         before = z < old  # A branch would be foreseen every other time.
+        if z == old:  # Of clusters triangles come in another order than that of their indices.
+            before = own < old_t
         nearest[k, row, i], triangle_ids[k, j, i] = moved if before else old, t if before else old_t
         barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = p if before else old_p, q if before else old_q
         moved, t = old if before else moved, old_t if before else t

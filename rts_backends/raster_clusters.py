@@ -1,0 +1,279 @@
+"""Triangles in clusters of what lies together: those out of view, or that all face away, are passed over at once.
+
+They are made of a mesh that stays (`rts.prepare`). Triangles are put in the order of a Morton curve through their middles,
+vertices in the order of their use. Of each cluster a box tells where it is, and a cone which ways its triangles face.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.compiling import compiled, kernel
+from rts.records import Proxy
+from rts.sampling.facing import OTHER_COLUMNS
+from rts.threads import parallel, read_only
+
+SIZE = 256
+"""Triangles of a cluster, and vertices of a block."""
+
+FRONTS, BACKS = 1, 2
+"""Bits that say whether a cluster may hold triangles that face as asked for, and others."""
+
+AROUND = 1e-9
+"""What counts as nothing beside the terms of a sum, in float64: a cluster so near to the border of the view is kept."""
+
+NOISE = 1e-12
+"""How far off the determinant of three corners may be, of the product of the largest numbers in it."""
+
+TOWARDS = np.array([1, -1, 1, 1])
+"""Signs of the minors of three rows (3, 4) in a determinant of triangles; see `_find`."""
+
+STEPS = np.float64(2**10 - 1)
+
+
+class Clusters(NamedTuple):
+    """A mesh in clusters.
+
+    Attributes:
+        vertices: (V, 3) float32, those that triangles use, in the order of their first use.
+        faces: (T, 3) int32, triangles in the order of clusters, SIZE in each.
+        order: (T,) int32, which triangle of the proxy each is.
+        boxes: (6, C) float32, the least and the largest x, y and z of each cluster.
+        cones: (5, C), a unit vector (x, y, z), the least cosine between it and a triangle's normal, below 0 where nothing
+            is known, and the least length of (b − a) × (c − a).
+        offsets: (C + 1,) int64, where each cluster's blocks of vertices begin in `blocks`.
+        blocks: int32, numbers of the blocks of SIZE vertices that hold its corners.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    order: np.ndarray
+    boxes: np.ndarray
+    cones: np.ndarray
+    offsets: np.ndarray
+    blocks: np.ndarray
+
+    @classmethod
+    def of(cls, proxy: Proxy) -> Clusters:
+        """The clusters of a proxy's triangles."""
+        vertices, faces = read_only(proxy.vertices, np.float32), read_only(proxy.faces, np.int32)
+        count, clusters = len(faces), -(-len(faces) // SIZE)
+        keys = np.empty(count, np.uint64)
+        used = vertices[np.isfinite(vertices).all(axis=1)].astype(np.float64)
+        low, high = (used.min(axis=0), used.max(axis=0)) if len(used) else (np.zeros(3), np.zeros(3))
+        scale = STEPS / max((high - low).max(), 1e-30)
+        parallel(_keys, count, vertices, faces, low, scale, keys, work=10 * count)
+        keys.sort()
+        order = (keys & np.uint64(2**32 - 1)).astype(np.int32)
+        made = np.empty((len(vertices), 3), np.float32), np.empty((count, 3), np.int32)
+        used = _renumber(vertices, faces, order, *made)
+        vertices, faces = made[0][:used].copy(), made[1]
+        boxes, cones = np.empty((6, clusters), np.float32), np.empty((5, clusters))
+        parallel(_bound, clusters, vertices, faces, boxes, cones, work=50 * count)
+        offsets, blocks = np.zeros(clusters + 1, np.int64), np.empty(3 * count, np.int32)
+        blocks = blocks[: _find_blocks(faces, np.full(-(-used // SIZE), -1), offsets, blocks)].copy()
+        return cls(*map(read_only, (vertices, faces, order, boxes, cones, offsets, blocks)))
+
+    def seen(self, matrix: np.ndarray, size: tuple[int, int], keep: float, both: bool) -> tuple[np.ndarray, ...]:
+        """What may be in view.
+
+        Args:
+            matrix: (4, 4) to homogeneous pixels.
+            size: (height, width).
+            keep: sign of the determinants of triangles that are asked for; 0 for all.
+            both: whether the others are asked for, too.
+
+        Returns:
+            Numbers of clusters (N,) int32, which triangles these may hold (N,) uint8 as bits, and numbers of blocks of
+            vertices, int32.
+        """
+        height, width = size
+        # A pixel outside of the image nothing is rounded into it.
+        sums = [[1, 0, 0, 1], [-1, 0, 0, width + 1], [0, 1, 0, 1], [0, -1, 0, height + 1], [0, 0, 1, 1], [0, 0, -1, 1]]
+        rows = matrix[[0, 1, 3]]
+        minors = np.linalg.det(rows[:, OTHER_COLUMNS].transpose(1, 0, 2))
+        towards = keep * minors * TOWARDS
+        count, blocks = self.boxes.shape[1], -(-len(self.vertices) // SIZE)
+        kept, sides, used = np.empty(count, np.int32), np.empty(count, np.uint8), np.empty(blocks, np.int32)
+        wanted = FRONTS | BACKS if both or keep == 0 else FRONTS
+        tested = np.array(sums) @ matrix, towards, np.abs(rows)
+        found = _find(self.boxes, self.cones, self.offsets, self.blocks, *tested, wanted, kept, sides, used)
+        return kept[: found[0]], sides[: found[0]], used[: found[1]]
+
+
+@kernel
+def _keys(start, stop, vertices, faces, low, scale, keys):
+    """Places on the curve in the upper 32 bits, and indices below: what sorts triangles alike on every machine."""
+    for t in range(start, stop):
+        key = np.uint64(0)
+        for r in range(3):
+            middle = (
+                np.float64(vertices[faces[t, 0], r]) + vertices[faces[t, 1], r] + vertices[faces[t, 2], r]
+            ) / 3 - low[r]
+            place = middle * scale
+            place = place if 0 < place < STEPS else STEPS if place >= STEPS else 0.0
+            bits = np.uint64(place)
+            for n in (16, 8, 4, 2):
+                bits = bits | bits << np.uint64(n)
+                if n == 16:
+                    bits &= np.uint64(0x030000FF)
+                elif n == 8:
+                    bits &= np.uint64(0x0300F00F)
+                elif n == 4:
+                    bits &= np.uint64(0x030C30C3)
+                else:
+                    bits &= np.uint64(0x09249249)
+            key |= bits << np.uint64(r)
+        keys[t] = key << np.uint64(32) | np.uint64(t)
+
+
+@kernel
+def _renumber(vertices, faces, order, new_vertices, new_faces):
+    """Fill in the triangles in this order, and the vertices in the order of their use; how many there are."""
+    numbers, count = np.full(len(vertices), -1, np.int32), 0
+    for t in range(len(order)):
+        for c in range(3):
+            v = faces[order[t], c]
+            if numbers[v] < 0:
+                numbers[v] = count
+                for r in range(3):
+                    new_vertices[count, r] = vertices[v, r]
+                count += 1
+            new_faces[t, c] = numbers[v]
+    return count
+
+
+@kernel
+def _find_blocks(faces, last, offsets, blocks):
+    """Fill in which blocks of vertices each cluster uses, and where these begin; how many there are."""
+    count = 0
+    for t in range(len(faces)):
+        cluster = t // SIZE
+        for c in range(3):
+            block = faces[t, c] // SIZE
+            if last[block] != cluster:
+                last[block] = cluster
+                blocks[count] = block
+                count += 1
+        offsets[cluster + 1] = count
+    return count
+
+
+@kernel(error_model="numpy")
+def _bound(start, stop, vertices, faces, boxes, cones):
+    """Fill in boxes and cones of clusters."""
+    normals = np.empty((SIZE, 3))
+    for cluster in range(start, stop):
+        block = faces[cluster * SIZE : (cluster + 1) * SIZE]
+        known, count, least = True, 0, np.inf
+        for r in range(3):
+            low, high = np.float32(np.inf), np.float32(-np.inf)
+            for b in range(len(block)):
+                for c in range(3):
+                    x = vertices[block[b, c], r]
+                    known &= np.isfinite(x)
+                    low, high = min(low, x), max(high, x)
+            boxes[r, cluster], boxes[3 + r, cluster] = low, high
+        axis = np.zeros(3)
+        for b in range(len(block)):
+            i, j, k = block[b, 0], block[b, 1], block[b, 2]
+            if _same(vertices, i, j) or _same(vertices, j, k) or _same(vertices, k, i):
+                continue  # One of its edge functions is 0 everywhere: it covers nothing.
+            normal = normals[count]
+            for r in range(3):
+                p, q = (r + 1) % 3, (r + 2) % 3
+                ap, aq = np.float64(vertices[i, p]), np.float64(vertices[i, q])
+                normal[r] = (vertices[j, p] - ap) * (vertices[k, q] - aq) - (vertices[j, q] - aq) * (
+                    vertices[k, p] - ap
+                )
+            length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+            least = min(least, length)
+            for r in range(3):
+                normal[r] /= length
+                axis[r] += normal[r]
+            count += 1
+        axis /= np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
+        cosine = 1.0
+        for n in range(count):
+            cosine = min(cosine, normals[n, 0] * axis[0] + normals[n, 1] * axis[1] + normals[n, 2] * axis[2])
+        if not (known and cosine > 0 and least > 0 and least < np.inf):
+            axis[:], cosine = 0.0, -1.0
+        if not known:
+            boxes[:3, cluster], boxes[3:, cluster] = -np.inf, np.inf
+        cones[:3, cluster], cones[3, cluster], cones[4, cluster] = axis, cosine, least
+
+
+@compiled
+def _same(vertices, i, j):
+    return vertices[i, 0] == vertices[j, 0] and vertices[i, 1] == vertices[j, 1] and vertices[i, 2] == vertices[j, 2]
+
+
+@kernel(error_model="numpy")
+def _find(boxes, cones, offsets, blocks, planes, towards, rows, wanted, kept, sides, used):
+    """Fill in which clusters may hold what is wanted, what these may hold, and which blocks of vertices they use.
+
+    Args:
+        boxes: see `Clusters`.
+        cones: see `Clusters`.
+        offsets: see `Clusters`.
+        blocks: see `Clusters`.
+        planes: (6, 4) half-spaces p · (x, y, z, 1) ≥ 0 that the view lies in.
+        towards: (4,) q and s: a triangle's determinant is n · (q + s a), for its corner a and n = (b − a) × (c − a); with
+            the sign that makes it positive where asked for, or 0.
+        rows: (3, 4) absolute values of the rows of the matrix that the determinant is of.
+        wanted: bits, FRONTS, BACKS.
+        kept: (C,) int32.
+        sides: (C,) uint8.
+        used: (B,) int32.
+
+    Returns:
+        How many clusters, and how many blocks.
+    """
+    _test(boxes, cones, planes, towards, rows, sides)
+    count = 0
+    for cluster in range(len(sides)):
+        some = sides[cluster]
+        kept[count], sides[count] = cluster, some
+        count += (some & wanted) != 0
+    if count == len(kept):
+        for block in range(len(used)):
+            used[block] = block
+        return count, len(used)
+    marks = np.zeros(len(used), np.bool_)
+    for cluster in kept[:count]:
+        for n in range(offsets[cluster], offsets[cluster + 1]):
+            marks[blocks[n]] = True
+    found = 0
+    for block in range(len(used)):
+        used[found] = block
+        found += marks[block]
+    return count, found
+
+
+@compiled(inline="always", error_model="numpy")
+def _test(boxes, cones, planes, towards, rows, sides):
+    """Fill in for each cluster as bits which triangles it may hold: FRONTS, BACKS; none if it is out of view."""
+    s = towards[3]
+    for cluster in range(len(sides)):
+        x0, y0, z0 = np.float64(boxes[0, cluster]), np.float64(boxes[1, cluster]), np.float64(boxes[2, cluster])
+        x1, y1, z1 = np.float64(boxes[3, cluster]), np.float64(boxes[4, cluster]), np.float64(boxes[5, cluster])
+        x, y, z, dx, dy, dz = (x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2, (x1 - x0) / 2, (y1 - y0) / 2, (z1 - z0) / 2
+        mx, my, mz = max(-x0, x1), max(-y0, y1), max(-z0, z1)
+        out = False
+        for p in range(6):
+            a, b, c, d = planes[p, 0], planes[p, 1], planes[p, 2], planes[p, 3]
+            most = a * x + b * y + c * z + d + (abs(a) * dx + abs(b) * dy + abs(c) * dz)
+            out |= most < -AROUND * (abs(a) * mx + abs(b) * my + abs(c) * mz + abs(d))
+        noise = NOISE
+        for r in range(3):
+            noise *= rows[r, 0] * mx + rows[r, 1] * my + rows[r, 2] * mz + rows[r, 3]
+        gx, gy, gz = towards[0] + s * x, towards[1] + s * y, towards[2] + s * z
+        along = cones[0, cluster] * gx + cones[1, cluster] * gy + cones[2, cluster] * gz
+        across = np.sqrt(max(gx * gx + gy * gy + gz * gz - along * along, 0.0))
+        cosine, least = cones[3, cluster], cones[4, cluster]
+        spread = across * np.sqrt(1 - cosine * cosine + AROUND) + abs(s) * np.sqrt(dx * dx + dy * dy + dz * dz)
+        # Of the normal that is turned away most.
+        sure = (abs(along) * cosine - spread) * least > noise
+        sides[cluster] = 0 if out else FRONTS | BACKS if not sure else FRONTS if along > 0 else BACKS
