@@ -285,7 +285,7 @@ def _select(
     xy, box = np.empty((3, LONG_BLOCK), np.int32), np.empty((4, LONG_BLOCK), np.float32)
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
     chosen, sign = np.empty(LONG_BLOCK, np.uint32), np.float32(keep)
-    step, given = np.float32(step), (order, vertices, matrix, height, width, np.float32(step), bits)
+    step, given = np.float32(step), (vertices, matrix, height, width, np.float32(step), bits)
     found = opposite = first * CHUNK
     for chunk in range(first, last):
         fronts[1][chunk, 0], backs[1][chunk, 0] = found, opposite
@@ -301,6 +301,17 @@ def _select(
                 _look(len(block), xy, height, width, step, -sign, box, clips, near)
                 opposite = _list(chunk, start, block, near, box, clips, chosen, given, opposite, backs)
         fronts[1][chunk, 1], backs[1][chunk, 1] = found, opposite
+        _name(fronts, chunk, order)
+        _name(backs, chunk, order)
+
+
+@compiled
+def _name(made, chunk, order):
+    """Replace places in an order by what is there; in a loop so short that the processor overlaps its waits."""
+    listed, spans, _ = made
+    if len(order) > 0:
+        for n in range(spans[chunk, 0], spans[chunk, 1]):
+            listed[n, 0] = order[listed[n, 0]]
 
 
 @compiled(inline="always", error_model="numpy")
@@ -334,7 +345,7 @@ def _look(count, xy, height, width, step, sign, box, clips, near):
 @compiled(inline="always")
 def _list(chunk, start, block, near, box, clips, chosen, given, found, made):
     """List the triangles of a block that are near, from a place on; what comes after is the next place."""
-    order, vertices, matrix, height, width, step, bits = given
+    vertices, matrix, height, width, step, bits = given
     listed, _, counts = made
     count = 0
     for b in range(len(block)):
@@ -355,7 +366,7 @@ def _list(chunk, start, block, near, box, clips, chosen, given, found, made):
             i0, i1, j0, j1 = _centres(x0, x1, y0, y1, height, width, step)
             if i0 > i1 or j0 > j1:
                 continue
-        listed[found, 0] = order[start + b] if len(order) > 0 else start + b
+        listed[found, 0] = start + b
         listed[found, 1], listed[found, 2], listed[found, 3] = block[b, 0], block[b, 1], block[b, 2]
         listed[found, 4], listed[found, 5], listed[found, 6], listed[found, 7] = i0, i1, j0, j1
         found += 1
