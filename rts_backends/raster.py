@@ -132,12 +132,14 @@ class _List(NamedTuple):
 
     Attributes:
         keep: sign of the determinants of those to draw, or 0.
-        offsets: (bands + 1,), where the items of each band of rows begin.
+        turns: (bands,), bands of rows, those with most items first: so threads end together.
+        offsets: (bands + 1,), where the items of each band begin.
         items: uint32, places in `rows`, in the order of the triangles.
         rows: (T, LISTED) int32, what is known of a triangle.
     """
 
     keep: float
+    turns: np.ndarray
     offsets: np.ndarray
     items: np.ndarray
     rows: np.ndarray
@@ -200,7 +202,7 @@ class _Seen:
         """Fragments (layers, H, W)."""
         fragments = _empty((layers, *self.size))
         given = self.vertices, self.matrix, self.depth_row, EVERYTHING.bits
-        parallel(draw, len(listed.offsets) - 1, listed, *given, tuple(fragments))
+        parallel(draw, len(listed.turns), listed, *given, tuple(fragments))
         return fragments
 
     def draw_cells(self, listed: _List, layers: int, cells: np.ndarray, blocks: Blocks) -> Fragments:
@@ -211,7 +213,7 @@ class _Seen:
         for x, nothing in zip(flat, (-1, 0, 0), strict=True):
             x[:, absent] = nothing
         given = self.vertices, self.matrix, self.depth_row, blocks.bits, blocks.table, blocks.numbers
-        parallel(draw_cells, len(listed.offsets) - 1, listed, *given, flat)
+        parallel(draw_cells, len(listed.turns), listed, *given, flat)
         return fragments
 
 
@@ -221,11 +223,12 @@ def _empty(shape: tuple[int, ...]) -> Fragments:
 
 def _sorted(keep: float, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> _List:
     """A list that `_select` made, sorted by bands of rows."""
-    offsets = np.append(0, np.cumsum(counts.sum(axis=0)))
+    sums = counts.sum(axis=0)
+    offsets = np.append(0, np.cumsum(sums))
     places, items = offsets[:-1] + np.cumsum(counts, axis=0) - counts, np.empty(offsets[-1], np.uint32)
     if len(items):
         parallel(_sort, len(spans), rows, spans, places, items, work=8 * len(items))
-    return _List(keep, offsets, items, rows)
+    return _List(keep, np.argsort(-sums), offsets, items, rows)
 
 
 @kernel(error_model="numpy")
