@@ -192,11 +192,9 @@ class _Seen:
         # Threads do not write side by side.
         spans, counts = np.empty((2, chunks, 2), np.int64), np.zeros((2, chunks, bands), np.int64)
         lists = (self.listed, spans[0], counts[0]), (self.behind, spans[1], counts[1])
-        triangles = self.blocks, self.sides, self.faces, self.order
-        given = *triangles, self.vertices, self.screen, self.matrix, *self.size, self.step, self.keep, blocks.bits
+        given = self.blocks, self.sides, self.faces, self.vertices, self.screen, self.matrix, *self.size, self.step, self.keep, blocks.bits
         parallel(_select, chunks, *given, *lists, work=10 * SIZE * len(self.blocks))
-        fronts, backs = (_sorted(sign, *made) for sign, made in zip((self.keep, -self.keep), lists, strict=True))
-        return fronts, backs
+        return _sorted(self.keep, self.order, *lists[0]), _sorted(-self.keep, self.order, *lists[1])
 
     def draw(self, listed: _List, layers: int) -> Fragments:
         """Fragments (layers, H, W)."""
@@ -221,13 +219,13 @@ def _empty(shape: tuple[int, ...]) -> Fragments:
     return Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
 
 
-def _sorted(keep: float, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> _List:
-    """A list that `_select` made, sorted by bands of rows."""
+def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> _List:
+    """A list that `_select` made, sorted by bands of rows; triangles get their names."""
     sums = counts.sum(axis=0)
     offsets = np.append(0, np.cumsum(sums))
     places, items = offsets[:-1] + np.cumsum(counts, axis=0) - counts, np.empty(offsets[-1], np.uint32)
     if len(items):
-        parallel(_sort, len(spans), rows, spans, places, items, work=8 * len(items))
+        parallel(_sort, len(spans), order, rows, spans, places, items, work=8 * len(items))
     return _List(keep, np.argsort(-sums), offsets, items, rows)
 
 
@@ -265,7 +263,6 @@ def _select(
     blocks,
     sides,
     faces,
-    order,
     vertices,
     screen,
     matrix,
@@ -304,17 +301,6 @@ def _select(
                 _look(len(block), xy, height, width, step, -sign, box, clips, near)
                 opposite = _list(chunk, start, block, near, box, clips, chosen, given, opposite, backs)
         fronts[1][chunk, 1], backs[1][chunk, 1] = found, opposite
-        _name(fronts, chunk, order)
-        _name(backs, chunk, order)
-
-
-@compiled
-def _name(made, chunk, order):
-    """Replace places in an order by what is there; in a loop so short that the processor overlaps its waits."""
-    listed, spans, _ = made
-    if len(order) > 0:
-        for n in range(spans[chunk, 0], spans[chunk, 1]):
-            listed[n, 0] = order[listed[n, 0]]
 
 
 @compiled(inline="always", error_model="numpy")
@@ -408,9 +394,15 @@ def _clipped_box(corners, width, height):
 
 
 @kernel
-def _sort(first, last, listed, spans, places, items):
-    """Sort the list by bands: write where each band's triangles are, in order, from `places` (chunks, bands) on."""
+def _sort(first, last, order, listed, spans, places, items):
+    """Sort the list by bands: write where each band's triangles are, in order, from `places` (chunks, bands) on.
+
+    In place of where triangles were looked at comes their index in the proxy, unless the order is that of indices.
+    """
     for chunk in range(first, last):
+        if len(order) > 0:
+            for n in range(spans[chunk, 0], spans[chunk, 1]):
+                listed[n, 0] = order[listed[n, 0]]
         for n in range(spans[chunk, 0], spans[chunk, 1]):
             for band in range(listed[n, 6] // BAND_ROWS, listed[n, 7] // BAND_ROWS + 1):
                 items[places[chunk, band]] = n
