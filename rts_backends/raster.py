@@ -22,7 +22,6 @@ from rts.camera import Camera
 from rts.compiling import compiled, kernel
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
-from rts.sampling.validation import check_faces
 from rts.threads import parallel, read_only
 from rts_backends.raster_cells import EVERYTHING, Blocks, touching
 from rts_backends.raster_clusters import BACKS, FRONTS, SIZE, Clusters
@@ -43,7 +42,7 @@ Positions on screen take 16 bits, so that those of a million triangles stay in c
 
 SIXTEEN, LOWER = np.int32(16), np.int32(2**16 - 1)
 
-MANY = 2048
+MANY = 1 << 16
 """Triangles from which on they are put in clusters."""
 
 ALL_IN_ORDER = read_only(np.empty(0, np.int32))
@@ -65,10 +64,14 @@ class Raster(TriangleSampler):
         self._scratch = (), []  # Of one size alone; whoever draws takes his out, so threads never share.
         return self
 
-    def arrange(self, proxy: Proxy) -> Proxy | Clusters:
+    def __getstate__(self) -> dict[str, Any]:
+        """See `TriangleSampler`: scratch memory is nobody else's."""
+        return {name: value for name, value in super().__getstate__().items() if name != "_scratch"}
+
+    def arrange(self, prepared: Any) -> Any:
         """See `TriangleSampler.arrange`: triangles in clusters, if there are many."""
-        check_faces(proxy)
-        return proxy if len(proxy.faces) < MANY else Clusters.of(proxy)
+        many = isinstance(prepared, Proxy) and len(prepared.faces) >= MANY
+        return Clusters.of(prepared) if many and self._draws else prepared
 
     def rasterize(
         self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, cull: str
@@ -97,14 +100,19 @@ class Raster(TriangleSampler):
         self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
     ) -> tuple[Fragments, np.ndarray, Fragments]:
         """See `TriangleSampler.rasterize_exits`: all triangles are looked at once, for both."""
-        kind = type(self)
-        if (kind.rasterize, kind.rasterize_cells) != (Raster.rasterize, Raster.rasterize_cells):
+        if not self._draws:
             return super().rasterize_exits(prepared, camera, size, layers, beside)
         with self._seen(prepared, camera, size, facing(camera, "back"), both=True) as mesh:
             fronts, backs = mesh.select()
             fragments = mesh.draw(fronts, layers)
             cells = beside(fragments)
             return fragments, cells, mesh.draw_cells(backs, 1, cells, Blocks.of(cells, size))
+
+    @property
+    def _draws(self) -> bool:
+        """Whether it draws itself, not a subclass, which may look at what was prepared."""
+        kind = type(self)
+        return (kind.rasterize, kind.rasterize_cells) == (Raster.rasterize, Raster.rasterize_cells)
 
     @contextmanager
     def _seen(

@@ -66,7 +66,7 @@ class PreparedParts:
 
 
 def _built(sampler: Any, kept: Entry) -> Entry:
-    return kept._replace(prepared=sampler.prepare(kept.proxy) if len(kept.proxy.faces) else None)
+    return sampler.arranged(kept._replace(prepared=sampler.prepare(kept.proxy))) if len(kept.proxy.faces) else kept
 
 
 def prepare(
