@@ -200,7 +200,19 @@ class _Seen:
         # Threads do not write side by side.
         spans, counts = np.empty((2, chunks, 2), np.int64), np.zeros((2, chunks, bands), np.int64)
         lists = (self.listed, spans[0], counts[0]), (self.behind, spans[1], counts[1])
-        given = self.blocks, self.sides, self.faces, self.vertices, self.screen, self.matrix, *self.size, self.step, self.keep, blocks.bits
+        triangles = self.blocks, self.sides, self.faces, self.vertices, self.screen
+        given = *triangles, self.matrix, *self.size, self.step, self.keep, blocks.bits
+            self.blocks,
+            self.sides,
+            self.faces,
+            self.vertices,
+            self.screen,
+            self.matrix,
+            *self.size,
+            self.step,
+            self.keep,
+            blocks.bits,
+        )
         parallel(_select, chunks, *given, *lists, work=10 * SIZE * len(self.blocks))
         return _sorted(self.keep, self.order, *lists[0]), _sorted(-self.keep, self.order, *lists[1])
 

@@ -1,7 +1,8 @@
 """Triangles in clusters of what lies together: those out of view, or that all face away, are passed over at once.
 
-They are made of a mesh that stays (`rts.prepare`). Triangles are put in the order of a Morton curve through their middles,
-vertices in the order of their use. Of each cluster a box tells where it is, and a cone which ways its triangles face.
+They are made of a mesh that stays (`rts.prepare`). Triangles are put in the order of a Morton curve through their
+middles, vertices in the order of their use. Of each cluster a box tells where it is, and a cone which ways its triangles
+face.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import numpy as np
 
 from rts.compiling import compiled, kernel
 from rts.records import Proxy
-from rts.sampling.facing import OTHER_COLUMNS
 from rts.threads import parallel, read_only
 
 SIZE = 256
@@ -24,11 +24,8 @@ FRONTS, BACKS = 1, 2
 AROUND = 1e-9
 """What counts as nothing beside the terms of a sum, in float64: a cluster so near to the border of the view is kept."""
 
-NOISE = 1e-12
+NOISE = 1e-13
 """How far off the determinant of three corners may be, of the product of the largest numbers in it."""
-
-TOWARDS = np.array([1, -1, 1, 1])
-"""Signs of the minors of three rows (3, 4) in a determinant of triangles; see `_find`."""
 
 STEPS = np.float64(2**10 - 1)
 
@@ -41,8 +38,8 @@ class Clusters(NamedTuple):
         faces: (T, 3) int32, triangles in the order of clusters, SIZE in each.
         order: (T,) int32, which triangle of the proxy each is.
         boxes: (6, C) float32, the least and the largest x, y and z of each cluster.
-        cones: (5, C), a unit vector (x, y, z), the least cosine between it and a triangle's normal, below 0 where nothing
-            is known, and the least length of (b − a) × (c − a).
+        cones: (5, C), a unit vector (x, y, z), the least cosine between it and a triangle's normal, below 0 where
+            nothing is known, and the least length of (b − a) × (c − a).
         offsets: (C + 1,) int64, where each cluster's blocks of vertices begin in `blocks`.
         blocks: int32, numbers of the blocks of SIZE vertices that hold its corners.
     """
@@ -92,39 +89,27 @@ class Clusters(NamedTuple):
         height, width = size
         # A pixel outside of the image nothing is rounded into it.
         sums = [[1, 0, 0, 1], [-1, 0, 0, width + 1], [0, 1, 0, 1], [0, -1, 0, height + 1], [0, 0, 1, 1], [0, 0, -1, 1]]
-        rows = matrix[[0, 1, 3]]
-        minors = np.linalg.det(rows[:, OTHER_COLUMNS].transpose(1, 0, 2))
-        towards = keep * minors * TOWARDS
         count, blocks = self.boxes.shape[1], -(-len(self.vertices) // SIZE)
         kept, sides, used = np.empty(count, np.int32), np.empty(count, np.uint8), np.empty(blocks, np.int32)
         wanted = FRONTS | BACKS if both or keep == 0 else FRONTS
-        tested = np.array(sums) @ matrix, towards, np.abs(rows)
-        found = _find(self.boxes, self.cones, self.offsets, self.blocks, *tested, wanted, kept, sides, used)
+        tested = self.boxes, self.cones, np.array(sums) @ matrix, matrix[[0, 1, 3]], keep
+        found = _find(*tested, self.offsets, self.blocks, wanted, kept, sides, used)
         return kept[: found[0]], sides[: found[0]], used[: found[1]]
 
 
 @kernel
 def _keys(start, stop, vertices, faces, low, scale, keys):
-    """Places on the curve in the upper 32 bits, and indices below: what sorts triangles alike on every machine."""
+    """Fill in places on the curve in the upper 32 bits, and below the indices: what sorts alike on every machine."""
     for t in range(start, stop):
         key = np.uint64(0)
         for r in range(3):
-            middle = (
-                np.float64(vertices[faces[t, 0], r]) + vertices[faces[t, 1], r] + vertices[faces[t, 2], r]
-            ) / 3 - low[r]
-            place = middle * scale
-            place = place if 0 < place < STEPS else STEPS if place >= STEPS else 0.0
-            bits = np.uint64(place)
-            for n in (16, 8, 4, 2):
-                bits = bits | bits << np.uint64(n)
-                if n == 16:
-                    bits &= np.uint64(0x030000FF)
-                elif n == 8:
-                    bits &= np.uint64(0x0300F00F)
-                elif n == 4:
-                    bits &= np.uint64(0x030C30C3)
-                else:
-                    bits &= np.uint64(0x09249249)
+            x, y, z = vertices[faces[t, 0], r], vertices[faces[t, 1], r], vertices[faces[t, 2], r]
+            place = ((np.float64(x) + y + z) / 3 - low[r]) * scale
+            bits = np.uint64(min(place, STEPS) if place > 0 else 0.0)  # NaN comes first.
+            bits = (bits | bits << np.uint64(16)) & np.uint64(0x030000FF)
+            bits = (bits | bits << np.uint64(8)) & np.uint64(0x0300F00F)
+            bits = (bits | bits << np.uint64(4)) & np.uint64(0x030C30C3)
+            bits = (bits | bits << np.uint64(2)) & np.uint64(0x09249249)
             key |= bits << np.uint64(r)
         keys[t] = key << np.uint64(32) | np.uint64(t)
 
@@ -211,18 +196,17 @@ def _same(vertices, i, j):
 
 
 @kernel(error_model="numpy")
-def _find(boxes, cones, offsets, blocks, planes, towards, rows, wanted, kept, sides, used):
+def _find(boxes, cones, planes, rows, keep, offsets, blocks, wanted, kept, sides, used):
     """Fill in which clusters may hold what is wanted, what these may hold, and which blocks of vertices they use.
 
     Args:
         boxes: see `Clusters`.
         cones: see `Clusters`.
+        planes: (6, 4) half-spaces p · (x, y, z, 1) ≥ 0 that the view lies in.
+        rows: (3, 4) to homogeneous pixels (x, y, w).
+        keep: sign of the determinants of triangles that are asked for; 0 for all.
         offsets: see `Clusters`.
         blocks: see `Clusters`.
-        planes: (6, 4) half-spaces p · (x, y, z, 1) ≥ 0 that the view lies in.
-        towards: (4,) q and s: a triangle's determinant is n · (q + s a), for its corner a and n = (b − a) × (c − a); with
-            the sign that makes it positive where asked for, or 0.
-        rows: (3, 4) absolute values of the rows of the matrix that the determinant is of.
         wanted: bits, FRONTS, BACKS.
         kept: (C,) int32.
         sides: (C,) uint8.
@@ -231,7 +215,10 @@ def _find(boxes, cones, offsets, blocks, planes, towards, rows, wanted, kept, si
     Returns:
         How many clusters, and how many blocks.
     """
-    _test(boxes, cones, planes, towards, rows, sides)
+    # A triangle's determinant is n · (q + s a), for its corner a and n = (b − a) × (c − a); q and s are minors.
+    q0, q1, q2, s = _minor(rows, 1, 2, 3), _minor(rows, 2, 0, 3), _minor(rows, 0, 1, 3), _minor(rows, 0, 1, 2)
+    towards = keep * q0, keep * q1, keep * q2, keep * s
+    _test(boxes, cones, planes, towards, np.abs(rows), sides)
     count = 0
     for cluster in range(len(sides)):
         some = sides[cluster]
@@ -252,10 +239,16 @@ def _find(boxes, cones, offsets, blocks, planes, towards, rows, wanted, kept, si
     return count, found
 
 
+@compiled
+def _minor(rows, i, j, k):
+    a, b, c = rows[0], rows[1], rows[2]
+    return a[i] * (b[j] * c[k] - b[k] * c[j]) + a[j] * (b[k] * c[i] - b[i] * c[k]) + a[k] * (b[i] * c[j] - b[j] * c[i])
+
+
 @compiled(inline="always", error_model="numpy")
 def _test(boxes, cones, planes, towards, rows, sides):
     """Fill in for each cluster as bits which triangles it may hold: FRONTS, BACKS; none if it is out of view."""
-    s = towards[3]
+    qx, qy, qz, s = towards
     for cluster in range(len(sides)):
         x0, y0, z0 = np.float64(boxes[0, cluster]), np.float64(boxes[1, cluster]), np.float64(boxes[2, cluster])
         x1, y1, z1 = np.float64(boxes[3, cluster]), np.float64(boxes[4, cluster]), np.float64(boxes[5, cluster])
@@ -269,7 +262,7 @@ def _test(boxes, cones, planes, towards, rows, sides):
         noise = NOISE
         for r in range(3):
             noise *= rows[r, 0] * mx + rows[r, 1] * my + rows[r, 2] * mz + rows[r, 3]
-        gx, gy, gz = towards[0] + s * x, towards[1] + s * y, towards[2] + s * z
+        gx, gy, gz = qx + s * x, qy + s * y, qz + s * z
         along = cones[0, cluster] * gx + cones[1, cluster] * gy + cones[2, cluster] * gz
         across = np.sqrt(max(gx * gx + gy * gy + gz * gz - along * along, 0.0))
         cosine, least = cones[3, cluster], cones[4, cluster]

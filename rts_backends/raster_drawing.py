@@ -27,8 +27,8 @@ NUMBERS = 18
 def draw(first, last, listed, vertices, matrix, view_depth, bits, fragments):
     """Fill the three fragment arrays, band by band.
 
-    `listed` is the sign of determinants to draw, whose turn it is among bands, where the items of each begin, these, and
-    what is known of each triangle; `bits` are those of `Blocks` for all cells.
+    `listed` is the sign of determinants to draw, the order of bands, where the items of each begin, these, and what is
+    known of each triangle; `bits` are those of `Blocks` for all cells.
     """
     triangle_ids, barycentrics, depths = fragments
     layers, height, width = triangle_ids.shape
