@@ -202,17 +202,6 @@ class _Seen:
         lists = (self.listed, spans[0], counts[0]), (self.behind, spans[1], counts[1])
         triangles = self.blocks, self.sides, self.faces, self.vertices, self.screen
         given = *triangles, self.matrix, *self.size, self.step, self.keep, blocks.bits
-            self.blocks,
-            self.sides,
-            self.faces,
-            self.vertices,
-            self.screen,
-            self.matrix,
-            *self.size,
-            self.step,
-            self.keep,
-            blocks.bits,
-        )
         parallel(_select, chunks, *given, *lists, work=10 * SIZE * len(self.blocks))
         return _sorted(self.keep, self.order, *lists[0]), _sorted(-self.keep, self.order, *lists[1])
 

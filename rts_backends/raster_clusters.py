@@ -1,8 +1,7 @@
 """Triangles in clusters of what lies together: those out of view, or that all face away, are passed over at once.
 
 They are made of a mesh that stays (`rts.prepare`). Triangles are put in the order of a Morton curve through their
-middles, vertices in the order of their use. Of each cluster a box tells where it is, and a cone which ways its triangles
-face.
+middles, vertices in the order of their use. Of each cluster a box tells where it is, and a cone which ways it faces.
 """
 
 from __future__ import annotations
