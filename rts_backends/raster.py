@@ -91,9 +91,9 @@ class Raster(TriangleSampler):
         cells: np.ndarray,
     ) -> Fragments:
         """See `TriangleSampler.rasterize_cells`: triangles that touch none of these cells are passed over."""
-        with self._seen(prepared, camera, size, facing(camera, cull)) as mesh:
-            blocks = Blocks.of(cells, size)
-            listed, _ = mesh.select(blocks)
+        blocks = Blocks.of(cells, size)
+        with self._seen(prepared, camera, size, facing(camera, cull), asked=blocks) as mesh:
+            listed, _ = mesh.select()
             return mesh.draw_cells(listed, layers, cells, blocks)
 
     def rasterize_exits(
@@ -116,7 +116,13 @@ class Raster(TriangleSampler):
 
     @contextmanager
     def _seen(
-        self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], keep: float, both: bool = False
+        self,
+        prepared: Proxy | Clusters,
+        camera: Camera,
+        size: tuple[int, int],
+        keep: float,
+        both: bool = False,
+        asked: Blocks = EVERYTHING,
     ) -> Iterator[_Seen]:
         """A mesh as a camera sees it, in scratch memory.
 
@@ -131,7 +137,7 @@ class Raster(TriangleSampler):
             memory = scratch[1].pop()
         except IndexError:
             memory = np.empty(key[0], np.int32), *(np.empty((key[1], LISTED), np.int32) for _ in range(2))
-        yield _Seen(prepared, camera, size, keep, both, *memory)
+        yield _Seen(prepared, camera, size, keep, both, asked, *memory)
         scratch[1].append(memory)
 
 
@@ -162,6 +168,7 @@ class _Seen:
         size: (height, width).
         keep: sign of the determinants of triangles to draw, or 0.
         both: whether those that face the other way are asked for, too.
+        asked: the blocks of cells that are asked for.
         screen: (V,) int32, memory for positions on screen.
         listed: (T, LISTED) int32, memory for a list of triangles.
         behind: memory for a list of those that face the other way.
@@ -174,6 +181,7 @@ class _Seen:
         size: tuple[int, int],
         keep: float,
         both: bool,
+        asked: Blocks,
         screen: np.ndarray,
         listed: np.ndarray,
         behind: np.ndarray,
@@ -182,10 +190,10 @@ class _Seen:
         self.vertices, self.faces = read_only(mesh.vertices), read_only(mesh.faces, np.int32).view(np.uint32)
         self.matrix, self.depth_row, self.size, self.keep = pixel_matrix(camera, size), -camera.view[2], size, keep
         self.screen, self.listed, self.behind = screen, listed, behind if both else behind[:0]
-        self.step = (max(size) / 2 + 2) / float(LIMIT)
+        self.asked, self.step = asked, (max(size) / 2 + 2) / float(LIMIT)
         if isinstance(mesh, Clusters):
             self.order = mesh.order
-            self.blocks, self.sides, used = mesh.seen(self.matrix, size, keep, both)
+            self.blocks, self.sides, used = mesh.seen(self.matrix, size, keep, both, asked)
         else:
             self.order = ALL_IN_ORDER
             self.blocks, used = (np.arange(-(-len(x) // SIZE), dtype=np.int32) for x in (self.faces, self.vertices))
@@ -194,14 +202,14 @@ class _Seen:
         to_steps[:2, 3] = -size[1] / 2 / self.step, -size[0] / 2 / self.step
         parallel(_project, len(used), used, self.vertices, to_steps @ self.matrix, screen, work=4 * SIZE * len(used))
 
-    def select(self, blocks: Blocks = EVERYTHING) -> tuple[_List, _List]:
-        """The triangles that may cover cells of some blocks; and those that face the other way, if asked for."""
+    def select(self) -> tuple[_List, _List]:
+        """The triangles that may cover cells that are asked for; and those that face the other way, if these are."""
         chunks, bands = -(-len(self.blocks) // PER_CHUNK), -(-self.size[0] // BAND_ROWS)
         # Threads do not write side by side.
         spans, counts = np.empty((2, chunks, 2), np.int64), np.zeros((2, chunks, bands), np.int64)
         lists = (self.listed, spans[0], counts[0]), (self.behind, spans[1], counts[1])
         triangles = self.blocks, self.sides, self.faces, self.vertices, self.screen
-        given = *triangles, self.matrix, *self.size, self.step, self.keep, blocks.bits
+        given = *triangles, self.matrix, *self.size, self.step, self.keep, self.asked.bits
         parallel(_select, chunks, *given, *lists, work=10 * SIZE * len(self.blocks))
         return _sorted(self.keep, self.order, *lists[0]), _sorted(-self.keep, self.order, *lists[1])
 

@@ -13,6 +13,7 @@ import numpy as np
 from rts.compiling import compiled, kernel
 from rts.records import Proxy
 from rts.threads import parallel, read_only
+from rts_backends.raster_cells import EVERYTHING, SIDE, Blocks
 
 SIZE = 256
 """Triangles of a cluster, and vertices of a block."""
@@ -72,7 +73,9 @@ class Clusters(NamedTuple):
         blocks = blocks[: _find_blocks(faces, np.full(-(-used // SIZE), -1), offsets, blocks)].copy()
         return cls(*map(read_only, (vertices, faces, order, boxes, cones, offsets, blocks)))
 
-    def seen(self, matrix: np.ndarray, size: tuple[int, int], keep: float, both: bool) -> tuple[np.ndarray, ...]:
+    def seen(
+        self, matrix: np.ndarray, size: tuple[int, int], keep: float, both: bool, asked: Blocks = EVERYTHING
+    ) -> tuple[np.ndarray, ...]:
         """What may be in view.
 
         Args:
@@ -80,6 +83,7 @@ class Clusters(NamedTuple):
             size: (height, width).
             keep: sign of the determinants of triangles that are asked for; 0 for all.
             both: whether the others are asked for, too.
+            asked: the blocks of cells that are asked for.
 
         Returns:
             Numbers of clusters (N,) int32, which triangles these may hold (N,) uint8 as bits, and numbers of blocks of
@@ -88,12 +92,18 @@ class Clusters(NamedTuple):
         height, width = size
         # A pixel outside of the image nothing is rounded into it.
         sums = [[1, 0, 0, 1], [-1, 0, 0, width + 1], [0, 1, 0, 1], [0, -1, 0, height + 1], [0, 0, 1, 1], [0, 0, -1, 1]]
-        count, blocks = self.boxes.shape[1], -(-len(self.vertices) // SIZE)
-        kept, sides, used = np.empty(count, np.int32), np.empty(count, np.uint8), np.empty(blocks, np.int32)
+        planes, rows = np.array(sums) @ matrix, matrix[[0, 1, 3]]
+        kept, sides = np.empty(self.boxes.shape[1], np.int32), np.empty(self.boxes.shape[1], np.uint8)
         wanted = FRONTS | BACKS if both or keep == 0 else FRONTS
-        tested = self.boxes, self.cones, np.array(sums) @ matrix, matrix[[0, 1, 3]], keep
-        found = _find(*tested, self.offsets, self.blocks, wanted, kept, sides, used)
-        return kept[: found[0]], sides[: found[0]], used[: found[1]]
+        count = _find(self.boxes, self.cones, planes, rows, keep, wanted, kept, sides)
+        kept, sides = kept[:count], sides[:count]
+        if len(asked.bits):
+            there, near = np.zeros(np.add(asked.table.shape, 1), np.int32), np.empty(count, np.bool_)
+            there[1:, 1:] = (asked.table >= 0).cumsum(axis=0).cumsum(axis=1)
+            parallel(_touch, count, kept, self.boxes, rows, *size, there, near, work=60 * count)
+            kept, sides = kept[near], sides[near]
+        used = np.empty(-(-len(self.vertices) // SIZE), np.int32)
+        return kept, sides, used[: _use(kept, self.offsets, self.blocks, used)]
 
 
 @kernel
@@ -195,8 +205,8 @@ def _same(vertices, i, j):
 
 
 @kernel(error_model="numpy")
-def _find(boxes, cones, planes, rows, keep, offsets, blocks, wanted, kept, sides, used):
-    """Fill in which clusters may hold what is wanted, what these may hold, and which blocks of vertices they use.
+def _find(boxes, cones, planes, rows, keep, wanted, kept, sides):
+    """Fill in which clusters may hold what is wanted, and what these may hold; how many there are.
 
     Args:
         boxes: see `Clusters`.
@@ -204,15 +214,9 @@ def _find(boxes, cones, planes, rows, keep, offsets, blocks, wanted, kept, sides
         planes: (6, 4) half-spaces p · (x, y, z, 1) ≥ 0 that the view lies in.
         rows: (3, 4) to homogeneous pixels (x, y, w).
         keep: sign of the determinants of triangles that are asked for; 0 for all.
-        offsets: see `Clusters`.
-        blocks: see `Clusters`.
         wanted: bits, FRONTS, BACKS.
         kept: (C,) int32.
         sides: (C,) uint8.
-        used: (B,) int32.
-
-    Returns:
-        How many clusters, and how many blocks.
     """
     # A triangle's determinant is n · (q + s a), for its corner a and n = (b − a) × (c − a); q and s are minors.
     q0, q1, q2, s = _minor(rows, 1, 2, 3), _minor(rows, 2, 0, 3), _minor(rows, 0, 1, 3), _minor(rows, 0, 1, 2)
@@ -223,19 +227,7 @@ def _find(boxes, cones, planes, rows, keep, offsets, blocks, wanted, kept, sides
         some = sides[cluster]
         kept[count], sides[count] = cluster, some
         count += (some & wanted) != 0
-    if count == len(kept):
-        for block in range(len(used)):
-            used[block] = block
-        return count, len(used)
-    marks = np.zeros(len(used), np.bool_)
-    for cluster in kept[:count]:
-        for n in range(offsets[cluster], offsets[cluster + 1]):
-            marks[blocks[n]] = True
-    found = 0
-    for block in range(len(used)):
-        used[found] = block
-        found += marks[block]
-    return count, found
+    return count
 
 
 @compiled
@@ -269,3 +261,52 @@ def _test(boxes, cones, planes, towards, rows, sides):
         # Of the normal that is turned away most.
         sure = (abs(along) * cosine - spread) * least > noise
         sides[cluster] = 0 if out else FRONTS | BACKS if not sure else FRONTS if along > 0 else BACKS
+
+
+@kernel(error_model="numpy")
+def _touch(start, stop, kept, boxes, rows, height, width, there, near):
+    """Fill in for some clusters whether they may touch blocks that are asked for; `there` counts these from the first.
+
+    Where a box reaches behind the eye, its cluster may.
+    """
+    corner, side = np.empty(3), np.empty((3, 3))
+    for n in range(start, stop):
+        cluster, least = kept[n], abs(rows[2, 3])
+        corner[:] = rows[:, 3]
+        for c in range(3):
+            low, high = np.float64(boxes[c, cluster]), np.float64(boxes[3 + c, cluster])
+            least += abs(rows[2, c]) * max(-low, high)
+            for r in range(3):
+                corner[r] += rows[r, c] * low
+                side[r, c] = rows[r, c] * (high - low)
+        x0, x1, y0, y1, ahead = np.inf, -np.inf, np.inf, -np.inf, True
+        for k in range(8):
+            u, v, t = k & 1, k >> 1 & 1, k >> 2
+            x = corner[0] + u * side[0, 0] + v * side[0, 1] + t * side[0, 2]
+            y = corner[1] + u * side[1, 0] + v * side[1, 1] + t * side[1, 2]
+            w = corner[2] + u * side[2, 0] + v * side[2, 1] + t * side[2, 2]
+            ahead &= w > AROUND * least
+            x0, x1, y0, y1 = min(x0, x / w), max(x1, x / w), min(y0, y / w), max(y1, y / w)
+        near[n] = True
+        if ahead:
+            # A pixel more all around, since positions are rounded; what is out of view is known.
+            left, right = int(max(x0 - 1, 0.0)) // SIDE, int(min(x1 + 1, width - 1.0)) // SIDE + 1
+            top, bottom = int(max(y0 - 1, 0.0)) // SIDE, int(min(y1 + 1, height - 1.0)) // SIDE + 1
+            if left < right and top < bottom:
+                near[n] = there[bottom, right] - there[top, right] - there[bottom, left] + there[top, left] > 0
+
+
+@kernel
+def _use(kept, offsets, blocks, used):
+    """Fill in which blocks of vertices some clusters use; how many there are."""
+    every = len(kept) == len(offsets) - 1
+    marks = np.full(len(used), every)
+    if not every:
+        for cluster in kept:
+            for n in range(offsets[cluster], offsets[cluster + 1]):
+                marks[blocks[n]] = True
+    found = 0
+    for block in range(len(used)):
+        used[found] = block
+        found += marks[block]
+    return found

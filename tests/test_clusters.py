@@ -17,6 +17,7 @@ pytest.importorskip("numba")
 
 from rts_backends import raster  # noqa: E402
 from rts_backends.raster import Raster  # noqa: E402
+from rts_backends.raster_cells import Blocks  # noqa: E402
 from rts_backends.raster_clusters import BACKS, FRONTS, Clusters  # noqa: E402
 from rts_backends.triangles import facing, pixel_matrix  # noqa: E402
 
@@ -166,6 +167,27 @@ def test_fragments_of_clusters_are_those_of_the_triangles(kind):
         (fronts, _, backs), expected = sampler.rasterize_exits(made, *view), sampler.rasterize_exits(proxy, *view)
         assert_same((*fronts, *backs), (*expected[0], *expected[2]))
     assert refused > 100
+
+
+def test_clusters_that_touch_no_cells_that_are_asked_for_are_refused():
+    vertices, faces = icosphere(6)
+    proxy, size, sampler = Proxy(vertices.astype(np.float32), faces.astype(np.int32)), (150, 200), Raster()
+    made, rng = Clusters.of(proxy), np.random.default_rng(3)
+    # A pixel is 1 / 50, and its middle that of the ball.
+    plain = Camera.orthographic((0, 0, 9), (0, 0, 0), height=3.0, aspect=200 / 150, near=1, far=20)
+    low, high = (100 + 50 * made.boxes[0], 75 - 50 * made.boxes[4]), (100 + 50 * made.boxes[3], 75 - 50 * made.boxes[1])
+    for n, camera in enumerate([plain] * 6 + [*CAMERAS.values(), *looks()]):
+        y, x = rng.integers(20, 120), rng.integers(50, 150)
+        cells = (np.arange(y, y + 7)[:, None] * size[1] + np.arange(x, x + 9 - n % 9)).astype(np.int32)
+        view = camera, size, 2, ("none", "back")[n % 2], cells
+        assert_same(sampler.rasterize_cells(made, *view), sampler.rasterize_cells(proxy, *view))
+        if camera is plain:
+            found, _, _ = made.seen(pixel_matrix(camera, size), size, 0.0, False, Blocks.of(cells, size))
+            left, right, top, bottom = x, x + 9 - n % 9, y, y + 7
+            touches = (low[0] < right) & (high[0] > left) & (low[1] < bottom) & (high[1] > top)
+            off = (low[0] > right + 17) | (high[0] < left - 17) | (low[1] > bottom + 17) | (high[1] < top - 17)
+            assert np.isin(np.flatnonzero(touches), found).all() and touches.any()
+            assert not np.isin(np.flatnonzero(off), found).any() and off.any()
 
 
 def test_soups_of_all_kinds_are_drawn_as_ever():
