@@ -9,11 +9,13 @@ shortens compilation by a fifth. What is not on disk is compiled here and, meanw
 from __future__ import annotations
 
 import gc
+import os
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FunctionType
 from typing import Any, NamedTuple, cast
 
 import numba
@@ -22,6 +24,11 @@ from numba.core.caching import FunctionCache
 from numba.core.dispatcher import Dispatcher
 
 from rts import companion
+
+try:
+    import fcntl
+except ImportError:  # Windows.
+    fcntl = None
 
 TOLD_AFTER = 1.0
 """Seconds of compilation after which a terminal is told of it."""
@@ -55,6 +62,29 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
     return decorate if function is None else decorate(function)
 
 
+@contextmanager
+def alone(folder: str) -> Iterator[None]:
+    """Hold a folder of kernels as the only process, where the system and the file system know such locks.
+
+    numba reads a function's index, chooses a name for the code, and writes both. Two processes that do so at once,
+    for different types, may choose the same name: one type's calls would then run the other's code.
+    """
+    if fcntl is None:
+        yield
+        return
+    file = None
+    try:
+        file = open(os.path.join(folder, ".lock"), "ab")  # noqa: SIM115  # It is closed below.
+        fcntl.flock(file, fcntl.LOCK_EX)
+    except OSError:
+        pass
+    try:
+        yield
+    finally:
+        if file is not None:
+            file.close()
+
+
 class _Cache(FunctionCache):
     """A kernel's compiled code on disk, which another process may be about to write."""
 
@@ -69,7 +99,7 @@ class _Cache(FunctionCache):
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Write what has been compiled."""
-        with saving:
+        with saving, alone(self.cache_path):
             super().save_overload(sig, data)
         companion.end(_key(self._py_func, sig))
 
@@ -136,7 +166,7 @@ def _exchange(others: dict[Any, Any]) -> None:
     """Put others in place of globals of our modules."""
     for module in _modules():
         for name, value in list(vars(module).items()):
-            if callable(value) and value.__hash__ is not None and value in others:
+            if isinstance(value, (Dispatcher, FunctionType)) and value in others:
                 setattr(module, name, others[value])
 
 

@@ -7,6 +7,8 @@ by two threads at once.
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import itertools
 import os
 import sys
@@ -17,11 +19,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from rts import memory
+
 TASKS_PER_THREAD = 4
 """Several tasks for each thread, so that one that gets the heavy rows does not keep the others waiting."""
 
 LITTLE_WORK = 100_000
 """Nanoseconds, below which a loop stays on the thread that asks for it: to ask another takes tens of thousands."""
+
+memory.keep_freed()
 
 _In = TypeVar("_In")
 _Out = TypeVar("_Out")
@@ -71,6 +77,8 @@ class _Helpers:
 
     def __init__(self) -> None:
         self.count = 0
+        self._threads: list[int] = []
+        self._cores: set[int] = set()
         self._jobs: SimpleQueue[_Job] = SimpleQueue()
         self._under_way: set[_Job] = set()
         self._lock = threading.Lock()
@@ -79,17 +87,38 @@ class _Helpers:
         """How many of so many helpers have nothing to do, or are not there yet."""
         return max(0, count - len(self._under_way))
 
-    def ask(self, job: _Job, count: int) -> None:
-        """Hand a job to one of so many helpers."""
+    def ask(self, job: _Job, count: int, apart: bool) -> None:
+        """Hand a job to one of so many helpers, which run apart from the thread that asks, or on any core."""
         if self.count < count:
             with self._lock:
                 while self.count < count:
+                    thread = threading.Thread(target=self._serve, name="rts", daemon=True)
                     try:
-                        threading.Thread(target=self._serve, name="rts", daemon=True).start()
+                        thread.start()
                     except RuntimeError:  # The system gives no more: those that there are, or the caller, do the work.
                         break
                     self.count += 1
+                    self._threads.append(thread.native_id or 0)
+                    self._cores = set()
+        self._place(apart)
         self._jobs.put(job)
+
+    def _place(self, apart: bool) -> None:
+        """Say on which cores helpers may run.
+
+        Linux wakes a thread on the core of the one that wakes it, though others are idle, more often than not where
+        there are two: it would wait there until the loop is over.
+        """
+        if _core is None or self._under_way:
+            return
+        cores = os.sched_getaffinity(0)
+        if apart and len(cores) > 1:
+            cores.discard(_core())
+        if cores != self._cores:
+            self._cores = cores
+            for thread in self._threads:
+                with contextlib.suppress(OSError):  # Where that may not be said, they run anywhere.
+                    os.sched_setaffinity(thread, cores)
 
     def _serve(self) -> None:
         while True:
@@ -99,6 +128,13 @@ class _Helpers:
             del job  # A thread that waits must not keep arrays alive.
 
 
+def _core_of_caller() -> Callable[[], int] | None:
+    """A function that tells on which core it is called; None where the system does not tell."""
+    found = getattr(ctypes.PyDLL(None), "sched_getcpu", None) if sys.platform == "linux" else None
+    return found
+
+
+_core = _core_of_caller()
 _helpers = _Helpers()
 
 
@@ -127,7 +163,7 @@ def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
     return view
 
 
-def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) -> None:
+def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK, apart: bool = True) -> None:
     """Call `kernel(start, stop, *args)` so that the ranges cover [0, count); the kernel must release the lock.
 
     Args:
@@ -135,6 +171,8 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
         count: the end of the range.
         *args: handed on.
         work: nanoseconds that it takes on one thread, roughly.
+        apart: whether helpers are to keep off the caller's core. What they call must not start threads then, which
+            would have to keep off as well.
     """
     # In a task of another loop there may be no helper left, and to ask takes time.
     if work < LITTLE_WORK or count <= 1 or (threads := thread_count()) == 1 or not (free := _helpers.free(threads - 1)):
@@ -158,7 +196,7 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK) 
     try:
         for _ in range(free):
             jobs.append(_Job(share))
-            _helpers.ask(jobs[-1], threads - 1)
+            _helpers.ask(jobs[-1], threads - 1, apart)
         share()
     finally:
         # Whatever happens, none is to be left that writes to arrays which the caller may give away.
@@ -194,7 +232,7 @@ def each(f: Callable[[_In], _Out], items: Sequence[_In]) -> list[_Out]:
                 errors[i] = error
                 first = min(first, i)
 
-    parallel(some, len(items))
+    parallel(some, len(items), apart=False)
     if errors:
         raise errors[min(errors)]
     return found

@@ -2,6 +2,7 @@
 
 import gc
 import io
+import os
 import subprocess
 import sys
 
@@ -111,3 +112,37 @@ def test_warmup_has_as_many_processes_share_the_work_and_says_what_failed(monkey
 def test_a_wrong_number_of_processes_is_refused(processes):
     with pytest.raises(rts.InputError, match="processes is .*; expected a positive integer, or None"):
         rts.warmup(processes)
+
+
+SAVING = """
+import sys
+sys.path.insert(0, {folder!r})
+import numpy as np
+from several import double
+print("called", flush=True)
+double(np.zeros(3, np.{kind}))
+"""
+
+
+@pytest.mark.skipif(compiling.fcntl is None, reason="the system has no such locks")
+def test_kernels_are_written_by_one_process_at_a_time(tmp_path):
+    (tmp_path / "several.py").write_text("from rts.compiling import kernel\n\n\n@kernel\ndef double(x):\n    x *= 2\n")
+    kept = tmp_path / "__pycache__"
+    kept.mkdir()
+
+    def started(kind):
+        code = SAVING.format(folder=str(tmp_path), kind=kind)
+        variables = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | {"RTS_COMPILE_AHEAD": "0"}
+        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=variables)
+        assert process.stdout is not None and process.stdout.readline() == "called\n"
+        return process
+
+    with compiling.alone(str(kept)):
+        processes = [started(kind) for kind in ("float32", "int64")]
+        with pytest.raises(subprocess.TimeoutExpired):
+            processes[0].wait(3)  # To compile this takes a tenth of a second.
+        assert not list(kept.glob("several.double*"))
+    for process in processes:
+        process.communicate(timeout=60)
+    assert [process.returncode for process in processes] == [0, 0]
+    assert len(list(kept.glob("several.double*.nbc"))) == 2 and len(list(kept.glob("several.double*.nbi"))) == 1

@@ -3,6 +3,7 @@
 import gc
 import multiprocessing
 import os
+import platform
 import subprocess
 import sys
 import threading
@@ -147,6 +148,76 @@ def test_threads_that_start_together_share_few_helpers(monkeypatch, helpers):
         thread.join(60)
     assert helpers.count == 2
     assert sum(done) == 8 * 20 * 9
+
+
+def cores_of_helper(monkeypatch, run):
+    """The core of the caller of `run`, given a function of a range, and the cores on which its helper may run."""
+    from rts import threads
+
+    monkeypatch.setenv("RTS_NUM_THREADS", "2")
+    caller, both, seen = threading.get_ident(), threading.Barrier(2), {}
+
+    def kernel(start, stop):
+        if start in (0, 1):  # Each of the two threads has one of these.
+            both.wait(30)
+            seen[threading.get_ident() == caller] = os.sched_getaffinity(0)
+
+    core = threads._core
+    assert core is not None
+    asked = core()
+    run(kernel)
+    assert len(seen) == 2 and seen[True] == os.sched_getaffinity(0)
+    return asked, core(), seen[False]
+
+
+needs_cores = pytest.mark.skipif(
+    sys.platform != "linux" or len(os.sched_getaffinity(0)) < 2, reason="needs Linux and two cores"
+)
+
+
+@needs_cores
+def test_helpers_keep_off_the_core_of_the_thread_that_asks(monkeypatch, helpers):
+    from rts import threads
+
+    found = [cores_of_helper(monkeypatch, lambda kernel: threads.parallel(kernel, 9)) for _ in range(20)]
+    stayed = [(before, allowed) for before, after, allowed in found if before == after]  # The system may move it.
+    assert stayed and all(allowed == os.sched_getaffinity(0) - {before} for before, allowed in stayed)
+
+
+@needs_cores
+def test_helpers_that_call_any_function_run_on_all_cores(monkeypatch, helpers):
+    from rts import threads
+
+    threads.parallel(lambda start, stop: time.sleep(0.001), 9)
+    _, _, allowed = cores_of_helper(
+        monkeypatch, lambda kernel: threads.each(lambda i: kernel(i, i + 1), list(range(9)))
+    )
+    assert allowed == os.sched_getaffinity(0)
+
+
+ALLOCATING = """
+import resource
+import numpy as np
+if {keeping}:
+    import rts
+def iterate():
+    arrays = [np.ones(2 << 17) for _ in range(12)]
+for _ in range(5):
+    iterate()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for _ in range(10):
+    iterate()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="about glibc")
+def test_arrays_that_are_freed_and_made_again_take_no_new_pages():
+    def faults(keeping):
+        command = [sys.executable, "-c", ALLOCATING.format(keeping=keeping)]
+        return int(subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout)
+
+    assert faults(True) < 1000 < faults(False)
 
 
 def test_an_error_in_a_helper_reaches_the_caller_and_the_helper_lives_on(monkeypatch, helpers):
