@@ -58,10 +58,8 @@ class Clusters(NamedTuple):
         vertices, faces = read_only(proxy.vertices, np.float32), read_only(proxy.faces, np.int32)
         count, clusters = len(faces), -(-len(faces) // SIZE)
         keys = np.empty(count, np.uint64)
-        used = vertices[np.isfinite(vertices).all(axis=1)].astype(np.float64)
-        low, high = (used.min(axis=0), used.max(axis=0)) if len(used) else (np.zeros(3), np.zeros(3))
-        scale = STEPS / max((high - low).max(), 1e-30)
-        parallel(_keys, count, vertices, faces, low, scale, keys, work=10 * count)
+        low, extent = _extent(vertices)
+        parallel(_keys, count, vertices, faces, low, STEPS / extent, keys, work=10 * count)
         keys.sort()
         order = (keys & np.uint64(2**32 - 1)).astype(np.int32)
         made = np.empty((len(vertices), 3), np.float32), np.empty((count, 3), np.int32)
@@ -104,6 +102,18 @@ class Clusters(NamedTuple):
             kept, sides = kept[near], sides[near]
         used = np.empty(-(-len(self.vertices) // SIZE), np.int32)
         return kept, sides, used[: _use(kept, self.offsets, self.blocks, used)]
+
+
+@kernel
+def _extent(vertices):
+    """The least x, y and z (3,) of vertices, and how far these reach at most; without what is not finite."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for v in range(len(vertices)):
+        for r in range(3):
+            x = np.float64(vertices[v, r])
+            if np.isfinite(x):
+                low[r], high[r] = min(low[r], x), max(high[r], x)
+    return low, max((high - low).max(), 1e-30)
 
 
 @kernel
