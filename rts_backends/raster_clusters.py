@@ -1,7 +1,8 @@
 """Triangles in clusters of what lies together: those out of view, or that all face away, are passed over at once.
 
 They are made of a mesh that stays (`rts.prepare`). Triangles are put in the order of a Morton curve through their
-middles, vertices in the order of their use. Of each cluster a box tells where it is, and a cone which ways it faces.
+middles, those that face other ways apart, and vertices in the order of their use. Of each cluster a box tells where it
+is, and a cone which ways it faces.
 """
 
 from __future__ import annotations
@@ -28,6 +29,10 @@ NOISE = 1e-13
 """How far off the determinant of three corners may be, of the product of the largest numbers in it."""
 
 STEPS = np.float64(2**10 - 1)
+"""The largest place on an axis."""
+
+COARSE = 2
+"""Bits of a place on an axis that come before which eighth of all ways a triangle faces, the others after it."""
 
 
 class Clusters(NamedTuple):
@@ -61,7 +66,7 @@ class Clusters(NamedTuple):
         low, extent = _extent(vertices)
         parallel(_keys, count, vertices, faces, low, STEPS / extent, keys, work=10 * count)
         keys.sort()
-        order = (keys & np.uint64(2**32 - 1)).astype(np.int32)
+        order = (keys & np.uint64(2**31 - 1)).astype(np.int32)
         made = np.empty((len(vertices), 3), np.float32), np.empty((count, 3), np.int32)
         used = _renumber(vertices, faces, order, *made)
         vertices, faces = made[0][:used].copy(), made[1]
@@ -118,7 +123,7 @@ def _extent(vertices):
 
 @kernel
 def _keys(start, stop, vertices, faces, low, scale, keys):
-    """Fill in places on the curve in the upper 32 bits, and below the indices: what sorts alike on every machine."""
+    """Fill in 33 bits of where triangles are to be, and below the indices: what sorts alike on every machine."""
     for t in range(start, stop):
         key = np.uint64(0)
         for r in range(3):
@@ -130,7 +135,11 @@ def _keys(start, stop, vertices, faces, low, scale, keys):
             bits = (bits | bits << np.uint64(4)) & np.uint64(0x030C30C3)
             bits = (bits | bits << np.uint64(2)) & np.uint64(0x09249249)
             key |= bits << np.uint64(r)
-        keys[t] = key << np.uint64(32) | np.uint64(t)
+        eighth, fine = np.uint64(0), np.uint64(30 - 3 * COARSE)
+        for r in range(3):
+            eighth |= np.uint64(_normal(vertices, faces[t, 0], faces[t, 1], faces[t, 2], r) > 0) << np.uint64(r)
+        key = ((key >> fine) << np.uint64(3) | eighth) << fine | key & ((np.uint64(1) << fine) - np.uint64(1))
+        keys[t] = key << np.uint64(31) | np.uint64(t)
 
 
 @kernel
@@ -187,11 +196,7 @@ def _bound(start, stop, vertices, faces, boxes, cones):
                 continue  # One of its edge functions is 0 everywhere: it covers nothing.
             normal = normals[count]
             for r in range(3):
-                p, q = (r + 1) % 3, (r + 2) % 3
-                ap, aq = np.float64(vertices[i, p]), np.float64(vertices[i, q])
-                normal[r] = (vertices[j, p] - ap) * (vertices[k, q] - aq) - (vertices[j, q] - aq) * (
-                    vertices[k, p] - ap
-                )
+                normal[r] = _normal(vertices, i, j, k, r)
             length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
             least = min(least, length)
             for r in range(3):
@@ -207,6 +212,14 @@ def _bound(start, stop, vertices, faces, boxes, cones):
         if not known:
             boxes[:3, cluster], boxes[3:, cluster] = -np.inf, np.inf
         cones[:3, cluster], cones[3, cluster], cones[4, cluster] = axis, cosine, least
+
+
+@compiled
+def _normal(vertices, i, j, k, r):
+    """A number of (b − a) × (c − a) of corners a, b, c."""
+    p, q = (r + 1) % 3, (r + 2) % 3
+    x, y = np.float64(vertices[i, p]), np.float64(vertices[i, q])
+    return (vertices[j, p] - x) * (vertices[k, q] - y) - (vertices[j, q] - y) * (vertices[k, p] - x)
 
 
 @compiled
