@@ -23,7 +23,7 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
         uv: (N, 2), u to the right and v up; (0, 0) is the lower left corner of the image.
         wrap: "repeat", "mirror" or "clamp" outside [0, 1].
         footprint: (N, 4), ∂u/∂x, ∂v/∂x, ∂u/∂y, ∂v/∂y for one step from sample to sample: the texture is averaged over
-            about as much, by `pyramid` and `level_of`. What is taken for it has no derivative. None for no average.
+            about as much, by `mip_levels` and `level_of`. What is taken for it has no derivative. None for no average.
 
     Returns:
         (N, C).
@@ -39,7 +39,7 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
     height, width, channels = shape
     if footprint is None:
         return _bilinear(xp.reshape(texture, (height * width, channels)), uv, wrap, height, width)
-    levels, engine = pyramid(texture), engine_of(texture, uv)
+    levels, engine = mip_levels(texture), engine_of(texture, uv)
     table = xp.concat([xp.reshape(x, (-1, channels)) for x in levels])
     sizes = np.array([x.shape[:2] for x in levels])
     first = engine.constant(np.cumsum(sizes.prod(axis=1)) - sizes.prod(axis=1))
@@ -55,7 +55,7 @@ def sample_texture(texture: Array, uv: Array, wrap: str = "repeat", footprint: A
     return below + share * (at(xp.clip(lower + 1, 0, len(levels) - 1)) - below)
 
 
-def pyramid(texture: Array) -> list[Array]:
+def mip_levels(texture: Array) -> list[Array]:
     """The texture (h, w, C) and its averages, each of half the height and width of the one before, to a single texel.
 
     An odd number of lines n is halved to (n − 1) / 2, of which each averages n / ((n − 1) / 2) lines by the shares that

@@ -22,7 +22,7 @@ from rts import Camera, GBuffer
 from rts.errors import InputError
 from rts.footprints import uv_footprint
 from rts.shading import Textured
-from rts.textures import level_of, pyramid, sample_texture
+from rts.textures import level_of, mip_levels, sample_texture
 
 pytestmark = pytest.mark.rendering
 
@@ -60,7 +60,7 @@ def floor(texture, repeats, **options):
 )
 def test_each_level_averages_equal_areas_of_the_one_before(target, size):
     texture = RNG.random((*size, 3))
-    levels = [to_numpy(x) for x in pyramid(arrays(target, texture))]
+    levels = [to_numpy(x) for x in mip_levels(arrays(target, texture))]
     assert [x.shape[:2] for x in levels][-1] == (1, 1)
     np.testing.assert_allclose(levels[0], texture, atol=1e-6)
     for above, below in zip(levels, levels[1:], strict=False):
@@ -84,7 +84,7 @@ def test_lookup_is_linear_between_levels(target):
     for level in (0, 0.25, 1, 1.75, 2, 7):
         footprint = np.tile([2**level / 5, 0, 0, 0], (20, 1))
         finer, share = (min(int(level), 1), min(level, 2) - min(int(level), 1))
-        a, b = (sample_texture(x, uv) for x in pyramid(texture)[finer : finer + 2])
+        a, b = (sample_texture(x, uv) for x in mip_levels(texture)[finer : finer + 2])
         given = arrays(target, (texture, uv, footprint))
         found = to_numpy(sample_texture(given[0], given[1], "repeat", given[2]))
         np.testing.assert_allclose(found, a + share * (b - a), atol=2e-5)
@@ -95,7 +95,7 @@ def test_wrap_modes_hold_in_every_level(wrap):
     texture, uv, coarse = RNG.random((8, 8, 3)), RNG.uniform(-2, 3, (50, 2)), np.full((50, 4), 1 / 4)
     coarse[:, 1:] = 0  # Level 1.
     np.testing.assert_allclose(
-        sample_texture(texture, uv, wrap, coarse), sample_texture(pyramid(texture)[1], uv, wrap), atol=1e-12
+        sample_texture(texture, uv, wrap, coarse), sample_texture(mip_levels(texture)[1], uv, wrap), atol=1e-12
     )
 
 

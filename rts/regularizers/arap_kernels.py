@@ -7,6 +7,7 @@ import math
 import numba
 import numpy as np
 
+from rts.compiling import kernel
 from rts.threads import parallel, read_only
 
 SWEEPS = 12
@@ -29,7 +30,7 @@ def turned(spokes: np.ndarray, rest: np.ndarray, starts: np.ndarray) -> np.ndarr
     return out
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _turn(start, stop, spokes, rest, starts, out):
     columns, axes, rotation = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(start, stop):

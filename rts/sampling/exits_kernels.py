@@ -5,46 +5,53 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
-from rts.sampling.windows_kernels import add, spread
+from rts.sampling.windows_kernels import add, unite
 
 
 @kernel
 def find(kept, cells):
     """Fill `cells` (H · W,) with the places that `exits.beside_outlines` returns; how many there are."""
     layers, height, width = kept.shape
-    # Of three rows each, and one more cell at each side: what ends fronts, and fronts beside that.
-    ends, near = np.zeros((3, width + 2), np.uint8), np.zeros((3, width + 2), np.uint8)
-    wide, count = np.empty(width, np.uint8), 0
-    for y in range(height + 2):
-        level = ends[y % 3]
-        level[:] = 0
-        if y < height:
-            _add_empty(level[1:-1], kept[0, y])
-            for k in range(1, layers):
-                add(level[1:-1], kept[k, y])
-        beside = near[(y + 2) % 3]
-        beside[:] = 0
-        if 0 < y <= height:
-            _beside(beside[1:-1], ends[(y + 1) % 3], ends[(y + 2) % 3], level, kept[0, y - 1])
-        if y > 1 and _beside(wide, near[y % 3], near[(y + 1) % 3], beside, kept[0, y - 2]):
+    # With one more cell at each side, the cells of all rows follow on each other: loops over all are quick.
+    pitch = width + 2
+    size = (height + 2) * pitch
+    fronts, marks, wide = np.zeros(size, np.uint8), np.zeros(size, np.uint8), np.zeros(size, np.uint8)
+    for y in range(height):
+        first = (y + 1) * pitch + 1
+        _load(fronts[first : first + width], marks[first : first + width], kept[0, y])
+        for k in range(1, layers):
+            add(marks[first : first + width], kept[k, y])
+    for _ in range(2):  # Fronts beside what ends them, and fronts beside those.
+        unite(wide[1:-1], marks, marks[1:], marks[2:])
+        _beside(marks[pitch:-pitch], wide, wide[pitch:], wide[2 * pitch :], fronts[pitch:])
+    count = 0
+    for y in range(height):
+        first = (y + 1) * pitch + 1
+        row = marks[first : first + width]
+        if _any(row):
             for x in range(width):
-                cells[count] = (y - 2) * width + x
-                count += wide[x]
+                if row[x]:
+                    cells[count] = y * width + x
+                    count += 1
     return count
 
 
 @compiled
-def _add_empty(level, covered):
+def _load(fronts, ends, covered):
     for x in range(len(covered)):
-        level[x] |= np.uint8(not covered[x])
+        fronts[x] = np.uint8(covered[x])
+        ends[x] = np.uint8(1) - np.uint8(covered[x])
 
 
 @compiled
-def _beside(found, above, level, below, where):
-    """Mark the cells of a row that have a mark in their 3 × 3 window, among those that count; whether there is any."""
-    spread(found, above, level, below)
+def _beside(to, above, level, below, fronts):
+    for x in range(len(to)):
+        to[x] = (above[x] | level[x] | below[x]) & fronts[x]
+
+
+@compiled
+def _any(marks):
     some = np.uint8(0)
-    for x in range(len(found)):
-        found[x] &= np.uint8(where[x])
-        some |= found[x]
+    for x in range(len(marks)):
+        some |= marks[x]
     return some != 0

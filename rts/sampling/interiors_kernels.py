@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
-from rts.sampling.windows_kernels import add
+from rts.sampling.windows_kernels import add, unite
 from rts.threads import parallel
 
 LONG = 2
@@ -67,8 +67,8 @@ def _settle(start, stop, covered, depth, kept, wanted, reach, found, near, extre
             for k in range(1, layers):
                 add(loose[r, middle], kept[k, y])
     for r in range(rows - 2):
-        _unite(column, loose[r], loose[r + 1], loose[r + 2])
-        _unite(nine, column, column[1:], column[2:])
+        unite(column, loose[r], loose[r + 1], loose[r + 2])
+        unite(nine, column, column[1:], column[2:])
         y = start - around + r + 1
         if start <= y < stop:
             _reverse(found[y], nine[around - 1 :])
@@ -79,7 +79,7 @@ def _settle(start, stop, covered, depth, kept, wanted, reach, found, near, extre
             else:
                 nine[:] = 0
         # What is wider is united of threes, unless some of these do not count.
-        _unite(wide[r], nine, nine[min(step, far) :], nine[far:])
+        unite(wide[r], nine, nine[min(step, far) :], nine[far:])
         for v in range(2 * step, far, step):
             _join(wide[r], nine[v:])
     for y in range(start, stop):
@@ -119,12 +119,6 @@ def _join(to, cells):
 def _reverse(to, cells):
     for x in range(len(to)):
         to[x] = cells[x] == 0
-
-
-@compiled
-def _unite(to, a, b, c):
-    for x in range(len(to)):
-        to[x] = a[x] | b[x] | c[x]
 
 
 @compiled

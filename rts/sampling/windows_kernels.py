@@ -23,3 +23,10 @@ def spread(found, above, level, below):
     for x in range(len(found)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
         found[x] = around | below[x] | below[x + 1] | below[x + 2]
+
+
+@compiled
+def unite(found, a, b, c):
+    """Fill uint8 with what is marked in any of three; each may be longer."""
+    for x in range(len(found)):
+        found[x] = a[x] | b[x] | c[x]

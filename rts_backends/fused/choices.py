@@ -68,9 +68,8 @@ def find(start, stop, positions, row, visible, beyond, hidden, states, mixed, co
                     d = z[y % 3, k, x + 1]
                     target[k, x] = d if d == d else beyond
             for k in range(1, layers):
-                for n in range(9):
-                    source = z[(y + 2 + n // 3) % 3]
-                    _mark(marks, source[0, n % 3 :], source[k, n % 3 :], target[0], target[k])
+                above, level, below = z[(y + 2) % 3], z[y % 3], z[(y + 1) % 3]
+                _mark(marks, above[0], level[0], below[0], above[k], level[k], below[k], target[0], target[k])
             if visible:
                 for x in range(left, right):
                     if row[0, y, x] < 0:
@@ -103,13 +102,27 @@ def _any(states):
     return most == BUSY
 
 
+# Rows are handed over once, not for each source: to make views of so few cells takes as long as the work.
+
+
 @compiled
-def _mark(marks, front, hidden, target_front, target_hidden):
-    """Mark targets where a hidden layer pairs nearer than the two fronts; comparisons with NaN are false."""
+def _mark(marks, front0, front1, front2, hidden0, hidden1, hidden2, target_front, target_hidden):
+    """Mark targets where a hidden layer pairs nearer than the two fronts; rows begin a cell to the left of theirs."""
     for x in range(len(marks)):
-        d = abs(front[x] - target_front[x])
-        nearer = (abs(hidden[x] - target_front[x]) < d) | (abs(target_hidden[x] - front[x]) < d)
-        marks[x] |= np.uint8(nearer)
+        t, q = target_front[x], target_hidden[x]
+        some = _nearer(front0, hidden0, x, t, q) | _nearer(front1, hidden1, x, t, q) | _nearer(front2, hidden2, x, t, q)
+        marks[x] |= np.uint8(some)
+
+
+@compiled
+def _nearer(front, hidden, x, target_front, target_hidden):
+    """`_mark` for three sources; comparisons with NaN are false."""
+    some = False
+    for u in range(3):
+        f, h = front[x + u], hidden[x + u]
+        d = abs(f - target_front)
+        some |= (abs(h - target_front) < d) | (abs(target_hidden - f) < d)
+    return some
 
 
 @kernel
