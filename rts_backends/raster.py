@@ -1,8 +1,9 @@
 """Rasterizer for the CPU: K nearest triangles a pixel in one pass, on all cores (numba).
 
 Most triangles of a large mesh cover no pixel's centre. A first pass sees only their corners on screen, rounded, and
-lists those that may cover one. The second draws the image in bands of rows, each by one thread and in the order of the
-triangles, so the result does not depend on the number of threads. For blocks of listed triangles it works out, in
+lists those that may cover one; of a mesh that stays it passes over whole clusters (`rts_backends.raster_clusters`). The
+second draws the image in bands of rows, each by one thread. The result depends neither on the number of threads nor on
+the order of the list. For blocks of listed triangles it works out, in
 float64 and homogeneous coordinates, the numbers of `rts_backends.triangles`, finds the pixels that they may cover, and
 inserts these into the layers.
 
@@ -43,9 +44,10 @@ Positions on screen take 16 bits, so that those of a million triangles stay in c
 SIXTEEN, LOWER = np.int32(16), np.int32(2**16 - 1)
 
 MANY = 1 << 16
-"""Triangles from which on they are put in clusters."""
+"""Triangles from which on they are put in clusters; fewer gain nothing."""
 
 ALL_IN_ORDER = read_only(np.empty(0, np.int32))
+"""What stands for an order of triangles that is that of their indices."""
 
 BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 """In place of a position: before the near plane (or NaN), beyond the far plane."""
@@ -71,7 +73,8 @@ class Raster(TriangleSampler):
     def arrange(self, prepared: Any) -> Any:
         """See `TriangleSampler.arrange`: triangles in clusters, if there are many."""
         many = isinstance(prepared, Proxy) and len(prepared.faces) >= MANY
-        return Clusters.of(prepared) if many and self._draws else prepared
+        draws = self._draws and type(self).rasterize_exits == Raster.rasterize_exits
+        return Clusters.of(prepared) if many and draws else prepared
 
     def rasterize(
         self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, cull: str
@@ -148,7 +151,7 @@ class _List(NamedTuple):
         keep: sign of the determinants of those to draw, or 0.
         turns: (bands,), bands of rows, those with most items first: so threads end together.
         offsets: (bands + 1,), where the items of each band begin.
-        items: uint32, places in `rows`, in the order of the triangles.
+        items: uint32, places in `rows`, in the order in which triangles were looked at.
         rows: (T, LISTED) int32, what is known of a triangle.
     """
 

@@ -93,7 +93,7 @@ class Clusters(NamedTuple):
             vertices, int32.
         """
         height, width = size
-        # A pixel outside of the image nothing is rounded into it.
+        # Positions a pixel outside of the image are not rounded into it.
         sums = [[1, 0, 0, 1], [-1, 0, 0, width + 1], [0, 1, 0, 1], [0, -1, 0, height + 1], [0, 0, 1, 1], [0, 0, -1, 1]]
         planes, rows = np.array(sums) @ matrix, matrix[[0, 1, 3]]
         kept, sides = np.empty(self.boxes.shape[1], np.int32), np.empty(self.boxes.shape[1], np.uint8)
