@@ -126,6 +126,25 @@ class Engine(Plugin):
         """
         return x
 
+    def by_rows_in_use(
+        self, f: Callable[[dict[str, Array]], Array], rows: Mapping[str, Array], row: Array, whole: Array
+    ) -> Array:
+        """The value `whole` of `f(rows)`, a function that treats each row by itself.
+
+        The default returns `whole`. An engine whose compiled programs allot more rows than are used may return, in its
+        place, what takes no time for most of the others; it calls `f` with fewer rows, then.
+
+        Args:
+            f: packed arrays (n, ·) by name → (n, ·).
+            rows: packed arrays (N, ·).
+            row: (K, H, W) integers, the rows that are in use: those up to the largest.
+            whole: `f(rows)`, (N, ·).
+
+        Returns:
+            (N, ·), which may be anything in rows that are not in use.
+        """
+        return whole
+
     def block(self, x: Tree) -> Tree:
         """Wait until the arrays are computed, and return them."""
         return x

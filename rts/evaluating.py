@@ -18,7 +18,7 @@ from rts.gbuffer import GBuffer
 from rts.interfaces import CheckedPart
 from rts.operations.linear import affine_map
 from rts.operations.projection import projective_map_of_views
-from rts.operations.take import take
+from rts.operations.take import take, take_shifted
 from rts.records import Fine, Sampled, Samples, Splats
 from rts.sampling.scenes import Wide
 from rts.sampling.several import Views, in_one_table
@@ -134,8 +134,7 @@ def to_fine_splats(
     positions, rgba = _together(*_shown(fine.samples, fine.index, parts, camera, wide, engine, like))
     arrays = fine.index, fine.shift, fine.row, fine.part, fine.facing, fine.settled, fine.wanted
     index, shift, row, part, facing, settled, wanted = constants(arrays, *suiting(positions, rgba))
-    xp = namespace(positions)
-    moved = take(positions, index) + xp.astype(shift, positions.dtype)
+    moved = take_shifted(positions, index, namespace(positions).astype(shift, positions.dtype))
     return Splats(moved, take(rgba, index), row, part, facing, settled, wanted=wanted, border=fine.apron)
 
 
@@ -172,6 +171,9 @@ def _shown(
         world, rgba = _colored(part, theta, transform, samples, local, camera, own, wide.grid, engine, like)
         positions.append(constants(own.project(local["position"], wide.grid), engine, dtype))
         check_splats(index, part, world, positions[-1], rgba, row, first)
+        if not part.shader.uniform:
+            shade = partial(_colors, part, theta, transform, camera)
+            rgba = engine.by_rows_in_use(shade, local.computed, samples.row, rgba)
         colors.append(constants(rgba, engine, dtype))
         first += samples.ids.shape[-2]
     if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
@@ -315,6 +317,17 @@ def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, came
                 "engine='torch'), or 'jax'."
             )
         raise
+
+
+def _colors(
+    part: CheckedPart,
+    theta: Mapping[str, Tree],
+    transform: Array | None,
+    camera: Camera,
+    attributes: Mapping[str, Array],
+) -> Array:
+    """What the shader of a part returns for attributes in local space."""
+    return _shaded(part, theta, _to_world(GBuffer(attributes), transform), camera)
 
 
 def _evaluate(part: CheckedPart, reads: Sequence[str], samples: Samples, engine: Engine, like: Array | None) -> GBuffer:

@@ -32,6 +32,11 @@ class GBuffer(dict):
     def like(self, value: Any) -> None:
         self._like = value
 
+    @property
+    def computed(self) -> dict[str, Any]:
+        """The attributes that are there by now: all but those that are deferred, and have not been read."""
+        return {name: self[name] for name in super().__iter__()}
+
     def defer(self, name: str, compute: Callable[[], Any]) -> None:
         """Add an attribute that `compute()` gives when it is first read."""
         self._deferred[name] = compute

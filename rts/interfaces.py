@@ -437,6 +437,7 @@ class Splatter(Plugin):
         reads_exits: whether it reads `Splats.exit`, which is found only then.
         prunes: whether it says which samples it needs; True in a class with its own `needed`.
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
+        sums_squares: whether it gives mean squares; True in a class with its own `mean_square`.
         averages: whether its normal equations may be asked for with a target of fewer pixels than there are cells.
         settles: whether it reads `Splats.settled`: where all nine samples around a cell are fronts of one opaque
             colour, on cells' centres, and no hidden one beside them is `needed`, the cell has that colour, whatever
@@ -446,7 +447,7 @@ class Splatter(Plugin):
             those that have none show nothing, where `rts.Adaptive` sees no outline: hidden samples have no effect.
     """
 
-    FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}
+    FLAGS = {"needed": "prunes", "normal_equations": "sums_products", "mean_square": "sums_squares"}
     STAND_INS = {"image": ("splat", _image_of_arrays)}
 
     layers: int | None = None
@@ -455,6 +456,7 @@ class Splatter(Plugin):
     reads_exits: bool = False
     prunes: bool = False
     sums_products: bool = False
+    sums_squares: bool = False
     averages: bool = False
     settles: bool = False
     follows_outlines: bool = False
@@ -525,6 +527,22 @@ class Splatter(Plugin):
         """
         return None
 
+    def mean_square(
+        self, splats: Splats, target: Array, weights: Array | None = None, background: Array | None = None
+    ) -> Array | None:
+        """Mean square () of the residuals weight · (image − target), differentiable in the splats.
+
+        Args:
+            splats: the samples; without their border there are h × w cells, each a pixel.
+            target: (h, w, C): alpha (C = 1), colours (3) or both (4); a constant.
+            weights: (h, w, 1) or (h, w, C); None for ones. A constant.
+            background: (h, w, 4), what the image is composited onto, or None. A constant.
+
+        Returns:
+            The mean square; None where it cannot work on these arrays.
+        """
+        return None
+
 
 def _checked_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Splats:
     """Splats of arrays, or of lists, all of one engine; wrong shapes and dtypes are refused."""
@@ -551,11 +569,13 @@ class Residuals(Plugin):
 
     Attributes:
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
+        sums_squares: whether it gives its mean square; True in a class with its own `mean_square`.
         has_stages: whether it can be had at other resolutions; True in a class with its own `at_stage`.
     """
 
-    FLAGS = {"normal_equations": "sums_products", "at_stage": "has_stages"}
+    FLAGS = {"normal_equations": "sums_products", "mean_square": "sums_squares", "at_stage": "has_stages"}
     sums_products: bool = False
+    sums_squares: bool = False
     has_stages: bool = False
 
     @abc.abstractmethod
@@ -572,6 +592,10 @@ class Residuals(Plugin):
         U counts the numbers in the parameters, in the order of `rts.trees.leaves`. All are arrays of the parameters'
         engine, which may be traced. With it, Levenberg–Marquardt makes no Jacobian of its own.
         """
+        raise NotImplementedError
+
+    def mean_square(self, parameters: Tree) -> Array:
+        """Mean square () of the residuals, differentiable. With it, gradient descent asks for no residuals."""
         raise NotImplementedError
 
 

@@ -14,6 +14,7 @@ from rts.camera import Camera
 from rts.checks import check_splatter
 from rts.engines import engine_named
 from rts.evaluating import to_splats
+from rts.fitting.image_residuals import ImageResiduals
 from rts.interfaces import Part
 from rts.operations.operation import Operation
 from rts.operations.rigid import rigid
@@ -138,6 +139,13 @@ def _least_squares(
         splatter.normal_equations(splats, t_positions, t_rgba, np.zeros((*size, channels), np.float32))
 
 
+def _mean_square(parts: list[Part], size: tuple[int, int]) -> None:
+    with _differentiating() as tape:
+        target = np.zeros((*size, 4), np.float32)
+        ImageResiduals(lambda _: _posed(parts), _camera(), size, target).mean_square(target)
+        tape.pull()
+
+
 def _adaptive(parts: list[Part], size: tuple[int, int]) -> None:
     render(parts, _camera(), size, supersample=Adaptive(2))
 
@@ -158,5 +166,6 @@ KINDS = (
     _adaptive,
     _gradient_of_silhouette,
     _least_squares_of_silhouette,
+    _mean_square,
 )
 LEAST_SQUARES = _least_squares, _least_squares_of_silhouette

@@ -1,8 +1,9 @@
 """Rasterizer for the CPU: K nearest triangles a pixel in one pass, on all cores (numba).
 
 Most triangles of a large mesh cover no pixel's centre. A first pass sees only their corners on screen, rounded, and
-lists those that may cover one. The second draws the image in bands of rows, each by one thread and in the order of the
-triangles, so the result does not depend on the number of threads. For blocks of listed triangles it works out, in
+lists those that may cover one; of a mesh that stays it passes over whole clusters (`rts_backends.raster_clusters`). The
+second draws the image in bands of rows, each by one thread. The result depends neither on the number of threads nor on
+the order of the list. For blocks of listed triangles it works out, in
 float64 and homogeneous coordinates, the numbers of `rts_backends.triangles`, finds the pixels that they may cover, and
 inserts these into the layers.
 
@@ -24,12 +25,15 @@ from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel, read_only
 from rts_backends.raster_cells import EVERYTHING, Blocks, touching
+from rts_backends.raster_clusters import BACKS, FRONTS, SIZE, Clusters
 from rts_backends.raster_drawing import BAND_ROWS, LISTED, draw, draw_cells
 from rts_backends.triangles import facing, pixel_matrix, to_corner
 
-CHUNK = 1 << 11
-LONG_BLOCK = 256
+LONG_BLOCK = SIZE
 """The block for loops that keep little of each triangle or vertex."""
+
+PER_CHUNK = 8
+CHUNK = PER_CHUNK * LONG_BLOCK
 
 LIMIT = np.float32(2**15 - 2)
 """Steps from the middle of the image to two pixels outside of it; a position beyond is put there.
@@ -38,6 +42,12 @@ Positions on screen take 16 bits, so that those of a million triangles stay in c
 """
 
 SIXTEEN, LOWER = np.int32(16), np.int32(2**16 - 1)
+
+MANY = 1 << 16
+"""Triangles from which on they are put in clusters; fewer gain nothing."""
+
+ALL_IN_ORDER = read_only(np.empty(0, np.int32))
+"""What stands for an order of triangles that is that of their indices."""
 
 BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 """In place of a position: before the near plane (or NaN), beyond the far plane."""
@@ -56,36 +66,67 @@ class Raster(TriangleSampler):
         self._scratch = (), []  # Of one size alone; whoever draws takes his out, so threads never share.
         return self
 
-    def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
+    def __getstate__(self) -> dict[str, Any]:
+        """See `TriangleSampler`: scratch memory is nobody else's."""
+        return {name: value for name, value in super().__getstate__().items() if name != "_scratch"}
+
+    def arrange(self, prepared: Any) -> Any:
+        """See `TriangleSampler.arrange`: triangles in clusters, if there are many."""
+        many = isinstance(prepared, Proxy) and len(prepared.faces) >= MANY
+        draws = self._draws and type(self).rasterize_exits == Raster.rasterize_exits
+        return Clusters.of(prepared) if many and draws else prepared
+
+    def rasterize(
+        self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, cull: str
+    ) -> Fragments:
         """See `TriangleSampler.rasterize`."""
-        with self._seen(prepared, camera, size) as mesh:
-            listed, _ = mesh.select(facing(camera, cull))
+        with self._seen(prepared, camera, size, facing(camera, cull)) as mesh:
+            listed, _ = mesh.select()
             return mesh.draw(listed, layers)
 
     def rasterize_cells(
-        self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str, cells: np.ndarray
+        self,
+        prepared: Proxy | Clusters,
+        camera: Camera,
+        size: tuple[int, int],
+        layers: int,
+        cull: str,
+        cells: np.ndarray,
     ) -> Fragments:
         """See `TriangleSampler.rasterize_cells`: triangles that touch none of these cells are passed over."""
-        with self._seen(prepared, camera, size) as mesh:
-            blocks = Blocks.of(cells, size)
-            listed, _ = mesh.select(facing(camera, cull), blocks)
+        blocks = Blocks.of(cells, size)
+        with self._seen(prepared, camera, size, facing(camera, cull), asked=blocks) as mesh:
+            listed, _ = mesh.select()
             return mesh.draw_cells(listed, layers, cells, blocks)
 
     def rasterize_exits(
-        self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
+        self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
     ) -> tuple[Fragments, np.ndarray, Fragments]:
         """See `TriangleSampler.rasterize_exits`: all triangles are looked at once, for both."""
-        kind = type(self)
-        if (kind.rasterize, kind.rasterize_cells) != (Raster.rasterize, Raster.rasterize_cells):
+        if not self._draws:
             return super().rasterize_exits(prepared, camera, size, layers, beside)
-        with self._seen(prepared, camera, size) as mesh:
-            fronts, backs = mesh.select(facing(camera, "back"), both=True)
+        with self._seen(prepared, camera, size, facing(camera, "back"), both=True) as mesh:
+            fronts, backs = mesh.select()
             fragments = mesh.draw(fronts, layers)
             cells = beside(fragments)
             return fragments, cells, mesh.draw_cells(backs, 1, cells, Blocks.of(cells, size))
 
+    @property
+    def _draws(self) -> bool:
+        """Whether it draws itself, not a subclass, which may look at what was prepared."""
+        kind = type(self)
+        return (kind.rasterize, kind.rasterize_cells) == (Raster.rasterize, Raster.rasterize_cells)
+
     @contextmanager
-    def _seen(self, prepared: Proxy, camera: Camera, size: tuple[int, int]) -> Iterator[_Seen]:
+    def _seen(
+        self,
+        prepared: Proxy | Clusters,
+        camera: Camera,
+        size: tuple[int, int],
+        keep: float,
+        both: bool = False,
+        asked: Blocks = EVERYTHING,
+    ) -> Iterator[_Seen]:
         """A mesh as a camera sees it, in scratch memory.
 
         Drawn again and again, one mesh touches the same pages of memory: the system clears them only once. There is
@@ -99,7 +140,7 @@ class Raster(TriangleSampler):
             memory = scratch[1].pop()
         except IndexError:
             memory = np.empty(key[0], np.int32), *(np.empty((key[1], LISTED), np.int32) for _ in range(2))
-        yield _Seen(prepared, camera, size, *memory)
+        yield _Seen(prepared, camera, size, keep, both, asked, *memory)
         scratch[1].append(memory)
 
 
@@ -108,12 +149,14 @@ class _List(NamedTuple):
 
     Attributes:
         keep: sign of the determinants of those to draw, or 0.
-        offsets: (bands + 1,), where the items of each band of rows begin.
-        items: uint32, places in `rows`, in the order of the triangles.
+        turns: (bands,), bands of rows, those with most items first: so threads end together.
+        offsets: (bands + 1,), where the items of each band begin.
+        items: uint32, places in `rows`, in the order in which triangles were looked at.
         rows: (T, LISTED) int32, what is known of a triangle.
     """
 
     keep: float
+    turns: np.ndarray
     offsets: np.ndarray
     items: np.ndarray
     rows: np.ndarray
@@ -126,38 +169,58 @@ class _Seen:
         mesh: the mesh.
         camera: the camera.
         size: (height, width).
+        keep: sign of the determinants of triangles to draw, or 0.
+        both: whether those that face the other way are asked for, too.
+        asked: the blocks of cells that are asked for.
         screen: (V,) int32, memory for positions on screen.
         listed: (T, LISTED) int32, memory for a list of triangles.
         behind: memory for a list of those that face the other way.
     """
 
-    def __init__(self, mesh: Proxy, camera: Camera, size: tuple[int, int], screen: Any, listed: Any, behind: Any):
+    def __init__(
+        self,
+        mesh: Proxy | Clusters,
+        camera: Camera,
+        size: tuple[int, int],
+        keep: float,
+        both: bool,
+        asked: Blocks,
+        screen: np.ndarray,
+        listed: np.ndarray,
+        behind: np.ndarray,
+    ):
         # With unsigned indices compiled code need not look for negative ones, which count from the end.
         self.vertices, self.faces = read_only(mesh.vertices), read_only(mesh.faces, np.int32).view(np.uint32)
-        self.matrix, self.depth_row, self.size = pixel_matrix(camera, size), -camera.view[2], size
-        self.screen, self.listed, self.behind = screen, listed, behind
-        self.step = (max(size) / 2 + 2) / float(LIMIT)
+        self.matrix, self.depth_row, self.size, self.keep = pixel_matrix(camera, size), -camera.view[2], size, keep
+        self.screen, self.listed, self.behind = screen, listed, behind if both else behind[:0]
+        self.asked, self.step = asked, (max(size) / 2 + 2) / float(LIMIT)
+        if isinstance(mesh, Clusters):
+            self.order = mesh.order
+            self.blocks, self.sides, used = mesh.seen(self.matrix, size, keep, both, asked)
+        else:
+            self.order = ALL_IN_ORDER
+            self.blocks, used = (np.arange(-(-len(x) // SIZE), dtype=np.int32) for x in (self.faces, self.vertices))
+            self.sides = np.full(len(self.blocks), FRONTS | BACKS, np.uint8)
         to_steps = np.diag([1 / self.step, 1 / self.step, 1, 1])
         to_steps[:2, 3] = -size[1] / 2 / self.step, -size[0] / 2 / self.step
-        count = len(self.vertices)
-        parallel(_project, count, self.vertices, to_steps @ self.matrix, screen, work=4 * count)
+        parallel(_project, len(used), used, self.vertices, to_steps @ self.matrix, screen, work=4 * SIZE * len(used))
 
-    def select(self, keep: float, blocks: Blocks = EVERYTHING, both: bool = False) -> tuple[_List, _List]:
-        """The triangles that may cover cells of some blocks; and those that face the other way, if asked for `both`."""
-        chunks, bands = -(-len(self.faces) // CHUNK), -(-self.size[0] // BAND_ROWS)
+    def select(self) -> tuple[_List, _List]:
+        """The triangles that may cover cells that are asked for; and those that face the other way, if these are."""
+        chunks, bands = -(-len(self.blocks) // PER_CHUNK), -(-self.size[0] // BAND_ROWS)
         # Threads do not write side by side.
         spans, counts = np.empty((2, chunks, 2), np.int64), np.zeros((2, chunks, bands), np.int64)
-        lists = (self.listed, spans[0], counts[0]), (self.behind if both else self.behind[:0], spans[1], counts[1])
-        given = self.vertices, self.faces, self.screen, self.matrix, *self.size, self.step, keep, blocks.bits
-        parallel(_select, chunks, *given, *lists, work=10 * len(self.faces))
-        fronts, backs = (_sorted(sign, *made) for sign, made in zip((keep, -keep), lists, strict=True))
-        return fronts, backs
+        lists = (self.listed, spans[0], counts[0]), (self.behind, spans[1], counts[1])
+        triangles = self.blocks, self.sides, self.faces, self.vertices, self.screen
+        given = *triangles, self.matrix, *self.size, self.step, self.keep, self.asked.bits
+        parallel(_select, chunks, *given, *lists, work=10 * SIZE * len(self.blocks))
+        return _sorted(self.keep, self.order, *lists[0]), _sorted(-self.keep, self.order, *lists[1])
 
     def draw(self, listed: _List, layers: int) -> Fragments:
         """Fragments (layers, H, W)."""
         fragments = _empty((layers, *self.size))
         given = self.vertices, self.matrix, self.depth_row, EVERYTHING.bits
-        parallel(draw, len(listed.offsets) - 1, listed, *given, tuple(fragments))
+        parallel(draw, len(listed.turns), listed, *given, tuple(fragments))
         return fragments
 
     def draw_cells(self, listed: _List, layers: int, cells: np.ndarray, blocks: Blocks) -> Fragments:
@@ -168,7 +231,7 @@ class _Seen:
         for x, nothing in zip(flat, (-1, 0, 0), strict=True):
             x[:, absent] = nothing
         given = self.vertices, self.matrix, self.depth_row, blocks.bits, blocks.table, blocks.numbers
-        parallel(draw_cells, len(listed.offsets) - 1, listed, *given, flat)
+        parallel(draw_cells, len(listed.turns), listed, *given, flat)
         return fragments
 
 
@@ -176,21 +239,25 @@ def _empty(shape: tuple[int, ...]) -> Fragments:
     return Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
 
 
-def _sorted(keep: float, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> _List:
-    """A list that `_select` made, sorted by bands of rows."""
-    offsets = np.append(0, np.cumsum(counts.sum(axis=0)))
+def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> _List:
+    """A list that `_select` made, sorted by bands of rows; triangles get their names."""
+    sums = counts.sum(axis=0)
+    offsets = np.append(0, np.cumsum(sums))
     places, items = offsets[:-1] + np.cumsum(counts, axis=0) - counts, np.empty(offsets[-1], np.uint32)
     if len(items):
-        parallel(_sort, len(spans), rows, spans, places, items, work=8 * len(items))
-    return _List(keep, offsets, items, rows)
+        parallel(_sort, len(spans), order, rows, spans, places, items, work=8 * len(items))
+    return _List(keep, np.argsort(-sums), offsets, items, rows)
 
 
 @kernel(error_model="numpy")
-def _project(start, stop, vertices, m, screen):
-    """Positions (V,) on screen, in steps from the image's middle: columns in the lower 16 bits, rows in the others."""
+def _project(first, last, used, vertices, m, screen):
+    """Positions (V,) on screen, in steps from the image's middle: columns in the lower 16 bits, rows in the others.
+
+    They are filled in for some blocks of vertices.
+    """
     points, pixels = np.empty((3, LONG_BLOCK), np.float32), np.empty((2, LONG_BLOCK), np.int32)
-    for first in range(start, stop, LONG_BLOCK):
-        block = slice(first, min(stop, first + LONG_BLOCK))
+    for n in used[first:last]:
+        block = slice(n * LONG_BLOCK, min(len(vertices), (n + 1) * LONG_BLOCK))
         read, written = vertices[block], screen[block]
         for v in range(len(read)):
             points[0, v], points[1, v], points[2, v] = read[v, 0], read[v, 1], read[v, 2]
@@ -210,8 +277,26 @@ def _project(start, stop, vertices, m, screen):
 
 
 @kernel(error_model="numpy")
-def _select(first, last, vertices, faces, screen, matrix, height, width, step, keep, bits, fronts, backs):
+def _select(
+    first,
+    last,
+    blocks,
+    sides,
+    faces,
+    vertices,
+    screen,
+    matrix,
+    height,
+    width,
+    step,
+    keep,
+    bits,
+    fronts,
+    backs,
+):
     """List the triangles that may cover a pixel's centre, of those that `bits` of `Blocks` tell; and count them.
+
+    Looked at are some blocks of triangles, of which `sides` tell as bits which they may hold: FRONTS, BACKS.
 
     A list is what is known of triangles (T, LISTED), where each chunk begins and ends in it (chunks, 2), and how many
     of a chunk touch a band of rows (chunks, bands). Chunks of one call follow on each other. Of `backs`, if there is
@@ -224,14 +309,15 @@ def _select(first, last, vertices, faces, screen, matrix, height, width, step, k
     found = opposite = first * CHUNK
     for chunk in range(first, last):
         fronts[1][chunk, 0], backs[1][chunk, 0] = found, opposite
-        end = min(len(faces), (chunk + 1) * CHUNK)
-        for start in range(chunk * CHUNK, end, LONG_BLOCK):
-            block = faces[start : min(end, start + LONG_BLOCK)]
+        for n in range(chunk * PER_CHUNK, min(len(blocks), (chunk + 1) * PER_CHUNK)):
+            start, some = blocks[n] * LONG_BLOCK, sides[n]
+            block = faces[start : min(len(faces), start + LONG_BLOCK)]
             for b in range(len(block)):
                 xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
-            _look(len(block), xy, height, width, step, sign, box, clips, near)
-            found = _list(chunk, start, block, near, box, clips, chosen, given, found, fronts)
-            if len(backs[0]) > 0:
+            if some & FRONTS:
+                _look(len(block), xy, height, width, step, sign, box, clips, near)
+                found = _list(chunk, start, block, near, box, clips, chosen, given, found, fronts)
+            if some & BACKS and len(backs[0]) > 0:
                 _look(len(block), xy, height, width, step, -sign, box, clips, near)
                 opposite = _list(chunk, start, block, near, box, clips, chosen, given, opposite, backs)
         fronts[1][chunk, 1], backs[1][chunk, 1] = found, opposite
@@ -328,9 +414,15 @@ def _clipped_box(corners, width, height):
 
 
 @kernel
-def _sort(first, last, listed, spans, places, items):
-    """Sort the list by bands: write where each band's triangles are, in order, from `places` (chunks, bands) on."""
+def _sort(first, last, order, listed, spans, places, items):
+    """Sort the list by bands: write where each band's triangles are, in order, from `places` (chunks, bands) on.
+
+    In place of where triangles were looked at comes their index in the proxy, unless the order is that of indices.
+    """
     for chunk in range(first, last):
+        if len(order) > 0:
+            for n in range(spans[chunk, 0], spans[chunk, 1]):
+                listed[n, 0] = order[listed[n, 0]]
         for n in range(spans[chunk, 0], spans[chunk, 1]):
             for band in range(listed[n, 6] // BAND_ROWS, listed[n, 7] // BAND_ROWS + 1):
                 items[places[chunk, band]] = n

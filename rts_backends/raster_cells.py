@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.compiling import compiled, kernel
+from rts.errors import InputError
 
 SIDE = 16
 """Cells along each side of a block, which are as many as rows of a band of the rasterizer."""
@@ -29,12 +30,20 @@ class Blocks(NamedTuple):
 
     @classmethod
     def of(cls, cells: np.ndarray, size: tuple[int, int]) -> Blocks:
-        """The blocks of cells (L, C), flat indices in a grid of (height, width), or −1."""
+        """The blocks of cells (L, C), flat indices in a grid of (height, width), or −1.
+
+        Raises:
+            InputError: a cell is not in the grid, or there twice.
+        """
         height, width = size
         table = np.full((-(-height // SIDE), -(-width // SIDE)), -1, np.int32)
         numbers = np.empty((table.size, SIDE, SIDE), np.int32)
         bits = np.zeros((height, table.shape[1]), np.uint16)
-        count = _fill(np.ascontiguousarray(cells, np.int32).reshape(-1), width, table, numbers, bits)
+        flat = np.ascontiguousarray(cells, np.int32).reshape(-1)
+        count, bad = _fill(flat, width, table, numbers, bits)
+        if bad >= 0:
+            wrong = f"beyond the grid's {height} × {width}" if flat[bad] >= height * width else "there twice"
+            raise InputError(f"cells name cell {flat[bad]}, which is {wrong}")
         return cls(table, numbers[:count], bits)
 
 
@@ -44,12 +53,17 @@ EVERYTHING = Blocks(np.empty((0, 0), np.int32), np.empty((0, SIDE, SIDE), np.int
 
 @kernel
 def _fill(cells, width, table, numbers, bits):
-    """Number the blocks that hold any cells, and fill in what these are; how many there are."""
-    count, last, y, x, side = 0, -2, 0, 0, np.uint32(SIDE)
+    """Number the blocks that hold any cells, and fill in what these are; how many there are.
+
+    With it comes the place of a cell that is not in the grid or there twice, at which it stops, or −1.
+    """
+    count, last, y, x, side, size = 0, -2, 0, 0, np.uint32(SIDE), len(bits) * width
     for m in range(len(cells)):
         cell = cells[m]
         if cell < 0:
             continue
+        if cell >= size:
+            return count, m
         x += 1
         if cell != last + 1 or x == width:  # Most follow on each other.
             y, x = cell // width, cell % width
@@ -59,9 +73,12 @@ def _fill(cells, width, table, numbers, bits):
             table[v // side, u // side] = count
             numbers[count] = -1
             count += 1
-        numbers[np.uint32(table[v // side, u // side]), v % side, u % side] = m
+        number = np.uint32(table[v // side, u // side])
+        if numbers[number, v % side, u % side] >= 0:
+            return count, m
+        numbers[number, v % side, u % side] = m
         bits[v, u // side] |= np.uint16(1 << u % side)
-    return count
+    return count, -1
 
 
 @compiled

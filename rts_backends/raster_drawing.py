@@ -27,15 +27,15 @@ NUMBERS = 18
 def draw(first, last, listed, vertices, matrix, view_depth, bits, fragments):
     """Fill the three fragment arrays, band by band.
 
-    `listed` is the sign of determinants to draw, where the items of each band begin, these, and what is known of each
-    triangle; `bits` are those of `Blocks` for all cells.
+    `listed` is the sign of determinants to draw, the order of bands, where the items of each begin, these, and what is
+    known of each triangle; `bits` are those of `Blocks` for all cells.
     """
     triangle_ids, barycentrics, depths = fragments
     layers, height, width = triangle_ids.shape
     nearest = np.empty((layers, BAND_ROWS, width))
-    keep, offsets, items, rows = listed
+    keep, turns, offsets, items, rows = listed
     given = rows, vertices, matrix, view_depth, keep, bits
-    for band in range(first, last):
+    for band in turns[first:last]:
         top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
         nearest[:], triangle_ids[:, top:end], barycentrics[:, top:end] = np.inf, -1, 0
         _draw(items[offsets[band] : offsets[band + 1]], given, top, end, top, nearest, triangle_ids, barycentrics)
@@ -56,9 +56,9 @@ def draw_cells(first, last, listed, vertices, matrix, view_depth, bits, table, n
     layers, height, width = len(triangle_ids), len(bits), table.shape[1] * BAND_ROWS
     nearest, drawn = np.empty((layers, BAND_ROWS, width)), np.empty((layers, BAND_ROWS, width), np.int32)
     within = np.empty((layers, BAND_ROWS, width, 2), np.float32)
-    keep, offsets, items, rows = listed
+    keep, turns, offsets, items, rows = listed
     given = rows, vertices, matrix, view_depth, keep, bits
-    for band in range(first, last):
+    for band in turns[first:last]:
         top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
         for j in range(top, end):
             for column in range(table.shape[1]):
@@ -268,11 +268,13 @@ def _covers(b, x, y, numbers, clips):
 @compiled(inline="always")
 def _put(z, t, p, q, row, j, i, nearest, triangle_ids, barycentrics):
     """Put a hit into the layers of a cell, at its row of `nearest` and of the rest: behind what is as near."""
-    moved = z
+    moved, own = z, t
     for k in range(len(nearest)):
         old, old_t = nearest[k, row, i], triangle_ids[k, j, i]
         old_p, old_q = barycentrics[k, j, i, 0], barycentrics[k, j, i, 1]
         before = z < old  # A branch would be foreseen every other time.
+        if z == old:  # Of clusters triangles come in another order than that of their indices.
+            before = own < old_t
         nearest[k, row, i], triangle_ids[k, j, i] = moved if before else old, t if before else old_t
         barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = p if before else old_p, q if before else old_q
         moved, t = old if before else moved, old_t if before else t

@@ -235,7 +235,7 @@ from rts_backends import raster
 def kept():
     return {path.name for path in Path(sys.argv[1]).rglob("*.nbc")}
 
-raster._project(0, 0, read_only(np.zeros((1, 3), np.float32)), np.eye(4), np.zeros(1, np.int32))
+raster._project(0, 0, np.zeros(1, np.int32), read_only(np.zeros((1, 3), np.float32)), np.eye(4), np.zeros(1, np.int32))
 own, end = kept(), time.monotonic() + 100
 while kept() == own and time.monotonic() < end:
     time.sleep(0.05)

@@ -869,6 +869,11 @@ ODD_ENGINES = {
     "unused_rows_are_filled": {
         "left": engine_with(padded=lambda self, x: True, fill_unused=lambda self, x, row: x),
     },
+    "functions_of_rows_in_use_are_those_of_all_rows": {
+        "one too few": engine_with(
+            by_rows_in_use=lambda self, f, rows, row, whole: f({"x": rows["x"] * (row.max() > 2)})
+        ),
+    },
     "compiled_functions_are_the_same": {"off by one": engine_with(jit=lambda self, f: lambda *args: f(*args) + 1)},
     "without_derivatives_it_says_so": {"has them": engine_with(differentiates=False)},
     "gradients_are_those_of_closed_forms": {

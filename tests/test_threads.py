@@ -180,8 +180,10 @@ def test_helpers_keep_off_the_core_of_the_thread_that_asks(monkeypatch, helpers)
     from rts import threads
 
     found = [cores_of_helper(monkeypatch, lambda kernel: threads.parallel(kernel, 9)) for _ in range(20)]
-    stayed = [(before, allowed) for before, after, allowed in found if before == after]  # The system may move it.
-    assert stayed and all(allowed == os.sched_getaffinity(0) - {before} for before, allowed in stayed)
+    cores = os.sched_getaffinity(0)
+    assert all(len(allowed) == len(cores) - 1 for _, _, allowed in found)
+    # The system may move this thread between any two of its steps.
+    assert any(allowed == cores - {before} for before, after, allowed in found if before == after)
 
 
 @needs_cores

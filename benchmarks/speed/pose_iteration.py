@@ -78,12 +78,18 @@ class Task:
         difference = image[..., self.channels] - target
         return (difference * difference).mean()
 
+    def swept_loss(self, pose: Any, vertices: Any, target: Any, sampler: str) -> Any:
+        """`loss`, made as the image is: `rts.ImageResiduals.mean_square`."""
+        options: dict[str, Any] = {"sampler": sampler, "splatter": self.splatter, "layers": self.layers}
+        residuals = rts.ImageResiduals(lambda pose: self.posed(pose, vertices), self.view, self.size, target, **options)
+        return residuals.mean_square(pose)
+
 
 # ------------------------------------------------------------------------------------------------------- iterations
 
 
-def torch_iteration(task: Task, mode: str = "pose", sampler: str = "auto") -> Callable[[], object]:
-    """One eager iteration a call."""
+def torch_iteration(task: Task, mode: str = "pose", sampler: str = "auto", swept: bool = False) -> Callable[[], object]:
+    """One eager iteration a call; the loss `swept`, or of an image."""
     import torch
 
     pose = torch.tensor(START, requires_grad=True)
@@ -98,7 +104,7 @@ def torch_iteration(task: Task, mode: str = "pose", sampler: str = "auto") -> Ca
         pose.grad = None
         if vertices is not None:
             vertices.grad = None
-        loss = task.loss(pose, vertices, target, sampler)
+        loss = (task.swept_loss if swept else task.loss)(pose, vertices, target, sampler)
         loss.backward()
         optimizer.step()
         return loss.item()

@@ -23,7 +23,7 @@ from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 from benchmarks.meshes import MESHES, kept_mesh
 from benchmarks.speed import levenberg_marquardt, memory, second_layer, splatters, stages, tables
 from benchmarks.speed.charts import CHARTS
-from benchmarks.speed.pose_iteration import ENGINES, MODES, Task
+from benchmarks.speed.pose_iteration import ENGINES, MODES, Task, torch_iteration
 from benchmarks.timing import ROUNDS, WARM_UP, in_turn
 from rts.diagnostics.comparison.environment import environment
 
@@ -45,6 +45,7 @@ def iterations(task: Task, args: argparse.Namespace) -> dict[str, Callable[[], o
         for engine, make in ENGINES.items():
             for sampler in ("auto", "embree") if mode == "pose" else ("auto",):
                 found[f"{NAMES[mode]}, {engine}, {sampler}"] = make(task, mode, sampler)
+    found["RtS-pose, torch, auto, one sweep"] = torch_iteration(task, swept=True)
     if args.peers:
         from benchmarks.speed import other_renderers
 

@@ -137,7 +137,8 @@ def fit(
                     supersample = finest(getattr(stage, "supersample", None))
                     levenberg_marquardt(checked, parameters, engine, run, jit, own, supersample)
                 else:
-                    _descend(checked, _scalar(loss, engine), parameters, engine, method, rate, run, jit)
+                    own = stage.mean_square if stage.sums_squares and loss is mean_square else None
+                    _descend(checked, loss, own, parameters, engine, method, rate, run, jit)
             except Astray as stop:
                 run.stop(str(stop))
         runs.append(run)
@@ -163,6 +164,7 @@ def _copied(engine: Engine, x: Array) -> Array:
 def _descend(
     residuals: Callable,
     loss: Callable,
+    own: Callable | None,
     parameters: Tree,
     engine: Engine,
     method: str,
@@ -170,9 +172,9 @@ def _descend(
     run: Run,
     jit: bool,
 ) -> None:
-    """Run Adam or SGD."""
+    """Run Adam or SGD on the loss of residuals; `own` gives it without them, if there is one."""
     xp = engine.namespace
-    value_and_grad = engine.value_and_grad(lambda p: loss(residuals(p)))
+    value_and_grad = engine.value_and_grad(_scalar(own or (lambda p: loss(residuals(p))), engine))
 
     def evaluate(p: Tree) -> tuple[Array, Tree, list[Array], list[Array]]:
         value, gradient = value_and_grad(p)
@@ -187,7 +189,7 @@ def _descend(
         require(math.isfinite(value), f"the loss is {float(value)}", start)
         run.note_gradient([*map(bool, mattered)])
         if not run.history and not any(run.mattered):
-            refuse_independent(residuals, loss, parameters, engine)
+            refuse_independent(residuals, _scalar(loss, engine), parameters, engine)
         if not run.record(parameters, float(value)):
             return
         require(all(map(bool, finite)), "the gradient is not finite", start)

@@ -25,23 +25,24 @@ from rts.checks import (
     is_count,
 )
 from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting
-from rts.errors import InputError
+from rts.errors import EmptyImageWarning, InputError, warn
 from rts.evaluating import to_fine_splats, to_splats
-from rts.fitting.least_squares import flatten, normal_equations
+from rts.fitting.least_squares import flatten, mean_square, normal_equations
 from rts.fitting.names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.interfaces import CheckedPart, Part, Residuals, Splatter
 from rts.records import ArraySpec, Fine, Splats
 from rts.rendering import bands_of, render
 from rts.sampling.adaptive import Adaptive, finest
+from rts.sampling.emptiness import why_empty
 from rts.sampling.prepared import PreparedParts
-from rts.sampling.scenes import sample
+from rts.sampling.scenes import Scene, sample, sampled_scene
 from rts.trees import Array, Tree
 from rts.views import render_views
 
 Parts = Part | Sequence[Part] | PreparedParts
 Cameras = Camera | Sequence[Camera]
-Scene = Callable[[Tree], "Parts | tuple[Parts, Cameras]"]
+SceneFunction = Callable[[Tree], "Parts | tuple[Parts, Cameras]"]
 
 
 class ImageResiduals(Residuals):
@@ -81,7 +82,7 @@ class ImageResiduals(Residuals):
 
     def __init__(
         self,
-        scene: Scene,
+        scene: SceneFunction,
         camera: Cameras | None,
         size: tuple[int, int],
         target: Array | Sequence[Array],
@@ -239,6 +240,39 @@ class ImageResiduals(Residuals):
             companion.expect(companion.LEAST_SQUARES)
             found = self._swept(splatter, parameters, engine)
         return normal_equations(self, parameters, engine) if found is None else found
+
+    def mean_square(self, parameters: Tree) -> Array:
+        """Mean square () of the residuals: a loss to differentiate, which takes less time than that of an image.
+
+        The image is compared with the target as it is made, and neither it nor its gradient is kept. Where that cannot
+        be (several views, `supersample`, a blurred stage, other `channels`, splatters and devices), it is the mean
+        square of what a call gives.
+
+        Args:
+            parameters: as in a call.
+        """
+        splatter = self._splatter
+        ordinary = not self._views and not self._sigma and self.supersample == 1 and self._image_channels == 3
+        found = self._compared(splatter, parameters) if ordinary and splatter.sums_squares else None
+        return mean_square(self(parameters)) if found is None else found
+
+    def _compared(self, splatter: Splatter, parameters: Tree) -> Array | None:
+        """`mean_square` by that of the splatter; None where it gives none."""
+        parts, camera = self.scene(parameters)
+        scene = Scene.of(parts, camera, self._sampling["sampler"], None).at(self.size)
+        self._refuse_other(scene.channels)
+        options = {name: self._sampling[name] for name in ("layers", "capacity")}
+        options |= {"splatter": splatter, "supersample": 1, "settles": True}
+        sampled = sampled_scene(scene, scene.camera, self.size, **options)
+        splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, *scene.suited)
+        engine = engine_of(splats.rgba, parameters)
+        splats = constants(splats, engine, exemplar(parameters))
+        target, weights, background = self._constants(splats.positions)
+        found = splatter.mean_square(splats, target, weights, background)
+        row = None if found is None else engine.known(splats.row)
+        if row is not None and not (row >= 0).any():
+            warn(f"nothing is seen in the image: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
+        return found
 
     def _swept(self, splatter: Splatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
         """`normal_equations` by those of the splatter, in the bands that `render` takes; None where it gives none."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.engines import namespace
+from rts.engines import engine_of, namespace
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some, known_value
 from rts.trees import Array
@@ -16,6 +16,11 @@ from rts.trees import Array
 def take(rows: Array, index: Array) -> Array:
     """(M, C): the rows of (V, C) that (M,) integers name. Gradients are added up in the order of the index."""
     return TAKE(rows, index)
+
+
+def take_shifted(rows: Array, index: Array, shift: Array) -> Array:
+    """(M, C): the rows of (V, C) that (M,) integers name, plus a constant shift (M, C), which has no derivative."""
+    return SHIFTED(rows, index, shift)
 
 
 def _specification(rows: Array, index: Array) -> Array:
@@ -54,3 +59,31 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
 
 _PACKED: dict[str, Any] = {"packed": (1,), "packed_result": True}
 TAKE = Operation("rts.take", _specification, (2, 1), _shape, _forward, _push, _pull, **_PACKED)
+
+
+def _specified_shift(rows: Array, index: Array, shift: Array) -> Array:
+    xp, still = namespace(rows, index), engine_of(shift).stop_gradient(shift)
+    return _specification(rows, index) + xp.astype(still, rows.dtype)
+
+
+def _shifted_shape(rows: tuple[int, ...], index: tuple[int, ...], shift: tuple[int, ...]) -> tuple[int, ...]:
+    return shift
+
+
+def _shifted(operands: Arrays, out: np.ndarray) -> None:
+    rows, index, shift = operands
+    _forward((rows, index), out)
+    out += shift
+
+
+SHIFTED = Operation(
+    "rts.take_shifted",
+    _specified_shift,
+    (2, 1, 2),
+    _shifted_shape,
+    _shifted,
+    _push,
+    _pull,
+    packed=(1, 2),
+    packed_result=True,
+)

@@ -71,12 +71,19 @@ class TriangleSampler(Sampler):
         """Adapt what was prepared to moved vertices of the same faces, and return it; None if it must be made anew."""
         return None
 
+    def arrange(self, prepared: Any) -> Any:
+        """Rearrange what was prepared of triangles that will stay as they are, as `rts.prepare` promises.
+
+        It may take longer than to draw them a few times. The default returns what was prepared.
+        """
+        return prepared
+
     @abc.abstractmethod
     def rasterize(self, prepared: Any, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """The `layers` nearest triangles of every pixel, at its centre, between the near and the far plane.
 
         Args:
-            prepared: what `prepare` gave.
+            prepared: what `prepare` or `arrange` gave.
             camera: NumPy float64 matrices; world is the proxy's local space.
             size: (height, width).
             layers: K.
@@ -148,11 +155,15 @@ class TriangleSampler(Sampler):
         if camera is not None:
             camera = camera if size is None else camera.for_size(size)
             camera = camera.within(part.transform).map(lambda m: engine_of(m).to_numpy(m))
-        built = self._built(surface, inputs, camera, size)
+        built = self.arranged(self._built(surface, inputs, camera, size))
         arrays = leaves(stopped({name: part.theta[name] for name in surface.reads(part.theta)}))
         read = [engine_of(x).to_numpy(x) for x in arrays]
         built = built._replace(size=max([built.size or 0.0, *(largest(x) for x in read if x.dtype.kind == "f")]))
         return built._replace(inputs=map_leaves(np.copy, inputs)) if surface.refines else built
+
+    def arranged(self, entry: Entry) -> Entry:
+        """An entry for triangles that will stay; see `arrange`."""
+        return entry if entry.prepared is None else entry._replace(prepared=self.arrange(entry.prepared))
 
     def _built(self, surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Entry:
         """A copy of the surface's proxy for host inputs, checked, and what this sampler prepares of it."""

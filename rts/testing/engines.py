@@ -172,6 +172,22 @@ class EngineConformance(Conformance):
             found = chosen.to_numpy(chosen.fill_unused(chosen.constant(x), chosen.constant(row)))
         claim_close(found, np.concatenate([x[:3], x[[0, 0, 0]]]), 0, "fill_unused")
 
+    def test_functions_of_rows_in_use_are_those_of_all_rows(self, engine: Any) -> None:
+        """`by_rows_in_use` gives what the function gives of the rows that some cell names, compiled or not."""
+        chosen, x = _instance(engine), numbers(N, 3)
+        row = np.array([[[0, 2, -1], [1, -1, -1]]], np.int32)
+
+        def f(rows: Any) -> Any:
+            return rows["x"] * 2
+
+        def call(x: Any, row: Any) -> Any:
+            return chosen.by_rows_in_use(f, {"x": x}, row, f({"x": x}))
+
+        for how, function in _both_ways(chosen, call):
+            with owning(chosen), no_error(f"by_rows_in_use{how}"):
+                found = chosen.to_numpy(function(chosen.constant(x), chosen.constant(row)))
+            claim_close(found[:3], 2 * x[:3], 0, f"what by_rows_in_use gives{how}")
+
     def test_compiled_functions_are_the_same(self, engine: Any) -> None:
         """`jit` of a function of a record gives what the function gives; `block` gives back what it is given."""
         chosen = _instance(engine)

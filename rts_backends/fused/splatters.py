@@ -41,13 +41,16 @@ class _Fused(splatting.Kernel):
 
     def _of(self, splats: Splats, border: int) -> Array:
         """The image without a border."""
+        return IMAGE(*self._operands(splats), settings=self._settings(border))
+
+    def _operands(self, splats: Splats) -> tuple[Array, ...]:
+        """Those of `IMAGE`."""
         part = splats.row[:0, :, :] if splats.part is None else splats.part
         facing = self._facing(splats)
         facing = splats.row[:0, :, :] if facing is None else facing
         none = splats.row[0, :0, :]
         known = splats.wanted, splats.settled, self._exits(splats)
-        given = splats.positions, splats.rgba, splats.row, part, facing, *(none if x is None else x for x in known)
-        return IMAGE(*given, settings=self._settings(border))
+        return splats.positions, splats.rgba, splats.row, part, facing, *(none if x is None else x for x in known)
 
     def _facing(self, splats: Splats) -> Array | None:
         return splats.facing if self.reads_facing else None
@@ -76,6 +79,17 @@ class _Fused(splatting.Kernel):
         own += splats.wanted, splats.settled, self._exits(splats)
         given = *own, t_positions, t_rgba, target, weights, background
         return normal_equations.equations(self._settings(splats.border), engine_of(given), *given)
+
+    def mean_square(
+        self, splats: Splats, target: Array, weights: Array | None = None, background: Array | None = None
+    ) -> Array | None:
+        """See `rts.Splatter`."""
+        if type(self).image is not _Fused.image or splats.rgba.shape[0] == 0:
+            return None
+        from rts_backends.fused import mean_square
+
+        given = self._operands(splats), target, weights, background
+        return mean_square.mean_square(self._settings(splats.border), *given)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`."""
@@ -114,7 +128,7 @@ class Visible(_Fused, splatting.Visible):
 _SPECIFICATIONS = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}
 
 
-def _specification(
+def specification(
     positions: Array,
     rgba: Array,
     row: Array,
@@ -126,6 +140,7 @@ def _specification(
     *,
     settings: Settings,
 ) -> Array:
+    """The image in array code."""
     given = settings.sigma, settings.epsilon, settings.gamma
     options = {"rims": settings.rims, "crossings": settings.crossings} if settings.kind == "visible" else {}
     part, facing, settled, exits = (x if x.shape[0] else None for x in (part, facing, settled, exits))
@@ -169,14 +184,15 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings,
     _cells(settings, operands, kept).vjp(g, g_positions, g_rgba)
 
 
-def _used(operands: Arrays) -> int:
-    return max(1, int(operands[2].max(initial=0)) + 1, int(operands[-1].max(initial=0)) + 1)
+def used(operands: Arrays) -> int:
+    """How many rows cells refer to."""
+    return max(1, int(operands[2].max(initial=0)) + 1, int(operands[7].max(initial=0)) + 1)
 
 
-_OPTIONS: dict[str, Any] = {"differentiable": 2, "packed": (0, 1), "used": _used, "even": (1,)}
+_OPTIONS: dict[str, Any] = {"differentiable": 2, "packed": (0, 1), "used": used, "even": (1,)}
 IMAGE = Operation(
     "rts.image",
-    _specification,
+    specification,
     (2, 2, 3, 3, 3, 2, 2, 2),
     _shape,
     _forward,

@@ -16,7 +16,7 @@ from rts.errors import InputError, RtsError
 from rts.operations.operation import Operation
 from rts.records import ArraySpec
 from rts.trees import STATIC_FIELDS, Tree, join_record, split_record
-from rts_backends.jax_engine import host, operations
+from rts_backends.jax_engine import host, operations, rows_in_use
 
 for _cls in STATIC_FIELDS:
     jax.tree_util.register_pytree_node(
@@ -160,6 +160,22 @@ class JaxEngine(Engine):
         used = jnp.max(row) + 1
         index = jnp.arange(x.shape[0]).reshape(-1, *[1] * (x.ndim - 1))
         return jnp.where(index < used, x, jnp.where(used > 0, x[:1], 1))
+
+    def by_rows_in_use(
+        self, f: Callable[[dict[str, jax.Array]], jax.Array], rows: Mapping[str, jax.Array], row: jax.Array, whole: Any
+    ) -> jax.Array:
+        """See `Engine.by_rows_in_use`: in a traced program piece after piece. Other devices take all at once."""
+        if not isinstance(row, Tracer) or jax.default_backend() != "cpu":
+            return whole
+        used = jnp.max(row) + 1
+
+        def few(*own: jax.Array) -> jax.Array:
+            # Of small pieces array code takes less time than a call to the host.
+            with operations.by_specification():
+                return f(dict(zip(rows, own, strict=True)))
+
+        found = rows_in_use.apply(few, used, list(rows.values()))
+        return whole if found is None else found
 
     def segment_sum(self, values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:
         """Sums of the rows of `values` that share a segment."""

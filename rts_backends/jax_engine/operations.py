@@ -12,11 +12,13 @@ are in use, and a note of what its value has kept for the derivatives.
 from __future__ import annotations
 
 import collections
+import contextlib
+import contextvars
 import functools
 import itertools
 import secrets
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -53,8 +55,21 @@ def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[s
 
 
 def fits(operation: Operation, operands: Sequence[jax.Array]) -> bool:
-    """Whether the arrays are of the kernels' dtypes; on what device they are, a traced function cannot know."""
-    return operation.fits([x.dtype for x in operands])
+    """Whether kernels may compute it: dtypes are theirs; on what device arrays are, a traced function cannot know."""
+    return not _specifying.get() and operation.fits([x.dtype for x in operands])
+
+
+_specifying = contextvars.ContextVar("rts_specifying", default=False)
+
+
+@contextlib.contextmanager
+def by_specification() -> Iterator[None]:
+    """Within it no operation `fits`."""
+    token = _specifying.set(True)
+    try:
+        yield
+    finally:
+        _specifying.reset(token)
 
 
 class _Kept:

@@ -1,0 +1,267 @@
+"""Functions of packed rows, computed on about as many of the allotted rows as are in use.
+
+A compiled program allots rows for the worst case, and learns how many are in use when it runs. Here it takes a piece of
+some thousand rows at a time, in a loop that ends with those in use.
+
+There are three primitives, as of operations: the value, its pushforward and its pullback. jax cannot pull back through
+a loop of a length that it does not know; here derivatives are taken within each piece, for which the value is computed
+once more. Their own derivatives are those of loops over all rows, whose length jax knows.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+from jax.core import ShapedArray, Tracer, eval_jaxpr
+from jax.extend.core import Jaxpr, Primitive
+from jax.interpreters import ad, batching, mlir
+
+from rts_backends.jax_engine.columns import summed_by_columns, variables
+
+LEAST = 1 << 15
+"""Rows, below which all are computed: a loop would take as long as it saves."""
+
+PIECE = 1 << 12
+"""Rows of a piece: so many that calls of XLA's are worth it, and so few that intermediate arrays stay in caches."""
+
+CLOSED = 1 << 16
+"""The most numbers that a function may close over: their gradients are as large as they are, for each piece."""
+
+
+def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array]) -> jax.Array | None:
+    """The value (N, ·) of a function that treats each row by itself; anything in rows that are not in use.
+
+    Args:
+        f: arrays (n, ·) → (n, ·), for any n.
+        used: how many rows are in use, () int32.
+        rows: arrays (N, ·).
+
+    Returns:
+        The value, or None where the whole of it may as well be computed: of few rows; of a function that closes over
+        much, that does not read rows, or that has effects, which must happen once.
+    """
+    if rows[0].shape[0] < max(LEAST, PIECE):
+        return None
+    traced = jax.make_jaxpr(f)(*(jax.ShapeDtypeStruct((PIECE, *x.shape[1:]), x.dtype) for x in rows))
+    if traced.effects:
+        return None
+    jaxpr, closed = _of_rows_alone(traced.jaxpr, traced.consts)
+    if variables(jaxpr.eqns, jaxpr.outvars).keys().isdisjoint(jaxpr.invars):
+        return None
+    if sum(x.size for x in closed if isinstance(x, Tracer)) > CLOSED:
+        return None
+    return _value.bind(used, used, *closed, *rows, jaxpr=jaxpr)[0]
+
+
+def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any]]:
+    """A function without what does not depend on its arguments, which is computed here, and what it now closes over."""
+    varying, before, rest = set(jaxpr.invars), [], []
+    for equation in jaxpr.eqns:
+        # Numbers spread over the rows of a piece are no less to keep than to make.
+        if equation.primitive.name in _SPREADING or not variables([equation]).keys().isdisjoint(varying):
+            rest.append(equation)
+            varying.update(equation.outvars)
+        else:
+            before.append(equation)
+    read = variables(rest, jaxpr.outvars)
+    known = [*jaxpr.constvars, *(x for equation in before for x in equation.outvars)]
+    known = [x for x in known if x in read]
+    names = jaxpr.debug_info.with_unknown_names()
+    found = eval_jaxpr(jaxpr.replace(invars=[], outvars=known, eqns=before, debug_info=names), consts)
+    return jaxpr.replace(constvars=known, eqns=rest), found
+
+
+_SPREADING = {"broadcast_in_dim", "iota"}
+
+# --------------------------------------------------------------------------------------------------- three functions
+
+
+class _Pieces:
+    """How a function of rows is computed.
+
+    Args:
+        jaxpr: arrays (n, ·) → (n, ·), the function of a piece.
+        operands: arrays that it closes over, and arrays (N, ·).
+        most: how many rows are in use, at most; None to go through all.
+        used: how many rows are in use.
+    """
+
+    def __init__(self, jaxpr: Jaxpr, operands: Sequence[Any], most: Any, used: Any):
+        self._jaxpr, self._most, self._used = jaxpr, most, used
+        self.fixed = len(operands) - len(jaxpr.invars)
+        self._closed, self._rows = operands[: self.fixed], operands[self.fixed :]
+        first: Any = jaxpr.invars[0].aval
+        self._total, self._size = self._rows[0].shape[0], first.shape[0]
+
+    def zeros(self) -> jax.Array:
+        """Zeros in the shape of the value."""
+        out: Any = self._jaxpr.outvars[0].aval
+        return jnp.zeros((self._total, *out.shape[1:]), out.dtype)
+
+    def repeat(self, step: Callable[[Any, Any, Any], Any], state: Any) -> Any:
+        """Do `state = step(start, first, state)` for each piece: rows from `start`, new ones from `first` on."""
+        size = self._size
+
+        def body(i: Any, state: Any) -> Any:
+            return step(jnp.minimum(i * size, self._total - size), i * size, state)
+
+        count = -(-(self._total if self._most is None else self._most) // size)
+        if self._most is None or isinstance(count, Tracer):
+            return jax.lax.fori_loop(0, count, body, state)
+        for i in range(int(count)):  # jax would compile a loop anew whenever it is called.
+            state = body(i, state)
+        return state
+
+    def cut(self, x: Any, start: Any) -> Any:
+        """The rows of a piece."""
+        return jax.lax.dynamic_slice_in_dim(x, start, self._size)
+
+    def among(self, x: Any, there: jax.Array, other: Any) -> Any:
+        """The rows of a piece that are there, and others."""
+        return jnp.where(there.reshape(-1, *[1] * (x.ndim - 1)), x, other)
+
+    def index(self, start: Any) -> jax.Array:
+        """The number of each row of a piece."""
+        return start + jnp.arange(self._size)
+
+    def varying(self, start: Any, wanted: Sequence[bool]) -> tuple[Callable[..., jax.Array], list[Any]]:
+        """The value of a piece as a function of those operands that are wanted, closed ones and pieces, and these."""
+        operands = [*self._closed, *(self.cut(x, start) for x in self._rows)]
+        there = self.index(start) < self._used
+
+        def function(*varied: Any) -> jax.Array:
+            it = iter(varied)
+            given = [next(it) if wish else x for x, wish in zip(operands, wanted, strict=True)]
+            own = []
+            for x, whole in zip(given[self.fixed :], self._rows, strict=True):
+                # What is not in use may hold values at which there are no derivatives.
+                other = jnp.where(self._used > 0, jax.lax.stop_gradient(whole[:1]), jnp.ones((), x.dtype))
+                own.append(self.among(x, there, other))
+            return eval_jaxpr(self._jaxpr, given[: self.fixed], *own)[0]
+
+        return function, [x for x, wish in zip(operands, wanted, strict=True) if wish]
+
+
+def _computed(most: Any, used: Any, *operands: Any, jaxpr: Jaxpr) -> list[jax.Array]:
+    pieces = _Pieces(jaxpr, operands, most, used)
+
+    def step(start: Any, first: Any, out: jax.Array) -> jax.Array:
+        function, _ = pieces.varying(start, [False] * len(operands))
+        return jax.lax.dynamic_update_slice_in_dim(out, summed_by_columns(function)(), start, 0)
+
+    return [pieces.repeat(step, pieces.zeros())]
+
+
+def _pushed(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, wanted: tuple[bool, ...]) -> list[jax.Array]:
+    """The derivative along tangents of those operands that are wanted, which follow the operands."""
+    operands, tangents = given[: len(wanted)], given[len(wanted) :]
+    pieces = _Pieces(jaxpr, operands, most, used)
+    fixed = sum(wanted[: pieces.fixed])
+
+    def step(start: Any, first: Any, out: jax.Array) -> jax.Array:
+        function, varied = pieces.varying(start, wanted)
+        along = *tangents[:fixed], *(pieces.cut(t, start) for t in tangents[fixed:])
+        push = summed_by_columns(lambda *along: jax.jvp(function, tuple(varied), along)[1])
+        return jax.lax.dynamic_update_slice_in_dim(out, push(*along), start, 0)
+
+    return [pieces.repeat(step, pieces.zeros())]
+
+
+def _pulled(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, wanted: tuple[bool, ...]) -> list[jax.Array]:
+    """The gradients of those operands that are wanted; that of the value follows the operands."""
+    *operands, g = given
+    pieces = _Pieces(jaxpr, operands, most, used)
+    fixed = sum(wanted[: pieces.fixed])
+
+    def step(start: Any, first: Any, found: list[jax.Array]) -> list[jax.Array]:
+        function, varied = pieces.varying(start, wanted)
+        # The last piece may begin with rows of the one before.
+        own = pieces.among(pieces.cut(g, start), pieces.index(start) >= first, 0)
+        gradients = summed_by_columns(lambda g: jax.vjp(function, *varied)[1](g))(own)
+        sums = [a + b for a, b in zip(found[:fixed], gradients[:fixed], strict=True)]
+        for whole, x in zip(found[fixed:], gradients[fixed:], strict=True):
+            sums.append(jax.lax.dynamic_update_slice_in_dim(whole, pieces.cut(whole, start) + x, start, 0))
+        return sums
+
+    return pieces.repeat(step, [jnp.zeros_like(x) for x, wish in zip(operands, wanted, strict=True) if wish])
+
+
+# --------------------------------------------------------------------------------------------------- as primitives
+
+
+def _primitive(name: str, function: Callable, results: Callable) -> Primitive:
+    """A primitive of one of the functions, whose first operands say how many rows are in use: at most, and each item.
+
+    Args:
+        name: its name.
+        function: computes it.
+        results: shapes and dtypes of the operands after these, and parameters → those of the results.
+    """
+    made = Primitive(f"rts_rows_in_use_{name}")
+    made.multiple_results = True
+    made.def_impl(function)
+    made.def_abstract_eval(lambda most, used, *avals, **params: results(*avals, **params))
+    mlir.register_lowering(made, mlir.lower_fun(function, multiple_results=True))
+
+    def batched(operands: Sequence, dims: Sequence, **params: Any) -> tuple[list, list[int]]:
+        # One loop serves all items, as long as the longest.
+        most = operands[0] if dims[0] is None else jnp.max(operands[0])
+        found = jax.vmap(functools.partial(function, most, **params), tuple(dims[1:]))(*operands[1:])
+        return found, [0] * len(found)
+
+    def along(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[list, list]:
+        present = _present(tangents)
+        varied, moves = (tuple(x for x, t in zip(xs, present, strict=True) if t) for xs in (primals, tangents))
+
+        def whole(*varied: Any) -> list[jax.Array]:
+            it = iter(varied)
+            _, *given = (next(it) if t else x for x, t in zip(primals, present, strict=True))
+            return function(None, *given, **params)
+
+        return made.bind(*primals, **params), jax.jvp(whole, varied, moves)[1]
+
+    batching.primitive_batchers[made] = batched
+    ad.primitive_jvps[made] = along
+    return made
+
+
+def _present(tangents: Sequence[Any]) -> tuple[bool, ...]:
+    """Which tangents there are; integers have none."""
+    return tuple(type(t) is not ad.Zero and t.dtype != jax.dtypes.float0 for t in tangents)
+
+
+def _like_value(*avals: Any, jaxpr: Jaxpr, **_: Any) -> list[ShapedArray]:
+    rows, out = avals[len(jaxpr.constvars)], cast(Any, jaxpr.outvars[0].aval)
+    return [ShapedArray((rows.shape[0], *out.shape[1:]), out.dtype)]
+
+
+def _like_operands(*avals: Any, wanted: tuple[bool, ...], **_: Any) -> list[ShapedArray]:
+    return [ShapedArray(x.shape, x.dtype) for x, wish in zip(avals, wanted, strict=False) if wish]
+
+
+_value = _primitive("value", _computed, _like_value)
+_push = _primitive("push", _pushed, _like_value)
+_pull = _primitive("pull", _pulled, _like_operands)
+
+
+def _value_jvp(primals: Sequence, tangents: Sequence, **params: Any) -> tuple[list, list]:
+    found, wanted = _value.bind(*primals, **params), _present(tangents[2:])
+    along = [t for t, there in zip(tangents[2:], wanted, strict=True) if there]
+    if not along:
+        return found, [ad.Zero(ShapedArray(x.shape, x.dtype).to_tangent_aval()) for x in found]
+    return found, _push.bind(*primals, *along, wanted=wanted, **params)
+
+
+def _push_transpose(gradients: Sequence, *given: Any, wanted: tuple[bool, ...], **params: Any) -> list:
+    (g,), operands, tangents = gradients, given[: 2 + len(wanted)], given[2 + len(wanted) :]
+    if type(g) is ad.Zero:
+        return [None] * len(operands) + [ad.Zero(t.aval) for t in tangents]
+    return [None] * len(operands) + _pull.bind(*operands, g, wanted=wanted, **params)
+
+
+ad.primitive_jvps[_value] = _value_jvp
+ad.primitive_transposes[_push] = _push_transpose

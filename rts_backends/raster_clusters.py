@@ -1,0 +1,335 @@
+"""Triangles in clusters of what lies together: those out of view, or that all face away, are passed over at once.
+
+They are made of a mesh that stays (`rts.prepare`). Triangles are put in the order of a Morton curve through their
+middles, those that face other ways apart, and vertices in the order of their use. Of each cluster a box tells where it
+is, and a cone which ways it faces.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from rts.compiling import compiled, kernel
+from rts.records import Proxy
+from rts.threads import parallel, read_only
+from rts_backends.raster_cells import EVERYTHING, SIDE, Blocks
+
+SIZE = 256
+"""Triangles of a cluster, and vertices of a block."""
+
+FRONTS, BACKS = 1, 2
+"""Bits that say whether a cluster may hold triangles that face as asked for, and others."""
+
+AROUND = 1e-9
+"""What counts as nothing beside the terms of a sum, in float64: a cluster so near to the border of the view is kept."""
+
+NOISE = 1e-13
+"""How far off the determinant of three corners may be, of the product of the largest numbers in it."""
+
+STEPS = np.float64(2**10 - 1)
+"""The largest place on an axis."""
+
+COARSE = 2
+"""Bits of a place on an axis that come before which eighth of all ways a triangle faces, the others after it."""
+
+
+class Clusters(NamedTuple):
+    """A mesh in clusters.
+
+    Attributes:
+        vertices: (V, 3) float32, those that triangles use, in the order of their first use.
+        faces: (T, 3) int32, triangles in the order of clusters, SIZE in each.
+        order: (T,) int32, which triangle of the proxy each is.
+        boxes: (6, C) float32, the least and the largest x, y and z of each cluster.
+        cones: (5, C), a unit vector (x, y, z), the least cosine between it and a triangle's normal, below 0 where
+            nothing is known, and the least length of (b − a) × (c − a).
+        offsets: (C + 1,) int64, where each cluster's blocks of vertices begin in `blocks`.
+        blocks: int32, numbers of the blocks of SIZE vertices that hold its corners.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    order: np.ndarray
+    boxes: np.ndarray
+    cones: np.ndarray
+    offsets: np.ndarray
+    blocks: np.ndarray
+
+    @classmethod
+    def of(cls, proxy: Proxy) -> Clusters:
+        """The clusters of a proxy's triangles."""
+        vertices, faces = read_only(proxy.vertices, np.float32), read_only(proxy.faces, np.int32)
+        count, clusters = len(faces), -(-len(faces) // SIZE)
+        keys = np.empty(count, np.uint64)
+        low, extent = _extent(vertices)
+        parallel(_keys, count, vertices, faces, low, STEPS / extent, keys, work=10 * count)
+        keys.sort()
+        order = (keys & np.uint64(2**31 - 1)).astype(np.int32)
+        made = np.empty((len(vertices), 3), np.float32), np.empty((count, 3), np.int32)
+        used = _renumber(vertices, faces, order, *made)
+        vertices, faces = made[0][:used].copy(), made[1]
+        boxes, cones = np.empty((6, clusters), np.float32), np.empty((5, clusters))
+        parallel(_bound, clusters, vertices, faces, boxes, cones, work=50 * count)
+        offsets, blocks = np.zeros(clusters + 1, np.int64), np.empty(3 * count, np.int32)
+        blocks = blocks[: _find_blocks(faces, np.full(-(-used // SIZE), -1), offsets, blocks)].copy()
+        return cls(*map(read_only, (vertices, faces, order, boxes, cones, offsets, blocks)))
+
+    def seen(
+        self, matrix: np.ndarray, size: tuple[int, int], keep: float, both: bool, asked: Blocks = EVERYTHING
+    ) -> tuple[np.ndarray, ...]:
+        """What may be in view.
+
+        Args:
+            matrix: (4, 4) to homogeneous pixels.
+            size: (height, width).
+            keep: sign of the determinants of triangles that are asked for; 0 for all.
+            both: whether the others are asked for, too.
+            asked: the blocks of cells that are asked for.
+
+        Returns:
+            Numbers of clusters (N,) int32, which triangles these may hold (N,) uint8 as bits, and numbers of blocks of
+            vertices, int32.
+        """
+        height, width = size
+        # Positions a pixel outside of the image are not rounded into it.
+        sums = [[1, 0, 0, 1], [-1, 0, 0, width + 1], [0, 1, 0, 1], [0, -1, 0, height + 1], [0, 0, 1, 1], [0, 0, -1, 1]]
+        planes, rows = np.array(sums) @ matrix, matrix[[0, 1, 3]]
+        kept, sides = np.empty(self.boxes.shape[1], np.int32), np.empty(self.boxes.shape[1], np.uint8)
+        wanted = FRONTS | BACKS if both or keep == 0 else FRONTS
+        count = _find(self.boxes, self.cones, planes, rows, keep, wanted, kept, sides)
+        kept, sides = kept[:count], sides[:count]
+        if len(asked.bits):
+            there, near = np.zeros(np.add(asked.table.shape, 1), np.int32), np.empty(count, np.bool_)
+            there[1:, 1:] = (asked.table >= 0).cumsum(axis=0).cumsum(axis=1)
+            parallel(_touch, count, kept, self.boxes, rows, *size, there, near, work=60 * count)
+            kept, sides = kept[near], sides[near]
+        used = np.empty(-(-len(self.vertices) // SIZE), np.int32)
+        return kept, sides, used[: _use(kept, self.offsets, self.blocks, used)]
+
+
+@kernel
+def _extent(vertices):
+    """The least x, y and z (3,) of vertices, and how far these reach at most; without what is not finite."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for v in range(len(vertices)):
+        for r in range(3):
+            x = np.float64(vertices[v, r])
+            if np.isfinite(x):
+                low[r], high[r] = min(low[r], x), max(high[r], x)
+    return low, max((high - low).max(), 1e-30)
+
+
+@kernel
+def _keys(start, stop, vertices, faces, low, scale, keys):
+    """Fill in 33 bits of where triangles are to be, and below the indices: what sorts alike on every machine."""
+    for t in range(start, stop):
+        key = np.uint64(0)
+        for r in range(3):
+            x, y, z = vertices[faces[t, 0], r], vertices[faces[t, 1], r], vertices[faces[t, 2], r]
+            place = ((np.float64(x) + y + z) / 3 - low[r]) * scale
+            bits = np.uint64(min(place, STEPS) if place > 0 else 0.0)  # NaN comes first.
+            bits = (bits | bits << np.uint64(16)) & np.uint64(0x030000FF)
+            bits = (bits | bits << np.uint64(8)) & np.uint64(0x0300F00F)
+            bits = (bits | bits << np.uint64(4)) & np.uint64(0x030C30C3)
+            bits = (bits | bits << np.uint64(2)) & np.uint64(0x09249249)
+            key |= bits << np.uint64(r)
+        eighth, fine = np.uint64(0), np.uint64(30 - 3 * COARSE)
+        for r in range(3):
+            eighth |= np.uint64(_normal(vertices, faces[t, 0], faces[t, 1], faces[t, 2], r) > 0) << np.uint64(r)
+        key = ((key >> fine) << np.uint64(3) | eighth) << fine | key & ((np.uint64(1) << fine) - np.uint64(1))
+        keys[t] = key << np.uint64(31) | np.uint64(t)
+
+
+@kernel
+def _renumber(vertices, faces, order, new_vertices, new_faces):
+    """Fill in the triangles in this order, and the vertices in the order of their use; how many there are."""
+    numbers, count = np.full(len(vertices), -1, np.int32), 0
+    for t in range(len(order)):
+        for c in range(3):
+            v = faces[order[t], c]
+            if numbers[v] < 0:
+                numbers[v] = count
+                for r in range(3):
+                    new_vertices[count, r] = vertices[v, r]
+                count += 1
+            new_faces[t, c] = numbers[v]
+    return count
+
+
+@kernel
+def _find_blocks(faces, last, offsets, blocks):
+    """Fill in which blocks of vertices each cluster uses, and where these begin; how many there are."""
+    count = 0
+    for t in range(len(faces)):
+        cluster = t // SIZE
+        for c in range(3):
+            block = faces[t, c] // SIZE
+            if last[block] != cluster:
+                last[block] = cluster
+                blocks[count] = block
+                count += 1
+        offsets[cluster + 1] = count
+    return count
+
+
+@kernel(error_model="numpy")
+def _bound(start, stop, vertices, faces, boxes, cones):
+    """Fill in boxes and cones of clusters."""
+    normals = np.empty((SIZE, 3))
+    for cluster in range(start, stop):
+        block = faces[cluster * SIZE : (cluster + 1) * SIZE]
+        known, count, least = True, 0, np.inf
+        for r in range(3):
+            low, high = np.float32(np.inf), np.float32(-np.inf)
+            for b in range(len(block)):
+                for c in range(3):
+                    x = vertices[block[b, c], r]
+                    known &= np.isfinite(x)
+                    low, high = min(low, x), max(high, x)
+            boxes[r, cluster], boxes[3 + r, cluster] = low, high
+        axis = np.zeros(3)
+        for b in range(len(block)):
+            i, j, k = block[b, 0], block[b, 1], block[b, 2]
+            if _same(vertices, i, j) or _same(vertices, j, k) or _same(vertices, k, i):
+                continue  # One of its edge functions is 0 everywhere: it covers nothing.
+            normal = normals[count]
+            for r in range(3):
+                normal[r] = _normal(vertices, i, j, k, r)
+            length = np.sqrt(normal[0] ** 2 + normal[1] ** 2 + normal[2] ** 2)
+            least = min(least, length)
+            for r in range(3):
+                normal[r] /= length
+                axis[r] += normal[r]
+            count += 1
+        axis /= np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
+        cosine = 1.0
+        for n in range(count):
+            cosine = min(cosine, normals[n, 0] * axis[0] + normals[n, 1] * axis[1] + normals[n, 2] * axis[2])
+        if not (known and cosine > 0 and least > 0 and least < np.inf):
+            axis[:], cosine = 0.0, -1.0
+        if not known:
+            boxes[:3, cluster], boxes[3:, cluster] = -np.inf, np.inf
+        cones[:3, cluster], cones[3, cluster], cones[4, cluster] = axis, cosine, least
+
+
+@compiled
+def _normal(vertices, i, j, k, r):
+    """A number of (b − a) × (c − a) of corners a, b, c."""
+    p, q = (r + 1) % 3, (r + 2) % 3
+    x, y = np.float64(vertices[i, p]), np.float64(vertices[i, q])
+    return (vertices[j, p] - x) * (vertices[k, q] - y) - (vertices[j, q] - y) * (vertices[k, p] - x)
+
+
+@compiled
+def _same(vertices, i, j):
+    return vertices[i, 0] == vertices[j, 0] and vertices[i, 1] == vertices[j, 1] and vertices[i, 2] == vertices[j, 2]
+
+
+@kernel(error_model="numpy")
+def _find(boxes, cones, planes, rows, keep, wanted, kept, sides):
+    """Fill in which clusters may hold what is wanted, and what these may hold; how many there are.
+
+    Args:
+        boxes: see `Clusters`.
+        cones: see `Clusters`.
+        planes: (6, 4) half-spaces p · (x, y, z, 1) ≥ 0 that the view lies in.
+        rows: (3, 4) to homogeneous pixels (x, y, w).
+        keep: sign of the determinants of triangles that are asked for; 0 for all.
+        wanted: bits, FRONTS, BACKS.
+        kept: (C,) int32.
+        sides: (C,) uint8.
+    """
+    # A triangle's determinant is n · (q + s a), for its corner a and n = (b − a) × (c − a); q and s are minors.
+    q0, q1, q2, s = _minor(rows, 1, 2, 3), _minor(rows, 2, 0, 3), _minor(rows, 0, 1, 3), _minor(rows, 0, 1, 2)
+    towards = keep * q0, keep * q1, keep * q2, keep * s
+    _test(boxes, cones, planes, towards, np.abs(rows), sides)
+    count = 0
+    for cluster in range(len(sides)):
+        some = sides[cluster]
+        kept[count], sides[count] = cluster, some
+        count += (some & wanted) != 0
+    return count
+
+
+@compiled
+def _minor(rows, i, j, k):
+    a, b, c = rows[0], rows[1], rows[2]
+    return a[i] * (b[j] * c[k] - b[k] * c[j]) + a[j] * (b[k] * c[i] - b[i] * c[k]) + a[k] * (b[i] * c[j] - b[j] * c[i])
+
+
+@compiled(inline="always", error_model="numpy")
+def _test(boxes, cones, planes, towards, rows, sides):
+    """Fill in for each cluster as bits which triangles it may hold: FRONTS, BACKS; none if it is out of view."""
+    qx, qy, qz, s = towards
+    for cluster in range(len(sides)):
+        x0, y0, z0 = np.float64(boxes[0, cluster]), np.float64(boxes[1, cluster]), np.float64(boxes[2, cluster])
+        x1, y1, z1 = np.float64(boxes[3, cluster]), np.float64(boxes[4, cluster]), np.float64(boxes[5, cluster])
+        x, y, z, dx, dy, dz = (x0 + x1) / 2, (y0 + y1) / 2, (z0 + z1) / 2, (x1 - x0) / 2, (y1 - y0) / 2, (z1 - z0) / 2
+        mx, my, mz = max(-x0, x1), max(-y0, y1), max(-z0, z1)
+        out = False
+        for p in range(6):
+            a, b, c, d = planes[p, 0], planes[p, 1], planes[p, 2], planes[p, 3]
+            most = a * x + b * y + c * z + d + (abs(a) * dx + abs(b) * dy + abs(c) * dz)
+            out |= most < -AROUND * (abs(a) * mx + abs(b) * my + abs(c) * mz + abs(d))
+        noise = NOISE
+        for r in range(3):
+            noise *= rows[r, 0] * mx + rows[r, 1] * my + rows[r, 2] * mz + rows[r, 3]
+        gx, gy, gz = qx + s * x, qy + s * y, qz + s * z
+        along = cones[0, cluster] * gx + cones[1, cluster] * gy + cones[2, cluster] * gz
+        across = np.sqrt(max(gx * gx + gy * gy + gz * gz - along * along, 0.0))
+        cosine, least = cones[3, cluster], cones[4, cluster]
+        spread = across * np.sqrt(1 - cosine * cosine + AROUND) + abs(s) * np.sqrt(dx * dx + dy * dy + dz * dz)
+        # Of the normal that is turned away most.
+        sure = (abs(along) * cosine - spread) * least > noise
+        sides[cluster] = 0 if out else FRONTS | BACKS if not sure else FRONTS if along > 0 else BACKS
+
+
+@kernel(error_model="numpy")
+def _touch(start, stop, kept, boxes, rows, height, width, there, near):
+    """Fill in for some clusters whether they may touch blocks that are asked for; `there` counts these from the first.
+
+    Where a box reaches behind the eye, its cluster may.
+    """
+    corner, side = np.empty(3), np.empty((3, 3))
+    for n in range(start, stop):
+        cluster, least = kept[n], abs(rows[2, 3])
+        corner[:] = rows[:, 3]
+        for c in range(3):
+            low, high = np.float64(boxes[c, cluster]), np.float64(boxes[3 + c, cluster])
+            least += abs(rows[2, c]) * max(-low, high)
+            for r in range(3):
+                corner[r] += rows[r, c] * low
+                side[r, c] = rows[r, c] * (high - low)
+        x0, x1, y0, y1, ahead = np.inf, -np.inf, np.inf, -np.inf, True
+        for k in range(8):
+            u, v, t = k & 1, k >> 1 & 1, k >> 2
+            x = corner[0] + u * side[0, 0] + v * side[0, 1] + t * side[0, 2]
+            y = corner[1] + u * side[1, 0] + v * side[1, 1] + t * side[1, 2]
+            w = corner[2] + u * side[2, 0] + v * side[2, 1] + t * side[2, 2]
+            ahead &= w > AROUND * least
+            x0, x1, y0, y1 = min(x0, x / w), max(x1, x / w), min(y0, y / w), max(y1, y / w)
+        near[n] = True
+        if ahead:
+            # A pixel more all around, since positions are rounded; what is out of view is known.
+            left, right = int(max(x0 - 1, 0.0)) // SIDE, int(min(x1 + 1, width - 1.0)) // SIDE + 1
+            top, bottom = int(max(y0 - 1, 0.0)) // SIDE, int(min(y1 + 1, height - 1.0)) // SIDE + 1
+            if left < right and top < bottom:
+                near[n] = there[bottom, right] - there[top, right] - there[bottom, left] + there[top, left] > 0
+
+
+@kernel
+def _use(kept, offsets, blocks, used):
+    """Fill in which blocks of vertices some clusters use; how many there are."""
+    every = len(kept) == len(offsets) - 1
+    marks = np.full(len(used), every)
+    if not every:
+        for cluster in kept:
+            for n in range(offsets[cluster], offsets[cluster + 1]):
+                marks[blocks[n]] = True
+    found = 0
+    for block in range(len(used)):
+        used[found] = block
+        found += marks[block]
+    return found
