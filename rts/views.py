@@ -113,9 +113,8 @@ def _images(
     """The images (B, H, W, C + 1) of several views of one scene, over nothing."""
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
     draw, (engine, like) = partial(image_of, size=size, suited=suited, **options), scenes[0].suited
-    several = layers != "auto" and _concurrent(
-        scenes[0]
-    )  # Where layers are "auto" it may warn, which is for this thread.
+    # Where layers are "auto" it may warn, which is for this thread.
+    several = layers != "auto" and _concurrent(scenes[0])
     whole = layers != "auto" and len(bands_of(*size, layers, supersample)) == 1
     if whole and not isinstance(supersample, Adaptive):
         view = supersample * size[0] + 2 * apron_of(splatter), supersample * size[1] + 2 * apron_of(splatter)

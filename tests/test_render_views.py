@@ -159,7 +159,7 @@ def test_a_compiled_program_renders_views_and_takes_capacity():
 
 @pytest.mark.parametrize("capacity", [None, 700])
 def test_compiled_silhouettes_are_those_of_a_loop(capacity):
-    """Of one part of one colour jax samples and splats all views together."""
+    """For one part of one colour jax samples and splats all views together."""
     jax = pytest.importorskip("jax")
     part, options = mesh_part(icosphere(1), shader="silhouette"), {"capacity": capacity}
 

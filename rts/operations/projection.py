@@ -44,7 +44,7 @@ def projective_map_of_views(rows: Array, points: Array, view: Array, places: Arr
 
 
 def _ranges(view: np.ndarray, count: int) -> Iterator[tuple[int, slice]]:
-    """Of so many views their numbers, from 0 on, and where their points are."""
+    """The numbers of so many views, from 0 on, and where the points of each are."""
     ends = np.searchsorted(view[: np.count_nonzero(view)], np.arange(1, count + 2))
     return enumerate(itertools.starmap(slice, itertools.pairwise(ends.tolist())))
 
@@ -118,7 +118,7 @@ def _shape_of_views(rows: tuple, points: tuple[int, ...], view: tuple, places: t
 
 
 def _each_view(operands: Arrays) -> Iterator[tuple[int, slice, Arrays, np.ndarray]]:
-    """Of each view its number, where its points are, the operands of its projection, and its place."""
+    """The number of each view, where its points are, the operands of its projection, and its place."""
     rows, points, view, places = operands
     if rows.shape[1:] != (4, 4) or points.shape != (len(view), 3) or places.shape != (len(rows), 3):
         shapes = ", ".join(str(x.shape) for x in operands)

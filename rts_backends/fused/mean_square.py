@@ -15,8 +15,8 @@ from rts.engines import namespace
 from rts.operations.operation import Arrays, Operation, Some
 from rts.threads import parallel, read_only
 from rts.trees import Array
-from rts_backends.fused import splatters
 from rts_backends.fused.cells import Cells, Choices, Settings
+from rts_backends.fused.image import specification, used
 
 
 class Swept(NamedTuple):
@@ -42,7 +42,7 @@ def difference(image: Array, target: Array, weights: Array | None, background: A
 
 def _specification(*operands: Array, settings: Settings) -> Array:
     *splats, target, weights, background = operands
-    image = splatters.specification(*splats, settings=settings)
+    image = specification(*splats, settings=settings)
     given = (x if x.shape[0] else None for x in (weights, background))
     found = difference(image, target, *given)
     return namespace(found).mean(found * found)
@@ -149,12 +149,12 @@ MEAN_SQUARE = Operation(
     _pull,
     differentiable=2,
     packed=(0, 1),
-    used=splatters.used,
+    used=used,
     even=(1,),
     keeps=True,
     sweeps=True,
 )
-"""The mean square () of weight · (image − target) for the operands of `splatters.IMAGE`, and of a target (H, W, C),
+"""The mean square () of weight · (image − target) for the operands of `image.IMAGE`, and of a target (H, W, C),
 weights (H, W, 1 or C) and a background (H, W, 4), (0, 0, 0) where there are none."""
 
 
@@ -165,7 +165,7 @@ def mean_square(
     weights: Array | None,
     background: Array | None,
 ) -> Array:
-    """See `rts.Splatter.mean_square`; `splats` are the operands of `splatters.IMAGE`."""
+    """See `rts.Splatter.mean_square`; `splats` are the operands of `image.IMAGE`."""
     none = target[:0, :0, :]
     given: tuple[Any, ...] = tuple(none if x is None else x for x in (weights, background))
     return MEAN_SQUARE(*splats, target, *given, settings=settings)

@@ -1,0 +1,96 @@
+"""A splatted image as an operation: compiled kernels, and the specification that they equal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rts import splatting
+from rts.arrays import without_border
+from rts.operations.operation import Arrays, Operation, Some
+from rts.records import Splats
+from rts.trees import Array
+from rts_backends.fused.cells import Cells, Choices, Settings
+
+_SPECIFICATIONS = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}
+
+
+def specification(
+    positions: Array,
+    rgba: Array,
+    row: Array,
+    part: Array,
+    facing: Array,
+    wanted: Array,
+    settled: Array,
+    exits: Array,
+    *,
+    settings: Settings,
+) -> Array:
+    """The image in array code."""
+    given = settings.sigma, settings.epsilon, settings.gamma
+    options = {"rims": settings.rims, "crossings": settings.crossings} if settings.kind == "visible" else {}
+    part, facing, settled, exits = (x if x.shape[0] else None for x in (part, facing, settled, exits))
+    splats = Splats(positions, rgba, row, part, facing, settled, exit=exits)
+    return without_border(_SPECIFICATIONS[settings.kind](*given, **options).image(splats), settings.border)
+
+
+def _shape(
+    positions: tuple,
+    rgba: tuple,
+    row: tuple,
+    part: tuple,
+    facing: tuple,
+    wanted: tuple,
+    settled: tuple,
+    exits: tuple,
+    *,
+    settings: Settings,
+) -> tuple[int, ...]:
+    return *(max(0, n - 2 * settings.border) for n in row[1:]), 4
+
+
+def _cells(settings: Settings, operands: Arrays, kept: Choices | None) -> Cells:
+    positions, rgba, row, *known = operands
+    return Cells(settings, positions, rgba, row, kept, *known)
+
+
+def _forward(operands: Arrays, out: np.ndarray, *, settings: Settings) -> Choices | None:
+    cells = _cells(settings, operands, None)
+    cells.image(out)
+    return cells.choices if out.size else None
+
+
+def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, settings: Settings, kept: Choices | None) -> None:
+    t_positions, t_rgba = tangents
+    _cells(settings, operands, kept).jvp(t_positions, t_rgba, out)
+
+
+def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings, kept: Choices | None) -> None:
+    g_positions, g_rgba = results
+    _cells(settings, operands, kept).vjp(g, g_positions, g_rgba)
+
+
+def used(operands: Arrays) -> int:
+    """How many rows cells refer to."""
+    return max(1, int(operands[2].max(initial=0)) + 1, int(operands[7].max(initial=0)) + 1)
+
+
+_OPTIONS: dict[str, Any] = {"differentiable": 2, "packed": (0, 1), "used": used, "even": (1,)}
+IMAGE = Operation(
+    "rts.image",
+    specification,
+    (2, 2, 3, 3, 3, 2, 2, 2),
+    _shape,
+    _forward,
+    _push,
+    _pull,
+    keeps=True,
+    sweeps=True,
+    **_OPTIONS,
+)
+"""The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled and exit, without
+a border.
+
+The last five are those of `rts.Splats`; (0, H, W) and (0, W) where they are not known."""
