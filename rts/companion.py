@@ -19,7 +19,7 @@ import zlib
 from pathlib import Path
 from typing import IO, Any
 
-from rts.threads import thread_count
+from rts.threads import cores, thread_count
 
 if sys.platform != "win32":  # There each process compiles for itself.
     import fcntl
@@ -200,6 +200,9 @@ class _Companion:
         except BaseException:
             self._to.close()
             raise
+        if sys.platform == "linux":
+            with contextlib.suppress(OSError):
+                os.sched_setaffinity(self._process.pid, cores())  # A helper that asks may be kept off one.
         self._to.settimeout(1)  # It reads whatever comes, unless it hangs.
         for kind in _expected:
             self.tell(number(kind))

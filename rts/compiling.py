@@ -14,9 +14,9 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FunctionType
-from typing import Any, NamedTuple, cast
+from typing import IO, Any, NamedTuple, cast
 
 import numba
 from numba.core import event
@@ -63,26 +63,35 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
 
 
 @contextmanager
-def alone(folder: str) -> Iterator[None]:
-    """Hold a folder of kernels as the only process, where the system and the file system know such locks.
+def alone(folder: str, writes: bool = True) -> Iterator[None]:
+    """Hold a folder of kernels as the only process that writes, where the system and the file system know such locks.
 
-    numba reads a function's index, chooses a name for the code, and writes both. Two processes that do so at once,
-    for different types, may choose the same name: one type's calls would then run the other's code.
+    numba reads a function's index, chooses a name for the code, and writes both, one after the other. Two processes
+    that do so at once, for different types, may choose the same name: one type's calls would then run the other's code.
+
+    Args:
+        folder: where the kernels are.
+        writes: False to hold it together with others that read.
     """
-    if fcntl is None:
+    file = _lock_file(folder)
+    if fcntl is None or file is None:
         yield
         return
-    file = None
-    try:
-        file = open(os.path.join(folder, ".lock"), "ab")  # noqa: SIM115  # It is closed below.
-        fcntl.flock(file, fcntl.LOCK_EX)
-    except OSError:
-        pass
-    try:
-        yield
-    finally:
-        if file is not None:
-            file.close()
+    with file:
+        with suppress(OSError):
+            fcntl.flock(file, fcntl.LOCK_EX if writes else fcntl.LOCK_SH)
+        try:
+            yield
+        finally:
+            with suppress(OSError):
+                fcntl.flock(file, fcntl.LOCK_UN)  # A child that was forked meanwhile has the file, too.
+
+
+def _lock_file(folder: str) -> IO[bytes] | None:
+    for mode in ("ab", "rb"):  # It may be another user's.
+        with suppress(OSError):
+            return open(os.path.join(folder, ".lock"), mode)
+    return None
 
 
 class _Cache(FunctionCache):
@@ -90,12 +99,16 @@ class _Cache(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """What is on disk; None if it is to be compiled here."""
-        found = super().load_overload(sig, target_context)
+        found = self._loaded(sig, target_context)
         if found is None and companion.begin(key := _key(self._py_func, sig)):
-            found = super().load_overload(sig, target_context)
+            found = self._loaded(sig, target_context)
             if found is not None:
                 companion.end(key)
         return found
+
+    def _loaded(self, sig: Any, target_context: Any) -> Any:
+        with alone(self.cache_path, writes=False):
+            return super().load_overload(sig, target_context)
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Write what has been compiled."""

@@ -19,15 +19,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rts import memory
-
 TASKS_PER_THREAD = 4
 """Several tasks for each thread, so that one that gets the heavy rows does not keep the others waiting."""
 
 LITTLE_WORK = 100_000
 """Nanoseconds, below which a loop stays on the thread that asks for it: to ask another takes tens of thousands."""
-
-memory.keep_freed()
 
 _In = TypeVar("_In")
 _Out = TypeVar("_Out")
@@ -37,11 +33,32 @@ def _nothing() -> None:
     pass
 
 
-class _Job:
-    """Work that a helper is asked to join in; whoever claims it first, helper or caller, decides whether it does."""
+def _core_of_caller() -> Callable[[], int] | None:
+    """A function that tells on which core it is called; None where the system does not tell."""
+    return getattr(ctypes.PyDLL(None), "sched_getcpu", None) if sys.platform == "linux" else None
 
-    def __init__(self, work: Callable[[], None]):
-        self.work = work
+
+_core = _core_of_caller()
+_local = threading.local()
+
+
+def cores() -> set[int]:
+    """The cores that this thread may run on; a helper has those of the thread that asked it. Linux alone tells."""
+    return getattr(_local, "cores", None) or os.sched_getaffinity(0)
+
+
+class _Job:
+    """Work that a helper is asked to join in; whoever claims it first, helper or caller, decides whether it does.
+
+    Attributes:
+        work: a function.
+        cores: of the thread that asks, if the system tells.
+        roams: whether it may run on all of these, also on that of this thread.
+        error: what it raised.
+    """
+
+    def __init__(self, work: Callable[[], None], cores: set[int] | None, roams: bool):
+        self.work, self.cores, self.roams = work, cores, roams
         self.error: BaseException | None = None
         self._unclaimed, self._going = threading.Lock(), threading.Lock()
         self._going.acquire()
@@ -57,14 +74,15 @@ class _Job:
             self.work = _nothing
         return mine
 
-    def run(self, under_way: set[_Job]) -> None:
-        """Do the work, and mark it as done; as long as it goes on, it is in the set."""
-        under_way.add(self)
+    def run(self) -> None:
+        """Do the work, and keep what it raises."""
         try:
             self.work()
         except BaseException as error:
             self.error = error
-        under_way.discard(self)
+
+    def end(self) -> None:
+        """Let go those that wait until it is done."""
         self._going.release()
 
     def wait(self) -> None:
@@ -77,64 +95,84 @@ class _Helpers:
 
     def __init__(self) -> None:
         self.count = 0
-        self._threads: list[int] = []
-        self._cores: set[int] = set()
         self._jobs: SimpleQueue[_Job] = SimpleQueue()
         self._under_way: set[_Job] = set()
         self._lock = threading.Lock()
+        # Threads by the system's numbers, those of them that run anywhere now, and where the others run.
+        self._threads: list[int] = []
+        self._roaming: set[int] = set()
+        self._placed: set[int] | None = None
 
     def free(self, count: int) -> int:
         """How many of so many helpers have nothing to do, or are not there yet."""
         return max(0, count - len(self._under_way))
 
-    def ask(self, job: _Job, count: int, apart: bool) -> None:
-        """Hand a job to one of so many helpers, which run apart from the thread that asks, or on any core."""
-        if self.count < count:
-            with self._lock:
-                while self.count < count:
-                    thread = threading.Thread(target=self._serve, name="rts", daemon=True)
-                    try:
-                        thread.start()
-                    except RuntimeError:  # The system gives no more: those that there are, or the caller, do the work.
-                        break
-                    self.count += 1
-                    self._threads.append(thread.native_id or 0)
-                    self._cores = set()
-        self._place(apart)
-        self._jobs.put(job)
+    def start(self, count: int) -> None:
+        """Start so many helpers, if there are fewer."""
+        if self.count >= count:
+            return
+        with self._lock:
+            while self.count < count:
+                thread = threading.Thread(target=self._serve, name="rts", daemon=True)
+                try:
+                    thread.start()
+                except RuntimeError:  # The system gives no more: those that there are, or the caller, do the work.
+                    break
+                self.count += 1
+                if thread.native_id:
+                    self._threads.append(thread.native_id)
+                self._placed = None
 
-    def _place(self, apart: bool) -> None:
-        """Say on which cores helpers may run.
+    def keep_off(self, core: int, cores: set[int]) -> None:
+        """Have helpers that have nothing to do run on other cores than one of these.
 
         Linux wakes a thread on the core of the one that wakes it, though others are idle, more often than not where
         there are two: it would wait there until the loop is over.
         """
-        if _core is None or self._under_way:
+        cores = cores - {core} or cores
+        if self._under_way or cores == self._placed:
             return
-        cores = os.sched_getaffinity(0)
-        if apart and len(cores) > 1:
-            cores.discard(_core())
-        if cores != self._cores:
-            self._cores = cores
+        with self._lock:
+            self._placed = cores
             for thread in self._threads:
-                with contextlib.suppress(OSError):  # Where that may not be said, they run anywhere.
-                    os.sched_setaffinity(thread, cores)
+                if thread not in self._roaming:
+                    _place(thread, cores)
+
+    def ask(self, job: _Job) -> None:
+        """Hand a job to one of the helpers."""
+        self._jobs.put(job)
 
     def _serve(self) -> None:
         while True:
             job = self._jobs.get()
             if job.claim():
-                job.run(self._under_way)
+                self._under_way.add(job)
+                _local.cores = job.cores
+                if job.roams and job.cores:
+                    self._run_anywhere(job, job.cores)
+                else:
+                    job.run()
+                self._under_way.discard(job)
+                job.end()
             del job  # A thread that waits must not keep arrays alive.
 
+    def _run_anywhere(self, job: _Job, cores: set[int]) -> None:
+        """Run a job on any of some cores; where the helper runs afterwards is for the next that asks."""
+        own = threading.get_native_id()
+        with self._lock:
+            self._roaming.add(own)
+            _place(own, cores)
+        job.run()
+        with self._lock:
+            self._roaming.discard(own)
+            self._placed = None
 
-def _core_of_caller() -> Callable[[], int] | None:
-    """A function that tells on which core it is called; None where the system does not tell."""
-    found = getattr(ctypes.PyDLL(None), "sched_getcpu", None) if sys.platform == "linux" else None
-    return found
+
+def _place(thread: int, cores: set[int]) -> None:
+    with contextlib.suppress(OSError):  # Where that may not be said, they run anywhere.
+        os.sched_setaffinity(thread, cores)
 
 
-_core = _core_of_caller()
 _helpers = _Helpers()
 
 
@@ -153,7 +191,7 @@ def thread_count() -> int:
     wanted = os.environ.get("RTS_NUM_THREADS", "")
     if wanted.isdigit() and int(wanted) > 0:
         return int(wanted)
-    return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
+    return len(cores()) if sys.platform == "linux" else os.cpu_count() or 1
 
 
 def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
@@ -171,8 +209,8 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK, 
         count: the end of the range.
         *args: handed on.
         work: nanoseconds that it takes on one thread, roughly.
-        apart: whether helpers are to keep off the caller's core. What they call must not start threads then, which
-            would have to keep off as well.
+        apart: whether helpers are to keep off the caller's core all the time. What they call must not start threads
+            then, which would have to keep off as well.
     """
     # In a task of another loop there may be no helper left, and to ask takes time.
     if work < LITTLE_WORK or count <= 1 or (threads := thread_count()) == 1 or not (free := _helpers.free(threads - 1)):
@@ -193,10 +231,14 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK, 
 
     # The caller works too. A helper that has not woken by the time all is begun is not waited for.
     jobs: list[_Job] = []
+    _helpers.start(threads - 1)
+    own = cores() if _core else None
+    if _core and own:
+        _helpers.keep_off(_core(), own)
     try:
         for _ in range(free):
-            jobs.append(_Job(share))
-            _helpers.ask(jobs[-1], threads - 1, apart)
+            jobs.append(_Job(share, own, not apart))
+            _helpers.ask(jobs[-1])
         share()
     finally:
         # Whatever happens, none is to be left that writes to arrays which the caller may give away.

@@ -134,6 +134,17 @@ class TestRaster(SamplerConformance):
         return "raster"
 
 
+class TestClusters(SamplerConformance):
+    """What was prepared is in clusters, though there are few triangles."""
+
+    @pytest.fixture
+    def sampler(self, monkeypatch):
+        from rts_backends import raster
+
+        monkeypatch.setattr(raster, "MANY", 1)
+        return "raster"
+
+
 class TestReference(SamplerConformance):
     @pytest.fixture
     def sampler(self):

@@ -79,7 +79,7 @@ def prepare(
     """Build what a sampler needs of each part, once.
 
     `raster` puts the triangles of large meshes in order by place, so that it can pass over many at once. That takes 22
-    bytes a triangle, and as long as to draw them five to forty times.
+    bytes for each triangle of a closed mesh, and as long as to draw them some 5 to 40 times.
 
     Args:
         parts: one part or several, with values that are known (not traced).

@@ -14,6 +14,8 @@ from rts.checks import check_sampler
 from rts.gbuffer import GBuffer
 from rts.interfaces import Part, TriangleSurface
 from rts.records import Sampled
+from rts.sampling.prepared import prepare
+from rts.sampling.scenes import sample
 from rts.testing import derivatives, scenes
 from rts.testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing
 from rts.testing.claims import claim, no_error, refusal
@@ -121,6 +123,21 @@ class SamplerConformance(Conformance):
                 silhouettes += claim_like(found, like, f"part {i} with new arrays in θ, after {view}")
             _claim_same(scenes.find(part, camera, sampler), first, view)
         silhouettes.claim_few("with new arrays in θ, ")
+
+    def test_prepared_parts_are_sampled_alike(self, sampler: Any, parts: list[Part]) -> None:
+        """What `rts.prepare` builds once for a part that stays gives the right samples, wherever it is moved."""
+        turn, silhouettes = (
+            np.array([(0, -1, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0.1), (0, 0, 0, 1)], np.float32),
+            Silhouettes(),
+        )
+        for index, part in enumerate(parts):
+            held = prepare(part, sampler, camera=scenes.CAMERA, size=scenes.SIZE)
+            for moved in (part, part.replace(transform=turn)):
+                found = sample(
+                    held.replace(transform=moved.transform), scenes.CAMERA, scenes.SIZE, layers=scenes.LAYERS
+                )
+                silhouettes += claim_like(found, right(moved, scenes.CAMERA, sampler), f"part {index}, prepared")
+        silhouettes.claim_few("prepared, ")
 
     def test_it_follows_theta(self, sampler: Any, parts: list[Part]) -> None:
         """Each of several θ on one surface is sampled rightly: more than are kept, built, updated or found again."""
