@@ -17,7 +17,14 @@ VARIABLES: Mapping[str, Mapping[str, Any]] = {
         ("culls", "prunes", "takes_cells", "tells_facing", "tells_exits", "concurrent"), False
     ),
     "rts.shaders": {"opaque": False, "uniform": False, "reads": None},
-    "rts.splatters": {"layers": None, "reach": 1, "reads_facing": False, "prunes": False, "sums_products": False},
+    "rts.splatters": {
+        "layers": None,
+        "reach": 1,
+        "reads_facing": False,
+        "prunes": False,
+        "sums_products": False,
+        "sums_squares": False,
+    },
 }
 """Group → class variable of its base → its default, for plugins of other classes."""
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 
@@ -172,8 +174,9 @@ def _shown(
         positions.append(constants(own.project(local["position"], wide.grid), engine, dtype))
         check_splats(index, part, world, positions[-1], rgba, row, first)
         if not part.shader.uniform:
-            shade = partial(_colors, part, theta, transform, camera)
-            rgba = engine.by_rows_in_use(shade, local.computed, samples.row, rgba)
+            shade = partial(_colors, part, theta, transform, camera, [*local])
+            with suppress(_UnreadError):
+                rgba = engine.by_rows_in_use(shade, local.computed, samples.row, rgba)
         colors.append(constants(rgba, engine, dtype))
         first += samples.ids.shape[-2]
     if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
@@ -222,6 +225,10 @@ def _shown_in_views(
 
     def colored(given: tuple) -> Array:
         camera, own, (samples, local) = given
+        if not local["position"].shape[0]:
+            # Shaders may expect a row at least.
+            none = namespace(local["position"]).broadcast_to(local["position"][:, :1], (0, part.shader.channels + 1))
+            return constants(none, engine, dtype)
         known = samples, local, constants(camera, engine, like), own, grid, engine, like
         return constants(_colored(part, theta, transform, *known)[1], engine, dtype)
 
@@ -294,7 +301,12 @@ def _together(*kinds: Sequence[Array]) -> list[Array]:
 
 def _apart(samples: Samples, gbuffer: GBuffer, sizes: Sequence[int], engine: Engine) -> list[tuple[Samples, GBuffer]]:
     """The samples of several views, of so many rows each, and their G-buffers, from those of them all."""
-    split = cache(lambda name: engine.split(gbuffer[name], sizes))
+    known, lock = cache(lambda name: engine.split(gbuffer[name], sizes)), threading.Lock()
+
+    def split(name: str) -> Sequence[Array]:
+        with lock:  # Views are shaded by several threads.
+            return known(name)
+
     rows = [engine.split(x, sizes) for x in (samples.ids, samples.params, *samples.tables.values())]
     views = []
     for b, (ids, params, *tables) in enumerate(zip(*rows, strict=True)):
@@ -319,15 +331,28 @@ def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, came
         raise
 
 
+class _UnreadError(Exception):
+    """A shader reads what it did not read before."""
+
+
 def _colors(
     part: CheckedPart,
     theta: Mapping[str, Tree],
     transform: Array | None,
     camera: Camera,
+    names: Sequence[str],
     attributes: Mapping[str, Array],
 ) -> Array:
-    """What the shader of a part returns for attributes in local space."""
-    return _shaded(part, theta, _to_world(GBuffer(attributes), transform), camera)
+    """What the shader of a part returns for attributes in local space, of those names that it has read."""
+
+    def unread() -> Array:
+        raise _UnreadError
+
+    local = GBuffer(attributes)
+    for name in names:
+        if name not in local:
+            local.defer(name, unread)
+    return _shaded(part, theta, _to_world(local, transform), camera)
 
 
 def _evaluate(part: CheckedPart, reads: Sequence[str], samples: Samples, engine: Engine, like: Array | None) -> GBuffer:

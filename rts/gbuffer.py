@@ -47,11 +47,12 @@ class GBuffer(dict):
                 f"the shader reads {name!r}, but the surface provides {', '.join(map(repr, self))}; "
                 f"add the attribute to the part's theta or choose another shader"
             )
-        self[name] = self._deferred.pop(name)()
-        return self[name]
+        self[name] = value = self._deferred[name]()
+        self._deferred.pop(name, None)
+        return value
 
     def __contains__(self, name: object) -> bool:
         return super().__contains__(name) or name in self._deferred
 
     def __iter__(self) -> Iterator[str]:
-        yield from [*super().__iter__(), *self._deferred]
+        yield from dict.fromkeys([*super().__iter__(), *self._deferred])

@@ -406,7 +406,7 @@ class Shader(Plugin):
 
     @abc.abstractmethod
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
-        """The colours of N samples, each from its own sample alone.
+        """The colours of N samples, each from its own sample alone: N may be all, or some thousands at a time.
 
         Args:
             theta: θ of the part.

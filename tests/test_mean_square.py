@@ -162,3 +162,20 @@ def test_it_warns_where_nothing_is_seen():
         value = swept.mean_square(POSE)
     image, weights = goal(1)
     np.testing.assert_allclose(value, np.mean((image * weights) ** 2), 1e-5)
+
+
+def test_residuals_of_a_subclass_are_its_own(sweeps):
+    class Shifted(rts.ImageResiduals):
+        def __call__(self, parameters):
+            return super().__call__(parameters) + 5
+
+    torch = pytest.importorskip("torch")
+    own = Shifted(lambda pose: moving(pose), CAMERA, SIZE, goal(1)[0])
+    pose, plain = torch.tensor(POSE), rts.ImageResiduals(lambda pose: moving(pose), CAMERA, SIZE, goal(1)[0])
+    expected = float(((plain(pose) + 5) ** 2).mean())
+    assert float(own.mean_square(pose)) == pytest.approx(expected, rel=1e-5)
+    for method in ("adam", "lm"):
+        assert rts.fit(own, pose, method=method, steps=1, progress=False).history[0] == pytest.approx(
+            expected, rel=1e-5
+        )
+    assert not sweeps

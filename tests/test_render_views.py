@@ -430,3 +430,40 @@ def test_as_many_targets_as_cameras_are_asked_for():
         rts.ImageResiduals(lambda p: part, CAMERAS, SIZE, np.zeros(SIZE))(torch.zeros(6))
     with pytest.raises(InputError, match="weights are of 2 views; expected 3"):
         rts.ImageResiduals(lambda p: part, CAMERAS, SIZE, np.zeros((3, *SIZE)), weights=np.ones((2, *SIZE)))
+
+
+@pytest.mark.parametrize("target", ["numpy", *TORCH])
+def test_shaders_are_not_asked_where_a_part_is_out_of_sight(target):
+    def shader(theta, gbuffer, camera):
+        xp = rts.namespace(position := gbuffer["position"])
+        return xp.concat([position * 0 + xp.max(position), xp.ones_like(position[:, :1])], axis=1)
+
+    vertices, faces = icosphere(1)
+    parts = [mesh_part((arrays(target, vertices), faces), shader=shader), scene()[2]]
+    cameras = [CAMERAS[0], Camera.look_at((0, 0, 3), (0, 0, 9)), CAMERAS[1]]
+    with pytest.warns(EmptyImageWarning):
+        found, expected = rts.render_views(parts, cameras, SIZE), looped(parts, cameras)
+    np.testing.assert_allclose(to_numpy(found), expected, rtol=0, atol=1e-5)
+
+
+def test_views_whose_shaders_read_other_attributes_may_be_shaded_at_once():
+    def shader(theta, gbuffer, camera):
+        towards = np.asarray(camera.view)[2, 2] > 0
+        colors = 0.5 + 0.5 * gbuffer["normal"] if towards else np.full(gbuffer["position"].shape, 0.5, np.float32)
+        return np.concatenate([colors, np.ones((len(colors), 1), np.float32)], axis=1)
+
+    turns = np.linspace(0, 6, 12)
+    cameras = [Camera.look_at((3 * np.sin(a), 0.5, -3 * np.cos(a)), (0, 0, 0), fov_y=45) for a in turns]
+    part = mesh_part(icosphere(3), shader=shader)
+    expected = looped(part, cameras)
+    for _ in range(10):
+        np.testing.assert_allclose(rts.render_views(part, cameras, SIZE), expected, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("view", [(1000, 20), (20, 1000), (1024, 1), (30, 34), (500, 500), (2000, 3)])
+def test_no_picture_of_views_is_larger_than_it_may_be(view):
+    most = side_by_side.at_once(view)
+    for count in {1, 2, most // 3 + 1, most - 1 or 1, most}:
+        picture = Picture.of(count, view)
+        assert picture.down * picture.across >= count > (picture.down - 1) * picture.across
+        assert all(size <= max(side_by_side.SIDE, n) for size, n in zip(picture.size, view, strict=True))

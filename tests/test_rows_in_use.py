@@ -146,3 +146,18 @@ def test_sums_of_vectors_are_sums_of_columns():
         np.testing.assert_allclose(a, b, 1e-6)
     sums = [line for line in str(jax.make_jaxpr(found)(x)).splitlines() if "reduce_sum" in line]
     assert len(sums) == 2  # Of rows, and of an array that is as short as its rows.
+
+
+def test_a_shader_may_ask_whether_an_attribute_is_there():
+    def shader(theta, gbuffer, camera):
+        position = gbuffer["position"]
+        color = 0.5 + 0 * position if "normal" in gbuffer else 0.2 * position
+        return jnp.concatenate([color, jnp.ones_like(position[:, :1])], axis=1)
+
+    part = rts.Mesh.example().replace(shader=shader)
+
+    def image(vertices):
+        return rts.render(part.replace(theta={"vertices": vertices}), CAMERA, (12, 15), capacity=400)
+
+    vertices = jnp.asarray(part.theta["vertices"])
+    np.testing.assert_allclose(jax.jit(image)(vertices), image(vertices), rtol=0, atol=1e-6)

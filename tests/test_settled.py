@@ -297,3 +297,35 @@ def test_a_class_with_its_own_sums_says_anew_whether_it_follows_outlines():
     kinds = splatting.Single, fused.Single, splatting.Visible, fused.Visible, Sharp
     assert all(kind().follows_outlines for kind in kinds)
     assert not any(kind().follows_outlines for kind in (Wide, splatting.Multi, fused.Multi))
+
+
+@pytest.mark.parametrize("capacity", [60, 100])
+def test_where_samples_were_dropped_only_outlines_that_are_known_are_read(capacity, monkeypatch):
+    """A settled cell without a sample beside a cell whose sample was dropped has no outline of its own."""
+    torch = pytest.importorskip("torch")
+    from rts_backends.fused import cells, outlines
+
+    read = []
+
+    class Poisoned:
+        """NumPy whose new arrays hold NaN."""
+
+        def __getattr__(self, name):
+            return getattr(np, name)
+
+        def empty(self, shape, dtype):
+            return np.full(shape, np.nan, dtype) if np.dtype(dtype).kind == "f" else np.empty(shape, dtype)
+
+    def pull(row, found, border, g, g_positions):
+        for y in range(row.shape[1]):
+            for d in range(found.offsets[y], found.offsets[y + 1]):
+                for n in np.flatnonzero((found.gives[d] != outlines.NOTHING) & (found.gives[d] != outlines.JOINED)):
+                    read.append(found.beta[y + 1 - n // 3, found.columns[d] + 1 - n % 3])
+
+    monkeypatch.setattr(outlines, "pull", pull)
+    monkeypatch.setattr(cells, "np", Poisoned())
+    vertices, faces = icosphere(2)
+    moved = torch.tensor(vertices, requires_grad=True)
+    part = rts.Part(MESH(faces), {"vertices": moved}, "silhouette")
+    rts.render(part, rts.Camera.look_at((0, 0.5, 3), (0, 0, 0), fov_y=45), (20, 27), capacity=capacity).sum().backward()
+    assert len(read) > 20 and np.isfinite(read).all()

@@ -444,7 +444,7 @@ def compare(
 def tune(
     scene: Scene,
     tolerance: Annotated[float, typer.Option(help="The largest error of derivatives, a share of them.")] = 0.05,
-    budget: Annotated[float, typer.Option(help="Seconds of measuring; the truth has half as many before.")] = 60.0,
+    budget: Annotated[float, typer.Option(help="Seconds of measuring, after the truth.")] = 60.0,
     modes: Modes = None,
     size: SceneSize = None,
     surface: Surface = "mesh",

@@ -220,6 +220,11 @@ class ImageResiduals(Residuals):
             )
         return found, self._camera
 
+    @property
+    def _ordinary(self) -> bool:
+        """Whether residuals are those of this class: a subclass may make others of them."""
+        return type(self).__call__ is ImageResiduals.__call__
+
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
         """Mean square () of the n residuals, JᵀJ / n (U, U) and Jᵀr / n (U,) for the U numbers in the parameters."""
         if self._views:
@@ -230,7 +235,8 @@ class ImageResiduals(Residuals):
         engine = engine_of(parameters)
         splatter, found = self._splatter, None
         if (
-            not self._sigma
+            self._ordinary
+            and not self._sigma
             and splatter.sums_products
             and engine.differentiates
             and self._image_channels == 3
@@ -252,7 +258,8 @@ class ImageResiduals(Residuals):
             parameters: as in a call.
         """
         splatter = self._splatter
-        ordinary = not self._views and not self._sigma and self.supersample == 1 and self._image_channels == 3
+        ordinary = self._ordinary and not self._views and not self._sigma and self._image_channels == 3
+        ordinary = ordinary and self.supersample == 1
         found = self._compared(splatter, parameters) if ordinary and splatter.sums_squares else None
         return mean_square(self(parameters)) if found is None else found
 

@@ -37,7 +37,8 @@ class Picture(NamedTuple):
     @classmethod
     def of(cls, count: int, view: tuple[int, int]) -> Picture:
         """A picture of so many views, about as high as wide."""
-        across = min(count, max(1, round(math.sqrt(count * view[0] / view[1]))))
+        down, most = (max(1, SIDE // n) for n in view)
+        across = min(max(round(math.sqrt(count * view[0] / view[1])), -(-count // down)), most, count)
         return cls(count, view, -(-count // across), across)
 
     @property

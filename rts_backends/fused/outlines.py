@@ -91,7 +91,10 @@ def find(start, stop, positions, row, reach, states, mixed, offsets, columns, ra
         for x in range(width):
             around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
             around |= below[x] | below[x + 1] | below[x + 2]
-            marks[y, x] = np.uint8((around & COVERED != 0) & (around & LOOSE != 0)) | mixed[y, x]
+            # Settled targets have nothing loose beside them, unless samples there were dropped for want of room.
+            known = (states[y, x] == SETTLED) & (row[0, y, x] < 0)
+            partial = (around & COVERED != 0) & (around & LOOSE != 0) & ~known
+            marks[y, x] = np.uint8(partial) | mixed[y, x]
             ends[y, x] = np.uint16(around & EMPTY)
         for x in range(width):
             counts[y] += marks[y, x]

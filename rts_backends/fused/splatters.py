@@ -59,6 +59,12 @@ class _Fused(splatting.Kernel):
     def _exits(self, splats: Splats) -> Array | None:
         return splats.exit if self.reads_exits else None
 
+    @property
+    def _sweeps(self) -> bool:
+        """Whether the image is that of compiled kernels: a subclass may have one of its own."""
+        kind = type(self)
+        return kind.image is _Fused.image and kind.cropped is _Fused.cropped
+
     def _settings(self, border: int) -> Settings:
         return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border)
 
@@ -72,7 +78,7 @@ class _Fused(splatting.Kernel):
         background: Array | None = None,
     ) -> tuple[Array, Array, Array] | None:
         """See `rts.Splatter`."""
-        if type(self).image is not _Fused.image:
+        if not self._sweeps:
             return None
         from rts_backends.fused import normal_equations
 
@@ -85,7 +91,7 @@ class _Fused(splatting.Kernel):
         self, splats: Splats, target: Array, weights: Array | None = None, background: Array | None = None
     ) -> Array | None:
         """See `rts.Splatter`."""
-        if type(self).image is not _Fused.image or splats.rgba.shape[0] == 0:
+        if not self._sweeps or splats.rgba.shape[0] == 0:
             return None
         given = self._operands(splats), target, weights, background
         return mean_square.mean_square(self._settings(splats.border), *given)
