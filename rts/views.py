@@ -46,6 +46,9 @@ def render_views(
 ) -> Array:
     """Render several views of a scene; they are those of a loop of `render`, but for rounding.
 
+    Where depths of layers are as good as equal, what counts as equal goes by the farthest view of the picture: beside a
+    view from a thousand times as far, gradients of hidden parts may differ more.
+
     Views lie side by side in one picture, of 1024² cells at most: Python's share of the work is paid once for all, what
     the surface computes of the whole of θ, such as smooth normals, serves them all, and one splat does. With jax, and
     under `torch.func`, that is so for one part of one colour (`Shader.uniform`), such as a silhouette; else one view
