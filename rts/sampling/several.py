@@ -27,7 +27,7 @@ from rts.sampling.merging import merge
 from rts.sampling.packing import FAR, lift
 from rts.sampling.pruning import prune
 from rts.sampling.scenes import Scene, apron_of, widened
-from rts.sampling.triangle_sampler import TriangleSampler, _attribute_specs, _Shape
+from rts.sampling.triangle_sampler import Shape, TriangleSampler, attribute_specs
 from rts.sampling.validation import check_camera, check_fragments, checked_pieces
 from rts.splatting.side_by_side import Picture, depth_scales
 from rts.threads import each
@@ -118,8 +118,8 @@ class Sampling(NamedTuple):
         shader = adapted(part.shader, Shader)
         asked = None if shader is None else shader.reads
         capacity = None if self.capacity is None else picture.views * self.capacity
-        shape = _Shape(layers, picture.size, capacity, picture.size)
-        attributes = _attribute_specs(surface, asked, host_theta, shape, like)
+        shape = Shape(layers, picture.size, capacity, picture.size)
+        attributes = attribute_specs(surface, asked, host_theta, shape, like)
         transform = [] if part.transform is None else [part.transform]
 
         def host(*arrays: np.ndarray) -> tuple[Any, ...]:

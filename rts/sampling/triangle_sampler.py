@@ -225,7 +225,7 @@ class TriangleSampler(Sampler):
         """
         surface, theta, camera = _of_triangles(part.surface), part.theta, camera.for_size(size)
         engine, like = suiting(theta, camera)
-        shape = _Shape(layers, size if cells is None else tuple(cells.shape), capacity, size)
+        shape = Shape(layers, size if cells is None else tuple(cells.shape), capacity, size)
         tells = facing and layers > 1 and part.cull == "none" and surface.tells_pieces
         tells = tells and not (surface.refines and surface.refine_moves)
         exits = exits and part.cull == "back" and cells is None and not surface.refines
@@ -238,7 +238,7 @@ class TriangleSampler(Sampler):
         asked = None if shader is None else shader.reads
         wanted: Needed | None = None if needed is None else adapted(needed, Needed)
         settles = wanted is not None and wanted.settles and not surface.refines
-        attributes = _attribute_specs(surface, asked, host_theta, shape, like)
+        attributes = attribute_specs(surface, asked, host_theta, shape, like)
 
         transform = [] if part.transform is None else [part.transform]
 
@@ -289,7 +289,7 @@ class TriangleSampler(Sampler):
         cull: str,
         inputs: Tree,
         camera: Camera,
-        shape: _Shape,
+        shape: Shape,
         tables: Mapping[str, ArraySpec],
         needed: Needed | None,
         entry: Entry | None,
@@ -400,7 +400,7 @@ class TriangleSampler(Sampler):
         return all_of(found)
 
 
-class _Shape(NamedTuple):
+class Shape(NamedTuple):
     """How many samples there may be.
 
     Attributes:
@@ -461,8 +461,8 @@ def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
     return np.concatenate([table, np.zeros((spec.shape[0] - len(table), *table.shape[1:]), table.dtype)])
 
 
-def _attribute_specs(
-    surface: TriangleSurface, asked: Sequence[str] | None, host_theta: Mapping | None, shape: _Shape, like: Array | None
+def attribute_specs(
+    surface: TriangleSurface, asked: Sequence[str] | None, host_theta: Mapping | None, shape: Shape, like: Array | None
 ) -> dict[str, ArraySpec]:
     """The attributes to evaluate on the host for a surface that is constant: those its shader reads."""
     if host_theta is None:
