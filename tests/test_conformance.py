@@ -411,6 +411,13 @@ class StaleUpdate(Raster):
         return prepared
 
 
+class Disarranged(Raster):
+    """Triangles put in another order whose numbers are not told."""
+
+    def arrange(self, prepared):
+        return prepared._replace(faces=prepared.faces[::-1].copy())
+
+
 class ByIdentity(Raster):
     """Keeps what it was given first by the identity of the faces."""
 
@@ -521,6 +528,7 @@ SAMPLERS = {
     },
     "samples_lie_between_the_near_and_the_far_plane": {"no planes": OddRaster(camera=wider_planes)},
     "two_calls_give_the_same": {"a counter": Unsteady(), "kept by identity": ByIdentity()},
+    "prepared_parts_are_sampled_alike": {"in another order": Disarranged()},
     "it_follows_theta": {"stale update": StaleUpdate(), "kept by identity": ByIdentity()},
     "it_sees_arrays_that_change_in_place": {"kept for ever": Forgetful()},
     "capacity_drops_the_deepest_layers_first": {
