@@ -30,6 +30,12 @@ try:
 except ImportError:  # Windows.
     fcntl = None
 
+try:
+    from rts.pipeline import KERNEL, PART
+except (ImportError, AttributeError):  # A numba that is built in another way compiles as it does.
+    KERNEL = {"no_cfunc_wrapper": True}
+    PART = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
+
 TOLD_AFTER = 1.0
 """Seconds of compilation after which a terminal is told of it."""
 
@@ -41,7 +47,7 @@ saving = threading.RLock()
 
 def kernel(function: Callable | None = None, **options: Any) -> Any:
     """Compile a loop that Python calls, without the interpreter lock, and keep it on disk; `options` are numba's."""
-    options |= {"nogil": True, "no_cfunc_wrapper": True}
+    options |= {"nogil": True} | KERNEL
 
     def decorate(function: Callable) -> Any:
         made = cast(Any, numba.njit(**options)(function))
@@ -54,7 +60,7 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
     """Compile a function that only compiled loops call; Python cannot. `options` are numba's."""
-    options |= {"nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    options |= {"nogil": True} | PART
 
     def decorate(function: Callable) -> Any:
         return _interpreted(numba.njit(**options)(function))
