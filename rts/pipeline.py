@@ -30,6 +30,7 @@ _NEEDED = {
         "_ensure_finalized",
         "_finalize_final_module",
         "_finalize_dynamic_globals",
+        "_optimize_final_module",
     ],
     Flags: ["copy", "no_cpython_wrapper", "no_cfunc_wrapper", "release_gil", "inline"],
     BaseContext: ["subtarget"],
@@ -65,6 +66,9 @@ class _Part(JITCodeLibrary):
         """Null: there is none."""
         self._ensure_finalized()
         return 0
+
+    def _optimize_final_module(self) -> None:
+        """Leave that to what it is linked into."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
