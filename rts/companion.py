@@ -1,9 +1,10 @@
 """A companion: a process that compiles kernels beside this one, from the last that this one will need on.
 
-numba's compiler has one lock a process. So the first kernel that is missing on disk, or that comes to where none is kept,
-starts another process (`rts.accompanying`), which finds out what such a call needs, begins in the last half of it, and
-goes on until the two meet. This process tells which kernels it misses; who compiles which is settled by locks on single bytes of a nameless
-file. Nothing waits for the companion but a kernel that it has begun, and it ends with this process.
+numba's compiler has one lock a process. So the first kernel that is missing on disk, or that comes to where none is
+kept, starts another process (`rts.accompanying`), which finds out what such a call needs, begins in the last half of
+it, and goes on until the two meet. This process tells which kernels it misses; who compiles which is settled by locks
+on single bytes of a nameless file. Nothing waits for the companion but a kernel that it has begun, and it ends with
+this process.
 """
 
 from __future__ import annotations

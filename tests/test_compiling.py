@@ -13,7 +13,9 @@ import pytest
 
 import rts
 
-numba = pytest.importorskip("numba")
+pytest.importorskip("numba")
+import numba
+
 from rts import companion, compiling
 
 pytestmark = pytest.mark.core
