@@ -31,8 +31,8 @@ SWITCH = "RTS_COMPILE_AHEAD"
 SHARED = sys.platform != "win32"
 """Whether processes can tell one another what they compile."""
 
-LEAST_SQUARES = "least squares"
-"""A kind of call that can be expected."""
+LEAST_SQUARES, LEAST_SQUARES_OF_MASKS = "least squares", "least squares of masks"
+"""Kinds of calls that can be expected."""
 
 _state: _Companion | None | bool = None
 """The companion of this process; None before one was needed, False where there is none."""

@@ -45,7 +45,7 @@ def _route(kind: Callable[[list[Part], tuple[int, int]], None], count: int) -> d
 
     with compiling.interpreting() as needs, np.errstate(all="ignore"):
         kind(_parts()[:count], SIZES[count])
-    name = {companion.number(companion.LEAST_SQUARES): None} if kind in LEAST_SQUARES else {}
+    name = {companion.number(EXPECTED[kind]): None} if kind in EXPECTED else {}
     return {**name, **needs}
 
 
@@ -168,4 +168,7 @@ KINDS = (
     _least_squares_of_silhouette,
     _mean_square,
 )
-LEAST_SQUARES = _least_squares, _least_squares_of_silhouette
+EXPECTED = {
+    _least_squares: companion.LEAST_SQUARES,
+    _least_squares_of_silhouette: companion.LEAST_SQUARES_OF_MASKS,
+}

@@ -243,7 +243,8 @@ class ImageResiduals(Residuals):
             and (self.supersample == 1 or splatter.averages)
             and not (isinstance(self.supersample, Adaptive) and self.supersample.contrast is not None)
         ):
-            companion.expect(companion.LEAST_SQUARES)
+            mask = self._channels == 1
+            companion.expect(companion.LEAST_SQUARES_OF_MASKS if mask else companion.LEAST_SQUARES)
             found = self._swept(splatter, parameters, engine)
         return normal_equations(self, parameters, engine) if found is None else found
 
