@@ -58,7 +58,8 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, dep
                 elif asks and k > 0:
                     _hide(row[k, y], near[now])
             if start <= y < stop:
-                near[now] = hidden[y]
+                for b in range(blocks):  # To copy an array compiles errors that tell shapes, a second long.
+                    near[now, b] = hidden[y, b]
         if y > start and asks:
             for b in range(blocks):
                 asked[b] = near[0, b] | near[1, b] | near[2, b]
