@@ -14,7 +14,7 @@ from rts.channels import cropped_image
 from rts.checks import check_background, check_cameras, check_size, check_splatter, suited_sampler
 from rts.engines import Engine, is_constant, namespace, suiting_scene, uncompiled
 from rts.errors import InputError
-from rts.evaluating import views_to_splats
+from rts.evaluating import shaded_at_once, views_to_splats
 from rts.interfaces import Part, Splatter
 from rts.operations.inset import averaged
 from rts.records import Sampled
@@ -128,8 +128,8 @@ def _images(
             for own in chunks
         ]
         if place.views > 1 and all(own.possible for own in given):
-            # Of padded rows it is not known which are those of a view, so that shaders must not see the camera.
-            alike = len(given) == len(scenes[0].parts) == 1 and scenes[0].parts[0].shader.uniform
+            # Of padded rows it is not known which are those of a view, so that there must be one call for all.
+            alike = len(given) == len(scenes[0].parts) == 1 and shaded_at_once(scenes[0].parts[0].shader)
             known = capacity is None and engine.concurrent() and engine.on_host(like)
             if alike if engine.padded(like) else known:
                 return _as_pictures([sampled_as_one(own) for own in given], scenes, suited, splatter)
