@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rts.arguments import quoted
-from rts.arrays import described, is_finite, shape_of, unit
+from rts.arrays import described, dot, is_finite, shape_of, unit
 from rts.camera import Camera
 from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
@@ -175,7 +175,7 @@ class Lambert(Unlit):
         xp = namespace(color)
         shade, lights = _lit(theta, camera)
         for direction, brightness in lights:
-            cosine = _dot(normal, direction)
+            cosine = dot(normal, direction)
             shade = shade + _positive(xp.where(behind, -cosine, cosine)) * brightness
         return self.premultiplied(xp.clip(color * shade, 0.0, 1.0), alpha)
 
@@ -196,10 +196,10 @@ class BlinnPhong(Unlit):
         shininess = _entry(theta, "shininess", (), (1,)) if "shininess" in theta else DEFAULT_SHININESS
         highlight = xp.zeros_like(color)
         for direction, brightness in lights:
-            cosine = _dot(normal, direction)
+            cosine = dot(normal, direction)
             shade = shade + _positive(cosine) * brightness
             # A power of zero has an infinite derivative for exponents below one, and a NaN one in its exponent.
-            half = xp.clip(_dot(normal, unit(direction + toward)), 1e-6, 1.0)
+            half = xp.clip(dot(normal, unit(direction + toward)), 1e-6, 1.0)
             highlight = highlight + xp.where(cosine > 0, half**shininess, 0 * half) * brightness
         return self.premultiplied(xp.clip(color * shade + specular * highlight, 0.0, 1.0), alpha)
 
@@ -207,7 +207,7 @@ class BlinnPhong(Unlit):
 def facing_normals(gbuffer: GBuffer, camera: Camera | RowCameras) -> tuple[Array, Array]:
     """Unit normals (N, 3) turned to the viewer's side, and unit vectors (N, 3) towards the viewer; world space."""
     normal, toward = unit(gbuffer["normal"]), unit(camera.toward(gbuffer["position"]))
-    return namespace(normal).where(_dot(normal, toward) < 0, -normal, normal), toward
+    return namespace(normal).where(dot(normal, toward) < 0, -normal, normal), toward
 
 
 def _is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
@@ -215,7 +215,7 @@ def _is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
     given = gbuffer["position"], gbuffer["normal"], camera
     engine = engine_of(given)
     position, normal, camera = map_leaves(lambda x: x if is_constant(x) else engine.stop_gradient(x), given)
-    return _dot(normal, camera.toward(position)) < 0
+    return dot(normal, camera.toward(position)) < 0
 
 
 def _lit(
@@ -270,10 +270,6 @@ def _check(entry: str, value: Any, expected: str, ok: bool) -> None:
         raise InputError(f"theta{entry} has dtype {value.dtype}; expected floating numbers")
     if not (math.isfinite(value) if number else is_finite(value)):
         raise InputError(f"theta{entry} holds NaN or infinity; expected finite numbers")
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return namespace(a).sum(a * b, axis=-1, keepdims=True)
 
 
 def _positive(x: Array) -> Array:
