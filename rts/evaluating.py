@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 
@@ -350,7 +351,7 @@ def _apart(samples: Samples, gbuffer: GBuffer, sizes: Sequence[int], engine: Eng
     return views
 
 
-def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
+def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
     """What the shader of a part returns."""
     try:
         return part.shader(theta, gbuffer, camera)

@@ -396,9 +396,9 @@ class Shader(Plugin):
         opaque: a promise that alpha is 1.
         uniform: a promise that all samples of a part have one colour, through whatever camera.
         reads: the entries of the G-buffer that it needs besides position; None for all.
-        takes_views: whether a call may be of samples of several views, which `rts.render_views` makes use of: `camera` is
-            an `rts.RowCameras` then, with the methods `toward`, `depth`, `to_world` and `depth_range` of a camera, a row
-            for each sample. It has to say what it `reads`, too, without "uv_footprint".
+        takes_views: whether a call may be of samples of several views, as `rts.render_views` then makes it: `camera` is
+            an `rts.RowCameras`, whose methods give a row for each sample. A shader that says so also says what it
+            `reads`, without "uv_footprint".
         channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
     """
 

@@ -14,24 +14,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.adapting import adapted
 from rts.camera import Camera
 from rts.checks import check_memory, suited_sampler
-from rts.engines import engine_of, is_constant, namespace, stopped, suiting, value_of
-from rts.interfaces import CheckedPart, Needed, Shader, Splatter, TriangleSurface
+from rts.engines import engine_of, namespace, stopped, value_of
+from rts.interfaces import CheckedPart, Needed, Splatter, TriangleSurface
 from rts.records import ArraySpec, Fragments, Sampled, Samples
 from rts.sampling.cache import Entry
 from rts.sampling.extremes import largest
 from rts.sampling.facing import facing_of_views
+from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.merging import merge
 from rts.sampling.packing import FAR, lift
 from rts.sampling.pruning import prune
 from rts.sampling.scenes import Scene, apron_of, widened
-from rts.sampling.triangle_sampler import Shape, TriangleSampler, attribute_specs
-from rts.sampling.validation import check_camera, check_fragments, checked_pieces
+from rts.sampling.triangle_sampler import TriangleSampler
+from rts.sampling.validation import check_fragments, checked_pieces
 from rts.splatting.side_by_side import Picture, depth_scales
 from rts.threads import each
-from rts.trees import Array, leaves, map_leaves
+from rts.trees import Array
 
 
 class Views(NamedTuple):
@@ -108,65 +108,37 @@ class Sampling(NamedTuple):
         apron, cells = apron_of(self.splatter), (self.side * self.size[0], self.side * self.size[1])
         wides = [widened(scene, scene.camera, cells, apron) for scene in self.scenes]
         cameras = [stopped(wide.camera.within(part.transform)) for wide in wides]
-        surface, theta, picture, layers = part.surface, part.theta, self.picture, self.layers
+        surface, picture, layers = part.surface, self.picture, self.layers
         assert isinstance(surface, TriangleSurface)
-        engine, like = suiting(theta, cameras)
         tells = self.splatter.reads_facing and layers > 1 and part.cull == "none" and surface.tells_pieces
-        inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
-        reads = {name: theta[name] for name in surface.reads(theta)}
-        host_theta = reads if engine.differentiates and is_constant(reads) else None
-        shader = adapted(part.shader, Shader)
-        asked = None if shader is None else shader.reads
         capacity = None if self.capacity is None else picture.views * self.capacity
         shape = Shape(layers, picture.size, capacity, picture.size)
-        attributes = attribute_specs(surface, asked, host_theta, shape, like)
-        transform = [] if part.transform is None else [part.transform]
+        beside = {
+            "view": shape.row_spec(np.int32),
+            "scales": ArraySpec((picture.views,), np.float32),
+            **({"facing": ArraySpec((layers, *picture.size), np.int16)} if tells else {}),
+            **({"settled": ArraySpec(picture.size, np.bool_)} if pruning.settles else {}),
+        }
 
-        def host(*arrays: np.ndarray) -> tuple[Any, ...]:
-            it = iter(arrays)
-            own = [Camera(np.asarray(next(it), np.float64), np.asarray(next(it), np.float64)) for _ in cameras]
-            moved = [next(it) for _ in transform]
-            own = [check_camera(camera, *moved) for camera in own]
-            given = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
-            with sampler._keeper.lock:
-                known = entry or sampler._entry(surface, given, own[0], picture.view)
-                alone = sampler.follows or not sampler.concurrent
-                fragments = _drawn(sampler, known, own, picture, layers, part.cull) if alone else None
-            fragments = fragments or _drawn(sampler, known, own, picture, layers, part.cull)
-            size = known.size or largest(known.proxy.vertices)
-            kept, settled, scales = pruning.asked(fragments, size)
-            sides = []
+        def find(own: Sequence[Camera], inputs: Any) -> tuple[Samples, dict[str, np.ndarray]]:
+            def drawn(known: Entry) -> tuple[Entry, Fragments]:
+                return known, _drawn(sampler, known, own, picture, layers, part.cull)
+
+            known, fragments = sampler.working_on(surface, inputs, own[0], picture.view, entry, drawn)
+            kept, more = pruning.asked(fragments, known.size or largest(known.proxy.vertices))
             if tells:
                 pieces = checked_pieces(surface, known.proxy) if kept[1:].any() else np.zeros(1, np.int16)
-                sides = [facing_of_views(fragments, kept, known.proxy, pieces, own, picture.view)]
+                more["facing"] = facing_of_views(fragments, kept, known.proxy, pieces, own, picture.view)
             over = 0 if self.capacity is None else _leave_out(kept, picture, self.capacity)
             found = lift(fragments, known.proxy, capacity, kept, 0.0, views=(picture.down, picture.across))
             counts = _counts(found.row, len(found.ids) if capacity is None else 0, picture)
-            view = np.zeros(len(found.ids), np.int32)
-            view[: counts.sum()] = np.repeat(np.arange(1, picture.views + 1), counts)
-            gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
-            return (
-                *(found.ids, found.params, found.row, found.depth, np.asarray(over, np.int32), view, scales),
-                *(*sides, *settled),
-                *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
-            )
+            more["view"] = np.zeros(len(found.ids), np.int32)
+            more["view"][: counts.sum()] = np.repeat(np.arange(1, picture.views + 1), counts)
+            return replace(found, overflow=np.asarray(over, np.int32)), more
 
-        marks = shape.row_spec(np.int32), ArraySpec((picture.views,), np.float32)
-        sides = [ArraySpec((layers, *picture.size), np.int16)] if tells else []
-        amid = [ArraySpec(picture.size, np.bool_)] if pruning.settles else []
-        specs = *shape.specs(surface.sample_widths), *marks, *sides, *amid, *attributes.values()
-        matrices = [m for camera in cameras for m in (camera.view, camera.projection)]
-        results = engine.call_host(host, specs, *matrices, *transform, *leaves(inputs))
-        rest = 7 + len(sides) + len(amid)
-        samples = Samples(
-            *results[:5],
-            gbuffer=dict(zip(attributes, results[rest:], strict=True)) if host_theta is not None else None,
-            asked=asked,
-            centered=surface.centered,
-            facing=results[7] if tells else None,
-            settled=results[rest - 1] if amid else None,
-        )
-        return samples, results[5], results[6]
+        samples, more = HostCall(part, surface, cameras, shape, entry).samples(find, beside)
+        view, scales = more.pop("view"), more.pop("scales")
+        return replace(samples, **more), view, scales
 
 
 def sampled_as_one(given: Sampling) -> Views:
@@ -286,7 +258,9 @@ def _drawn(
 ) -> Fragments:
     """The fragments (K, height, width) of the picture: views on all cores, if the sampler is `concurrent`."""
     shape, faces, places = (layers, *picture.size), len(known.proxy.faces), picture.places()
-    found = Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
+    # One array for them all: where such are allotted anew in each call, the system gives fewer pages.
+    numbers = np.empty((4, *shape), np.float32)
+    found = Fragments(numbers[0].view(np.int32), numbers[1:3].reshape(*shape, 2), numbers[3])
     if not faces or len(places) < picture.down * picture.across:
         for x, nothing in zip(found, (-1, 0, 0), strict=True):
             x[...] = nothing
@@ -299,7 +273,7 @@ def _drawn(
         for to, x in zip(found, own, strict=True):
             to[:, *places[b]] = x
 
-    if sampler.concurrent and not sampler.follows:
+    if sampler.draws_at_once:
         each(draw, range(len(cameras)))
     else:
         for b in range(len(cameras)):
@@ -327,8 +301,8 @@ class _Pruning:
         """See `Needed`."""
         return self._asked(covered, depth, 0.0)[0]
 
-    def asked(self, fragments: Fragments, size: float) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-        """Which fragments (K, height, width) are needed; `Needed.settled`, if it `settles`; and scales of depths (B,).
+    def asked(self, fragments: Fragments, size: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Which fragments (K, height, width) are needed; and "scales" (B,) of depths, and "settled", if it `settles`.
 
         Args:
             fragments: of the picture.
@@ -337,11 +311,12 @@ class _Pruning:
         covered = fragments.triangle_ids >= 0
         kept, depth, scales = self._asked(covered, fragments.depth, size)
         if not self.settles:
-            return kept, [], scales
-        if depth is None:
-            return kept, [np.zeros(covered.shape[1:], bool)], scales
-        assert self._near is not None
-        return kept, [self._near.settled(covered, depth, kept, 0.0)], scales
+            return kept, {"scales": scales}
+        settled = np.zeros(covered.shape[1:], bool)
+        if depth is not None:
+            assert self._near is not None
+            settled = self._near.settled(covered, depth, kept, 0.0)
+        return kept, {"scales": scales, "settled": settled}
 
     def _asked(
         self, covered: np.ndarray, depth: np.ndarray, size: float
