@@ -129,7 +129,7 @@ def _images(
         ]
         if place.views > 1 and all(own.possible for own in given):
             # Of padded rows it is not known which are those of a view, so that there must be one call for all.
-            alike = len(given) == len(scenes[0].parts) == 1 and shaded_at_once(scenes[0].parts[0].shader)
+            alike = len(given) == 1 and all(shaded_at_once(part.shader) for part in scenes[0].parts)
             known = capacity is None and engine.concurrent() and engine.on_host(like)
             if alike if engine.padded(like) else known:
                 return _as_pictures([sampled_as_one(own) for own in given], scenes, suited, splatter)

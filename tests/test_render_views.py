@@ -339,6 +339,39 @@ def test_compiled_views_are_shaded_together_in_pieces_of_rows_in_use(capacity, m
         np.testing.assert_allclose(a, b, atol=1e-4 * float(b.abs().max()))
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_several_parts_are_one_picture_with_jax_too(compiled):
+    jax = pytest.importorskip("jax")
+    torch = pytest.importorskip("torch")
+
+    def loss(vertices, weights):
+        moved = [p.replace(theta=p.theta | {"vertices": v}) for p, v in zip(scene(), vertices, strict=True)]
+        return (rts.render_views(moved, CAMERAS, SIZE) * weights).sum()
+
+    given = [part.theta["vertices"] for part in scene()]
+    leaves = [torch.tensor(x, requires_grad=True) for x in given]
+    expected = torch.autograd.grad(loss(leaves, torch.tensor(WEIGHTS)), leaves)
+    gradient_of = jax.grad(lambda x: loss(x, WEIGHTS))
+    found = (jax.jit(gradient_of) if compiled else gradient_of)(arrays("jax", given))
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4 * float(b.abs().max()))
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_several_parts_in_a_batch_are_those_of_a_loop(target):
+    vmap = pytest.importorskip("torch").vmap if target != "jax" else pytest.importorskip("jax").vmap
+    parts, sizes = scene()[:2], np.float32([1.0, 0.7])
+
+    def images(size):
+        own = [part.replace(theta={"vertices": size * arrays(target, part.theta["vertices"])}) for part in parts]
+        return rts.render_views(own, CAMERAS, SIZE)
+
+    found = to_numpy(vmap(images)(arrays(target, sizes)))
+    for size, own in zip(sizes, found, strict=True):
+        expected = looped([part.replace(theta={"vertices": size * part.theta["vertices"]}) for part in parts])
+        np.testing.assert_allclose(own, expected, atol=2e-5)
+
+
 def test_shaders_are_given_one_camera_unless_they_take_views_and_say_what_they_read():
     calls = []
 

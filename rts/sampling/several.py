@@ -16,7 +16,7 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.checks import check_memory, suited_sampler
-from rts.engines import engine_of, namespace, stopped, value_of
+from rts.engines import engine_of, is_traced, namespace, stopped, value_of
 from rts.interfaces import CheckedPart, Needed, Splatter, TriangleSurface
 from rts.records import ArraySpec, Fragments, Sampled, Samples
 from rts.sampling.cache import Entry
@@ -132,8 +132,7 @@ class Sampling(NamedTuple):
             over = 0 if self.capacity is None else _leave_out(kept, picture, self.capacity)
             found = lift(fragments, known.proxy, capacity, kept, 0.0, views=(picture.down, picture.across))
             counts = _counts(found.row, len(found.ids) if capacity is None else 0, picture)
-            more["view"] = np.zeros(len(found.ids), np.int32)
-            more["view"][: counts.sum()] = np.repeat(np.arange(1, picture.views + 1), counts)
+            more["view"] = _numbers(counts, len(found.ids))
             return replace(found, overflow=np.asarray(over, np.int32)), more
 
         samples, more = HostCall(part, surface, cameras, shape, entry).samples(find, beside)
@@ -142,30 +141,49 @@ class Sampling(NamedTuple):
 
 
 def sampled_as_one(given: Sampling) -> Views:
-    """The views of a scene, sampled as one picture. Of several parts values must be known."""
+    """The views of a scene, sampled as one picture."""
     needed, parts, picture = given.needed(), given.parts(), given.picture
     pruning = _Pruning(needed, picture)
     found = [given.of_part(*part, pruning if len(parts) == 1 else _Pruning(None, picture)) for part in parts]
     sampled, scales = merge([samples for samples, _, _ in found], given.layers), found[0][2]
     if len(parts) > 1:
         scales = _scales_of(sampled.depth, picture)
-        sampled = sampled if needed is None else prune(sampled, pruning)
+        sampled = sampled if needed is None or is_traced(sampled.row) else prune(sampled, pruning)
     sampled = replace(sampled, supersample=given.side, apron=apron_of(given.splatter))
-    if engine_of(sampled.row).padded(sampled.row):
-        return Views(sampled, picture, tuple(view for _, view, _ in found), None, scales)
+    padded, view = engine_of(sampled.row).padded(sampled.row), tuple(own for _, own, _ in found)
+    if is_traced(sampled.row) or (padded and len(parts) == 1):
+        return Views(sampled, picture, view, None, scales)
     if len(parts) == 1:
-        view = found[0][1]
-        counts = np.bincount(engine_of(view).to_numpy(view), minlength=picture.views + 1)[1:]
-        return Views(sampled, picture, (view,), (counts,), scales)
+        counts = np.bincount(engine_of(view[0]).to_numpy(view[0]), minlength=picture.views + 1)[1:]
+        return Views(sampled, picture, view, (counts,), scales)
+    if padded:
+        return Views(sampled, picture, tuple(_views_of(s, picture) for s in sampled.samples), None, scales)
     counts = tuple(_counts(value_of(s.row), s.ids.shape[0], picture) for s in sampled.samples)
     return _with_counts(sampled, picture, scales, counts)
+
+
+def _views_of(samples: Samples, picture: Picture) -> Array:
+    """(N,) the view of each row in a table of a part, of which each stands in one cell; 0 for others."""
+    size = samples.ids.shape[0]
+
+    def host(row: np.ndarray) -> tuple[np.ndarray]:
+        return (_numbers(_counts(row, 0, picture), size),)
+
+    return engine_of(samples.row).call_host(host, [ArraySpec((size,), np.int32)], samples.row)[0]
+
+
+def _numbers(counts: np.ndarray, size: int) -> np.ndarray:
+    """(size,) int32, the number of each row's view, from 1 on, of so many rows each; 0 for those that are left."""
+    found = np.zeros(size, np.int32)
+    found[: counts.sum()] = np.repeat(np.arange(1, len(counts) + 1), counts)
+    return found
 
 
 def _with_counts(sampled: Sampled, picture: Picture, scales: Array, counts: tuple[np.ndarray, ...]) -> Views:
     """Views whose samples are known, and all used."""
     constant = engine_of(sampled.row).constant
-    view = [np.repeat(np.arange(1, picture.views + 1, dtype=np.int32), own) for own in counts]
-    return Views(sampled, picture, tuple(constant(own) for own in view), counts, scales)
+    view = tuple(constant(_numbers(own, own.sum())) for own in counts)
+    return Views(sampled, picture, view, counts, scales)
 
 
 def _leave_out(kept: np.ndarray, picture: Picture, capacity: int) -> int:
@@ -347,11 +365,13 @@ def _largest(depth: np.ndarray, picture: Picture) -> np.ndarray:
     return sizes.reshape(layers, picture.down, height, -1).max(axis=(0, 2)).reshape(-1)[: picture.views]
 
 
-def _scales_of(depth: Array, picture: Picture) -> np.ndarray:
-    """The `depth_scales` of the depths (K, height, width) of views, which are known."""
-    known = value_of(depth)
-    assert known is not None
-    return depth_scales(_largest(known, picture))
+def _scales_of(depth: Array, picture: Picture) -> Array:
+    """The `depth_scales` of the depths (K, height, width) of views."""
+
+    def host(depth: np.ndarray) -> tuple[np.ndarray]:
+        return (depth_scales(_largest(depth, picture)),)
+
+    return engine_of(depth).call_host(host, [ArraySpec((picture.views,), np.float32)], depth)[0]
 
 
 def _counts(row: np.ndarray | None, rows: int, picture: Picture) -> np.ndarray:
