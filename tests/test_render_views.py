@@ -285,6 +285,8 @@ def test_cameras_of_rows_are_those_of_their_views(target):
         near, far = camera.depth_range()
         expected = eye - point[0], camera.view[:3, :3].T @ direction, camera.project(point, SIZE)[0, 2], near, far
         np.testing.assert_allclose(found[1][n], expected[1] / np.linalg.norm(expected[1]), atol=1e-6)
+        np.testing.assert_allclose(camera.to_world(direction), found[1][n], atol=1e-6)
+        np.testing.assert_allclose(camera.depth(point)[0], expected[2])
         for i in (0, 2, 3, 4):
             np.testing.assert_allclose(found[i][n], expected[i], rtol=1e-4, atol=1e-5)
     rows = rts.RowCameras.of(arrays(target, cameras), arrays(target, np.full(6, 2, np.int32)))
