@@ -86,7 +86,7 @@ def call_of(kind: str, part: rts.Part, side: int, together: bool) -> Callable[[]
             return (rts.render(moved, camera, (side, side)) * w).sum()
 
         one = jax.jit(jax.grad(of_view))
-        return lambda: sum(one(at, *view) for view in zip(cameras(), w, strict=True)).block_until_ready()
+        return lambda: jax.block_until_ready(sum(one(at, *view) for view in zip(cameras(), w, strict=True)))
     gradient = jax.grad(loss)
     gradient = jax.jit(gradient) if what[0] in ("jit", "each") else gradient
     return lambda: gradient(at).block_until_ready()

@@ -91,7 +91,7 @@ class ShaderConformance(Conformance):
 
     def test_samples_of_several_views_are_shaded_as_by_each(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
         """A shader that takes samples of several views gives each the colour that it has through its own camera."""
-        own = _instance(shader)
+        own: Any = _instance(shader)
         if not own.takes_views:
             pytest.skip("the shader does not take samples of several views")
         claim(
