@@ -56,6 +56,7 @@ from rts.radiance_fields import load_radiance_field, volume_render
 from rts.records import ArraySpec, Fine, Fragments, Proxy, RayHits, Rays, Sampled, Samples, Splats
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples
+from rts.row_cameras import RowCameras
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.prepared import prepare
 from rts.sampling.scenes import sample
@@ -114,6 +115,7 @@ __all__ = [
     "Rate",
     "Rays",
     "Residuals",
+    "RowCameras",
     "RtsError",
     "RtsWarning",
     "Sampled",

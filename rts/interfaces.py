@@ -396,12 +396,16 @@ class Shader(Plugin):
         opaque: a promise that alpha is 1.
         uniform: a promise that all samples of a part have one colour, through whatever camera.
         reads: the entries of the G-buffer that it needs besides position; None for all.
+        takes_views: whether a call may be of samples of several views, as `rts.render_views` then makes it: `camera` is
+            an `rts.RowCameras`, whose methods give a row for each sample. A shader that says so also says what it
+            `reads`, without "uv_footprint".
         channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
     """
 
     channels: int = 3
     opaque: bool = False
     uniform: bool = False
+    takes_views: bool = False
     reads: tuple[str, ...] | None = None
 
     @abc.abstractmethod
@@ -411,7 +415,7 @@ class Shader(Plugin):
         Args:
             theta: θ of the part.
             gbuffer: its G-buffer, in world space.
-            camera: the camera of the whole image.
+            camera: the camera of the whole image; of a shader that `takes_views`, or the cameras of the samples.
 
         Returns:
             (N, 4) premultiplied linear RGBA, in [0, 1]; (N, C + 1), alpha last, of a shader with other `channels`, all
