@@ -79,10 +79,10 @@ class Task:
         return (difference * difference).mean()
 
     def swept_loss(self, pose: Any, vertices: Any, target: Any, sampler: str) -> Any:
-        """`loss`, made as the image is: `rts.ImageResiduals.mean_square`."""
+        """`loss`, made as the image is: `rts.ImageResiduals.mean_loss`."""
         options: dict[str, Any] = {"sampler": sampler, "splatter": self.splatter, "layers": self.layers}
         residuals = rts.ImageResiduals(lambda pose: self.posed(pose, vertices), self.view, self.size, target, **options)
-        return residuals.mean_square(pose)
+        return residuals.mean_loss(pose)
 
 
 # ------------------------------------------------------------------------------------------------------- iterations

@@ -16,7 +16,6 @@ from rts.engines import Engine, engine_named, engine_of, namespace
 from rts.errors import InputError, PluginError
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
-from rts.fitting.least_squares import mean_square
 from rts.fitting.schedule import Stage, box_filtered, pyramid
 from rts.interfaces import Part
 from rts.operations.rigid import rigid
@@ -150,7 +149,7 @@ def fit_pose(
         result.history,
         list(result.stages),
         Pose(np.eye(4), camera, target.shape),
-        float(mean_square(residuals.at_stage(schedule[-1])(start))),
+        float(residuals.loss(residuals.at_stage(schedule[-1])(start))),
         result.loss,
         result.reason,
         result.seconds,
