@@ -1,7 +1,7 @@
 """The pose iteration that speed is measured on, by rts: loss, and a step with torch or jax.
 
-One iteration renders the silhouette of a mesh, takes the mean squared difference (or another loss) to the hard silhouette of 4 × 4
-samples a pixel at the zero pose, its gradient in the pose, and a step of Adam.
+One iteration renders the silhouette of a mesh, takes the mean squared difference (or another loss) to the hard
+silhouette of 4 × 4 samples a pixel at the zero pose, its gradient in the pose, and a step of Adam.
 """
 
 from __future__ import annotations

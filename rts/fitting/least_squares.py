@@ -98,8 +98,8 @@ def levenberg_marquardt(
     rounding of JᵀJ.
 
     The model of a robust loss has its second derivative where that is positive enough (`Loss.weights`). With ρ' alone
-    (iteratively reweighted least squares) it lies above the loss, but steps are shorter: silhouettes with a part cut
-    off take 1.2 to 2.5 times as many.
+    (iteratively reweighted least squares) it lies above the loss, but steps are shorter: up to 2.7 times as many are
+    taken (benchmarks/RESULTS.md).
 
     Args:
         residuals: a checked function of the parameters.
