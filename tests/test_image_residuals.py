@@ -83,9 +83,9 @@ def count_sweeps(monkeypatch):
     calls = []
     whole = fused_normal.normal_equations
 
-    def counted(*args):
+    def counted(*args, **options):
         calls.append(args)
-        return whole(*args)
+        return whole(*args, **options)
 
     monkeypatch.setattr(fused_normal, "normal_equations", counted)
     return calls

@@ -104,7 +104,7 @@ class ImageResiduals(Residuals):
         loss: str = "linear",
         f_scale: float = 1.0,
     ):
-        self.loss = Loss(loss, f_scale)
+        self.loss: Loss = Loss(loss, f_scale)  # pyright: ignore[reportIncompatibleVariableOverride]  # Never None.
         if not callable(scene):
             raise InputError(f"scene is {quoted(scene)}; expected a function: parameters → parts, or (parts, camera)")
         if camera is not None and not _are_cameras(camera):

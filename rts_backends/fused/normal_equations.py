@@ -81,7 +81,7 @@ def equations(settings: Settings, engine: Engine, loss: Loss, *given: Any) -> tu
         used = int(row.max(initial=0)) if exits is None else int(max(row.max(initial=0), exits.max(initial=0)))
         used += 1  # Under `jit` many more rows may be allotted.
         cells = Cells(settings, positions[:used], rgba[:used], row, None, *known)
-        return tuple(np.asarray(x, kind) for x in normal_equations(cells, *rest, loss))
+        return tuple(np.asarray(x, kind) for x in normal_equations(cells, *rest, loss=loss))
 
     count = t_positions.shape[0]
     specs = ArraySpec((), kind), ArraySpec((count, count), kind), ArraySpec((count,), kind)
