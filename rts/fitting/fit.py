@@ -122,7 +122,7 @@ def fit(
     _check_limits(tolerance, patience)
     stages = _stages(known, schedule)
     own_loss = _own_loss(known)
-    loss = loss or own_loss
+    loss = own_loss if loss is None else loss
     engine = _checked_engine(parameters)
     names = [name for name, _ in named_leaves(parameters)]
     # Private copies: neither the caller's later changes nor the graph that made them may reach the result.
