@@ -1,4 +1,4 @@
-"""How large the numbers of an array are."""
+"""How large the numbers of an array are, and how small."""
 
 from __future__ import annotations
 
@@ -17,3 +17,41 @@ def largest(x: np.ndarray) -> float:
     found = np.zeros(max(1, -(-bits.size // extremes_kernels.CHUNK)), np.int32)
     parallel(extremes_kernels.find, len(found), bits, found, work=bits.size // 12)
     return float(found.max().view(np.float32))
+
+
+def bounds(x: np.ndarray, covered: np.ndarray) -> tuple[float, float]:
+    """The least and the largest of those numbers of an array of floats that are covered, and zero; none is NaN."""
+    if x.dtype != np.float32:
+        return float(x.min(initial=0, where=covered)), float(x.max(initial=0, where=covered))
+    low, high = _sizes(x, covered).max(axis=0).view(np.float32)
+    return -float(low), float(high)
+
+
+def places(x: np.ndarray, covered: np.ndarray) -> list[tuple[int, ...]]:
+    """Where the least and the largest covered number first stand: of those that are below, and above, zero."""
+    if x.dtype != np.float32:
+        sizes = np.where(covered, x, 0).reshape(1, -1)
+        found, length = np.concatenate([-sizes, sizes]).max(axis=1, initial=0)[None], x.size
+    else:
+        from rts.sampling.extremes_kernels import CHUNK as length
+
+        found = _sizes(x, covered).view(np.float32)
+    numbers, there = x.reshape(-1), covered.reshape(-1)
+    flat = []
+    for sign, sizes in zip((-1, 1), found.T, strict=True):
+        if size := sizes.max():
+            first = int(sizes.argmax()) * length
+            chunk = slice(first, first + length)
+            flat.append(first + int(((numbers[chunk] == sign * size) & there[chunk]).argmax()))
+    return [tuple(int(i) for i in np.unravel_index(place, x.shape)) for place in flat]
+
+
+def _sizes(x: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """How far numbers (float32) of each chunk are below and above zero at most, as bits (·, 2) int32."""
+    from rts.sampling import extremes_kernels
+
+    bits = read_only(x).reshape(-1).view(np.int32)
+    found = np.zeros((max(1, -(-bits.size // extremes_kernels.CHUNK)), 2), np.int32)
+    given = bits, read_only(covered).reshape(-1), found
+    parallel(extremes_kernels.bounds, len(found), *given, work=bits.size // 12)
+    return found

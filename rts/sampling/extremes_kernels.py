@@ -22,3 +22,20 @@ def find(first, last, bits, found):
         for i in range(len(block)):
             most = np.int32(max(most, np.int32(block[i] & UNSIGNED)))
         found[chunk] = most
+
+
+@kernel
+def bounds(first, last, bits, covered, found):
+    """Fill `found` (·, 2) with how far floats of each chunk are below and above zero at most, as bits.
+
+    Those count that are covered. Bits are below zero where the float has a sign.
+    """
+    zero = np.int32(0)
+    for chunk in range(first, last):
+        low, high = zero, zero
+        block, taken = bits[chunk * CHUNK : (chunk + 1) * CHUNK], covered[chunk * CHUNK : (chunk + 1) * CHUNK]
+        for i in range(len(block)):
+            number = block[i] if taken[i] else zero
+            high = np.int32(max(high, number))
+            low = np.int32(max(low, np.int32(number & UNSIGNED) if number < zero else zero))
+        found[chunk, 0], found[chunk, 1] = low, high

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
+from rts.sampling.extremes import places
 from rts.sampling.windows_kernels import add, unite
 from rts.threads import parallel
 
@@ -31,27 +32,18 @@ def settle(
     wanted = np.empty((0, width), np.bool_) if wanted is None else np.ascontiguousarray(wanted)
     covered, depth = np.ascontiguousarray(covered), np.ascontiguousarray(depth)
     found, near = np.empty((height, width), np.bool_), np.empty((height, width), np.bool_)
-    extremes = np.zeros((2, height), depth.dtype)
-    given = covered, depth, kept, wanted, reach, found, near, extremes
+    given = covered, kept, wanted, reach, found, near
     parallel(_settle, height, *given, work=LONG * covered.size)
-    least, largest = extremes[0].min(initial=0), extremes[1].max(initial=0)
-    farthest = [_place(extremes[i], x, depth, kept) for i, x in enumerate((least, largest)) if x]
+    farthest = places(depth, kept)
     parallel(_drop, height, near, kept, work=covered.size // 8)
     for k, y, x in farthest:
         kept[: k + 1, y, x] = covered[: k + 1, y, x]
     return found
 
 
-def _place(extremes: np.ndarray, depth: np.floating, depths: np.ndarray, kept: np.ndarray) -> tuple[int, int, int]:
-    """Layer, row and column of the first sample of a depth that is one of the extremes (H,) of the rows."""
-    y = int((extremes == depth).argmax())
-    k, x = np.argwhere(kept[:, y] & (depths[:, y] == depth))[0]
-    return int(k), y, int(x)
-
-
 @kernel
-def _settle(start, stop, covered, depth, kept, wanted, reach, found, near, extremes):
-    """Fill rows [start, stop) of what is found, of cells near any that are not, and of extremes of the depths."""
+def _settle(start, stop, covered, kept, wanted, reach, found, near):
+    """Fill rows [start, stop) of what is found, and of cells near any that are not."""
     layers, height, width = covered.shape
     around = reach + 1
     rows = stop - start + 2 * around
@@ -87,9 +79,6 @@ def _settle(start, stop, covered, depth, kept, wanted, reach, found, near, extre
         _near(near[y], wide[r], wide[r + min(step, far)], wide[r + far])
         for v in range(2 * step, far, step):
             _join(near[y], wide[r + v])
-        for k in range(layers):
-            low, high = bounds(depth[k, y], kept[k, y])
-            extremes[0, y], extremes[1, y] = min(low, extremes[0, y]), max(high, extremes[1, y])
 
 
 @kernel
@@ -131,13 +120,3 @@ def _near(to, a, b, c):
 def _mask(kept, near):
     for x in range(len(kept)):
         kept[x] &= near[x]
-
-
-@compiled(fastmath={"nnan", "nsz", "reassoc"})
-def bounds(depth, covered):
-    """The least and the largest depth of those that are covered, and zero."""
-    low = high = depth.dtype.type(0)
-    for x in range(len(depth)):
-        z = depth[x] if covered[x] else depth.dtype.type(0)
-        low, high = min(low, z), max(high, z)
-    return low, high

@@ -18,7 +18,7 @@ from those that were sampled by less than splatters allow for."""
 
 def too_far(size: float, depth: np.ndarray) -> bool:
     """Whether coordinates of a size are so large that rounding may reorder depths (0 where there is none)."""
-    return size > FAR * largest(depth)
+    return size > 0 and size > FAR * largest(depth)
 
 
 def lift(

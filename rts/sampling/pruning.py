@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -18,7 +19,7 @@ from rts.operations.operation import known_value
 from rts.records import ArraySpec, Sampled, Samples
 from rts.sampling.exits import beside_outlines
 from rts.sampling.extremes import largest
-from rts.sampling.packing import too_far
+from rts.sampling.packing import FAR
 from rts.trees import leaves
 
 LAYER_LIMIT = 8
@@ -85,10 +86,11 @@ class _BySplatter(Needed):
 
     def __init__(self, splatter: Splatter, size: float | None, settles: bool):
         self._splatter, self.size, self.settles = splatter, size, settles
+        self._asked: tuple[weakref.ref[np.ndarray], float] | None = None
 
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `Needed`."""
-        if len(covered) == 1 or (self.size is not None and too_far(self.size, depth)):
+        if len(covered) == 1 or (self.size is not None and self.size > FAR * self._largest(depth)):
             return covered
         kept = self._splatter.needed(covered, depth)
         if not (isinstance(kept, np.ndarray) and kept.shape == covered.shape and kept.dtype == bool):
@@ -102,13 +104,20 @@ class _BySplatter(Needed):
         self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float, wanted: np.ndarray | None = None
     ) -> np.ndarray:
         """See `Needed`."""
-        if too_far(max(size, self.size or 0.0), depth):
+        if max(size, self.size or 0.0) > FAR * self._largest(depth):
             return np.zeros(covered.shape[1:], bool)
         from rts.sampling import interiors_kernels
 
         # Beside cells that are not wanted, what decides for others is not settled, and may look at one cell more.
         reach = self._splatter.reach + (wanted is not None)
         return interiors_kernels.settle(covered, depth, kept, reach, wanted)
+
+    def _largest(self, depth: np.ndarray) -> float:
+        """The largest of some depths; of an array that was asked for last it is known."""
+        asked = self._asked
+        if asked is None or asked[0]() is not depth:
+            asked = self._asked = weakref.ref(depth), largest(depth)
+        return asked[1]
 
 
 class Inspection(Needed):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
-from rts.sampling.interiors_kernels import bounds
+from rts.sampling.extremes import bounds
 from rts.splatting.kernel import LEAST_EPSILON, TIE
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel
@@ -26,23 +26,13 @@ def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.nda
     if layers == 1 or not (visible or settings.epsilon >= LEAST_EPSILON):
         return covered
     covered, depth = np.ascontiguousarray(covered), np.ascontiguousarray(depth)
-    extent, kept = np.zeros((2, height), depth.dtype), np.empty_like(covered)
-    parallel(_extent, height, covered, depth, extent, work=covered.size // 4)
-    least, largest, kind = extent[0].min(initial=0), extent[1].max(initial=0), depth.dtype.type
+    kept, kind = np.empty_like(covered), depth.dtype.type
+    least, largest = map(kind, bounds(depth, covered))
     numbers = kind(2 * (largest - least)), kind(TIE * max(largest, -least)), kind(CONTINUED)
     parallel(_keep, height, covered, depth, visible, rims, *numbers, kept, work=2 * covered.size)
     if settings.crossings:
         crossing_pairs.sheets(covered, depth, kind(largest - least), kept)
     return kept
-
-
-@kernel
-def _extent(start, stop, covered, depth, extent):
-    """The least and the largest depth in each row, and zero."""
-    for y in range(start, stop):
-        for k in range(len(covered)):
-            low, high = bounds(depth[k, y], covered[k, y])
-            extent[0, y], extent[1, y] = min(low, extent[0, y]), max(high, extent[1, y])
 
 
 @kernel
