@@ -33,6 +33,7 @@ from rts.files.models import load
 from rts.files.views import View, load_views
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
+from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
 from rts.gbuffer import GBuffer
 from rts.interfaces import (
@@ -105,6 +106,7 @@ __all__ = [
     "ImageResiduals",
     "InputError",
     "LayersWarning",
+    "Loss",
     "Ndc",
     "Operation",
     "Part",
