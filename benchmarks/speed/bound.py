@@ -23,7 +23,6 @@ import rts.threads
 from benchmarks.meshes import MESHES, kept_mesh
 from benchmarks.report import table
 from benchmarks.speed.pose_iteration import Task, torch_iteration
-from rts.compiling import kernel
 
 LINE = 64
 """Bytes that memory hands over at once."""
@@ -38,24 +37,13 @@ STAGES = {
 
 def bandwidth(size: int, rounds: int = 9) -> float:
     """Bytes a second that all threads read together, of an array of so many bytes that they read again and again."""
-    numbers, sums = np.ones(size // 8, np.int64), np.zeros(64, np.int64)
-    times = []
+    shares = np.array_split(np.ones(size // 4, np.float32), rts.threads.thread_count())
+    times, again = [], max(1, (1 << 28) // size)
     for _ in range(rounds):
         start = time.perf_counter()
-        for _ in range(max(1, (1 << 28) // size)):
-            rts.threads.parallel(_read, len(sums), rts.threads.read_only(numbers), sums, work=1 << 30)
+        rts.threads.each(lambda share: [share.max() for _ in range(again)], shares)
         times.append(time.perf_counter() - start)
-    return max(1, (1 << 28) // size) * size / statistics.median(times)
-
-
-@kernel
-def _read(start, stop, numbers, sums):
-    length = len(numbers) // len(sums)
-    for chunk in range(start, stop):
-        found = np.int64(0)
-        for number in numbers[chunk * length : (chunk + 1) * length]:
-            found |= number
-        sums[chunk] = found
+    return again * size / statistics.median(times)
 
 
 class Loops:
