@@ -139,10 +139,10 @@ def _least_squares(
         splatter.normal_equations(splats, t_positions, t_rgba, np.zeros((*size, channels), np.float32))
 
 
-def _mean_square(parts: list[Part], size: tuple[int, int]) -> None:
+def _mean_loss(parts: list[Part], size: tuple[int, int]) -> None:
     with _differentiating() as tape:
         target = np.zeros((*size, 4), np.float32)
-        ImageResiduals(lambda _: _posed(parts), _camera(), size, target).mean_square(target)
+        ImageResiduals(lambda _: _posed(parts), _camera(), size, target).mean_loss(target)
         tape.pull()
 
 
@@ -166,7 +166,7 @@ KINDS = (
     _adaptive,
     _gradient_of_silhouette,
     _least_squares_of_silhouette,
-    _mean_square,
+    _mean_loss,
 )
 EXPECTED = {
     _least_squares: companion.LEAST_SQUARES,
