@@ -24,6 +24,7 @@ VARIABLES: Mapping[str, Mapping[str, Any]] = {
         "prunes": False,
         "sums_products": False,
         "sums_losses": False,
+        "takes_losses": False,
     },
 }
 """Group → class variable of its base → its default, for plugins of other classes."""

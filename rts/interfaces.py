@@ -587,7 +587,8 @@ class Residuals(Plugin):
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
         sums_losses: whether it gives its mean loss; True in a class with its own `mean_loss`.
         has_stages: whether it can be had at other resolutions; True in a class with its own `at_stage`.
-        loss: what their mean is taken of, an `rts.Loss`; None for the square.
+        loss: what their mean is taken of, an `rts.Loss`; None for the square. What `at_stage` gives has its own, or
+            where that is None this one.
     """
 
     FLAGS = {"normal_equations": "sums_products", "mean_loss": "sums_losses", "at_stage": "has_stages"}

@@ -384,7 +384,7 @@ def test_fit_pose_takes_a_robust_loss(model, tmp_path):
     dark = [part.replace(shader="silhouette") for part in parts]
     image = rts.render(dark, orbit(bounds_of(parts), (48, 48), 30, 20), (48, 48), splatter="single", layers=1)
     for loss in ("linear", "cauchy"):
-        options = "--steps", 1, "--loss", loss, "--f-scale", 0.2
+        options = "--steps", 1, "--loss", loss, *(("--f-scale", 0.2) if loss == "cauchy" else ())
         output = succeed("fit-pose", model, tmp_path / "t.png", "-o", tmp_path / loss, *options)
         expected = float(rts.Loss(loss, 0.2)(image[..., 3] - target))
         assert float(re.search(r"loss (\S+) → ", output).group(1)) == pytest.approx(expected, rel=5e-3)
@@ -420,6 +420,11 @@ def test_fit_pose_says_which_extra_draws_the_plot(model, tmp_path, monkeypatch):
 def test_fit_pose_refuses(model, tmp_path, options, expected):
     succeed("render", model, "-o", tmp_path / "t.png", "--size", 32)
     assert expected in fail("fit-pose", model, tmp_path / "t.png", *options)
+
+
+def test_fit_pose_takes_a_scale_with_a_robust_loss_alone(model):
+    output = fail("fit-pose", model, "t.png", "--f-scale", "0.2", code=2)
+    assert "--f-scale is for a robust --loss: soft_l1, huber or cauchy" in output
 
 
 def bright(path):

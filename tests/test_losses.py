@@ -2,7 +2,9 @@
 
 import dataclasses
 import math
+from fractions import Fraction
 
+import numba
 import numpy as np
 import pytest
 from helpers import DIFFERENTIABLE, arrays, icosphere, quad, to_numpy
@@ -11,14 +13,17 @@ from test_mean_loss import CAMERA, POSE, SIZE, goal, gradient, moving, residuals
 
 import rts
 from rts import splatting
+from rts.capabilities import capabilities
 from rts.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
 from rts_backends.fused import normal_equations as fused_normal
 from rts_backends.fused import splatters as fused
+from rts_backends.fused.losses import cost_and_weight, in_numbers
 
 pytestmark = pytest.mark.fitting
 
+compiled_cost = numba.njit(lambda r, loss: cost_and_weight(r, loss))
 ROBUST = ("soft_l1", "huber", "cauchy")
 targets = pytest.mark.parametrize("target", DIFFERENTIABLE)
 losses = pytest.mark.parametrize("name", ROBUST)
@@ -93,6 +98,25 @@ def test_an_image_of_one_colour_has_the_loss_of_that_colour(name, target):
     np.testing.assert_allclose(2 * half, to_numpy(found), 1e-4)
     curvatures = rts.Loss(name, 0.1).weights(off)[1]
     np.testing.assert_allclose(matrix, np.diag(0.25 * curvatures / 3), rtol=1e-4, atol=1e-9)
+
+
+@losses
+@pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
+def test_losses_of_huge_residuals_are_finite_and_right(name, target):
+    """In float32, where (r / s)² is too large a number; in array code and compiled."""
+    for s in (1e-10, 1e-3, 0.1, 1e3):
+        loss = rts.Loss(name, s)
+        for r in (0.9e8 * s, 1.1e8 * s, 1e12, 1e18, -1e20):
+            expected = cost(name, r, s), slope(name, r, s)
+            given = arrays(target, np.array([r], np.float32))
+            assert float(loss(given)) == pytest.approx(expected[0], rel=1e-5)
+            found = compiled_cost(np.float32(r), in_numbers(loss, np.float32))
+            assert float(found[0]) == pytest.approx(expected[0], rel=1e-5)
+            assert 2 * r * float(found[1]) == pytest.approx(expected[1], rel=1e-5, abs=3e-38 * abs(r))
+            weights, curvatures = map(to_numpy, loss.weights(given))
+            assert 0 <= curvatures[0] <= weights[0] <= 1
+            if target != "numpy":
+                np.testing.assert_allclose(gradient(loss, given), [expected[1]], rtol=1e-5, atol=1e-30)
 
 
 # ------------------------------------------------------------------------------------- other implementations
@@ -278,7 +302,7 @@ def test_a_place_is_found_though_a_part_of_the_mask_is_hidden(method):
 @targets
 @pytest.mark.parametrize("method", ["lm", "adam"])
 def test_a_line_through_points_of_which_some_are_wrong(target, method):
-    """Of residuals by a function of one's own; the least squares are off by one tenth of the outliers."""
+    """Residuals are a function of one's own; the least squares are off by one tenth of the outliers."""
     x = np.linspace(-1, 1, 40)
     points = arrays(target, np.where(np.arange(40) % 10 == 3, 4.0, 0.5 + 2 * x))
     powers = arrays(target, np.stack([np.ones(40), x], 1))
@@ -296,6 +320,80 @@ def test_a_line_through_points_of_which_some_are_wrong(target, method):
     np.testing.assert_allclose(to_numpy(found.parameters), [0.5, 2], atol=0.02)
     assert np.abs(to_numpy(rts.fit(off, start, **options).parameters) - [0.5, 2]).max() > 0.2
     assert found.loss == pytest.approx(2 * theirs.cost / 40, rel=1e-4)
+
+
+@losses
+def test_levenberg_marquardt_comes_back_from_trials_with_huge_residuals(name):
+    """Colours are exp(p), of which the first step is far too long; compiled and by the Jacobian."""
+    torch = pytest.importorskip("torch")
+    vertices, faces = quad(-9, 9, -9, 9, 0)
+    part = rts.Part(rts.Mesh(faces), {"vertices": vertices}, "unlit")
+    target = np.full((*SIZE, 3), 0.5, np.float32)
+    swept = rts.ImageResiduals(
+        lambda p: part.replace(theta={"vertices": vertices, "color": torch.exp(p)}), CAMERA, SIZE, target, loss=name
+    )
+    for own, start in ((swept, -2.5), (lambda p: torch.exp(p) - 0.5, -2.5), (lambda p: torch.exp(p) - 0.5, -3.7)):
+        found = rts.fit(own, torch.full((3,), start), method="lm", loss=rts.Loss(name, 0.1), progress=False)
+        assert max(found.history) > 10 * found.history[0] and found.loss < 1e-6
+        np.testing.assert_allclose(found.parameters.exp(), 0.5, atol=1e-3)
+
+
+@losses
+def test_normal_equations_of_residuals_without_a_weight_are_finite(name):
+    torch = pytest.importorskip("torch")
+    pose, given = torch.tensor(POSE), {"loss": name, "f_scale": 1e-10}
+    swept = residuals("lambert", 4, weights=np.full((*SIZE, 1), 1e15, np.float32), **given)
+    for found in (swept.normal_equations(pose), normal_equations(swept, pose, engine_of(pose), swept.loss)):
+        assert all(bool(torch.isfinite(x).all()) for x in found) and float(found[0]) > 0
+
+
+class Off(rts.Residuals):
+    """p less a point, with normal equations and a mean loss for the loss that it says."""
+
+    def __init__(self, loss):
+        self.loss = loss
+
+    def __call__(self, p):
+        return p - arrays("torch-cpu", np.array([0.0, 0.0, 9.0]))
+
+    def normal_equations(self, p):
+        return normal_equations(self, p, engine_of(p), self.loss or rts.Loss())
+
+    def mean_loss(self, p):
+        return (self.loss or rts.Loss())(self(p))
+
+
+class Staged(Off):
+    """Residuals of which every stage is another object."""
+
+    def __init__(self, loss, stages):
+        super().__init__(loss)
+        self.stages = stages
+
+    def at_stage(self, stage):
+        return self.stages
+
+
+HUBER = rts.Loss("huber", 0.5)
+
+
+@pytest.mark.parametrize("method", ["lm", "adam"])
+@pytest.mark.parametrize(
+    ("outer", "inner", "given", "expected"),
+    [
+        (None, HUBER, None, HUBER),
+        (rts.Loss("cauchy"), HUBER, None, HUBER),
+        (HUBER, None, None, HUBER),
+        (None, HUBER, rts.Loss(), rts.Loss()),
+        (None, None, HUBER, HUBER),
+    ],
+)
+def test_each_stage_has_its_own_loss(method, outer, inner, given, expected):
+    torch = pytest.importorskip("torch")
+    options = {"method": method, "steps": 20, "progress": False, "schedule": [rts.Stage()], "loss": given}
+    found = rts.fit(Staged(outer, Off(inner)), torch.zeros(3), **options)
+    assert found.history[0] == pytest.approx(float(expected(torch.tensor([0.0, 0.0, -9.0]))))
+    assert found.loss < found.history[0]
 
 
 def test_residuals_of_ones_own_may_say_their_loss():
@@ -319,9 +417,12 @@ def test_residuals_of_ones_own_may_say_their_loss():
         assert rts.fit(Off(), start, method=method, **options).loss == pytest.approx((9 - 0.25) / 3)
         assert rts.fit(Off(), start, method=method, loss=rts.Loss(), **options).loss == pytest.approx(27)
         assert rts.fit(Unrelated(), start, method=method, **options).loss == pytest.approx(27)
-    Off.loss = "huber"
-    with pytest.raises(InputError, match="the residuals' loss is 'huber'; expected an rts.Loss, or None"):
-        rts.fit(Off(), start, **options)
+    for loss in ("huber", 3, abs):
+        Off.loss, Unrelated.loss = staticmethod(loss) if loss is abs else loss, loss
+        with pytest.raises(InputError, match="the residuals' loss is .*; expected an rts.Loss, or None"):
+            rts.fit(Off(), start, **options)
+        assert rts.fit(Off(), start, loss=rts.Loss(), **options).loss == pytest.approx(27)
+        assert rts.fit(Unrelated(), start, **options).loss == pytest.approx(27)
 
 
 def test_another_loss_than_that_of_the_image_is_taken_of_its_residuals():
@@ -334,6 +435,51 @@ def test_another_loss_than_that_of_the_image_is_taken_of_its_residuals():
         assert other.loss == pytest.approx(float((swept(pose) ** 2).mean()), rel=1e-5)
 
 
+def test_a_subclass_with_more_residuals_has_the_normal_equations_of_all_of_them():
+    torch = pytest.importorskip("torch")
+
+    class Held(rts.ImageResiduals):
+        def __call__(self, parameters):
+            return torch.cat([super().__call__(parameters).reshape(-1), 3 * parameters])
+
+    image, weights = goal(1)
+    given = {"weights": [weights] * 2, "loss": "huber"}
+    swept = Held(lambda p: moving(p, "silhouette"), [CAMERA, CAMERA], SIZE, [image] * 2, **given)
+    pose = torch.tensor(POSE)
+    value, found = engine_of(pose).value_and_grad(swept.mean_loss)(pose)
+    equations = swept.normal_equations(pose)
+    torch.testing.assert_close(equations[0], value)
+    torch.testing.assert_close(2 * equations[2], found, rtol=1e-4, atol=1e-7)
+
+
+def test_a_splatter_that_is_mixed_with_another_is_asked_for_what_that_takes():
+    class Mixed:
+        def mean_loss(self, splats, target, weights=None, background=None):
+            raise AssertionError
+
+    class Own(Mixed, fused.Visible):
+        pass
+
+    class Below(Own):
+        pass
+
+    class Knowing(Own):
+        takes_losses = True
+
+    assert capabilities("rts.splatters", fused.Visible)["takes_losses"]
+    assert not Own.takes_losses and not Below.takes_losses and Knowing.takes_losses and fused.Visible.takes_losses
+
+
+def test_images_have_a_scale_that_suits_them():
+    assert residuals(loss="huber").loss == rts.Loss("huber", 0.1)
+    assert residuals(loss=rts.Loss("huber", 0.3)).loss == rts.Loss("huber", 0.3)
+    assert residuals(f_scale=0.2).loss == rts.Loss() == rts.Loss("linear", 0.2)
+    with pytest.raises(InputError, match="loss is .*and f_scale 0.2; expected one of them to say the scale"):
+        residuals(loss=rts.Loss("huber"), f_scale=0.2)
+    with pytest.raises(AttributeError):
+        residuals().loss = rts.Loss("huber")
+
+
 # ------------------------------------------------------------------------------------------------------- misuse
 
 
@@ -342,18 +488,38 @@ def test_another_loss_than_that_of_the_image_is_taken_of_its_residuals():
     [
         ({"loss": "square"}, "loss is 'square'; expected one of linear, soft_l1, huber, cauchy"),
         ({"loss": None}, "loss is None; expected one of"),
-        ({"loss": "huber", "f_scale": 0}, "f_scale is 0; expected a positive, finite number"),
+        ({"loss": "huber", "f_scale": 0}, "f_scale is 0; expected a positive number from 1e-10 to 1e.10"),
         ({"loss": "huber", "f_scale": -0.1}, "f_scale is -0.1"),
         ({"loss": "huber", "f_scale": math.inf}, "f_scale is inf"),
         ({"loss": "cauchy", "f_scale": math.nan}, "f_scale is nan"),
         ({"loss": "cauchy", "f_scale": "wide"}, "f_scale is 'wide'"),
         ({"f_scale": 0}, "f_scale is 0"),
+        ({"loss": "huber", "f_scale": 10**400}, "f_scale is 10+.*; expected a positive number"),
+        ({"loss": "huber", "f_scale": Fraction(1, 10**400)}, "f_scale is .*; expected a positive number"),
+        ({"loss": "huber", "f_scale": 1e40}, r"f_scale is 1e.40; expected a positive number from 1e-10 to 1e.10"),
+        ({"loss": "huber", "f_scale": 1e-20}, "f_scale is 1e-20"),
     ],
 )
 def test_losses_that_are_none_are_refused(options, expected):
     with pytest.raises(InputError, match=expected) as error:
         residuals(**options)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (np.array([1, 2]), "residuals has dtype int64; expected floating numbers"),
+        (np.zeros((0, 3)), r"residuals has shape \(0, 3\); expected an array of floats, of at least one"),
+        (2.0, "residuals is a float; expected an array of floats"),
+        (None, "residuals is a NoneType; expected an array of floats"),
+    ],
+)
+def test_residuals_that_have_no_loss_are_refused(given, expected):
+    for call in (rts.Loss("huber"), rts.Loss().weights):
+        with pytest.raises(InputError, match=expected):
+            call(given)
+    assert float(rts.Loss("huber", 0.5)([0.5, 1, -1])) == pytest.approx((0.25 + 2 * 0.75) / 3)
 
 
 def test_losses_are_values():

@@ -277,7 +277,7 @@ OPTIONAL = """
     render.background render.capacity render.engine sample.splatter render_samples.background prepare.camera
     prepare.size
     Part.transform Mesh.indices look_at.aspect look_at.near look_at.far within.transform splatter.calibration
-    ImageResiduals.weights fit.loss fit.steps fit.learning_rate fit.callback gradient_image.scale
+    ImageResiduals.weights ImageResiduals.f_scale fit.loss fit.steps fit.learning_rate fit.callback gradient_image.scale
     fit.schedule Stage.supersample pyramid.largest
     Isosurface.band Isosurface.lipschitz Isosurface.reads Isosurface.attributes Sdf.lipschitz Sdf.steps
     NarrowBand.lipschitz NarrowBand.coarse

@@ -82,6 +82,8 @@ def test_the_verdict_says_what_is_wrong(model, pose):
     assert good == (1.0, []) and good.word == "good fit"
     poor = judged(pose, parts, np.roll(drawn[..., 3], 12, axis=1))
     assert poor.word == "poor fit" and poor.iou < 0.9 and "--fit-fov" in poor.notes[0]
+    robust = judged(pose, parts, np.roll(drawn[..., 3], 12, axis=1), robust=True)
+    assert "hidden" in robust.notes[0] and "hidden" not in poor.notes[0] and robust.iou == poor.iou
     cut = judged(pose, parts, rectangle(0, 48, 0, 64, (48, 64)))
     assert "touches the border" in cut.notes[1]
     photo = np.dstack([drawn[..., 3] * 0.2 + 0.3] * 3 + [np.ones(pose.size)])

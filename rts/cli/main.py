@@ -326,8 +326,9 @@ def fit_pose(
         ),
     ] = "linear",
     f_scale: Annotated[
-        float, typer.Option(help="The difference, of 1, from which on a robust loss counts it less than its square.")
-    ] = 0.1,
+        float | None,
+        typer.Option(help="The difference, of 1, beyond which a robust loss counts less than its square: 0.1."),
+    ] = None,
 ) -> None:
     """Find the turn and shift of a model that make its silhouette match a picture's: coarse, blurred pixels first.
 
@@ -343,6 +344,8 @@ def fit_pose(
     from rts.cli.views import bounds_of, orbit
     from rts.files.paths import output_folder
 
+    if f_scale is not None and loss == "linear":
+        raise typer.BadParameter("--f-scale is for a robust --loss: soft_l1, huber or cauchy")
     view = _view(camera)
     output_folder(output)
     parts = rts.load(model, surface=surface)
@@ -353,7 +356,7 @@ def fit_pose(
     chosen = None if engine == "auto" else engine
     options: dict[str, Any] = {"method": method, "steps": steps, "fit_fov": fit_fov, "loss": loss, "f_scale": f_scale}
     found = fit(parts, mask, seen, bounds, engine=chosen, **options)
-    verdict = judged(found.pose, parts, mask, picture)
+    verdict = judged(found.pose, parts, mask, picture, robust=loss != "linear")
     files = write_report(output, found, verdict, parts, mask)
     _say(
         f"loss {found.first_loss:.3g} → {found.loss:.3g} in {len(found.history)} steps, {_sum(found.levels)} from "

@@ -104,7 +104,7 @@ def fit_pose(
     steps: int | None = None,
     fit_fov: bool = False,
     loss: str = "linear",
-    f_scale: float = 0.1,
+    f_scale: float | None = None,
     progress: bool | None = None,
 ) -> PoseFit:
     """Turn and move a model until its silhouette is the target's, from coarse pixels to fine ones.

@@ -42,7 +42,9 @@ class Verdict(NamedTuple):
         return {"iou": self.iou, "verdict": self.word, "notes": self.notes}
 
 
-def judged(pose: Pose, parts: Sequence[Part], mask: np.ndarray, picture: np.ndarray | None = None) -> Verdict:
+def judged(
+    pose: Pose, parts: Sequence[Part], mask: np.ndarray, picture: np.ndarray | None = None, robust: bool = False
+) -> Verdict:
     """The verdict on a pose.
 
     Args:
@@ -50,13 +52,16 @@ def judged(pose: Pose, parts: Sequence[Part], mask: np.ndarray, picture: np.ndar
         parts: the model as loaded, NumPy arrays.
         mask: (H, W) the silhouette that it was fitted to, in [0, 1].
         picture: (H, W, 4) linear; the picture of which the mask was made.
+        robust: whether the loss was a robust one: a part of the mask may be missing, which the pose is right without.
     """
     drawn = render(posed(parts, pose.matrix, "silhouette"), pose.camera, mask.shape, splatter="single", layers=1)
     iou = intersection_over_union(np.asarray(drawn)[..., 3], mask)
     notes = []
     if iou < GOOD:
+        hidden = "with a part of the mask hidden or wrong the pose may be right all the same (after.png); if not: "
         notes.append(
-            f"poor fit: the model covers the mask with an IoU of {iou:.2f}; expected {GOOD} or more: is it this model, "
+            f"poor fit: the model covers the mask with an IoU of {iou:.2f}; expected {GOOD} or more: "
+            f"{hidden if robust else ''}is it this model, "
             f"is its start (before.png) roughly right (--camera), and is the field of view (--fov, or --fit-fov)?"
         )
     if touches_border(mask):

@@ -101,7 +101,8 @@ def fit(
         method: "adam" or "sgd" (torch.optim or optax, on the gradient of the loss), or "lm": Levenberg–Marquardt, by
             the forward-mode Jacobian, for up to some hundred unknowns.
         loss: reduces residuals to a scalar; for "lm" an `rts.Loss`, such as `rts.Loss("huber", f_scale=0.1)`. By
-            default that of the residuals (`ImageResiduals(loss=…)`), which for a function is the mean square.
+            default that of the residuals (`ImageResiduals(loss=…)`), at each stage its own, which for a function is the
+            mean square.
         steps: at most so many losses are computed at each stage, the first at its start; default 200, for "lm" 50.
         learning_rate: the rate of Adam (default 0.01) or SGD (default 0.1).
         tolerance: stop when the loss has not fallen by this fraction in `patience` steps ("lm": in an accepted step).
@@ -121,8 +122,7 @@ def fit(
     _check_method(method, loss, steps, learning_rate)
     _check_limits(tolerance, patience)
     stages = _stages(known, schedule)
-    own_loss = _own_loss(known)
-    loss = own_loss if loss is None else loss
+    taken = [_taken(stage, known, loss) for stage in stages]
     engine = _checked_engine(parameters)
     names = [name for name, _ in named_leaves(parameters)]
     # Private copies: neither the caller's later changes nor the graph that made them may reach the result.
@@ -130,19 +130,19 @@ def fit(
     rate = LEARNING_RATES.get(method, 0.0) if learning_rate is None else float(learning_rate)
     start = time.perf_counter()
     runs: list[Run] = []
-    for number, stage in enumerate(stages, 1):
+    for number, (stage, (reduced, fits)) in enumerate(zip(stages, taken, strict=True), 1):
         run = Run(int(steps or STEPS[method]), callback, tolerance, patience, sum(len(r.history) for r in runs))
         bar = method if len(stages) == 1 else f"{method} {number}/{len(stages)}"
         with progress_bar(progress, run.steps, bar, run):
             try:
                 checked = _checked(stage, engine, run)
-                if isinstance(loss, Loss) and method == "lm":
-                    own = stage.normal_equations if stage.sums_products and loss == own_loss else None
+                if isinstance(reduced, Loss) and method == "lm":
+                    own = stage.normal_equations if fits and stage.sums_products else None
                     supersample = finest(getattr(stage, "supersample", None))
-                    levenberg_marquardt(checked, parameters, engine, run, jit, loss, own, supersample)
+                    levenberg_marquardt(checked, parameters, engine, run, jit, reduced, own, supersample)
                 else:
-                    own = stage.mean_loss if stage.sums_losses and loss == own_loss else None
-                    _descend(checked, loss, own, parameters, engine, method, rate, run, jit)
+                    own = stage.mean_loss if fits and stage.sums_losses else None
+                    _descend(checked, reduced, own, parameters, engine, method, rate, run, jit)
             except Astray as stop:
                 run.stop(str(stop))
         runs.append(run)
@@ -242,13 +242,23 @@ def _stages(residuals: Residuals, schedule: Any) -> list[Residuals]:
     return found
 
 
-def _own_loss(residuals: Residuals) -> Loss:
+def _taken(stage: Residuals, whole: Residuals, given: Callable | None) -> tuple[Callable[[Array], Array], bool]:
+    """The loss at a stage of the residuals `whole`, and whether the stage's own sums are for it."""
+    if given is not None and not (stage.sums_products or stage.sums_losses):
+        return given, False
+    own = _own_loss(stage)
+    taken = (own or _own_loss(whole) or SQUARE) if given is None else given
+    return taken, (own or SQUARE) == taken
+
+
+def _own_loss(residuals: Residuals) -> Loss | None:
     """The loss that residuals say they are for."""
     loss = residuals.loss
-    if isinstance(loss, str):
+    if loss is None or isinstance(loss, Loss):
+        return loss
+    if unwrapped(residuals) is residuals:
         raise InputError(f"the residuals' loss is {quoted(loss)}; expected an rts.Loss, or None")
-    # Objects of other classes may mean anything by the name.
-    return loss if isinstance(loss, Loss) else SQUARE
+    return None  # Objects of other classes may mean anything by the name.
 
 
 def _check_method(method: str, loss: Callable | None, steps: int | None, learning_rate: float | None) -> None:

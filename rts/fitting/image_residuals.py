@@ -45,6 +45,9 @@ Parts = Part | Sequence[Part] | PreparedParts
 Cameras = Camera | Sequence[Camera]
 SceneFunction = Callable[[Tree], "Parts | tuple[Parts, Cameras]"]
 
+F_SCALE = 0.1
+"""The scale of a robust loss of images, whose numbers are mostly from 0 to 1."""
+
 
 class ImageResiduals(Residuals):
     """The difference between the render of a scene and a target, as a function of the scene's parameters.
@@ -73,17 +76,17 @@ class ImageResiduals(Residuals):
             Jacobian.
         loss: what becomes of each residual, named as in `scipy.optimize.least_squares`: "linear" (its square), or
             "soft_l1", "huber" or "cauchy", to which large residuals count less: where part of the target is wrong, such
-            as a mask with something in front. See `Loss`.
-        f_scale: the residual at which square turns into robust, in units of the image times weights; 0.1 suits masks.
+            as a mask with something in front. Or an `rts.Loss`, which has its own `f_scale`.
+        f_scale: the residual at which square turns into robust, in units of the image times weights; by default 0.1,
+            which suits images in [0, 1].
 
     Attributes:
         size: (height, width).
-        loss: the `Loss`; that of all stages and views.
         supersample: samples a pixel along each axis, or an `rts.Adaptive`.
 
     Raises:
         InputError: an argument of the wrong kind, shapes that do not fit, integers as target, or a target, weights or
-            background that are not finite; another `loss`, or a scale that is not positive and finite.
+            background that are not finite; another `loss`, or a scale that is no number from 1e-10 to 1e10.
     """
 
     def __init__(
@@ -101,10 +104,10 @@ class ImageResiduals(Residuals):
         supersample: int | Adaptive = 1,
         capacity: int | None = None,
         channels: int = 3,
-        loss: str = "linear",
-        f_scale: float = 1.0,
+        loss: str | Loss = "linear",
+        f_scale: float | None = None,
     ):
-        self.loss: Loss = Loss(loss, f_scale)  # pyright: ignore[reportIncompatibleVariableOverride]  # Never None.
+        self._loss = _checked_loss(loss, f_scale)
         if not callable(scene):
             raise InputError(f"scene is {quoted(scene)}; expected a function: parameters → parts, or (parts, camera)")
         if camera is not None and not _are_cameras(camera):
@@ -133,6 +136,11 @@ class ImageResiduals(Residuals):
             self._views.append(view)
         if len(kinds := {tuple(view._target.shape[2:]) for view in self._views}) > 1:
             raise InputError(f"targets of views have the channels {sorted(kinds)}; expected one kind for all views")
+
+    @property
+    def loss(self) -> Loss:  # pyright: ignore[reportIncompatibleVariableOverride]  # Never None, nor set.
+        """What the mean is taken of; that of all stages and views."""
+        return self._loss
 
     def _take(self, target: Any, weights: Any) -> None:
         """Compare with this target (H, W, ·) of one view."""
@@ -178,7 +186,8 @@ class ImageResiduals(Residuals):
         """The residuals at another resolution, for the same camera and extent of the image; see `rts.fit`.
 
         Target and background are box-filtered. Where there are weights, the target's pixels count by their squares: an
-        image that is constant over each coarse pixel has the same sum of squares, but for a constant, as before.
+        image that is constant over each coarse pixel has the same sum of squares, but for a constant, as before. That
+        holds for the loss "linear": a robust one is taken of the mean difference over a coarse pixel, times its weight.
         Differences are blurred with their weights; those take the Jacobian for Levenberg–Marquardt.
 
         Args:
@@ -239,7 +248,7 @@ class ImageResiduals(Residuals):
 
         W and S are diagonals, ones for the loss "linear"; see `Loss.weights`.
         """
-        if self._views:
+        if self._views and self._ordinary:
             self.scene(parameters)  # Refused where there are not as many cameras.
             found = [view.normal_equations(parameters) for view in self._views]
             value, matrix, gradient = (sum(x[1:], x[0]) / len(x) for x in zip(*found, strict=True))
@@ -417,6 +426,14 @@ def _split(fields: _Fields, pixel: Array, fine: Fine) -> tuple[_Fields, _Fields]
     background = None if fields.background is None else laid_out(fields.background)
     coarse = fields._replace(weights=xp.where((pixel >= 0)[..., None], 0.0, weights))
     return coarse, _Fields(laid_out(fields.target), laid_out(weights), background)
+
+
+def _checked_loss(loss: Any, f_scale: Any) -> Loss:
+    if not isinstance(loss, Loss):
+        return Loss(loss, F_SCALE if f_scale is None else f_scale)
+    if f_scale is not None:
+        raise InputError(f"loss is {loss}, and f_scale {quoted(f_scale)}; expected one of them to say the scale")
+    return loss
 
 
 def _checked_supersample(given: Any) -> int | Adaptive:

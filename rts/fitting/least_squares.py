@@ -205,7 +205,8 @@ def normal_equations(
     if loss.robust:
         weights, curvatures = loss.weights(r)
         root = xp.sqrt(curvatures)
-        r, rows = weights / root * r, root * rows
+        # A weight too small for the dtype is zero: the residual has no say, but for its loss.
+        r, rows = xp.where(root > 0, weights / xp.where(root > 0, root, 1.0), 0.0) * r, root * rows
     return value, rows @ xp.matrix_transpose(rows) / r.shape[0], rows @ r / r.shape[0]
 
 

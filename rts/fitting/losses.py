@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from rts.arguments import quoted
-from rts.checks import is_real
+from rts.arrays import described, from_numbers, shape_of
+from rts.checks import check_floating, is_real
 from rts.engines import namespace
 from rts.errors import InputError
 from rts.trees import Array
@@ -28,8 +28,29 @@ class _Form(NamedTuple):
     share: Callable[[Any, Array], Array]
 
 
-def _soft_root(xp: Any, r: Array, f_scale: float) -> Array:
-    return xp.sqrt(1 + (r / f_scale) ** 2)
+FAR = 1e8
+"""Residuals beyond so many scales take the limits of the forms, which z may be too large a number for.
+
+They differ from them by less than the rounding of float64.
+"""
+
+
+def _split(xp: Any, r: Array, f_scale: float) -> tuple[Array, Array, Array]:
+    """Which residuals are far, |r| / s of these, and r / s of the others; 1 and 0 elsewhere."""
+    ratio = r / f_scale
+    far = abs(ratio) > FAR
+    return far, xp.where(far, abs(ratio), 1.0), xp.where(far, 0.0, ratio)
+
+
+def _soft_l1(xp: Any, r: Array, f_scale: float) -> Array:
+    far, _, near = _split(xp, r, f_scale)
+    small = 2 * xp.where(far, 0.0, r) * (f_scale * (near / (1 + xp.sqrt(1 + near * near))))
+    return xp.where(far, 2 * f_scale * (abs(r) - f_scale), small)
+
+
+def _soft_weight(xp: Any, r: Array, f_scale: float) -> Array:
+    far, ratio, near = _split(xp, r, f_scale)
+    return 1 / xp.where(far, ratio, xp.sqrt(1 + near * near))
 
 
 def _huber(xp: Any, r: Array, f_scale: float) -> Array:
@@ -37,22 +58,23 @@ def _huber(xp: Any, r: Array, f_scale: float) -> Array:
     return kept * (2 * r - kept)
 
 
+def _cauchy(xp: Any, r: Array, f_scale: float) -> Array:
+    far, ratio, near = _split(xp, r, f_scale)
+    return f_scale * (f_scale * xp.where(far, 2 * xp.log(ratio), xp.log1p(near * near)))
+
+
 # The forms lose no digits where z is small, and have the right gradient at 0 and where they change.
 FORMS = {
     "linear": _Form(lambda xp, r, f_scale: r * r, lambda xp, r, f_scale: xp.ones_like(r), lambda xp, weight: weight),
-    "soft_l1": _Form(
-        lambda xp, r, f_scale: 2 * r * r / (1 + _soft_root(xp, r, f_scale)),
-        lambda xp, r, f_scale: 1 / _soft_root(xp, r, f_scale),
-        lambda xp, weight: weight * weight,
-    ),
+    "soft_l1": _Form(_soft_l1, _soft_weight, lambda xp, weight: weight * weight),
     "huber": _Form(
         _huber,
         lambda xp, r, f_scale: f_scale / xp.clip(abs(r), f_scale, None),
         lambda xp, weight: xp.where(weight < 1, 0.0, weight),
     ),
     "cauchy": _Form(
-        lambda xp, r, f_scale: f_scale * (f_scale * xp.log1p((r / f_scale) ** 2)),
-        lambda xp, r, f_scale: 1 / (1 + (r / f_scale) ** 2),
+        _cauchy,
+        lambda xp, r, f_scale: _soft_weight(xp, r, f_scale) ** 2,
         lambda xp, weight: 2 * weight - 1,
     ),
 }
@@ -60,6 +82,9 @@ FORMS = {
 
 LEAST_SHARE = 0.1
 """What residuals beyond the scale keep of the curvature that their weight gives them."""
+
+SCALES = 1e-10, 1e10
+"""Least and largest scale: with these float32 holds losses of residuals up to 1e20, and their derivatives."""
 
 
 @dataclass(frozen=True)
@@ -77,11 +102,12 @@ class Loss:
 
     Attributes:
         name: one of the above.
-        f_scale: s, the residual at which square turns into robust, in units of the residuals; 0.1 suits masks. It has
-            no effect on "linear".
+        f_scale: s, the residual at which square turns into robust, in units of the residuals, from 1e-10 to 1e10. By
+            default it is SciPy's 1, for residuals of any unit; for images see `rts.ImageResiduals`. "linear" has none:
+            it is 1 there, whatever is given.
 
     Raises:
-        InputError: another name, or a scale that is not positive and finite.
+        InputError: another name, or a scale that is no number from 1e-10 to 1e10.
     """
 
     name: str = "linear"
@@ -90,22 +116,27 @@ class Loss:
     def __post_init__(self):
         if not isinstance(self.name, str) or self.name not in FORMS:
             raise InputError(f"loss is {quoted(self.name)}; expected one of {', '.join(FORMS)}")
-        if not (is_real(self.f_scale) and 0 < self.f_scale < math.inf):
-            raise InputError(f"f_scale is {quoted(self.f_scale)}; expected a positive, finite number")
-        object.__setattr__(self, "f_scale", float(self.f_scale))
+        scale = _checked_scale(self.f_scale)
+        object.__setattr__(self, "f_scale", scale if self.robust else 1.0)
 
     def __call__(self, residuals: Array) -> Array:
-        """The mean loss () of residuals of any shape."""
+        """The mean loss () of residuals, an array of floats of any shape, or a list of numbers.
+
+        Raises:
+            InputError: an array of integers, or without numbers.
+        """
+        residuals = _checked_residuals(residuals)
         xp = namespace(residuals)
         return xp.mean(FORMS[self.name].cost(xp, residuals, self.f_scale))
 
     def weights(self, residuals: Array) -> tuple[Array, Array]:
         """Weights W and curvatures S of residuals, for normal equations JᵀSJ and JᵀWr.
 
-        Half the derivative of a residual's loss is W r, where W is ρ', in (0, 1]. S is half its second derivative,
-        but a tenth of W where it is less, or negative: JᵀSJ is positive semidefinite. (Triggs et al. 2000; scipy takes
-        them so, too, with the rounding for a tenth.)
+        Half the derivative of a residual's loss is W r, where W is ρ', at most 1. S is half its second derivative, but
+        a tenth of W where it is less, or negative: JᵀSJ is positive semidefinite. (Triggs et al. 2000; scipy takes
+        them so, too, with the rounding for a tenth.) Both are zero only where the dtype has no number so small.
         """
+        residuals = _checked_residuals(residuals)
         xp, form = namespace(residuals), FORMS[self.name]
         weight = form.weight(xp, residuals, self.f_scale)
         return weight, weight * xp.clip(form.share(xp, weight), LEAST_SHARE, None)
@@ -119,6 +150,25 @@ class Loss:
     def place(self) -> int:
         """Its place among the losses; 0 is the square."""
         return list(FORMS).index(self.name)
+
+
+def _checked_scale(given: Any) -> float:
+    try:
+        scale = float(given) if is_real(given) else 0.0
+    except OverflowError:
+        scale = 0.0
+    least, largest = SCALES
+    if not least <= scale <= largest:
+        raise InputError(f"f_scale is {quoted(given)}; expected a positive number from {least:g} to {largest:g}")
+    return scale
+
+
+def _checked_residuals(given: Any) -> Array:
+    residuals = from_numbers(given, "residuals")
+    if not hasattr(residuals, "dtype") or 0 in shape_of(residuals):
+        raise InputError(f"residuals {described(residuals)}; expected an array of floats, of at least one")
+    check_floating("residuals", residuals)
+    return residuals
 
 
 SQUARE = Loss()

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from rts.compiling import compiled
-from rts.fitting.losses import FORMS, LEAST_SHARE, Loss
+from rts.fitting.losses import FAR, FORMS, LEAST_SHARE, Loss
 
 LINEAR, SOFT_L1, HUBER, CAUCHY = range(len(FORMS))
 
@@ -27,11 +27,13 @@ def cost_and_weight(residual, loss):
     if place == HUBER:
         kept = min(max(residual, -scale), scale)
         return kept * (residual + residual - kept), kept / residual
-    z = (residual / scale) * (residual / scale)
+    ratio = residual / scale
+    z, far = ratio * ratio, abs(ratio) > type(scale)(FAR)
     if place == SOFT_L1:
-        root = math.sqrt(one + z)
-        return (residual + residual) * residual / (one + root), one / root
-    return scale * (scale * math.log1p(z)), one / (one + z)
+        root = abs(ratio) if far else math.sqrt(one + z)
+        return (residual + residual) * (scale * (ratio / (one + root))), one / root
+    log = math.log(abs(ratio)) if far else math.log1p(z)
+    return scale * (scale * (log + log if far else log)), one / (one + z)
 
 
 @compiled

@@ -354,7 +354,8 @@ def _weigh(products, many, loss, count):
         cost, weight = cost_and_weight(residuals[j], loss)
         total += cost
         roots[j] = math.sqrt(curvature(weight, loss))
-        residuals[j] *= weight / roots[j]
+        # A weight too small for the dtype is zero: the residual has no say, but for its loss.
+        residuals[j] *= weight / roots[j] if roots[j] > 0 else roots[j]
     for n in range(many):
         for j in range(count):
             products[n, j] *= roots[j]

@@ -30,8 +30,12 @@ class _Fused(splatting.Kernel):
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        if vars(cls).keys() & {"normal_equations", "mean_loss"} and "takes_losses" not in vars(cls):
-            cls.takes_losses = False  # What a class inherits it may not do.
+        for own in cls.__mro__[: cls.__mro__.index(_Fused)]:
+            if "takes_losses" in vars(own):
+                break
+            if vars(own).keys() & {"normal_equations", "mean_loss"}:
+                cls.takes_losses = False  # What a class inherits it may not do, nor may what is mixed in.
+                break
 
     def image(self, splats: Splats) -> Array:
         """See `rts.splatting.Kernel`."""
