@@ -65,8 +65,8 @@ def views_to_splats(
 ) -> list[Splats]:
     """The splats of pictures of several views: those of a picture have no border, but cells that are wanted.
 
-    A surface is asked once, for the samples of all views: what it computes of the whole of θ serves them all. Shaders
-    are asked for the samples of each view.
+    A surface is asked once, for the samples of all views: what it computes of the whole of θ serves them all. So are
+    shaders that take views; others are asked view by view.
 
     Args:
         pictures: the samples of the views; pictures are of one size.
@@ -198,7 +198,7 @@ def _shown_in_views(
 
     Args:
         index: the part's.
-        part: the part; `uniform`, where the number of samples in each view is not known.
+        part: the part; `shaded_at_once`, where the number of samples in each view is not known.
         pictures: the views.
         sampled: their samples, in arrays of the engine.
         cameras: of the whole image of each view.

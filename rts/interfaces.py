@@ -399,7 +399,7 @@ class Shader(Plugin):
         reads: the entries of the G-buffer that it needs besides position; None for all.
         takes_views: whether a call may be of samples of several views, as `rts.render_views` then makes it: `camera` is
             an `rts.RowCameras`, whose methods give a row for each sample. A shader that says so also says what it
-            `reads`, without "uv_footprint".
+            `reads`, without "uv_footprint". A subclass with its own `__call__` has to say so itself.
         channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
     """
 
@@ -409,6 +409,12 @@ class Shader(Plugin):
     takes_views: bool = False
     reads: tuple[str, ...] | None = None
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Take back what the class that is overridden promised of its `__call__`."""
+        super().__init_subclass__(**options)
+        if "__call__" in cls.__dict__ and "takes_views" not in cls.__dict__:
+            cls.takes_views = False
+
     @abc.abstractmethod
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
         """The colours of N samples, each from its own sample alone: N may be all, or some thousands at a time.
@@ -416,7 +422,7 @@ class Shader(Plugin):
         Args:
             theta: θ of the part.
             gbuffer: its G-buffer, in world space.
-            camera: the camera of the whole image; of a shader that `takes_views`, or the cameras of the samples.
+            camera: the camera of the whole image; for a shader that `takes_views` it may be an `rts.RowCameras`.
 
         Returns:
             (N, 4) premultiplied linear RGBA, in [0, 1]; (N, C + 1), alpha last, of a shader with other `channels`, all

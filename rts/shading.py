@@ -152,6 +152,7 @@ class Unlit(Shader):
 class Textured(Unlit):
     """The base colour, which must come from a texture."""
 
+    takes_views = True
     reads = ("uv",)
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
@@ -166,6 +167,7 @@ class Textured(Unlit):
 class Lambert(Unlit):
     """Diffuse shading, two-sided: normals are turned towards the viewer."""
 
+    takes_views = True
     reads = ("normal", "color", "uv")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
@@ -184,6 +186,7 @@ class Lambert(Unlit):
 class BlinnPhong(Unlit):
     """Diffuse shading with highlights (Blinn 1977), two-sided."""
 
+    takes_views = True
     reads = ("normal", "color", "uv")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:

@@ -46,8 +46,8 @@ def render_views(
 ) -> Array:
     """Render several views of a scene; they are those of a loop of `render`, but for rounding.
 
-    Where depths of layers are as good as equal, what counts as equal goes by the farthest view of the picture: beside a
-    view from a thousand times as far, gradients of hidden parts may differ more.
+    Where layers are nearer to one another than float32 tells apart at their distance, gradients of hidden parts may
+    differ more: what counts as equal goes by the farthest view, and is up to twice what it is of a view alone.
 
     Views lie side by side in one picture, of 1024² cells at most: Python's share of the work is paid once for all, what
     the surface computes of the whole of θ, such as smooth normals, serves them all, one splat does, and one call of a

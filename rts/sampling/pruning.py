@@ -76,7 +76,7 @@ def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float 
 
 
 class _BySplatter(Needed):
-    """What a splatter needs of a scene.
+    """What a splatter needs of a scene. Arrays of depths are not to change from call to call.
 
     Args:
         splatter: the splatter.
