@@ -173,7 +173,7 @@ def _shown(
         world, rgba = _colored(part, theta, transform, samples, local, camera, own, wide.grid, engine, like)
         positions.append(constants(own.project(local["position"], wide.grid), engine, dtype))
         check_splats(index, part, world, positions[-1], rgba, row, first)
-        if not part.shader.uniform:
+        if not part.uniform:
             shade = partial(_colors, part, theta, transform, camera, [*local])
             with suppress(_UnreadError):
                 rgba = engine.by_rows_in_use(shade, local.computed, samples.row, rgba)
@@ -219,7 +219,7 @@ def _shown_in_views(
     gbuffer = _evaluate(part, part.surface.reads(part.theta), whole, engine, like)
     seen = [w.camera.replace(view=constants(w.camera.view, engine, like)).within(transform) for w in wides]
     shaded = [(whole, gbuffer)]
-    if not part.shader.uniform:
+    if not part.uniform:
         assert counts is not None
         shaded = _apart(whole, gbuffer, counts.tolist(), engine)
 

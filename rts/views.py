@@ -51,7 +51,7 @@ def render_views(
 
     Views lie side by side in one picture, of 1024² cells at most: Python's share of the work is paid once for all, what
     the surface computes of the whole of θ, such as smooth normals, serves them all, and one splat does. With jax, and
-    under `torch.func`, that is so for one part of one colour (`Shader.uniform`), such as a silhouette; else one view
+    under `torch.func`, that is so for one part of one colour (`Shader.uniform_by`), such as a silhouette; else one view
     follows the other, as with `layers="auto"` and in bands. NumPy views that are too large for a picture are rendered
     one on each core. With torch memory is that of all views at once, with a gradient or without.
 
@@ -129,7 +129,7 @@ def _images(
         ]
         if place.views > 1 and all(own.possible for own in given):
             # Of padded rows it is not known which are those of a view, so that shaders must not see the camera.
-            alike = len(given) == len(scenes[0].parts) == 1 and scenes[0].parts[0].shader.uniform
+            alike = len(given) == len(scenes[0].parts) == 1 and scenes[0].parts[0].uniform
             known = capacity is None and engine.concurrent() and engine.on_host(like)
             if alike if engine.padded(like) else known:
                 return _as_pictures([sampled_as_one(own) for own in given], scenes, suited, splatter)

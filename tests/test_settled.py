@@ -27,6 +27,13 @@ def joined(*meshes):
     return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)
 
 
+def at(*place):
+    """The transform that moves a part there."""
+    move = np.eye(4)
+    move[:3, 3] = place
+    return move
+
+
 SCENES = {
     "sphere": icosphere(3, 0.9),
     "box before a card": joined(box(0.5), quad(-1.0, 1.0, -1.0, 1.0, -0.8)),
@@ -115,13 +122,13 @@ def test_so_are_those_of_active_pixels(name, splatter):
 
 
 def test_pixels_that_are_not_active_are_flat_where_hidden_samples_have_no_effect_on_them():
-    part = part_of(SCENES["sphere"][0], "sphere")
+    part, behind = (part_of(SCENES["sphere"][0], "sphere", transform=at(*place)) for place in ((0, 0, 0), (0.5, 0, -2)))
     cases = {
         "visible": {},
         "single": {},
         "multi": {"splatter": "multi"},
         "no room": {"capacity": 1500},
-        "two": {"parts": [part, part]},
+        "two": {"parts": [part, behind]},
         "shaded": {"parts": part.replace(shader="normals")},
     }
     flat = {}
@@ -129,7 +136,7 @@ def test_pixels_that_are_not_active_are_flat_where_hidden_samples_have_no_effect
         options = {"splatter": case if case == "single" else "visible", "supersample": rts.Adaptive(4), **given}
         sampled = sample(options.pop("parts", part), CAMERA, SIZE, settles=True, **options)
         flat[case] = sampled.fine.flat
-    assert flat == {case: case in ("visible", "single") for case in cases}
+    assert flat == {case: case in ("visible", "single", "two") for case in cases}
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
@@ -239,12 +246,13 @@ def test_samples_are_left_out_only_where_nothing_can_depend_on_them():
             (painted, "multi"),
             (normals, "visible"),
             ([part, part], "visible"),
+            ([part, normals], "visible"),
             (part, Twice()),
             (part, "none"),
             (part, splatting.Visible(epsilon=0.0)),
         )
     ]
-    assert settled == [True, True, False, False, False, False, False]
+    assert settled == [True, True, False, True, False, False, False, False]
 
 
 def test_what_needs_the_samples_that_were_left_out_is_refused():
