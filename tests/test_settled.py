@@ -8,8 +8,11 @@ from helpers import DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere
 
 import rts
 from rts import splatting
+from rts.checks import check_scene
 from rts.sampling.interiors_kernels import settle
+from rts.sampling.pruning import of_one_color
 from rts.sampling.scenes import sample
+from rts.shading import Unlit
 from rts.splatting.layers import dilated
 from rts_backends.fused import splatters as fused
 
@@ -40,6 +43,19 @@ SCENES = {
     "spheres that cross": joined(icosphere(2, 0.8), (icosphere(2, 0.8)[0] + np.float32((0.5, 0, 0)), icosphere(2)[1])),
     "cut by the frame": icosphere(3, 1.6),
 }
+
+
+class Twice(splatting.Visible):
+    """A splatter with an image of its own."""
+
+    def image(self, splats):
+        return super().image(splats)
+
+
+class Whole(fused.Visible):
+    """A splatter that does not read which cells are settled."""
+
+    settles = False
 
 
 class Painted(rts.Shader):
@@ -186,6 +202,145 @@ def test_the_specification_agrees(name, make):
         np.testing.assert_allclose(settled, whole, rtol=0, atol=1e-10 * max(1, np.abs(whole).max()))
 
 
+SPHERE = icosphere(2, 0.8)
+SEVERAL = {
+    "overlapping": [(SPHERE, at(0.4, 0.1, 0.3)), (SPHERE, at(-0.3, 0, -0.6))],
+    "crossing": [(SPHERE, at(0.3, 0, 0)), (SPHERE, at(-0.3, 0, 0.1))],
+    "out of sight": [(SPHERE, at(30, 0, 0)), (SPHERE, at(0, 0, 0))],
+    "hidden": [(SPHERE, at(0, 0, 0)), (icosphere(1, 0.2), at(0, 0, -1))],
+    "a box before a card": [(box(0.5), at(0, 0, 0.2)), (quad(-1.0, 1.0, -1.0, 1.0, -0.8), at(0, 0, 0))],
+    "three": [(SPHERE, at(0.4, 0.1, 0.3)), (SPHERE, at(-0.3, 0, -0.6)), (box(0.4), at(0, -0.3, 1))],
+}
+
+
+def several_of(name, poses=None, color=None, **options):
+    """The parts of a scene, moved by poses (P, 6), all silhouettes or unlit in one colour."""
+    theta = {} if color is None else {"color": color}
+    return [
+        rts.Part(
+            MESH(faces),
+            {"vertices": vertices, **theta},
+            "silhouette" if color is None else "unlit",
+            place if poses is None else poses.new_tensor(place) @ rts.rigid(poses[i]),
+            **options,
+        )
+        for i, ((vertices, faces), place) in enumerate(SEVERAL[name])
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "splatter", "options"),
+    [
+        *((name, "visible", {}) for name in SEVERAL),
+        ("overlapping", "visible", {"layers": 1}),
+        ("overlapping", "visible", {"layers": "auto"}),
+        ("overlapping", "visible", {"supersample": 2}),
+        ("crossing", "visible", {"cull": "back"}),
+        ("crossing", splatting.Visible(), {"cull": "back", "layers": 3}),
+        ("three", "multi", {}),
+        ("three", splatting.Multi(), {"layers": 3}),
+        ("a box before a card", "single", {}),
+        *((name, "visible", {"supersample": rts.Adaptive(3)}) for name in SEVERAL),
+        ("overlapping", "single", {"supersample": rts.Adaptive(3)}),
+    ],
+)
+def test_so_are_those_of_several_parts_of_one_colour(name, splatter, options):
+    import torch
+
+    options, cull = dict(options), options.get("cull", "none")
+    options.pop("cull", None)
+    count = len(SEVERAL[name])
+    rng, weights = np.random.default_rng(5), np.random.default_rng(2).normal(size=(*SIZE, 4))
+    start = torch.from_numpy(np.concatenate([0.02 * rng.normal(size=6 * count), [0.3, 0.6, 0.2]]))
+    along, results, counts = torch.from_numpy(rng.normal(size=len(start))), [], []
+    for settles in (False, True):
+
+        def scene(x):
+            return several_of(name, x[:-3].reshape(-1, 6), x[-3:], cull=cull)
+
+        sampled = sample(scene(start), CAMERA, SIZE, splatter=splatter, settles=settles, **options)
+
+        def image(x, sampled=sampled, scene=scene):
+            return rts.render_samples(sampled, scene(x), CAMERA, splatter=splatter)
+
+        def loss(x, image=image):
+            return (image(x) * torch.from_numpy(weights)).sum()
+
+        results.append([*derivative("torch", image, start, along), gradient("torch", loss, start)])
+        counts.append(sum(len(s.ids) for s in (sampled.fine or sampled).samples))
+    shown = sampled.fine or sampled
+    assert shown.settled.any() and (counts[1] < counts[0] or splatter == "multi")
+    assert np.abs(results[0][2]).max() > 1
+    for whole, settled in zip(*results, strict=True):
+        np.testing.assert_allclose(settled, whole, rtol=0, atol=1e-10 * max(1, np.abs(whole).max()))
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_unlit_parts_of_one_colour_are_settled_and_their_colour_has_its_gradient(target):
+    weights = arrays(target, np.random.default_rng(0).normal(size=(*SIZE, 4)).astype(np.float32))
+    start, found = arrays(target, np.array([0.3, 0.6, 0.2, 0.02, -0.01, 0.03], np.float32)), []
+    for splatter in (fused.Visible(), Whole()):
+
+        def loss(x, splatter=splatter):
+            xp = rts.namespace(x)
+            pose = xp.concat([x[3:], 0 * x[3:]])
+            theta = {"vertices": SPHERE[0], "color": x[:3]}
+            part = rts.Part(MESH(SPHERE[1]), theta, "unlit", rts.rigid(pose))
+            return xp.sum(rts.render(part, CAMERA, SIZE, splatter=splatter) * weights)
+
+        found.append(to_numpy(gradient(target, loss, start)))
+    assert np.abs(found[0]).max() > 1
+    np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-5 * np.abs(found[1]).max())
+
+
+def test_which_scenes_are_of_one_colour():
+    import torch
+
+    vertices, rng = SPHERE[0], np.random.default_rng(0)
+    red, green = np.array([1.0, 0, 0], np.float32), np.array([0, 1.0, 0], np.float32)
+
+    def part(shader="unlit", indices=None, **theta):
+        return rts.Part(MESH(SPHERE[1], indices), {"vertices": vertices, **theta}, shader)
+
+    class Shaded(Unlit):
+        def base_color(self, theta, gbuffer):
+            return gbuffer["normal"], gbuffer["position"][:, :1]
+
+    class Bare(rts.TriangleSurface):
+        """Does not say what it gives."""
+
+        sample_widths, proxy, proxy_inputs = (3, 2), MESH.proxy, MESH.proxy_inputs
+
+    free, colors, uv = torch.tensor(red), rng.random((len(vertices), 3)), rng.random((len(vertices), 2))
+    texture = rng.random((4, 4, 3))
+    mixed = {"color": (SPHERE[1])}
+    of_one = {
+        "white": [part()],
+        "red": [part(color=red)],
+        "texture without uv": [part(texture=texture)],
+        "uv without texture": [part(uv=uv)],
+        "alike": [part(color=red), part(color=red.copy()), part(Unlit(), color=red)],
+        "one tensor": [part(color=free), part(color=free)],
+        "silhouettes": [part("silhouette"), part("silhouette", colors=colors)],
+    }
+    of_more = {
+        "colours": [part(colors=colors)],
+        "a table of colours": [part(indices=mixed, color=colors)],
+        "textured": [part(texture=texture, uv=uv)],
+        "shaded": [part("lambert")],
+        "own colours": [part(Shaded())],
+        "a function": [part(lambda theta, gbuffer, camera: gbuffer["normal"])],
+        "red and green": [part(color=red), part(color=green)],
+        "white and red": [part(), part(color=red)],
+        "two tensors": [part(color=free), part(color=free.clone())],
+        "two of one class": [part(Painted(), color=red), part(Painted(), color=red)],
+        "silhouette and white": [part("silhouette"), part()],
+    }
+    for expected, scenes in ((True, of_one), (False, of_more)):
+        for name, parts in scenes.items():
+            assert of_one_color(check_scene(parts, CAMERA)[0]) is expected, name
+
+
 @pytest.mark.parametrize("supersample", [1, 2, rts.Adaptive(3)])
 @pytest.mark.parametrize("color", [None, "free"])
 def test_normal_equations_are_those_of_all_samples(color, supersample, monkeypatch):
@@ -226,13 +381,6 @@ def test_the_number_of_threads_changes_nothing(monkeypatch):
         found.append([image, sampled.settled, sampled.row])
     for one, two in zip(*found, strict=True):
         np.testing.assert_array_equal(one, two)
-
-
-class Twice(splatting.Visible):
-    """A splatter with an image of its own."""
-
-    def image(self, splats):
-        return super().image(splats)
 
 
 def test_samples_are_left_out_only_where_nothing_can_depend_on_them():
