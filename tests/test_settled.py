@@ -288,6 +288,10 @@ def test_unlit_parts_of_one_colour_are_settled_and_their_colour_has_its_gradient
             part = rts.Part(MESH(SPHERE[1]), theta, "unlit", rts.rigid(pose))
             return xp.sum(rts.render(part, CAMERA, SIZE, splatter=splatter) * weights)
 
+        if target == "jax" and not found:
+            import jax
+
+            loss = jax.jit(loss)
         found.append(to_numpy(gradient(target, loss, start)))
     assert np.abs(found[0]).max() > 1
     np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-5 * np.abs(found[1]).max())
@@ -306,14 +310,14 @@ def test_which_scenes_are_of_one_colour():
         def base_color(self, theta, gbuffer):
             return gbuffer["normal"], gbuffer["position"][:, :1]
 
-    class Bare(rts.TriangleSurface):
-        """Does not say what it gives."""
+    class Odd(MESH):
+        """Does not say what it gives, any more."""
 
-        sample_widths, proxy, proxy_inputs = (3, 2), MESH.proxy, MESH.proxy_inputs
+        def evaluate(self, theta, samples):
+            return {**super().evaluate(theta, samples), "color": samples.params}
 
     free, colors, uv = torch.tensor(red), rng.random((len(vertices), 3)), rng.random((len(vertices), 2))
     texture = rng.random((4, 4, 3))
-    mixed = {"color": (SPHERE[1])}
     of_one = {
         "white": [part()],
         "red": [part(color=red)],
@@ -325,9 +329,10 @@ def test_which_scenes_are_of_one_colour():
     }
     of_more = {
         "colours": [part(colors=colors)],
-        "a table of colours": [part(indices=mixed, color=colors)],
+        "a table of colours": [part(indices={"color": None}, color=colors)],
         "textured": [part(texture=texture, uv=uv)],
         "shaded": [part("lambert")],
+        "of a surface that does not say": [part().replace(surface=Odd(SPHERE[1]))],
         "own colours": [part(Shaded())],
         "a function": [part(lambda theta, gbuffer, camera: gbuffer["normal"])],
         "red and green": [part(color=red), part(color=green)],
@@ -343,7 +348,8 @@ def test_which_scenes_are_of_one_colour():
 
 @pytest.mark.parametrize("supersample", [1, 2, rts.Adaptive(3)])
 @pytest.mark.parametrize("color", [None, "free"])
-def test_normal_equations_are_those_of_all_samples(color, supersample, monkeypatch):
+@pytest.mark.parametrize("several", [False, True])
+def test_normal_equations_are_those_of_all_samples(several, color, supersample, monkeypatch):
     import torch
 
     from rts.fitting import image_residuals
@@ -353,9 +359,13 @@ def test_normal_equations_are_those_of_all_samples(color, supersample, monkeypat
         parameters["color"] = torch.tensor([0.3, 0.6, 0.2], dtype=torch.float64)
 
     def scene(p):
+        if several:
+            return several_of("overlapping", p["pose"][None] * p["pose"].new_tensor([[1.0], [0.5]]), p.get("color"))
         return part_of(SCENES["sphere"][0], "sphere", p.get("color"), transform=rts.rigid(p["pose"]))
 
     target = np.random.default_rng(3).random((*SIZE, 4 if color else 1))
+    sampled = sample(scene(parameters), CAMERA, SIZE, splatter="visible", supersample=supersample, settles=True)
+    assert (sampled.fine or sampled).settled.any()
     residuals = rts.ImageResiduals(scene, CAMERA, SIZE, target, supersample=supersample)
     found = residuals.normal_equations(parameters)
     monkeypatch.setattr(image_residuals, "sample", lambda *a, settles, **k: sample(*a, **k))
