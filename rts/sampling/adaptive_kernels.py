@@ -25,7 +25,7 @@ def mark(start, stop, row, depth, firsts, beyond, continued, marks):
         marks: (H, W) uint8, to be filled.
     """
     layers, height, width = row.shape
-    # Of three rows of cells, repeated at the ends: the part seen, −1 for none, −2 for any; and whether a layer is hidden.
+    # Of three rows of cells, repeated at the ends: the part, −1 for none, −2 for any; and whether a layer is hidden.
     parts, hidden = np.empty((3, width + 2), np.int32), np.empty((3, width + 2), np.uint8)
     for y in range(start - 1, stop + 1):
         at = min(max(y, 0), height - 1)

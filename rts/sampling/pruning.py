@@ -240,11 +240,14 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
             amid = (asked.settled(covered, depth, kept, 0.0),)
         used[row[kept]] = True
         # The order stays, so that neighbours in the image stay neighbours in memory.
-        indices = [np.flatnonzero(used[a:b]).astype(np.int32) for a, b in itertools.pairwise(offsets)]
-        numbers = [np.where(used[a:b], np.cumsum(used[a:b]) - 1, -1) for a, b in itertools.pairwise(offsets)]
-        every = np.concatenate(numbers)
+        of_parts = [used[a:b] for a, b in itertools.pairwise(offsets)]
+        indices = [np.flatnonzero(own).astype(np.int32) for own in of_parts]
+        # For a row of −1 there is −1 at the end.
+        none = np.full(1, -1, np.int32)
+        numbers = [np.where(own, np.cumsum(own, dtype=np.int32) - 1, none) for own in of_parts]
+        every, *numbers = (np.concatenate([*n, none]) for n in (numbers, *([n] for n in numbers)))
         rows = zip((every, *numbers, *[every] * len(exits)), (row, *own_rows, *exits), strict=True)
-        renumbered = [np.where(r >= 0, n[r], -1).astype(np.int32) for n, r in rows]
+        renumbered = [n[r] for n, r in rows]
         return *renumbered, *amid, *(i if len(i) else np.zeros(1, np.int32) for i in indices)
 
     rows = sampled.row, *(s.row for s in sampled.samples), *([] if sampled.exit is None else [sampled.exit])
@@ -257,8 +260,8 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
     samples = [_selected(*z) for z in zip(sampled.samples, own_rows, indices, strict=True)]
     xp, part = namespace(row), sampled.part
     # Row numbers are within parts up to here, since an engine may have padded what comes before.
-    start = 0
-    for i, index in enumerate(indices):
+    start = indices[0].shape[0]
+    for i, index in enumerate(indices[1:], start=1):
         row = xp.where((row >= 0) & (part == i), row + start, row)
         exits = None if exits is None else xp.where((exits >= 0) & (part[0] == i), exits + start, exits)
         start += index.shape[0]
