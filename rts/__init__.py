@@ -33,6 +33,7 @@ from rts.files.models import load
 from rts.files.views import View, load_views
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
+from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
 from rts.gbuffer import GBuffer
 from rts.interfaces import (
@@ -56,6 +57,7 @@ from rts.radiance_fields import load_radiance_field, volume_render
 from rts.records import ArraySpec, Fine, Fragments, Proxy, RayHits, Rays, Sampled, Samples, Splats
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples
+from rts.row_cameras import RowCameras
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.prepared import prepare
 from rts.sampling.scenes import sample
@@ -104,6 +106,7 @@ __all__ = [
     "ImageResiduals",
     "InputError",
     "LayersWarning",
+    "Loss",
     "Ndc",
     "Operation",
     "Part",
@@ -114,6 +117,7 @@ __all__ = [
     "Rate",
     "Rays",
     "Residuals",
+    "RowCameras",
     "RtsError",
     "RtsWarning",
     "Sampled",

@@ -61,12 +61,12 @@ def _all() -> Iterator[tuple[int, Need]]:
 def _asked(missed: SimpleQueue[int]) -> Iterator[tuple[int, Need]]:
     """What to compile next, by number, as long as something is missed now and then."""
     ahead = rehearsal.routes()
-    known, seen, done = next(ahead), [missed.get()], set[int]()
+    known, seen, done = next(ahead), list[int](), set[int]()
     while True:
         with contextlib.suppress(Empty):
             while True:
                 seen.append(missed.get_nowait())
-        while not any(route.keys() >= set(seen) for route in known) and (more := next(ahead, None)):
+        while seen and not any(route.keys() >= set(seen) for route in known) and (more := next(ahead, None)):
             known += more
         key, need = following(known, seen, done)
         if need is not None:
@@ -82,7 +82,9 @@ def _asked(missed: SimpleQueue[int]) -> Iterator[tuple[int, Need]]:
 def following(
     routes: Sequence[dict[int, Need | None]], seen: Sequence[int], done: Container[int]
 ) -> tuple[int, Need | None]:
-    """What a process will need last of what nobody has begun to compile; (0, None) if there is nothing.
+    """What to compile next of what a process will need last and nobody has begun; (0, None) if there is nothing.
+
+    It is what takes longest of the last half, so that little is left when the two meet, and neither waits for long.
 
     Args:
         routes: what each kind of call needs, in this order. Where it may be the first, it is taken to be; of the others
@@ -98,7 +100,20 @@ def following(
     route, *others = (route for route, count in zip(routes, known, strict=True) if count == max(known))
     ways = [route] if route is routes[0] else [{k: route[k] for k in route if all(k in r for r in others)}, route]
     for way in ways:
-        for key in reversed(way):
-            if key not in seen and key not in done and way[key] is not None:
-                return key, way[key]
+        left = {k: need for k, need in way.items() if need is not None and k not in seen and k not in done}
+        if left:
+            key = max(_last_half(left), key=lambda k: left[k].effort)
+            return key, left[key]
     return 0, None
+
+
+def _last_half(left: dict[int, Need]) -> list[int]:
+    """The last of some needs that are half of the effort, or one, the last of all first."""
+    rest, half = sum(need.effort for need in left.values()) / 2, list[int]()
+    for key in reversed(left):
+        effort = left[key].effort
+        if half and rest < effort / 2:
+            break
+        half.append(key)
+        rest -= effort
+    return half

@@ -28,7 +28,7 @@ from rts.arguments import (
 from rts.arrays import described, from_numbers, promote, shape_of, unit
 from rts.engines import constants, engine_of, is_constant, load_engines, namespace, value_of
 from rts.errors import InputError
-from rts.operations.linear import affine, matmul
+from rts.operations.linear import affine, matmul, specified_affine_map
 from rts.operations.projection import projective_map
 from rts.records import Rays
 from rts.transforms import (
@@ -586,11 +586,15 @@ class Camera:
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points towards the viewer, not normalised; parallel where orthographic."""
-        xp = namespace(points)
-        at = xp.stack([affine(self.view[i, :], points) for i in range(3)], axis=-1) * self.projection[3, 2]
-        r = self.view[:3, :3]
-        axis = self.projection[3, 3] * r[2, :]
-        return at[..., 0:1] * r[0, :] + at[..., 1:2] * r[1, :] + at[..., 2:3] * r[2, :] + axis
+        return specified_affine_map(toward_rows(self.view, self.projection), points)
+
+    def depth(self, points: Array) -> Array:
+        """(N,) linear depth of world points (N, 3)."""
+        return -affine(self.view[2, :], points)
+
+    def to_world(self, direction: Sequence[float]) -> Array:
+        """(3,) the unit vector, in the world, of a direction (3,) in camera space."""
+        return world_vectors(self.view, direction)
 
     def turned(self) -> Camera:
         """The camera of the same image that looks along −z, for one that looks along +z."""
@@ -659,6 +663,19 @@ class Camera:
         # If the view scales, widths are in its local units; a geometric mean if it scales axes differently.
         scale = xp.abs(xp.sum(a * xp.linalg.cross(b, c))) ** (1 / 3)
         return xp.sqrt(area) * scale * xp.stack([p[3, 3], -p[3, 2]])
+
+
+def toward_rows(view: Array, projection: Array) -> Array:
+    """The affine maps (…, 3, 4) of `Camera.toward`, of matrices (…, 4, 4)."""
+    xp, rotation = namespace(view), view[..., :3, :3]
+    at = xp.sum(rotation[..., :, :, None] * view[..., :3, None, :], axis=-3) * projection[..., 3:, 2:3]
+    axis = projection[..., 3, 3:] * rotation[..., 2, :]
+    return xp.concat([at[..., :3], at[..., 3:] + axis[..., None]], axis=-1)
+
+
+def world_vectors(view: Array, direction: Sequence[float]) -> Array:
+    """Unit vectors (…, 3) in the world of a direction (3,) in the space of cameras with these views (…, 4, 4)."""
+    return unit(sum(c * view[..., i, :3] for i, c in enumerate(direction)))
 
 
 ROUNDING = 1e-5

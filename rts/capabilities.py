@@ -23,7 +23,7 @@ VARIABLES: Mapping[str, Mapping[str, Any]] = {
         "reads_facing": False,
         "prunes": False,
         "sums_products": False,
-        "sums_squares": False,
+        "sums_losses": False,
     },
 }
 """Group → class variable of its base → its default, for plugins of other classes."""

@@ -1,9 +1,10 @@
 """A companion: a process that compiles kernels beside this one, from the last that this one will need on.
 
-numba's compiler has one lock a process. So where kernels are not on disk, the first that is missing starts another
-process (`rts.accompanying`), which finds out what such a call needs, begins at the end of it, and goes on until the two
-meet. This process tells which kernels it misses; who compiles which is settled by locks on single bytes of a nameless
-file. Nothing waits for the companion but a kernel that it has begun, and it ends with this process.
+numba's compiler has one lock a process. So the first kernel that is missing on disk, or that comes to where none is
+kept, starts another process (`rts.accompanying`), which finds out what such a call needs, begins in the last half of
+it, and goes on until the two meet. This process tells which kernels it misses; who compiles which is settled by locks
+on single bytes of a nameless file. Nothing waits for the companion but a kernel that it has begun, and it ends with
+this process.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ SWITCH = "RTS_COMPILE_AHEAD"
 SHARED = sys.platform != "win32"
 """Whether processes can tell one another what they compile."""
 
-LEAST_SQUARES = "least squares"
-"""A kind of call that can be expected."""
+LEAST_SQUARES, LEAST_SQUARES_OF_MASKS = "least squares", "least squares of masks"
+"""Kinds of calls that can be expected."""
 
 _state: _Companion | None | bool = None
 """The companion of this process; None before one was needed, False where there is none."""
@@ -52,11 +53,17 @@ def expect(kind: str) -> None:
             _state.tell(number(kind))
 
 
-def begin(key: int) -> bool:
-    """Say that a kernel is missing on disk; whether another process has compiled it meanwhile, perhaps."""
+def prepare() -> None:
+    """Start the companion of this process, if it may have one, since a kernel will be missing."""
     global _state
     if _state is None:
         _state = _started() if _may_start() else False
+
+
+def begin(key: int) -> bool:
+    """Say that a kernel is missing on disk; whether another process has compiled it meanwhile, perhaps."""
+    global _state
+    prepare()
     if isinstance(_state, _Companion) and not _state.goes_on():
         _state = False
     return isinstance(_state, _Companion) and _state.begin(key)

@@ -8,7 +8,9 @@ shortens compilation by a fifth. What is not on disk is compiled here and, meanw
 
 from __future__ import annotations
 
+import functools
 import gc
+import inspect
 import os
 import sys
 import threading
@@ -30,6 +32,12 @@ try:
 except ImportError:  # Windows.
     fcntl = None
 
+try:
+    from rts.pipeline import KERNEL, PART
+except (ImportError, AttributeError):  # A numba that is built in another way compiles as it does.
+    KERNEL = {"no_cfunc_wrapper": True}
+    PART = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
+
 TOLD_AFTER = 1.0
 """Seconds of compilation after which a terminal is told of it."""
 
@@ -41,12 +49,13 @@ saving = threading.RLock()
 
 def kernel(function: Callable | None = None, **options: Any) -> Any:
     """Compile a loop that Python calls, without the interpreter lock, and keep it on disk; `options` are numba's."""
-    options |= {"nogil": True, "no_cfunc_wrapper": True}
+    options |= {"nogil": True} | KERNEL
 
     def decorate(function: Callable) -> Any:
         made = cast(Any, numba.njit(**options)(function))
         if made is not function:  # As it is where compilation is switched off.
             made._cache = _Cache(function)
+            _foresee(made._cache.cache_path)
         return _interpreted(made)
 
     return decorate if function is None else decorate(function)
@@ -54,12 +63,23 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
     """Compile a function that only compiled loops call; Python cannot. `options` are numba's."""
-    options |= {"nogil": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    options |= {"nogil": True} | PART
 
     def decorate(function: Callable) -> Any:
         return _interpreted(numba.njit(**options)(function))
 
     return decorate if function is None else decorate(function)
+
+
+@functools.cache
+def _foresee(folder: str) -> None:
+    """Where a folder has no kernels yet, the companion can begin before one is missed."""
+    try:
+        begun = any(name.endswith(".nbi") for name in os.listdir(folder))
+    except OSError:
+        begun = False
+    if not begun:
+        companion.prepare()
 
 
 @contextmanager
@@ -126,10 +146,17 @@ def _key(function: Callable, types: Any) -> int:
 
 
 class Need(NamedTuple):
-    """A kernel, and the types of arguments that it is called with."""
+    """A kernel, and the types of arguments that it is called with.
+
+    Attributes:
+        kernel: what compiles it.
+        types: numba's.
+        effort: how long it takes to compile, compared to others.
+    """
 
     kernel: Any
     types: tuple
+    effort: float = 1
 
 
 _needs: dict[int, Need] | None = None
@@ -141,8 +168,8 @@ def interpreting() -> Iterator[dict[int, Need]]:
     """Have Python interpret all kernels and helpers, which takes long but for the smallest pictures.
 
     Yields:
-        What calls would have had compiled, in the order of the first calls; filled as they come. For a process that
-        does nothing else.
+        What calls would have had compiled, in the order of the first calls; filled as they come, and with what effort
+        once this is left. For a process that does nothing else.
     """
     global _needs
     _needs = needs = {}
@@ -153,6 +180,8 @@ def interpreting() -> Iterator[dict[int, Need]]:
         _needs = None
         _exchange(_stand_ins)
         _stand_ins.clear()
+    for key, need in needs.items():
+        needs[key] = need._replace(effort=_effort(need.kernel))
 
 
 def _interpreted(made: Any) -> Any:
@@ -169,6 +198,22 @@ def _interpreted(made: Any) -> Any:
     stand_in = noted if isinstance(getattr(made, "_cache", None), _Cache) else function
     _stand_ins[stand_in] = made
     return stand_in
+
+
+def _effort(made: Any) -> int:
+    """The size of a compiled function and of all that it calls, each counted once."""
+    found = [made]
+    for each in found:  # It grows.
+        function = each.py_func
+        places = [function.__globals__, *map(vars, filter(inspect.ismodule, _named(function.__globals__, function)))]
+        called = [x for place in places for x in _named(place, function) if isinstance(x, Dispatcher)]
+        found += [x for x in dict.fromkeys(called) if x not in found]
+    return sum(len(each.py_func.__code__.co_code) for each in found)
+
+
+def _named(place: dict[str, Any], function: Any) -> list[Any]:
+    """What a function may mean by the names that it uses, in a module."""
+    return [place[name] for name in function.__code__.co_names if name in place]
 
 
 def _globals() -> list[Any]:
@@ -242,7 +287,11 @@ class _Progress(_Outermost):
 
 
 class _NoCollection(_Outermost):
-    """No garbage is collected while a kernel is compiled, which makes many objects: that takes a tenth of the time."""
+    """No garbage is collected while a kernel is compiled, which makes many objects, nor right after it.
+
+    To look through what is new takes a tenth of the time. What is new counts as old instead, which is looked through
+    when so much has become old that it pays.
+    """
 
     def __init__(self) -> None:
         super().__init__()
@@ -257,6 +306,9 @@ class _NoCollection(_Outermost):
     def ended(self, ours: bool) -> None:
         """Go on."""
         if self._paused:
+            if not gc.get_freeze_count():  # Else somebody keeps objects there.
+                gc.freeze()
+                gc.unfreeze()
             gc.enable()
 
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +23,7 @@ from rts.operations.linear import affine_map
 from rts.operations.projection import projective_map_of_views
 from rts.operations.take import take, take_shifted
 from rts.records import Fine, Sampled, Samples, Splats
+from rts.row_cameras import RowCameras
 from rts.sampling.scenes import Wide
 from rts.sampling.several import Views, in_one_table
 from rts.threads import each
@@ -164,19 +166,16 @@ def _shown(
     if not engine.differentiates:
         like = None  # All is constant, and computed in the dtypes that are given.
     seen = wide.camera.replace(view=constants(wide.camera.view, engine, like))
-    camera = constants(camera, engine, like)
+    camera = constants(camera, engine, dtype)
     positions, colors, first = [], [], 0
     for index, (part, samples) in enumerate(zip(parts, sampled, strict=True)):
         theta, transform = _theta_of(part, engine, like), constants(part.transform, engine, like)
         local = _evaluate(part, part.surface.reads(part.theta), samples, engine, like)
         own = seen.within(transform)
-        world, rgba = _colored(part, theta, transform, samples, local, camera, own, wide.grid, engine, like)
+        _add_footprint(part, samples, local, own, wide.grid, engine, like)
+        world, rgba = _shade(part, theta, transform, samples, local, camera, engine)
         positions.append(constants(own.project(local["position"], wide.grid), engine, dtype))
         check_splats(index, part, world, positions[-1], rgba, row, first)
-        if not part.uniform:
-            shade = partial(_colors, part, theta, transform, camera, [*local])
-            with suppress(_UnreadError):
-                rgba = engine.by_rows_in_use(shade, local.computed, samples.row, rgba)
         colors.append(constants(rgba, engine, dtype))
         first += samples.ids.shape[-2]
     if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
@@ -210,41 +209,46 @@ def _shown_in_views(
     dtype = like
     if not engine.differentiates:
         like = None
-    whole, counts, grid = (
-        in_one_table([own.samples[index] for own in sampled]),
-        _counts_of(pictures, index),
-        wides[0].grid,
-    )
+    whole = in_one_table([own.samples[index] for own in sampled])
+    counts, grid = _counts_of(pictures, index), wides[0].grid
     theta, transform = _theta_of(part, engine, like), constants(part.transform, engine, like)
     gbuffer = _evaluate(part, part.surface.reads(part.theta), whole, engine, like)
-    seen = [w.camera.replace(view=constants(w.camera.view, engine, like)).within(transform) for w in wides]
-    shaded = [(whole, gbuffer)]
-    if not part.uniform:
-        assert counts is not None
-        shaded = _apart(whole, gbuffer, counts.tolist(), engine)
-
-    def colored(given: tuple) -> Array:
-        camera, own, (samples, local) = given
-        if not local["position"].shape[0]:
-            # Shaders may expect a row at least.
-            none = namespace(local["position"]).broadcast_to(local["position"][:, :1], (0, part.shader.channels + 1))
-            return constants(none, engine, dtype)
-        known = samples, local, constants(camera, engine, like), own, grid, engine, like
-        return constants(_colored(part, theta, transform, *known)[1], engine, dtype)
-
-    views = list(zip(cameras, seen, shaded, strict=False))
-    colors = [colored(views[0])]
-    colors += each(colored, views[1:]) if type(colors[0]) is np.ndarray and len(views) > 1 else map(colored, views[1:])
-    (rgba,) = _together(colors)
-    rows = namespace(seen[0].view).stack([own.pixel_rows(grid) for own in seen])
-    rows, points = constants((rows, gbuffer["position"]), *suiting(rows, gbuffer["position"]))
     view, first = [], 0
     for picture in pictures:
         view.append(picture.view[index] + first if first else picture.view[index])
         first += picture.picture.views
     (view,) = _together([constants(own, engine, like) for own in view])
+    seen = [w.camera.replace(view=constants(w.camera.view, engine, like)).within(transform) for w in wides]
+    rows = namespace(seen[0].view).stack([own.pixel_rows(grid) for own in seen])
+    rows, points = constants((rows, gbuffer["position"]), *suiting(rows, gbuffer["position"]))
     places = _places_of(pictures, engine_of(points), points)
     positions = constants(projective_map_of_views(rows, points, view, places), engine, dtype)
+    cameras = constants(cameras, engine, dtype)
+    if shaded_at_once(part):
+        camera = cameras[0] if part.uniform else RowCameras.of(cameras, view)
+        rgba = _shade(part, theta, transform, whole, gbuffer, camera, engine)[1]
+    else:
+        assert counts is not None
+        shaded = []
+        for own, (samples, local) in zip(seen, _apart(whole, gbuffer, counts.tolist(), engine), strict=True):
+            _add_footprint(part, samples, local, own, grid, engine, like)
+            shaded.append((samples, local))
+
+        def colored(given: tuple) -> Array:
+            camera, (samples, local) = given
+            if not local["position"].shape[0]:
+                # Shaders may expect a row at least.
+                none = namespace(local["position"]).broadcast_to(
+                    local["position"][:, :1], (0, part.shader.channels + 1)
+                )
+                return constants(none, engine, dtype)
+            return constants(_shade(part, theta, transform, samples, local, camera, engine)[1], engine, dtype)
+
+        views = list(zip(cameras, shaded, strict=True))
+        colors = [colored(views[0])]
+        colors += each(colored, views[1:]) if type(colors[0]) is np.ndarray else map(colored, views[1:])
+        (rgba,) = _together(colors)
+    rgba = constants(rgba, engine, dtype)
     if engine_of(rgba) is not engine:
         positions, rgba = constants((positions, rgba), *suiting(rgba))
     # Where rows are not used, values are not looked at.
@@ -253,23 +257,42 @@ def _shown_in_views(
     return positions, rgba
 
 
+def shaded_at_once(part: CheckedPart) -> bool:
+    """Whether a part's shader takes the samples of several views in one call."""
+    # The footprint of a sample is found by the camera of its view.
+    tells = part.shader.reads is not None and FOOTPRINT not in part.shader.reads
+    return part.uniform or (part.shader.takes_views and tells)
+
+
 def _theta_of(part: CheckedPart, engine: Engine, like: Array | None) -> dict[str, Tree]:
     """The θ that a part's shader sees."""
     reads = part.surface.reads(part.theta)
     return {k: v if k in reads else constants(v, engine, like) for k, v in part.theta.items()}
 
 
-def _colored(
+def _add_footprint(
+    part: CheckedPart,
+    samples: Samples,
+    local: GBuffer,
+    own: Camera,
+    grid: tuple[int, int],
+    engine: Engine,
+    like: Array | None,
+) -> None:
+    """Add the footprint to the G-buffer of samples in one view, where there is uv; arguments as in `uv_footprint`."""
+    if "uv" in local and FOOTPRINT not in local:
+        read = {k: part.theta[k] for k in part.surface.reads(part.theta)}
+        local.defer(FOOTPRINT, partial(uv_footprint, part.surface, read, samples, local, own, grid, engine, like))
+
+
+def _shade(
     part: CheckedPart,
     theta: Mapping[str, Tree],
     transform: Array | None,
     samples: Samples,
     local: GBuffer,
-    camera: Camera,
-    own: Camera,
-    grid: tuple[int, int],
+    camera: Camera | RowCameras,
     engine: Engine,
-    like: Array | None,
 ) -> tuple[GBuffer, Array]:
     """What the shader of a part reads, in world space, and the colours (N, C + 1) that it gives.
 
@@ -277,21 +300,31 @@ def _colored(
         part: the part.
         theta: what `_theta_of` gave.
         transform: the part's.
-        samples: the samples, in one view.
+        samples: the samples.
         local: their G-buffer, in local space.
-        camera: of the whole image.
-        own: that of the grid in the part's local space.
-        grid: height and width in cells.
+        camera: of the whole image, or those of the samples.
         engine: the engine to compute with.
-        like: an array that sets dtype and device of its constants.
     """
-    if "uv" in local and FOOTPRINT not in local:
-        read = {k: part.theta[k] for k in part.surface.reads(part.theta)}
-        local.defer(FOOTPRINT, partial(uv_footprint, part.surface, read, samples, local, own, grid, engine, like))
     world = _to_world(_readable(local, samples, engine), transform)
     rgba = _shaded(part, theta, world, camera)
-    check_shaded(rgba, local["position"].shape[0], part.shader)
+    check_shaded(rgba, samples.ids.shape[-2], part.shader)
+    if part.uniform:
+        return world, rgba
+    rows, names = local.computed, [*local]
+    if isinstance(camera, RowCameras):
+        rows[NUMBER] = camera.number
+
+    def few(rows: dict[str, Array]) -> Array:
+        own = camera.of_rows(rows.pop(NUMBER)) if isinstance(camera, RowCameras) else camera
+        return _colors(part, theta, transform, own, names, rows)
+
+    with suppress(_UnreadError):
+        rgba = engine.by_rows_in_use(few, rows, samples.row, rgba)
     return world, rgba
+
+
+NUMBER = "the numbers of views"
+"""What stands for the numbers of `RowCameras` beside attributes."""
 
 
 def _together(*kinds: Sequence[Array]) -> list[Array]:
@@ -318,7 +351,7 @@ def _apart(samples: Samples, gbuffer: GBuffer, sizes: Sequence[int], engine: Eng
     return views
 
 
-def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
     """What the shader of a part returns."""
     try:
         return part.shader(theta, gbuffer, camera)
@@ -339,7 +372,7 @@ def _colors(
     part: CheckedPart,
     theta: Mapping[str, Tree],
     transform: Array | None,
-    camera: Camera,
+    camera: Camera | RowCameras,
     names: Sequence[str],
     attributes: Mapping[str, Array],
 ) -> Array:

@@ -26,6 +26,7 @@ from rts.trees import Array, Tree, map_leaves, record
 
 if TYPE_CHECKING:
     from rts.camera import Camera
+    from rts.fitting.losses import Loss
     from rts.fitting.schedule import Stage
 
 
@@ -414,12 +415,16 @@ class Shader(Plugin):
         uniform: a promise that all samples of a part have one colour, through whatever camera. Where that depends on
             the part, the class has a method `uniform_by` instead.
         reads: the entries of the G-buffer that it needs besides position; None for all.
+        takes_views: whether a call may be of samples of several views, as `rts.render_views` then makes it: `camera` is
+            an `rts.RowCameras`, whose methods give a row for each sample. A shader that says so also says what it
+            `reads`, without "uv_footprint".
         channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
     """
 
     channels: int = 3
     opaque: bool = False
     uniform: bool = False
+    takes_views: bool = False
     reads: tuple[str, ...] | None = None
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -450,7 +455,7 @@ class Shader(Plugin):
         Args:
             theta: θ of the part.
             gbuffer: its G-buffer, in world space.
-            camera: the camera of the whole image.
+            camera: the camera of the whole image; of a shader that `takes_views`, or the cameras of the samples.
 
         Returns:
             (N, 4) premultiplied linear RGBA, in [0, 1]; (N, C + 1), alpha last, of a shader with other `channels`, all
@@ -476,7 +481,8 @@ class Splatter(Plugin):
         reads_exits: whether it reads `Splats.exit`, which is found only then.
         prunes: whether it says which samples it needs; True in a class with its own `needed`.
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
-        sums_squares: whether it gives mean squares; True in a class with its own `mean_square`.
+        sums_losses: whether it gives mean losses; True in a class with its own `mean_loss`.
+        takes_losses: whether normal equations and mean losses may be asked for with another `loss` than the square.
         averages: whether its normal equations may be asked for with a target of fewer pixels than there are cells.
         settles: whether it reads `Splats.settled`: where all nine samples around a cell are fronts of one opaque
             colour, on cells' centres, and no hidden one beside them is `needed`, the cell has that colour, whatever
@@ -486,7 +492,7 @@ class Splatter(Plugin):
             those that have none show nothing, where `rts.Adaptive` sees no outline: hidden samples have no effect.
     """
 
-    FLAGS = {"needed": "prunes", "normal_equations": "sums_products", "mean_square": "sums_squares"}
+    FLAGS = {"needed": "prunes", "normal_equations": "sums_products", "mean_loss": "sums_losses"}
     STAND_INS = {"image": ("splat", _image_of_arrays)}
 
     layers: int | None = None
@@ -495,7 +501,8 @@ class Splatter(Plugin):
     reads_exits: bool = False
     prunes: bool = False
     sums_products: bool = False
-    sums_squares: bool = False
+    sums_losses: bool = False
+    takes_losses: bool = False
     averages: bool = False
     settles: bool = False
     follows_outlines: bool = False
@@ -549,6 +556,7 @@ class Splatter(Plugin):
         target: Array,
         weights: Array | None = None,
         background: Array | None = None,
+        loss: Loss | None = None,
     ) -> tuple[Array, Array, Array] | None:
         """Normal equations of the n residuals weight · (image − target), without their Jacobian.
 
@@ -560,25 +568,33 @@ class Splatter(Plugin):
             target: (h, w, C): alpha (C = 1), colours (3) or both (4).
             weights: (h, w, 1) or (h, w, C); None for ones.
             background: (h, w, 4), what the image is composited onto, or None.
+            loss: of the residuals; None for the square. Given only where the class says `takes_losses`.
 
         Returns:
-            Mean square (), JᵀJ / n (T, T) and Jᵀr / n (T,); None where it cannot work on these arrays.
+            Mean loss (), JᵀSJ / n (T, T) and JᵀWr / n (T,), where W and S are diagonals of `loss.weights(r)`, ones for
+            the square; None where it cannot work on these arrays.
         """
         return None
 
-    def mean_square(
-        self, splats: Splats, target: Array, weights: Array | None = None, background: Array | None = None
+    def mean_loss(
+        self,
+        splats: Splats,
+        target: Array,
+        weights: Array | None = None,
+        background: Array | None = None,
+        loss: Loss | None = None,
     ) -> Array | None:
-        """Mean square () of the residuals weight · (image − target), differentiable in the splats.
+        """Mean loss () of the residuals weight · (image − target), differentiable in the splats.
 
         Args:
             splats: the samples; without their border there are h × w cells, each a pixel.
             target: (h, w, C): alpha (C = 1), colours (3) or both (4); a constant.
             weights: (h, w, 1) or (h, w, C); None for ones. A constant.
             background: (h, w, 4), what the image is composited onto, or None. A constant.
+            loss: of the residuals; None for the square. Given only where the class says `takes_losses`.
 
         Returns:
-            The mean square; None where it cannot work on these arrays.
+            The mean loss; None where it cannot work on these arrays.
         """
         return None
 
@@ -608,14 +624,16 @@ class Residuals(Plugin):
 
     Attributes:
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
-        sums_squares: whether it gives its mean square; True in a class with its own `mean_square`.
+        sums_losses: whether it gives its mean loss; True in a class with its own `mean_loss`.
         has_stages: whether it can be had at other resolutions; True in a class with its own `at_stage`.
+        loss: what their mean is taken of, an `rts.Loss`; None for the square.
     """
 
-    FLAGS = {"normal_equations": "sums_products", "mean_square": "sums_squares", "at_stage": "has_stages"}
+    FLAGS = {"normal_equations": "sums_products", "mean_loss": "sums_losses", "at_stage": "has_stages"}
     sums_products: bool = False
-    sums_squares: bool = False
+    sums_losses: bool = False
     has_stages: bool = False
+    loss: Loss | None = None
 
     @abc.abstractmethod
     def __call__(self, parameters: Tree) -> Array:
@@ -626,15 +644,16 @@ class Residuals(Plugin):
         raise NotImplementedError
 
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
-        """Mean square () of the n residuals r, JᵀJ / n (U, U) and Jᵀr / n (U,) for their Jacobian J.
+        """Mean loss () of the n residuals r, JᵀSJ / n (U, U) and JᵀWr / n (U,) for their Jacobian J.
 
+        W and S are diagonals of `self.loss.weights(r)`, ones for the mean square.
         U counts the numbers in the parameters, in the order of `rts.trees.leaves`. All are arrays of the parameters'
         engine, which may be traced. With it, Levenberg–Marquardt makes no Jacobian of its own.
         """
         raise NotImplementedError
 
-    def mean_square(self, parameters: Tree) -> Array:
-        """Mean square () of the residuals, differentiable. With it, gradient descent asks for no residuals."""
+    def mean_loss(self, parameters: Tree) -> Array:
+        """Mean loss () of the residuals, differentiable. With it, gradient descent asks for no residuals."""
         raise NotImplementedError
 
 

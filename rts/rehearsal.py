@@ -45,7 +45,7 @@ def _route(kind: Callable[[list[Part], tuple[int, int]], None], count: int) -> d
 
     with compiling.interpreting() as needs, np.errstate(all="ignore"):
         kind(_parts()[:count], SIZES[count])
-    name = {companion.number(companion.LEAST_SQUARES): None} if kind in LEAST_SQUARES else {}
+    name = {companion.number(EXPECTED[kind]): None} if kind in EXPECTED else {}
     return {**name, **needs}
 
 
@@ -139,10 +139,10 @@ def _least_squares(
         splatter.normal_equations(splats, t_positions, t_rgba, np.zeros((*size, channels), np.float32))
 
 
-def _mean_square(parts: list[Part], size: tuple[int, int]) -> None:
+def _mean_loss(parts: list[Part], size: tuple[int, int]) -> None:
     with _differentiating() as tape:
         target = np.zeros((*size, 4), np.float32)
-        ImageResiduals(lambda _: _posed(parts), _camera(), size, target).mean_square(target)
+        ImageResiduals(lambda _: _posed(parts), _camera(), size, target).mean_loss(target)
         tape.pull()
 
 
@@ -166,6 +166,9 @@ KINDS = (
     _adaptive,
     _gradient_of_silhouette,
     _least_squares_of_silhouette,
-    _mean_square,
+    _mean_loss,
 )
-LEAST_SQUARES = _least_squares, _least_squares_of_silhouette
+EXPECTED = {
+    _least_squares: companion.LEAST_SQUARES,
+    _least_squares_of_silhouette: companion.LEAST_SQUARES_OF_MASKS,
+}

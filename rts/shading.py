@@ -22,13 +22,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from rts.arguments import quoted
-from rts.arrays import described, is_finite, shape_of, unit
+from rts.arrays import described, dot, is_finite, shape_of, unit
 from rts.camera import Camera
 from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.footprints import FOOTPRINT
 from rts.gbuffer import GBuffer
 from rts.interfaces import Shader
+from rts.row_cameras import RowCameras
 from rts.textures import WRAPS, sample_texture
 from rts.trees import Array, Tree, map_leaves
 
@@ -50,7 +51,7 @@ class Silhouette(Shader):
         """See `rts.Shader`: nothing."""
         return ()
 
-    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
         like = gbuffer.like
         xp = namespace(like)
@@ -62,9 +63,10 @@ class Normals(Shader):
     """World-space unit normals, mapped from [−1, 1] to [0, 1]."""
 
     opaque = True
+    takes_views = True
     reads = ("normal",)
 
-    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
         return _opaque(unit(gbuffer["normal"]) * 0.5 + 0.5)
 
@@ -74,13 +76,13 @@ class Depth(Shader):
     """Linear depth, from 0 at the near plane (or θ["depth_range"][0]) to 1 at the far plane."""
 
     opaque = True
+    takes_views = True
     reads = ()
 
-    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
-        position = gbuffer["position"]
-        xp = namespace(position)
-        depth = camera.project(position, (1, 1))[:, 2]
+        depth = camera.depth(gbuffer["position"])
+        xp = namespace(depth)
         if "depth_range" in theta:
             near, far = (_entry(theta, "depth_range", (2,))[i] for i in (0, 1))
         else:
@@ -103,6 +105,7 @@ class Unlit(Shader):
     wrap: str = "repeat"
     opaque: bool = True
     mip: bool = False
+    takes_views = True
     reads = ("color", "uv")
 
     def __post_init__(self):
@@ -111,7 +114,7 @@ class Unlit(Shader):
         if self.mip and self.reads is not None:
             object.__setattr__(self, "reads", (*self.reads, FOOTPRINT))
 
-    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
         color, alpha = self.base_color(theta, gbuffer)
         return self.premultiplied(color, alpha)
@@ -163,7 +166,7 @@ class Textured(Unlit):
 
     reads = ("uv",)
 
-    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
         if "texture" not in theta:
             raise InputError(f"the textured shader needs theta['texture'] (h, w, C); theta has {sorted(theta)}")
@@ -177,15 +180,15 @@ class Lambert(Unlit):
 
     reads = ("normal", "color", "uv")
 
-    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
         color, alpha = self.base_color(theta, gbuffer)
-        normal = _turned(unit(gbuffer["normal"]), _towards(gbuffer, camera))
+        normal, behind = unit(gbuffer["normal"]), _is_behind(gbuffer, camera)
         xp = namespace(color)
-        light = _light(theta, camera)
-        shade = light["ambient"] + xp.zeros_like(color)
-        for direction, brightness in zip(*_each(light), strict=True):
-            shade = shade + _positive(_dot(normal, direction)) * brightness
+        shade, lights = _lit(theta, camera)
+        for direction, brightness in lights:
+            cosine = dot(normal, direction)
+            shade = shade + _positive(xp.where(behind, -cosine, cosine)) * brightness
         return self.premultiplied(xp.clip(color * shade, 0.0, 1.0), alpha)
 
 
@@ -195,43 +198,42 @@ class BlinnPhong(Unlit):
 
     reads = ("normal", "color", "uv")
 
-    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
         color, alpha = self.base_color(theta, gbuffer)
         normal, toward = facing_normals(gbuffer, camera)
         xp = namespace(color)
-        light = _light(theta, camera)
+        shade, lights = _lit(theta, camera)
         specular = _entry(theta, "specular", (), (1,), (3,)) if "specular" in theta else DEFAULT_SPECULAR
         shininess = _entry(theta, "shininess", (), (1,)) if "shininess" in theta else DEFAULT_SHININESS
-        shade, highlight = light["ambient"] + xp.zeros_like(color), xp.zeros_like(color)
-        for direction, brightness in zip(*_each(light), strict=True):
-            cosine = _dot(normal, direction)
+        highlight = xp.zeros_like(color)
+        for direction, brightness in lights:
+            cosine = dot(normal, direction)
             shade = shade + _positive(cosine) * brightness
             # A power of zero has an infinite derivative for exponents below one, and a NaN one in its exponent.
-            half = xp.clip(_dot(normal, unit(direction + toward)), 1e-6, 1.0)
+            half = xp.clip(dot(normal, unit(direction + toward)), 1e-6, 1.0)
             highlight = highlight + xp.where(cosine > 0, half**shininess, 0 * half) * brightness
         return self.premultiplied(xp.clip(color * shade + specular * highlight, 0.0, 1.0), alpha)
 
 
-def facing_normals(gbuffer: GBuffer, camera: Camera) -> tuple[Array, Array]:
+def facing_normals(gbuffer: GBuffer, camera: Camera | RowCameras) -> tuple[Array, Array]:
     """Unit normals (N, 3) turned to the viewer's side, and unit vectors (N, 3) towards the viewer; world space."""
     normal, toward = unit(gbuffer["normal"]), unit(camera.toward(gbuffer["position"]))
-    return _turned(normal, toward), toward
+    return namespace(normal).where(dot(normal, toward) < 0, -normal, normal), toward
 
 
-def _towards(gbuffer: GBuffer, camera: Camera) -> Array:
-    """Vectors (N, 3) towards the viewer, of any length and without derivative: enough to tell which side is seen."""
-    given = gbuffer["position"], camera
+def _is_behind(gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
+    """(N, 1) whether the viewer is on the side of a sample that its normal faces away from."""
+    given = gbuffer["position"], gbuffer["normal"], camera
     engine = engine_of(given)
-    position, camera = map_leaves(lambda x: x if is_constant(x) else engine.stop_gradient(x), given)
-    return camera.toward(position)
+    position, normal, camera = map_leaves(lambda x: x if is_constant(x) else engine.stop_gradient(x), given)
+    return dot(normal, camera.toward(position)) < 0
 
 
-def _turned(normal: Array, toward: Array) -> Array:
-    return namespace(normal).where(_dot(normal, toward) < 0, -normal, normal)
-
-
-def _light(theta: Mapping[str, Tree], camera: Camera) -> dict[str, Array]:
+def _lit(
+    theta: Mapping[str, Tree], camera: Camera | RowCameras
+) -> tuple[Array | float, list[tuple[Array, Array | float]]]:
+    """The ambient light, and of each other the unit vector towards it, (3,) or (N, 3), and its colour."""
     given = theta.get("light", {})
     if not isinstance(given, Mapping):
         raise InputError(f"theta['light'] is a {type(given).__name__}; expected a dict of {', '.join(LIGHT_ENTRIES)}")
@@ -244,15 +246,24 @@ def _light(theta: Mapping[str, Tree], camera: Camera) -> dict[str, Array]:
         else:
             ok = len(shape) in (1, 2) and shape[-1] == 3 and shape[0] > 0
             _check(f"['light'][{name!r}]", value, "(3,) or (L, 3)", ok)
-    given = dict(given)
-    r = camera.view[:3, :3]
-    if "direction" not in given:
-        given.update(direction=sum(c * r[i, :] for i, c in enumerate(DEFAULT_LIGHT)))
-    xp = namespace(given["direction"])
-    one = xp.ones_like(given["direction"][..., :3])
-    given.setdefault("color", DEFAULT_DIFFUSE * one)
-    given.setdefault("ambient", DEFAULT_AMBIENT)
-    return given
+    colors = [DEFAULT_DIFFUSE]
+    if "color" in given:
+        colors = _listed(given["color"])
+    if "direction" in given:
+        directions = _listed(unit(given["direction"]))
+    else:
+        directions = [camera.to_world(DEFAULT_LIGHT)]
+    if len(colors) not in (1, len(directions)):
+        raise InputError(f"theta['light'] has {len(directions)} directions but {len(colors)} colors")
+    if len(colors) == 1:
+        colors *= len(directions)
+    return given.get("ambient", DEFAULT_AMBIENT), list(zip(directions, colors, strict=True))
+
+
+def _listed(vectors: Array) -> list[Array]:
+    """The vectors (3,) of an array (3,) or (L, 3)."""
+    vectors = namespace(vectors).reshape(vectors, (-1, 3))
+    return [vectors[i, :] for i in range(vectors.shape[0])]
 
 
 def _entry(theta: Mapping[str, Tree], name: str, *shapes: tuple[int, ...]) -> Array:
@@ -271,21 +282,6 @@ def _check(entry: str, value: Any, expected: str, ok: bool) -> None:
         raise InputError(f"theta{entry} has dtype {value.dtype}; expected floating numbers")
     if not (math.isfinite(value) if number else is_finite(value)):
         raise InputError(f"theta{entry} holds NaN or infinity; expected finite numbers")
-
-
-def _each(light: dict[str, Array]) -> tuple[list[Array], list[Array]]:
-    """Unit directions and colours (3,) of each light."""
-    xp = namespace(light["direction"])
-    directions = xp.reshape(unit(light["direction"]), (-1, 3))
-    colors = xp.reshape(light["color"], (-1, 3))
-    if colors.shape[0] not in (1, directions.shape[0]):
-        raise InputError(f"theta['light'] has {directions.shape[0]} directions but {colors.shape[0]} colors")
-    count = directions.shape[0]
-    return [directions[i, :] for i in range(count)], [colors[min(i, colors.shape[0] - 1), :] for i in range(count)]
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return namespace(a).sum(a * b, axis=-1, keepdims=True)
 
 
 def _positive(x: Array) -> Array:

@@ -14,7 +14,7 @@ from rts.channels import cropped_image
 from rts.checks import check_background, check_cameras, check_size, check_splatter, suited_sampler
 from rts.engines import Engine, is_constant, namespace, suiting_scene, uncompiled
 from rts.errors import InputError
-from rts.evaluating import views_to_splats
+from rts.evaluating import shaded_at_once, views_to_splats
 from rts.interfaces import Part, Splatter
 from rts.operations.inset import averaged
 from rts.records import Sampled
@@ -50,10 +50,11 @@ def render_views(
     view from a thousand times as far, gradients of hidden parts may differ more.
 
     Views lie side by side in one picture, of 1024² cells at most: Python's share of the work is paid once for all, what
-    the surface computes of the whole of θ, such as smooth normals, serves them all, and one splat does. With jax, and
-    under `torch.func`, that is so for one part of one colour (`Shader.uniform_by`), such as a silhouette; else one view
-    follows the other, as with `layers="auto"` and in bands. NumPy views that are too large for a picture are rendered
-    one on each core. With torch memory is that of all views at once, with a gradient or without.
+    the surface computes of the whole of θ, such as smooth normals, serves them all, one splat does, and one call of a
+    shader that `takes_views`, as the built-in ones do but for those with mipmaps. With jax, and under `torch.func`,
+    that is so for shaders which take views, for parts of one colour, and for one picture; else one view follows the other, as with
+    `layers="auto"` and in bands. NumPy views that are too large for a picture are rendered one on each core. With torch
+    and jax memory is that of all views at once, with a gradient or without.
 
     Args:
         parts: as in `render`.
@@ -128,8 +129,8 @@ def _images(
             for own in chunks
         ]
         if place.views > 1 and all(own.possible for own in given):
-            # Of padded rows it is not known which are those of a view, so that shaders must not see the camera.
-            alike = len(given) == len(scenes[0].parts) == 1 and scenes[0].parts[0].uniform
+            # Of padded rows it is not known which are those of a view, so that there must be one call for all.
+            alike = len(given) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
             known = capacity is None and engine.concurrent() and engine.on_host(like)
             if alike if engine.padded(like) else known:
                 return _as_pictures([sampled_as_one(own) for own in given], scenes, suited, splatter)

@@ -306,21 +306,21 @@ def _select(
     clips, near = np.empty(LONG_BLOCK, np.bool_), np.empty(LONG_BLOCK, np.bool_)
     chosen, sign = np.empty(LONG_BLOCK, np.uint32), np.float32(keep)
     step, given = np.float32(step), (vertices, matrix, height, width, np.float32(step), bits)
-    found = opposite = first * CHUNK
+    places = np.empty(2, np.int64)
+    places[0] = places[1] = first * CHUNK
     for chunk in range(first, last):
-        fronts[1][chunk, 0], backs[1][chunk, 0] = found, opposite
+        fronts[1][chunk, 0], backs[1][chunk, 0] = places[0], places[1]
         for n in range(chunk * PER_CHUNK, min(len(blocks), (chunk + 1) * PER_CHUNK)):
             start, some = blocks[n] * LONG_BLOCK, sides[n]
             block = faces[start : min(len(faces), start + LONG_BLOCK)]
             for b in range(len(block)):
                 xy[0, b], xy[1, b], xy[2, b] = screen[block[b, 0]], screen[block[b, 1]], screen[block[b, 2]]
-            if some & FRONTS:
-                _look(len(block), xy, height, width, step, sign, box, clips, near)
-                found = _list(chunk, start, block, near, box, clips, chosen, given, found, fronts)
-            if some & BACKS and len(backs[0]) > 0:
-                _look(len(block), xy, height, width, step, -sign, box, clips, near)
-                opposite = _list(chunk, start, block, near, box, clips, chosen, given, opposite, backs)
-        fronts[1][chunk, 1], backs[1][chunk, 1] = found, opposite
+            for side in range(2):  # One loop, since what is called in it is compiled once for each place where it is.
+                made = backs if side else fronts
+                if some & (BACKS if side else FRONTS) and len(made[0]) > 0:
+                    _look(len(block), xy, height, width, step, -sign if side else sign, box, clips, near)
+                    places[side] = _list(chunk, start, block, near, box, clips, chosen, given, places[side], made)
+        fronts[1][chunk, 1], backs[1][chunk, 1] = places[0], places[1]
 
 
 @compiled(inline="always", error_model="numpy")

@@ -376,6 +376,20 @@ def test_fit_pose_with_adam_lowers_the_loss(model, tmp_path):
     assert after < before / 4
 
 
+def test_fit_pose_takes_a_robust_loss(model, tmp_path):
+    pytest.importorskip("torch")
+    mask = "--shader", "silhouette", "--splatter", "single", "--layers", 1
+    succeed("render", model, "-o", tmp_path / "t.png", "--size", 48, "--camera", "40,20", *mask)
+    target, parts = rts.load_image(tmp_path / "t.png")[..., 3], rts.load(model)
+    dark = [part.replace(shader="silhouette") for part in parts]
+    image = rts.render(dark, orbit(bounds_of(parts), (48, 48), 30, 20), (48, 48), splatter="single", layers=1)
+    for loss in ("linear", "cauchy"):
+        options = "--steps", 1, "--loss", loss, "--f-scale", 0.2
+        output = succeed("fit-pose", model, tmp_path / "t.png", "-o", tmp_path / loss, *options)
+        expected = float(rts.Loss(loss, 0.2)(image[..., 3] - target))
+        assert float(re.search(r"loss (\S+) → ", output).group(1)) == pytest.approx(expected, rel=5e-3)
+
+
 def test_fit_pose_says_how_many_steps_it_made_where(model, tmp_path):
     pytest.importorskip("torch")
     succeed("render", model, "-o", tmp_path / "t.png", "--size", 48, "--shader", "silhouette")
@@ -399,6 +413,8 @@ def test_fit_pose_says_which_extra_draws_the_plot(model, tmp_path, monkeypatch):
         (["--method", "newton"], "method is 'newton'"),
         (["--engine", "numpy"], "'numpy', which has no derivatives"),
         (["--engine", "torsh"], "did you mean 'torch'"),
+        (["--loss", "square"], "loss is 'square'; expected one of linear, soft_l1, huber, cauchy"),
+        (["--loss", "huber", "--f-scale", "0"], "f_scale is 0.0; expected a positive"),
     ],
 )
 def test_fit_pose_refuses(model, tmp_path, options, expected):

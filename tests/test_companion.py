@@ -11,7 +11,7 @@ import time
 import pytest
 
 pytest.importorskip("numba")
-from rts import accompanying, companion
+from rts import accompanying, companion, compiling
 from rts.compiling import Need
 
 pytestmark = pytest.mark.core
@@ -121,6 +121,24 @@ def test_what_will_be_needed_last_is_compiled_first(seen, done, expected):
     key, need = accompanying.following([PICTURE, GRADIENT, POSE, FIT], [*map(ord, seen)], {*map(ord, done)})
     assert (need.kernel if need else None) == expected
     assert key == (ord(expected) if expected else 0)
+
+
+@pytest.mark.parametrize(
+    ("efforts", "order"),
+    [
+        ((1, 1, 1, 1), "dcba"),
+        ((1, 9, 5, 6), "dcba"),  # What is left shrinks, and the other process is at the front of it.
+        ((3, 2, 4, 1), "cbda"),
+        ((1, 1, 9, 1), "cdba"),
+    ],
+)
+def test_of_the_last_half_of_what_is_left_the_largest_is_compiled_first(efforts, order):
+    left = {ord(x): Need(x, (), effort) for x, effort in zip("abcd", efforts, strict=True)}
+    done, found = set(), ""
+    while (key := accompanying.following([left | {ord("s"): Need("s", ())}], [ord("s")], done))[1]:
+        done.add(key[0])
+        found += key[1].kernel
+    assert found == order
 
 
 def test_an_expected_kind_of_call_counts_as_a_kernel_but_is_none():
@@ -250,6 +268,19 @@ def test_it_compiles_what_nobody_has_asked_for_yet(tmp_path, willing):
         [sys.executable, "-c", MISSED, str(tmp_path)], env=environment, capture_output=True, text=True
     )
     assert done.returncode == 0 and "nbc" in done.stdout, done.stderr + done.stdout
+
+
+@pytest.mark.parametrize(("kept", "begun"), [(None, 1), ("__init__.pyc", 1), ("several.double-7.py311.nbi", 0)])
+def test_it_starts_before_a_kernel_is_missed_where_none_is_kept(kept, begun, tmp_path, monkeypatch):
+    started = []
+    monkeypatch.setattr(companion, "prepare", lambda: started.append(1))
+    folder = tmp_path / "kernels"
+    if kept:
+        folder.mkdir()
+        (folder / kept).touch()
+    for _ in range(2):
+        compiling._foresee(str(folder))
+    assert len(started) == begun
 
 
 BROKEN_PIPE = """

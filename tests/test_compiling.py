@@ -3,8 +3,10 @@
 import gc
 import io
 import os
+import re
 import subprocess
 import sys
+from types import FunctionType
 
 import numpy as np
 import pytest
@@ -12,6 +14,8 @@ import pytest
 import rts
 
 pytest.importorskip("numba")
+import numba
+
 from rts import companion, compiling
 
 pytestmark = pytest.mark.core
@@ -91,6 +95,79 @@ def test_no_garbage_is_collected_while_our_kernels_are_compiled():
         assert gc.isenabled() is not paused
         listener.on_end(event)
         assert gc.isenabled()
+
+
+def test_what_is_new_after_a_compilation_is_not_looked_through():
+    listener = compiling._NoCollection()
+    event = type("", (), {"data": {"dispatcher": type("", (), {"py_func": rts.render})}})
+    collected = []
+    gc.callbacks.append(lambda phase, info: collected.append(info["generation"]))
+    try:
+        listener.on_start(event)
+        new = [[] for _ in range(10 * gc.get_threshold()[0])]
+        listener.on_end(event)
+        also = [[] for _ in range(10)]
+    finally:
+        gc.callbacks.pop()
+    assert not collected and gc.isenabled() and gc.get_freeze_count() == 0
+    assert len(new) + len(also) > gc.get_threshold()[0]
+
+
+def _doubled(x):
+    return x + x if x > 0 else -x
+
+
+def _total(values):
+    """By a helper and by functions of numba's own."""
+    kept = np.empty(len(values), np.float64)
+    for n in range(len(values)):
+        kept[n] = min(_doubled(values[n]), 7.0)
+    return kept[1:].sum()
+
+
+def compiled_total(kernel, helper):
+    names = {"np": np, "_doubled": numba.njit(_doubled, nogil=True, **helper), "__name__": __name__}
+    made = numba.njit(FunctionType(_total.__code__, names), nogil=True, **kernel)
+    assert made(np.array([9, -2, 3, 8])) == 2 + 6 + 7
+    return made, names["_doubled"]
+
+
+def instructions(made):
+    """The machine code, without names."""
+    (text,) = made.inspect_asm().values()
+    names = {}
+    text = re.sub(r"_ZN[\w.$]+|\.const\.[\w.$<>]+", lambda m: names.setdefault(m.group(), f"name {len(names)}"), text)
+    return [line for line in text.splitlines() if not re.match(r"\s*\.(asci|file|globl|section|size|type|weak)", line)]
+
+
+def test_what_only_kernels_call_has_no_machine_code_and_kernels_are_those_that_numba_makes():
+    plain, helper = compiled_total({"no_cfunc_wrapper": True}, {"no_cfunc_wrapper": True})
+    ours, part = compiled_total(compiling.KERNEL, compiling.PART)
+    assert instructions(ours) == instructions(plain)
+    for each, running in ((plain, True), (helper, True), (ours, True), (part, False)):
+        ((types, compiled),) = each.overloads.items()
+        assert (compiled.library.get_pointer_to_function(compiled.fndesc.llvm_func_name) != 0) is running, each
+
+
+ANOTHER_NUMBA = """
+import numpy as np
+from numba.core import compiler
+
+class Compiler(compiler.Compiler):
+    def __init__(self, *everything):
+        super().__init__(*everything)
+
+compiler.Compiler = Compiler
+from rts import compiling
+helper = compiling.compiled(lambda x: x + x)
+made = compiling.numba.njit(lambda x: helper(x), **compiling.KERNEL)
+print(made(3.0), "pipeline_class" in compiling.KERNEL | compiling.PART)
+"""
+
+
+def test_a_numba_that_is_built_in_another_way_compiles_as_it_does():
+    done = subprocess.run([sys.executable, "-c", ANOTHER_NUMBA], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["6.0", "False"]
 
 
 def test_warmup_has_as_many_processes_share_the_work_and_says_what_failed(monkeypatch):

@@ -15,7 +15,7 @@ from rts import Fragments, GBuffer, InputError, Part, PluginError, RayHits, Spla
 from rts.arrays import without_border
 from rts.engines import engine_of, namespace
 from rts.registry import instance
-from rts.shading import Unlit
+from rts.shading import Depth, Normals, Unlit
 from rts.splatting import Multi, Plain
 from rts.testing import (
     EngineConformance,
@@ -754,6 +754,19 @@ def by_length(rgba, theta, gbuffer):
     return rgba * xp.sqrt(xp.sum(gbuffer["normal"] ** 2, axis=1, keepdims=True))
 
 
+def one_view(theta, gbuffer, camera):
+    """Shades all samples as those of the first."""
+    first = camera.of_rows(1 + 0 * camera.number) if isinstance(camera, rts.RowCameras) else camera
+    return Depth()(theta, gbuffer, first)
+
+
+def by_matrix(theta, gbuffer, camera):
+    return Normals()(theta, {"normal": gbuffer["normal"] @ camera.view[:3, :3].T}, camera)
+
+
+for _shader in (one_view, by_matrix):
+    _shader.takes_views, _shader.reads = True, ("normal",)
+
 SHADERS = {
     "it_gives_a_premultiplied_color_for_each_sample": {
         "straight alpha": shading(straight),
@@ -776,6 +789,11 @@ SHADERS = {
     "it_reads_what_it_says": {
         "color unsaid": shading(reads=("uv",)),
         "normal unsaid": shading(by_length, reads=("color",)),
+    },
+    "samples_of_several_views_are_shaded_as_by_each": {
+        "one view": one_view,
+        "reads unsaid": shading(takes_views=True),
+        "no matrices": by_matrix,
     },
     "engines_agree": {"not in torch": shading(lambda c, *_: wrong_in_torch(c))},
     "gradients_are_finite_differences": {"detached": shading(lambda c, *_: stopped(c))},

@@ -275,8 +275,7 @@ def test_methods_of_any_kind_are_refused(method):
 @pytest.mark.parametrize(
     ("loss", "expected"),
     [
-        (None, "loss is None; expected a function of the residuals"),
-        ("mse", "loss is 'mse'"),
+        ("mse", "loss is 'mse'; expected a function of the residuals"),
         (3, "loss is 3"),
         (lambda r: r, r"loss gave an array of shape \(3,\); expected a \w+ scalar"),
         (lambda r: np.float32(1), "loss gave a numpy.float32; expected"),

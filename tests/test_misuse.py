@@ -227,6 +227,8 @@ CALLS = {
     "ImageResiduals.size": lambda v: rts.ImageResiduals(scene, CAMERA, v, MASK),
     "ImageResiduals.target": lambda v: rts.ImageResiduals(scene, CAMERA, SIZE, v),
     "ImageResiduals.weights": lambda v: rts.ImageResiduals(scene, CAMERA, SIZE, MASK, weights=v),
+    "ImageResiduals.loss": lambda v: rts.ImageResiduals(scene, CAMERA, SIZE, MASK, loss=v),
+    "ImageResiduals.f_scale": lambda v: rts.ImageResiduals(scene, CAMERA, SIZE, MASK, loss="huber", f_scale=v),
     "fit.residuals": lambda v: rts.fit(v, START()),
     "fit.parameters": lambda v: rts.fit(lambda p: p, v),
     "fit.method": lambda v: rts.fit(lambda p: p, START(), method=v),
@@ -275,7 +277,7 @@ OPTIONAL = """
     render.background render.capacity render.engine sample.splatter render_samples.background prepare.camera
     prepare.size
     Part.transform Mesh.indices look_at.aspect look_at.near look_at.far within.transform splatter.calibration
-    ImageResiduals.weights fit.steps fit.learning_rate fit.callback gradient_image.scale
+    ImageResiduals.weights fit.loss fit.steps fit.learning_rate fit.callback gradient_image.scale
     fit.schedule Stage.supersample pyramid.largest
     Isosurface.band Isosurface.lipschitz Isosurface.reads Isosurface.attributes Sdf.lipschitz Sdf.steps
     NarrowBand.lipschitz NarrowBand.coarse
@@ -284,8 +286,8 @@ NUMBERS = """
     shader.specular shader.shininess shader.ambient look_at.fov_y look_at.aspect look_at.near look_at.far
     orthographic.height from_opencv.near from_opencv.pixel_center from_pytorch3d.focal_length from_blender.focal
     splatter.sigma splatter.calibration exact_calibration.sigma save_animation.fps fit.learning_rate fit.tolerance
-    gradient_image.scale Bezier.tolerance tessellate.rate Isosurface.isovalue Isosurface.lipschitz Sdf.radius
-    Sdf.lipschitz NarrowBand.lipschitz Stage.sigma
+    ImageResiduals.f_scale gradient_image.scale Bezier.tolerance tessellate.rate Isosurface.isovalue
+    Isosurface.lipschitz Sdf.radius Sdf.lipschitz NarrowBand.lipschitz Stage.sigma
 """
 ACCEPTED = {
     "None": OPTIONAL.split(),

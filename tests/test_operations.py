@@ -7,7 +7,7 @@ from helpers import ALL, DIFFERENTIABLE, arrays, derivative, finite_difference, 
 import rts
 from rts.operations.combine import COMBINE, combine, interpolate
 from rts.operations.inset import with_inset
-from rts.operations.linear import affine_map, matmul
+from rts.operations.linear import affine_map, affine_map_of_views, matmul
 from rts.operations.projection import projective_map, projective_map_of_views
 from rts.operations.take import take
 
@@ -442,3 +442,9 @@ def test_their_derivatives_are_those_of_differences_to_second_order():
 
     assert torch.autograd.gradcheck(projected, given, check_forward_ad=True)
     assert torch.autograd.gradgradcheck(projected, given)
+
+    def mapped(r, p):
+        return affine_map_of_views(r[:, :2, :], p, view)
+
+    assert torch.autograd.gradcheck(mapped, given, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(mapped, given)

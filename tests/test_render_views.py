@@ -9,6 +9,7 @@ from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, box, gradient, icosphere
 import rts
 from rts import Camera
 from rts.errors import EmptyImageWarning, InputError
+from rts.shading import Lambert
 from rts.splatting import side_by_side
 from rts.splatting.side_by_side import Picture
 
@@ -262,6 +263,136 @@ def test_poses_alone_are_differentiated_without_a_look_at_the_mesh():
     part = scene()[0].replace(transform=rts.rigid(torch.tensor([0.1, 0.2, 0, 0, 0.1, 0])))
     found = rts.render_views(part, CAMERAS, SIZE)
     np.testing.assert_allclose(to_numpy(found), looped(part), atol=2e-5)
+
+
+# ------------------------------------------------------------------------------------------ shaders of several views
+
+LIGHT = {"direction": np.float32([[0, 1, 1], [1, 0, 0.5]]), "ambient": np.float32(0.1)}
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_cameras_of_rows_are_those_of_their_views(target):
+    flat = Camera.orthographic((0, 2, 3), (0, 0, 0), height=3, near=1, far=8)
+    cameras = [camera.for_size(SIZE) for camera in (CAMERAS[0], flat, CAMERAS[1])]
+    number = np.array([1, 1, 3, 3, 3, 0], np.int32)  # Nothing is seen in the second, and one row is not used.
+    points, direction = np.random.default_rng(1).normal(size=(6, 3)).astype(np.float32), (0.3, -0.2, 0.9)
+    rows = rts.RowCameras.of(arrays(target, cameras), arrays(target, number))
+    found = [rows.toward(arrays(target, points)), rows.to_world(direction), rows.depth(arrays(target, points))]
+    found = [to_numpy(x) for x in (*found, *rows.depth_range())]
+    for n in range(5):
+        camera, point = cameras[number[n] - 1], points[n : n + 1]
+        eye = np.linalg.inv(camera.view)[:3, 3]
+        near, far = camera.depth_range()
+        expected = eye - point[0], camera.view[:3, :3].T @ direction, camera.project(point, SIZE)[0, 2], near, far
+        np.testing.assert_allclose(found[1][n], expected[1] / np.linalg.norm(expected[1]), atol=1e-6)
+        np.testing.assert_allclose(camera.to_world(direction), found[1][n], atol=1e-6)
+        np.testing.assert_allclose(camera.depth(point)[0], expected[2])
+        for i in (0, 2, 3, 4):
+            np.testing.assert_allclose(found[i][n], expected[i], rtol=1e-4, atol=1e-5)
+    rows = rts.RowCameras.of(arrays(target, cameras), arrays(target, np.full(6, 2, np.int32)))
+    np.testing.assert_allclose(to_numpy(rows.toward(arrays(target, points))), flat.toward(points), atol=1e-5)
+
+
+@pytest.mark.parametrize("shader", ["depth", "blinn_phong", "lambert"])
+def test_shaded_views_move_with_cameras_and_lights_as_in_a_loop(shader):
+    torch = pytest.importorskip("torch")
+    found = []
+    for together in (True, False):
+        eyes, light = (torch.tensor(x, requires_grad=True) for x in (np.float32(EYES), LIGHT["direction"]))
+        theta = scene()[0].theta if shader == "depth" else scene()[0].theta | {"light": LIGHT | {"direction": light}}
+        cameras = [Camera.look_at(eye, torch.zeros(3), fov_y=45) for eye in eyes]
+        part = scene(shader)[0].replace(theta=theta)
+        if together:
+            images = rts.render_views(part, cameras, SIZE)
+        else:
+            images = torch.stack([rts.render(part, camera, SIZE) for camera in cameras])
+        leaves = [eyes] if shader == "depth" else [eyes, light]
+        found.append((images.detach(), *torch.autograd.grad((images * torch.tensor(WEIGHTS)).sum(), leaves)))
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=1e-4 * float(b.abs().max()))
+
+
+@pytest.mark.parametrize("capacity", [None, 700])
+def test_compiled_views_are_shaded_together_in_pieces_of_rows_in_use(capacity, monkeypatch):
+    jax = pytest.importorskip("jax")
+    torch = pytest.importorskip("torch")
+    rows_in_use = pytest.importorskip("rts_backends.jax_engine.rows_in_use")
+    monkeypatch.setattr(rows_in_use, "LEAST", 1)
+    monkeypatch.setattr(rows_in_use, "PIECE", 128)
+    calls, part = [], mesh_part(icosphere(1))
+
+    class Counted(Lambert):
+        def __call__(self, theta, gbuffer, camera):
+            calls.append(type(camera))
+            return super().__call__(theta, gbuffer, camera)
+
+    def loss(vertices, pose, weights, **options):
+        moved = part.replace(theta={"vertices": vertices}, transform=rts.rigid(pose), shader=Counted())
+        images = rts.render_views(moved, CAMERAS, SIZE, **options)
+        return (images * weights).sum()
+
+    pose = np.float32([0.1, 0.2, 0.0, 0.0, 0.1, 0.0])
+    given = [torch.tensor(x, requires_grad=True) for x in (part.theta["vertices"], pose)]
+    expected = torch.autograd.grad(loss(*given, torch.tensor(WEIGHTS)), given)
+    gradient_of = jax.jit(jax.grad(lambda v, p: loss(v, p, WEIGHTS, capacity=capacity), (0, 1)))
+    found = gradient_of(*arrays("jax", [part.theta["vertices"], pose]))
+    assert set(calls) == {rts.RowCameras}
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4 * float(b.abs().max()))
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_several_parts_are_one_picture_with_jax_too(compiled):
+    jax = pytest.importorskip("jax")
+    torch = pytest.importorskip("torch")
+
+    def loss(vertices, weights):
+        moved = [p.replace(theta=p.theta | {"vertices": v}) for p, v in zip(scene(), vertices, strict=True)]
+        return (rts.render_views(moved, CAMERAS, SIZE) * weights).sum()
+
+    given = [part.theta["vertices"] for part in scene()]
+    leaves = [torch.tensor(x, requires_grad=True) for x in given]
+    expected = torch.autograd.grad(loss(leaves, torch.tensor(WEIGHTS)), leaves)
+    gradient_of = jax.grad(lambda x: loss(x, WEIGHTS))
+    found = (jax.jit(gradient_of) if compiled else gradient_of)(arrays("jax", given))
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4 * float(b.abs().max()))
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_several_parts_in_a_batch_are_those_of_a_loop(target):
+    vmap = pytest.importorskip("torch").vmap if target != "jax" else pytest.importorskip("jax").vmap
+    parts, sizes = scene()[:2], np.float32([1.0, 0.7])
+
+    def images(size):
+        own = [part.replace(theta={"vertices": size * arrays(target, part.theta["vertices"])}) for part in parts]
+        return rts.render_views(own, CAMERAS, SIZE)
+
+    found = to_numpy(vmap(images)(arrays(target, sizes)))
+    for size, own in zip(sizes, found, strict=True):
+        expected = looped([part.replace(theta={"vertices": size * part.theta["vertices"]}) for part in parts])
+        np.testing.assert_allclose(own, expected, atol=2e-5)
+
+
+def test_shaders_are_given_one_camera_unless_they_take_views_and_say_what_they_read():
+    calls = []
+
+    def shader(theta, gbuffer, camera):
+        calls.append(type(camera))
+        position = gbuffer["position"]
+        return np.concatenate([np.abs(position) / 2, np.ones_like(position[:, :1])], axis=1)
+
+    expected = looped(part := mesh_part(icosphere(1), shader=shader))
+    for promises, kinds in (
+        ({}, [Camera] * 3),
+        ({"takes_views": True}, [Camera] * 3),
+        ({"takes_views": True, "reads": ("uv_footprint",)}, [Camera] * 3),
+        ({"takes_views": True, "reads": ()}, [rts.RowCameras]),
+    ):
+        vars(shader).update(promises)
+        calls.clear()
+        np.testing.assert_allclose(rts.render_views(part, CAMERAS, SIZE), expected, rtol=0, atol=1e-5)
+        assert calls == kinds
 
 
 # ----------------------------------------------------------------------------------------------- how it is done

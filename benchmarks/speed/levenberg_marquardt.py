@@ -42,8 +42,11 @@ def levenberg_marquardt(task: Task, engine: str, unknowns: int) -> dict[str, Cal
     def scene(v: Any) -> rts.Part:
         return task.part.replace(transform=transform(v))
 
-    residuals = rts.ImageResiduals(scene, task.view, task.size, task.target, splatter=task.splatter, layers=task.layers)
-    descend = library.jit(library.value_and_grad(lambda v: (residuals(v) ** 2).mean()))
+    options = {"loss": task.reduction.name, "f_scale": task.reduction.f_scale}
+    residuals = rts.ImageResiduals(
+        scene, task.view, task.size, task.target, splatter=task.splatter, layers=task.layers, **options
+    )
+    descend = library.jit(library.value_and_grad(lambda v: task.reduction(residuals(v))))
 
     def step_of(equations: Callable) -> Callable[[], object]:
         linearize = library.jit(equations)
@@ -62,7 +65,7 @@ def levenberg_marquardt(task: Task, engine: str, unknowns: int) -> dict[str, Cal
     return {
         "forward and gradient": lambda: library.block(descend(start)),
         "step": step_of(residuals.normal_equations),
-        "step by the Jacobian": step_of(lambda v: normal_equations(residuals, v, library)),
+        "step by the Jacobian": step_of(lambda v: normal_equations(residuals, v, library, task.reduction)),
     }
 
 

@@ -1,7 +1,7 @@
 """The pose iteration that speed is measured on, by rts: loss, and a step with torch or jax.
 
-One iteration renders the silhouette of a mesh, takes the mean squared difference to the hard silhouette of 4 × 4
-samples a pixel at the zero pose, its gradient in the pose, and a step of Adam.
+One iteration renders the silhouette of a mesh, takes the mean squared difference (or another loss) to the hard
+silhouette of 4 × 4 samples a pixel at the zero pose, its gradient in the pose, and a step of Adam.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ class Task:
         layers: K.
         splatter: by which it is rendered.
         cull: of the part.
+        reduction: the loss of the differences to the target.
     """
 
     def __init__(
@@ -47,9 +48,10 @@ class Task:
         layers: int = 2,
         splatter: Any = "auto",
         cull: str = "none",
+        reduction: rts.Loss = rts.Loss(),  # noqa: B008  (It is a constant.)
     ):
         self.name, self.vertices, self.faces, self.side = name, vertices, faces, side
-        self.layers, self.splatter = layers, splatter
+        self.layers, self.splatter, self.reduction = layers, splatter, reduction
         self.size, self.view = (side, side), camera()
         self.part = rts.Part(rts.plugin("rts.surfaces", "mesh")(faces), {"vertices": vertices}, shader, cull=cull)
         self.channels = slice(3, 4) if shader == "silhouette" else slice(0, 4)
@@ -72,17 +74,17 @@ class Task:
         return part if vertices is None else part.replace(theta={"vertices": vertices})
 
     def loss(self, pose: Any, vertices: Any, target: Any, sampler: str) -> Any:
-        """Mean squared difference."""
+        """Mean loss of the differences."""
         parts = self.posed(pose, vertices)
         image = rts.render(parts, self.view, self.size, sampler=sampler, splatter=self.splatter, layers=self.layers)
-        difference = image[..., self.channels] - target
-        return (difference * difference).mean()
+        return self.reduction(image[..., self.channels] - target)
 
     def swept_loss(self, pose: Any, vertices: Any, target: Any, sampler: str) -> Any:
-        """`loss`, made as the image is: `rts.ImageResiduals.mean_square`."""
+        """`loss`, made as the image is: `rts.ImageResiduals.mean_loss`."""
         options: dict[str, Any] = {"sampler": sampler, "splatter": self.splatter, "layers": self.layers}
+        options |= {"loss": self.reduction.name, "f_scale": self.reduction.f_scale}
         residuals = rts.ImageResiduals(lambda pose: self.posed(pose, vertices), self.view, self.size, target, **options)
-        return residuals.mean_square(pose)
+        return residuals.mean_loss(pose)
 
 
 # ------------------------------------------------------------------------------------------------------- iterations

@@ -29,6 +29,8 @@ KINDS = {
     "jax jit pose": "gradient in the pose, compiled",
     "jax jit vertices": "gradient in the vertices, compiled",
     "jax vertices": "gradient in the vertices, as it is",
+    "jax each pose": "gradient in the pose, the loop's of a view compiled",
+    "jax each vertices": "gradient in the vertices, the loop's of a view compiled",
 }
 
 
@@ -76,9 +78,17 @@ def call_of(kind: str, part: rts.Part, side: int, together: bool) -> Callable[[]
         moved, _ = _moved(part, vertices if what[-1] == "pose" else x, x, what, lambda x: x)
         return (images(moved, side, together) * w).sum()
 
-    gradient = jax.grad(loss)
-    gradient = jax.jit(gradient) if what[0] == "jit" else gradient
     at = pose if what[-1] == "pose" else vertices
+    if what[0] == "each" and not together:
+
+        def of_view(x: Any, camera: rts.Camera, w: Any) -> Any:
+            moved, _ = _moved(part, vertices if what[-1] == "pose" else x, x, what, lambda x: x)
+            return (rts.render(moved, camera, (side, side)) * w).sum()
+
+        one = jax.jit(jax.grad(of_view))
+        return lambda: jax.block_until_ready(sum(one(at, *view) for view in zip(cameras(), w, strict=True)))
+    gradient = jax.grad(loss)
+    gradient = jax.jit(gradient) if what[0] in ("jit", "each") else gradient
     return lambda: gradient(at).block_until_ready()
 
 

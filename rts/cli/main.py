@@ -318,6 +318,16 @@ def fit_pose(
     fov: Fov = 40.0,
     up: Up = "y",
     fit_fov: Annotated[bool, typer.Option("--fit-fov", help="Fit the field of view, too; --fov is the start.")] = False,
+    loss: Annotated[
+        str,
+        typer.Option(
+            help="linear: the mean square of the difference. Where part of the mask is wrong, such as something in "
+            "front, a robust one: soft_l1, huber or cauchy."
+        ),
+    ] = "linear",
+    f_scale: Annotated[
+        float, typer.Option(help="The difference, of 1, from which on a robust loss counts it less than its square.")
+    ] = 0.1,
 ) -> None:
     """Find the turn and shift of a model that make its silhouette match a picture's: coarse, blurred pixels first.
 
@@ -341,7 +351,8 @@ def fit_pose(
     bounds = bounds_of(parts)
     seen = orbit(bounds, mask.shape, *view, fov=fov, up=up)
     chosen = None if engine == "auto" else engine
-    found = fit(parts, mask, seen, bounds, engine=chosen, method=method, steps=steps, fit_fov=fit_fov)
+    options: dict[str, Any] = {"method": method, "steps": steps, "fit_fov": fit_fov, "loss": loss, "f_scale": f_scale}
+    found = fit(parts, mask, seen, bounds, engine=chosen, **options)
     verdict = judged(found.pose, parts, mask, picture)
     files = write_report(output, found, verdict, parts, mask)
     _say(

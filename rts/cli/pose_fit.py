@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from rts.engines import Engine, engine_named, engine_of, namespace
 from rts.errors import InputError, PluginError
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
-from rts.fitting.least_squares import mean_square
 from rts.fitting.schedule import Stage, box_filtered, pyramid
 from rts.interfaces import Part
 from rts.operations.rigid import rigid
@@ -34,8 +33,8 @@ class PoseFit(NamedTuple):
         translation: (3,) world units.
         center: (3,) world.
         trail: the best pose so far, at each step; the last is the pose found.
-        history: the loss at each step: mean square of the difference of silhouettes, at that step's resolution and
-            blur.
+        history: the loss at each step: mean square of the difference of silhouettes, or a robust loss of it, at that
+            step's resolution and blur.
         levels: how many steps were made at each stage, from coarse to fine.
         start: the model as loaded, seen by the camera given.
         first_loss: the loss of the start at full resolution.
@@ -104,6 +103,8 @@ def fit_pose(
     method: str = "lm",
     steps: int | None = None,
     fit_fov: bool = False,
+    loss: str = "linear",
+    f_scale: float = 0.1,
     progress: bool | None = None,
 ) -> PoseFit:
     """Turn and move a model until its silhouette is the target's, from coarse pixels to fine ones.
@@ -119,6 +120,8 @@ def fit_pose(
         method: as in `rts.fit`.
         steps: at most so many at each resolution; default that of `rts.fit`.
         fit_fov: whether the camera's field of view is fitted, too.
+        loss: as in `rts.ImageResiduals`.
+        f_scale: as in `rts.ImageResiduals`.
         progress: see `rts.fit`.
     """
     chosen = _engine(engine or available_engine())
@@ -128,7 +131,7 @@ def fit_pose(
     def note(step: int, unknowns: Array, loss: float) -> None:
         met.append(chosen.to_numpy(unknowns).astype(np.float64) * weights)
 
-    residuals = _residuals(parts, camera, target, bounds, weights, chosen)
+    residuals = _residuals(parts, camera, target, bounds, weights, chosen, loss=loss, f_scale=f_scale)
     start = chosen.constant(np.zeros(len(weights), np.float32))
     schedule = pyramid(target.shape, largest=LARGEST_SIDE)
     result = fit(
@@ -150,7 +153,7 @@ def fit_pose(
         result.history,
         list(result.stages),
         Pose(np.eye(4), camera, target.shape),
-        float(mean_square(residuals.at_stage(schedule[-1])(start))),
+        float(residuals.loss(residuals.at_stage(schedule[-1])(start))),
         result.loss,
         result.reason,
         result.seconds,
@@ -178,13 +181,19 @@ def _engine(name: str) -> Engine:
 
 
 def _residuals(
-    parts: Sequence[Part], camera: Camera, target: np.ndarray, bounds: Bounds, weights: np.ndarray, engine: Engine
+    parts: Sequence[Part],
+    camera: Camera,
+    target: np.ndarray,
+    bounds: Bounds,
+    weights: np.ndarray,
+    engine: Engine,
+    **options: Any,
 ) -> ImageResiduals:
     def silhouettes(unknowns: Array) -> tuple[list[Part], Camera]:
         unknowns = unknowns * engine.constant(weights, unknowns)
         return posed(parts, rigid(unknowns[:6], bounds.center), "silhouette"), _zoomed(camera, unknowns[6:])
 
-    return ImageResiduals(silhouettes, None, target.shape, target, layers=1, splatter="single")
+    return ImageResiduals(silhouettes, None, target.shape, target, layers=1, splatter="single", **options)
 
 
 def _pose(unknowns: np.ndarray, bounds: Bounds, camera: Camera, size: tuple[int, int]) -> Pose:

@@ -106,7 +106,7 @@ def _plot(path: Path, history: list[float]) -> list[Path]:
     figure = Figure(figsize=(6, 3.5), layout="constrained")
     axes = figure.subplots()
     axes.semilogy(np.maximum(history, 1e-12), ".-", color="#c2410c", linewidth=1, markersize=4)
-    axes.set(xlabel="step", ylabel="mean square difference", title="Silhouette, from coarse pixels to fine")
+    axes.set(xlabel="step", ylabel="loss", title="Silhouette, from coarse pixels to fine")
     axes.grid(alpha=0.3)
     with writing(path):
         figure.savefig(path, dpi=120)

@@ -17,7 +17,8 @@ from rts.checks import is_count, is_real
 from rts.engines import Engine
 from rts.errors import InputError
 from rts.fitting.dependence import differentiable, refuse_independent
-from rts.fitting.least_squares import levenberg_marquardt, mean_square
+from rts.fitting.least_squares import levenberg_marquardt
+from rts.fitting.losses import SQUARE, Loss
 from rts.fitting.names import listed, named_leaves, one_line
 from rts.fitting.run import LONGEST_REASON, NO_GRADIENT, Astray, Report, Run, progress_bar, require
 from rts.fitting.schedule import Stage, checked_schedule
@@ -75,7 +76,7 @@ def fit(
     parameters: Tree,
     *,
     method: str = "adam",
-    loss: Callable[[Array], Array] = mean_square,
+    loss: Callable[[Array], Array] | None = None,
     steps: int | None = None,
     learning_rate: float | None = None,
     tolerance: float = 1e-6,
@@ -97,9 +98,10 @@ def fit(
         residuals: parameters → array of any shape, of the parameters' engine, such as an image difference; see
             `ImageResiduals` for one that "lm" takes less time and memory for, and `rts.Residuals` for what makes it so.
         parameters: a torch or jax array, or nested dicts and lists of them; where to start.
-        method: "adam" or "sgd" (torch.optim or optax, on the gradient of the loss), or "lm": Levenberg–Marquardt on the
-            sum of squares, by the forward-mode Jacobian, for up to some hundred unknowns.
-        loss: reduces residuals to a scalar, for Adam and SGD; Levenberg–Marquardt always takes the mean square.
+        method: "adam" or "sgd" (torch.optim or optax, on the gradient of the loss), or "lm": Levenberg–Marquardt, by
+            the forward-mode Jacobian, for up to some hundred unknowns.
+        loss: reduces residuals to a scalar; for "lm" an `rts.Loss`, such as `rts.Loss("huber", f_scale=0.1)`. By
+            default that of the residuals (`ImageResiduals(loss=…)`), which for a function is the mean square.
         steps: at most so many losses are computed at each stage, the first at its start; default 200, for "lm" 50.
         learning_rate: the rate of Adam (default 0.01) or SGD (default 0.1).
         tolerance: stop when the loss has not fallen by this fraction in `patience` steps ("lm": in an accepted step).
@@ -119,6 +121,8 @@ def fit(
     _check_method(method, loss, steps, learning_rate)
     _check_limits(tolerance, patience)
     stages = _stages(known, schedule)
+    own_loss = _own_loss(known)
+    loss = own_loss if loss is None else loss
     engine = _checked_engine(parameters)
     names = [name for name, _ in named_leaves(parameters)]
     # Private copies: neither the caller's later changes nor the graph that made them may reach the result.
@@ -132,12 +136,12 @@ def fit(
         with progress_bar(progress, run.steps, bar, run):
             try:
                 checked = _checked(stage, engine, run)
-                if method == "lm":
-                    own = stage.normal_equations if stage.sums_products else None
+                if isinstance(loss, Loss) and method == "lm":
+                    own = stage.normal_equations if stage.sums_products and loss == own_loss else None
                     supersample = finest(getattr(stage, "supersample", None))
-                    levenberg_marquardt(checked, parameters, engine, run, jit, own, supersample)
+                    levenberg_marquardt(checked, parameters, engine, run, jit, loss, own, supersample)
                 else:
-                    own = stage.mean_square if stage.sums_squares and loss is mean_square else None
+                    own = stage.mean_loss if stage.sums_losses and loss == own_loss else None
                     _descend(checked, loss, own, parameters, engine, method, rate, run, jit)
             except Astray as stop:
                 run.stop(str(stop))
@@ -212,8 +216,11 @@ def _check_functions(residuals: Any, loss: Any, callback: Any) -> Residuals:
     known = adapted(residuals, Residuals)
     if known is None:
         raise InputError(f"residuals is {quoted(residuals)}; expected a function of the parameters")
-    if not callable(loss):
-        raise InputError(f"loss is {quoted(loss)}; expected a function of the residuals, or leave it out")
+    if loss is not None and not callable(loss):
+        raise InputError(
+            f"loss is {quoted(loss)}; expected a function of the residuals, such as rts.Loss('huber', f_scale=0.1), or "
+            f"leave it out"
+        )
     if callback is not None and not callable(callback):
         raise InputError(f"callback is {quoted(callback)}; expected a function of step, parameters and loss, or None")
     return known
@@ -235,11 +242,23 @@ def _stages(residuals: Residuals, schedule: Any) -> list[Residuals]:
     return found
 
 
-def _check_method(method: str, loss: Callable, steps: int | None, learning_rate: float | None) -> None:
+def _own_loss(residuals: Residuals) -> Loss:
+    """The loss that residuals say they are for."""
+    loss = residuals.loss
+    if isinstance(loss, str):
+        raise InputError(f"the residuals' loss is {quoted(loss)}; expected an rts.Loss, or None")
+    # Objects of other classes may mean anything by the name.
+    return loss if isinstance(loss, Loss) else SQUARE
+
+
+def _check_method(method: str, loss: Callable | None, steps: int | None, learning_rate: float | None) -> None:
     if not isinstance(method, str) or method not in STEPS:
         raise InputError(f"method is {quoted(method)}; expected one of {', '.join(STEPS)}")
-    if method == "lm" and loss is not mean_square:
-        raise InputError('method "lm" minimises the mean square and takes no other loss; use "adam", or leave out loss')
+    if method == "lm" and not (loss is None or isinstance(loss, Loss)):
+        raise InputError(
+            f'method "lm" takes no loss but an rts.Loss, such as rts.Loss("huber", f_scale=0.1); it is {quoted(loss)}: '
+            f'use "adam", or leave it out'
+        )
     if steps is not None:
         _check_count("steps", steps)
     if learning_rate is not None and not (is_real(learning_rate) and 0 < learning_rate < math.inf):

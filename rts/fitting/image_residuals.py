@@ -27,7 +27,8 @@ from rts.checks import (
 from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting
 from rts.errors import EmptyImageWarning, InputError, warn
 from rts.evaluating import to_fine_splats, to_splats
-from rts.fitting.least_squares import flatten, mean_square, normal_equations
+from rts.fitting.least_squares import flatten, normal_equations
+from rts.fitting.losses import Loss
 from rts.fitting.names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.interfaces import CheckedPart, Part, Residuals, Splatter
@@ -70,14 +71,19 @@ class ImageResiduals(Residuals):
         capacity: as in `render`.
         channels: C of the image, as the scene's shaders say it. Where it is not 3, Levenberg–Marquardt takes the
             Jacobian.
+        loss: what becomes of each residual, named as in `scipy.optimize.least_squares`: "linear" (its square), or
+            "soft_l1", "huber" or "cauchy", to which large residuals count less: where part of the target is wrong, such
+            as a mask with something in front. See `Loss`.
+        f_scale: the residual at which square turns into robust, in units of the image times weights; 0.1 suits masks.
 
     Attributes:
         size: (height, width).
+        loss: the `Loss`; that of all stages and views.
         supersample: samples a pixel along each axis, or an `rts.Adaptive`.
 
     Raises:
         InputError: an argument of the wrong kind, shapes that do not fit, integers as target, or a target, weights or
-            background that are not finite.
+            background that are not finite; another `loss`, or a scale that is not positive and finite.
     """
 
     def __init__(
@@ -95,7 +101,10 @@ class ImageResiduals(Residuals):
         supersample: int | Adaptive = 1,
         capacity: int | None = None,
         channels: int = 3,
+        loss: str = "linear",
+        f_scale: float = 1.0,
     ):
+        self.loss: Loss = Loss(loss, f_scale)  # pyright: ignore[reportIncompatibleVariableOverride]  # Never None.
         if not callable(scene):
             raise InputError(f"scene is {quoted(scene)}; expected a function: parameters → parts, or (parts, camera)")
         if camera is not None and not _are_cameras(camera):
@@ -131,7 +140,7 @@ class ImageResiduals(Residuals):
         self._weights = _checked_weights(weights, self._target.shape, self.size)
 
     def __call__(self, parameters: Tree) -> Array:
-        """`weights * (image − target)`, of the target's shape."""
+        """`weights * (image − target)`, of the target's shape, whatever the loss."""
         parts, camera = self.scene(parameters)
         options: dict[str, Any] = dict(
             splatter=self._splatter, supersample=self.supersample, background=self._background, **self._sampling
@@ -226,7 +235,10 @@ class ImageResiduals(Residuals):
         return type(self).__call__ is ImageResiduals.__call__
 
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
-        """Mean square () of the n residuals, JᵀJ / n (U, U) and Jᵀr / n (U,) for the U numbers in the parameters."""
+        """Mean loss () of the n residuals, JᵀSJ / n (U, U) and JᵀWr / n (U,) for the U numbers in the parameters.
+
+        W and S are diagonals, ones for the loss "linear"; see `Loss.weights`.
+        """
         if self._views:
             self.scene(parameters)  # Refused where there are not as many cameras.
             found = [view.normal_equations(parameters) for view in self._views]
@@ -240,31 +252,33 @@ class ImageResiduals(Residuals):
             and splatter.sums_products
             and engine.differentiates
             and self._image_channels == 3
+            and (splatter.takes_losses or not self.loss.robust)
             and (self.supersample == 1 or splatter.averages)
             and not (isinstance(self.supersample, Adaptive) and self.supersample.contrast is not None)
         ):
-            companion.expect(companion.LEAST_SQUARES)
+            mask = self._channels == 1
+            companion.expect(companion.LEAST_SQUARES_OF_MASKS if mask else companion.LEAST_SQUARES)
             found = self._swept(splatter, parameters, engine)
-        return normal_equations(self, parameters, engine) if found is None else found
+        return normal_equations(self, parameters, engine, self.loss) if found is None else found
 
-    def mean_square(self, parameters: Tree) -> Array:
-        """Mean square () of the residuals: a loss to differentiate, which takes less time than that of an image.
+    def mean_loss(self, parameters: Tree) -> Array:
+        """Mean loss () of the residuals, to differentiate; it takes less time than that of an image.
 
         The image is compared with the target as it is made, and neither it nor its gradient is kept. Where that cannot
-        be (several views, `supersample`, a blurred stage, other `channels`, splatters and devices), it is the mean
-        square of what a call gives.
+        be (several views, `supersample`, a blurred stage, other `channels`, splatters and devices), it is the loss of
+        what a call gives.
 
         Args:
             parameters: as in a call.
         """
         splatter = self._splatter
         ordinary = self._ordinary and not self._views and not self._sigma and self._image_channels == 3
-        ordinary = ordinary and self.supersample == 1
-        found = self._compared(splatter, parameters) if ordinary and splatter.sums_squares else None
-        return mean_square(self(parameters)) if found is None else found
+        ordinary = ordinary and self.supersample == 1 and (splatter.takes_losses or not self.loss.robust)
+        found = self._compared(splatter, parameters) if ordinary and splatter.sums_losses else None
+        return self.loss(self(parameters)) if found is None else found
 
     def _compared(self, splatter: Splatter, parameters: Tree) -> Array | None:
-        """`mean_square` by that of the splatter; None where it gives none."""
+        """`mean_loss` by that of the splatter; None where it gives none."""
         parts, camera = self.scene(parameters)
         scene = Scene.of(parts, camera, self._sampling["sampler"], None).at(self.size)
         self._refuse_other(scene.channels)
@@ -275,11 +289,15 @@ class ImageResiduals(Residuals):
         engine = engine_of(splats.rgba, parameters)
         splats = constants(splats, engine, exemplar(parameters))
         target, weights, background = self._constants(splats.positions)
-        found = splatter.mean_square(splats, target, weights, background)
+        found = splatter.mean_loss(splats, target, weights, background, **self._loss_beside())
         row = None if found is None else engine.known(splats.row)
         if row is not None and not (row >= 0).any():
             warn(f"nothing is seen in the image: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
         return found
+
+    def _loss_beside(self) -> dict[str, Loss]:
+        """The argument of a splatter's sums beside those that all take."""
+        return {"loss": self.loss} if self.loss.robust else {}
 
     def _swept(self, splatter: Splatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
         """`normal_equations` by those of the splatter, in the bands that `render` takes; None where it gives none."""
@@ -332,6 +350,7 @@ class ImageResiduals(Residuals):
                 t_positions,
                 t_rgba if colored else None,
                 **fields._asdict(),
+                **self._loss_beside(),
             )
 
         known = {name: getattr(sampled, name) for name in ("row", "part", "facing", "settled", "exit")}

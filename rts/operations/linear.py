@@ -5,12 +5,14 @@ Matrix units of some devices round float32 products to fewer bits: there all is 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from rts.engines import constants, engine_of, exemplar
+from rts.engines import constants, engine_of, exemplar, namespace
 from rts.errors import InputError
+from rts.operations.by_view import index_of_views, of_view, ranges_of_views, rows_in_views
 from rts.operations.operation import Arrays, Operation, Some
 from rts.trees import Array
 
@@ -88,3 +90,78 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
 
 _PACKED: dict[str, Any] = {"differentiable": 2, "packed": (1,), "packed_result": True}
 AFFINE = Operation("rts.affine", specified_affine_map, (2, 2), _shape, _forward, _push, _pull, **_PACKED)
+
+
+# ------------------------------------------------------------------------------------------------- of several views
+
+
+def affine_map_of_views(rows: Array, points: Array, view: Array) -> Array:
+    """Points (N, 3) of several views under the affine map of each: (N, R).
+
+    Args:
+        rows: (B, R, 4), those of each view.
+        points: (N, 3), views one after the other.
+        view: (N,) int32, the view of each point; see `rts.operations.by_view`.
+    """
+    if not is_plain_product(rows, points):
+        return VIEWS(rows, points, view)
+    VIEWS.check_ranks((rows, points, view))
+    found = np.zeros((len(points), rows.shape[1]), np.result_type(rows, points))
+    for b, own in ranges_of_views(view, len(rows)):
+        np.matmul(points[own], rows[b, :, :3].T, out=found[own])
+        found[own] += rows[b, :, 3]
+    return found
+
+
+def _specification_of_views(rows: Array, points: Array, view: Array) -> Array:
+    xp = namespace(points)
+    own = xp.take(rows, index_of_views(view), axis=0)
+    terms = own[..., 0] * points[:, :1], own[..., 1] * points[:, 1:2], own[..., 2] * points[:, 2:]
+    return terms[0] + terms[1] + terms[2] + own[..., 3]
+
+
+def _shape_of_views(rows: tuple[int, ...], points: tuple[int, ...], view: tuple[int, ...]) -> tuple[int, ...]:
+    return points[0], rows[1]
+
+
+def _each_view(operands: Arrays) -> Iterator[tuple[int, slice, Arrays]]:
+    """The number of each view, where its points are, and the operands of its map."""
+    rows, points, view = operands
+    if rows.shape[2] != 4 or points.shape != (len(view), 3):
+        shapes = ", ".join(str(x.shape) for x in operands)
+        raise InputError(f"rows, points and view have shapes {shapes}; expected (B, R, 4), (N, 3) and (N,)")
+    for b, own in ranges_of_views(view, len(rows)):
+        yield b, own, (rows[b], points[own])
+
+
+def _forward_of_views(operands: Arrays, out: np.ndarray) -> None:
+    out[rows_in_views(operands[2]) :] = 0
+    for _, own, given in _each_view(operands):
+        _forward(given, out[own])
+
+
+def _push_of_views(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
+    out[rows_in_views(operands[2]) :] = 0
+    for b, own, given in _each_view(operands):
+        _push(given, [of_view(tangents[0], b), of_view(tangents[1], own)], out[own])
+
+
+def _pull_of_views(operands: Arrays, g: np.ndarray, results: Some) -> None:
+    for b, own, given in _each_view(operands):
+        _pull(given, g[own], [of_view(results[0], b), of_view(results[1], own)])
+
+
+VIEWS = Operation(
+    "rts.affine_of_views",
+    _specification_of_views,
+    ranks=(3, 2, 1),
+    shape=_shape_of_views,
+    forward=_forward_of_views,
+    push=_push_of_views,
+    pull=_pull_of_views,
+    differentiable=2,
+    packed=(1, 2),
+    packed_result=True,
+    used=lambda operands: rows_in_views(operands[2]),
+)
+"""See `affine_map_of_views`."""

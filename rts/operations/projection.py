@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 
 import numpy as np
 
 from rts.engines import namespace
 from rts.errors import InputError
+from rts.operations.by_view import index_of_views, of_view, ranges_of_views, rows_in_views
 from rts.operations.linear import is_plain_product, specified_affine_map
 from rts.operations.operation import Arrays, Operation, Some
 from rts.trees import Array
@@ -31,30 +31,23 @@ def projective_map_of_views(rows: Array, points: Array, view: Array, places: Arr
     Args:
         rows: (B, 4, 4), those of each view.
         points: (N, 3), views one after the other.
-        view: (N,) int32, the number of each point's view, from 1 on; 0 behind all others for rows that are not used.
+        view: (N,) int32, the view of each point; see `rts.operations.by_view`.
         places: (B, 3) of each view what is added to the first and to the second, and by what depth is multiplied.
     """
     if not is_plain_product(rows[0, ...], points):
         return VIEWS(rows, points, view, places)
     xp, found = namespace(points), []
-    for b, own in _ranges(view, len(rows)):
+    for b, own in ranges_of_views(view, len(rows)):
         shown = _specification(rows[b, ...], points[own, :])
         found.append(xp.concat([shown[:, :2] + places[b, :2], shown[:, 2:] * places[b, 2]], axis=1))
     return xp.concat(found)
 
 
-def _ranges(view: np.ndarray, count: int) -> Iterator[tuple[int, slice]]:
-    """The numbers of so many views, from 0 on, and where the points of each are."""
-    ends = np.searchsorted(view[: np.count_nonzero(view)], np.arange(1, count + 2))
-    return enumerate(itertools.starmap(slice, itertools.pairwise(ends.tolist())))
-
-
 def _specification(rows: Array, points: Array) -> Array:
-    divisor = specified_affine_map(rows[2:3, :], points)
-    xp = namespace(divisor)
+    mapped = specified_affine_map(rows, points)
+    xp, divisor = namespace(mapped), mapped[:, 2:3]
     safe = xp.where(divisor == 0, xp.ones_like(divisor), divisor)
-    depth = specified_affine_map(rows[3:, :], points)
-    return xp.concat([specified_affine_map(rows[:2, :], points) / safe, depth], axis=1)
+    return xp.concat([mapped[:, :2] / safe, mapped[:, 3:]], axis=1)
 
 
 def _shape(rows: tuple[int, ...], points: tuple[int, ...]) -> tuple[int, ...]:
@@ -106,7 +99,7 @@ PROJECTION = Operation(
 
 
 def _specification_of_views(rows: Array, points: Array, view: Array, places: Array) -> Array:
-    xp, index = namespace(points), view - namespace(view).astype(view > 0, view.dtype)
+    xp, index = namespace(points), index_of_views(view)
     rows, places, points = xp.take(rows, index, axis=0), xp.take(places, index, axis=0), points[:, None, :]
     x, y, divisor, depth = xp.unstack(xp.sum(rows[..., :3] * points, axis=-1) + rows[..., 3], axis=1)
     safe = xp.where(divisor == 0, xp.ones_like(divisor), divisor)
@@ -125,16 +118,12 @@ def _each_view(operands: Arrays) -> Iterator[tuple[int, slice, Arrays, np.ndarra
         raise InputError(
             f"rows, points, view and places have shapes {shapes}; expected (B, 4, 4), (N, 3), (N,) and (B, 3)"
         )
-    for b, own in _ranges(view, len(rows)):
+    for b, own in ranges_of_views(view, len(rows)):
         yield b, own, (rows[b], points[own]), places[b]
 
 
-def _at(x: np.ndarray | None, place: int | slice) -> np.ndarray | None:
-    return None if x is None else x[place]
-
-
 def _forward_of_views(operands: Arrays, out: np.ndarray) -> None:
-    out[np.count_nonzero(operands[2]) :] = 0
+    out[rows_in_views(operands[2]) :] = 0
     for _, own, given, place in _each_view(operands):
         found = out[own]
         _forward(given, found)
@@ -143,20 +132,16 @@ def _forward_of_views(operands: Arrays, out: np.ndarray) -> None:
 
 
 def _push_of_views(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
-    out[np.count_nonzero(operands[2]) :] = 0
+    out[rows_in_views(operands[2]) :] = 0
     for b, own, given, place in _each_view(operands):
-        _push(given, [_at(tangents[0], b), _at(tangents[1], own)], out[own])
+        _push(given, [of_view(tangents[0], b), of_view(tangents[1], own)], out[own])
         out[own, 2] *= place[2]
 
 
 def _pull_of_views(operands: Arrays, g: np.ndarray, results: Some) -> None:
     for b, own, given, place in _each_view(operands):
         gradient = g[own] if place[2] == 1 else g[own] * np.array([1, 1, place[2]], g.dtype)
-        _pull(given, gradient, [_at(results[0], b), _at(results[1], own)])
-
-
-def _used_of_views(operands: Arrays) -> int:
-    return int(np.count_nonzero(operands[2]))
+        _pull(given, gradient, [of_view(results[0], b), of_view(results[1], own)])
 
 
 VIEWS = Operation(
@@ -170,6 +155,6 @@ VIEWS = Operation(
     differentiable=2,
     packed=(1, 2),
     packed_result=True,
-    used=_used_of_views,
+    used=lambda operands: rows_in_views(operands[2]),
 )
 """See `projective_map_of_views`."""

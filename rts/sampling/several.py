@@ -14,24 +14,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.adapting import adapted
 from rts.camera import Camera
 from rts.checks import check_memory, suited_sampler
-from rts.engines import engine_of, is_constant, namespace, stopped, suiting, value_of
-from rts.interfaces import CheckedPart, Needed, Shader, Splatter, TriangleSurface
+from rts.engines import engine_of, is_traced, namespace, stopped, value_of
+from rts.interfaces import CheckedPart, Needed, Splatter, TriangleSurface
 from rts.records import ArraySpec, Fragments, Sampled, Samples
 from rts.sampling.cache import Entry
 from rts.sampling.extremes import largest
 from rts.sampling.facing import facing_of_views
+from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.merging import merge
 from rts.sampling.packing import FAR, lift
 from rts.sampling.pruning import prune
 from rts.sampling.scenes import Scene, apron_of, widened
-from rts.sampling.triangle_sampler import Shape, TriangleSampler, attribute_specs
-from rts.sampling.validation import check_camera, check_fragments, checked_pieces
+from rts.sampling.triangle_sampler import TriangleSampler
+from rts.sampling.validation import check_fragments, checked_pieces
 from rts.splatting.side_by_side import Picture, depth_scales
 from rts.threads import each
-from rts.trees import Array, leaves, map_leaves
+from rts.trees import Array
 
 
 class Views(NamedTuple):
@@ -108,92 +108,82 @@ class Sampling(NamedTuple):
         apron, cells = apron_of(self.splatter), (self.side * self.size[0], self.side * self.size[1])
         wides = [widened(scene, scene.camera, cells, apron) for scene in self.scenes]
         cameras = [stopped(wide.camera.within(part.transform)) for wide in wides]
-        surface, theta, picture, layers = part.surface, part.theta, self.picture, self.layers
+        surface, picture, layers = part.surface, self.picture, self.layers
         assert isinstance(surface, TriangleSurface)
-        engine, like = suiting(theta, cameras)
         tells = self.splatter.reads_facing and layers > 1 and part.cull == "none" and surface.tells_pieces
-        inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
-        reads = {name: theta[name] for name in surface.reads(theta)}
-        host_theta = reads if engine.differentiates and is_constant(reads) else None
-        shader = adapted(part.shader, Shader)
-        asked = None if shader is None else shader.reads
         capacity = None if self.capacity is None else picture.views * self.capacity
         shape = Shape(layers, picture.size, capacity, picture.size)
-        attributes = attribute_specs(surface, asked, host_theta, shape, like)
-        transform = [] if part.transform is None else [part.transform]
+        beside = {
+            "view": shape.row_spec(np.int32),
+            "scales": ArraySpec((picture.views,), np.float32),
+            **({"facing": ArraySpec((layers, *picture.size), np.int16)} if tells else {}),
+            **({"settled": ArraySpec(picture.size, np.bool_)} if pruning.settles else {}),
+        }
 
-        def host(*arrays: np.ndarray) -> tuple[Any, ...]:
-            it = iter(arrays)
-            own = [Camera(np.asarray(next(it), np.float64), np.asarray(next(it), np.float64)) for _ in cameras]
-            moved = [next(it) for _ in transform]
-            own = [check_camera(camera, *moved) for camera in own]
-            given = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
-            with sampler._keeper.lock:
-                known = entry or sampler._entry(surface, given, own[0], picture.view)
-                alone = sampler.follows or not sampler.concurrent
-                fragments = _drawn(sampler, known, own, picture, layers, part.cull) if alone else None
-            fragments = fragments or _drawn(sampler, known, own, picture, layers, part.cull)
-            size = known.size or largest(known.proxy.vertices)
-            kept, settled, scales = pruning.asked(fragments, size)
-            sides = []
+        def find(own: Sequence[Camera], inputs: Any) -> tuple[Samples, dict[str, np.ndarray]]:
+            def drawn(known: Entry) -> tuple[Entry, Fragments]:
+                return known, _drawn(sampler, known, own, picture, layers, part.cull)
+
+            known, fragments = sampler.working_on(surface, inputs, own[0], picture.view, entry, drawn)
+            kept, more = pruning.asked(fragments, known.size or largest(known.proxy.vertices))
             if tells:
                 pieces = checked_pieces(surface, known.proxy) if kept[1:].any() else np.zeros(1, np.int16)
-                sides = [facing_of_views(fragments, kept, known.proxy, pieces, own, picture.view)]
+                more["facing"] = facing_of_views(fragments, kept, known.proxy, pieces, own, picture.view)
             over = 0 if self.capacity is None else _leave_out(kept, picture, self.capacity)
             found = lift(fragments, known.proxy, capacity, kept, 0.0, views=(picture.down, picture.across))
             counts = _counts(found.row, len(found.ids) if capacity is None else 0, picture)
-            view = np.zeros(len(found.ids), np.int32)
-            view[: counts.sum()] = np.repeat(np.arange(1, picture.views + 1), counts)
-            gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
-            return (
-                *(found.ids, found.params, found.row, found.depth, np.asarray(over, np.int32), view, scales),
-                *(*sides, *settled),
-                *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
-            )
+            more["view"] = _numbers(counts, len(found.ids))
+            return replace(found, overflow=np.asarray(over, np.int32)), more
 
-        marks = shape.row_spec(np.int32), ArraySpec((picture.views,), np.float32)
-        sides = [ArraySpec((layers, *picture.size), np.int16)] if tells else []
-        amid = [ArraySpec(picture.size, np.bool_)] if pruning.settles else []
-        specs = *shape.specs(surface.sample_widths), *marks, *sides, *amid, *attributes.values()
-        matrices = [m for camera in cameras for m in (camera.view, camera.projection)]
-        results = engine.call_host(host, specs, *matrices, *transform, *leaves(inputs))
-        rest = 7 + len(sides) + len(amid)
-        samples = Samples(
-            *results[:5],
-            gbuffer=dict(zip(attributes, results[rest:], strict=True)) if host_theta is not None else None,
-            asked=asked,
-            centered=surface.centered,
-            facing=results[7] if tells else None,
-            settled=results[rest - 1] if amid else None,
-        )
-        return samples, results[5], results[6]
+        samples, more = HostCall(part, surface, cameras, shape, entry).samples(find, beside)
+        view, scales = more.pop("view"), more.pop("scales")
+        return replace(samples, **more), view, scales
 
 
 def sampled_as_one(given: Sampling) -> Views:
-    """The views of a scene, sampled as one picture. Of several parts values must be known."""
+    """The views of a scene, sampled as one picture."""
     needed, parts, picture = given.needed(), given.parts(), given.picture
     pruning = _Pruning(needed, picture)
     found = [given.of_part(*part, pruning if len(parts) == 1 else _Pruning(None, picture)) for part in parts]
     sampled, scales = merge([samples for samples, _, _ in found], given.layers), found[0][2]
     if len(parts) > 1:
         scales = _scales_of(sampled.depth, picture)
-        sampled = sampled if needed is None else prune(sampled, pruning)
+        sampled = sampled if needed is None or is_traced(sampled.row) else prune(sampled, pruning)
     sampled = replace(sampled, supersample=given.side, apron=apron_of(given.splatter))
-    if engine_of(sampled.row).padded(sampled.row):
-        return Views(sampled, picture, tuple(view for _, view, _ in found), None, scales)
+    padded, view = engine_of(sampled.row).padded(sampled.row), tuple(own for _, own, _ in found)
+    if is_traced(sampled.row) or (padded and len(parts) == 1):
+        return Views(sampled, picture, view, None, scales)
     if len(parts) == 1:
-        view = found[0][1]
-        counts = np.bincount(engine_of(view).to_numpy(view), minlength=picture.views + 1)[1:]
-        return Views(sampled, picture, (view,), (counts,), scales)
+        counts = np.bincount(engine_of(view[0]).to_numpy(view[0]), minlength=picture.views + 1)[1:]
+        return Views(sampled, picture, view, (counts,), scales)
+    if padded:
+        return Views(sampled, picture, tuple(_views_of(s, picture) for s in sampled.samples), None, scales)
     counts = tuple(_counts(value_of(s.row), s.ids.shape[0], picture) for s in sampled.samples)
     return _with_counts(sampled, picture, scales, counts)
+
+
+def _views_of(samples: Samples, picture: Picture) -> Array:
+    """(N,) the view of each row in a table of a part, of which each stands in one cell; 0 for others."""
+    size = samples.ids.shape[0]
+
+    def host(row: np.ndarray) -> tuple[np.ndarray]:
+        return (_numbers(_counts(row, 0, picture), size),)
+
+    return engine_of(samples.row).call_host(host, [ArraySpec((size,), np.int32)], samples.row)[0]
+
+
+def _numbers(counts: np.ndarray, size: int) -> np.ndarray:
+    """(size,) int32, the number of each row's view, from 1 on, of so many rows each; 0 for those that are left."""
+    found = np.zeros(size, np.int32)
+    found[: counts.sum()] = np.repeat(np.arange(1, len(counts) + 1), counts)
+    return found
 
 
 def _with_counts(sampled: Sampled, picture: Picture, scales: Array, counts: tuple[np.ndarray, ...]) -> Views:
     """Views whose samples are known, and all used."""
     constant = engine_of(sampled.row).constant
-    view = [np.repeat(np.arange(1, picture.views + 1, dtype=np.int32), own) for own in counts]
-    return Views(sampled, picture, tuple(constant(own) for own in view), counts, scales)
+    view = tuple(constant(_numbers(own, own.sum())) for own in counts)
+    return Views(sampled, picture, view, counts, scales)
 
 
 def _leave_out(kept: np.ndarray, picture: Picture, capacity: int) -> int:
@@ -286,7 +276,9 @@ def _drawn(
 ) -> Fragments:
     """The fragments (K, height, width) of the picture: views on all cores, if the sampler is `concurrent`."""
     shape, faces, places = (layers, *picture.size), len(known.proxy.faces), picture.places()
-    found = Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
+    # One array for them all: where such are allotted anew in each call, the system gives fewer pages.
+    numbers = np.empty((4, *shape), np.float32)
+    found = Fragments(numbers[0].view(np.int32), numbers[1:3].reshape(*shape, 2), numbers[3])
     if not faces or len(places) < picture.down * picture.across:
         for x, nothing in zip(found, (-1, 0, 0), strict=True):
             x[...] = nothing
@@ -299,7 +291,7 @@ def _drawn(
         for to, x in zip(found, own, strict=True):
             to[:, *places[b]] = x
 
-    if sampler.concurrent and not sampler.follows:
+    if sampler.draws_at_once:
         each(draw, range(len(cameras)))
     else:
         for b in range(len(cameras)):
@@ -327,8 +319,8 @@ class _Pruning:
         """See `Needed`."""
         return self._asked(covered, depth, 0.0)[0]
 
-    def asked(self, fragments: Fragments, size: float) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-        """Which fragments (K, height, width) are needed; `Needed.settled`, if it `settles`; and scales of depths (B,).
+    def asked(self, fragments: Fragments, size: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Which fragments (K, height, width) are needed; and "scales" (B,) of depths, and "settled", if it `settles`.
 
         Args:
             fragments: of the picture.
@@ -337,11 +329,12 @@ class _Pruning:
         covered = fragments.triangle_ids >= 0
         kept, depth, scales = self._asked(covered, fragments.depth, size)
         if not self.settles:
-            return kept, [], scales
-        if depth is None:
-            return kept, [np.zeros(covered.shape[1:], bool)], scales
-        assert self._near is not None
-        return kept, [self._near.settled(covered, depth, kept, 0.0)], scales
+            return kept, {"scales": scales}
+        settled = np.zeros(covered.shape[1:], bool)
+        if depth is not None:
+            assert self._near is not None
+            settled = self._near.settled(covered, depth, kept, 0.0)
+        return kept, {"scales": scales, "settled": settled}
 
     def _asked(
         self, covered: np.ndarray, depth: np.ndarray, size: float
@@ -372,11 +365,13 @@ def _largest(depth: np.ndarray, picture: Picture) -> np.ndarray:
     return sizes.reshape(layers, picture.down, height, -1).max(axis=(0, 2)).reshape(-1)[: picture.views]
 
 
-def _scales_of(depth: Array, picture: Picture) -> np.ndarray:
-    """The `depth_scales` of the depths (K, height, width) of views, which are known."""
-    known = value_of(depth)
-    assert known is not None
-    return depth_scales(_largest(known, picture))
+def _scales_of(depth: Array, picture: Picture) -> Array:
+    """The `depth_scales` of the depths (K, height, width) of views."""
+
+    def host(depth: np.ndarray) -> tuple[np.ndarray]:
+        return (depth_scales(_largest(depth, picture)),)
+
+    return engine_of(depth).call_host(host, [ArraySpec((picture.views,), np.float32)], depth)[0]
 
 
 def _counts(row: np.ndarray | None, rows: int, picture: Picture) -> np.ndarray:

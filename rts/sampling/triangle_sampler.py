@@ -5,24 +5,27 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
 from rts.adapting import adapted, unwrapped
 from rts.camera import Camera
-from rts.engines import engine_of, is_constant, namespace, stopped, suiting
+from rts.engines import engine_of, stopped
 from rts.errors import InputError
-from rts.interfaces import AnyNeeded, Needed, Part, Sampler, Shader, TriangleSurface, as_surface
+from rts.interfaces import AnyNeeded, Needed, Part, Sampler, TriangleSurface, as_surface
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines
 from rts.sampling.extremes import largest
 from rts.sampling.facing import facing as facing_of
+from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.packing import lift, repack
 from rts.sampling.settling import on_surface, refined
-from rts.sampling.validation import check_camera, check_faces, check_fragments, checked_pieces, checked_proxy
+from rts.sampling.validation import check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
+
+_T = TypeVar("_T")
 
 LEAST_LAYERS = 3
 """Where a surface refines its samples, so many layers of triangles are looked for, or one more than samples are asked
@@ -223,65 +226,29 @@ class TriangleSampler(Sampler):
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
         """
-        surface, theta, camera = _of_triangles(part.surface), part.theta, camera.for_size(size)
-        engine, like = suiting(theta, camera)
+        surface, camera = _of_triangles(part.surface), camera.for_size(size)
         shape = Shape(layers, size if cells is None else tuple(cells.shape), capacity, size)
         tells = facing and layers > 1 and part.cull == "none" and surface.tells_pieces
         tells = tells and not (surface.refines and surface.refine_moves)
         exits = exits and part.cull == "back" and cells is None and not surface.refines
-        listed = [] if cells is None else [cells]
-        inputs = surface.proxy_inputs(stopped(theta)) if entry is None else None
-        reads = {name: theta[name] for name in surface.reads(theta)}
-        host_theta = reads if engine.differentiates and is_constant(reads) else None
         tables = shape.tables(surface) if surface.refines else {}
-        shader = adapted(part.shader, Shader)
-        asked = None if shader is None else shader.reads
         wanted: Needed | None = None if needed is None else adapted(needed, Needed)
         settles = wanted is not None and wanted.settles and not surface.refines
-        attributes = attribute_specs(surface, asked, host_theta, shape, like)
+        beside = {
+            **({"facing": ArraySpec((layers, *shape.size), np.int16)} if tells else {}),
+            **({"settled": ArraySpec(shape.size, np.bool_)} if settles else {}),
+            **({"exit": ArraySpec(size, np.int32)} if exits else {}),
+        }
 
-        transform = [] if part.transform is None else [part.transform]
+        def find(cameras: Sequence[Camera], inputs: Tree, *cells: np.ndarray) -> tuple[Samples, dict[str, Any]]:
+            own = np.asarray(cells[0], np.int32) if cells else None
+            given = shape, tables, wanted, entry, own, tells, exits
+            found = self._found(surface, part.cull, inputs, cameras[0], *given)
+            return found, {name: getattr(found, name) for name in beside}
 
-        def host(view: np.ndarray, projection: np.ndarray, *rest: np.ndarray) -> tuple[Any, ...]:
-            it = iter(rest[len(transform) + len(listed) :])
-            host_cells = np.asarray(rest[len(transform)], np.int32) if listed else None
-            host_inputs = map_leaves(lambda _: next(it), inputs) if entry is None else entry.inputs
-            host_camera = Camera(np.asarray(view, np.float64), np.asarray(projection, np.float64))
-            host_camera = check_camera(host_camera, *rest[: len(transform)])
-            given = shape, tables, wanted, entry, host_cells, tells, exits
-            found = self._found(surface, part.cull, host_inputs, host_camera, *given)
-            gbuffer = surface.evaluate(host_theta, found) if host_theta is not None else {}
-            return (
-                found.ids,
-                found.params,
-                found.row,
-                found.depth,
-                found.overflow,
-                *([found.facing] if tells else []),
-                *([found.settled] if settles else []),
-                *([found.exit] if exits else []),
-                *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
-                *(np.asarray(gbuffer[name], spec.dtype) for name, spec in attributes.items()),
-            )
-
-        sides = [ArraySpec((layers, *shape.size), np.int16)] if tells else []
-        amid = [ArraySpec(shape.size, np.bool_)] if settles else []
-        behind = [ArraySpec(size, np.int32)] if exits else []
-        specs = *shape.specs(surface.sample_widths), *sides, *amid, *behind, *tables.values(), *attributes.values()
-        results = engine.call_host(host, specs, camera.view, camera.projection, *transform, *listed, *leaves(inputs))
-        first = 5 + len(sides) + len(amid) + len(behind)
-        rest = first + len(tables)
-        return Samples(
-            *results[:5],
-            tables=dict(zip(tables, results[first:rest], strict=True)),
-            gbuffer=dict(zip(attributes, results[rest:], strict=True)) if host_theta is not None else None,
-            asked=asked,
-            centered=surface.centered,
-            by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
-            facing=results[5] if tells else None,
-            settled=results[5 + len(sides)] if settles else None,
-            exit=results[first - 1] if exits else None,
-        )
+        call = HostCall(part, surface, [camera], shape, entry)
+        samples, more = call.samples(find, beside, tables, [] if cells is None else [cells])
+        return replace(samples, **more)
 
     def _found(
         self,
@@ -393,55 +360,37 @@ class TriangleSampler(Sampler):
                 check_fragments(backs, (1, *asked.shape), count, self)
             return found, fragments, kept, Exits.of(fragments, asked, backs)
 
+        return self.working_on(surface, inputs, camera, view, entry, all_of)
+
+    def working_on(
+        self,
+        surface: TriangleSurface,
+        inputs: Tree,
+        camera: Camera,
+        view: tuple[int, int],
+        entry: Entry | None,
+        work: Callable[[Entry], _T],
+    ) -> _T:
+        """What `work` gives for what is prepared of a surface, which no other thread changes meanwhile.
+
+        Args:
+            surface: the surface.
+            inputs: of its proxy, on the host.
+            camera: the camera.
+            view: (height, width) of the grid of cells.
+            entry: what is prepared, if it is known.
+            work: may be called by several threads at once where several may draw.
+        """
         with self._keeper.lock:
             found = entry or self._entry(surface, inputs, camera, view)
-            if self.follows or not self.concurrent:
-                return all_of(found)
-        return all_of(found)
-
-
-class Shape(NamedTuple):
-    """How many samples there may be.
-
-    Attributes:
-        layers: K.
-        size: lines and columns of the samples: of the grid, or of the list of its cells.
-        capacity: rows to allot, or None for as many as there are.
-        view: (height, width) of the grid.
-    """
-
-    layers: int
-    size: tuple[int, int]
-    capacity: int | None
-    view: tuple[int, int]
+            if not self.draws_at_once:
+                return work(found)
+        return work(found)
 
     @property
-    def rows(self) -> int:
-        """The largest number of samples."""
-        return self.layers * self.size[0] * self.size[1] if self.capacity is None else self.capacity
-
-    def row_spec(self, dtype: Any, *widths: int) -> ArraySpec:
-        """The spec of an array with a row for each sample."""
-        return ArraySpec((self.rows, *widths), dtype, self.capacity is None)
-
-    def tables(self, surface: TriangleSurface) -> dict[str, ArraySpec]:
-        """The specs of what a surface's `refine` fills."""
-        specs = dict(surface.table_specs(self.layers * self.size[0] * self.size[1], self.capacity))
-        for name, spec in specs.items():
-            if spec.by_sample:
-                specs[name] = self.row_spec(spec.dtype, *spec.shape[1:])._replace(by_sample=True)
-        return specs
-
-    def specs(self, widths: tuple[int, int]) -> tuple[ArraySpec, ...]:
-        """The specs of ids, params, row, depth and overflow."""
-        grid = self.layers, *self.size
-        return (
-            self.row_spec(np.int32, widths[0]),
-            self.row_spec(np.float32, widths[1]),
-            ArraySpec(grid, np.int32),
-            ArraySpec(grid, np.float32),
-            ArraySpec((), np.int32),
-        )
+    def draws_at_once(self) -> bool:
+        """Whether several threads may draw what is prepared of one surface at once."""
+        return self.concurrent and not self.follows
 
 
 def _of_triangles(given: Any) -> TriangleSurface:
@@ -452,31 +401,6 @@ def _of_triangles(given: Any) -> TriangleSurface:
             f"{given!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
         )
     return surface
-
-
-def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
-    """A table with zeros added up to the number of rows that its spec fixes."""
-    if spec.packed or len(table) == spec.shape[0]:
-        return table
-    return np.concatenate([table, np.zeros((spec.shape[0] - len(table), *table.shape[1:]), table.dtype)])
-
-
-def attribute_specs(
-    surface: TriangleSurface, asked: Sequence[str] | None, host_theta: Mapping | None, shape: Shape, like: Array | None
-) -> dict[str, ArraySpec]:
-    """The attributes to evaluate on the host for a surface that is constant: those its shader reads."""
-    if host_theta is None:
-        return {}
-    real = np.float64 if like is not None and namespace(like).finfo(like.dtype).bits == 64 else np.float32
-    if asked is not None and not asked:
-        return {"position": shape.row_spec(real, 3)}
-    i, p = surface.sample_widths
-    none = np.full((1, 1, 1), -1, np.int32)
-    tables = {name: np.zeros((1, *spec.shape[1:]), spec.dtype) for name, spec in shape.tables(surface).items()}
-    one = Samples(np.zeros((1, i), np.int32), np.zeros((1, p), np.float32), none, none, np.int32(0), tables)
-    gbuffer = surface.evaluate(host_theta, one)
-    names = list(gbuffer) if asked is None else ["position", *(n for n in asked if n in gbuffer)]
-    return {n: shape.row_spec(real, *gbuffer[n].shape[1:]) for n in dict.fromkeys(names)}
 
 
 def _no_fragments(shape: tuple[int, int, int]) -> Fragments:

@@ -36,9 +36,19 @@ class Picture(NamedTuple):
 
     @classmethod
     def of(cls, count: int, view: tuple[int, int]) -> Picture:
-        """A picture of so many views, about as high as wide."""
+        """A picture of so many views, about as high as wide, with few places left over."""
         down, most = (max(1, SIDE // n) for n in view)
-        across = min(max(round(math.sqrt(count * view[0] / view[1])), -(-count // down)), most, count)
+        even = math.sqrt(count * view[0] / view[1])
+        # From half as wide to twice as wide as high.
+        least, most = (
+            max(-(-count // down), min(round(n), most, count)) for n in (even / math.sqrt(2), even * math.sqrt(2))
+        )
+
+        def cost(across: int) -> tuple[int, int]:
+            lines = -(-count // across)
+            return lines * across, max(lines * view[0], across * view[1])
+
+        across = min(range(least, most + 1), key=cost)
         return cls(count, view, -(-count // across), across)
 
     @property

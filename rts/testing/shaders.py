@@ -12,6 +12,7 @@ from rts.adapting import adapted
 from rts.engines import Engine, constants, engine_of
 from rts.gbuffer import GBuffer
 from rts.interfaces import Shader
+from rts.row_cameras import RowCameras
 from rts.testing import derivatives, scenes
 from rts.testing.claims import claim, claim_close, claim_finite, no_error, refusal
 from rts.testing.conformance import Conformance
@@ -110,6 +111,22 @@ class ShaderConformance(Conformance):
         with no_error(f"shading with position, {', '.join(reads)} only, as `reads` says"):
             found = _shaded(shader, theta, fewer)
         claim_close(found, _shaded(shader, theta, gbuffer), 0, "the colour without what is not in `reads`")
+
+    def test_samples_of_several_views_are_shaded_as_by_each(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
+        """A shader that takes samples of several views gives each the colour that it has through its own camera."""
+        own: Any = _instance(shader)
+        if not own.takes_views:
+            pytest.skip("the shader does not take samples of several views")
+        claim(
+            own.reads is not None, "the shader takes samples of several views; expected it to say what it `reads`, too"
+        )
+        cameras, single = [scenes.CAMERA, scenes.NEAR], map_leaves(derivatives.single, theta)
+        number = np.repeat(np.array([1, 2], np.int32), [ROWS // 4, ROWS - ROWS // 4])
+        with no_error("shading samples of two views with rts.RowCameras"):
+            found = own(single, GBuffer(gbuffer), RowCameras.of(cameras, number))
+        first, second = (np.asarray(own(single, GBuffer(gbuffer), camera)) for camera in cameras)
+        expected = np.where(number[:, None] == 1, first, second)
+        claim_close(found, expected, TOLERANCE, "the colour of samples of two views")
 
     # -------------------------------------------------------------------------------------- derivatives
 

@@ -23,7 +23,8 @@ from rts_backends.fused import choices as listing
 from rts_backends.fused import crossing_pairs, crossings, mixed, outlines, stencil
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
-from rts_backends.fused.survey import BLOCK, collect, paint, survey
+from rts_backends.fused.pairs import BLOCK
+from rts_backends.fused.survey import collect, paint, survey
 
 
 class Settings(NamedTuple):
@@ -169,30 +170,30 @@ class Cells:
         counts = np.zeros(height, np.int64)
         depths = np.zeros((height, 2), kind)
         fronts = self.visible or layers == 1
-        noted = states, hidden, depths, seen, counts
+        marks, marked = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
+        noted = states, hidden, depths, seen, counts, marks if self.visible and layers > 1 else marks[:0], marked
         given = self.positions, self.rgba, self.row, fronts, self._reach
-        parallel(survey, height, *given, *noted, work=2 * self.row.size)
+        parallel(survey, height, *given, *noted, work=3 * self.row.size)
         leaves = self.exits[self.exits >= 0]
         seen[leaves] = 1
         repeated = int(np.count_nonzero(seen)) != int(counts.sum()) + len(leaves)
-        marks, counts = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
         if self._wanted is not None:
             states *= self._wanted | self.settled if len(self.settled) else self._wanted
         least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
         # See `rts.splatting.layers`: nothing is nearer to what is beyond everything than to a front.
         extent = largest - least
         beyond = 2 * extent if least < 0 or largest > 0 else kind.type(1)
-        if layers > 1:
-            given = self.row, self.visible, beyond, hidden, states
-            parallel(listing.find, height, self.positions, *given, marks, counts, work=self.row.size)
-            # How an outline moves is decided by pairs up to two cells away.
-            if self._wanted is not None:
-                found, marks = marks, np.empty_like(marks)
-                parallel(listing.narrow, height, found, self._wanted, marks, counts, work=self.row[0].size)
-            if len(self.settled) and not self.visible:
-                marks &= ~self.settled
-                counts = marks.sum(axis=1, dtype=np.int64)
-        offsets = np.concatenate([[0], np.cumsum(counts)])
+        if layers > 1 and not self.visible:
+            given = self.positions, self.row, beyond, hidden, states
+            parallel(listing.find, height, *given, marks, marked, work=self.row.size)
+        # How an outline moves is decided by pairs up to two cells away.
+        if layers > 1 and self._wanted is not None:
+            found, marks = marks, np.empty_like(marks)
+            parallel(listing.narrow, height, found, self._wanted, marks, marked, work=self.row[0].size)
+        if len(self.settled) and not self.visible:
+            marks &= ~self.settled
+            marked = marks.sum(axis=1, dtype=np.int64)
+        offsets = np.concatenate([[0], np.cumsum(marked)])
         columns = np.empty(offsets[-1], np.int32)
         ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
         sums = np.empty((offsets[-1], 3, 5), kind)

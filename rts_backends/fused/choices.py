@@ -13,7 +13,8 @@ import numpy as np
 from rts.compiling import compiled, kernel
 from rts.records import MORE
 from rts_backends.fused.mixed import sums_of
-from rts_backends.fused.survey import BLOCK, BUSY, EMPTY
+from rts_backends.fused.pairs import BLOCK, mark
+from rts_backends.fused.survey import BUSY, EMPTY
 
 
 @compiled
@@ -32,15 +33,14 @@ def _depths(z, at, positions, row, y, x, beyond):
 
 
 @kernel
-def find(start, stop, positions, row, visible, beyond, hidden, states, mixed, counts):
-    """Mark mixed targets (H, W), and count those of each row.
+def find(start, stop, positions, row, beyond, hidden, states, mixed, counts):
+    """Mark mixed targets (H, W) of `Multi`, and count those of each row. `survey` finds those of `Visible`.
 
     Args:
         start: first row.
         stop: end of the rows.
         positions: (N, 3).
         row: (K, H, W).
-        visible: whether the splatter is `Visible`.
         beyond: depth of layers that are not covered; no two layers are farther apart than each is from it.
         hidden: (H, B) uint8, the blocks of columns in or beside which hidden layers are covered.
         states: (H, W) of `survey.py`.
@@ -48,50 +48,14 @@ def find(start, stop, positions, row, visible, beyond, hidden, states, mixed, co
         counts: (H,) zeros, to be filled.
     """
     layers, height, width = row.shape
-    z, target = np.empty((3, layers, BLOCK + 2), positions.dtype), np.empty((layers, BLOCK), positions.dtype)
-    loaded = np.empty(3, np.int64)
-    for b in range(hidden.shape[1]):
-        left, right = b * BLOCK, min((b + 1) * BLOCK, width)
-        loaded[:] = -9
-        for y in range(start, stop):
-            marks = mixed[y, left:right]
-            marks[:] = 0
+    blocks, kind = hidden.shape[1], positions.dtype
+    z, target = np.empty((3, layers, width + 2), kind), np.empty((layers, BLOCK), kind)
+    asked, loaded = np.empty(blocks, np.uint8), np.full((3, blocks), -9, np.int64)
+    for y in range(start, stop):
+        for b in range(blocks):
             near = hidden[max(y - 1, 0), b] | hidden[y, b] | hidden[min(y + 1, height - 1), b]
-            if not (near or (not visible and _any(states[y, left:right]))):
-                continue
-            for v in range(y - 1, y + 2):
-                if loaded[(v + 3) % 3] != v:
-                    loaded[(v + 3) % 3] = v
-                    _load(z[(v + 3) % 3], positions, row, v, left - 1, right + 1, beyond)
-            for k in range(layers):
-                for x in range(right - left):
-                    d = z[y % 3, k, x + 1]
-                    target[k, x] = d if d == d else beyond
-            for k in range(1, layers):
-                above, level, below = z[(y + 2) % 3], z[y % 3], z[(y + 1) % 3]
-                _mark(marks, above[0], level[0], below[0], above[k], level[k], below[k], target[0], target[k])
-            if visible:
-                for x in range(left, right):
-                    if row[0, y, x] < 0:
-                        mixed[y, x] = 0
-            counts[y] += marks.sum()
-
-
-@compiled
-def _load(z, positions, row, y, first, last, beyond):
-    """Depths of some cells of a row into z (K, ·): NaN where one holds nothing, `beyond` where it lacks the layer."""
-    layers, height, width = row.shape
-    nothing = z.dtype.type(np.nan)
-    for x in range(first, last):
-        some = False
-        if 0 <= y < height and 0 <= x < width:
-            for k in range(layers):
-                some |= row[k, y, x] >= 0
-        for k in range(layers):
-            z[k, x - first] = nothing
-            if some:
-                i = row[k, y, x]
-                z[k, x - first] = positions[i, 2] if i >= 0 else beyond
+            asked[b] = near | np.uint8(_any(states[y, b * BLOCK : (b + 1) * BLOCK]))
+        counts[y] = mark(mixed[y], asked, positions, row, y, beyond, z, loaded, target)
 
 
 @compiled
@@ -100,29 +64,6 @@ def _any(states):
     for state in states:
         most = max(most, state)
     return most == BUSY
-
-
-# Rows are handed over once, not for each source: to make views of so few cells takes as long as the work.
-
-
-@compiled
-def _mark(marks, front0, front1, front2, hidden0, hidden1, hidden2, target_front, target_hidden):
-    """Mark targets where a hidden layer pairs nearer than the two fronts; rows begin a cell to the left of theirs."""
-    for x in range(len(marks)):
-        t, q = target_front[x], target_hidden[x]
-        some = _nearer(front0, hidden0, x, t, q) | _nearer(front1, hidden1, x, t, q) | _nearer(front2, hidden2, x, t, q)
-        marks[x] |= np.uint8(some)
-
-
-@compiled
-def _nearer(front, hidden, x, target_front, target_hidden):
-    """`_mark` for three sources; comparisons with NaN are false."""
-    some = False
-    for u in range(3):
-        f, h = front[x + u], hidden[x + u]
-        d = abs(f - target_front)
-        some |= (abs(h - target_front) < d) | (abs(target_hidden - f) < d)
-    return some
 
 
 @kernel

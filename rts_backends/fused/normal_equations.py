@@ -10,16 +10,19 @@ added up to those of the pixels' means, and only these are multiplied.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from rts.engines import Engine
+from rts.fitting.losses import SQUARE, Loss
 from rts.records import ArraySpec
 from rts.threads import parallel, read_only
 from rts.trees import Array
 from rts_backends.fused.cells import Cells, Settings
 from rts_backends.fused.crossings import change_of
+from rts_backends.fused.losses import LINEAR, cost_and_weight, curvature, in_numbers
 from rts_backends.fused.mixed import changes_of, composited
 from rts_backends.fused.outlines import gain
 from rts_backends.fused.rows import (
@@ -49,7 +52,7 @@ OPACITY = 3 * PITCH
 """Place of alpha among the planes of a row."""
 
 
-def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, ...] | None:
+def equations(settings: Settings, engine: Engine, loss: Loss, *given: Any) -> tuple[Array, ...] | None:
     """`normal_equations` of arrays of any engine on the host, traced or not; None for others.
 
     None, too, where a pixel has more cells than a tile.
@@ -57,6 +60,7 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
     Args:
         settings: the splatter, as numbers.
         engine: the engine of the arrays.
+        loss: of the residuals.
         *given: positions, rgba, row, part, facing, wanted, settled, exit and the arguments of `normal_equations` from
             `t_positions`, arrays or None.
     """
@@ -77,7 +81,7 @@ def equations(settings: Settings, engine: Engine, *given: Any) -> tuple[Array, .
         used = int(row.max(initial=0)) if exits is None else int(max(row.max(initial=0), exits.max(initial=0)))
         used += 1  # Under `jit` many more rows may be allotted.
         cells = Cells(settings, positions[:used], rgba[:used], row, None, *known)
-        return tuple(np.asarray(x, kind) for x in normal_equations(cells, *rest))
+        return tuple(np.asarray(x, kind) for x in normal_equations(cells, *rest, loss=loss))
 
     count = t_positions.shape[0]
     specs = ArraySpec((), kind), ArraySpec((count, count), kind), ArraySpec((count,), kind)
@@ -91,8 +95,9 @@ def normal_equations(
     target: np.ndarray,
     weights: np.ndarray | None,
     background: np.ndarray | None,
+    loss: Loss = SQUARE,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean square of the n residuals weight · (image − target), JᵀJ / n and Jᵀr / n, float64.
+    """Mean loss of the n residuals weight · (image − target), JᵀSJ / n and JᵀWr / n, float64.
 
     Args:
         cells: the samples, s · H times s · W without their border; a pixel of the image is the mean of s² of them.
@@ -101,6 +106,7 @@ def normal_equations(
         target: (H, W, C), of alpha (C = 1), colours (3) or both (4).
         weights: (H, W, 1) or (H, W, C), or None.
         background: (H, W, 4), what the image is composited onto, or None.
+        loss: of the residuals; W and S are diagonals of its `weights`.
     """
     count, dtype = len(t_positions), cells.positions.dtype
     if t_rgba is None or not _any(t_rgba):
@@ -110,7 +116,7 @@ def normal_equations(
     bands, fine = -(-len(target) // BAND), _cells_a_pixel(cells.row.shape, cells.border, target.shape)
     sums = np.zeros((bands, count + 1, count + 1))
     drawn = cells.plain_arguments, cells.row, cells.choices, cells.outlines, cells.crossings, cells.settled
-    given = *drawn, tangents, tuple(fields), cells.border, fine
+    given = *drawn, tangents, tuple(fields), in_numbers(loss, dtype), cells.border, fine
     parallel(_accumulate, bands, ALPHA if target.shape[2] == 1 else COLORS, *given, sums)
     total = sums.sum(axis=0) / max(target.size, 1)
     matrix = total[:count, :count]
@@ -129,7 +135,7 @@ def _any(tangents: np.ndarray) -> bool:
 
 @kernel
 def _accumulate(
-    start, stop, planes, plain, row, choices, outlines, crossings, settled, tangents, fields, border, fine, sums
+    start, stop, planes, plain, row, choices, outlines, crossings, settled, tangents, fields, loss, border, fine, sums
 ):
     """Products (B, T + 1, T + 1) of tangents and, last, residuals in bands [start, stop); the lower triangles.
 
@@ -145,7 +151,8 @@ def _accumulate(
         np.empty((many, 3 * layers * TANGENT), positions.dtype),
         np.empty((many, SUMS), positions.dtype),
     )
-    products = np.empty((many + 1, channels * PITCH), positions.dtype)
+    # One for each unknown, one for the residuals, and one for what their loss weighs them by.
+    products = np.empty((many + 2, channels * PITCH), positions.dtype)
     changes = np.empty((many, 3, 5), positions.dtype)
     loaded, least = np.empty(3, np.int64), FLAT if t_rgba.shape[1] > 0 else BUSY
     mean, mean_change = (value, change) if fine == 1 else (np.empty_like(value), np.empty_like(change))
@@ -202,7 +209,7 @@ def _accumulate(
                         _add_means(mean_change[n], change[n], fine, pixels)
                 changing = moving_row or (fine > 1 and changing)
                 if (y + 1) % fine == 0:
-                    _multiply(sums[band], products, mean_change, mean, fields, y // fine, own, pixels, changing)
+                    _multiply(sums[band], products, mean_change, mean, fields, loss, y // fine, own, pixels, changing)
 
 
 @compiled
@@ -297,7 +304,7 @@ def _settle(change, value, rgba, t_rgba, settled, moving):
 
 
 @compiled
-def _multiply(sums, products, change, value, fields, y, left, count, changing):
+def _multiply(sums, products, change, value, fields, loss, y, left, count, changing):
     """Add the products of a row of a tile; where nothing changes, of the residuals alone."""
     target, weights, background = fields
     channels, many = target.shape[2], len(change)
@@ -323,9 +330,35 @@ def _multiply(sums, products, change, value, fields, y, left, count, changing):
                 w = min(c, weights.shape[2] - 1)
                 for j in range(count):
                     to[j] *= weights[y, left + j, w]
-    for a in range(0 if changing else many, many + 1):
-        for b in range(0 if changing else many, a + 1):
+    start, stop = 0 if changing else many, many + 1
+    if loss[0] != LINEAR:
+        sums[many, many] += _weigh(products[start:], many - start, loss, channels * count)
+        stop = many
+    for a in range(start, many + 1):
+        for b in range(start, min(a + 1, stop)):
             sums[a, b] += _dot(products[a], products[b], channels * count)
+
+
+@compiled
+def _weigh(products, many, loss, count):
+    """Scale tangents and residuals so that their products are those of a loss's normal equations; the sum of losses.
+
+    Args:
+        products: (many + 2, ·), tangents, residuals, and a row that is overwritten.
+        many: how many tangents.
+        loss: see `in_numbers`.
+        count: how many numbers in each row.
+    """
+    total, residuals, roots = 0.0, products[many], products[many + 1]
+    for j in range(count):
+        cost, weight = cost_and_weight(residuals[j], loss)
+        total += cost
+        roots[j] = math.sqrt(curvature(weight, loss))
+        residuals[j] *= weight / roots[j]
+    for n in range(many):
+        for j in range(count):
+            products[n, j] *= roots[j]
+    return total
 
 
 @compiled(fastmath={"contract", "reassoc"})

@@ -5,16 +5,17 @@ What fits is float32 or float64 in the memory of the host. Second derivatives ar
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from rts import splatting
 from rts.arrays import without_border
 from rts.engines import engine_of
+from rts.fitting.losses import SQUARE, Loss
 from rts.records import Splats
 from rts.trees import Array
-from rts_backends.fused import mean_square
+from rts_backends.fused import mean_loss
 from rts_backends.fused.cells import Settings
 from rts_backends.fused.image import IMAGE
 
@@ -24,7 +25,13 @@ class _Fused(splatting.Kernel):
 
     kind: ClassVar[str]
     averages = True
+    takes_losses = True
     _knows_settled = True
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if vars(cls).keys() & {"normal_equations", "mean_loss"} and "takes_losses" not in vars(cls):
+            cls.takes_losses = False  # What a class inherits it may not do.
 
     def image(self, splats: Splats) -> Array:
         """See `rts.splatting.Kernel`."""
@@ -76,6 +83,7 @@ class _Fused(splatting.Kernel):
         target: Array,
         weights: Array | None = None,
         background: Array | None = None,
+        loss: Loss | None = None,
     ) -> tuple[Array, Array, Array] | None:
         """See `rts.Splatter`."""
         if not self._sweeps:
@@ -85,16 +93,21 @@ class _Fused(splatting.Kernel):
         own = splats.positions, splats.rgba, splats.row, splats.part, self._facing(splats)
         own += splats.wanted, splats.settled, self._exits(splats)
         given = *own, t_positions, t_rgba, target, weights, background
-        return normal_equations.equations(self._settings(splats.border), engine_of(given), *given)
+        return normal_equations.equations(self._settings(splats.border), engine_of(given), loss or SQUARE, *given)
 
-    def mean_square(
-        self, splats: Splats, target: Array, weights: Array | None = None, background: Array | None = None
+    def mean_loss(
+        self,
+        splats: Splats,
+        target: Array,
+        weights: Array | None = None,
+        background: Array | None = None,
+        loss: Loss | None = None,
     ) -> Array | None:
         """See `rts.Splatter`."""
         if not self._sweeps or splats.rgba.shape[0] == 0:
             return None
         given = self._operands(splats), target, weights, background
-        return mean_square.mean_square(self._settings(splats.border), *given)
+        return mean_loss.mean_loss(self._settings(splats.border), loss or SQUARE, *given)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`."""

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
-
-BLOCK = 32
-"""Columns that share a note of whether hidden layers are near."""
+from rts_backends.fused.pairs import BLOCK, mark
 
 EMPTY, SETTLED, FLAT, BUSY = 0, 1, 2, 3
 """Targets that no splat reaches, that are told to show the colour of all, that are amid splats of one colour, and all
@@ -15,8 +13,11 @@ others."""
 
 
 @kernel
-def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, depths, seen, counts):
+def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, depths, seen, counts, mixed, marked):
     """Find the states of the targets of rows [start, stop), and fill the other arrays that describe the cells.
+
+    Which targets of `Visible` are mixed is seen on the way: there, other than in `Multi`, it does not go by how far
+    depths reach, which is not known yet.
 
     Args:
         start: first row.
@@ -31,14 +32,21 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, dep
         depths: (H, 2) zeros, for the least and the largest depth of each row, and zero.
         seen: (N,) uint8, zeros, to be marked: samples that some cell refers to.
         counts: (H,) zeros, for the number of such cells.
+        mixed: (H, W) uint8, to be filled with marks of the mixed targets of `Visible`; no rows where nobody asks.
+        marked: (H,) zeros, to be filled with their number in each row.
     """
-    _, height, width = row.shape
+    layers, height, width = row.shape
+    blocks, kind, asks = hidden.shape[1], positions.dtype, len(mixed) > 0
+    # For three rows: in or beside which blocks hidden layers are, and depths of those.
+    near, z = np.zeros((3, blocks), np.uint8), np.empty((3, layers, width + 2 if asks else 0), kind)
+    asked, loaded = np.empty(blocks, np.uint8), np.full((3, blocks), -9, np.int64)
+    target, beyond = np.empty((layers, BLOCK), kind), kind.type(np.inf)
     # For three rows of cells: which are covered, which amid three alike, and which alike with the cell above.
     cells = np.zeros((3, 3, width + 2), np.uint8)
     covered, calm, joins = cells[0], cells[1], cells[2]
     for y in range(start - 1, stop + 1):
         now, before = (y + 3) % 3, (y + 2) % 3
-        covered[now], calm[now], joins[now] = 0, 0, 0
+        covered[now], calm[now], joins[now], near[now] = 0, 0, 0, 0
         if 0 <= y < height:
             above = row[0, max(y - 1, 0)]
             _inspect(positions, rgba, row[0, y], above, y, fronts, reach, covered[now], calm[now], joins[now])
@@ -47,6 +55,16 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, dep
                     _cover(covered[now], row[k, y])
                 if start <= y < stop:
                     counts[y] += _note(row[k, y], positions, k > 0, hidden[y], depths[y], seen)
+                elif asks and k > 0:
+                    _hide(row[k, y], near[now])
+            if start <= y < stop:
+                for b in range(blocks):  # To copy an array compiles errors that tell shapes, a second long.
+                    near[now, b] = hidden[y, b]
+        if y > start and asks:
+            for b in range(blocks):
+                asked[b] = near[0, b] | near[1, b] | near[2, b]
+            mark(mixed[y - 1], asked, positions, row, y - 1, beyond, z, loaded, target)
+            marked[y - 1] = _keep_covered(mixed[y - 1], row[0, y - 1])
         if y > start:
             first = (y + 1) % 3
             runs = calm[first], calm[before], calm[now]
@@ -107,6 +125,25 @@ def _note(cells, positions, behind, hidden, depths, seen):
             if behind:
                 hidden[max(x - 1, 0) // BLOCK] = hidden[min(x + 1, last) // BLOCK] = 1
     depths[0], depths[1] = least, largest
+    return count
+
+
+@compiled
+def _hide(cells, hidden):
+    """Take note of where a row of a hidden layer is covered, as `_note` does."""
+    last = len(cells) - 1
+    for x in range(len(cells)):
+        if cells[x] >= 0:
+            hidden[max(x - 1, 0) // BLOCK] = hidden[min(x + 1, last) // BLOCK] = 1
+
+
+@compiled
+def _keep_covered(mixed, cells):
+    """Leave out marks of targets without a sample; returns how many are left."""
+    count = 0
+    for x in range(len(cells)):
+        mixed[x] &= np.uint8(cells[x] >= 0)
+        count += mixed[x]
     return count
 
 

@@ -15,6 +15,7 @@ from rts.errors import InputError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Shader
 from rts.ndc import Ndc
+from rts.row_cameras import RowCameras
 from rts.trees import Array, Tree
 from rts_surfaces.radiance_field.chunks import CHUNK, in_chunks
 from rts_surfaces.radiance_field.field import RadianceField, load_radiance_field
@@ -38,6 +39,7 @@ class RadianceShader(Shader):
     ndc: Ndc | None = None
     chunk: int = CHUNK
     opaque = True
+    takes_views = True
     reads = ()
 
     def __post_init__(self):
@@ -46,7 +48,7 @@ class RadianceShader(Shader):
         if not is_count(self.chunk):
             raise InputError(f"chunk is {quoted(self.chunk)}; expected an integer of at least 1")
 
-    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
         if "weights" not in theta:
             raise InputError(

@@ -1,4 +1,4 @@
-"""The mean square of the difference between a splatted image and a target, and its derivatives, in one sweep.
+"""The mean loss of the difference between a splatted image and a target, and its derivatives, in one sweep.
 
 The image is made in an array of its own, in whose place its cotangents are put as it is compared with the target: there
 is no other array of the image's size, and the way back starts at what is left in it.
@@ -11,19 +11,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.compiling import compiled, kernel
-from rts.engines import namespace
+from rts.fitting.losses import Loss
 from rts.operations.operation import Arrays, Operation, Some
 from rts.threads import parallel, read_only
 from rts.trees import Array
 from rts_backends.fused.cells import Cells, Choices, Settings
 from rts_backends.fused.image import specification, used
+from rts_backends.fused.losses import LINEAR, cost_and_weight, in_numbers
 
 
 class Swept(NamedTuple):
     """What the value leaves to its derivatives.
 
     Attributes:
-        cotangents: (H, W, 4), derivatives of the mean square by the image over nothing.
+        cotangents: (H, W, 4), derivatives of the mean loss by the image over nothing.
         choices: what was decided for each target.
     """
 
@@ -40,15 +41,14 @@ def difference(image: Array, target: Array, weights: Array | None, background: A
     return found if weights is None else found * weights
 
 
-def _specification(*operands: Array, settings: Settings) -> Array:
+def _specification(*operands: Array, settings: Settings, loss: Loss) -> Array:
     *splats, target, weights, background = operands
     image = specification(*splats, settings=settings)
     given = (x if x.shape[0] else None for x in (weights, background))
-    found = difference(image, target, *given)
-    return namespace(found).mean(found * found)
+    return loss(difference(image, target, *given))
 
 
-def _shape(*shapes: tuple[int, ...], settings: Settings) -> tuple[int, ...]:
+def _shape(*shapes: tuple[int, ...], settings: Settings, loss: Loss) -> tuple[int, ...]:
     return ()
 
 
@@ -57,23 +57,26 @@ def _cells(operands: Arrays, settings: Settings, choices: Choices | None) -> Cel
     return Cells(settings, positions, rgba, row, choices, *known)
 
 
-def _swept(operands: Arrays, settings: Settings) -> tuple[Swept, float]:
+def _swept(operands: Arrays, settings: Settings, loss: Loss) -> tuple[Swept, float]:
     """What is left to the derivatives, and the value."""
     target, weights, background = map(read_only, operands[8:])
     cells, image = _cells(operands, settings, None), np.empty((*target.shape[:2], 4), target.dtype)
     cells.image(image)
     sums = np.zeros(len(image))
-    parallel(_compare, len(image), image, target, weights, background, sums, work=image.size // 2)
+    given = image, target, weights, background, in_numbers(loss, image.dtype)
+    parallel(_compare, len(image), *given, sums, work=image.size // 2)
     return Swept(read_only(image), cells.choices), float(sums.sum() / max(target.size, 1))
 
 
-def _forward(operands: Arrays, out: np.ndarray, *, settings: Settings) -> Swept:
-    swept, out[...] = _swept(operands, settings)
+def _forward(operands: Arrays, out: np.ndarray, *, settings: Settings, loss: Loss) -> Swept:
+    swept, out[...] = _swept(operands, settings, loss)
     return swept
 
 
-def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, settings: Settings, kept: Swept | None) -> None:
-    swept = kept or _swept(operands, settings)[0]
+def _push(
+    operands: Arrays, tangents: Some, out: np.ndarray, *, settings: Settings, loss: Loss, kept: Swept | None
+) -> None:
+    swept = kept or _swept(operands, settings, loss)[0]
     images = np.empty((len(out), *swept.cotangents.shape), swept.cotangents.dtype)
     t_positions, t_rgba = tangents
     _cells(operands, settings, swept.choices).jvp(t_positions, t_rgba, images)
@@ -81,8 +84,10 @@ def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, settings: Settin
     out[:] = [np.where(swept.cotangents != 0, image * swept.cotangents, 0).sum(dtype=np.float64) for image in images]
 
 
-def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings, kept: Swept | None) -> None:
-    swept = kept or _swept(operands, settings)[0]
+def _pull(
+    operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings, loss: Loss, kept: Swept | None
+) -> None:
+    swept = kept or _swept(operands, settings, loss)[0]
     g_positions, g_rgba = results
     _cells(operands, settings, swept.choices).vjp(swept.cotangents, g_positions, g_rgba)
     if g != 1:
@@ -92,15 +97,20 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings,
 
 
 @kernel
-def _compare(start, stop, image, target, weights, background, sums):
-    """Put cotangents in the place of rows [start, stop) of the image, and the sums of squares of each row in (H,)."""
+def _compare(start, stop, image, target, weights, background, loss, sums):
+    """Put cotangents in the place of rows [start, stop) of the image, and the sum of losses of each row in (H,)."""
     scale = image.dtype.type(2 / max(target.size, 1))
+    plain = target.shape[2] == 1 and len(weights) == 0 and len(background) == 0 and loss[0] == LINEAR
     for y in range(start, stop):
-        if target.shape[2] == 1 and len(weights) == 0 and len(background) == 0:
+        if plain:
             sums[y] = _compare_alpha(image[y], target[y], scale)
         else:
             at = y if len(weights) > 0 else 0, y if len(background) > 0 else 0
-            sums[y] = _compare_row(image[y], target[y], weights, background, at, scale)
+            given = image[y], target[y], weights, background
+            if loss[0] == LINEAR:  # A loop that is compiled for the square alone is quicker.
+                sums[y] = _compare_row(*given, None, at, scale)
+            else:
+                sums[y] = _compare_row(*given, loss, at, scale)
 
 
 @compiled(fastmath={"contract", "reassoc"})
@@ -115,7 +125,7 @@ def _compare_alpha(image, target, scale):
 
 
 @compiled
-def _compare_row(image, target, weights, background, at, scale):
+def _compare_row(image, target, weights, background, loss, at, scale):
     zero, one, total, count = image.dtype.type(0), image.dtype.type(1), 0.0, target.shape[1]
     first = 3 if count == 1 else 0
     for x in range(len(image)):
@@ -131,16 +141,19 @@ def _compare_row(image, target, weights, background, at, scale):
             if len(weights) > 0:
                 weight = weights[at[0], x, min(c - first, weights.shape[2] - 1)]
                 off = weight * off if weight != zero else zero
-            total += off * off
-            image[x, c] = scale * weight * off
+            cost, slope = off * off, one
+            if loss is not None:
+                cost, slope = cost_and_weight(off, loss)
+            total += cost
+            image[x, c] = scale * weight * off * slope
             if len(background) > 0:
                 g_alpha -= image[x, c] * background[at[1], x, c]
         image[x, 3] += g_alpha
     return total
 
 
-MEAN_SQUARE = Operation(
-    "rts.image_mean_square",
+MEAN_LOSS = Operation(
+    "rts.image_mean_loss",
     _specification,
     (2, 2, 3, 3, 3, 2, 2, 2, 3, 3, 3),
     _shape,
@@ -154,18 +167,19 @@ MEAN_SQUARE = Operation(
     keeps=True,
     sweeps=True,
 )
-"""The mean square () of weight · (image − target) for the operands of `image.IMAGE`, and of a target (H, W, C),
+"""The mean loss () of weight · (image − target) for the operands of `image.IMAGE`, and of a target (H, W, C),
 weights (H, W, 1 or C) and a background (H, W, 4), (0, 0, 0) where there are none."""
 
 
-def mean_square(
+def mean_loss(
     settings: Settings,
+    loss: Loss,
     splats: tuple[Array, ...],
     target: Array,
     weights: Array | None,
     background: Array | None,
 ) -> Array:
-    """See `rts.Splatter.mean_square`; `splats` are the operands of `image.IMAGE`."""
+    """See `rts.Splatter.mean_loss`; `splats` are the operands of `image.IMAGE`."""
     none = target[:0, :0, :]
     given: tuple[Any, ...] = tuple(none if x is None else x for x in (weights, background))
-    return MEAN_SQUARE(*splats, target, *given, settings=settings)
+    return MEAN_LOSS(*splats, target, *given, settings=settings, loss=loss)

@@ -1,0 +1,129 @@
+"""numba's compiler without what kernels do not need: functions that only they call have no machine code of their own.
+
+A kernel has what it calls linked into it, ours (`rts.compiling.compiled`) and numba's own (`min`, `np.empty`). numba
+makes machine code of each of these all the same, with two wrappers where it is numba's. Here they stay intermediate
+code, which is optimised in the kernels. It saves a quarter of the time.
+
+numba is told by classes of pipelines, and by a target of ours that inherits all from the processor. This depends on
+parts of numba that it does not promise to keep, so nothing but `rts.compiling` imports it, which does without it where
+that fails.
+"""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import numba
+from numba.core.base import BaseContext
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler, Flags
+from numba.core.target_extension import CPU, dispatcher_registry, jit_registry
+
+_PARAMETERS = ["typingctx", "targetctx", "library", "args", "return_type", "flags", "locals"]
+_NEEDED = {
+    Compiler: ["define_pipelines"],
+    JITCodeLibrary: [
+        "codegen",
+        "get_pointer_to_function",
+        "_ensure_finalized",
+        "_finalize_final_module",
+        "_finalize_dynamic_globals",
+        "_optimize_final_module",
+    ],
+    Flags: ["copy", "no_cpython_wrapper", "no_cfunc_wrapper", "release_gil", "inline"],
+    BaseContext: ["subtarget"],
+}
+if [*inspect.signature(Compiler).parameters] != _PARAMETERS or not all(
+    hasattr(owner, name) for owner, names in _NEEDED.items() for name in names
+):
+    raise ImportError("this numba is built in another way")
+
+
+class _NoEnvironments:
+    """A code generator for code that is nowhere yet, and has no place for what it refers to."""
+
+    def __init__(self, generator: Any):
+        self._generator = generator
+
+    def set_env(self, name: str, environment: Any) -> None:
+        """Leave it."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._generator, name)
+
+
+class _Part(JITCodeLibrary):
+    """Code to be linked into others; none that calls itself, since numba links that by its address."""
+
+    @property
+    def codegen(self) -> Any:
+        """The code generator, as whoever prepares a function to be called sees it."""
+        return _NoEnvironments(self._codegen)
+
+    def get_pointer_to_function(self, name: str) -> int:
+        """Null: there is none."""
+        self._ensure_finalized()
+        return 0
+
+    def _optimize_final_module(self) -> None:
+        """Leave that to what it is linked into."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+
+class _Flags(Flags):
+    """Flags whose copies, if they are equal, are one object.
+
+    numba looks up its own functions by them, for every operator of every function, and compares all flags if they are
+    not one object. What says how a caller is wrapped does not concern what it calls.
+    """
+
+    __slots__ = ()
+    _copies: dict[Flags, Flags] = {}
+
+    def copy(self) -> Flags:
+        """What the functions that are called know of these flags."""
+        flags: Any = Flags(self)
+        flags.no_cpython_wrapper = flags.no_cfunc_wrapper = flags.release_gil = True
+        flags.inline = "never"
+        return self._copies.setdefault(flags, flags)
+
+
+class _Kernels(Compiler):
+    """Compiles functions that Python calls."""
+
+    def __init__(
+        self, typingctx: Any, targetctx: Any, library: Any, args: Any, return_type: Any, flags: Any, locals: Any
+    ):
+        targetctx = targetctx.subtarget(target=_Target)
+        super().__init__(typingctx, targetctx, library, args, return_type, _Flags(flags), locals)
+
+
+class _Parts(_Kernels):
+    """Compiles functions that only compiled functions call."""
+
+    def define_pipelines(self) -> list[Any]:
+        """numba's, which put the code in the library that is there."""
+        if self.state.library is None:
+            self.state.library = _Part(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        return super().define_pipelines()
+
+
+KERNEL = {"no_cfunc_wrapper": True, "pipeline_class": _Kernels}
+PART = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": _Parts}
+
+
+class _Target(CPU):
+    """The processor, as kernels have it."""
+
+
+def _for_kernels(*args: Any, **options: Any) -> Any:
+    """Numba's decorator, as it is used for its own functions where kernels call them."""
+    return numba.jit(*args, **(options | PART))
+
+
+dispatcher_registry[_Target] = dispatcher_registry[CPU]
+jit_registry[_Target] = _for_kernels

@@ -1,0 +1,58 @@
+"""The cameras of samples of several views, for shaders that colour them all in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rts.camera import Camera, toward_rows, world_vectors
+from rts.engines import namespace
+from rts.operations.by_view import index_of_views
+from rts.operations.linear import affine_map_of_views
+from rts.operations.take import take
+from rts.trees import Array, record
+
+
+@record()
+class RowCameras:
+    """A camera for each of N samples: what a shader is given that `takes_views`.
+
+    Its methods are those of a `Camera` of one view, and give a row for each sample. Points are those of the N samples.
+
+    Attributes:
+        view: (B, 4, 4) camera-from-world, of each view.
+        projection: (B, 4, 4) OpenGL clip space from camera space.
+        number: (N,) int32, the view of each sample, from 1 on; 0 for rows that are not used.
+    """
+
+    view: Array
+    projection: Array
+    number: Array
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], number: Array) -> RowCameras:
+        """The cameras of several views, for samples of which `number` (N,) says whose they are."""
+        stacked = Camera.stack(cameras)
+        return cls(stacked.view, stacked.projection, number)
+
+    def of_rows(self, number: Array) -> RowCameras:
+        """These cameras, for other samples."""
+        return RowCameras(self.view, self.projection, number)
+
+    def toward(self, points: Array) -> Array:
+        """(N, 3) world vectors from points (N, 3) towards the viewer, not normalised; parallel where orthographic."""
+        return affine_map_of_views(toward_rows(self.view, self.projection), points, self.number)
+
+    def depth(self, points: Array) -> Array:
+        """(N,) linear depth of world points (N, 3)."""
+        return -affine_map_of_views(self.view[:, 2:3, :], points, self.number)[:, 0]
+
+    def to_world(self, direction: Sequence[float]) -> Array:
+        """(N, 3) the unit vector, in the world, of a direction (3,) in the space of each sample's camera."""
+        return take(world_vectors(self.view, direction), index_of_views(self.number))
+
+    def depth_range(self) -> tuple[Array, Array]:
+        """(N,) linear depths of the near and the far plane; infinity for no such plane."""
+        views = [Camera(self.view[b, ...], self.projection[b, ...]).depth_range() for b in range(self.view.shape[0])]
+        xp, index = namespace(self.view), index_of_views(self.number)
+        near, far = (take(xp.stack(depths)[:, None], index)[:, 0] for depths in zip(*views, strict=True))
+        return near, far

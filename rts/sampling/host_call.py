@@ -1,0 +1,170 @@
+"""The one call to the host in which a part of triangles is sampled: what goes there, and what comes back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.adapting import adapted
+from rts.camera import Camera
+from rts.engines import is_constant, namespace, stopped, suiting
+from rts.interfaces import CheckedPart, Part, Shader, TriangleSurface
+from rts.records import ArraySpec, Samples
+from rts.sampling.cache import Entry
+from rts.sampling.validation import check_camera
+from rts.trees import Array, leaves, map_leaves
+
+Find = Callable[..., tuple[Samples, Mapping[str, np.ndarray]]]
+"""(cameras, inputs of the proxy, further arrays), all on the host → samples, and further results by name."""
+
+
+class Shape(NamedTuple):
+    """How many samples there may be.
+
+    Attributes:
+        layers: K.
+        size: lines and columns of the samples: of the grid, or of the list of its cells.
+        capacity: rows to allot, or None for as many as there are.
+        view: (height, width) of the grid.
+    """
+
+    layers: int
+    size: tuple[int, int]
+    capacity: int | None
+    view: tuple[int, int]
+
+    @property
+    def rows(self) -> int:
+        """The largest number of samples."""
+        return self.layers * self.size[0] * self.size[1] if self.capacity is None else self.capacity
+
+    def row_spec(self, dtype: Any, *widths: int) -> ArraySpec:
+        """The spec of an array with a row for each sample."""
+        return ArraySpec((self.rows, *widths), dtype, self.capacity is None)
+
+    def tables(self, surface: TriangleSurface) -> dict[str, ArraySpec]:
+        """The specs of what a surface's `refine` fills."""
+        specs = dict(surface.table_specs(self.layers * self.size[0] * self.size[1], self.capacity))
+        for name, spec in specs.items():
+            if spec.by_sample:
+                specs[name] = self.row_spec(spec.dtype, *spec.shape[1:])._replace(by_sample=True)
+        return specs
+
+    def specs(self, widths: tuple[int, int]) -> tuple[ArraySpec, ...]:
+        """The specs of ids, params, row, depth and overflow."""
+        grid = self.layers, *self.size
+        return (
+            self.row_spec(np.int32, widths[0]),
+            self.row_spec(np.float32, widths[1]),
+            ArraySpec(grid, np.int32),
+            ArraySpec(grid, np.float32),
+            ArraySpec((), np.int32),
+        )
+
+
+class HostCall:
+    """What is known of a part before it is sampled on the host.
+
+    Args:
+        part: the part.
+        surface: its surface.
+        cameras: through which it is seen, in its local space, without derivatives.
+        shape: how many samples there may be.
+        entry: what is prepared of it, if that is known: the inputs of its proxy are not looked at, then.
+    """
+
+    def __init__(
+        self,
+        part: Part | CheckedPart,
+        surface: TriangleSurface,
+        cameras: Sequence[Camera],
+        shape: Shape,
+        entry: Entry | None,
+    ):
+        self._surface, self._cameras, self._shape, self._entry = surface, cameras, shape, entry
+        self._transform = [] if part.transform is None else [part.transform]
+        self._engine, like = suiting(part.theta, cameras)
+        self._inputs = surface.proxy_inputs(stopped(part.theta)) if entry is None else None
+        reads = {name: part.theta[name] for name in surface.reads(part.theta)}
+        # What has no derivative is evaluated where it is sampled.
+        self._theta = reads if self._engine.differentiates and is_constant(reads) else None
+        shader = adapted(part.shader, Shader)
+        self._asked = None if shader is None else shader.reads
+        self._attributes = _attribute_specs(surface, self._asked, self._theta, shape, like)
+
+    def samples(
+        self,
+        find: Find,
+        beside: Mapping[str, ArraySpec],
+        tables: Mapping[str, ArraySpec] | None = None,
+        arrays: Sequence[Array] = (),
+    ) -> tuple[Samples, dict[str, Array]]:
+        """The samples that `find` finds, and what else, by one call to the host.
+
+        Args:
+            find: does it, on the host.
+            beside: what it gives beside samples.
+            tables: `Samples.tables` of the samples.
+            arrays: what it is given beside cameras and inputs.
+        """
+        tables = tables or {}
+
+        def host(*given: np.ndarray) -> tuple[Any, ...]:
+            it = iter(given)
+            own = [Camera(np.asarray(next(it), np.float64), np.asarray(next(it), np.float64)) for _ in self._cameras]
+            moved = [next(it) for _ in self._transform]
+            cameras = [check_camera(camera, *moved) for camera in own]
+            others = [next(it) for _ in arrays]
+            inputs = map_leaves(lambda _: next(it), self._inputs) if self._entry is None else self._entry.inputs
+            found, more = find(cameras, inputs, *others)
+            gbuffer = {} if self._theta is None else self._surface.evaluate(self._theta, found)
+            return (
+                *(found.ids, found.params, found.row, found.depth, found.overflow),
+                *(more[name] for name in beside),
+                *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
+                *(np.asarray(gbuffer[name], spec.dtype) for name, spec in self._attributes.items()),
+            )
+
+        own = self._shape.specs(self._surface.sample_widths)
+        specs = *own, *beside.values(), *tables.values(), *self._attributes.values()
+        matrices = [m for camera in self._cameras for m in (camera.view, camera.projection)]
+        given = *matrices, *self._transform, *arrays, *leaves(self._inputs)
+        results = iter(self._engine.call_host(host, specs, *given))
+        found = [next(results) for _ in own]
+        more, filled, known = ({name: next(results) for name in x} for x in (beside, tables, self._attributes))
+        samples = Samples(
+            *found,
+            tables=filled,
+            gbuffer=None if self._theta is None else known,
+            asked=self._asked,
+            centered=self._surface.centered,
+            by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
+        )
+        return samples, more
+
+
+def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:
+    """A table with zeros added up to the number of rows that its spec fixes."""
+    if spec.packed or len(table) == spec.shape[0]:
+        return table
+    return np.concatenate([table, np.zeros((spec.shape[0] - len(table), *table.shape[1:]), table.dtype)])
+
+
+def _attribute_specs(
+    surface: TriangleSurface, asked: Sequence[str] | None, host_theta: Mapping | None, shape: Shape, like: Array | None
+) -> dict[str, ArraySpec]:
+    """The attributes to evaluate on the host for a surface that is constant: those its shader reads."""
+    if host_theta is None:
+        return {}
+    real = np.float64 if like is not None and namespace(like).finfo(like.dtype).bits == 64 else np.float32
+    if asked is not None and not asked:
+        return {"position": shape.row_spec(real, 3)}
+    i, p = surface.sample_widths
+    none = np.full((1, 1, 1), -1, np.int32)
+    tables = {name: np.zeros((1, *spec.shape[1:]), spec.dtype) for name, spec in shape.tables(surface).items()}
+    one = Samples(np.zeros((1, i), np.int32), np.zeros((1, p), np.float32), none, none, np.int32(0), tables)
+    gbuffer = surface.evaluate(host_theta, one)
+    names = list(gbuffer) if asked is None else ["position", *(n for n in asked if n in gbuffer)]
+    return {n: shape.row_spec(real, *gbuffer[n].shape[1:]) for n in dict.fromkeys(names)}

@@ -1,0 +1,48 @@
+"""The losses of `rts.fitting.losses` as compiled functions of one residual."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from rts.compiling import compiled
+from rts.fitting.losses import FORMS, LEAST_SHARE, Loss
+
+LINEAR, SOFT_L1, HUBER, CAUCHY = range(len(FORMS))
+
+
+def in_numbers(loss: Loss, dtype: np.dtype) -> tuple[int, np.floating]:
+    """A loss as kernels take it: its place, and the scale as a number of the residuals' dtype."""
+    return loss.place, np.dtype(dtype).type(loss.f_scale)
+
+
+@compiled
+def cost_and_weight(residual, loss):
+    """s² ρ((r / s)²) of a residual r, and ρ'."""
+    place, scale = loss
+    one = type(scale)(1)
+    if place == LINEAR or residual == 0:
+        return residual * residual, one
+    if place == HUBER:
+        kept = min(max(residual, -scale), scale)
+        return kept * (residual + residual - kept), kept / residual
+    z = (residual / scale) * (residual / scale)
+    if place == SOFT_L1:
+        root = math.sqrt(one + z)
+        return (residual + residual) * residual / (one + root), one / root
+    return scale * (scale * math.log1p(z)), one / (one + z)
+
+
+@compiled
+def curvature(weight, loss):
+    """What `Loss.weights` gives beside the weight of a residual."""
+    place, scale = loss
+    share, one = weight, type(scale)(1)
+    if place == SOFT_L1:
+        share = weight * weight
+    elif place == HUBER and weight < one:
+        share = type(scale)(0)
+    elif place == CAUCHY:
+        share = weight + weight - one
+    return weight * max(share, type(scale)(LEAST_SHARE))

@@ -1,0 +1,365 @@
+"""Robust losses: closed forms, SciPy's, finite differences, and fits to images of which a part is wrong."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from helpers import DIFFERENTIABLE, arrays, icosphere, quad, to_numpy
+from scipy.optimize import least_squares
+from test_mean_loss import CAMERA, POSE, SIZE, goal, gradient, moving, residuals
+
+import rts
+from rts import splatting
+from rts.engines import engine_of
+from rts.errors import InputError
+from rts.fitting.least_squares import normal_equations
+from rts_backends.fused import normal_equations as fused_normal
+from rts_backends.fused import splatters as fused
+
+pytestmark = pytest.mark.fitting
+
+ROBUST = ("soft_l1", "huber", "cauchy")
+targets = pytest.mark.parametrize("target", DIFFERENTIABLE)
+losses = pytest.mark.parametrize("name", ROBUST)
+
+
+def cost(name, r, s):
+    """s² ρ((r / s)²) of one number."""
+    z = (r / s) ** 2
+    rho = {"linear": z, "soft_l1": 2 * (math.sqrt(1 + z) - 1), "cauchy": math.log(1 + z)}
+    return s**2 * (rho[name] if name in rho else z if z <= 1 else 2 * math.sqrt(z) - 1)
+
+
+def slope(name, r, s):
+    """Its derivative."""
+    z = (r / s) ** 2
+    return 2 * r / {"soft_l1": math.sqrt(1 + z), "huber": max(1, math.sqrt(z)), "cauchy": 1 + z}[name]
+
+
+# ------------------------------------------------------------------------------------------------- closed forms
+
+
+@pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
+@pytest.mark.parametrize("name", ("linear", *ROBUST))
+def test_of_one_number_they_are_their_closed_forms(name, target):
+    for s in (0.1, 2.0):
+        for r in (-3.0, -0.1, 0.0, 0.01, 0.1, 1.0, 5.0):
+            assert float(rts.Loss(name, s)(arrays(target, np.array([r])))) == pytest.approx(cost(name, r, s), rel=1e-6)
+
+
+@losses
+@targets
+def test_derivatives_are_finite_and_right_everywhere(name, target):
+    """At zero, where it turns into robust, and far beyond."""
+    for s in (0.125, 2.0):
+        r = np.array([-3.0, -s, 0.0, 1e-30, 0.01, s, 5.0, 1e6])
+        found = gradient(lambda x, s=s: 8 * rts.Loss(name, s)(x), arrays(target, r))
+        np.testing.assert_allclose(found, [slope(name, x, s) for x in r], rtol=1e-5, atol=1e-30)
+
+
+@losses
+def test_weights_are_derivatives_and_curvatures_second_ones(name):
+    torch = pytest.importorskip("torch")
+    r = torch.tensor([-3.0, -0.9, -0.1, 0.3, 0.6, 1.3, 5.0], dtype=torch.float64)
+    loss = rts.Loss(name, 0.7)
+    first = torch.func.vmap(torch.func.grad(loss))(r)
+    second = torch.func.vmap(torch.func.grad(torch.func.grad(loss)))(r)
+    weights, curvatures = loss.weights(r)
+    torch.testing.assert_close(weights * r, first / 2)
+    torch.testing.assert_close(curvatures, torch.maximum(second / 2, weights / 10))
+    assert (second < 0).any() or name != "cauchy"
+    ones = rts.Loss().weights(r)
+    assert (ones[0] == 1).all() and (ones[1] == 1).all()
+
+
+@losses
+@targets
+def test_an_image_of_one_colour_has_the_loss_of_that_colour(name, target):
+    vertices, faces = quad(-9, 9, -9, 9, 0)
+    part = rts.Part(rts.Mesh(faces), {"vertices": vertices}, "unlit")
+    wanted, color = np.float32([0.25, 0.45, 0.1]), np.float32([0.2, 0.5, 0.9])
+    swept = rts.ImageResiduals(
+        lambda color: part.replace(theta={"vertices": vertices, "color": color}),
+        *(CAMERA, SIZE, np.broadcast_to(wanted, (*SIZE, 3)).copy()),
+        **{"weights": np.full(SIZE, 0.5, np.float32), "loss": name, "f_scale": 0.1},
+    )
+    off = 0.5 * (color - wanted).astype(float)
+    value, found = engine_of(arrays(target, color)).value_and_grad(swept.mean_loss)(arrays(target, color))
+    assert float(value) == pytest.approx(np.mean([cost(name, r, 0.1) for r in off]), rel=1e-5)
+    np.testing.assert_allclose(to_numpy(found), [0.5 * slope(name, r, 0.1) / 3 for r in off], 1e-4)
+    value, matrix, half = map(to_numpy, swept.normal_equations(arrays(target, color)))
+    assert float(value) == pytest.approx(np.mean([cost(name, r, 0.1) for r in off]), rel=1e-5)
+    np.testing.assert_allclose(2 * half, to_numpy(found), 1e-4)
+    curvatures = rts.Loss(name, 0.1).weights(off)[1]
+    np.testing.assert_allclose(matrix, np.diag(0.25 * curvatures / 3), rtol=1e-4, atol=1e-9)
+
+
+# ------------------------------------------------------------------------------------- other implementations
+
+
+@pytest.mark.parametrize("name", ("linear", *ROBUST))
+def test_cost_and_gradient_are_those_of_scipy(name):
+    torch = pytest.importorskip("torch")
+    swept = residuals("lambert", 3, loss=name, f_scale=0.1)
+    pose = torch.tensor(POSE, dtype=torch.float64)
+
+    def rows(x):
+        return torch.func.jacfwd(swept)(torch.tensor(x)).reshape(-1, 6).numpy()
+
+    theirs = least_squares(
+        lambda x: swept(torch.tensor(x)).numpy().ravel(), pose.numpy(), rows, loss=name, f_scale=0.1, max_nfev=1
+    )
+    count = math.prod((*SIZE, 3))
+    value, found = engine_of(pose).value_and_grad(swept.mean_loss)(pose)
+    assert float(value) == pytest.approx(2 * theirs.cost / count, rel=1e-9)
+    np.testing.assert_allclose(found, 2 * theirs.grad / count, rtol=1e-8, atol=1e-14)
+    value, _, half = swept.normal_equations(pose)
+    assert float(value) == pytest.approx(2 * theirs.cost / count, rel=1e-9)
+    np.testing.assert_allclose(half, theirs.grad / count, rtol=1e-8, atol=1e-14)
+
+
+@losses
+def test_the_gradient_is_that_of_finite_differences(name):
+    torch = pytest.importorskip("torch")
+    image, weights = goal(3)
+    ball = rts.Mesh.example().replace(shader="unlit")
+
+    def scene(color):
+        return ball.replace(theta={**ball.theta, "color": color})
+
+    swept = rts.ImageResiduals(scene, CAMERA, SIZE, image, weights=weights, loss=name, f_scale=0.3)
+    color = torch.tensor([0.3, 0.6, 0.8], dtype=torch.float64)
+    step = 1e-6 * torch.eye(3, dtype=torch.float64)
+    slopes = [float(swept.mean_loss(color + h) - swept.mean_loss(color - h)) / 2e-6 for h in step]
+    found = gradient(swept.mean_loss, color)
+    np.testing.assert_allclose(found, slopes, rtol=1e-6, atol=1e-9)
+    assert np.abs(found).min() > 1e-3
+
+
+@losses
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"supersample": 2},
+        {"supersample": rts.Adaptive(2)},
+        {"background": (0.2, 0.7, 0.1)},
+        {"splatter": "single", "layers": 1},
+        {"splatter": splatting.Visible()},
+    ],
+    ids=["plain", "finer", "adaptive", "background", "single", "array code"],
+)
+def test_normal_equations_are_those_of_the_jacobian(name, options):
+    torch = pytest.importorskip("torch")
+    swept = residuals("lambert", 4, loss=name, f_scale=0.1, **options)
+    pose = torch.tensor(POSE, dtype=torch.float64)
+    expected = normal_equations(swept, pose, engine_of(pose), swept.loss)
+    for a, b in zip(swept.normal_equations(pose), expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-10)
+    assert float(torch.linalg.eigvalsh(expected[1]).min()) > 0
+    half = gradient(lambda p: swept.mean_loss(p) / 2, pose)
+    np.testing.assert_allclose(expected[2], half, rtol=1e-6, atol=1e-10)
+
+
+def test_normal_equations_in_a_compiled_program():
+    jax, _ = pytest.importorskip("jax"), pytest.importorskip("torch")
+    swept = residuals("lambert", 4, loss="huber", f_scale=0.1)
+    found = jax.jit(swept.normal_equations)(arrays("jax", POSE))
+    for a, b in zip(found, swept.normal_equations(arrays("torch-cpu", POSE)), strict=True):
+        np.testing.assert_allclose(to_numpy(a), to_numpy(b), rtol=1e-4, atol=1e-7)
+
+
+def test_every_way_has_the_same_number():
+    """Compiled and in array code, in NumPy, of views, and of a stage as large as the image."""
+    torch = pytest.importorskip("torch")
+    options = {"loss": "huber", "f_scale": 0.1}
+    expected = float(residuals("lambert", 4, **options).mean_loss(torch.tensor(POSE)))
+    assert expected < 0.7 * float(residuals("lambert", 4).mean_loss(torch.tensor(POSE)))
+    image, weights = goal(4)
+    several = rts.ImageResiduals(
+        *(lambda p: moving(p, "lambert"), [CAMERA, CAMERA], SIZE, [image] * 2), weights=[weights] * 2, **options
+    )
+    ways = [
+        residuals("lambert", 4, **options).mean_loss(POSE),
+        residuals("lambert", 4, splatter=splatting.Visible(), **options).mean_loss(torch.tensor(POSE)),
+        residuals("lambert", 4, **options).at_stage(rts.Stage()).mean_loss(torch.tensor(POSE)),
+        several.mean_loss(torch.tensor(POSE)),
+        several.normal_equations(torch.tensor(POSE))[0],
+        rts.Loss("huber", 0.1)(several(torch.tensor(POSE))),
+    ]
+    np.testing.assert_allclose([float(x) for x in ways], expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.8])
+def test_stages_have_the_loss_of_their_own_residuals(sigma):
+    torch = pytest.importorskip("torch")
+    stage = residuals("lambert", 4, loss="cauchy", f_scale=0.1).at_stage(rts.Stage(0.5, supersample=2, sigma=sigma))
+    pose = torch.tensor(POSE)
+    expected = float(rts.Loss("cauchy", 0.1)(stage(pose)))
+    assert stage.loss == rts.Loss("cauchy", 0.1)
+    assert float(stage.mean_loss(pose)) == pytest.approx(expected, rel=1e-5)
+    assert float(stage.normal_equations(pose)[0]) == pytest.approx(expected, rel=1e-5)
+
+
+def test_normal_equations_are_bitwise_the_same_on_any_number_of_threads(monkeypatch):
+    torch = pytest.importorskip("torch")
+    image = np.random.default_rng(0).random((144, 184, 4)).astype(np.float32)
+    swept = rts.ImageResiduals(lambda p: moving(p, "lambert"), CAMERA, (144, 184), image, loss="huber", f_scale=0.2)
+    found = []
+    for threads in ("1", "2", "3"):
+        monkeypatch.setenv("RTS_NUM_THREADS", threads)
+        found.append(torch.cat([x.reshape(-1) for x in swept.normal_equations(torch.tensor(POSE))]))
+    assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
+
+
+def test_splatters_that_know_no_losses_are_never_asked_for_them(monkeypatch):
+    torch = pytest.importorskip("torch")
+    asked = []
+
+    class Own(fused.Visible):
+        def normal_equations(self, splats, t_positions, t_rgba, target, weights=None, background=None):
+            asked.append("equations")
+            return super().normal_equations(splats, t_positions, t_rgba, target, weights, background)
+
+        def mean_loss(self, splats, target, weights=None, background=None):
+            asked.append("loss")
+            return super().mean_loss(splats, target, weights, background)
+
+    pose, given = torch.tensor(POSE), {"loss": "huber", "f_scale": 0.1}
+    swept, own = residuals("lambert", 4, **given), residuals("lambert", 4, splatter=Own(), **given)
+    torch.testing.assert_close(own.mean_loss(pose), swept.mean_loss(pose))
+    for a, b in zip(own.normal_equations(pose), swept.normal_equations(pose), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-7)
+    assert not asked and fused.Visible.takes_losses and not rts.Splatter.takes_losses
+    square = residuals("lambert", 4, splatter=Own())
+    square.mean_loss(pose), square.normal_equations(pose)
+    assert asked == ["loss", "equations"]
+
+
+# --------------------------------------------------------------------------------------------------------- fits
+
+
+BALL = icosphere(2, 0.8)
+SHIFT = np.float32([0.05, -0.03, 0.1])
+
+
+def shifted(shift):
+    vertices = engine_of(shift).constant(BALL[0], shift) + shift
+    return rts.Part(rts.Mesh(BALL[1]), {"vertices": vertices}, "silhouette")
+
+
+def cut_mask(side):
+    """The mask of a ball of which the right sixth is hidden, and how much of it."""
+    camera = rts.Camera.look_at((0.5, 0.9, 3), (0, 0, 0), fov_y=40)
+    whole = rts.render(shifted(SHIFT), camera, (side, side), supersample=4)[..., 3]
+    mask = whole.copy()
+    mask[:, np.nonzero(whole > 0.5)[1].max() - side // 8 :] = 0
+    return camera, mask, 1 - mask.sum() / whole.sum()
+
+
+@pytest.mark.parametrize("method", ["lm", "adam", "sgd"])
+def test_a_place_is_found_though_a_part_of_the_mask_is_hidden(method):
+    torch = pytest.importorskip("torch")
+    camera, mask, hidden = cut_mask(48)
+    assert 0.14 < hidden < 0.18
+    rate = {"lm": None, "adam": 0.005, "sgd": 0.3}[method]
+    off = {}
+    for name in ("linear", "cauchy"):
+        found = rts.fit(
+            rts.ImageResiduals(shifted, camera, mask.shape, mask, supersample=2, loss=name, f_scale=0.1),
+            torch.tensor(SHIFT + np.float32([0.03, -0.04, -0.05])),
+            **{"method": method, "steps": 60, "learning_rate": rate, "progress": False},
+        )
+        off[name] = np.linalg.norm(found.parameters.numpy() - SHIFT)
+    assert off["cauchy"] < 0.5 * off["linear"]
+
+
+@targets
+@pytest.mark.parametrize("method", ["lm", "adam"])
+def test_a_line_through_points_of_which_some_are_wrong(target, method):
+    """Of residuals by a function of one's own; the least squares are off by one tenth of the outliers."""
+    x = np.linspace(-1, 1, 40)
+    points = arrays(target, np.where(np.arange(40) % 10 == 3, 4.0, 0.5 + 2 * x))
+    powers = arrays(target, np.stack([np.ones(40), x], 1))
+
+    def off(p):
+        return powers @ p - points
+
+    loss, start = rts.Loss("cauchy", 0.1), arrays(target, np.array([0.0, 1.0]))
+    options = {"method": method, "steps": 600, "progress": False, "tolerance": 0.0}
+    if method == "adam":
+        options["learning_rate"] = 0.05
+    found = rts.fit(off, start, loss=loss, **options)
+    theirs = least_squares(lambda p: to_numpy(off(arrays(target, p))), [0.5, 2.0], loss="cauchy", f_scale=0.1)
+    np.testing.assert_allclose(to_numpy(found.parameters), theirs.x, atol=1e-3)
+    np.testing.assert_allclose(to_numpy(found.parameters), [0.5, 2], atol=0.02)
+    assert np.abs(to_numpy(rts.fit(off, start, **options).parameters) - [0.5, 2]).max() > 0.2
+    assert found.loss == pytest.approx(2 * theirs.cost / 40, rel=1e-4)
+
+
+def test_residuals_of_ones_own_may_say_their_loss():
+    torch = pytest.importorskip("torch")
+
+    class Off(rts.Residuals):
+        loss = rts.Loss("huber", 0.5)
+
+        def __call__(self, p):
+            return p - torch.tensor([0.0, 0.0, 9.0])
+
+    class Unrelated:
+        def loss(self):
+            raise AssertionError
+
+        def __call__(self, p):
+            return p - torch.tensor([0.0, 0.0, 9.0])
+
+    start, options = torch.zeros(3), {"steps": 1, "progress": False}
+    for method in ("lm", "adam"):
+        assert rts.fit(Off(), start, method=method, **options).loss == pytest.approx((9 - 0.25) / 3)
+        assert rts.fit(Off(), start, method=method, loss=rts.Loss(), **options).loss == pytest.approx(27)
+        assert rts.fit(Unrelated(), start, method=method, **options).loss == pytest.approx(27)
+    Off.loss = "huber"
+    with pytest.raises(InputError, match="the residuals' loss is 'huber'; expected an rts.Loss, or None"):
+        rts.fit(Off(), start, **options)
+
+
+def test_another_loss_than_that_of_the_image_is_taken_of_its_residuals():
+    torch = pytest.importorskip("torch")
+    swept, pose = residuals("lambert", 4, loss="huber", f_scale=0.1), torch.tensor(POSE)
+    for method in ("lm", "adam"):
+        own = rts.fit(swept, pose, method=method, steps=1, progress=False)
+        assert own.loss == pytest.approx(float(swept.loss(swept(pose))), rel=1e-5)
+        other = rts.fit(swept, pose, method=method, loss=rts.Loss(), steps=1, progress=False)
+        assert other.loss == pytest.approx(float((swept(pose) ** 2).mean()), rel=1e-5)
+
+
+# ------------------------------------------------------------------------------------------------------- misuse
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"loss": "square"}, "loss is 'square'; expected one of linear, soft_l1, huber, cauchy"),
+        ({"loss": None}, "loss is None; expected one of"),
+        ({"loss": "huber", "f_scale": 0}, "f_scale is 0; expected a positive, finite number"),
+        ({"loss": "huber", "f_scale": -0.1}, "f_scale is -0.1"),
+        ({"loss": "huber", "f_scale": math.inf}, "f_scale is inf"),
+        ({"loss": "cauchy", "f_scale": math.nan}, "f_scale is nan"),
+        ({"loss": "cauchy", "f_scale": "wide"}, "f_scale is 'wide'"),
+        ({"f_scale": 0}, "f_scale is 0"),
+    ],
+)
+def test_losses_that_are_none_are_refused(options, expected):
+    with pytest.raises(InputError, match=expected) as error:
+        residuals(**options)
+    assert "\n" not in str(error.value)
+
+
+def test_losses_are_values():
+    loss = rts.Loss("huber", np.float32(0.5))
+    assert loss == rts.Loss("huber", 0.5) and hash(loss) == hash(rts.Loss("huber", 0.5)) and loss.robust
+    assert not rts.Loss().robust and rts.Loss() == rts.Loss("linear", 1)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        loss.f_scale = 1.0
+    assert fused_normal.SQUARE == rts.Loss()
