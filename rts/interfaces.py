@@ -695,7 +695,7 @@ class CheckedPart(Part):
 
     surface: Surface
     theta: Mapping[str, Tree]
-    shader: Shader
+    shader: Shader  # pyright: ignore[reportGeneralTypeIssues]  # It is always given.
     transform: Array | None = None
     cull: str = "none"
 
