@@ -308,7 +308,7 @@ def _shade(
     world = _to_world(_readable(local, samples, engine), transform)
     rgba = _shaded(part, theta, world, camera)
     check_shaded(rgba, samples.ids.shape[-2], part.shader)
-    if part.uniform:
+    if part.uniform_by == ():  # It is constant, and takes no time.
         return world, rgba
     rows, names = local.computed, [*local]
     if isinstance(camera, RowCameras):
