@@ -25,7 +25,7 @@ LOSSES = ("linear", "soft_l1", "huber", "cauchy")
 F_SCALE = 0.1
 OFFSET = 0.15
 SHARE = 0.15
-"""Of the silhouette, that is hidden."""
+"""What part of the silhouette is hidden."""
 PLACES = ("nowhere", "side", "bar", "corner")
 
 

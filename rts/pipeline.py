@@ -20,6 +20,8 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
 from numba.core.target_extension import CPU, dispatcher_registry, jit_registry
 
+TESTED = (0, 60), (0, 68)
+"""The first and the last of numba's versions with which this is known to work."""
 _PARAMETERS = ["typingctx", "targetctx", "library", "args", "return_type", "flags", "locals"]
 _NEEDED = {
     Compiler: ["define_pipelines"],
@@ -34,6 +36,8 @@ _NEEDED = {
     Flags: ["copy", "no_cpython_wrapper", "no_cfunc_wrapper", "release_gil", "inline"],
     BaseContext: ["subtarget"],
 }
+if not TESTED[0] <= numba.version_info.short <= TESTED[1]:
+    raise ImportError(f"not tested with numba {numba.__version__}")
 if [*inspect.signature(Compiler).parameters] != _PARAMETERS or not all(
     hasattr(owner, name) for owner, names in _NEEDED.items() for name in names
 ):
