@@ -68,6 +68,11 @@ class Evaluator(Plugin):
         """
 
 
+def _overrides(cls: type, method: str, declared_by: type) -> bool:
+    """Whether a class has a method in place of another that works, not of that which only declares it."""
+    return method in vars(cls) and any(method in vars(c) for c in cls.__mro__[1:] if c not in (declared_by, object))
+
+
 class Surface(Evaluator):
     """A kind of surface. It holds topology and is immutable; its numbers come as θ.
 
@@ -87,7 +92,7 @@ class Surface(Evaluator):
     def __init_subclass__(cls, **options: Any) -> None:
         """What another `evaluate` gives is said anew."""
         super().__init_subclass__(**options)
-        if "evaluate" in vars(cls) and "gives" not in vars(cls):
+        if "gives" not in vars(cls) and _overrides(cls, "evaluate", Evaluator):
             cls.gives = Surface.gives
 
     def check(self, theta: Mapping[str, Tree]) -> None:
@@ -430,7 +435,7 @@ class Shader(Plugin):
     def __init_subclass__(cls, **options: Any) -> None:
         """Other colours are promised anew."""
         super().__init_subclass__(**options)
-        if "__call__" in vars(cls) and "uniform_by" not in vars(cls):
+        if "uniform_by" not in vars(cls) and _overrides(cls, "__call__", Shader):
             cls.uniform_by = Shader.uniform_by
 
     def uniform_by(self, theta: Mapping[str, Tree], given: Sequence[str] | None) -> tuple[str, ...] | None:

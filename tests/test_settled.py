@@ -316,10 +316,18 @@ def test_which_scenes_are_of_one_colour():
         def evaluate(self, theta, samples):
             return {**super().evaluate(theta, samples), "color": samples.params}
 
+    class Moved(Unlit):
+        """Unlit, but for what a class inherits it may not promise."""
+
+        def __call__(self, theta, gbuffer, camera):
+            return super().__call__(theta, gbuffer, camera) * gbuffer["position"][:, :1]
+
+    ball = rts.plugin("rts.surfaces", "sdf")(lambda theta, p: p[:, 0])
     free, colors, uv = torch.tensor(red), rng.random((len(vertices), 3)), rng.random((len(vertices), 2))
     texture = rng.random((4, 4, 3))
     of_one = {
         "white": [part()],
+        "a field": [rts.Part(ball, {}, "unlit")],
         "red": [part(color=red)],
         "texture without uv": [part(texture=texture)],
         "uv without texture": [part(uv=uv)],
@@ -334,6 +342,7 @@ def test_which_scenes_are_of_one_colour():
         "shaded": [part("lambert")],
         "of a surface that does not say": [part().replace(surface=Odd(SPHERE[1]))],
         "own colours": [part(Shaded())],
+        "a call of its own": [part(Moved())],
         "a function": [part(lambda theta, gbuffer, camera: gbuffer["normal"])],
         "red and green": [part(color=red), part(color=green)],
         "white and red": [part(), part(color=red)],
