@@ -18,7 +18,7 @@ from rts.engines import Engine, constants, engine_of, is_constant, namespace, su
 from rts.errors import InputError
 from rts.footprints import FOOTPRINT, uv_footprint
 from rts.gbuffer import GBuffer
-from rts.interfaces import CheckedPart, Shader
+from rts.interfaces import CheckedPart
 from rts.operations.linear import affine_map
 from rts.operations.projection import projective_map_of_views
 from rts.operations.take import take, take_shifted
@@ -224,8 +224,8 @@ def _shown_in_views(
     places = _places_of(pictures, engine_of(points), points)
     positions = constants(projective_map_of_views(rows, points, view, places), engine, dtype)
     cameras = constants(cameras, engine, dtype)
-    if shaded_at_once(part.shader):
-        camera = cameras[0] if part.shader.uniform else RowCameras.of(cameras, view)
+    if shaded_at_once(part):
+        camera = cameras[0] if part.uniform else RowCameras.of(cameras, view)
         rgba = _shade(part, theta, transform, whole, gbuffer, camera, engine)[1]
     else:
         assert counts is not None
@@ -257,11 +257,11 @@ def _shown_in_views(
     return positions, rgba
 
 
-def shaded_at_once(shader: Shader) -> bool:
-    """Whether a shader takes the samples of several views in one call."""
+def shaded_at_once(part: CheckedPart) -> bool:
+    """Whether a part's shader takes the samples of several views in one call."""
     # The footprint of a sample is found by the camera of its view.
-    tells = shader.reads is not None and FOOTPRINT not in shader.reads
-    return shader.uniform or (shader.takes_views and tells)
+    tells = part.shader.reads is not None and FOOTPRINT not in part.shader.reads
+    return part.uniform or (part.shader.takes_views and tells)
 
 
 def _theta_of(part: CheckedPart, engine: Engine, like: Array | None) -> dict[str, Tree]:
@@ -308,7 +308,7 @@ def _shade(
     world = _to_world(_readable(local, samples, engine), transform)
     rgba = _shaded(part, theta, world, camera)
     check_shaded(rgba, samples.ids.shape[-2], part.shader)
-    if part.shader.uniform:
+    if part.uniform_by == ():  # It is constant, and takes no time.
         return world, rgba
     rows, names = local.computed, [*local]
     if isinstance(camera, RowCameras):
