@@ -37,7 +37,7 @@ class RowCameras:
 
     def of_rows(self, number: Array) -> RowCameras:
         """These cameras, for other samples."""
-        return RowCameras(self.views, self.projection, number)
+        return RowCameras(self.views, self.projections, number)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points (N, 3) towards the viewer, not normalised; parallel where orthographic."""
