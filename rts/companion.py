@@ -16,6 +16,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import zlib
 from pathlib import Path
 from typing import IO, Any
@@ -38,6 +39,17 @@ _state: _Companion | None | bool = None
 """The companion of this process; None before one was needed, False where there is none."""
 
 _expected: list[str] = []
+_starting = threading.Lock()
+
+
+def _renew() -> None:
+    """In a fork nobody is starting one."""
+    global _starting
+    _starting = threading.Lock()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_renew)
 
 
 def number(name: str) -> int:
@@ -56,8 +68,9 @@ def expect(kind: str) -> None:
 def prepare() -> None:
     """Start the companion of this process, if it may have one, since a kernel will be missing."""
     global _state
-    if _state is None:
-        _state = _started() if _may_start() else False
+    with _starting:
+        if _state is None:
+            _state = _started() if _may_start() else False
 
 
 def begin(key: int) -> bool:

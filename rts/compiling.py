@@ -55,7 +55,8 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
         made = cast(Any, numba.njit(**options)(function))
         if made is not function:  # As it is where compilation is switched off.
             made._cache = _Cache(function)
-            _foresee(made._cache.cache_path)
+            if _is_ours(made):
+                _foresee(made._cache.cache_path)
         return _interpreted(made)
 
     return decorate if function is None else decorate(function)
@@ -287,11 +288,7 @@ class _Progress(_Outermost):
 
 
 class _NoCollection(_Outermost):
-    """No garbage is collected while a kernel is compiled, which makes many objects, nor right after it.
-
-    To look through what is new takes a tenth of the time. What is new counts as old instead, which is looked through
-    when so much has become old that it pays.
-    """
+    """No garbage is collected while a kernel is compiled, which makes many objects: it takes a tenth of the time."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -306,9 +303,6 @@ class _NoCollection(_Outermost):
     def ended(self, ours: bool) -> None:
         """Go on."""
         if self._paused:
-            if not gc.get_freeze_count():  # Else somebody keeps objects there.
-                gc.freeze()
-                gc.unfreeze()
             gc.enable()
 
 

@@ -18,7 +18,7 @@ from rts.engines import Engine, constants, engine_of, is_constant, namespace, su
 from rts.errors import InputError
 from rts.footprints import FOOTPRINT, uv_footprint
 from rts.gbuffer import GBuffer
-from rts.interfaces import CheckedPart, Shader
+from rts.interfaces import CheckedPart
 from rts.operations.linear import affine_map
 from rts.operations.projection import projective_map_of_views
 from rts.operations.take import take, take_shifted
@@ -65,8 +65,8 @@ def views_to_splats(
 ) -> list[Splats]:
     """The splats of pictures of several views: those of a picture have no border, but cells that are wanted.
 
-    A surface is asked once, for the samples of all views: what it computes of the whole of θ serves them all. Shaders
-    are asked for the samples of each view.
+    A surface is asked once, for the samples of all views: what it computes of the whole of θ serves them all. So are
+    shaders that take views; others are asked view by view.
 
     Args:
         pictures: the samples of the views; pictures are of one size.
@@ -198,7 +198,7 @@ def _shown_in_views(
 
     Args:
         index: the part's.
-        part: the part; `uniform`, where the number of samples in each view is not known.
+        part: the part; `shaded_at_once`, where the number of samples in each view is not known.
         pictures: the views.
         sampled: their samples, in arrays of the engine.
         cameras: of the whole image of each view.
@@ -224,8 +224,8 @@ def _shown_in_views(
     places = _places_of(pictures, engine_of(points), points)
     positions = constants(projective_map_of_views(rows, points, view, places), engine, dtype)
     cameras = constants(cameras, engine, dtype)
-    if shaded_at_once(part.shader):
-        camera = cameras[0] if part.shader.uniform else RowCameras.of(cameras, view)
+    if shaded_at_once(part):
+        camera = cameras[0] if part.uniform else RowCameras.of(cameras, view)
         rgba = _shade(part, theta, transform, whole, gbuffer, camera, engine)[1]
     else:
         assert counts is not None
@@ -257,11 +257,11 @@ def _shown_in_views(
     return positions, rgba
 
 
-def shaded_at_once(shader: Shader) -> bool:
-    """Whether a shader takes the samples of several views in one call."""
+def shaded_at_once(part: CheckedPart) -> bool:
+    """Whether a part's shader takes the samples of several views in one call."""
     # The footprint of a sample is found by the camera of its view.
-    tells = shader.reads is not None and FOOTPRINT not in shader.reads
-    return shader.uniform or (shader.takes_views and tells)
+    tells = part.shader.reads is not None and FOOTPRINT not in part.shader.reads
+    return part.uniform or (part.shader.takes_views and tells)
 
 
 def _theta_of(part: CheckedPart, engine: Engine, like: Array | None) -> dict[str, Tree]:
@@ -308,7 +308,7 @@ def _shade(
     world = _to_world(_readable(local, samples, engine), transform)
     rgba = _shaded(part, theta, world, camera)
     check_shaded(rgba, samples.ids.shape[-2], part.shader)
-    if part.shader.uniform:
+    if part.uniform_by == ():  # It is constant, and takes no time.
         return world, rgba
     rows, names = local.computed, [*local]
     if isinstance(camera, RowCameras):

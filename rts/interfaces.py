@@ -68,6 +68,11 @@ class Evaluator(Plugin):
         """
 
 
+def _overrides(cls: type, method: str, declared_by: type) -> bool:
+    """Whether a class has a method in place of another that works, not of that which only declares it."""
+    return method in vars(cls) and any(method in vars(c) for c in cls.__mro__[1:] if c not in (declared_by, object))
+
+
 class Surface(Evaluator):
     """A kind of surface. It holds topology and is immutable; its numbers come as θ.
 
@@ -84,12 +89,29 @@ class Surface(Evaluator):
     centered: bool = True
     param_step: float = 2**-8
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """What another `evaluate` gives is said anew."""
+        super().__init_subclass__(**options)
+        if "gives" not in vars(cls) and _overrides(cls, "evaluate", Evaluator):
+            cls.gives = Surface.gives
+
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Raise an `InputError` of one line where an entry is missing or of a wrong shape; values may be traced."""
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
         """The names of the entries of θ that the surface reads; others are its shader's. The default is all of them."""
         return tuple(theta)
+
+    def gives(self, theta: Mapping[str, Tree]) -> tuple[str, ...] | None:
+        """The names of the entries of the G-buffer that `evaluate` gives; None where the surface does not say.
+
+        It is asked before samples are made. Shaders may promise more where they know what they will not be given. A
+        class with an `evaluate` of its own does not inherit that of another surface.
+
+        Args:
+            theta: θ; values may be traced.
+        """
+        return None
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
         """Coarser and finer forms of the surface, for whoever looks for the cheapest that will do; none by default.
@@ -395,11 +417,12 @@ class Shader(Plugin):
 
     Attributes:
         opaque: a promise that alpha is 1.
-        uniform: a promise that all samples of a part have one colour, through whatever camera.
+        uniform: a promise that all samples of a part have one colour, through whatever camera. Where that depends on
+            the part, the class has a method `uniform_by` instead.
         reads: the entries of the G-buffer that it needs besides position; None for all.
         takes_views: whether a call may be of samples of several views, as `rts.render_views` then makes it: `camera` is
             an `rts.RowCameras`, whose methods give a row for each sample. A shader that says so also says what it
-            `reads`, without "uv_footprint".
+            `reads`, without "uv_footprint". A subclass with its own `__call__` has to say so itself.
         channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
     """
 
@@ -409,6 +432,29 @@ class Shader(Plugin):
     takes_views: bool = False
     reads: tuple[str, ...] | None = None
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """What another `__call__` does is promised anew."""
+        super().__init_subclass__(**options)
+        if _overrides(cls, "__call__", Shader):
+            for name in ("takes_views", "uniform_by"):
+                if name not in vars(cls):
+                    setattr(cls, name, getattr(Shader, name))
+
+    def uniform_by(self, theta: Mapping[str, Tree], given: Sequence[str] | None) -> tuple[str, ...] | None:
+        """Where all samples of a part have one colour, the entries of θ that it depends on; None where they may not.
+
+        It is asked before samples are made. The default goes by the class: all entries, where it is `uniform`. A class
+        with a `__call__` of its own does not inherit that of another shader.
+
+        Args:
+            theta: θ of the part; values may be traced.
+            given: the names of the entries of the G-buffer; None where the surface does not say (`Surface.gives`).
+
+        Returns:
+            Names of entries, or None. Parts whose shaders are equal, and these entries of θ, show the same colour.
+        """
+        return tuple(theta) if self.uniform else None
+
     @abc.abstractmethod
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
         """The colours of N samples, each from its own sample alone: N may be all, or some thousands at a time.
@@ -416,7 +462,7 @@ class Shader(Plugin):
         Args:
             theta: θ of the part.
             gbuffer: its G-buffer, in world space.
-            camera: the camera of the whole image; of a shader that `takes_views`, or the cameras of the samples.
+            camera: the camera of the whole image; for a shader that `takes_views` it may be an `rts.RowCameras`.
 
         Returns:
             (N, 4) premultiplied linear RGBA, in [0, 1]; (N, C + 1), alpha last, of a shader with other `channels`, all
@@ -651,13 +697,34 @@ class Part:
         return replace(self, **changes)
 
 
-if TYPE_CHECKING:
+@record(static=("surface", "shader", "cull"))
+class CheckedPart(Part):
+    """A part whose surface and shader have all members of their bases, as `rts.checks` makes it."""
 
-    class CheckedPart(Part):
-        """A part whose surface and shader have all members of their bases, as `rts.checks` makes it: it is a `Part`."""
+    surface: Surface
+    theta: Mapping[str, Tree]
+    shader: Shader  # pyright: ignore[reportGeneralTypeIssues]  # It is always given.
+    transform: Array | None = None
+    cull: str = "none"
 
-        surface: Surface
-        shader: Shader
+    @property
+    def uniform_by(self) -> tuple[str, ...] | None:
+        """Where all its samples have one colour, the entries of θ that this depends on; see `Shader`."""
+        return self.shader.uniform_by(self.theta, self.surface.gives(self.theta))
 
-else:
-    CheckedPart = Part
+    @property
+    def uniform(self) -> bool:
+        """Whether all its samples have one colour, through whatever camera."""
+        return self.uniform_by is not None
+
+    def shows_color_of(self, other: CheckedPart) -> bool:
+        """Whether both are certain to show one and the same colour, whatever arrays that are not NumPy's hold."""
+        names = self.uniform_by
+        if names is None or names != other.uniform_by or self.shader != other.shader:
+            return False
+        return all(_same(self.theta[name], other.theta[name]) for name in names)
+
+
+def _same(a: Tree, b: Tree) -> bool:
+    """Whether two entries of θ are one object, or constants of one value."""
+    return a is b or (isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b))

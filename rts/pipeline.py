@@ -58,22 +58,39 @@ class _NoEnvironments:
 
 
 class _Part(JITCodeLibrary):
-    """Code to be linked into others; none that calls itself, since numba links that by its address."""
+    """Code to be linked into others, which has machine code only where it needs a place of its own.
+
+    That is where it refers to Python's objects (to print them, or to raise errors with values), by what numba calls its
+    environment, and where two call one another, which numba links by address.
+    """
+
+    _alone = False
 
     @property
     def codegen(self) -> Any:
         """The code generator, as whoever prepares a function to be called sees it."""
-        return _NoEnvironments(self._codegen)
+        self._ensure_finalized()
+        return self._codegen if self._alone else _NoEnvironments(self._codegen)
 
     def get_pointer_to_function(self, name: str) -> int:
         """Null: there is none."""
         self._ensure_finalized()
-        return 0
+        return super().get_pointer_to_function(name) if self._alone else 0
 
     def _optimize_final_module(self) -> None:
-        """Leave that to what it is linked into."""
+        """Leave that to what it is linked into, where that will do."""
+        names = [x.name for x in self._final_module.global_variables]
+        names = [x for x in names if x.startswith(("_ZN08NumbaEnv", ".numba.unresolved$"))]
+        text = str(self._final_module) if names else ""
+        # An environment that nothing refers to is named once, where it is declared.
+        self._alone = any(x.startswith(".") or text.count("@" + x) > 1 for x in names)
+        if self._alone:
+            super()._optimize_final_module()
 
     def _finalize_final_module(self) -> None:
+        if self._alone:
+            super()._finalize_final_module()
+            return
         self._finalize_dynamic_globals()
         self._finalized = True
 

@@ -32,7 +32,7 @@ from rts.records import Sampled, Splats
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.emptiness import why_empty
 from rts.sampling.prepared import PreparedParts
-from rts.sampling.pruning import planned
+from rts.sampling.pruning import of_one_color, planned
 from rts.sampling.scenes import Scene, apron_of, sampled_scene, with_fine
 from rts.trees import Array
 
@@ -256,10 +256,11 @@ def render_samples(
             f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
             f"{apron_of(splatter)}; give it to rts.sample, too"
         )
-    if sampled.settled is not None and not (splatter.settles and scene.parts[0].shader.uniform):
+    if sampled.settled is not None and not (splatter.settles and of_one_color(scene.parts)):
+        shaders = ", ".join(dict.fromkeys(repr(part.shader) for part in scene.parts))
         raise InputError(
             f"samples of cells amid one colour were left out (settles=True), which {splatter!r} and "
-            f"{scene.parts[0].shader!r} need; give rts.sample this splatter and these parts, or leave it out"
+            f"{shaders} need; give rts.sample this splatter and these parts, or leave it out"
         )
     sampled = _narrowed(sampled, apron - apron_of(splatter))
     background = check_background(background, size, scene.channels)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from rts.camera import Camera, toward_rows, world_vectors
 from rts.engines import namespace
@@ -19,13 +20,13 @@ class RowCameras:
     Its methods are those of a `Camera` of one view, and give a row for each sample. Points are those of the N samples.
 
     Attributes:
-        view: (B, 4, 4) camera-from-world, of each view.
-        projection: (B, 4, 4) OpenGL clip space from camera space.
+        views: (B, 4, 4) camera-from-world, of each view.
+        projections: (B, 4, 4) OpenGL clip space from camera space.
         number: (N,) int32, the view of each sample, from 1 on; 0 for rows that are not used.
     """
 
-    view: Array
-    projection: Array
+    views: Array
+    projections: Array
     number: Array
 
     @classmethod
@@ -36,23 +37,29 @@ class RowCameras:
 
     def of_rows(self, number: Array) -> RowCameras:
         """These cameras, for other samples."""
-        return RowCameras(self.view, self.projection, number)
+        return RowCameras(self.views, self.projections, number)
 
     def toward(self, points: Array) -> Array:
         """(N, 3) world vectors from points (N, 3) towards the viewer, not normalised; parallel where orthographic."""
-        return affine_map_of_views(toward_rows(self.view, self.projection), points, self.number)
+        return affine_map_of_views(toward_rows(self.views, self.projections), points, self.number)
 
     def depth(self, points: Array) -> Array:
         """(N,) linear depth of world points (N, 3)."""
-        return -affine_map_of_views(self.view[:, 2:3, :], points, self.number)[:, 0]
+        return -affine_map_of_views(self.views[:, 2:3, :], points, self.number)[:, 0]
 
     def to_world(self, direction: Sequence[float]) -> Array:
         """(N, 3) the unit vector, in the world, of a direction (3,) in the space of each sample's camera."""
-        return take(world_vectors(self.view, direction), index_of_views(self.number))
+        return take(world_vectors(self.views, direction), index_of_views(self.number))
 
     def depth_range(self) -> tuple[Array, Array]:
         """(N,) linear depths of the near and the far plane; infinity for no such plane."""
-        views = [Camera(self.view[b, ...], self.projection[b, ...]).depth_range() for b in range(self.view.shape[0])]
-        xp, index = namespace(self.view), index_of_views(self.number)
+        views = [Camera(self.views[b, ...], self.projections[b, ...]).depth_range() for b in range(self.views.shape[0])]
+        xp, index = namespace(self.views), index_of_views(self.number)
         near, far = (take(xp.stack(depths)[:, None], index)[:, 0] for depths in zip(*views, strict=True))
         return near, far
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(
+            f"{name} of a camera was asked for by a shader that takes_views: there is one for each sample then, with "
+            f"toward, to_world, depth and depth_range alone; a shader that needs more says takes_views = False"
+        )

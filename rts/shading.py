@@ -17,7 +17,7 @@ The base colour is the texture where θ has one and the surface has uv, else the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,6 +46,10 @@ class Silhouette(Shader):
     opaque = True
     uniform = True
     reads = ()
+
+    def uniform_by(self, theta: Mapping[str, Tree], given: Sequence[str] | None) -> tuple[str, ...]:
+        """See `rts.Shader`: nothing."""
+        return ()
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -115,6 +119,14 @@ class Unlit(Shader):
         color, alpha = self.base_color(theta, gbuffer)
         return self.premultiplied(color, alpha)
 
+    def uniform_by(self, theta: Mapping[str, Tree], given: Sequence[str] | None) -> tuple[str, ...] | None:
+        """See `rts.Shader`: θ["color"], where there is neither a texture nor colours of the surface."""
+        if given is None or "color" in given or ("uv" in given and "texture" in theta):
+            return None
+        if type(self).base_color is not Unlit.base_color:
+            return None
+        return ("color",) if "color" in theta else ()
+
     def base_color(self, theta: Mapping[str, Tree], gbuffer: GBuffer) -> tuple[Array, Array]:
         """Colour (N, 3), not premultiplied, and alpha (N, 1)."""
         position = gbuffer["position"]
@@ -152,6 +164,7 @@ class Unlit(Shader):
 class Textured(Unlit):
     """The base colour, which must come from a texture."""
 
+    takes_views = True
     reads = ("uv",)
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
@@ -166,6 +179,7 @@ class Textured(Unlit):
 class Lambert(Unlit):
     """Diffuse shading, two-sided: normals are turned towards the viewer."""
 
+    takes_views = True
     reads = ("normal", "color", "uv")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
@@ -184,6 +198,7 @@ class Lambert(Unlit):
 class BlinnPhong(Unlit):
     """Diffuse shading with highlights (Blinn 1977), two-sided."""
 
+    takes_views = True
     reads = ("normal", "color", "uv")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:

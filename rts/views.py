@@ -46,15 +46,15 @@ def render_views(
 ) -> Array:
     """Render several views of a scene; they are those of a loop of `render`, but for rounding.
 
-    Where depths of layers are as good as equal, what counts as equal goes by the farthest view of the picture: beside a
-    view from a thousand times as far, gradients of hidden parts may differ more.
+    Where layers are nearer to one another than float32 tells apart at their distance, gradients of hidden parts may
+    differ more: what counts as equal goes by the farthest view, and is up to twice what it is of a view alone.
 
     Views lie side by side in one picture, of 1024² cells at most: Python's share of the work is paid once for all, what
     the surface computes of the whole of θ, such as smooth normals, serves them all, one splat does, and one call of a
     shader that `takes_views`, as the built-in ones do but for those with mipmaps. With jax, and under `torch.func`,
-    that is so for shaders which take views or are `uniform`, and one picture; else one view follows the other, as with
-    `layers="auto"` and in bands. NumPy views that are too large for a picture are rendered one on each core. With torch
-    and jax memory is that of all views at once, with a gradient or without.
+    that is so for shaders which take views, for parts of one colour, and for one picture; else one view follows the
+    other, as with `layers="auto"` and in bands. NumPy views that are too large for a picture are rendered one on each
+    core. With torch and jax memory is that of all views at once, with a gradient or without.
 
     Args:
         parts: as in `render`.
@@ -130,7 +130,7 @@ def _images(
         ]
         if place.views > 1 and all(own.possible for own in given):
             # Of padded rows it is not known which are those of a view, so that there must be one call for all.
-            alike = len(given) == 1 and all(shaded_at_once(part.shader) for part in scenes[0].parts)
+            alike = len(given) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
             known = capacity is None and engine.concurrent() and engine.on_host(like)
             if alike if engine.padded(like) else known:
                 return _as_pictures([sampled_as_one(own) for own in given], scenes, suited, splatter)

@@ -97,22 +97,6 @@ def test_no_garbage_is_collected_while_our_kernels_are_compiled():
         assert gc.isenabled()
 
 
-def test_what_is_new_after_a_compilation_is_not_looked_through():
-    listener = compiling._NoCollection()
-    event = type("", (), {"data": {"dispatcher": type("", (), {"py_func": rts.render})}})
-    collected = []
-    gc.callbacks.append(lambda phase, info: collected.append(info["generation"]))
-    try:
-        listener.on_start(event)
-        new = [[] for _ in range(10 * gc.get_threshold()[0])]
-        listener.on_end(event)
-        also = [[] for _ in range(10)]
-    finally:
-        gc.callbacks.pop()
-    assert not collected and gc.isenabled() and gc.get_freeze_count() == 0
-    assert len(new) + len(also) > gc.get_threshold()[0]
-
-
 def _doubled(x):
     return x + x if x > 0 else -x
 
@@ -177,6 +161,42 @@ print(made(3.0), "pipeline_class" in compiling.KERNEL | compiling.PART)
 def test_another_numba_compiles_as_it_does(numba):
     done = subprocess.run([sys.executable, "-c", numba + DOUBLED], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["6.0", "False"]
+
+
+NEEDS_PYTHON = """
+import sys
+sys.path.insert(0, {folder!r})
+import needy
+import numpy as np
+try:
+    needy.checked(-3.0)
+except ValueError as error:
+    print(error)
+print(needy.checked(3.0))
+"""
+
+NEEDY = """
+from rts.compiling import compiled, kernel
+
+@compiled
+def check(x):
+    if x < 0:
+        raise ValueError("below zero", x)
+    print("checked", x)
+
+@kernel
+def checked(x):
+    check(x)
+    return 2 * x
+"""
+
+
+def test_helpers_may_print_and_raise_errors_with_values(tmp_path):
+    (tmp_path / "needy.py").write_text(NEEDY)
+    code = NEEDS_PYTHON.format(folder=str(tmp_path))
+    for _ in range(2):  # Compiled, and from disk.
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+        assert done.stdout.splitlines() == ["('below zero', -3.0)", "checked 3.0", "6.0"]
 
 
 def test_warmup_has_as_many_processes_share_the_work_and_says_what_failed(monkeypatch):

@@ -322,6 +322,8 @@ def test_compiled_views_are_shaded_together_in_pieces_of_rows_in_use(capacity, m
     calls, part = [], mesh_part(icosphere(1))
 
     class Counted(Lambert):
+        takes_views = True
+
         def __call__(self, theta, gbuffer, camera):
             calls.append(type(camera))
             return super().__call__(theta, gbuffer, camera)
@@ -393,6 +395,21 @@ def test_shaders_are_given_one_camera_unless_they_take_views_and_say_what_they_r
         calls.clear()
         np.testing.assert_allclose(rts.render_views(part, CAMERAS, SIZE), expected, rtol=0, atol=1e-5)
         assert calls == kinds
+
+
+class Dimmed(rts.plugin("rts.shaders", "lambert")):
+    """A shader that reads what only one camera has."""
+
+    def __call__(self, theta, gbuffer, camera):
+        return super().__call__(theta, gbuffer, camera) * np.float32(1 / (1 + abs(camera.view[2, 3])))
+
+
+def test_promises_of_a_call_that_is_overridden_hold_no_more():
+    part = mesh_part(icosphere(1), shader=Dimmed())
+    np.testing.assert_allclose(rts.render_views(part, CAMERAS, SIZE), looped(part), rtol=0, atol=1e-5)
+    again = type("Again", (Dimmed,), {"takes_views": True})
+    with pytest.raises(AttributeError, match="view of a camera was asked for by a shader that takes_views"):
+        rts.render_views(part.replace(shader=again()), CAMERAS, SIZE)
 
 
 # ----------------------------------------------------------------------------------------------- how it is done

@@ -8,8 +8,11 @@ from helpers import DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere
 
 import rts
 from rts import splatting
+from rts.checks import check_scene
 from rts.sampling.interiors_kernels import settle
+from rts.sampling.pruning import of_one_color
 from rts.sampling.scenes import sample
+from rts.shading import Unlit
 from rts.splatting.layers import dilated
 from rts_backends.fused import splatters as fused
 
@@ -27,12 +30,32 @@ def joined(*meshes):
     return np.concatenate([vertices for vertices, _ in meshes]), np.concatenate(faces)
 
 
+def at(*place):
+    """The transform that moves a part there."""
+    move = np.eye(4)
+    move[:3, 3] = place
+    return move
+
+
 SCENES = {
     "sphere": icosphere(3, 0.9),
     "box before a card": joined(box(0.5), quad(-1.0, 1.0, -1.0, 1.0, -0.8)),
     "spheres that cross": joined(icosphere(2, 0.8), (icosphere(2, 0.8)[0] + np.float32((0.5, 0, 0)), icosphere(2)[1])),
     "cut by the frame": icosphere(3, 1.6),
 }
+
+
+class Twice(splatting.Visible):
+    """A splatter with an image of its own."""
+
+    def image(self, splats):
+        return super().image(splats)
+
+
+class Whole(fused.Visible):
+    """A splatter that does not read which cells are settled."""
+
+    settles = False
 
 
 class Painted(rts.Shader):
@@ -115,13 +138,13 @@ def test_so_are_those_of_active_pixels(name, splatter):
 
 
 def test_pixels_that_are_not_active_are_flat_where_hidden_samples_have_no_effect_on_them():
-    part = part_of(SCENES["sphere"][0], "sphere")
+    part, behind = (part_of(SCENES["sphere"][0], "sphere", transform=at(*place)) for place in ((0, 0, 0), (0.5, 0, -2)))
     cases = {
         "visible": {},
         "single": {},
         "multi": {"splatter": "multi"},
         "no room": {"capacity": 1500},
-        "two": {"parts": [part, part]},
+        "two": {"parts": [part, behind]},
         "shaded": {"parts": part.replace(shader="normals")},
     }
     flat = {}
@@ -129,7 +152,7 @@ def test_pixels_that_are_not_active_are_flat_where_hidden_samples_have_no_effect
         options = {"splatter": case if case == "single" else "visible", "supersample": rts.Adaptive(4), **given}
         sampled = sample(options.pop("parts", part), CAMERA, SIZE, settles=True, **options)
         flat[case] = sampled.fine.flat
-    assert flat == {case: case in ("visible", "single") for case in cases}
+    assert flat == {case: case in ("visible", "single", "two") for case in cases}
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
@@ -179,9 +202,163 @@ def test_the_specification_agrees(name, make):
         np.testing.assert_allclose(settled, whole, rtol=0, atol=1e-10 * max(1, np.abs(whole).max()))
 
 
+SPHERE = icosphere(2, 0.8)
+SEVERAL = {
+    "overlapping": [(SPHERE, at(0.4, 0.1, 0.3)), (SPHERE, at(-0.3, 0, -0.6))],
+    "crossing": [(SPHERE, at(0.3, 0, 0)), (SPHERE, at(-0.3, 0, 0.1))],
+    "out of sight": [(SPHERE, at(30, 0, 0)), (SPHERE, at(0, 0, 0))],
+    "hidden": [(SPHERE, at(0, 0, 0)), (icosphere(1, 0.2), at(0, 0, -1))],
+    "a box before a card": [(box(0.5), at(0, 0, 0.2)), (quad(-1.0, 1.0, -1.0, 1.0, -0.8), at(0, 0, 0))],
+    "three": [(SPHERE, at(0.4, 0.1, 0.3)), (SPHERE, at(-0.3, 0, -0.6)), (box(0.4), at(0, -0.3, 1))],
+}
+
+
+def several_of(name, poses=None, color=None, **options):
+    """The parts of a scene, moved by poses (P, 6), all silhouettes or unlit in one colour."""
+    theta = {} if color is None else {"color": color}
+    return [
+        rts.Part(
+            MESH(faces),
+            {"vertices": vertices, **theta},
+            "silhouette" if color is None else "unlit",
+            place if poses is None else poses.new_tensor(place) @ rts.rigid(poses[i]),
+            **options,
+        )
+        for i, ((vertices, faces), place) in enumerate(SEVERAL[name])
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "splatter", "options"),
+    [
+        *((name, "visible", {}) for name in SEVERAL),
+        ("overlapping", "visible", {"layers": 1}),
+        ("overlapping", "visible", {"layers": "auto"}),
+        ("overlapping", "visible", {"supersample": 2}),
+        ("crossing", "visible", {"cull": "back"}),
+        ("crossing", splatting.Visible(), {"cull": "back", "layers": 3}),
+        ("three", "multi", {}),
+        ("three", splatting.Multi(), {"layers": 3}),
+        ("a box before a card", "single", {}),
+        *((name, "visible", {"supersample": rts.Adaptive(3)}) for name in SEVERAL),
+        ("overlapping", "single", {"supersample": rts.Adaptive(3)}),
+    ],
+)
+def test_so_are_those_of_several_parts_of_one_colour(name, splatter, options):
+    import torch
+
+    options, cull = dict(options), options.get("cull", "none")
+    options.pop("cull", None)
+    count = len(SEVERAL[name])
+    rng, weights = np.random.default_rng(5), np.random.default_rng(2).normal(size=(*SIZE, 4))
+    start = torch.from_numpy(np.concatenate([0.02 * rng.normal(size=6 * count), [0.3, 0.6, 0.2]]))
+    along, results, counts = torch.from_numpy(rng.normal(size=len(start))), [], []
+    for settles in (False, True):
+
+        def scene(x):
+            return several_of(name, x[:-3].reshape(-1, 6), x[-3:], cull=cull)
+
+        sampled = sample(scene(start), CAMERA, SIZE, splatter=splatter, settles=settles, **options)
+
+        def image(x, sampled=sampled, scene=scene):
+            return rts.render_samples(sampled, scene(x), CAMERA, splatter=splatter)
+
+        def loss(x, image=image):
+            return (image(x) * torch.from_numpy(weights)).sum()
+
+        results.append([*derivative("torch", image, start, along), gradient("torch", loss, start)])
+        counts.append(sum(len(s.ids) for s in (sampled.fine or sampled).samples))
+    shown = sampled.fine or sampled
+    assert shown.settled.any() and (counts[1] < counts[0] or splatter == "multi")
+    assert np.abs(results[0][2]).max() > 1
+    for whole, settled in zip(*results, strict=True):
+        np.testing.assert_allclose(settled, whole, rtol=0, atol=1e-10 * max(1, np.abs(whole).max()))
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_unlit_parts_of_one_colour_are_settled_and_their_colour_has_its_gradient(target):
+    weights = arrays(target, np.random.default_rng(0).normal(size=(*SIZE, 4)).astype(np.float32))
+    start, found = arrays(target, np.array([0.3, 0.6, 0.2, 0.02, -0.01, 0.03], np.float32)), []
+    for splatter in (fused.Visible(), Whole()):
+
+        def loss(x, splatter=splatter):
+            xp = rts.namespace(x)
+            pose = xp.concat([x[3:], 0 * x[3:]])
+            theta = {"vertices": SPHERE[0], "color": x[:3]}
+            part = rts.Part(MESH(SPHERE[1]), theta, "unlit", rts.rigid(pose))
+            return xp.sum(rts.render(part, CAMERA, SIZE, splatter=splatter) * weights)
+
+        if target == "jax" and not found:
+            import jax
+
+            loss = jax.jit(loss)
+        found.append(to_numpy(gradient(target, loss, start)))
+    assert np.abs(found[0]).max() > 1
+    np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-5 * np.abs(found[1]).max())
+
+
+def test_which_scenes_are_of_one_colour():
+    import torch
+
+    vertices, rng = SPHERE[0], np.random.default_rng(0)
+    red, green = np.array([1.0, 0, 0], np.float32), np.array([0, 1.0, 0], np.float32)
+
+    def part(shader="unlit", indices=None, **theta):
+        return rts.Part(MESH(SPHERE[1], indices), {"vertices": vertices, **theta}, shader)
+
+    class Shaded(Unlit):
+        def base_color(self, theta, gbuffer):
+            return gbuffer["normal"], gbuffer["position"][:, :1]
+
+    class Odd(MESH):
+        """Does not say what it gives, any more."""
+
+        def evaluate(self, theta, samples):
+            return {**super().evaluate(theta, samples), "color": samples.params}
+
+    class Moved(Unlit):
+        """Unlit, but for what a class inherits it may not promise."""
+
+        def __call__(self, theta, gbuffer, camera):
+            return super().__call__(theta, gbuffer, camera) * gbuffer["position"][:, :1]
+
+    ball = rts.plugin("rts.surfaces", "sdf")(lambda theta, p: p[:, 0])
+    free, colors, uv = torch.tensor(red), rng.random((len(vertices), 3)), rng.random((len(vertices), 2))
+    texture = rng.random((4, 4, 3))
+    of_one = {
+        "white": [part()],
+        "a field": [rts.Part(ball, {}, "unlit")],
+        "red": [part(color=red)],
+        "texture without uv": [part(texture=texture)],
+        "uv without texture": [part(uv=uv)],
+        "alike": [part(color=red), part(color=red.copy()), part(Unlit(), color=red)],
+        "one tensor": [part(color=free), part(color=free)],
+        "silhouettes": [part("silhouette"), part("silhouette", colors=colors)],
+    }
+    of_more = {
+        "colours": [part(colors=colors)],
+        "a table of colours": [part(indices={"color": None}, color=colors)],
+        "textured": [part(texture=texture, uv=uv)],
+        "shaded": [part("lambert")],
+        "of a surface that does not say": [part().replace(surface=Odd(SPHERE[1]))],
+        "own colours": [part(Shaded())],
+        "a call of its own": [part(Moved())],
+        "a function": [part(lambda theta, gbuffer, camera: gbuffer["normal"])],
+        "red and green": [part(color=red), part(color=green)],
+        "white and red": [part(), part(color=red)],
+        "two tensors": [part(color=free), part(color=free.clone())],
+        "two of one class": [part(Painted(), color=red), part(Painted(), color=red)],
+        "silhouette and white": [part("silhouette"), part()],
+    }
+    for expected, scenes in ((True, of_one), (False, of_more)):
+        for name, parts in scenes.items():
+            assert of_one_color(check_scene(parts, CAMERA)[0]) is expected, name
+
+
 @pytest.mark.parametrize("supersample", [1, 2, rts.Adaptive(3)])
 @pytest.mark.parametrize("color", [None, "free"])
-def test_normal_equations_are_those_of_all_samples(color, supersample, monkeypatch):
+@pytest.mark.parametrize("several", [False, True])
+def test_normal_equations_are_those_of_all_samples(several, color, supersample, monkeypatch):
     import torch
 
     from rts.fitting import image_residuals
@@ -191,9 +368,13 @@ def test_normal_equations_are_those_of_all_samples(color, supersample, monkeypat
         parameters["color"] = torch.tensor([0.3, 0.6, 0.2], dtype=torch.float64)
 
     def scene(p):
+        if several:
+            return several_of("overlapping", p["pose"][None] * p["pose"].new_tensor([[1.0], [0.5]]), p.get("color"))
         return part_of(SCENES["sphere"][0], "sphere", p.get("color"), transform=rts.rigid(p["pose"]))
 
     target = np.random.default_rng(3).random((*SIZE, 4 if color else 1))
+    sampled = sample(scene(parameters), CAMERA, SIZE, splatter="visible", supersample=supersample, settles=True)
+    assert (sampled.fine or sampled).settled.any()
     residuals = rts.ImageResiduals(scene, CAMERA, SIZE, target, supersample=supersample)
     found = residuals.normal_equations(parameters)
     monkeypatch.setattr(image_residuals, "sample", lambda *a, settles, **k: sample(*a, **k))
@@ -221,13 +402,6 @@ def test_the_number_of_threads_changes_nothing(monkeypatch):
         np.testing.assert_array_equal(one, two)
 
 
-class Twice(splatting.Visible):
-    """A splatter with an image of its own."""
-
-    def image(self, splats):
-        return super().image(splats)
-
-
 def test_samples_are_left_out_only_where_nothing_can_depend_on_them():
     vertices = SCENES["sphere"][0]
     part, painted = part_of(vertices, "sphere"), part_of(vertices, "sphere", np.array([1.0, 0.0, 0.0]))
@@ -239,12 +413,13 @@ def test_samples_are_left_out_only_where_nothing_can_depend_on_them():
             (painted, "multi"),
             (normals, "visible"),
             ([part, part], "visible"),
+            ([part, normals], "visible"),
             (part, Twice()),
             (part, "none"),
             (part, splatting.Visible(epsilon=0.0)),
         )
     ]
-    assert settled == [True, True, False, False, False, False, False]
+    assert settled == [True, True, False, True, False, False, False, False]
 
 
 def test_what_needs_the_samples_that_were_left_out_is_refused():

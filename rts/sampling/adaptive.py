@@ -25,7 +25,7 @@ class Adaptive:
     Attributes:
         samples: s, along each side of an active pixel; at least 2.
         dilated: whether the eight neighbours of active pixels are active too. Colours that change near outlines need
-            that; None for where some shader gives a part more than one colour (`Shader.uniform`).
+            that; None for where some part has more than one colour (`Shader.uniform_by`).
         contrast: pixels are also active whose colour, in any channel, has a second difference above this along any of
             four directions: edges of colour on surfaces. Needs colours, which `rts.sample` does not have, nor do
             compiled programs and derivatives of several directions at once. None for not to look; 0.2 suits.
@@ -51,7 +51,7 @@ class Adaptive:
     def dilates(self, parts: Sequence[CheckedPart]) -> bool:
         """Whether active pixels of a scene are dilated."""
         if self.dilated is None:
-            return self.contrast is not None or not all(part.shader.uniform for part in parts)
+            return self.contrast is not None or not all(part.uniform for part in parts)
         return self.dilated
 
 
@@ -105,14 +105,16 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
         row: (K, H, W) int32 of one sample a pixel.
         depth: (K, H, W).
         sizes: the number of rows of each part.
-        settled: (H, W) bool, cells that are covered by the only part, with a sample or without; None for none.
+        settled: (H, W) bool, cells amid fronts of one colour: they have no outline where they have no sample. None for
+            none.
     """
     from rts.sampling import adaptive_kernels
     from rts.splatting.visible import CONTINUED
 
     if settled is not None:
         # None of their layers is hidden, nor is any beside them: depths there are not looked at.
-        row = np.concatenate([np.maximum(row[:1], settled - np.int32(1)), row[1:]])
+        front = np.where(settled & (row[0] < 0), np.int32(adaptive_kernels.ANY), row[0])
+        row = np.concatenate([front[None], row[1:]])
     depth, kind = read_only(depth), depth.dtype.type
     extent = max(depth.max(initial=0), 0) - min(depth.min(initial=0), 0)
     marks = np.empty(row.shape[1:], np.uint8)

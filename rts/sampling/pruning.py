@@ -47,15 +47,20 @@ def needed_by(
         splatter: the splatter.
         parts: checked parts.
         sizes: of each part the largest number of those that its surface reads, or None where it is to be looked for.
-        settles: whether samples may be left out that only cells of one colour need. Where samples are to be evaluated
-            at other values of θ than they were found for, they may not.
+        settles: whether samples may be left out that only cells of one colour need, if the scene is `of_one_color`.
+            Where samples are to be evaluated at other values of θ than they were found for, they may not.
     """
     if not splatter.prunes or not all(p.shader.opaque and p.surface.centered for p in parts):
         return None
     size = _size(parts, sizes or [None] * len(parts))
     if size is None and not all(isinstance(p.surface, TriangleSurface) and not p.surface.refines for p in parts):
         return None
-    return _BySplatter(splatter, size, settles and splatter.settles and len(parts) == 1 and parts[0].shader.uniform)
+    return _BySplatter(splatter, size, settles and splatter.settles and of_one_color(parts))
+
+
+def of_one_color(parts: Sequence[CheckedPart]) -> bool:
+    """Whether all samples of a scene are certain to have one and the same colour."""
+    return parts[0].uniform and all(part.shows_color_of(parts[0]) for part in parts[1:])
 
 
 def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float | None:
@@ -76,7 +81,7 @@ def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float 
 
 
 class _BySplatter(Needed):
-    """What a splatter needs of a scene.
+    """What a splatter needs of a scene. Arrays of depths are not to change from call to call.
 
     Args:
         splatter: the splatter.
@@ -210,16 +215,18 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: AnyNeeded | None)
 
 
 def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
-    """The scene without the samples that are not needed; one call to the host."""
+    """The scene without the samples that are not needed, with `settled` cells if these are told; one host call."""
+    asked: Needed = adapted(needed, Needed)
+    # Where numbers are traced, nobody knows how rounding orders depths.
+    settles = asked.settles and asked.size is not None
     sizes = [s.ids.shape[0] for s in sampled.samples]
     offsets = np.cumsum([0, *sizes])
 
     def host(row: np.ndarray, depth: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
         if row.max(initial=-1) >= offsets[-1]:
             raise InputError(f"row refers to sample {row.max()} of {offsets[-1]}; sample this scene anew")
-        used = np.zeros(offsets[-1], bool)
-        kept = needed(row >= 0, depth)
-        used[row[kept]] = True
+        used, covered = np.zeros(offsets[-1], bool), row >= 0
+        kept = asked(covered, depth)
         own_rows, exits = rest[: len(sizes)], rest[len(sizes) :]
         if exits:
             near = np.full(exits[0].size, -1, np.int32)
@@ -227,30 +234,40 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
             near[cells] = exits[0].reshape(-1)[cells]
             used[near[near >= 0]] = True
             exits = (near.reshape(exits[0].shape),)
+        amid = ()
+        if settles:
+            kept = kept.copy() if kept is covered else kept
+            amid = (asked.settled(covered, depth, kept, 0.0),)
+        used[row[kept]] = True
         # The order stays, so that neighbours in the image stay neighbours in memory.
-        indices = [np.flatnonzero(used[a:b]).astype(np.int32) for a, b in itertools.pairwise(offsets)]
-        numbers = [np.where(used[a:b], np.cumsum(used[a:b]) - 1, -1) for a, b in itertools.pairwise(offsets)]
-        every = np.concatenate(numbers)
+        of_parts = [used[a:b] for a, b in itertools.pairwise(offsets)]
+        indices = [np.flatnonzero(own).astype(np.int32) for own in of_parts]
+        # For a row of −1 there is −1 at the end.
+        none = np.full(1, -1, np.int32)
+        numbers = [np.where(own, np.cumsum(own, dtype=np.int32) - 1, none) for own in of_parts]
+        every, *numbers = (np.concatenate([*n, none]) for n in (numbers, *([n] for n in numbers)))
         rows = zip((every, *numbers, *[every] * len(exits)), (row, *own_rows, *exits), strict=True)
-        renumbered = [np.where(r >= 0, n[r], -1).astype(np.int32) for n, r in rows]
-        return *renumbered, *(i if len(i) else np.zeros(1, np.int32) for i in indices)
+        renumbered = [n[r] for n, r in rows]
+        return *renumbered, *amid, *(i if len(i) else np.zeros(1, np.int32) for i in indices)
 
     rows = sampled.row, *(s.row for s in sampled.samples), *([] if sampled.exit is None else [sampled.exit])
     shapes = [ArraySpec(tuple(r.shape), np.int32) for r in rows]
+    amid = [ArraySpec(tuple(sampled.row.shape[1:]), np.bool_)] if settles else []
     packed = [ArraySpec((n,), np.int32, packed=True) for n in sizes]
-    found = engine_of(sampled).call_host(host, (*shapes, *packed), rows[0], sampled.depth, *rows[1:])
-    row, own_rows, indices = found[0], found[1 : 1 + len(sizes)], found[len(rows) :]
+    found = engine_of(sampled).call_host(host, (*shapes, *amid, *packed), rows[0], sampled.depth, *rows[1:])
+    row, own_rows, indices = found[0], found[1 : 1 + len(sizes)], found[len(rows) + len(amid) :]
     exits = None if sampled.exit is None else found[1 + len(sizes)]
     samples = [_selected(*z) for z in zip(sampled.samples, own_rows, indices, strict=True)]
     xp, part = namespace(row), sampled.part
     # Row numbers are within parts up to here, since an engine may have padded what comes before.
-    start = 0
-    for i, index in enumerate(indices):
+    start = indices[0].shape[0]
+    for i, index in enumerate(indices[1:], start=1):
         row = xp.where((row >= 0) & (part == i), row + start, row)
         exits = None if exits is None else xp.where((exits >= 0) & (part[0] == i), exits + start, exits)
         start += index.shape[0]
     depth = xp.where(row >= 0, sampled.depth, 0.0)
-    return replace(sampled, samples=tuple(samples), row=row, depth=depth, exit=exits)
+    settled = found[len(rows)] if settles else None
+    return replace(sampled, samples=tuple(samples), row=row, depth=depth, settled=settled, exit=exits)
 
 
 def _selected(samples: Samples, row: Any, index: Any) -> Samples:

@@ -53,7 +53,7 @@ def sample(
         supersample: as in `render`.
         capacity: as in `render`.
         engine: as in `render`.
-        settles: leave out samples of one part of one colour that only cells amid them need, which show this colour
+        settles: leave out samples of parts of one colour that only cells amid them need, which show this colour
             whatever moves. What renders them must be given the values of θ, transform and camera that are given here.
             `render` does so.
 

@@ -95,7 +95,7 @@ class Sampling(NamedTuple):
         height, width = (self.side * n for n in self.size)
         first = self.scenes[0]
         check_memory(height, width, self.layers, self.capacity, gradient=first.suited[0].differentiates)
-        return first.needed_by(self.splatter, settles=True)
+        return first.needed_by(self.splatter, settles=len(first.parts) == 1)
 
     def of_part(
         self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None, pruning: _Pruning

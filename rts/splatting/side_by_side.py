@@ -2,7 +2,7 @@
 
 Each view keeps the apron that it was sampled with, so no splat of another reaches its image. What splatters decide by
 depths they decide in terms of the largest: where those of views differ much, they are brought between 1 and 2, by
-powers of two.
+powers of two, which round nothing. So the depths that count as equal are up to twice as far apart as in a view alone.
 """
 
 from __future__ import annotations
