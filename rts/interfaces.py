@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
-from rts.adapting import Plugin, adapted
+from rts.adapting import Plugin, adapted, unwrapped
 from rts.arguments import quoted
 from rts.arrays import from_numbers, shape_of, without_border
 from rts.engines import constants, engine_of, exemplar, namespace, stopped
@@ -68,9 +68,16 @@ class Evaluator(Plugin):
         """
 
 
-def _overrides(cls: type, method: str, declared_by: type) -> bool:
-    """Whether a class has a method in place of another that works, not of that which only declares it."""
-    return method in vars(cls) and any(method in vars(c) for c in cls.__mro__[1:] if c not in (declared_by, object))
+def _promise_anew(cls: type, method: str, promises: Sequence[str], default: type) -> None:
+    """Take back promises about a method that come from a class with another one that works; see `default` instead."""
+
+    def place(name: str) -> int:
+        return next(i for i, c in enumerate(cls.__mro__) if name in vars(c))
+
+    for name in promises:
+        promised = getattr(cls.__mro__[place(name)], method)
+        if place(method) < place(name) and not getattr(promised, "__isabstractmethod__", False):
+            setattr(cls, name, getattr(default, name))
 
 
 class Surface(Evaluator):
@@ -92,8 +99,7 @@ class Surface(Evaluator):
     def __init_subclass__(cls, **options: Any) -> None:
         """What another `evaluate` gives is said anew."""
         super().__init_subclass__(**options)
-        if "gives" not in vars(cls) and _overrides(cls, "evaluate", Evaluator):
-            cls.gives = Surface.gives
+        _promise_anew(cls, "evaluate", ["gives"], Surface)
 
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Raise an `InputError` of one line where an entry is missing or of a wrong shape; values may be traced."""
@@ -435,10 +441,7 @@ class Shader(Plugin):
     def __init_subclass__(cls, **options: Any) -> None:
         """What another `__call__` does is promised anew."""
         super().__init_subclass__(**options)
-        if _overrides(cls, "__call__", Shader):
-            for name in ("takes_views", "uniform_by"):
-                if name not in vars(cls):
-                    setattr(cls, name, getattr(Shader, name))
+        _promise_anew(cls, "__call__", ["takes_views", "uniform", "uniform_by"], Shader)
 
     def uniform_by(self, theta: Mapping[str, Tree], given: Sequence[str] | None) -> tuple[str, ...] | None:
         """Where all samples of a part have one colour, the entries of θ that it depends on; None where they may not.
@@ -720,9 +723,17 @@ class CheckedPart(Part):
     def shows_color_of(self, other: CheckedPart) -> bool:
         """Whether both are certain to show one and the same colour, whatever arrays that are not NumPy's hold."""
         names = self.uniform_by
-        if names is None or names != other.uniform_by or self.shader != other.shader:
+        if names is None or names != other.uniform_by or not _alike(unwrapped(self.shader), unwrapped(other.shader)):
             return False
         return all(_same(self.theta[name], other.theta[name]) for name in names)
+
+
+def _alike(a: Any, b: Any) -> bool:
+    """Whether two shaders are one, or equal data classes that hold nothing but their fields."""
+    if a is b:
+        return True
+    known = {f.name for f in fields(a)} if is_dataclass(a) else set()
+    return type(a) is type(b) and a == b and set(getattr(a, "__dict__", {})) <= known
 
 
 def _same(a: Tree, b: Tree) -> bool:

@@ -146,6 +146,8 @@ def sampled_scene(
     See `sample`; where `settles`, samples that only cells of one colour need may be left out.
     """
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, capacity=capacity)
+    # Fine cells may see a gap between parts that coarse ones do not: there parts are told apart.
+    settles = settles and (len(scene.parts) == 1 or not isinstance(supersample, Adaptive))
     needed = scene.needed_by(splatter, settles)
     if not isinstance(supersample, Adaptive):
         return _on_one_grid(scene, camera, size, int(supersample), needed=needed, **options)
