@@ -16,7 +16,7 @@ VARIABLES: Mapping[str, Mapping[str, Any]] = {
     "rts.samplers": dict.fromkeys(
         ("culls", "prunes", "takes_cells", "tells_facing", "tells_exits", "concurrent"), False
     ),
-    "rts.shaders": {"opaque": False, "uniform": False, "reads": None},
+    "rts.shaders": {"opaque": False, "uniform": False, "takes_views": False, "reads": None},
     "rts.splatters": {
         "layers": None,
         "reach": 1,

@@ -68,16 +68,24 @@ class Evaluator(Plugin):
         """
 
 
-def _promise_anew(cls: type, method: str, promises: Sequence[str], default: type) -> None:
-    """Take back promises about a method that come from a class with another one that works; see `default` instead."""
+def _promise_anew(cls: type, method: str, promises: Sequence[str], base: type) -> None:
+    """Have a class with a method of its own, or of another base, not inherit what was promised of the one it replaces.
+
+    Args:
+        cls: the class, as it is made.
+        method: the name of the method.
+        promises: names of members that promise something of it. They become those of `base`, unless they come from the
+            class that the method comes from, or from one that has no such method yet.
+        base: declares the method and these members.
+    """
 
     def place(name: str) -> int:
         return next(i for i, c in enumerate(cls.__mro__) if name in vars(c))
 
     for name in promises:
         promised = getattr(cls.__mro__[place(name)], method)
-        if place(method) < place(name) and not getattr(promised, "__isabstractmethod__", False):
-            setattr(cls, name, getattr(default, name))
+        if place(method) < place(name) and promised is not getattr(base, method):
+            setattr(cls, name, getattr(base, name))
 
 
 class Surface(Evaluator):
@@ -492,7 +500,8 @@ class Splatter(Plugin):
         prunes: whether it says which samples it needs; True in a class with its own `needed`.
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
         sums_losses: whether it gives mean losses; True in a class with its own `mean_loss`.
-        takes_losses: whether normal equations and mean losses may be asked for with another `loss` than the square.
+        takes_losses: whether normal equations and mean losses may be asked for with another `loss` than the square. A
+            subclass with its own of these has to say so itself.
         averages: whether its normal equations may be asked for with a target of fewer pixels than there are cells.
         settles: whether it reads `Splats.settled`: where all nine samples around a cell are fronts of one opaque
             colour, on cells' centres, and no hidden one beside them is `needed`, the cell has that colour, whatever
@@ -516,6 +525,12 @@ class Splatter(Plugin):
     averages: bool = False
     settles: bool = False
     follows_outlines: bool = False
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """What other sums take is said anew."""
+        super().__init_subclass__(**options)
+        for method in ("normal_equations", "mean_loss"):
+            _promise_anew(cls, method, ["takes_losses"], Splatter)
 
     @abc.abstractmethod
     def image(self, splats: Splats) -> Array:

@@ -6,9 +6,6 @@ import numpy as np
 
 from rts.compiling import compiled, kernel
 
-ANY = -2
-"""What covers a cell that has no sample, as if it were any part."""
-
 
 @kernel
 def mark(start, stop, row, depth, firsts, beyond, continued, marks):
@@ -17,7 +14,7 @@ def mark(start, stop, row, depth, firsts, beyond, continued, marks):
     Args:
         start: first row.
         stop: end of the rows.
-        row: (K, H, W) int32; −2 in the front of a cell that is covered by what goes on beside it, without a sample.
+        row: (K, H, W) int32.
         depth: (K, H, W).
         firsts: (P − 1,) the first row of each part but the first.
         beyond: depth of layers that are not covered; no two layers are farther apart than each is from it.
@@ -25,14 +22,14 @@ def mark(start, stop, row, depth, firsts, beyond, continued, marks):
         marks: (H, W) uint8, to be filled.
     """
     layers, height, width = row.shape
-    # Of three rows of cells, repeated at the ends: the part, −1 for none, −2 for any; and whether a layer is hidden.
+    # Of three rows of cells, repeated at the ends: the part seen, −1 for none, and whether there is a hidden layer.
     parts, hidden = np.empty((3, width + 2), np.int32), np.empty((3, width + 2), np.uint8)
     for y in range(start - 1, stop + 1):
         at = min(max(y, 0), height - 1)
         seen, behind = parts[(y + 3) % 3], hidden[(y + 3) % 3]
         for x in range(width):
             i = row[0, at, x]
-            part = np.int32(min(i, 0))
+            part = np.int32(-1 if i < 0 else 0)
             for first in firsts:
                 part += i >= first
             seen[x + 1], behind[x + 1] = part, layers > 1 and row[min(1, layers - 1), at, x] >= 0
@@ -55,15 +52,9 @@ def _differ(marks, above, level, below):
     """Mark the cells of a row beside which another part is seen, or nothing."""
     for x in range(len(marks)):
         own = level[x + 1]
-        found = _other(above[x], own) | _other(above[x + 1], own) | _other(above[x + 2], own) | _other(level[x], own)
-        found |= _other(level[x + 2], own) | _other(below[x], own) | _other(below[x + 1], own)
-        marks[x] = (found | _other(below[x + 2], own)) & (own != ANY)
-
-
-@compiled
-def _other(part, own):
-    """Whether something else is seen beside a part, or nothing."""
-    return (part != own) & (part != ANY)
+        found = (above[x] != own) | (above[x + 1] != own) | (above[x + 2] != own) | (level[x] != own)
+        found |= (level[x + 2] != own) | (below[x] != own) | (below[x + 1] != own) | (below[x + 2] != own)
+        marks[x] = found
 
 
 @compiled

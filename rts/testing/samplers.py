@@ -126,10 +126,8 @@ class SamplerConformance(Conformance):
 
     def test_prepared_parts_are_sampled_alike(self, sampler: Any, parts: list[Part]) -> None:
         """What `rts.prepare` builds once for a part that stays gives the right samples, wherever it is moved."""
-        turn, silhouettes = (
-            np.array([(0, -1, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0.1), (0, 0, 0, 1)], np.float32),
-            Silhouettes(),
-        )
+        turn = np.array([(0, -1, 0, 0), (1, 0, 0, 0), (0, 0, 1, 0.1), (0, 0, 0, 1)], np.float32)
+        silhouettes = Silhouettes()
         for index, part in enumerate(parts):
             held = prepare(part, sampler, camera=scenes.CAMERA, size=scenes.SIZE)
             for moved in (part, part.replace(transform=turn)):

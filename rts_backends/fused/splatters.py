@@ -5,7 +5,7 @@ What fits is float32 or float64 in the memory of the host. Second derivatives ar
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -27,15 +27,6 @@ class _Fused(splatting.Kernel):
     averages = True
     takes_losses = True
     _knows_settled = True
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        super().__init_subclass__(**options)
-        for own in cls.__mro__[: cls.__mro__.index(_Fused)]:
-            if "takes_losses" in vars(own):
-                break
-            if vars(own).keys() & {"normal_equations", "mean_loss"}:
-                cls.takes_losses = False  # What a class inherits it may not do, nor may what is mixed in.
-                break
 
     def image(self, splats: Splats) -> Array:
         """See `rts.splatting.Kernel`."""
