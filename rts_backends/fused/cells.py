@@ -60,6 +60,8 @@ class Choices(NamedTuple):
             (u + 1) lies at −(u, v), and the buffers are in front, at the surface, behind.
         sums: (M, 3, 5), of each buffer the colours over the weight, taken as at least one, and the weight.
         states: (H, W) uint8, states of targets (`survey.py`); mixed ones are EMPTY here.
+        ends: (H, W) uint16, where fronts end, and targets that outlines may cover in part (`survey.py`); or no rows.
+        partial: (H,) int64, the number of these in each row.
         repeated: whether several cells name a sample, and would add to its gradient at the same time.
         extent: of the depths, the camera's included.
     """
@@ -70,6 +72,8 @@ class Choices(NamedTuple):
     ranges: np.ndarray
     sums: np.ndarray
     states: np.ndarray
+    ends: np.ndarray
+    partial: np.ndarray
     repeated: bool
     extent: float
 
@@ -171,12 +175,11 @@ class Cells:
         depths = np.zeros((height, 2), kind)
         fronts = self.visible or layers == 1
         marks, marked = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
+        ends, partial = np.empty((height if self.rims else 0, width), np.uint16), np.zeros(height, np.int64)
         noted = states, hidden, depths, seen, counts, marks if self.visible and layers > 1 else marks[:0], marked
-        given = self.positions, self.rgba, self.row, fronts, self._reach
-        parallel(survey, height, *given, *noted, work=3 * self.row.size)
-        leaves = self.exits[self.exits >= 0]
-        seen[leaves] = 1
-        repeated = int(np.count_nonzero(seen)) != int(counts.sum()) + len(leaves)
+        given = self.positions, self.rgba, self.row, self.exits, fronts, self._reach
+        parallel(survey, height, *given, *noted, ends, partial, work=3 * self.row.size)
+        repeated = int(np.count_nonzero(seen)) != int(counts.sum())
         if self._wanted is not None:
             states *= self._wanted | self.settled if len(self.settled) else self._wanted
         least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
@@ -199,24 +202,21 @@ class Cells:
         sums = np.empty((offsets[-1], 3, 5), kind)
         if len(columns):
             continued = kind.type(CONTINUED)  # An argument, since compiled code that is cached would keep its value.
-            given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states
+            given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states, ends
             arrays = self.positions, self.rgba, self.row, *self._numbers
             parallel(listing.choose, height, *arrays, *given, work=500 * len(columns))
-        return Choices(marks, offsets, columns, ranges, sums, states, repeated, extent)
+        return Choices(marks, offsets, columns, ranges, sums, states, ends, partial, repeated, extent)
 
     @cached_property
     def outlines(self) -> Outlines:
         """How outlines move, and what that changes; nothing without rims."""
         _, height, width = self.row.shape
-        choices, kind, counts = self.choices, self.positions.dtype, np.zeros(height, np.int64)
-        ends, marks = np.empty((height, width), np.uint16), np.empty((height, width), np.uint8)
-        if self.rims:
-            listed = choices.mixed, choices.offsets, choices.columns, choices.ranges
-            given = self.positions, self.row, self._reach, choices.states, *listed, ends, marks, counts
-            parallel(outlines.find, height, *given, work=2 * self.row[0].size)
-            if self._wanted is not None:
-                found, marks = marks, np.empty_like(marks)
-                parallel(outlines.narrow, height, found, self._wanted, marks, counts, work=self.row[0].size)
+        choices, kind = self.choices, self.positions.dtype
+        ends, counts = choices.ends, choices.partial
+        if self.rims and self._wanted is not None:
+            ends, counts = np.empty_like(ends), np.empty_like(counts)
+            given = choices.ends, self._wanted, ends, counts
+            parallel(outlines.narrow, height, *given, work=self.row[0].size)
         offsets = np.concatenate([[0], np.cumsum(counts)])
         found = Outlines(
             np.empty((height, width), kind),
@@ -231,8 +231,8 @@ class Cells:
             rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
             arrays = self.positions, self.rgba, self.row, *self._numbers
             decide = self.part, self.exits, kind.type(choices.extent), rules, self._pairs
-            listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
-            given = *arrays, *decide, *listed, ends, marks
+            listed = choices.columns, choices.offsets, choices.ranges, choices.sums
+            given = *arrays, *decide, *listed, ends
             parallel(outlines.fill, height, *given, found, work=150 * len(found.columns))
         return found
 

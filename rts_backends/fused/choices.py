@@ -112,10 +112,12 @@ def choose(
     choices,
     sums,
     states,
+    ends,
 ):
     """List each row's mixed targets: the arrays of `rts_backends.fused.cells.Choices` from `columns` to `sums`.
 
-    Marks go by depths alone. Where `facing` (K, H, W) is told, which else has no layers, more fronts may pair.
+    Marks go by depths alone. Where `facing` (K, H, W) is told, which else has no layers, more fronts may pair. In
+    `ends` (H, W) of `survey.survey`, which may have no rows, come the directions in which fronts end before others.
     """
     layers, height, width = row.shape
     z, target = np.empty((layers, 9), positions.dtype), np.empty(layers, positions.dtype)
@@ -147,6 +149,8 @@ def choose(
                     choices[d, n, 1, 0], choices[d, n, 1, 1] = max(s, 0), max(s + 1, 0)
                     choices[d, n, 2, 0], choices[d, n, 2, 1] = max(s + 1, 0), layers
             sums_of(sums[d], positions, rgba, row, y, x, choices[d], scale, peak, gamma)
+            if len(ends) > 0:
+                ends[y, x] |= _ends_before_others(choices[d], row, y, x)
             d += 1
 
 
@@ -225,3 +229,16 @@ def _choose_visible(choice, shift, z, row, y, x, target):
                 best, hidden = distance, k
         if hidden < layers:
             choice[n, 2, 0], choice[n, 2, 1] = hidden, hidden + 1
+
+
+@compiled
+def _ends_before_others(choice, row, y, x):
+    """Directions in which neighbours of a target are covered, and not paired front to front, as bits."""
+    _, height, width = row.shape
+    bits = 0
+    for n in range(9):
+        py, px = y + 1 - n // 3, x + 1 - n % 3
+        if n != 4 and 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0:
+            if not (choice[n, 1, 0] == 0 and choice[n, 1, 1] == 1):
+                bits |= 1 << (8 - n)
+    return np.uint16(bits)

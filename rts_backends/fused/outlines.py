@@ -15,8 +15,9 @@ import numpy as np
 from rts.compiling import compiled, kernel
 from rts.threads import parallel
 from rts_backends.fused.crossing_pairs import steps
-from rts_backends.fused.mixed import splat
-from rts_backends.fused.survey import BUSY, SETTLED
+from rts_backends.fused.pairs import BLOCK
+from rts_backends.fused.rows import exp
+from rts_backends.fused.survey import LISTED
 
 BAND = 16
 """Rows whose gradients are added up by one thread, more than samples of which one target knows are apart."""
@@ -25,8 +26,8 @@ NOTHING, FRONT, JOINED, SURFACE = 0, 1, 2, 3
 """What a source gives to a target: nothing, or coverage of the buffer in front as its outline moves; of that at the
 surface as the target's outline moves; of that at the surface, over nothing or another part, as its own does."""
 
-LISTED, BESIDE = 1, 2
-"""Marks of targets that are listed, and of those whose outline matters to listed ones beside them."""
+NEAR = 1e-3
+"""Exponents below which four terms of its series give the exponential in double precision."""
 
 
 class Rules(NamedTuple):
@@ -61,162 +62,88 @@ class Outlines(NamedTuple):
     changes: np.ndarray
 
 
+DIRECTIONS = LISTED - 1
+"""Bits 3 (v + 1) + (u + 1) of directions (u, v) in which a front ends, in `survey.survey`'s `ends`."""
+
+BESIDE = LISTED << 1
+"""Mark in `ends` of targets whose outline matters to listed ones beside them."""
+
+
+def _ordered(bits: int) -> list[int]:
+    """Nine places of directions: those of which the opposite one is not among the bits, the most outward first; −1."""
+    steps = {n: np.array([n % 3 - 1, n // 3 - 1]) for n in range(9) if bits >> n & 1}
+    outward = sum(steps.values(), np.zeros(2, int))
+
+    def score(n: int) -> int:
+        """Ordered as n · outward / ‖n‖ is, in whole numbers."""
+        along = int(steps[n] @ outward)
+        return along * abs(along) * (3 - int(abs(steps[n]).sum()))
+
+    found = sorted((n for n in steps if not bits >> (8 - n) & 1), key=score, reverse=True)
+    return found + [-1] * (9 - len(found))
+
+
+OUTWARD = np.array([_ordered(bits) for bits in range(LISTED)], np.int8)
+"""The order (512, 9) in which directions are looked at, by the bits of those in which a front ends."""
+
+
 @kernel
-def find(start, stop, positions, row, reach, states, mixed, offsets, columns, ranges, ends, marks, counts):
-    """Find where fronts end in rows [start, stop), and mark targets that may be covered in part.
+def narrow(start, stop, ends, wanted, kept, counts):
+    """Take marks of rows [start, stop) off targets that are neither wanted nor beside wanted ones.
 
     Args:
         start: first row.
         stop: end of the rows.
-        positions: (N, 3).
-        row: (K, H, W).
-        reach: pixels that a sample may lie off its cell's centre, so that weights are sure to add up to one.
-        states: (H, W) of `survey.py`.
-        mixed: (H, W), see `rts_backends.fused.cells.Choices`, as `offsets`, `columns` and `ranges`.
-        offsets: (H + 1,).
-        columns: (M,).
-        ranges: (M, 9, 3, 2).
-        ends: (H, W) uint16, to be filled: bit 3 (v + 1) + (u + 1) where a front ends towards (u, v).
-        marks: (H, W) uint8, to be filled.
-        counts: (H,) zeros, to be filled with the number of marks.
-    """
-    _, height, width = row.shape
-    # Of the cells of three rows and one more at each side: bits for what is empty, covered, and not sure to fill.
-    cells = np.empty((3, width + 2), np.uint8)
-    for y in range(start, stop):
-        for v in range(3):
-            if y == start or v == 2:
-                _look(cells[(y + v) % 3], positions, row[0], states, y + v - 1, reach)
-        above, level, below = cells[y % 3], cells[(y + 1) % 3], cells[(y + 2) % 3]
-        for x in range(width):
-            around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
-            around |= below[x] | below[x + 1] | below[x + 2]
-            # Settled targets have nothing loose beside them, unless samples there were dropped for want of room.
-            known = (states[y, x] == SETTLED) & (row[0, y, x] < 0)
-            partial = (around & COVERED != 0) & (around & LOOSE != 0) & ~known
-            marks[y, x] = np.uint8(partial) | mixed[y, x]
-            ends[y, x] = np.uint16(around & EMPTY)
-        for x in range(width):
-            counts[y] += marks[y, x]
-            if ends[y, x]:
-                ends[y, x] = _ends_before_nothing(above, level, below, x) if level[x + 1] & COVERED else 0
-        for d in range(offsets[y], offsets[y + 1]):
-            ends[y, columns[d]] |= _ends_before_others(ranges[d], row, y, columns[d])
-
-
-_BITS = (np.arange(512)[:, None] >> np.arange(9) & 1).astype(np.int8)
-ALONG = (_BITS @ [(n % 3 - 1, n // 3 - 1) for n in range(9)]).astype(np.int64)
-OPPOSITE = (_BITS[:, ::-1].astype(np.int64) << np.arange(9)).sum(axis=1)
-LOWEST = _BITS.argmax(axis=1)
-"""What nine directions as bits sum up to, the bits of those opposite, and the place of the first that is set."""
-
-
-@kernel
-def narrow(start, stop, marks, wanted, kept, counts):
-    """Leave out marks of rows [start, stop) that are neither wanted nor beside wanted ones.
-
-    Args:
-        start: first row.
-        stop: end of the rows.
-        marks: (H, W) of `find`.
+        ends: (H, W) of `survey.survey` and `choices.choose`.
         wanted: (H, W) uint8.
-        kept: (H, W) uint8, to be filled with marks.
+        kept: (H, W) uint16, to be filled as `ends`, and with marks BESIDE.
         counts: (H,), to be filled with the number of those that are listed.
     """
-    height, width = marks.shape
+    height, width = ends.shape
     for y in range(start, stop):
         counts[y] = 0
         for x in range(width):
-            kept[y, x] = marks[y, x] & wanted[y, x]
-            counts[y] += kept[y, x]
-            if marks[y, x] and not kept[y, x]:
+            bits = ends[y, x]
+            if bits & LISTED and not wanted[y, x]:
+                bits &= DIRECTIONS
                 for n in range(9):
                     v, u = y + n // 3 - 1, x + n % 3 - 1
-                    if 0 <= v < height and 0 <= u < width and marks[v, u] & wanted[v, u]:
-                        kept[y, x] = BESIDE
-
-
-EMPTY, COVERED, LOOSE = np.uint8(1), np.uint8(2), np.uint8(4)
-"""Bits of a cell: in the array without a sample, with one, and not sure to fill its share of what is around it."""
-
-
-@compiled
-def _look(cells, positions, row, states, y, reach):
-    """Bits of a row of cells, and of one cell at each side."""
-    height, width = row.shape
-    half = positions.dtype.type(0.5)
-    cells[:] = LOOSE
-    if not 0 <= y < height:
-        return
-    middle = positions.dtype.type(y) + half
-    for x in range(width):
-        if SETTLED <= states[y, x] < BUSY:
-            cells[x + 1] = COVERED
-            continue
-        i = row[y, x]
-        if i < 0:
-            cells[x + 1] = EMPTY | LOOSE
-            continue
-        off = max(abs(positions[i, 0] - (positions.dtype.type(x) + half)), abs(positions[i, 1] - middle))
-        cells[x + 1] = COVERED if off <= reach else COVERED | LOOSE
-
-
-@compiled
-def _ends_before_nothing(above, level, below, x):
-    """Directions in which neighbours of cell x are empty, as bits."""
-    bits = 0
-    for u in range(3):
-        bits |= (above[x + u] & EMPTY) << u
-        bits |= (level[x + u] & EMPTY) << (3 + u)
-        bits |= (below[x + u] & EMPTY) << (6 + u)
-    return np.uint16(bits)
-
-
-@compiled
-def _ends_before_others(choice, row, y, x):
-    """Directions in which neighbours of a mixed target are covered, and not paired front to front, as bits."""
-    _, height, width = row.shape
-    bits = 0
-    for n in range(9):
-        py, px = y + 1 - n // 3, x + 1 - n % 3
-        if n != 4 and 0 <= py < height and 0 <= px < width and row[0, py, px] >= 0:
-            if not (choice[n, 1, 0] == 0 and choice[n, 1, 1] == 1):
-                bits |= 1 << (8 - n)
-    return np.uint16(bits)
+                    if 0 <= v < height and 0 <= u < width and ends[v, u] & LISTED and wanted[v, u]:
+                        bits |= BESIDE
+            kept[y, x] = bits
+            counts[y] += bits & LISTED != 0
 
 
 @compiled
 def _rule(positions, row, part, exits, ends, y, x, extent, rules):
     """β and the partner's sample of a cell whose front ends somewhere."""
-    one, two, bits = positions.dtype.type(1), positions.dtype.type(2), np.int64(ends[y, x])
-    beta, partner, best, deep, steepest = positions.dtype.type(0), -1, -1000, False, two
-    along_x, along_y, left = ALONG[bits, 0], ALONG[bits, 1], bits & ~OPPOSITE[bits]
+    zero, one, two = positions.dtype.type(0), positions.dtype.type(1), positions.dtype.type(2)
+    bits = ends[y, x] & DIRECTIONS
     leaves = len(exits) > 0 and exits[y, x] >= 0
-    paired = leaves or (len(part) > 1 and part[0, y, x] == part[1, y, x])
-    back = exits if leaves else row[-1 if len(row) < 2 else 1]
-    own = _gap(positions, row, back, y, x) if paired else beta
-    while left:
-        n = LOWEST[left]
-        left &= left - 1
-        u, v = n % 3 - 1, n // 3 - 1
-        py, px = y - v, x - u
-        if not _covered(row, py, px):
+    if leaves or (len(part) > 1 and part[0, y, x] == part[1, y, x]):
+        own = _gap(positions, row, exits, leaves, y, x)
+        least, m = rules.converging * own * own, 0
+        while OUTWARD[bits, m] >= 0:
+            py, px = y + 1 - OUTWARD[bits, m] // 3, x + 1 - OUTWARD[bits, m] % 3
+            if _covered(row, py, px):
+                inner = _gap(positions, row, exits, leaves, py, px)
+                if least <= inner * inner:
+                    return -rules.half, _back(row, exits, leaves, y, x)
+            m += 1
+    beta, partner = zero, np.int32(-1)
+    for m in range(9):
+        n = OUTWARD[bits, m]
+        if n < 0:
+            break
+        v, u = n // 3 - 1, n % 3 - 1
+        if not _covered(row, y - v, x - u):
             continue
-        if paired:
-            inner = _gap(positions, row, back, py, px)
-            if rules.converging * own * own <= inner * inner:
-                return -rules.half, back[y, x]
-        along = u * along_x + v * along_y
-        score = along * abs(along) * (3 - abs(u) - abs(v))
-        if deep and score <= best:
-            continue
+        if partner < 0:
+            beta, partner = rules.half, row[0, y - v, x - u]
         ratio = _ratio(positions, row, ends, y, x, v, u, rules.flat * extent)
-        rim = ratio > rules.least
-        if (rim and not deep) or (rim == deep and score > best):
-            best, deep, partner, beta, steepest = score, rim, row[0, py, px], rules.half, ratio
-    if deep:
-        root = (one + two * steepest - steepest * steepest) / (two * steepest * (steepest - one))
-        beta = min(max(root, positions.dtype.type(0)), rules.largest)
+        if ratio > rules.least:
+            root = (one + two * ratio - ratio * ratio) / (two * ratio * (ratio - one))
+            return min(max(root, zero), rules.largest), row[0, y - v, x - u]
     return beta, partner
 
 
@@ -228,9 +155,15 @@ def _covered(row, y, x):
 
 
 @compiled
-def _gap(positions, row, back, y, x):
+def _back(row, exits, leaves, y, x):
+    """The sample at the other end of a cell's chord, or −1: where the ray leaves, or of the second layer."""
+    return exits[y, x] if leaves else row[min(1, len(row) - 1), y, x]
+
+
+@compiled
+def _gap(positions, row, exits, leaves, y, x):
     """How far the other end of a chord lies behind the front of a cell; NaN, which compares as false, without one."""
-    i, j = row[0, y, x], back[y, x]
+    i, j = row[0, y, x], _back(row, exits, leaves, y, x)
     return positions[j, 2] - positions[i, 2] if j >= 0 else positions.dtype.type(np.nan)
 
 
@@ -261,11 +194,10 @@ def fill(
     rules,
     crossed,
     mixed,
+    firsts,
     ranges,
     sums,
-    firsts,
     ends,
-    marks,
     found,
 ):
     """Decide how outlines move in rows [start, stop), as `rts.splatting.rims.rules` does, and list the marked targets.
@@ -284,65 +216,89 @@ def fill(
         extent: of the depths.
         rules: numbers of the rules.
         crossed: (H, W) uint8, the pairs of `crossing_pairs.py`, or no rows.
-        mixed: (H, W), see `rts_backends.fused.cells.Choices`, as `ranges` and `sums`.
+        mixed: (M,), columns of the mixed targets, see `rts_backends.fused.cells.Choices`, as `ranges` and `sums`.
+        firsts: (H + 1,), where those of each row begin.
         ranges: (M, 9, 3, 2).
         sums: (M, 3, 5).
-        firsts: (H + 1,), where the mixed targets of each row begin.
-        ends: (H, W) of `find`.
-        marks: (H, W) of `find` or `narrow`.
+        ends: (H, W) of `survey.survey` and `choices.choose`, or of `narrow`.
         found: `Outlines`, to be filled but for its offsets.
     """
     beta, partner, offsets, columns, gives, slopes, changes = found
+    kind, width = positions.dtype.type, ends.shape[1]
+    around, which, samples = np.empty((9, 3), positions.dtype), np.empty(9, np.int64), np.empty(9, np.int64)
+    for n in range(9):
+        u, v = kind(n % 3 - 1), kind(n // 3 - 1)
+        around[n, 0], around[n, 1], around[n, 2] = u, v, peak * peak * exp(-(u * u + v * v) * scale)
     for y in range(start, stop):
         d, m = offsets[y], firsts[y]
-        for x in range(marks.shape[1]):
-            if not marks[y, x]:
-                m += mixed[y, x]
+        for b in range((width + BLOCK - 1) // BLOCK):
+            first, last = b * BLOCK, min((b + 1) * BLOCK, width)
+            if not _any(ends[y, first:last]):
                 continue
-            covered = row[0, y, x] >= 0
-            if covered:
-                beta[y, x] = positions.dtype.type(0)
-                if ends[y, x]:
-                    beta[y, x], partner[y, x] = _rule(positions, row, part, exits, ends, y, x, extent, rules)
-            if marks[y, x] == BESIDE:
-                m += mixed[y, x]
-                continue
-            columns[d] = x
-            given = JOINED if covered else SURFACE
-            own = _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, peak, gamma, given)
-            if mixed[y, x]:
-                _list(gives[d], changes[d], ranges[m], sums[m], row, y, x)
-                m += 1
-            else:
-                _change(gives, changes, d, own)
-            if covered and len(part) and not (len(crossed) and steps(crossed, y, x)):
-                _part(gives, d, part, ends, y, x)
-            d += 1
+            for x in range(first, last):
+                if ends[y, x] <= DIRECTIONS:
+                    continue
+                covered = row[0, y, x] >= 0
+                if covered:
+                    beta[y, x] = positions.dtype.type(0)
+                    if ends[y, x] & DIRECTIONS:
+                        rule = _rule(positions, row, part, exits, ends, y, x, extent, rules)
+                        beta[y, x], partner[y, x] = rule
+                if not ends[y, x] & LISTED:
+                    continue
+                columns[d] = x
+                while m < firsts[y + 1] and mixed[m] < x:
+                    m += 1
+                own = _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, gamma, around, which, samples)
+                if m < firsts[y + 1] and mixed[m] == x:
+                    front, surface = _change_mixed(changes, d, sums, m)
+                    _list(gives, d, ranges, m, front, surface)
+                else:
+                    _change(gives, changes, d, own)
+                if covered and len(part) and not (len(crossed) and steps(crossed, y, x)):
+                    _part(gives, d, part, ends, y, x)
+                d += 1
+
+
+@compiled
+def _any(ends):
+    some = np.uint16(0)
+    for x in range(len(ends)):
+        some |= ends[x]
+    return some != 0
 
 
 # Not handed views of single targets, since to make and to count these takes as long as the work.
 
 
 @compiled
-def _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, peak, gamma, given):
-    """List the slopes of the weights of the fronts around a target, and that each gives what is given.
+def _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, gamma, around, which, samples):
+    """List the slopes of the weights of the fronts around a target, and what each gives if none is mixed.
 
     Returns their sums, of colours and weights.
     """
     _, height, width = row.shape
-    zero, slope = positions.dtype.type(0), positions.dtype.type(2) * scale * gamma
-    red, green, blue, alpha, weight, n = zero, zero, zero, zero, zero, 0
-    for v in range(-1, 2):
-        for u in range(-1, 2):
-            py, px = y - v, x - u
-            i = row[0, py, px] if 0 <= py < height and 0 <= px < width else -1
-            gives[d, n] = NOTHING
-            if i >= 0:
-                w, dx, dy = splat(positions, i, py, px, u, v, scale, peak, gamma)
-                gives[d, n], slopes[d, n, 0], slopes[d, n, 1] = given, slope * w * dx, slope * w * dy
-                red, green, blue = red + w * rgba[i, 0], green + w * rgba[i, 1], blue + w * rgba[i, 2]
-                alpha, weight = alpha + w * rgba[i, 3], weight + w
-            n += 1
+    kind, count = positions.dtype.type, 0
+    for n in range(9):
+        py, px = y + 1 - n // 3, x + 1 - n % 3
+        i = row[0, py, px] if 0 <= py < height and 0 <= px < width else -1
+        gives[d, n], which[count], samples[count] = NOTHING, n, i
+        count += i >= 0
+    zero, half, slope, peak = kind(0), kind(0.5), kind(2) * scale * gamma, around[4, 2]
+    red, green, blue, alpha, weight, given = zero, zero, zero, zero, zero, JOINED if row[0, y, x] >= 0 else SURFACE
+    for k in range(count):
+        n, i = which[k], samples[k]
+        u, v, w = around[n, 0], around[n, 1], around[n, 2]
+        rx, ry = gamma * (positions[i, 0] - (kind(x) + half - u)), gamma * (positions[i, 1] - (kind(y) + half - v))
+        dx, dy = u - rx, v - ry
+        more = scale * ((u + dx) * rx + (v + dy) * ry)
+        if abs(more) < NEAR:
+            w *= kind(1) + more + more * more * (half + more * kind(1 / 6) + more * more * kind(1 / 24))
+        else:
+            w = peak * exp(-(dx * dx + dy * dy) * scale)
+        gives[d, n], slopes[d, n, 0], slopes[d, n, 1] = given, slope * w * dx, slope * w * dy
+        red, green, blue = red + w * rgba[i, 0], green + w * rgba[i, 1], blue + w * rgba[i, 2]
+        alpha, weight = alpha + w * rgba[i, 3], weight + w
     return red, green, blue, alpha, weight
 
 
@@ -354,29 +310,39 @@ def _change(gives, changes, d, total):
     over = one / total[4] if partial else zero
     for c in range(4):
         changes[d, 0, c], changes[d, 1, c] = zero, over * total[c]
-    for n in range(0 if partial else 9):
+    if not partial:
+        _clear(gives, d)
+
+
+@compiled
+def _clear(gives, d):
+    for n in range(9):
         gives[d, n] = NOTHING
 
 
 @compiled
-def _list(gives, changes, choice, total, row, y, x):
-    """What the sources of a mixed target give, and how its colour changes with the coverage of its buffers."""
-    zero, one = total.dtype.type(0), total.dtype.type(1)
-    front, surface = zero < total[0, 4] < one, zero < total[1, 4] < one
+def _change_mixed(changes, d, sums, m):
+    """How the colour of a mixed target changes with the coverage of its buffers, and whether these may change."""
+    zero, one = sums.dtype.type(0), sums.dtype.type(1)
+    front, surface = zero < sums[m, 0, 4] < one, zero < sums[m, 1, 4] < one
+    over = one / sums[m, 0, 4] if front else zero
+    through = (one - sums[m, 0, 3]) / sums[m, 1, 4] if surface else zero
     for c in range(4):
-        under = total[1, c] + (one - total[1, 3]) * total[2, c]
-        changes[0, c] = (total[0, c] - total[0, 3] * under) / total[0, 4] if front else zero
-        through = (one - total[0, 3]) * (total[1, c] - total[1, 3] * total[2, c])
-        changes[1, c] = through / total[1, 4] if surface else zero
+        under = sums[m, 1, c] + (one - sums[m, 1, 3]) * sums[m, 2, c]
+        changes[d, 0, c] = over * (sums[m, 0, c] - sums[m, 0, 3] * under)
+        changes[d, 1, c] = through * (sums[m, 1, c] - sums[m, 1, 3] * sums[m, 2, c])
+    return front, surface
+
+
+@compiled
+def _list(gives, d, ranges, m, front, surface):
+    """What the sources of a mixed target give, of which all those with a front are marked."""
     for n in range(9):
-        py, px = y + 1 - n // 3, x + 1 - n % 3
-        gives[n] = NOTHING
-        if not _covered(row, py, px):
-            continue
-        if front and choice[n, 0, 1] == 1:
-            gives[n] = FRONT
-        elif surface and choice[n, 1, 0] == 0 and choice[n, 1, 1] == 1:
-            gives[n] = JOINED if row[0, y, x] >= 0 else SURFACE
+        if gives[d, n] != NOTHING:
+            if front and ranges[m, n, 0, 1] == 1:
+                gives[d, n] = FRONT
+            elif not (surface and ranges[m, n, 1, 0] == 0 and ranges[m, n, 1, 1] == 1):
+                gives[d, n] = NOTHING
 
 
 @compiled
@@ -385,7 +351,7 @@ def _part(gives, d, part, ends, y, x):
     for n in range(9):
         py, px = y + 1 - n // 3, x + 1 - n % 3
         if gives[d, n] == JOINED and part[0, py, px] != part[0, y, x]:
-            gives[d, n] = SURFACE if ends[py, px] else NOTHING
+            gives[d, n] = SURFACE if ends[py, px] & DIRECTIONS else NOTHING
 
 
 @compiled

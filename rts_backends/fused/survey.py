@@ -12,8 +12,33 @@ EMPTY, SETTLED, FLAT, BUSY = 0, 1, 2, 3
 others."""
 
 
+LISTED = 1 << 9
+"""Beside bits 3 (v + 1) + (u + 1) of directions (u, v) in which a front ends: targets that may be covered in part."""
+
+NOTHING, COVERED, LOOSE = np.uint8(1), np.uint8(2), np.uint8(4)
+"""Bits of a cell: in the array without a sample, with one, and not sure to fill its share of what is around it."""
+
+
 @kernel
-def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, depths, seen, counts, mixed, marked):
+def survey(
+    start,
+    stop,
+    positions,
+    rgba,
+    row,
+    exits,
+    fronts,
+    reach,
+    states,
+    hidden,
+    depths,
+    seen,
+    counts,
+    mixed,
+    marked,
+    ends,
+    listed,
+):
     """Find the states of the targets of rows [start, stop), and fill the other arrays that describe the cells.
 
     Which targets of `Visible` are mixed is seen on the way: there, other than in `Multi`, it does not go by how far
@@ -25,15 +50,19 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, dep
         positions: (N, 3).
         rgba: (N, 4).
         row: (K, H, W).
+        exits: (H, W), samples where rays leave the part of the front, or no rows.
         fronts: whether only front layers count; otherwise those behind must be hidden by opaque ones.
         reach: pixels that a sample may lie off its cell's centre, so that the weights are sure to add up to one.
         states: (H, W) uint8, EMPTY or SETTLED, to be filled where they are EMPTY.
         hidden: (H, B) uint8, zeros, to be marked: the blocks of columns in or beside which hidden layers are covered.
         depths: (H, 2) zeros, for the least and the largest depth of each row, and zero.
         seen: (N,) uint8, zeros, to be marked: samples that some cell refers to.
-        counts: (H,) zeros, for the number of such cells.
+        counts: (H,) zeros, for the number of such cells, of `row` and `exits`.
         mixed: (H, W) uint8, to be filled with marks of the mixed targets of `Visible`; no rows where nobody asks.
         marked: (H,) zeros, to be filled with their number in each row.
+        ends: (H, W) uint16, to be filled with where fronts end before nothing, and LISTED, also where targets are mixed;
+            no rows where nobody asks.
+        listed: (H,) zeros, to be filled with the number of the latter in each row.
     """
     layers, height, width = row.shape
     blocks, kind, asks = hidden.shape[1], positions.dtype, len(mixed) > 0
@@ -44,12 +73,15 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, dep
     # For three rows of cells: which are covered, which amid three alike, and which alike with the cell above.
     cells = np.zeros((3, 3, width + 2), np.uint8)
     covered, calm, joins = cells[0], cells[1], cells[2]
+    kinds, partial, ends_asked = np.empty((3, width + 2), np.uint8), np.empty(width, np.uint8), len(ends) > 0
     for y in range(start - 1, stop + 1):
         now, before = (y + 3) % 3, (y + 2) % 3
-        covered[now], calm[now], joins[now], near[now] = 0, 0, 0, 0
+        covered[now], calm[now], joins[now], near[now], kinds[now] = 0, 0, 0, 0, LOOSE
         if 0 <= y < height:
-            above = row[0, max(y - 1, 0)]
-            _inspect(positions, rgba, row[0, y], above, y, fronts, reach, covered[now], calm[now], joins[now])
+            above, found = row[0, max(y - 1, 0)], (covered[now], calm[now], joins[now], kinds[now, 1:-1])
+            _inspect(positions, rgba, row[0, y], above, y, fronts, reach, *found)
+            if ends_asked:
+                _fill_settled(kinds[now, 1:-1], states[y])
             for k in range(len(row)):
                 if k > 0 and not fronts:
                     _cover(covered[now], row[k, y])
@@ -58,6 +90,8 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, dep
                 elif asks and k > 0:
                     _hide(row[k, y], near[now])
             if start <= y < stop:
+                if len(exits) > 0:
+                    counts[y] += _note_exits(exits[y], seen)
                 for b in range(blocks):  # To copy an array compiles errors that tell shapes, a second long.
                     near[now, b] = hidden[y, b]
         if y > start and asks:
@@ -69,22 +103,30 @@ def survey(start, stop, positions, rgba, row, fronts, reach, states, hidden, dep
             first = (y + 1) % 3
             runs = calm[first], calm[before], calm[now]
             _decide(states[y - 1], covered[0], covered[1], covered[2], *runs, joins[before], joins[now])
+            if ends_asked:
+                given = kinds[first], kinds[before], kinds[now]
+                if asks:
+                    listed[y - 1] = _mark_partial(partial, *given, row[0, y - 1], mixed[y - 1])
+                else:
+                    listed[y - 1] = _mark_partial(partial, *given, row[0, y - 1], partial[:0])
+                _fill_ends(ends[y - 1], partial, *given)
 
 
 @compiled
-def _inspect(positions, rgba, cells, above, y, fronts, reach, covered, calm, joins):
-    """Fill what is to be known of a row of cells; places are one to the right of the cells'."""
+def _inspect(positions, rgba, cells, above, y, fronts, reach, covered, calm, joins, kinds):
+    """Fill what is to be known of a row of cells; places are one to the right of the cells', but for their kinds."""
     kind = positions.dtype.type
     half, opaque, last, run = kind(0.5), kind(1), -1, 0
     for x in range(len(cells)):
         i = cells[x]
         if i < 0:
-            run = 0
+            run, kinds[x] = 0, NOTHING | LOOSE
             continue
         covered[x + 1] = 1
         centered = (abs(positions[i, 0] - (kind(x) + half)) <= reach) & (
             abs(positions[i, 1] - (kind(y) + half)) <= reach
         )
+        kinds[x] = COVERED if centered else COVERED | LOOSE
         if not (centered and (fronts or rgba[i, 3] == opaque)):
             run = 0
             continue
@@ -129,6 +171,17 @@ def _note(cells, positions, behind, hidden, depths, seen):
 
 
 @compiled
+def _note_exits(cells, seen):
+    """Take note of a row of exits; returns how many there are."""
+    count = 0
+    for x in range(len(cells)):
+        if cells[x] >= 0:
+            count += 1
+            seen[cells[x]] = 1
+    return count
+
+
+@compiled
 def _hide(cells, hidden):
     """Take note of where a row of a hidden layer is covered, as `_note` does."""
     last = len(cells) - 1
@@ -154,6 +207,40 @@ def _decide(states, covered0, covered1, covered2, calm0, calm1, calm2, joins1, j
         some |= covered2[x] | covered2[x + 1] | covered2[x + 2]
         flat = calm0[x + 1] & calm1[x + 1] & calm2[x + 1] & joins1[x + 1] & joins2[x + 1]
         states[x] = SETTLED if states[x] == SETTLED else (some << 1 | some) - flat
+
+
+@compiled
+def _fill_settled(kinds, states):
+    """Settled targets have nothing loose beside them, unless samples there were dropped for want of room."""
+    for x in range(len(kinds)):
+        kinds[x] = COVERED if states[x] == SETTLED else kinds[x]
+
+
+@compiled
+def _mark_partial(partial, above, level, below, fronts, mixed):
+    """Mark the targets of a row that are mixed, or may be covered in part; returns how many there are."""
+    count = 0
+    for x in range(len(partial)):
+        around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
+        around |= below[x] | below[x + 1] | below[x + 2]
+        dropped = (fronts[x] < 0) & (level[x + 1] == COVERED)
+        partial[x] = np.uint8((around & COVERED != 0) & (around & LOOSE != 0) & ~dropped)
+    for x in range(len(mixed)):
+        partial[x] |= mixed[x]
+    for x in range(len(partial)):
+        count += partial[x]
+    return count
+
+
+@compiled
+def _fill_ends(ends, listed, above, level, below):
+    """Fill a row of `ends`."""
+    for x in range(len(ends)):
+        bits = (above[x] & NOTHING) | (above[x + 1] & NOTHING) << 1 | (above[x + 2] & NOTHING) << 2
+        bits |= (level[x] & NOTHING) << 3 | (level[x + 2] & NOTHING) << 5
+        bits |= (below[x] & NOTHING) << 6 | (below[x + 1] & NOTHING) << 7 | (below[x + 2] & NOTHING) << 8
+        fronts = listed[x] & (level[x + 1] >> 1)
+        ends[x] = np.uint16(listed[x] << 9 | bits * fronts)
 
 
 @kernel
