@@ -145,13 +145,10 @@ class _Parts(_Kernels):
         return found
 
 
-_VIEWS = {"getitem", "static_getitem", "typed_getitem", "getattr", "cast", "build_tuple", "exhaust_iter", "phi"} | {
-    "getiter",
-    "iternext",
-    "pair_first",
-    "pair_second",
-}
-"""Operations that refer to arrays that are there, without making any."""
+_HARMLESS = ir.Assign, ir.Del, ir.Jump, ir.Branch, ir.Return, ir.StaticRaise
+_VIEWS = {"getitem", "static_getitem", "getattr", "cast", "phi", "build_tuple", "exhaust_iter", "getiter", "iternext"}
+_VIEWS |= {"pair_first", "pair_second"}
+"""Statements that make nothing, and operations that refer to arrays which are there."""
 
 
 @register_pass(mutates_CFG=False, analysis_only=True)
@@ -171,10 +168,14 @@ class _Uncounted(AnalysisPass):
 
         made = counted(state.return_type)
         for block in state.func_ir.blocks.values():
-            for assigned in block.find_insts(ir.Assign):
-                value, kind = assigned.value, state.typemap[assigned.target.name]
-                if isinstance(value, ir.Expr) and value.op not in _VIEWS:
-                    made |= counted(kind)
+            for statement in block.body:
+                if isinstance(statement, (ir.SetItem, ir.StaticSetItem)):  # An array may be copied first.
+                    made |= counted(state.typemap[statement.value.name])
+                elif isinstance(statement, ir.Assign) and isinstance(value := statement.value, ir.Expr):
+                    name = value.index.name if value.op == "getitem" else statement.target.name
+                    made |= value.op not in _VIEWS - {"getitem"} and counted(state.typemap[name])
+                else:
+                    made |= not isinstance(statement, _HARMLESS)
         if not made:
             state.targetctx = state.targetctx.subtarget(enable_nrt=False)
         return False
