@@ -6,7 +6,7 @@ import numpy as np
 
 from rts.compiling import compiled
 
-BLOCK = 32
+BLOCK = 16
 """Columns that share a note of whether hidden layers are near."""
 
 

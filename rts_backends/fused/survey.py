@@ -73,14 +73,14 @@ def survey(
     # For three rows of cells: which are covered, which amid three alike, and which alike with the cell above.
     cells = np.zeros((3, 3, width + 2), np.uint8)
     covered, calm, joins = cells[0], cells[1], cells[2]
-    kinds, partial, ends_asked = np.empty((3, width + 2), np.uint8), np.empty(width, np.uint8), len(ends) > 0
+    kinds, partial = np.empty((3, width + 2), np.uint8), np.empty(width, np.uint8)
     for y in range(start - 1, stop + 1):
         now, before = (y + 3) % 3, (y + 2) % 3
         covered[now], calm[now], joins[now], near[now], kinds[now] = 0, 0, 0, 0, LOOSE
         if 0 <= y < height:
             above, found = row[0, max(y - 1, 0)], (covered[now], calm[now], joins[now], kinds[now, 1:-1])
             _inspect(positions, rgba, row[0, y], above, y, fronts, reach, *found)
-            if ends_asked:
+            if len(ends) > 0:
                 _fill_settled(kinds[now, 1:-1], states[y])
             for k in range(len(row)):
                 if k > 0 and not fronts:
@@ -103,12 +103,10 @@ def survey(
             first = (y + 1) % 3
             runs = calm[first], calm[before], calm[now]
             _decide(states[y - 1], covered[0], covered[1], covered[2], *runs, joins[before], joins[now])
-            if ends_asked:
+            if len(ends) > 0:
                 given = kinds[first], kinds[before], kinds[now]
-                if asks:
-                    listed[y - 1] = _mark_partial(partial, *given, row[0, y - 1], mixed[y - 1])
-                else:
-                    listed[y - 1] = _mark_partial(partial, *given, row[0, y - 1], partial[:0])
+                _mark_partial(partial, *given, row[0, y - 1])
+                listed[y - 1] = _unite(partial, mixed, y - 1)
                 _fill_ends(ends[y - 1], partial, *given)
 
 
@@ -217,16 +215,21 @@ def _fill_settled(kinds, states):
 
 
 @compiled
-def _mark_partial(partial, above, level, below, fronts, mixed):
-    """Mark the targets of a row that are mixed, or may be covered in part; returns how many there are."""
-    count = 0
+def _mark_partial(partial, above, level, below, fronts):
+    """Mark the targets of a row that may be covered in part."""
     for x in range(len(partial)):
         around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
         around |= below[x] | below[x + 1] | below[x + 2]
         dropped = (fronts[x] < 0) & (level[x + 1] == COVERED)
         partial[x] = np.uint8((around & COVERED != 0) & (around & LOOSE != 0) & ~dropped)
-    for x in range(len(mixed)):
-        partial[x] |= mixed[x]
+
+
+@compiled
+def _unite(partial, mixed, y):
+    """Mark the mixed targets of a row, too; returns how many are marked."""
+    count = 0
+    for x in range(len(partial) if len(mixed) > 0 else 0):
+        partial[x] |= mixed[y, x]
     for x in range(len(partial)):
         count += partial[x]
     return count
