@@ -278,12 +278,14 @@ def _weigh(gives, slopes, d, positions, rgba, row, y, x, scale, gamma, around, w
     Returns their sums, of colours and weights.
     """
     _, height, width = row.shape
-    kind, count = positions.dtype.type, 0
-    for n in range(9):
-        py, px = y + 1 - n // 3, x + 1 - n % 3
-        i = row[0, py, px] if 0 <= py < height and 0 <= px < width else -1
-        gives[d, n], which[count], samples[count] = NOTHING, n, i
-        count += i >= 0
+    kind, count, n = positions.dtype.type, 0, 0
+    for v in range(-1, 2):
+        for u in range(-1, 2):
+            py, px = y - v, x - u
+            i = row[0, py, px] if 0 <= py < height and 0 <= px < width else -1
+            gives[d, n], which[count], samples[count] = NOTHING, n, i
+            count += i >= 0
+            n += 1
     zero, half, slope, peak = kind(0), kind(0.5), kind(2) * scale * gamma, around[4, 2]
     red, green, blue, alpha, weight, given = zero, zero, zero, zero, zero, JOINED if row[0, y, x] >= 0 else SURFACE
     for k in range(count):
@@ -348,10 +350,12 @@ def _list(gives, d, ranges, m, front, surface):
 @compiled
 def _part(gives, d, part, ends, y, x):
     """Sources of other parts than the target's move as their own outlines, if any: there may be a gap between."""
-    for n in range(9):
-        py, px = y + 1 - n // 3, x + 1 - n % 3
-        if gives[d, n] == JOINED and part[0, py, px] != part[0, y, x]:
-            gives[d, n] = SURFACE if ends[py, px] & DIRECTIONS else NOTHING
+    n = 0
+    for v in range(-1, 2):
+        for u in range(-1, 2):
+            if gives[d, n] == JOINED and part[0, y - v, x - u] != part[0, y, x]:
+                gives[d, n] = SURFACE if ends[y - v, x - u] & DIRECTIONS else NOTHING
+            n += 1
 
 
 @compiled
