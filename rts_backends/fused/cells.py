@@ -233,7 +233,7 @@ class Cells:
             decide = self.part, self.exits, kind.type(choices.extent), rules, self._pairs
             listed = choices.columns, choices.offsets, choices.ranges, choices.sums
             given = *arrays, *decide, *listed, ends
-            parallel(outlines.fill, height, *given, found, work=150 * len(found.columns))
+            parallel(outlines.fill, height, *given, found, work=90 * len(found.columns))
         return found
 
     @cached_property

@@ -433,32 +433,34 @@ def _pull_rows(top, bottom, row, outlines, border, g, width, zero, g_positions):
                 surface += g[y - border, x - border, c] * outlines.changes[d, 1, c]
             if front == zero and surface == zero:
                 continue
-            joined_x, joined_y = zero, zero
-            for n in range(9):
-                given = outlines.gives[d, n]
-                if given == NOTHING:
-                    continue
-                py, px = y + 1 - n // 3, x + 1 - n % 3
-                h = front if given == FRONT else surface
-                h_x, h_y = h * outlines.slopes[d, n, 0], h * outlines.slopes[d, n, 1]
-                i = row[0, py, px]
-                g_positions[i, 0] -= h_x
-                g_positions[i, 1] -= h_y
-                if given == JOINED:
-                    joined_x, joined_y = joined_x + h_x, joined_y + h_y
-                else:
-                    _add(g_positions, row, outlines, py, px, h_x, h_y)
+            joined_x, joined_y, n = zero, zero, 0
+            for v in range(-1, 2):
+                for u in range(-1, 2):
+                    given = outlines.gives[d, n]
+                    if given != NOTHING:
+                        h = front if given == FRONT else surface
+                        h_x, h_y = h * outlines.slopes[d, n, 0], h * outlines.slopes[d, n, 1]
+                        if given == JOINED:
+                            i = row[0, y - v, x - u]
+                            g_positions[i, 0] -= h_x
+                            g_positions[i, 1] -= h_y
+                            joined_x, joined_y = joined_x + h_x, joined_y + h_y
+                        else:
+                            _lead(g_positions, row, outlines, y - v, x - u, h_x, h_y)
+                    n += 1
             if joined_x != zero or joined_y != zero:
-                _add(g_positions, row, outlines, y, x, joined_x, joined_y)
+                i = row[0, y, x]
+                g_positions[i, 0] += joined_x
+                g_positions[i, 1] += joined_y
+                _lead(g_positions, row, outlines, y, x, joined_x, joined_y)
 
 
 @compiled
-def _add(g_positions, row, outlines, y, x, g_x, g_y):
-    """Hand the gradient of the motion of the outline beside a cell to its front and its partner."""
-    i, j, b = row[0, y, x], outlines.partner[y, x], outlines.beta[y, x]
-    g_positions[i, 0] += g_x
-    g_positions[i, 1] += g_y
+def _lead(g_positions, row, outlines, y, x, g_x, g_y):
+    """Hand on the gradient of what the outline beside a cell moves more than its front: to that, and to its partner."""
+    b = outlines.beta[y, x]
     if b != 0:
+        i, j = row[0, y, x], outlines.partner[y, x]
         g_positions[i, 0] += b * g_x
         g_positions[i, 1] += b * g_y
         g_positions[j, 0] -= b * g_x
