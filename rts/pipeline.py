@@ -160,7 +160,7 @@ class _Uncounted(AnalysisPass):
     def __init__(self) -> None:
         super().__init__()
 
-    def run_pass(self, state: Any) -> bool:
+    def run_pass(self, state: Any) -> Any:
         """Change how the function is lowered, not the function."""
 
         def counted(kind: Any) -> bool:

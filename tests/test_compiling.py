@@ -252,3 +252,53 @@ def test_kernels_are_written_by_one_process_at_a_time(tmp_path):
         process.communicate(timeout=60)
     assert [process.returncode for process in processes] == [0, 0]
     assert len(list(kept.glob("several.double*.nbc"))) == 2 and len(list(kept.glob("several.double*.nbi"))) == 1
+
+
+def test_parts_that_make_no_arrays_count_no_references():
+    """Those that make some, or hand some on, do: as many are freed as were made."""
+    pytest.importorskip("rts.pipeline")
+    memory, runtime = (pytest.importorskip(f"numba.core.runtime.{name}") for name in ("_nrt_python", "nrt"))
+
+    @compiling.compiled
+    def picked(a, b, i):
+        row = a[i] if i % 2 else b[i]
+        return row[1] if row[0] > 3 else last(b, i)
+
+    @compiling.compiled
+    def last(a, i):
+        return a[i, -1] if i > 3 else a[0, 0]
+
+    @compiling.compiled
+    def rest(row, i):
+        return row[i:]
+
+    @compiling.compiled
+    def doubled(a, b, i):
+        made = rest(a[i], i % 2) + rest(b[i], i % 2)
+        made[:1] = rest(a[i], 1)[:1]
+        return made[0] if made[1] > 3 else made[2]
+
+    def summed(part):
+        def total(a, b):
+            found = 0.0
+            for i in range(len(a)):
+                found += part(a, b, i)
+            return found
+
+        return numba.njit(total)
+
+    a = np.arange(40.0).reshape(10, 4)
+    b = a + 1
+    reads, makes = summed(picked), summed(doubled)
+    assert reads(a, b) == sum((a, b)[1 - i % 2][i, 1] if i > 0 else b[0, 0] for i in range(10))
+    assert "call void @NRT_incref" not in next(iter(reads.inspect_llvm().values()))
+    makes(a, b)
+    memory.memsys_enable_stats()
+    try:
+        before = runtime.rtsys.get_allocation_stats()
+        makes(a, b)
+        after = runtime.rtsys.get_allocation_stats()
+    finally:
+        memory.memsys_disable_stats()
+    made = after.mi_alloc - before.mi_alloc
+    assert made >= 10 and made == after.mi_free - before.mi_free

@@ -268,7 +268,7 @@ def _any(ends):
     return some != 0
 
 
-# Not handed views of single targets, since to make and to count these takes as long as the work.
+# Not handed views of single targets, since to make these takes as long as the work.
 
 
 @compiled

@@ -13,7 +13,8 @@ others."""
 
 
 LISTED = 1 << 9
-"""Beside bits 3 (v + 1) + (u + 1) of directions (u, v) in which a front ends: targets that may be covered in part."""
+"""Beside bits 3 (v + 1) + (u + 1) of directions (u, v) in which a front ends: mixed targets, and those that may be
+covered in part."""
 
 NOTHING, COVERED, LOOSE = np.uint8(1), np.uint8(2), np.uint8(4)
 """Bits of a cell: in the array without a sample, with one, and not sure to fill its share of what is around it."""
@@ -60,9 +61,8 @@ def survey(
         counts: (H,) zeros, for the number of such cells, of `row` and `exits`.
         mixed: (H, W) uint8, to be filled with marks of the mixed targets of `Visible`; no rows where nobody asks.
         marked: (H,) zeros, to be filled with their number in each row.
-        ends: (H, W) uint16, to be filled with where fronts end before nothing, and LISTED, also where targets are mixed;
-            no rows where nobody asks.
-        listed: (H,) zeros, to be filled with the number of the latter in each row.
+        ends: (H, W) uint16, to be filled with where fronts end before nothing, and LISTED; no rows where nobody asks.
+        listed: (H,) zeros, to be filled with the number of targets that are LISTED in each row.
     """
     layers, height, width = row.shape
     blocks, kind, asks = hidden.shape[1], positions.dtype, len(mixed) > 0
