@@ -239,11 +239,17 @@ def _unite(partial, mixed, y):
 def _fill_ends(ends, listed, above, level, below):
     """Fill a row of `ends`."""
     for x in range(len(ends)):
-        bits = (above[x] & NOTHING) | (above[x + 1] & NOTHING) << 1 | (above[x + 2] & NOTHING) << 2
-        bits |= (level[x] & NOTHING) << 3 | (level[x + 2] & NOTHING) << 5
-        bits |= (below[x] & NOTHING) << 6 | (below[x + 1] & NOTHING) << 7 | (below[x + 2] & NOTHING) << 8
+        bits = _empty(above, x, 0) | _empty(above, x + 1, 1) | _empty(above, x + 2, 2)
+        bits |= _empty(level, x, 3) | _empty(level, x + 2, 5)
+        bits |= _empty(below, x, 6) | _empty(below, x + 1, 7) | _empty(below, x + 2, 8)
         fronts = listed[x] & (level[x + 1] >> 1)
-        ends[x] = np.uint16(listed[x] << 9 | bits * fronts)
+        ends[x] = np.uint16(listed[x]) << 9 | bits * fronts
+
+
+@compiled
+def _empty(kinds, x, n):
+    """Bit n where a cell is empty."""
+    return np.uint16(kinds[x] & NOTHING) << n
 
 
 @kernel
