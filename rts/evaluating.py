@@ -18,10 +18,10 @@ from rts.engines import Engine, constants, engine_of, is_constant, namespace, su
 from rts.errors import InputError
 from rts.footprints import FOOTPRINT, uv_footprint
 from rts.gbuffer import GBuffer
-from rts.interfaces import CheckedPart
 from rts.operations.linear import affine_map
 from rts.operations.projection import projective_map_of_views
 from rts.operations.take import take, take_shifted
+from rts.parts import CheckedPart
 from rts.records import Fine, Sampled, Samples, Splats
 from rts.row_cameras import RowCameras
 from rts.sampling.scenes import Wide

@@ -15,8 +15,9 @@ from rts.checks import check_background, check_cameras, check_size, check_splatt
 from rts.engines import Engine, is_constant, namespace, suiting_scene, uncompiled
 from rts.errors import InputError
 from rts.evaluating import shaded_at_once, views_to_splats
-from rts.interfaces import Part, Splatter
+from rts.interfaces import Splatter
 from rts.operations.inset import averaged
+from rts.parts import Part
 from rts.records import Sampled
 from rts.rendering import bands_of, image_of, over_background, seen, splatted
 from rts.sampling.adaptive import Adaptive, finest
