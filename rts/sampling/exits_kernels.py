@@ -7,6 +7,9 @@ import numpy as np
 from rts.compiling import compiled, kernel
 from rts.sampling.windows_kernels import add, unite
 
+BLOCK = 32
+"""Cells that are passed over at once if none is marked."""
+
 
 @kernel
 def find(kept, cells):
@@ -27,11 +30,18 @@ def find(kept, cells):
     count = 0
     for y in range(height):
         first = (y + 1) * pitch + 1
-        row = marks[first : first + width]
-        if _any(row):
-            for x in range(width):
-                if row[x]:
-                    cells[count] = y * width + x
+        count = _list(cells, count, y * width, marks[first : first + width])
+    return count
+
+
+@compiled
+def _list(cells, count, first, marks):
+    """List the marks of a row, whose first cell has a number, from a place on; what comes after is the next place."""
+    for start in range(0, len(marks), BLOCK):
+        if _any(marks[start : start + BLOCK]):
+            for x in range(start, min(start + BLOCK, len(marks))):
+                if marks[x]:
+                    cells[count] = first + x
                     count += 1
     return count
 
