@@ -1,4 +1,7 @@
-"""Where a splatted image is the same colour all around: there it is that colour, and no motion of splats changes it."""
+"""Where a splatted image is the same colour all around: there it is that colour, and no motion of splats changes it.
+
+The same look at all samples tells where the fronts of `Visible` end.
+"""
 
 from __future__ import annotations
 
