@@ -64,7 +64,8 @@ def _settle(start, stop, covered, kept, wanted, part, colors, reach, found, near
     # A border of cells that are not amid fronts, as nothing is known there.
     loose, middle = np.ones((rows, width + 2 * around), np.uint8), slice(around, around + width)
     wide, far = np.ones((rows, width), np.uint8), 2 * around - 2
-    step = 1 if len(wanted) > 0 else 3
+    # What is not settled lies in blocks of 3 × 3 cells, at seams between colours of 2 × 3; what of it is wanted, anywhere.
+    step = 1 if len(wanted) > 0 else (2 if len(part) > 0 else 3)
     column, nine = np.empty(width + 2 * around, np.uint8), np.empty(width + 2 * around - 2, np.uint8)
     shown = np.empty((2, width), np.int32)  # The colours of two rows.
     for r in range(rows):
@@ -89,7 +90,6 @@ def _settle(start, stop, covered, kept, wanted, part, colors, reach, found, near
                 _mask(nine[around - 1 : around - 1 + width], wanted[y])
             else:
                 nine[:] = 0
-        # What is wider is united of threes, unless some of these do not count.
         unite(wide[r], nine, nine[min(step, far) :], nine[far:])
         for v in range(2 * step, far, step):
             _join(wide[r], nine[v:])
