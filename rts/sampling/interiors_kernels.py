@@ -64,7 +64,7 @@ def _settle(start, stop, covered, kept, wanted, part, colors, reach, found, near
     # A border of cells that are not amid fronts, as nothing is known there.
     loose, middle = np.ones((rows, width + 2 * around), np.uint8), slice(around, around + width)
     wide, far = np.ones((rows, width), np.uint8), 2 * around - 2
-    # What is not settled lies in blocks of 3 × 3 cells, at seams between colours of 2 × 3; what of it is wanted, anywhere.
+    # What is not settled lies in blocks of 3 × 3 cells, at seams of 2 × 3; what is wanted of it, anywhere.
     step = 1 if len(wanted) > 0 else (2 if len(part) > 0 else 3)
     column, nine = np.empty(width + 2 * around, np.uint8), np.empty(width + 2 * around - 2, np.uint8)
     shown = np.empty((2, width), np.int32)  # The colours of two rows.
