@@ -142,6 +142,11 @@ class Cells:
         """(H, W) int32, the sample whose colour a target shows, whatever moves, or −1; no rows for none."""
         return read_only(self._settled, np.int32)
 
+    @property
+    def _shows_several(self) -> bool:
+        """Whether settled targets show the colours of other samples than that of row 0."""
+        return self._settled.max(initial=-1) > 0
+
     def _paint(self, colors: np.ndarray, images: np.ndarray) -> None:
         """Give settled targets of images (T, H, W, 4) the colours (T, N, 4) of samples; zeros of none."""
         parallel(paint, images.shape[1], self.settled, self.border, read_only(colors), images, work=images.size // 8)
@@ -271,7 +276,7 @@ class Cells:
             parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
             if len(self.choices.columns):
                 parallel(mixed.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10)
-            if self._settled.max(initial=-1) > 0:  # What has no sample of its own shows that of row 0 so far.
+            if self._shows_several:  # What has no sample of its own shows that of row 0 so far.
                 self._paint(self.rgba[None], out[None])
 
     def vjp(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
@@ -280,9 +285,11 @@ class Cells:
             return
         self._pull(g, g_positions, g_rgba)
         if len(self._settled) and g_rgba is not None:
-            settled, number = self.settled, np.zeros(len(g_rgba), np.int32)
-            parallel(note, len(settled), settled, number, work=settled.size // 2)
-            shown = np.flatnonzero(number)
+            settled, noted, number = self.settled, np.zeros(len(g_rgba), bool), np.zeros(len(g_rgba), np.int32)
+            noted[0] = True
+            if self._shows_several:
+                parallel(note, len(settled), settled, noted, work=settled.size // 8)
+            shown = np.flatnonzero(noted)
             number[shown] = np.arange(len(shown))
             sums = np.zeros((len(g), len(shown), 4), g.dtype)
             parallel(collect, len(g), settled, number, self.border, read_only(g), sums, work=g.size // 4)

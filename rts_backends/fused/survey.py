@@ -176,11 +176,14 @@ def paint(start, stop, settled, border, colors, images):
 
 @kernel
 def note(start, stop, settled, shown):
-    """Mark the samples (N,) whose colours settled targets of rows [start, stop) show."""
+    """Mark the samples (N,) bool whose colours settled targets of rows [start, stop) show."""
+    last = -1
     for y in range(start, stop):
         for x in range(settled.shape[1]):
-            if settled[y, x] >= 0:
-                shown[settled[y, x]] = 1
+            if settled[y, x] != last:
+                last = settled[y, x]
+                if last >= 0:
+                    shown[last] = True
 
 
 @kernel
@@ -189,9 +192,24 @@ def collect(start, stop, settled, number, border, g, sums):
 
     Those of the samples whose colours are shown, which have numbers (N,).
     """
+    width = g.shape[1]
     for y in range(start, stop):
-        for x in range(g.shape[1]):
-            i = settled[y + border, x + border]
+        end = 0
+        while end < width:
+            first, i = end, settled[y + border, end + border]
+            while end < width and settled[y + border, end + border] == i:
+                end += 1
             if i >= 0:
-                for c in range(4):
-                    sums[y, number[i], c] += g[y, x, c]
+                _add(sums[y, number[i]], g[y, first:end])
+
+
+@compiled(fastmath={"contract", "reassoc"})
+def _add(to, g):
+    """Add the sums of (n, 4), in an order that suits vector instructions."""
+    a, b, c, d = to[0], to[1], to[2], to[3]
+    for x in range(len(g)):
+        a += g[x, 0]
+        b += g[x, 1]
+        c += g[x, 2]
+        d += g[x, 3]
+    to[0], to[1], to[2], to[3] = a, b, c, d
