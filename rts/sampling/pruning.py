@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import threading
 import weakref
 from collections.abc import Callable, Sequence
@@ -264,13 +263,15 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
     # Where numbers are traced, nobody knows how rounding orders depths.
     settles = asked.settles and asked.size is not None
     sizes = [s.ids.shape[0] for s in sampled.samples]
-    offsets, part = np.cumsum([0, *sizes]), sampled.part
+    total, part = sum(sizes), sampled.part
     front = [part[0, ...]] if settles and len(sizes) > 1 else []
 
     def host(row: np.ndarray, depth: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
-        if row.max(initial=-1) >= offsets[-1]:
-            raise InputError(f"row refers to sample {row.max()} of {offsets[-1]}; sample this scene anew")
-        used, covered = np.zeros(offsets[-1], bool), row >= 0
+        from rts.sampling.pruning_kernels import Numbering
+
+        if row.max(initial=-1) >= total:
+            raise InputError(f"row refers to sample {row.max()} of {total}; sample this scene anew")
+        numbering, covered = Numbering(sizes), row >= 0
         kept = asked(covered, depth)
         last = len(rest) - len(front)
         own_rows, exits, whose = rest[: len(sizes)], rest[len(sizes) : last], rest[last:]
@@ -278,24 +279,17 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
             near = np.full(exits[0].size, -1, np.int32)
             cells = beside_outlines(kept)[0]
             near[cells] = exits[0].reshape(-1)[cells]
-            used[near[near >= 0]] = True
             exits = (near.reshape(exits[0].shape),)
+            numbering.use(exits[0], exits[0] >= 0)
         amid = ()
         if settles:
             kept = kept.copy() if kept is covered else kept
             found = asked.settled(covered, depth, kept, 0.0, part=None if asked.colors is None else whose[0])
             amid = (np.where(found, whose[0], np.int32(-1)) if front else of_first_row(found),)
-        used[row[kept]] = True
-        # The order stays, so that neighbours in the image stay neighbours in memory.
-        of_parts = [used[a:b] for a, b in itertools.pairwise(offsets)]
-        indices = [np.flatnonzero(own).astype(np.int32) for own in of_parts]
-        # For a row of −1 there is −1 at the end.
-        none = np.full(1, -1, np.int32)
-        numbers = [np.where(own, np.cumsum(own, dtype=np.int32) - 1, none) for own in of_parts]
-        every, *numbers = (np.concatenate([*n, none]) for n in (numbers, *([n] for n in numbers)))
-        rows = zip((every, *numbers, *[every] * len(exits)), (row, *own_rows, *exits), strict=True)
-        renumbered = [n[r] for n, r in rows]
-        return *renumbered, *amid, *(i if len(i) else np.zeros(1, np.int32) for i in indices)
+        numbering.use(row, kept)
+        indices = [index if len(index) else np.zeros(1, np.int32) for index in numbering.indices()]
+        own_rows = [numbering.renumbered(own, part=i) for i, own in enumerate(own_rows)]
+        return numbering.renumbered(row), *own_rows, *map(numbering.renumbered, exits), *amid, *indices
 
     rows = sampled.row, *(s.row for s in sampled.samples), *([] if sampled.exit is None else [sampled.exit])
     shapes = [ArraySpec(tuple(r.shape), np.int32) for r in rows]
