@@ -284,7 +284,8 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
         amid = ()
         if settles:
             kept = kept.copy() if kept is covered else kept
-            found = asked.settled(covered, depth, kept, 0.0, part=None if asked.colors is None else whose[0])
+            told = {} if asked.colors is None else {"part": whose[0]}
+            found = asked.settled(covered, depth, kept, 0.0, **told)
             amid = (np.where(found, whose[0], np.int32(-1)) if front else of_first_row(found),)
         numbering.use(row, kept)
         indices = [index if len(index) else np.zeros(1, np.int32) for index in numbering.indices()]
