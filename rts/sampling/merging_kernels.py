@@ -28,19 +28,20 @@ def interleave(
     """
     (_, height, width), kind = rows[0].shape, np.result_type(*depths)
     shape = (min(layers, sum(r.shape[0] for r in rows)), height, width)
+    told = shape if facing else (0, height, width)
     given = [
         (read_only(r, np.int32), read_only(d, kind), read_only(facing[i] if facing else r[:0], np.int16))
         for i, (r, d) in enumerate(zip(rows, depths, strict=True))
     ]
     # One part after the other: those before are merged already, but for the first.
-    part, before = read_only(np.empty((0, height, width), np.int32)), given[0]
-    for number in range(1, len(rows)):
-        found = np.empty(shape, np.int32), np.empty(shape, np.int32), np.empty(shape, kind)
-        told = np.empty(shape if facing else (0, height, width), np.int16)
+    before: tuple[np.ndarray, ...] = (np.empty((0, height, width), np.int32), *given[0])
+    given += [tuple(x[:0] for x in given[0])] * (len(rows) == 1)  # With one alone nothing is merged.
+    for number, own in enumerate(given[1:], start=1):
+        found = *(np.empty(shape, dtype) for dtype in (np.int32, np.int32, kind)), np.empty(told, np.int16)
         numbers = number, len(rows), more
-        parallel(_merge, height, part, *before, *given[number], *numbers, *found, told, work=4 * found[0].size)
-        part, *before = map(read_only, (*found, told))
-    return (*found, told) if facing else found
+        parallel(_merge, height, *map(read_only, before), *own, *numbers, *found, work=4 * found[0].size)
+        before = found
+    return before if facing else before[:3]
 
 
 @kernel
@@ -91,7 +92,7 @@ def _merge(
                     merged_depth[k, y, x] = 0
                     if tells:
                         merged_facing[k, y, x] = 0
-            if tells and number == count - 1:
+            if tells and number >= count - 1:
                 told = merged_facing[layers - 1, y, x]
                 if 0 < abs(told) < more:
                     merged_facing[layers - 1, y, x] = told + more if told > 0 else told - more
