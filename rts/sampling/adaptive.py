@@ -105,14 +105,15 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
         row: (K, H, W) int32 of one sample a pixel.
         depth: (K, H, W).
         sizes: the number of rows of each part.
-        settled: (H, W) bool, cells that are covered by the only part, with a sample or without; None for none.
+        settled: (H, W) int8, 0 at cells that are covered by the only part, with a sample or without, −1 at others;
+            None for none.
     """
     from rts.sampling import adaptive_kernels
     from rts.splatting.visible import CONTINUED
 
     if settled is not None:
         # None of their layers is hidden, nor is any beside them: depths there are not looked at.
-        row = np.concatenate([np.maximum(row[:1], settled - np.int32(1)), row[1:]])
+        row = np.concatenate([np.maximum(row[:1], settled), row[1:]])
     depth, kind = read_only(depth), depth.dtype.type
     extent = max(depth.max(initial=0), 0) - min(depth.min(initial=0), 0)
     marks = np.empty(row.shape[1:], np.uint8)
