@@ -59,7 +59,7 @@ def needed_by(
 
 
 def colors_of(parts: Sequence[CheckedPart]) -> tuple[int, ...]:
-    """Of each part which one is the first to be certain to show its one colour; −1 where it may have several."""
+    """(P,) the first part that is certain to show the one colour of each part; −1 for parts that may have several."""
     found: list[int] = []
     known: dict[Any, list[int]] = {}  # The first of each colour, by what is quick to compare.
     for index, part in enumerate(parts):
