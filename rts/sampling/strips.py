@@ -191,8 +191,8 @@ def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: Grid, most: int | None
 
     def counted(n: int) -> np.ndarray:
         counts = np.zeros(grid.fine[0], np.int64)
-        given = marks, pieces[:n], _firsts(pieces[:n], grid), grid.side, grid.apron, grid.high, grid.gap
-        parallel(strips_kernels.count, len(counts), *given, grid.fine[1], counts, work=2000 * len(counts))
+        given = marks, pieces[:n], _firsts(pieces[:n], grid), grid.side, grid.apron, grid.high
+        parallel(strips_kernels.count, len(counts), *given, grid.fine[1], counts, work=500 * len(counts))
         return counts
 
     counts = counted(len(pieces))
