@@ -133,7 +133,7 @@ def _draw(items, given, top, end, width, asked, layered):
 
 @compiled
 def _asked(hits, found, top, asked, cells):
-    """Leave out hits (n, 2) in cells that are not asked for, and number those of others, unless all are; what is left."""
+    """Leave out hits (n, 2) in cells that are not asked for, and number the others if some are; how many are left."""
     table, numbers, bits = asked
     side, top = np.uint32(BAND_ROWS), np.uint32(top)
     if len(bits) == 0:

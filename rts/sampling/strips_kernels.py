@@ -14,6 +14,7 @@ from rts.compiling import compiled, kernel
 WANTED, NEAR = 1, 2
 """Bits of cells: inside of an active pixel, and within two cells of one."""
 
+
 @kernel
 def find(active, high, gap):
     """Runs (R, 3) int32 of columns of strips: strip, first column, number; those that aprons would join are one.
