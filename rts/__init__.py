@@ -38,7 +38,6 @@ from rts.fitting.schedule import Stage, pyramid
 from rts.gbuffer import GBuffer
 from rts.interfaces import (
     Evaluator,
-    Part,
     Rate,
     RaySurface,
     Residuals,
@@ -53,6 +52,7 @@ from rts.operations.combine import combine
 from rts.operations.gradient import gradient
 from rts.operations.operation import Operation
 from rts.operations.rigid import rigid
+from rts.parts import Part
 from rts.radiance_fields import load_radiance_field, volume_render
 from rts.records import ArraySpec, Fine, Fragments, Proxy, RayHits, Rays, Sampled, Samples, Splats
 from rts.registry import plugin, plugins

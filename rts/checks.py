@@ -18,7 +18,8 @@ from rts.camera import Camera
 from rts.engines import namespace, value_of
 from rts.errors import AspectWarning, InputError, warn
 from rts.gbuffer import GBuffer
-from rts.interfaces import CheckedPart, Part, Sampler, Shader, Splatter, as_surface
+from rts.interfaces import Sampler, Shader, Splatter, as_surface
+from rts.parts import CheckedPart, Part
 from rts.trees import Array, placed_leaves
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}

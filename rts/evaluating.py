@@ -1,33 +1,24 @@
-"""Samples evaluated, shaded and projected: what splatters take, differentiably."""
+"""Samples of scenes evaluated, shaded and projected: what splatters take of one view, or of several."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import replace
-from functools import cache, partial
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
-from rts.arrays import described, shape_of
+from rts.appearance import add_footprint, apart, evaluate, shade, shaded_at_once, theta_of
 from rts.camera import Camera
-from rts.checks import check_shaded, check_splats
-from rts.engines import Engine, constants, engine_of, is_constant, namespace, suiting
-from rts.errors import InputError
-from rts.footprints import FOOTPRINT, uv_footprint
-from rts.gbuffer import GBuffer
-from rts.interfaces import CheckedPart
-from rts.operations.linear import affine_map
+from rts.checks import check_splats
+from rts.engines import Engine, constants, engine_of, namespace, suiting
 from rts.operations.projection import projective_map_of_views
 from rts.operations.take import take, take_shifted
+from rts.parts import CheckedPart
 from rts.records import Fine, Sampled, Samples, Splats
 from rts.row_cameras import RowCameras
 from rts.sampling.scenes import Wide
 from rts.sampling.several import Views, in_one_table
 from rts.threads import each
-from rts.trees import Array, Tree
+from rts.trees import Array
 
 
 def to_splats(
@@ -169,11 +160,11 @@ def _shown(
     camera = constants(camera, engine, dtype)
     positions, colors, first = [], [], 0
     for index, (part, samples) in enumerate(zip(parts, sampled, strict=True)):
-        theta, transform = _theta_of(part, engine, like), constants(part.transform, engine, like)
-        local = _evaluate(part, part.surface.reads(part.theta), samples, engine, like)
+        theta, transform = theta_of(part, engine, like), constants(part.transform, engine, like)
+        local = evaluate(part, samples, engine, like)
         own = seen.within(transform)
-        _add_footprint(part, samples, local, own, wide.grid, engine, like)
-        world, rgba = _shade(part, theta, transform, samples, local, camera, engine)
+        add_footprint(part, samples, local, own, wide.grid, engine, like)
+        world, rgba = shade(part, theta, transform, samples, local, camera, engine)
         positions.append(constants(own.project(local["position"], wide.grid), engine, dtype))
         check_splats(index, part, world, positions[-1], rgba, row, first)
         colors.append(constants(rgba, engine, dtype))
@@ -211,8 +202,8 @@ def _shown_in_views(
         like = None
     whole = in_one_table([own.samples[index] for own in sampled])
     counts, grid = _counts_of(pictures, index), wides[0].grid
-    theta, transform = _theta_of(part, engine, like), constants(part.transform, engine, like)
-    gbuffer = _evaluate(part, part.surface.reads(part.theta), whole, engine, like)
+    theta, transform = theta_of(part, engine, like), constants(part.transform, engine, like)
+    gbuffer = evaluate(part, whole, engine, like)
     view, first = [], 0
     for picture in pictures:
         view.append(picture.view[index] + first if first else picture.view[index])
@@ -226,12 +217,12 @@ def _shown_in_views(
     cameras = constants(cameras, engine, dtype)
     if shaded_at_once(part):
         camera = cameras[0] if part.uniform else RowCameras.of(cameras, view)
-        rgba = _shade(part, theta, transform, whole, gbuffer, camera, engine)[1]
+        rgba = shade(part, theta, transform, whole, gbuffer, camera, engine)[1]
     else:
         assert counts is not None
         shaded = []
-        for own, (samples, local) in zip(seen, _apart(whole, gbuffer, counts.tolist(), engine), strict=True):
-            _add_footprint(part, samples, local, own, grid, engine, like)
+        for own, (samples, local) in zip(seen, apart(whole, gbuffer, counts.tolist(), engine), strict=True):
+            add_footprint(part, samples, local, own, grid, engine, like)
             shaded.append((samples, local))
 
         def colored(given: tuple) -> Array:
@@ -242,7 +233,7 @@ def _shown_in_views(
                     local["position"][:, :1], (0, part.shader.channels + 1)
                 )
                 return constants(none, engine, dtype)
-            return constants(_shade(part, theta, transform, samples, local, camera, engine)[1], engine, dtype)
+            return constants(shade(part, theta, transform, samples, local, camera, engine)[1], engine, dtype)
 
         views = list(zip(cameras, shaded, strict=True))
         colors = [colored(views[0])]
@@ -257,182 +248,6 @@ def _shown_in_views(
     return positions, rgba
 
 
-def shaded_at_once(part: CheckedPart) -> bool:
-    """Whether a part's shader takes the samples of several views in one call."""
-    # The footprint of a sample is found by the camera of its view.
-    tells = part.shader.reads is not None and FOOTPRINT not in part.shader.reads
-    return part.uniform or (part.shader.takes_views and tells)
-
-
-def _theta_of(part: CheckedPart, engine: Engine, like: Array | None) -> dict[str, Tree]:
-    """The θ that a part's shader sees."""
-    reads = part.surface.reads(part.theta)
-    return {k: v if k in reads else constants(v, engine, like) for k, v in part.theta.items()}
-
-
-def _add_footprint(
-    part: CheckedPart,
-    samples: Samples,
-    local: GBuffer,
-    own: Camera,
-    grid: tuple[int, int],
-    engine: Engine,
-    like: Array | None,
-) -> None:
-    """Add the footprint to the G-buffer of samples in one view, where there is uv; arguments as in `uv_footprint`."""
-    if "uv" in local and FOOTPRINT not in local:
-        read = {k: part.theta[k] for k in part.surface.reads(part.theta)}
-        local.defer(FOOTPRINT, partial(uv_footprint, part.surface, read, samples, local, own, grid, engine, like))
-
-
-def _shade(
-    part: CheckedPart,
-    theta: Mapping[str, Tree],
-    transform: Array | None,
-    samples: Samples,
-    local: GBuffer,
-    camera: Camera | RowCameras,
-    engine: Engine,
-) -> tuple[GBuffer, Array]:
-    """What the shader of a part reads, in world space, and the colours (N, C + 1) that it gives.
-
-    Args:
-        part: the part.
-        theta: what `_theta_of` gave.
-        transform: the part's.
-        samples: the samples.
-        local: their G-buffer, in local space.
-        camera: of the whole image, or those of the samples.
-        engine: the engine to compute with.
-    """
-    world = _to_world(_readable(local, samples, engine), transform)
-    rgba = _shaded(part, theta, world, camera)
-    check_shaded(rgba, samples.ids.shape[-2], part.shader)
-    if part.uniform_by == ():  # It is constant, and takes no time.
-        return world, rgba
-    rows, names = local.computed, [*local]
-    if isinstance(camera, RowCameras):
-        rows[NUMBER] = camera.number
-
-    def few(rows: dict[str, Array]) -> Array:
-        own = camera.of_rows(rows.pop(NUMBER)) if isinstance(camera, RowCameras) else camera
-        return _colors(part, theta, transform, own, names, rows)
-
-    with suppress(_UnreadError):
-        rgba = engine.by_rows_in_use(few, rows, samples.row, rgba)
-    return world, rgba
-
-
-NUMBER = "the numbers of views"
-"""What stands for the numbers of `RowCameras` beside attributes."""
-
-
 def _together(*kinds: Sequence[Array]) -> list[Array]:
     """One array of each kind, positions and colours, from several."""
     return [arrays[0] if len(arrays) == 1 else namespace(arrays[0]).concat(list(arrays)) for arrays in kinds]
-
-
-def _apart(samples: Samples, gbuffer: GBuffer, sizes: Sequence[int], engine: Engine) -> list[tuple[Samples, GBuffer]]:
-    """The samples of several views, of so many rows each, and their G-buffers, from those of them all."""
-    known, lock = cache(lambda name: engine.split(gbuffer[name], sizes)), threading.Lock()
-
-    def split(name: str) -> Sequence[Array]:
-        with lock:  # Views are shaded by several threads.
-            return known(name)
-
-    rows = [engine.split(x, sizes) for x in (samples.ids, samples.params, *samples.tables.values())]
-    views = []
-    for b, (ids, params, *tables) in enumerate(zip(*rows, strict=True)):
-        own = GBuffer(position=split("position")[b])
-        for name in set(gbuffer) - {"position"}:
-            own.defer(name, lambda name=name, b=b: split(name)[b])
-        tables = dict(zip(samples.tables, tables, strict=True))
-        views.append((replace(samples, ids=ids, params=params, tables=tables, gbuffer=None), own))
-    return views
-
-
-def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
-    """What the shader of a part returns."""
-    try:
-        return part.shader(theta, gbuffer, camera)
-    except TypeError as error:
-        if is_constant(gbuffer.like):
-            error.add_note(
-                "All arrays of this scene are NumPy's. If its shader holds a network, call rts.render(…, "
-                "engine='torch'), or 'jax'."
-            )
-        raise
-
-
-class _UnreadError(Exception):
-    """A shader reads what it did not read before."""
-
-
-def _colors(
-    part: CheckedPart,
-    theta: Mapping[str, Tree],
-    transform: Array | None,
-    camera: Camera | RowCameras,
-    names: Sequence[str],
-    attributes: Mapping[str, Array],
-) -> Array:
-    """What the shader of a part returns for attributes in local space, of those names that it has read."""
-
-    def unread() -> Array:
-        raise _UnreadError
-
-    local = GBuffer(attributes)
-    for name in names:
-        if name not in local:
-            local.defer(name, unread)
-    return _shaded(part, theta, _to_world(local, transform), camera)
-
-
-def _evaluate(part: CheckedPart, reads: Sequence[str], samples: Samples, engine: Engine, like: Array | None) -> GBuffer:
-    """The part's G-buffer in local space, of the entries of θ that its surface reads."""
-    theta = {name: part.theta[name] for name in reads}
-    if samples.gbuffer is not None and is_constant(theta):
-        wanted = part.shader.reads
-        if samples.asked is None or (wanted is not None and set(wanted) <= set(samples.asked)):
-            return GBuffer(samples.gbuffer)
-    gbuffer = part.surface.evaluate(constants(theta, engine, like), samples)
-    gbuffer = gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer)
-    if shape_of(gbuffer["position"]) != (samples.ids.shape[0], 3):
-        position = described(gbuffer["position"])
-        raise InputError(f"'position' of {part.surface!r} {position}; expected ({samples.ids.shape[0]}, 3)")
-    return gbuffer
-
-
-def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
-    """The G-buffer for shaders: rows that no cell refers to hold values at which derivatives are finite, too."""
-    if not engine.padded(samples.row):
-        return gbuffer
-    found = GBuffer()
-    found.like = gbuffer["position"]
-    for name in gbuffer:
-        found.defer(name, lambda name=name: engine.fill_unused(gbuffer[name], samples.row))
-    return found
-
-
-def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
-    """Positions and normals moved by the part's transform."""
-    if transform is None:
-        return gbuffer
-    world = GBuffer()
-    world.like = gbuffer.like
-    for name in gbuffer:
-        world.defer(name, lambda name=name: gbuffer[name])
-    world.defer("position", lambda: affine_map(transform[:3, :], gbuffer["position"]))
-    if "normal" in gbuffer:
-        world.defer("normal", lambda: _move_normals(transform, gbuffer["normal"]))
-    return world
-
-
-def _move_normals(transform: Array, normals: Array) -> Array:
-    """Normals under an affine map: times the cofactor matrix, turned so that a mirror image keeps its outside."""
-    xp = namespace(transform)
-    a, b, c = (transform[:3, i] for i in range(3))
-    cofactors = [xp.linalg.cross(b, c), xp.linalg.cross(c, a), xp.linalg.cross(a, b)]
-    volume = xp.sum(a * cofactors[0])
-    outside = xp.where(volume < 0, -xp.ones_like(volume), xp.ones_like(volume))
-    return sum(normals[:, i : i + 1] * (cofactors[i] * outside) for i in range(3))

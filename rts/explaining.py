@@ -10,7 +10,7 @@ import numpy as np
 from rts.camera import Camera
 from rts.checks import check_scene
 from rts.engines import engine_of
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.records import Samples
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.auto import Choice, choose, is_static

@@ -15,9 +15,9 @@ from rts.checks import check_splatter
 from rts.engines import engine_named
 from rts.evaluating import to_splats
 from rts.fitting.image_residuals import ImageResiduals
-from rts.interfaces import Part
 from rts.operations.operation import Operation
 from rts.operations.rigid import rigid
+from rts.parts import Part
 from rts.rendering import render
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.scenes import Scene, sample

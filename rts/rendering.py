@@ -26,8 +26,9 @@ from rts.engines import (
 )
 from rts.errors import EmptyImageWarning, InputError, warn
 from rts.evaluating import to_fine_splats, to_splats
-from rts.interfaces import Part, Splatter
+from rts.interfaces import Splatter
 from rts.operations.inset import averaged, painted_inset, with_inset
+from rts.parts import Part
 from rts.records import Sampled, Splats
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.emptiness import why_empty

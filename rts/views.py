@@ -8,15 +8,17 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
+from rts.appearance import shaded_at_once
 from rts.arrays import described, shape_of
 from rts.camera import Camera
 from rts.channels import cropped_image
 from rts.checks import check_background, check_cameras, check_size, check_splatter, suited_sampler
 from rts.engines import Engine, is_constant, namespace, suiting_scene, uncompiled
 from rts.errors import InputError
-from rts.evaluating import shaded_at_once, views_to_splats
-from rts.interfaces import Part, Splatter
+from rts.evaluating import views_to_splats
+from rts.interfaces import Splatter
 from rts.operations.inset import averaged
+from rts.parts import Part
 from rts.records import Sampled
 from rts.rendering import bands_of, image_of, over_background, seen, splatted
 from rts.sampling.adaptive import Adaptive, finest

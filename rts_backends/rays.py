@@ -10,7 +10,8 @@ from rts.arrays import shape_of
 from rts.camera import Camera
 from rts.engines import constants, engine_of, exemplar, namespace
 from rts.errors import InputError
-from rts.interfaces import Part, RaySurface, Sampler, as_surface
+from rts.interfaces import RaySurface, Sampler, as_surface
+from rts.parts import Part
 from rts.records import ArraySpec, RayHits, Samples
 from rts.sampling.validation import check_camera
 from rts.trees import Array, map_leaves

@@ -12,8 +12,8 @@ from rts.arrays import from_numbers, shape_of
 from rts.checks import is_count
 from rts.engines import engine_of, namespace
 from rts.errors import InputError
-from rts.interfaces import Part
 from rts.operations.linear import matmul
+from rts.parts import Part
 from rts.topology import fixed
 from rts.trees import Array, Tree
 from rts_surfaces.parametric import TOLERANCE

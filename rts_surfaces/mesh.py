@@ -14,9 +14,10 @@ from rts.arrays import unit
 from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.interfaces import Part, Rate, TriangleSurface
+from rts.interfaces import Rate, TriangleSurface
 from rts.operations.combine import interpolate
 from rts.operations.take import take
+from rts.parts import Part
 from rts.records import Proxy, Samples
 from rts.sampling.cache import fingerprint
 from rts.topology import fixed, index_table, pieces

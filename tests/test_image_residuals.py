@@ -572,7 +572,7 @@ def test_targets_of_an_engine_must_be_finite_too(target):
     [
         (lambda: None, "scene gave None; expected an rts.Part or several, or a tuple"),
         (lambda: (1, 2, 3), "scene gave a int, a int, a int"),
-        (lambda: (mesh(*box(0.5)), "front"), "scene gave a rts.interfaces.Part, a str"),
+        (lambda: (mesh(*box(0.5)), "front"), "scene gave a rts.parts.Part, a str"),
         (lambda: np.zeros((26, 31, 4)), r"scene gave a numpy.ndarray of shape \(26, 31, 4\)"),
         (lambda: [], "scene gave nothing"),
     ],

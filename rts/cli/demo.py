@@ -16,8 +16,8 @@ from rts.cli.pose_report import write_report
 from rts.cli.pose_verdict import judged
 from rts.cli.views import bounds_of, orbit
 from rts.files.paths import writing
-from rts.interfaces import Part
 from rts.operations.rigid import rigid
+from rts.parts import Part
 from rts.rendering import render
 
 SIZE = (320, 320)

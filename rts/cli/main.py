@@ -18,7 +18,7 @@ from typer.core import TyperGroup
 
 from rts import __version__, registry
 from rts.errors import RtsError
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.trees import map_leaves
 
 EXAMPLES = """

@@ -13,8 +13,8 @@ from rts.arguments import check_numbers, check_pixels, is_invertible
 from rts.camera import Camera
 from rts.errors import InputError
 from rts.files.paths import as_path
-from rts.interfaces import Part
 from rts.operations.linear import matmul
+from rts.parts import Part
 from rts.trees import Array
 
 

@@ -17,8 +17,8 @@ from rts.errors import InputError, PluginError
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.schedule import Stage, box_filtered, pyramid
-from rts.interfaces import Part
 from rts.operations.rigid import rigid
+from rts.parts import Part
 from rts.trees import Array
 
 LARGEST_SIDE = 256

@@ -15,7 +15,7 @@ from rts.cli.pose_fit import LARGEST_SIDE, PoseFit, shrunk
 from rts.cli.pose_verdict import Verdict
 from rts.files.images import save_animation, save_image
 from rts.files.paths import writing
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.rendering import render
 
 PICTURE_SIDE, FRAMES = 512, 48

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.cli.pose_file import Pose, posed
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.rendering import render
 
 GOOD = 0.9

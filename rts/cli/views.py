@@ -10,7 +10,7 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.interfaces import Part
+from rts.parts import Part
 
 ROUGHLY = 16
 """Cuts along each side of a patch, to see how large a surface is."""

@@ -21,7 +21,7 @@ from rts.diagnostics.comparison.truth import SAMPLES
 from rts.engines import stopped
 from rts.errors import InputError
 from rts.files.paths import output_folder
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.trees import Tree
 
 TRUTH_SAMPLES = (4, 8, SAMPLES)

@@ -20,7 +20,7 @@ from rts.files.paths import as_path
 from rts.files.pieces import Piece, check_piece
 from rts.files.srgb import decode_srgb
 from rts.files.trimesh_reader import read_with_trimesh
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.shading import Lambert, Textured
 
 

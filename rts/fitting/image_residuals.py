@@ -31,7 +31,8 @@ from rts.fitting.least_squares import flatten, normal_equations
 from rts.fitting.losses import Loss
 from rts.fitting.names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
-from rts.interfaces import CheckedPart, Part, Residuals, Splatter
+from rts.interfaces import Residuals, Splatter
+from rts.parts import CheckedPart, Part
 from rts.records import ArraySpec, Fine, Splats
 from rts.rendering import bands_of, render
 from rts.sampling.adaptive import Adaptive, finest

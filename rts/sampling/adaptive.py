@@ -11,7 +11,7 @@ import numpy as np
 from rts.arguments import quoted
 from rts.checks import is_count, is_real
 from rts.errors import InputError
-from rts.interfaces import CheckedPart
+from rts.parts import CheckedPart
 from rts.threads import parallel, read_only
 
 

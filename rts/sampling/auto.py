@@ -10,7 +10,8 @@ from rts.camera import Camera
 from rts.checks import check_sampler
 from rts.engines import engine_of, is_constant
 from rts.errors import PluginError
-from rts.interfaces import Part, Sampler, TriangleSurface
+from rts.interfaces import Sampler, TriangleSurface
+from rts.parts import Part
 from rts.records import Samples
 
 STATIC_FACES = 4_000_000

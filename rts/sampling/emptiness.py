@@ -8,7 +8,8 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.engines import stopped, value_of
-from rts.interfaces import CheckedPart, TriangleSurface
+from rts.interfaces import TriangleSurface
+from rts.parts import CheckedPart
 from rts.records import Proxy
 from rts.trees import Tree, map_leaves
 

@@ -10,7 +10,8 @@ import numpy as np
 from rts.adapting import adapted
 from rts.camera import Camera
 from rts.engines import is_constant, namespace, stopped, suiting
-from rts.interfaces import CheckedPart, Part, Shader, TriangleSurface
+from rts.interfaces import Shader, TriangleSurface
+from rts.parts import CheckedPart, Part
 from rts.records import ArraySpec, Samples
 from rts.sampling.cache import Entry
 from rts.sampling.validation import check_camera

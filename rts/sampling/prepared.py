@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from rts.arguments import check_pixels
 from rts.camera import Camera
 from rts.checks import check_changes, check_sampler, check_scene, suited_sampler
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.sampling.cache import Entry
 from rts.trees import Array
 

@@ -14,8 +14,9 @@ import numpy as np
 from rts.adapting import adapted
 from rts.engines import engine_of, is_constant, is_traced, namespace
 from rts.errors import InputError, LayersWarning, warn
-from rts.interfaces import AnyNeeded, CheckedPart, Needed, Splatter, TriangleSurface
+from rts.interfaces import AnyNeeded, Needed, Splatter, TriangleSurface
 from rts.operations.operation import known_value
+from rts.parts import CheckedPart
 from rts.records import ArraySpec, Sampled, Samples
 from rts.sampling.exits import beside_outlines
 from rts.sampling.extremes import largest

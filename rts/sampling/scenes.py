@@ -13,7 +13,8 @@ from rts.camera import Camera
 from rts.checks import check_memory, check_ratio, check_sampler, check_scene, check_size, check_splatter, suited_sampler
 from rts.engines import Engine, constants, is_traced, suiting_scene, uncompiled
 from rts.errors import InputError
-from rts.interfaces import AnyNeeded, CheckedPart, Needed, Part, Splatter
+from rts.interfaces import AnyNeeded, Needed, Splatter
+from rts.parts import CheckedPart, Part
 from rts.records import Sampled
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.cache import Entry

@@ -17,7 +17,8 @@ import numpy as np
 from rts.camera import Camera
 from rts.checks import check_memory, suited_sampler
 from rts.engines import engine_of, is_traced, namespace, stopped, value_of
-from rts.interfaces import CheckedPart, Needed, Splatter, TriangleSurface
+from rts.interfaces import Needed, Splatter, TriangleSurface
+from rts.parts import CheckedPart
 from rts.records import ArraySpec, Fragments, Sampled, Samples
 from rts.sampling.cache import Entry
 from rts.sampling.extremes import largest

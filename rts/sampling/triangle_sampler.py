@@ -13,7 +13,8 @@ from rts.adapting import adapted, unwrapped
 from rts.camera import Camera
 from rts.engines import engine_of, stopped
 from rts.errors import InputError
-from rts.interfaces import AnyNeeded, Needed, Part, Sampler, TriangleSurface, as_surface
+from rts.interfaces import AnyNeeded, Needed, Sampler, TriangleSurface, as_surface
+from rts.parts import Part
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines

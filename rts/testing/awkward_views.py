@@ -8,7 +8,7 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.engines import Engine
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.testing import derivatives, scenes
 from rts.testing.claims import claim, claim_finite, no_error
 from rts.testing.derivatives import joined, split

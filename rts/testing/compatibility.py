@@ -13,7 +13,8 @@ from rts.camera import Camera
 from rts.checks import check_sampler, check_scene
 from rts.engines import Engine, constants, engine_named, is_constant
 from rts.errors import EmptyImageWarning, RtsError
-from rts.interfaces import Part, RaySurface, TriangleSurface
+from rts.interfaces import RaySurface, TriangleSurface
+from rts.parts import Part
 from rts.rendering import render
 from rts.sampling.scenes import apron_of
 from rts.sampling.triangle_sampler import TriangleSampler

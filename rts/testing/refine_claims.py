@@ -7,7 +7,8 @@ import numpy as np
 from rts import registry
 from rts.camera import Camera
 from rts.errors import InputError
-from rts.interfaces import Part, RaySurface, TriangleSurface
+from rts.interfaces import RaySurface, TriangleSurface
+from rts.parts import Part
 from rts.sampling.packing import lift
 from rts.sampling.settling import refined
 from rts.testing import derivatives

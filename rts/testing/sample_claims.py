@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.camera import Camera
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.records import Sampled
 from rts.testing.claims import claim
 from rts.testing.compatibility import APRON

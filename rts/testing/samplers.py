@@ -12,7 +12,8 @@ from rts import registry
 from rts.camera import Camera
 from rts.checks import check_sampler
 from rts.gbuffer import GBuffer
-from rts.interfaces import Part, TriangleSurface
+from rts.interfaces import TriangleSurface
+from rts.parts import Part
 from rts.records import Sampled
 from rts.sampling.prepared import prepare
 from rts.sampling.scenes import sample

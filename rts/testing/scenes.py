@@ -9,7 +9,7 @@ import numpy as np
 from rts import registry
 from rts.camera import Camera
 from rts.checks import check_scene
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.records import Sampled
 from rts.rendering import render, render_samples
 from rts.sampling.scenes import sample

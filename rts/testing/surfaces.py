@@ -10,7 +10,8 @@ import pytest
 from rts.camera import Camera
 from rts.engines import engine_of
 from rts.gbuffer import GBuffer
-from rts.interfaces import Part, RaySurface, TriangleSurface
+from rts.interfaces import RaySurface, TriangleSurface
+from rts.parts import Part
 from rts.records import Proxy, Samples
 from rts.testing import derivatives, scenes
 from rts.testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing

@@ -24,7 +24,7 @@ from rts_backends.fused import crossing_pairs, crossings, mixed, outlines, stenc
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
 from rts_backends.fused.pairs import BLOCK
-from rts_backends.fused.survey import collect, paint, survey
+from rts_backends.fused.survey import EMPTY, collect, paint, survey
 
 
 class Settings(NamedTuple):
@@ -234,6 +234,8 @@ class Cells:
             listed = choices.mixed, choices.ranges, choices.sums, choices.offsets
             given = *arrays, *decide, *listed, ends, marks
             parallel(outlines.fill, height, *given, found, work=150 * len(found.columns))
+            if self._crossed is not None:
+                found.changes[self._crossed[crossings.rows_of(found.offsets), found.columns]] = 0
         return found
 
     @cached_property
@@ -250,6 +252,11 @@ class Cells:
             return crossings.nothing(self.row.shape[1], self.positions.dtype)
         arrays = self.positions, self.rgba, self.row, *self._numbers
         return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent), self._pairs)
+
+    @cached_property
+    def _crossed(self) -> np.ndarray | None:
+        """(H, W) bool, the targets of `crossings`; None where there are none."""
+        return self.crossings.places(self.row.shape[2]) if len(self.crossings.columns) else None
 
     def image(self, out: np.ndarray) -> None:
         """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""
@@ -280,31 +287,32 @@ class Cells:
             np.empty((0, 3), kind) if g_positions is None else g_positions,
             np.empty((0, 4), kind) if g_rgba is None else g_rgba,
         )
-        crossed = len(self.crossings.columns) > 0
-        g = own = read_only(g)
-        if crossed:
-            own = g.copy()
-            crossings.hide(self.crossings, self.border, own)
-            own = read_only(own)
-        plain = *self.plain_arguments, self.choices.states, self.border
-        parallel(stencil.pull, height, *plain, own, *found, work=self._plain_work)
-        if crossed:
-            self._pull_mixed(own, found[0], found[1][:0])
-            self._pull_mixed(g, found[0][:0], found[1])
+        g, states = read_only(g), self.choices.states
+        if self._crossed is not None:
+            states = read_only(np.where(self._crossed, np.uint8(EMPTY), states))
+        plain = *self.plain_arguments, states, self.border
+        parallel(stencil.pull, height, *plain, g, *found, work=self._plain_work)
+        self._pull_mixed(g, *found)
+        if self._crossed is not None:
             crossings.pull(self.rgba, self.row, self.crossings, self.border, g, *found)
-        else:
-            self._pull_mixed(g, *found)
         if self.rims and g_positions is not None:
-            outlines.pull(self.row, self.outlines, self.border, own, g_positions)
+            outlines.pull(self.row, self.outlines, self.border, g, g_positions)
 
     def _pull_mixed(self, g: np.ndarray, g_positions: np.ndarray, g_rgba: np.ndarray) -> None:
         """Add to the gradients what mixed targets give; to those of no rows, nothing."""
         count, height = len(self.choices.columns), self.row.shape[1]
-        if count and (len(g_positions) or len(g_rgba)):
-            adjoints = np.empty((count, 3, 5), g.dtype)
-            parallel(mixed.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=self._mixed_work // 5)
-            given = *self.mixed_arguments, adjoints, g_positions, g_rgba
-            parallel(mixed.pull, height, *given, work=self._mixed_work)
+        if not (count and (len(g_positions) or len(g_rgba))):
+            return
+        adjoints, work = np.empty((count, 3, 5), g.dtype), self._mixed_work
+        parallel(mixed.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=work // 5)
+        given = height, *self.mixed_arguments, adjoints
+        if self._crossed is not None:
+            # Lines of crossing take the place of what samples would give to positions, but not to colours.
+            if len(g_rgba):
+                parallel(mixed.pull, *given, g_positions[:0], g_rgba, work=work)
+            adjoints[self.crossings.among_mixed()], g_rgba = 0, g_rgba[:0]
+        if len(g_positions) or len(g_rgba):
+            parallel(mixed.pull, *given, g_positions, g_rgba, work=work)
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
         """Fill tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4), or None."""
@@ -341,6 +349,7 @@ class Cells:
         copy.row, copy.exits = read_only(own), read_only(exits)
         copy.__dict__.pop("outlines", None)  # They name samples.
         copy.__dict__.pop("crossings", None)
+        copy.__dict__.pop("_crossed", None)
         copy.positions, copy.rgba = read_only(self.positions[index]), read_only(self.rgba[index])
         found = [None if x is None else np.zeros((len(index), x.shape[1]), x.dtype) for x in results]
         copy._pull(g, *found)

@@ -42,6 +42,21 @@ class Crossings(NamedTuple):
     colors: np.ndarray
     slopes: np.ndarray
 
+    def places(self, width: int) -> np.ndarray:
+        """(H, W) bool, where these targets are."""
+        there, own = np.zeros((len(self.offsets) - 1, width), np.bool_), self.columns >= 0
+        there[rows_of(self.offsets)[own], self.columns[own]] = True
+        return there
+
+    def among_mixed(self) -> np.ndarray:
+        """Places in the list of mixed targets of those that are mixed."""
+        return self.mixed[(self.columns >= 0) & (self.mixed >= 0)]
+
+
+def rows_of(offsets: np.ndarray) -> np.ndarray:
+    """The row of each item of a list, where those of each row begin (H + 1,)."""
+    return np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
+
 
 def nothing(height: int, kind: np.dtype) -> Crossings:
     """No targets in so many rows."""
@@ -302,16 +317,6 @@ def push(
             if 0 <= x < out.shape[2]:
                 for t in range(len(out)):
                     change_of(out[t, y - border, x], d, found, *given, y, t_positions[t], t_rgba[t])
-
-
-@kernel
-def hide(found, border, g):
-    """Set the image's gradient (H, W, 4) to zero at listed targets."""
-    for y in range(border, len(g) + border):
-        for d in range(found.offsets[y], found.offsets[y + 1]):
-            x = found.columns[d] - border
-            if 0 <= x < g.shape[1]:
-                g[y - border, x] = g.dtype.type(0)
 
 
 @kernel

@@ -68,6 +68,17 @@ def call(function: HostFunction, shapes: Shapes, *operands: Any) -> list[jax.Arr
     return _call.bind(*operands, function=function, shapes=shapes, used=tuple(range(len(shapes))))
 
 
+def zeros(shape: tuple[int, ...], dtype: Any, number: int = 0) -> jax.Array:
+    """Zeros, in a traced program; on the CPU their memory is not touched before they are overwritten.
+
+    Args:
+        shape: of the array.
+        dtype: of the array.
+        number: tells apart arrays of one shape, so that XLA does not make copies of one.
+    """
+    return _zeros.bind(shape=tuple(shape), dtype=np.dtype(dtype), number=number)
+
+
 class _Selected:
     """Some of the results of a function."""
 
@@ -139,6 +150,31 @@ def _in_place(ctx: Any, *operands: Any, function: HostFunction, shapes: Shapes, 
     mlir.emit_python_callback(ctx.replace(avals_in=[], avals_out=[]), selected, None, [], [], [], has_side_effect=False)
     return jax.ffi.ffi_lowering(TARGET)(ctx, *operands, function=name)
 
+
+_zeros = Primitive("rts_zeros")
+
+
+@_zeros.def_impl
+def _all_zeros(shape: tuple[int, ...], dtype: np.dtype, number: int) -> jax.Array:
+    return jnp.zeros(shape, dtype)
+
+
+@_zeros.def_abstract_eval
+def _shape_of_zeros(shape: tuple[int, ...], dtype: np.dtype, number: int) -> ShapedArray:
+    return ShapedArray(shape, dtype)
+
+
+def _untouched(ctx: Any, *, number: int, **described: Any) -> Any:
+    if not _available():
+        return _touched(ctx, number=number, **described)
+    name = f"rts.zeros {number}"
+    _named[name] = lambda operands, results: clear(results[0])
+    return jax.ffi.ffi_lowering(TARGET)(ctx, function=name)
+
+
+_touched = mlir.lower_fun(_all_zeros, multiple_results=False)
+mlir.register_lowering(_zeros, _touched)
+mlir.register_lowering(_zeros, _untouched, platform="cpu")
 
 batching.primitive_batchers[_call] = _batched
 partial_eval.dce_rules[_call] = _without_unused

@@ -20,13 +20,15 @@ from jax.core import ShapedArray, Tracer, eval_jaxpr
 from jax.extend.core import Jaxpr, Primitive
 from jax.interpreters import ad, batching, mlir
 
+from rts_backends.jax_engine import host
 from rts_backends.jax_engine.columns import summed_by_columns, variables
 
 LEAST = 1 << 15
 """Rows, below which all are computed: a loop would take as long as it saves."""
 
-PIECE = 1 << 12
-"""Rows of a piece: so many that calls of XLA's are worth it, and so few that intermediate arrays stay in caches."""
+PIECE = 1 << 11
+"""Rows of a piece: so many that calls of XLA's are worth it, and so few that intermediate arrays stay in caches, and
+that XLA does not wake its other threads for each."""
 
 CLOSED = 1 << 16
 """The most numbers that a function may close over: their gradients are as large as they are, for each piece."""
@@ -100,7 +102,7 @@ class _Pieces:
     def zeros(self) -> jax.Array:
         """Zeros in the shape of the value."""
         out: Any = self._jaxpr.outvars[0].aval
-        return jnp.zeros((self._total, *out.shape[1:]), out.dtype)
+        return host.zeros((self._total, *out.shape[1:]), out.dtype)
 
     def repeat(self, step: Callable[[Any, Any, Any], Any], state: Any) -> Any:
         """Do `state = step(start, first, state)` for each piece: rows from `start`, new ones from `first` on."""
@@ -187,7 +189,8 @@ def _pulled(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, wanted: tuple[bool,
             sums.append(jax.lax.dynamic_update_slice_in_dim(whole, pieces.cut(whole, start) + x, start, 0))
         return sums
 
-    return pieces.repeat(step, [jnp.zeros_like(x) for x, wish in zip(operands, wanted, strict=True) if wish])
+    varied = [x for x, wish in zip(operands, wanted, strict=True) if wish]
+    return pieces.repeat(step, [host.zeros(x.shape, x.dtype, number) for number, x in enumerate(varied)])
 
 
 # --------------------------------------------------------------------------------------------------- as primitives

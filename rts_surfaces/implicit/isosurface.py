@@ -19,8 +19,9 @@ from rts.arrays import from_numbers, is_finite, unit
 from rts.engines import engine_of, namespace, stopped, value_of
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.interfaces import Part, Rate, RaySurface, TriangleSurface
+from rts.interfaces import Rate, RaySurface, TriangleSurface
 from rts.operations.gradient import gradient
+from rts.parts import Part
 from rts.records import ArraySpec, Proxy, RayHits, Rays, Samples
 from rts.sampling.cache import fingerprint
 from rts.threads import parallel

@@ -12,7 +12,8 @@ from rts.arguments import check_numbers, check_positive, quoted
 from rts.checks import is_count
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.interfaces import Part, RaySurface
+from rts.interfaces import RaySurface
+from rts.parts import Part
 from rts.records import RayHits, Samples
 from rts.trees import Array, Tree
 from rts_surfaces.implicit.casting import ball, cast, moving

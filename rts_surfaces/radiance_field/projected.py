@@ -17,8 +17,9 @@ from rts.arrays import unit
 from rts.engines import namespace
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.interfaces import Part, TriangleSurface
+from rts.interfaces import TriangleSurface
 from rts.ndc import Ndc
+from rts.parts import Part
 from rts.records import ArraySpec, Proxy, Rays, Samples
 from rts.trees import Array, Tree
 

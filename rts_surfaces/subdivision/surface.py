@@ -19,9 +19,9 @@ from rts.arrays import shape_of, unit
 from rts.engines import constants, engine_of
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.interfaces import Part
 from rts.operations.combine import combine
 from rts.operations.take import take
+from rts.parts import Part
 from rts.records import ArraySpec, Rays, Samples
 from rts.sampling.cache import fingerprint
 from rts.topology import fixed

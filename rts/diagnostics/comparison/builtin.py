@@ -21,7 +21,7 @@ from rts.diagnostics.comparison.shapes import normalised, rotation_xy, turned
 from rts.engines import namespace
 from rts.errors import InputError
 from rts.files.models import load
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.registry import plugin
 from rts.trees import Array, Tree
 

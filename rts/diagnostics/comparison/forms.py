@@ -9,7 +9,8 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.diagnostics.comparison.scene import SceneFunction, parts_of
-from rts.interfaces import Part, Rate, as_surface
+from rts.interfaces import Rate, as_surface
+from rts.parts import Part
 from rts.trees import Tree
 
 

@@ -14,7 +14,7 @@ from rts import registry
 from rts.camera import Camera
 from rts.checks import check_scene
 from rts.engines import engine_of
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.rendering import render
 from rts.sampling.cache import fingerprint
 from rts.sampling.pruning import LAYER_LIMIT

@@ -24,7 +24,8 @@ from rts.engines import Engine, is_constant, namespace
 from rts.errors import InputError, RtsWarning
 from rts.explaining import explain
 from rts.fitting.names import one_line
-from rts.interfaces import Part, as_surface
+from rts.interfaces import as_surface
+from rts.parts import Part
 from rts.registry import instance
 from rts.rendering import render
 from rts.sampling.scenes import sample

@@ -14,7 +14,8 @@ from rts.arguments import quoted
 from rts.camera import Camera
 from rts.engines import Engine, constants, engine_of, exemplar, is_constant
 from rts.errors import InputError
-from rts.interfaces import Part, TriangleSurface, as_surface
+from rts.interfaces import TriangleSurface, as_surface
+from rts.parts import Part
 from rts.registry import instance
 from rts.shading import Unlit
 from rts.trees import Array, Tree, collected, leaves, map_leaves

@@ -20,7 +20,7 @@ from rts.checks import check_scene
 from rts.diagnostics.comparison.scene import Scene
 from rts.engines import Engine, engine_of
 from rts.errors import InputError
-from rts.interfaces import CheckedPart, Part
+from rts.parts import CheckedPart, Part
 from rts.shading import Silhouette, Unlit
 from rts.trees import map_leaves
 

@@ -12,7 +12,7 @@ import numpy as np
 from rts.camera import Camera
 from rts.files.images import load_image
 from rts.files.models import load
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.registry import plugin
 
 FOV, DISTANCE = 40.0, 3.2

@@ -25,7 +25,7 @@ from rts.engines import Engine, engine_of, is_constant, namespace
 from rts.errors import InputError, RtsError
 from rts.files.paths import as_path
 from rts.fitting.names import named_leaves, one_line
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.trees import Tree, leaves, map_leaves
 
 SIZE = (256, 256)

@@ -23,7 +23,7 @@ from rts.diagnostics.comparison.scores import low_pass, relative_l2
 from rts.engines import Engine, engine_of
 from rts.errors import InputError
 from rts.files.paths import cache_folder, output_folder, own_folder, writing
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.views import render_views
 
 SAMPLES = 16

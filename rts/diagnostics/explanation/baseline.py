@@ -15,7 +15,7 @@ from rts.diagnostics.explanation import variants
 from rts.diagnostics.explanation.slopes import Number, measured
 from rts.diagnostics.explanation.subject import Subject
 from rts.engines import engine_of, namespace
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.trees import Tree, leaves, map_leaves
 
 SUBDIVISIONS = 4

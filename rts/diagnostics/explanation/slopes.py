@@ -11,7 +11,7 @@ from rts.camera import Camera
 from rts.diagnostics.comparison.scores import low_pass
 from rts.diagnostics.explanation.subject import DEEP, Subject
 from rts.engines import Engine, namespace
-from rts.interfaces import Part
+from rts.parts import Part
 from rts.trees import Array, Tree, leaves, map_leaves
 
 STEP_UNSEEN = 1e-2

@@ -18,7 +18,7 @@ from rts.diagnostics.steps import pixel_step
 from rts.engines import Engine, is_constant, namespace
 from rts.errors import InputError
 from rts.fitting.names import named_leaves
-from rts.interfaces import CheckedPart, Part
+from rts.parts import CheckedPart, Part
 from rts.records import Sampled
 from rts.rendering import render
 from rts.sampling.adaptive import finest

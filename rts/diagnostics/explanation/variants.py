@@ -11,7 +11,8 @@ from rts.camera import Camera
 from rts.diagnostics.explanation.subject import Change
 from rts.engines import engine_of, namespace
 from rts.gbuffer import GBuffer
-from rts.interfaces import Part, as_surface
+from rts.interfaces import as_surface
+from rts.parts import Part
 from rts.registry import instance
 from rts.trees import Array, Tree
 

@@ -18,8 +18,8 @@ from rts.diagnostics.failures.renderers import Own, Unable, quiet
 from rts.engines import engine_named
 from rts.errors import InputError
 from rts.fitting.fit import fit
-from rts.interfaces import Part
 from rts.operations.rigid import rigid
+from rts.parts import Part
 from rts.registry import plugin
 from rts.rendering import render
 from rts.trees import Array

@@ -15,8 +15,8 @@ from rts.diagnostics.comparison.builtin import data_file, read_mesh
 from rts.diagnostics.comparison.scene import Scene, parts_of
 from rts.diagnostics.comparison.shapes import CARD_DEPTH, DISTANCE, QUAD, on_screen, pixel, rectangle, unlit
 from rts.engines import engine_of
-from rts.interfaces import Part
 from rts.operations.rigid import rigid
+from rts.parts import Part
 from rts.trees import Tree
 
 SIZE = (96, 96)

@@ -1,0 +1,205 @@
+"""What a part looks like at samples: its G-buffer in world space, and the colours that its shader gives."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any
+
+from rts.arrays import described, shape_of
+from rts.camera import Camera
+from rts.checks import check_shaded
+from rts.engines import Engine, constants, is_constant, namespace
+from rts.errors import InputError
+from rts.footprints import FOOTPRINT, uv_footprint
+from rts.gbuffer import GBuffer
+from rts.operations.linear import affine_map
+from rts.parts import CheckedPart
+from rts.records import Samples
+from rts.row_cameras import RowCameras
+from rts.trees import Array, Tree
+
+
+def evaluate(part: CheckedPart, samples: Samples, engine: Engine, like: Array | None) -> GBuffer:
+    """The part's G-buffer in local space."""
+    theta = _read(part)
+    if samples.gbuffer is not None and is_constant(theta):
+        wanted = part.shader.reads
+        if samples.asked is None or (wanted is not None and set(wanted) <= set(samples.asked)):
+            return GBuffer(samples.gbuffer)
+    gbuffer = part.surface.evaluate(constants(theta, engine, like), samples)
+    gbuffer = gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer)
+    if shape_of(gbuffer["position"]) != (samples.ids.shape[0], 3):
+        position = described(gbuffer["position"])
+        raise InputError(f"'position' of {part.surface!r} {position}; expected ({samples.ids.shape[0]}, 3)")
+    return gbuffer
+
+
+def _read(part: CheckedPart) -> dict[str, Tree]:
+    """The entries of θ that a part's surface reads."""
+    return {name: part.theta[name] for name in part.surface.reads(part.theta)}
+
+
+def shaded_at_once(part: CheckedPart) -> bool:
+    """Whether a part's shader takes the samples of several views in one call."""
+    # The footprint of a sample is found by the camera of its view.
+    tells = part.shader.reads is not None and FOOTPRINT not in part.shader.reads
+    return part.uniform or (part.shader.takes_views and tells)
+
+
+def theta_of(part: CheckedPart, engine: Engine, like: Array | None) -> dict[str, Tree]:
+    """The θ that a part's shader sees."""
+    reads = part.surface.reads(part.theta)
+    return {k: v if k in reads else constants(v, engine, like) for k, v in part.theta.items()}
+
+
+def add_footprint(
+    part: CheckedPart,
+    samples: Samples,
+    local: GBuffer,
+    own: Camera,
+    grid: tuple[int, int],
+    engine: Engine,
+    like: Array | None,
+) -> None:
+    """Add the footprint to the G-buffer of samples in one view, where there is uv; arguments as in `uv_footprint`."""
+    if "uv" in local and FOOTPRINT not in local:
+        local.defer(
+            FOOTPRINT, partial(uv_footprint, part.surface, _read(part), samples, local, own, grid, engine, like)
+        )
+
+
+def shade(
+    part: CheckedPart,
+    theta: Mapping[str, Tree],
+    transform: Array | None,
+    samples: Samples,
+    local: GBuffer,
+    camera: Camera | RowCameras,
+    engine: Engine,
+) -> tuple[GBuffer, Array]:
+    """What the shader of a part reads, in world space, and the colours (N, C + 1) that it gives.
+
+    Args:
+        part: the part.
+        theta: what `theta_of` gave.
+        transform: the part's.
+        samples: the samples.
+        local: their G-buffer, in local space.
+        camera: of the whole image, or those of the samples.
+        engine: the engine to compute with.
+    """
+    world = _to_world(_readable(local, samples, engine), transform)
+    rgba = _shaded(part, theta, world, camera)
+    check_shaded(rgba, samples.ids.shape[-2], part.shader)
+    if part.uniform_by == ():  # It is constant, and takes no time.
+        return world, rgba
+    rows, names = local.computed, [*local]
+    if isinstance(camera, RowCameras):
+        rows[NUMBER] = camera.number
+
+    def few(rows: dict[str, Array]) -> Array:
+        own = camera.of_rows(rows.pop(NUMBER)) if isinstance(camera, RowCameras) else camera
+        return _colors(part, theta, transform, own, names, rows)
+
+    with suppress(_UnreadError):
+        rgba = engine.by_rows_in_use(few, rows, samples.row, rgba)
+    return world, rgba
+
+
+NUMBER = "the numbers of views"
+"""What stands for the numbers of `RowCameras` beside attributes."""
+
+
+def apart(samples: Samples, gbuffer: GBuffer, sizes: Sequence[int], engine: Engine) -> list[tuple[Samples, GBuffer]]:
+    """The samples of several views, of so many rows each, and their G-buffers, from those of them all."""
+    known, lock = cache(lambda name: engine.split(gbuffer[name], sizes)), threading.Lock()
+
+    def split(name: str) -> Sequence[Array]:
+        with lock:  # Views are shaded by several threads.
+            return known(name)
+
+    rows = [engine.split(x, sizes) for x in (samples.ids, samples.params, *samples.tables.values())]
+    views = []
+    for b, (ids, params, *tables) in enumerate(zip(*rows, strict=True)):
+        own = GBuffer(position=split("position")[b])
+        for name in set(gbuffer) - {"position"}:
+            own.defer(name, lambda name=name, b=b: split(name)[b])
+        tables = dict(zip(samples.tables, tables, strict=True))
+        views.append((replace(samples, ids=ids, params=params, tables=tables, gbuffer=None), own))
+    return views
+
+
+def _shaded(part: CheckedPart, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
+    """What the shader of a part returns."""
+    try:
+        return part.shader(theta, gbuffer, camera)
+    except TypeError as error:
+        if is_constant(gbuffer.like):
+            error.add_note(
+                "All arrays of this scene are NumPy's. If its shader holds a network, call rts.render(…, "
+                "engine='torch'), or 'jax'."
+            )
+        raise
+
+
+class _UnreadError(Exception):
+    """A shader reads what it did not read before."""
+
+
+def _colors(
+    part: CheckedPart,
+    theta: Mapping[str, Tree],
+    transform: Array | None,
+    camera: Camera | RowCameras,
+    names: Sequence[str],
+    attributes: Mapping[str, Array],
+) -> Array:
+    """What the shader of a part returns for attributes in local space, of those names that it has read."""
+
+    def unread() -> Array:
+        raise _UnreadError
+
+    local = GBuffer(attributes)
+    for name in names:
+        if name not in local:
+            local.defer(name, unread)
+    return _shaded(part, theta, _to_world(local, transform), camera)
+
+
+def _readable(gbuffer: GBuffer, samples: Samples, engine: Engine) -> GBuffer:
+    """The G-buffer for shaders: rows that no cell refers to hold values at which derivatives are finite, too."""
+    if not engine.padded(samples.row):
+        return gbuffer
+    found = GBuffer()
+    found.like = gbuffer["position"]
+    for name in gbuffer:
+        found.defer(name, lambda name=name: engine.fill_unused(gbuffer[name], samples.row))
+    return found
+
+
+def _to_world(gbuffer: GBuffer, transform: Array | None) -> GBuffer:
+    """Positions and normals moved by the part's transform."""
+    if transform is None:
+        return gbuffer
+    world = GBuffer()
+    world.like = gbuffer.like
+    for name in gbuffer:
+        world.defer(name, lambda name=name: gbuffer[name])
+    world.defer("position", lambda: affine_map(transform[:3, :], gbuffer["position"]))
+    if "normal" in gbuffer:
+        world.defer("normal", lambda: _move_normals(transform, gbuffer["normal"]))
+    return world
+
+
+def _move_normals(transform: Array, normals: Array) -> Array:
+    """Normals under an affine map: times the cofactor matrix, turned so that a mirror image keeps its outside."""
+    xp = namespace(transform)
+    a, b, c = (transform[:3, i] for i in range(3))
+    cofactors = [xp.linalg.cross(b, c), xp.linalg.cross(c, a), xp.linalg.cross(a, b)]
+    volume = xp.sum(a * cofactors[0])
+    outside = xp.where(volume < 0, -xp.ones_like(volume), xp.ones_like(volume))
+    return sum(normals[:, i : i + 1] * (cofactors[i] * outside) for i in range(3))

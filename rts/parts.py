@@ -1,0 +1,85 @@
+"""Part, one object of a scene: a surface, its numbers θ, a shader and a place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from rts.adapting import unwrapped
+from rts.arguments import quoted
+from rts.errors import InputError
+from rts.interfaces import Shader, Surface
+from rts.trees import Array, Tree, record
+
+
+@record(static=("surface", "shader", "cull"))
+class Part:
+    """One object of a scene.
+
+    Attributes:
+        surface: the topology, a `Surface`; immutable.
+        theta: nested dict of every number of the part: vertices or control points, texture, lights, weights.
+        shader: a `Shader`, the name of a registered one, or any function with the same signature.
+        transform: (4, 4) world-from-local affine map, differentiable, or None for the identity.
+        cull: "none", or "back" to ignore triangles seen from behind. Never inferred.
+    """
+
+    surface: Any
+    theta: Mapping[str, Tree]
+    shader: Shader | Callable[..., Array] | str = "silhouette"
+    transform: Array | None = None
+    cull: str = "none"
+
+    def __post_init__(self):
+        if not isinstance(self.cull, str) or self.cull not in ("none", "back"):
+            raise InputError(f'cull is {quoted(self.cull)}; expected "none" or "back"')
+        if not isinstance(self.theta, Mapping):
+            raise InputError(f"theta is {quoted(self.theta)}; expected a dict of arrays")
+
+    def replace(self, **changes: Any) -> Part:
+        """A copy with some fields changed."""
+        return replace(self, **changes)
+
+
+@record(static=("surface", "shader", "cull"))
+class CheckedPart(Part):
+    """A part whose surface and shader have all members of their bases, as `rts.checks` makes it."""
+
+    surface: Surface
+    theta: Mapping[str, Tree]
+    shader: Shader  # pyright: ignore[reportGeneralTypeIssues]  # It is always given.
+    transform: Array | None = None
+    cull: str = "none"
+
+    @property
+    def uniform_by(self) -> tuple[str, ...] | None:
+        """Where all its samples have one colour, the entries of θ that this depends on; see `Shader`."""
+        return self.shader.uniform_by(self.theta, self.surface.gives(self.theta))
+
+    @property
+    def uniform(self) -> bool:
+        """Whether all its samples have one colour, through whatever camera."""
+        return self.uniform_by is not None
+
+    def shows_color_of(self, other: CheckedPart) -> bool:
+        """Whether both are certain to show one and the same colour, whatever arrays that are not NumPy's hold."""
+        names = self.uniform_by
+        if names is None or names != other.uniform_by or not _alike(unwrapped(self.shader), unwrapped(other.shader)):
+            return False
+        return all(_same(self.theta[name], other.theta[name]) for name in names)
+
+
+def _alike(a: Any, b: Any) -> bool:
+    """Whether two shaders are one, or equal data classes that hold nothing but their fields."""
+    if a is b:
+        return True
+    known = {f.name for f in fields(a)} if is_dataclass(a) else set()
+    return type(a) is type(b) and a == b and set(getattr(a, "__dict__", {})) <= known
+
+
+def _same(a: Tree, b: Tree) -> bool:
+    """Whether two entries of θ are one object, or constants of one value."""
+    return a is b or (isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b))
