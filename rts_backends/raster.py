@@ -230,7 +230,7 @@ class _Seen:
         parallel(clear, cells.size, nearest, flat, False, work=nearest.size)
         given = self.vertices, self.matrix, self.depth_row, tuple(blocks), self.asked is EVERYTHING
         parallel(draw_cells, len(listed.turns), listed, *given, nearest, flat)
-        parallel(clear, cells.size, nearest, flat, True, work=nearest.size)
+        parallel(clear, cells.size, nearest, flat, True, work=nearest.size // 8)
         return fragments
 
 

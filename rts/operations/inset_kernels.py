@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from rts.compiling import compiled, kernel
 
 
@@ -13,16 +15,16 @@ def put(start, stop, image, color, row, settled, fine, pixel, side, out):
     """
     _, width, channels = out.shape
     across, share = fine.shape[1] // side, out.dtype.type(1) / out.dtype.type(side)
+    over, down, there = (row.shape[1] - width) // 2, (len(row) - len(out)) // 2, np.empty(width, np.uint8)
     for y in range(start, stop):
+        if len(image) == 0:
+            _look(there, row[y + down, over : over + width], settled[y + down, over : over + width])
+            for c in range(channels):
+                _paint(out[y], c, color[c], there)
         for x in range(width):
             if pixel[y, x] < 0:
-                if len(image) > 0:
-                    for c in range(channels):
-                        out[y, x, c] = image[y, x, c]
-                else:
-                    there = _there(row, settled, y, x, out)
-                    for c in range(channels):
-                        out[y, x, c] = color[c] if there else out.dtype.type(0)
+                for c in range(channels if len(image) > 0 else 0):
+                    out[y, x, c] = image[y, x, c]
                 continue
             top, left = pixel[y, x] // across * side, pixel[y, x] % across * side
             for c in range(channels):
@@ -37,10 +39,18 @@ def put(start, stop, image, color, row, settled, fine, pixel, side, out):
 
 
 @compiled
-def _there(row, settled, y, x, image):
-    """Whether anything is seen in a pixel of an image, of which cells have more on each side."""
-    v, u = y + (row.shape[0] - image.shape[0]) // 2, x + (row.shape[1] - image.shape[1]) // 2
-    return (row[v, u] >= 0) | settled[v, u]
+def _look(there, row, settled):
+    """Where anything is seen in a row of cells."""
+    for x in range(len(there)):
+        there[x] = np.uint8(row[x] >= 0) | np.uint8(settled[x])
+
+
+@compiled
+def _paint(out, c, value, there):
+    """Fill a channel of a row of an image."""
+    nothing = out.dtype.type(0)
+    for x in range(len(there)):
+        out[x, c] = value if there[x] else nothing
 
 
 @kernel
@@ -51,13 +61,14 @@ def pull(start, stop, g, pixel, row, settled, side, image, sums, fine):
     """
     _, width, channels = g.shape
     across, share = fine.shape[1] // side, g.dtype.type(1) / g.dtype.type(side * side)
+    over, down = (row.shape[1] - width) // 2, (len(row) - len(g)) // 2
     for y in range(start, stop):
         for x in range(width):
             if pixel[y, x] < 0:
                 if len(image) > 0:
                     for c in range(channels):
                         image[y, x, c] = g[y, x, c]
-                elif len(sums) > 0 and _there(row, settled, y, x, g):
+                elif len(sums) > 0 and (row[y + down, x + over] >= 0 or settled[y + down, x + over]):
                     for c in range(channels):
                         sums[y, c] += g[y, x, c]
             elif len(fine):
