@@ -175,6 +175,8 @@ def fill(start, stop, active, pieces, firsts, side, apron, high, gap, offsets, c
         # Lines of one pixel differ in their numbers alone.
         again = line > start and _pixels(line, side, apron) == _pixels(line - 1, side, apron)
         more = n - offsets[line - 1] if again else 0
+        near = _near(line, side, apron)
+        alike = line > start and near == _near(line - 1, side, apron)
         for p in range(firsts[begin], firsts[end]):
             strip, first, columns = pieces[p, 0], pieces[p, 1], pieces[p, 2]
             down, over = pieces[p, 3] * (high + gap) * side + line - strip * high * side, pieces[p, 4] * side
@@ -191,7 +193,10 @@ def fill(start, stop, active, pieces, firsts, side, apron, high, gap, offsets, c
                     until = j * side + 2 * apron
                     n = _number(numbers[left + u : left + until], cells, line * width + left + u, n)
                     _copy(place[down, over + u : over + until], numbers[left + u : left + until])
-            _tell(kinds[down, over : over + right - left], active, line, strip, first, columns, side, apron, high)
+            if alike and line > strip * high * side:
+                _copy(kinds[down, over : over + right - left], kinds[down - 1, over : over + right - left])
+            else:
+                _tell(kinds[down, over : over + right - left], active, near, strip, first, columns, side, apron, high)
         if again:
             _repeat(cells[n : n + more], cells[n - more : n], width)
         for p in range(firsts[begin], firsts[end] if not again else 0):
@@ -231,16 +236,20 @@ def _copy(to, given):
 
 
 @compiled
-def _tell(kinds, active, line, strip, first, columns, side, apron, high):
-    """Bits of a line of cells of a piece."""
-    around = min(apron, 2)
-    top, bottom = strip * high, min(len(active), (strip + 1) * high)
+def _near(line, side, apron):
+    """First and end of the lines of pixels to which a line of cells of the grid is near, and the one that it is of."""
     begin, end = _pixels(line, side, apron)
-    for y in range(max(top, begin), min(bottom, end)):
-        v, j = line - y * side - apron, 0
-        if not -2 <= v < side + 2:
-            continue
-        marks = active[y, first : first + columns]
+    own = line - apron
+    return max(begin, (own - side - 2) // side + 1), min(end, (own + 2) // side + 1), own // side
+
+
+@compiled
+def _tell(kinds, active, near, strip, first, columns, side, apron, high):
+    """Bits of a line of cells of a piece, `near` lines of pixels."""
+    around = min(apron, 2)
+    begin, end, own = near
+    for y in range(max(strip * high, begin), min(len(active), (strip + 1) * high, end)):
+        marks, j = active[y, first : first + columns], 0
         while j < columns:
             if not marks[j]:
                 j += 1
@@ -249,7 +258,7 @@ def _tell(kinds, active, line, strip, first, columns, side, apron, high):
             right = j * side + apron
             for u in range(left - around, right + around):
                 kinds[u] |= np.uint8(NEAR)
-            for u in range(left, right if 0 <= v < side else left):
+            for u in range(left, right if y == own else left):
                 kinds[u] |= np.uint8(WANTED)
 
 
