@@ -88,7 +88,7 @@ def _needs(needs, active, line, strip, first, columns, side, apron, high):
     begin, end = _pixels(line, side, apron)
     some = np.uint8(0)
     for y in range(max(top, begin), min(bottom, end)):
-        _unite(needs, active[y, first : first + columns])
+        _unite(needs[:columns], active[y, first : first + columns])
     for j in range(columns):
         some |= needs[j]
     return some != 0
@@ -138,7 +138,7 @@ def count(start, stop, active, pieces, firsts, side, apron, high, width, counts)
                     if needs[j]:
                         seen[(first + j) * side : (first + j + 1) * side + 2 * apron] = 1
         for u in range(width if begin < end else 0):
-            found += seen[u]
+            found += np.int64(seen[u])
             seen[u] = 0
         counts[line] = found
 
