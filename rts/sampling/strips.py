@@ -326,7 +326,8 @@ def _arranged(
     counts = np.empty(lines, np.int64)
     parallel(strips_kernels.count_samples, lines, row, place, counts, work=len(row) * place.size)
     offsets, total = np.cumsum(counts) - counts, int(counts.sum())
-    index, shift = np.zeros(max(1, total), np.int32), np.zeros((max(1, total), 3), np.float32)
+    make = np.empty if total else np.zeros
+    index, shift = make(max(1, total), np.int32), make((max(1, total), 3), np.float32)
     laid, part = (np.empty((len(row), *place.shape), np.int32) for _ in range(2))
     shown = np.empty(place.shape if len(amid) else (0, 0), bool)
     given = row, place, cells, amid, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part, shown
