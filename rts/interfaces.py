@@ -331,20 +331,29 @@ class Needed(Plugin):
     Attributes:
         settles: whether it also says which cells are `settled`; True in a class with its own method.
         size: of the largest number that surfaces read, if it is known.
+        colors: of each part the number of its one colour, or −1 where it may have several; None where all parts have
+            one and the same.
     """
 
     FLAGS = {"settled": "settles"}
     settles: bool = False
     size: float | None = None
+    colors: tuple[int, ...] | None = None
 
     @abc.abstractmethod
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Which samples to keep, (K, H, W) bool, where covered (K, H, W) bool lie at depth (K, H, W)."""
 
     def settled(
-        self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float, wanted: np.ndarray | None = None
+        self,
+        covered: np.ndarray,
+        depth: np.ndarray,
+        kept: np.ndarray,
+        size: float,
+        wanted: np.ndarray | None = None,
+        part: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Cells (H, W) bool whose colour is known without samples; those that only such cells need leave `kept`.
+        """Cells (H, W) bool whose colour is that of their front; samples that only such cells need leave `kept`.
 
         Args:
             covered: (K, H, W) bool.
@@ -352,6 +361,7 @@ class Needed(Plugin):
             kept: (K, H, W) bool, what `__call__` gave; changed in place.
             size: of the largest coordinate.
             wanted: (H, W) bool, the cells that are looked at; None for all.
+            part: (H, W) integers, the part of each front, or −1; given where `colors` are.
         """
         raise NotImplementedError
 
@@ -504,8 +514,8 @@ class Splatter(Plugin):
         averages: whether its normal equations may be asked for with a target of fewer pixels than there are cells.
         settles: whether it reads `Splats.settled`: where all nine samples around a cell are fronts of one opaque
             colour, on cells' centres, and no hidden one beside them is `needed`, the cell has that colour, whatever
-            moves by little; and samples farther than `reach` from all other cells need not be there: where
-            `Splats.wanted` is told, those farther than one cell more from the others of them.
+            moves by little and whatever colours others have; and samples farther than `reach` from all other cells
+            need not be there: where `Splats.wanted` is told, those farther than one cell more from the others of them.
         follows_outlines: whether, of samples of one colour, cells whose nine neighbours are fronts show this colour and
             those that have none show nothing, where `rts.Adaptive` sees no outline: hidden samples have no effect.
     """

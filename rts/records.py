@@ -112,7 +112,7 @@ class Samples:
         asked: the names of the entries that were wanted when `gbuffer` was evaluated; None for all.
         centered: whether the samples reproject to the centres of their cells.
         by_sample: the names of the tables that have a row for each sample; other tables are shared by all.
-        settled: (H, W) bool, see `Splats`; None where no samples were left out for it.
+        settled: (H, W) int8, see `Splats`; None where no samples were left out for it.
         facing: (K, H, W) int16, the number of the piece of surface that is seen in each cell, from 1 on, negative where
             it is seen from behind; 0 where that is not known or not of interest. Pieces are consistently oriented: what
             is seen from opposite sides in two neighbouring cells is not one sheet. Numbers are larger by `MORE` where
@@ -157,7 +157,7 @@ class Fine:
         supersample: s; each active pixel has s² cells.
         apron: cells around active pixels, and around the layout.
         facing: (K, h, w) int16, as in `Sampled`, or None.
-        settled: (h, w) bool, see `Splats`; None where no samples were left out for it.
+        settled: (h, w) int8, see `Splats`; None where no samples were left out for it.
         flat: whether all pixels that are not active show the one colour of all samples where anything is, whatever
             moves, so that nothing has to be splatted there.
     """
@@ -178,7 +178,7 @@ class Fine:
     flat: bool = False
 
 
-@record(static=("supersample", "apron"))
+@record(static=("supersample", "apron", "colors"))
 class Sampled:
     """A whole scene, sampled: what `rts.sample` returns and `rts.render_samples` takes.
 
@@ -194,11 +194,14 @@ class Sampled:
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
         fine: further samples where outlines are (`rts.Adaptive`), or None.
-        settled: (H, W) bool, see `Splats`; None where no samples were left out for it.
+        settled: (H, W) integers, see `Splats`, counted over all parts in order; None where no samples were left out
+            for it.
         facing: (K, H, W) int16, as in `Samples`; pieces of different parts have different numbers. None where nothing
             is told.
         exit: (H, W) int32, as in `Samples`, of the part that is seen, counted over all parts in order. None where
             nothing is told.
+        colors: where cells are settled, of each part the number of its one colour, or −1 where it may have several;
+            None where all parts have one and the same.
     """
 
     samples: tuple[Samples, ...]
@@ -211,6 +214,7 @@ class Sampled:
     settled: Array | None = None
     facing: Array | None = None
     exit: Array | None = None
+    colors: tuple[int, ...] | None = None
 
     @property
     def part(self) -> Array:
@@ -240,8 +244,8 @@ class Splats:
         part: (K, H, W) int32, the part of each sample, or −1; None if that is not known.
         facing: (K, H, W) integers, the number of the piece of surface in each cell, negative where it is seen from
             behind, 0 where that is not told; or None. See `Samples`.
-        settled: (H, W) bool, cells that show the one colour of all samples, whatever moves; or None. They may have
-            no sample, as cells around them that affect no others.
+        settled: (H, W) integers, the sample whose colour the cell shows, whatever moves; −1 where it may change; or
+            None. Settled cells may have no sample, as cells around them that affect no others.
         sentinel: () float, the depth that stands for empty layers, beyond all samples; None for one of the scene's
             scale.
         wanted: (H, W) bool, the targets that are looked at; others may have any finite colour. None for all.

@@ -839,6 +839,23 @@ class Frugal(OddMulti):
         return covered & (np.arange(len(covered)) == 0)[:, None, None]
 
 
+class Naming(OddMulti):
+    """Settled cells show the colour of some sample, or what is splatted there."""
+
+    settles = True
+
+    def __init__(self, show):
+        super().__init__()
+        object.__setattr__(self, "show", show)
+
+    def image(self, splats):
+        image = super().image(splats)
+        if splats.settled is None:
+            return image
+        xp, amid, named = namespace(image), splats.settled >= 0, splats.settled
+        return self.show(xp, image, amid[..., None], splats.rgba, xp.where(amid, named, 0))
+
+
 class Cutting(OddMulti):
     """What lies in the border does not splat at all."""
 
@@ -861,6 +878,11 @@ SPLATTERS = {
     },
     "rows_of_no_cell_have_no_effect": {"all rows": OddMulti(made=all_rows)},
     "what_it_does_not_need_has_no_effect": {"fronts only": Frugal()},
+    "settled_cells_show_the_colors_that_they_name": {
+        "not read": Naming(lambda xp, image, amid, rgba, row: image),
+        "one for all": Naming(lambda xp, image, amid, rgba, row: xp.where(amid, rgba[0], image)),
+        "constant": Naming(lambda xp, image, amid, rgba, row: xp.where(amid, stopped(rgba[row]), image)),
+    },
     "cells_of_the_border_only_splat": {"cut off": Cutting()},
     "a_shape_that_moves_brightens_what_it_moves_into": {"mirrored": OddMulti(from_centres), "none": Plain()},
     "every_engine_gives_the_same_image": {"not in torch": OddMulti(made=lambda image, *_: wrong_in_torch(image))},

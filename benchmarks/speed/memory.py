@@ -60,12 +60,13 @@ def jax_growth(task: Task, mode: str, sampler: str) -> float:
 
     small, state = jax_function(task.resized(16), mode, sampler)
     jax.block_until_ready(jax.jit(small)(*state))  # Compiles what samples on the host.
-    function, state = jax_function(task, mode, sampler)
-    compiled = jax.jit(function).lower(*state).compile()
+    function, (variables, states) = jax_function(task, mode, sampler)
+    compiled = jax.jit(function).lower(variables, states).compile()
 
     def iteration() -> None:
-        nonlocal state
-        state, *_ = jax.block_until_ready(compiled(*state))
+        nonlocal variables, states
+        (moved, states), *_ = jax.block_until_ready(compiled(variables, states))
+        variables = variables | moved
 
     return growth(iteration)
 

@@ -118,20 +118,25 @@ def jax_iteration(task: Task, mode: str = "pose", sampler: str = "auto") -> Call
     """One iteration a call, all of it in one compiled function."""
     import jax
 
-    function, state = jax_function(task, mode, sampler)
+    function, (variables, states) = jax_function(task, mode, sampler)
     function = jax.jit(function)
 
     def step() -> float:
-        nonlocal state
-        state, loss, _ = function(*state)
-        jax.block_until_ready(state)
+        nonlocal variables, states
+        (moved, states), loss, gradient = function(variables, states)
+        jax.block_until_ready((moved, states, gradient))
+        variables = variables | moved
         return loss.item()
 
     return step
 
 
 def jax_function(task: Task, mode: str, sampler: str) -> tuple[Callable, tuple]:
-    """An iteration as a function of parameters and the optimiser's state, and the first of both."""
+    """An iteration as a function of parameters and the optimiser's state, and the first of both.
+
+    It gives those parameters that are stepped, and the state; the loss; and its gradient. What is not stepped is not
+    handed out: a compiled program copies what it only passes on.
+    """
     import jax
     import jax.numpy as jnp
     import optax
@@ -148,7 +153,7 @@ def jax_function(task: Task, mode: str, sampler: str) -> tuple[Callable, tuple]:
         value, gradient = jax.value_and_grad(lambda x: task.loss(x["pose"], x.get("vertices"), target, sampler))(
             variables
         )
-        moved, kept = dict(variables), {}
+        moved, kept = {}, {}
         for name, rule in rules.items():
             updates, kept[name] = rule.update(gradient[name], states[name])
             moved[name] = optax.apply_updates(variables[name], updates)

@@ -31,7 +31,7 @@ def painted_inset(color: Array, fine: Array, pixel: Array, row: Array, settled: 
         fine: as in `with_inset`.
         pixel: as in `with_inset`.
         row: (H', W') integers, the image's pixels and as many more on each side; not negative where anything is.
-        settled: (H', W') bool, where anything is as well.
+        settled: (H', W') integers, not negative where anything is as well.
         side: as in `with_inset`.
     """
     return PAINTED(color, fine, pixel, row, settled, side=side)
@@ -54,7 +54,7 @@ def _specification(image: Array, fine: Array, pixel: Array, *, side: int) -> Arr
 
 def _painted(color: Array, fine: Array, pixel: Array, row: Array, settled: Array, *, side: int) -> Array:
     rows, columns = (slice(*_inside(n, wide)) for n, wide in zip(pixel.shape, row.shape, strict=True))
-    there = (row[rows, columns] >= 0) | settled[rows, columns]
+    there = (row[rows, columns] >= 0) | (settled[rows, columns] >= 0)
     return _specification(namespace(color).astype(there[..., None], color.dtype) * color, fine, pixel, side=side)
 
 
@@ -75,7 +75,11 @@ def _painted_shape(
 
 def _no_colors(like: np.ndarray) -> tuple[np.ndarray, ...]:
     """What stands for no colour, and for where it is."""
-    return read_only(np.empty(0, like.dtype)), read_only(np.empty((0, 0), np.int32)), read_only(np.empty((0, 0), bool))
+    return (
+        read_only(np.empty(0, like.dtype)),
+        read_only(np.empty((0, 0), np.int32)),
+        read_only(np.empty((0, 0), np.int8)),
+    )
 
 
 def _forward(operands: Arrays, out: np.ndarray, *, side: int) -> None:

@@ -42,7 +42,7 @@ def put(start, stop, image, color, row, settled, fine, pixel, side, out):
 def _look(there, row, settled):
     """Where anything is seen in a row of cells."""
     for x in range(len(there)):
-        there[x] = np.uint8(row[x] >= 0) | np.uint8(settled[x])
+        there[x] = np.uint8(row[x] >= 0) | np.uint8(settled[x] >= 0)
 
 
 @compiled
@@ -68,7 +68,7 @@ def pull(start, stop, g, pixel, row, settled, side, image, sums, fine):
                 if len(image) > 0:
                     for c in range(channels):
                         image[y, x, c] = g[y, x, c]
-                elif len(sums) > 0 and (row[y + down, x + over] >= 0 or settled[y + down, x + over]):
+                elif len(sums) > 0 and (row[y + down, x + over] >= 0 or settled[y + down, x + over] >= 0):
                     for c in range(channels):
                         sums[y, c] += g[y, x, c]
             elif len(fine):

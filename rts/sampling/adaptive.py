@@ -105,18 +105,19 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
         row: (K, H, W) int32 of one sample a pixel.
         depth: (K, H, W).
         sizes: the number of rows of each part.
-        settled: (H, W) bool, cells that are covered by the only part, with a sample or without; None for none.
+        settled: (H, W) int8, 0 at cells that are covered by the only part, with a sample or without, −1 at others;
+            None for none.
     """
     from rts.sampling import adaptive_kernels
     from rts.splatting.visible import CONTINUED
 
-    settled = np.empty((0, row.shape[2]), bool) if settled is None else settled
+    settled = np.empty((0, row.shape[2]), np.int8) if settled is None else settled
     depth, kind = read_only(depth), depth.dtype.type
     extent = max(depth.max(initial=0), 0) - min(depth.min(initial=0), 0)
     marks = np.empty(row.shape[1:], np.uint8)
     given = (
         read_only(row, np.int32),
-        read_only(settled),
+        read_only(settled, np.int8),
         depth,
         np.cumsum(sizes)[:-1],
         kind(2 * extent if extent > 0 else 1),

@@ -15,7 +15,7 @@ def mark(start, stop, row, settled, depth, firsts, beyond, continued, marks):
         start: first row.
         stop: end of the rows.
         row: (K, H, W) int32.
-        settled: (H, W) bool, cells that are covered by the first part, with a sample or without; or no rows.
+        settled: (H, W) int8, 0 at cells that are covered by the only part, with a sample or without; or no rows.
         depth: (K, H, W).
         firsts: (P − 1,) the first row of each part but the first.
         beyond: depth of layers that are not covered; no two layers are farther apart than each is from it.
@@ -31,7 +31,9 @@ def mark(start, stop, row, settled, depth, firsts, beyond, continued, marks):
         seen, behind = parts[(y + 3) % 3], hidden[(y + 3) % 3]
         for x in range(width):
             i = row[0, at, x]
-            part = np.int32(-1 if i < 0 and not (len(settled) > 0 and settled[at, x]) else 0)
+            if len(settled) > 0:
+                i = max(i, np.int32(settled[at, x]))
+            part = np.int32(-1 if i < 0 else 0)
             for first in firsts:
                 part += i >= first
             seen[x + 1], behind[x + 1] = part, layers > 1 and row[min(1, layers - 1), at, x] >= 0

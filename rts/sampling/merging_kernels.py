@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
-from rts.threads import parallel
+from rts.threads import parallel, read_only
 
 
 def interleave(
@@ -26,47 +26,76 @@ def interleave(
         layers: K.
         more: `rts.records.MORE`.
     """
-    count, (_, height, width) = len(rows), rows[0].shape
-    deepest = max(r.shape[0] for r in rows)
-    row = np.full((count, deepest, height, width), -1, np.int32)
-    depth = np.zeros(row.shape, np.result_type(*depths))
-    told = np.zeros(row.shape if facing else (0, deepest, height, width), np.int16)
-    for i, (r, d) in enumerate(zip(rows, depths, strict=True)):
-        row[i, : len(r)], depth[i, : len(d)] = r, d
-    for i, f in enumerate(facing):
-        told[i, : len(f)] = f
+    (_, height, width), kind = rows[0].shape, np.result_type(*depths)
     shape = (min(layers, sum(r.shape[0] for r in rows)), height, width)
-    found = np.empty(shape, np.int32), np.empty(shape, np.int32), np.empty(shape, depth.dtype)
-    merged = np.zeros(shape if facing else (0, height, width), np.int16)
-    parallel(_interleave, height, row, depth, told, more, *found, merged)
-    return (*found, merged) if facing else found
+    told = shape if facing else (0, height, width)
+    given = [
+        (read_only(r, np.int32), read_only(d, kind), read_only(facing[i] if facing else r[:0], np.int16))
+        for i, (r, d) in enumerate(zip(rows, depths, strict=True))
+    ]
+    # One part after the other: those before are merged already, but for the first.
+    before: tuple[np.ndarray, ...] = (np.empty((0, height, width), np.int32), *given[0])
+    given += [tuple(x[:0] for x in given[0])] * (len(rows) == 1)  # With one alone nothing is merged.
+    for number, own in enumerate(given[1:], start=1):
+        found = *(np.empty(shape, dtype) for dtype in (np.int32, np.int32, kind)), np.empty(told, np.int16)
+        numbers = number, len(rows), more
+        parallel(_merge, height, *map(read_only, before), *own, *numbers, *found, work=4 * found[0].size)
+        before = found
+    return before if facing else before[:3]
 
 
 @kernel
-def _interleave(start, stop, row, depth, facing, more, part, merged, merged_depth, merged_facing):
-    count, deepest, _, width = row.shape
-    at = np.empty(count, np.int64)
+def _merge(
+    start,
+    stop,
+    part,
+    row,
+    depth,
+    facing,
+    own_row,
+    own_depth,
+    own_facing,
+    number,
+    count,
+    more,
+    merged_part,
+    merged_row,
+    merged_depth,
+    merged_facing,
+):
+    """Merge a part into those before it, which are the first alone where `part` has no layers."""
+    before, deepest, layers, tells = len(row), len(own_row), len(merged_part), len(facing) > 0
     for y in range(start, stop):
-        for x in range(width):
-            at[:] = 0
-            for k in range(len(part)):
-                nearest, best = -1, depth.dtype.type(0)
-                for i in range(count):
-                    while at[i] < deepest and row[i, at[i], y, x] < 0:
-                        at[i] += 1
-                    if at[i] < deepest and (nearest < 0 or depth[i, at[i], y, x] < best):
-                        nearest, best = i, depth[i, at[i], y, x]
-                if nearest < 0:
-                    part[k, y, x], merged[k, y, x], merged_depth[k, y, x] = -1, -1, 0
+        for x in range(row.shape[2]):
+            a = b = 0
+            for k in range(layers):
+                while a < before and row[a, y, x] < 0:
+                    a += 1
+                while b < deepest and own_row[b, y, x] < 0:
+                    b += 1
+                if b < deepest and (a == before or own_depth[b, y, x] < depth[a, y, x]):
+                    merged_part[k, y, x], merged_row[k, y, x] = number, own_row[b, y, x]
+                    merged_depth[k, y, x] = own_depth[b, y, x]
+                    if tells:
+                        merged_facing[k, y, x] = _of_part(own_facing[b, y, x], number, count, more)
+                    b += 1
+                elif a < before:
+                    merged_part[k, y, x] = part[a, y, x] if len(part) > 0 else 0
+                    merged_row[k, y, x], merged_depth[k, y, x] = row[a, y, x], depth[a, y, x]
+                    if tells and len(part) > 0:
+                        merged_facing[k, y, x] = facing[a, y, x]
+                    elif tells:
+                        merged_facing[k, y, x] = _of_part(facing[a, y, x], 0, count, more)
+                    a += 1
                 else:
-                    part[k, y, x], merged[k, y, x] = nearest, row[nearest, at[nearest], y, x]
-                    merged_depth[k, y, x] = best
-                    if len(facing) > 0:
-                        merged_facing[k, y, x] = _of_part(facing[nearest, at[nearest], y, x], nearest, count, more)
-                    at[nearest] += 1
-            last = len(part) - 1
-            if len(facing) > 0 and 0 < abs(merged_facing[last, y, x]) < more:
-                merged_facing[last, y, x] += more if merged_facing[last, y, x] > 0 else -more
+                    merged_part[k, y, x] = merged_row[k, y, x] = -1
+                    merged_depth[k, y, x] = 0
+                    if tells:
+                        merged_facing[k, y, x] = 0
+            if tells and number >= count - 1:
+                told = merged_facing[layers - 1, y, x]
+                if 0 < abs(told) < more:
+                    merged_facing[layers - 1, y, x] = told + more if told > 0 else told - more
 
 
 @compiled

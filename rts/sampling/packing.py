@@ -21,6 +21,13 @@ def too_far(size: float, depth: np.ndarray) -> bool:
     return size > 0 and size > FAR * largest(depth)
 
 
+def of_first_row(settled: np.ndarray) -> np.ndarray:
+    """`Splats.settled` of a scene of one part, (H, W) int8, from what `Needed.settled` gives."""
+    if settled.dtype != bool:
+        raise InputError(f"settled of what says which samples are needed gave {settled.dtype}; expected bool")
+    return settled.view(np.int8) - np.int8(1)
+
+
 def lift(
     fragments: Fragments,
     proxy: Proxy,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import threading
 import weakref
 from collections.abc import Callable, Sequence
@@ -20,8 +19,8 @@ from rts.parts import CheckedPart
 from rts.records import ArraySpec, Sampled, Samples
 from rts.sampling.exits import beside_outlines
 from rts.sampling.extremes import largest
-from rts.sampling.packing import FAR
-from rts.trees import leaves
+from rts.sampling.packing import FAR, of_first_row
+from rts.trees import Tree, leaves
 
 LAYER_LIMIT = 8
 """The largest number of layers that `layers="auto"` takes."""
@@ -48,20 +47,49 @@ def needed_by(
         splatter: the splatter.
         parts: checked parts.
         sizes: of each part the largest number of those that its surface reads, or None where it is to be looked for.
-        settles: whether samples may be left out that only cells of one colour need, if the scene is `of_one_color`.
-            Where samples are to be evaluated at other values of θ than they were found for, they may not.
+        settles: whether samples may be left out that only cells amid one colour need. Where samples are to be evaluated
+            at other values of θ than they were found for, they may not.
     """
     if not splatter.prunes or not all(p.shader.opaque and p.surface.centered for p in parts):
         return None
     size = _size(parts, sizes or [None] * len(parts))
     if size is None and not all(isinstance(p.surface, TriangleSurface) and not p.surface.refines for p in parts):
         return None
-    return _BySplatter(splatter, size, settles and splatter.settles and of_one_color(parts))
+    return _BySplatter(splatter, size, colors_of(parts) if settles and splatter.settles else ())
 
 
-def of_one_color(parts: Sequence[CheckedPart]) -> bool:
-    """Whether all samples of a scene are certain to have one and the same colour."""
-    return parts[0].uniform and all(part.shows_color_of(parts[0]) for part in parts[1:])
+def colors_of(parts: Sequence[CheckedPart]) -> tuple[int, ...]:
+    """Of each part which one is the first to be certain to show its one colour; −1 where it may have several."""
+    found: list[int] = []
+    known: dict[Any, list[int]] = {}  # The first of each colour, by what is quick to compare.
+    for index, part in enumerate(parts):
+        names = part.uniform_by
+        if names is None:
+            found.append(-1)
+            continue
+        alike = known.setdefault((names, *(_hint(part.theta[name]) for name in names)), [])
+        first = next((i for i in alike if part.shows_color_of(parts[i])), index)
+        if first == index:
+            alike.append(index)
+        found.append(first)
+    return tuple(found)
+
+
+def _hint(entry: Tree) -> Any:
+    """What is the same of entries of θ that are one object, or constants of one value."""
+    return (entry.shape, *entry.flat[:3].tolist()) if isinstance(entry, np.ndarray) else id(entry)
+
+
+def keep_colors(parts: Sequence[CheckedPart], before: Sequence[int] | None) -> bool:
+    """Whether parts still promise what was known of them: one colour each, and those that shared one share it.
+
+    Args:
+        parts: as they are now.
+        before: what `colors_of` gave; None where all had one colour.
+    """
+    now = colors_of(parts)
+    pairs = {(old, new) for old, new in zip(before or [0] * len(now), now, strict=True) if old >= 0}
+    return len({old for old, _ in pairs}) == len(pairs) and all(new >= 0 for _, new in pairs)
 
 
 def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float | None:
@@ -87,11 +115,13 @@ class _BySplatter(Needed):
     Args:
         splatter: the splatter.
         size: of the largest number that surfaces read, if it is known.
-        settles: whether all samples are of one colour, and the splatter makes use of it.
+        colors: what `colors_of` gave, if the splatter makes use of it; else nothing.
     """
 
-    def __init__(self, splatter: Splatter, size: float | None, settles: bool):
-        self._splatter, self.size, self.settles = splatter, size, settles
+    def __init__(self, splatter: Splatter, size: float | None, colors: tuple[int, ...]):
+        self._splatter, self.size = splatter, size
+        self.settles = any(color >= 0 for color in colors)
+        self.colors = colors if any(colors) else None
         self._asked: tuple[weakref.ref[np.ndarray], float] | None = None
 
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -107,7 +137,13 @@ class _BySplatter(Needed):
         return kept & covered
 
     def settled(
-        self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float, wanted: np.ndarray | None = None
+        self,
+        covered: np.ndarray,
+        depth: np.ndarray,
+        kept: np.ndarray,
+        size: float,
+        wanted: np.ndarray | None = None,
+        part: np.ndarray | None = None,
     ) -> np.ndarray:
         """See `Needed`."""
         if max(size, self.size or 0.0) > FAR * self._largest(depth):
@@ -116,7 +152,7 @@ class _BySplatter(Needed):
 
         # Beside cells that are not wanted, what decides for others is not settled, and may look at one cell more.
         reach = self._splatter.reach + (wanted is not None)
-        return interiors_kernels.settle(covered, depth, kept, reach, wanted)
+        return interiors_kernels.settle(covered, depth, kept, reach, wanted, part, self.colors or ())
 
     def _largest(self, depth: np.ndarray) -> float:
         """The largest of some depths; of an array that was asked for last it is known."""
@@ -138,7 +174,7 @@ class Inspection(Needed):
     def __init__(self, needed: AnyNeeded | None):
         self._needed, self._lock = None if needed is None else adapted(needed, Needed), threading.Lock()
         self.settles = self._needed is not None and self._needed.settles
-        self.size = None if self._needed is None else self._needed.size
+        self.size, self.colors = (None, None) if self._needed is None else (self._needed.size, self._needed.colors)
         self.short = 0
         self.most: int | None = None
         self.beyond = np.zeros(0, np.int64)
@@ -156,11 +192,17 @@ class Inspection(Needed):
         return kept
 
     def settled(
-        self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float, wanted: np.ndarray | None = None
+        self,
+        covered: np.ndarray,
+        depth: np.ndarray,
+        kept: np.ndarray,
+        size: float,
+        wanted: np.ndarray | None = None,
+        part: np.ndarray | None = None,
     ) -> np.ndarray:
         """See `Needed`."""
         assert self._needed is not None
-        return self._needed.settled(covered, depth, kept, size, wanted)
+        return self._needed.settled(covered, depth, kept, size, wanted, part)
 
     def ran_out(self, cells: int) -> None:
         """See `Needed`."""
@@ -221,54 +263,55 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
     # Where numbers are traced, nobody knows how rounding orders depths.
     settles = asked.settles and asked.size is not None
     sizes = [s.ids.shape[0] for s in sampled.samples]
-    offsets = np.cumsum([0, *sizes])
+    total, part = sum(sizes), sampled.part
+    front = [part[0, ...]] if settles and len(sizes) > 1 else []
 
     def host(row: np.ndarray, depth: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
-        if row.max(initial=-1) >= offsets[-1]:
-            raise InputError(f"row refers to sample {row.max()} of {offsets[-1]}; sample this scene anew")
-        used, covered = np.zeros(offsets[-1], bool), row >= 0
+        from rts.sampling.pruning_kernels import Numbering
+
+        if row.max(initial=-1) >= total:
+            raise InputError(f"row refers to sample {row.max()} of {total}; sample this scene anew")
+        numbering, covered = Numbering(sizes), row >= 0
         kept = asked(covered, depth)
-        own_rows, exits = rest[: len(sizes)], rest[len(sizes) :]
+        last = len(rest) - len(front)
+        own_rows, exits, whose = rest[: len(sizes)], rest[len(sizes) : last], rest[last:]
         if exits:
             near = np.full(exits[0].size, -1, np.int32)
             cells = beside_outlines(kept)[0]
             near[cells] = exits[0].reshape(-1)[cells]
-            used[near[near >= 0]] = True
             exits = (near.reshape(exits[0].shape),)
+            numbering.use(exits[0], exits[0] >= 0)
         amid = ()
         if settles:
             kept = kept.copy() if kept is covered else kept
-            amid = (asked.settled(covered, depth, kept, 0.0),)
-        used[row[kept]] = True
-        # The order stays, so that neighbours in the image stay neighbours in memory.
-        of_parts = [used[a:b] for a, b in itertools.pairwise(offsets)]
-        indices = [np.flatnonzero(own).astype(np.int32) for own in of_parts]
-        # For a row of −1 there is −1 at the end.
-        none = np.full(1, -1, np.int32)
-        numbers = [np.where(own, np.cumsum(own, dtype=np.int32) - 1, none) for own in of_parts]
-        every, *numbers = (np.concatenate([*n, none]) for n in (numbers, *([n] for n in numbers)))
-        rows = zip((every, *numbers, *[every] * len(exits)), (row, *own_rows, *exits), strict=True)
-        renumbered = [n[r] for n, r in rows]
-        return *renumbered, *amid, *(i if len(i) else np.zeros(1, np.int32) for i in indices)
+            told = {} if asked.colors is None else {"part": whose[0]}
+            found = asked.settled(covered, depth, kept, 0.0, **told)
+            amid = (np.where(found, whose[0], np.int32(-1)) if front else of_first_row(found),)
+        numbering.use(row, kept)
+        indices = [index if len(index) else np.zeros(1, np.int32) for index in numbering.indices()]
+        own_rows = [numbering.renumbered(own, part=i) for i, own in enumerate(own_rows)]
+        return numbering.renumbered(row), *own_rows, *map(numbering.renumbered, exits), *amid, *indices
 
     rows = sampled.row, *(s.row for s in sampled.samples), *([] if sampled.exit is None else [sampled.exit])
     shapes = [ArraySpec(tuple(r.shape), np.int32) for r in rows]
-    amid = [ArraySpec(tuple(sampled.row.shape[1:]), np.bool_)] if settles else []
+    amid = [ArraySpec(tuple(sampled.row.shape[1:]), np.int32 if front else np.int8)] if settles else []
     packed = [ArraySpec((n,), np.int32, packed=True) for n in sizes]
-    found = engine_of(sampled).call_host(host, (*shapes, *amid, *packed), rows[0], sampled.depth, *rows[1:])
+    found = engine_of(sampled).call_host(host, (*shapes, *amid, *packed), rows[0], sampled.depth, *rows[1:], *front)
     row, own_rows, indices = found[0], found[1 : 1 + len(sizes)], found[len(rows) + len(amid) :]
     exits = None if sampled.exit is None else found[1 + len(sizes)]
     samples = [_selected(*z) for z in zip(sampled.samples, own_rows, indices, strict=True)]
-    xp, part = namespace(row), sampled.part
+    xp, settled = namespace(row), found[len(rows)] if settles else None
+    whose = settled  # The part whose colour a cell shows, by its first row.
     # Row numbers are within parts up to here, since an engine may have padded what comes before.
     start = indices[0].shape[0]
     for i, index in enumerate(indices[1:], start=1):
         row = xp.where((row >= 0) & (part == i), row + start, row)
         exits = None if exits is None else xp.where((exits >= 0) & (part[0] == i), exits + start, exits)
+        settled = None if settled is None else xp.where(whose == i, start, settled)
         start += index.shape[0]
     depth = xp.where(row >= 0, sampled.depth, 0.0)
-    settled = found[len(rows)] if settles else None
-    return replace(sampled, samples=tuple(samples), row=row, depth=depth, settled=settled, exit=exits)
+    told = {"settled": settled, "colors": asked.colors if settles else None, "exit": exits}
+    return replace(sampled, samples=tuple(samples), row=row, depth=depth, **told)
 
 
 def _selected(samples: Samples, row: Any, index: Any) -> Samples:

@@ -25,7 +25,7 @@ from rts.sampling.extremes import largest
 from rts.sampling.facing import facing_of_views
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.merging import merge
-from rts.sampling.packing import FAR, lift
+from rts.sampling.packing import FAR, lift, of_first_row
 from rts.sampling.pruning import prune
 from rts.sampling.scenes import Scene, apron_of, widened
 from rts.sampling.triangle_sampler import TriangleSampler
@@ -118,7 +118,7 @@ class Sampling(NamedTuple):
             "view": shape.row_spec(np.int32),
             "scales": ArraySpec((picture.views,), np.float32),
             **({"facing": ArraySpec((layers, *picture.size), np.int16)} if tells else {}),
-            **({"settled": ArraySpec(picture.size, np.bool_)} if pruning.settles else {}),
+            **({"settled": ArraySpec(picture.size, np.int8)} if pruning.settles else {}),
         }
 
         def find(own: Sequence[Camera], inputs: Any) -> tuple[Samples, dict[str, np.ndarray]]:
@@ -211,11 +211,12 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
     counts = np.array([[s.ids.shape[0] for s in view.samples] for view in views], np.int32)
     starts = np.cumsum(counts, axis=0, dtype=np.int32) - counts
     # Rows of all parts are counted part by part, in each view and in the picture.
+    own_starts = np.cumsum(counts, axis=1, dtype=np.int32) - counts
     total = counts.sum(axis=0, dtype=np.int32)
-    shifts = np.cumsum(total, dtype=np.int32) - total + starts - (np.cumsum(counts, axis=1, dtype=np.int32) - counts)
-    xp, part, samples = namespace(first.row), [view.part for view in views], []
+    shifts = np.cumsum(total, dtype=np.int32) - total + starts - own_starts
+    xp, samples = namespace(first.row), []
 
-    def laid_out(grids: Sequence[Array | None], empty: int | bool, shift: np.ndarray | None = None) -> Array | None:
+    def laid_out(grids: Sequence[Array | None], empty: int, shift: np.ndarray | None = None) -> Array | None:
         """One grid of those of all views; `shift` (B, parts) is added to rows of each part."""
         known = [grid for grid in grids if grid is not None]
         if not known:
@@ -223,12 +224,10 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
         several = len(known[0].shape) == 3
         stacked = xp.stack([x if several else x[None, ...] for x in known])
         if shift is not None:
-            whose = xp.stack([x if several else x[:1, ...] for x in part])
             given = stacked
             for index in range(shift.shape[1]):
-                moved = given + engine.constant(shift[:, index, None, None, None], given)
-                there = (given >= 0) if shift.shape[1] == 1 else (given >= 0) & (whose == index)
-                stacked = xp.where(there, moved, stacked)
+                from_row, by = (engine.constant(x[:, index, None, None, None], given) for x in (own_starts, shift))
+                stacked = xp.where(given >= from_row if index else given >= 0, given + by, stacked)
         found = picture.laid_out(stacked, empty)
         return found if several else found[0, ...]
 
@@ -242,7 +241,7 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
         row=laid_out([view.row for view in views], -1, shifts),
         depth=laid_out([view.depth for view in views], 0),
         overflow=sum(view.overflow for view in views),
-        settled=laid_out([view.settled for view in views], False),
+        settled=laid_out([view.settled for view in views], -1, shifts if counts.shape[1] > 1 else None),
         facing=laid_out([view.facing for view in views], 0),
         exit=laid_out([view.exit for view in views], -1, shifts),
     )
@@ -335,7 +334,7 @@ class _Pruning:
         if depth is not None:
             assert self._near is not None
             settled = self._near.settled(covered, depth, kept, 0.0)
-        return kept, {"scales": scales, "settled": settled}
+        return kept, {"scales": scales, "settled": of_first_row(settled)}
 
     def _asked(
         self, covered: np.ndarray, depth: np.ndarray, size: float

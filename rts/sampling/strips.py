@@ -238,7 +238,13 @@ class InStrips(Needed):
         return np.concatenate([covered[:1], self._listed(kept[1:], covered[1:], self._layout.kinds)])
 
     def settled(
-        self, covered: np.ndarray, depth: np.ndarray, kept: np.ndarray, size: float, wanted: np.ndarray | None = None
+        self,
+        covered: np.ndarray,
+        depth: np.ndarray,
+        kept: np.ndarray,
+        size: float,
+        wanted: np.ndarray | None = None,
+        part: np.ndarray | None = None,
     ) -> np.ndarray:
         """See `Needed`; (L, LINE), of the samples that were asked about last. Active pixels alone are wanted."""
         laid, deep, left = self._shown
@@ -283,7 +289,7 @@ def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
     told = [] if sampled.facing is None else [sampled.facing]
     specs += [ArraySpec(laid, np.int16) for _ in told]
     amid = [] if sampled.settled is None else [sampled.settled]
-    specs += [ArraySpec(laid[1:], np.bool_) for _ in amid]
+    specs += [ArraySpec(laid[1:], np.int8) for _ in amid]
 
     def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray, *known: np.ndarray) -> tuple[np.ndarray, ...]:
         sides = [np.where(place >= 0, x.reshape(layers, -1)[:, place], 0).astype(np.int16) for x in known[: len(told)]]
@@ -321,7 +327,7 @@ def _arranged(
     from rts.sampling import strips_kernels
 
     row, place, cells = (read_only(x, np.int32) for x in (row, place, cells))
-    amid = read_only(np.empty(0, bool) if settled is None else settled.reshape(-1))
+    amid = read_only(np.empty(0, np.int8) if settled is None else settled.reshape(-1))
     row, cells, lines = row.reshape(len(row), -1), cells.reshape(-1), len(row) * len(place)
     counts = np.empty(lines, np.int64)
     parallel(strips_kernels.count_samples, lines, row, place, counts, work=len(row) * place.size)
@@ -329,7 +335,7 @@ def _arranged(
     make = np.empty if total else np.zeros
     index, shift = make(max(1, total), np.int32), make((max(1, total), 3), np.float32)
     laid, part = (np.empty((len(row), *place.shape), np.int32) for _ in range(2))
-    shown = np.empty(place.shape if len(amid) else (0, 0), bool)
+    shown = np.empty(place.shape if len(amid) else (0, 0), np.int8)
     given = row, place, cells, amid, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part, shown
     parallel(strips_kernels.arrange, lines, *given, work=2 * laid.size)
     return index, shift, laid, part, shown

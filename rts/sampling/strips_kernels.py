@@ -283,7 +283,7 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
         row: (K, M) int32, the sample of each cell.
         place: (h, w).
         cells: (M,), the flat index of each cell in the grid.
-        settled: (M,) bool, or nothing.
+        settled: (M,) int8, 0 or −1, or nothing.
         firsts: (P − 1,) the first row of each part but the first.
         width: of the grid.
         offsets: (K · h,), the number of the first splat of each line.
@@ -291,7 +291,7 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
         shift: (N, 3) float32, to be filled: from the grid to the layout.
         laid: (K, h, w) int32, to be filled: the splat of each place.
         part: (K, h, w) int32, to be filled: its part.
-        shown: (h, w) bool, to be filled with what is settled; no rows for nothing.
+        shown: (h, w) int8, to be filled with what is settled; no rows for nothing.
     """
     height, across = len(place), np.uint32(width)
     for line in range(start, stop):
@@ -299,7 +299,7 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
         if k == 0 and len(shown) > 0:
             for x in range(place.shape[1]):
                 m = place[y, x]
-                shown[y, x] = m >= 0 and settled[m]
+                shown[y, x] = settled[m] if m >= 0 else -1
         for x in range(place.shape[1]):
             m = place[y, x]
             i = row[k, m] if m >= 0 else -1

@@ -21,7 +21,7 @@ from rts.sampling.exits import Exits, beside_outlines
 from rts.sampling.extremes import largest
 from rts.sampling.facing import facing as facing_of
 from rts.sampling.host_call import HostCall, Shape
-from rts.sampling.packing import lift, repack
+from rts.sampling.packing import lift, of_first_row, repack
 from rts.sampling.settling import on_surface, refined
 from rts.sampling.validation import check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
@@ -237,7 +237,7 @@ class TriangleSampler(Sampler):
         settles = wanted is not None and wanted.settles and not surface.refines
         beside = {
             **({"facing": ArraySpec((layers, *shape.size), np.int16)} if tells else {}),
-            **({"settled": ArraySpec(shape.size, np.bool_)} if settles else {}),
+            **({"settled": ArraySpec(shape.size, np.int8)} if settles else {}),
             **({"exit": ArraySpec(size, np.int32)} if exits else {}),
         }
 
@@ -293,7 +293,7 @@ class TriangleSampler(Sampler):
                     read = any(np.may_share_memory(x, found.proxy.vertices) for x in leaves(inputs))
                     size = needed.size if read and needed.size is not None else largest(found.proxy.vertices)
                 if needed.settles:
-                    settled = needed.settled(covered, fragments.depth, kept, size)
+                    settled = of_first_row(needed.settled(covered, fragments.depth, kept, size))
             sides = None
             if tells:
                 # Nobody looks at them where no sample is hidden, and to find them takes long.

@@ -26,7 +26,7 @@ from rts.engines import engine_of, namespace
 from rts.errors import InputError
 from rts.interfaces import Splatter
 from rts.records import Splats
-from rts.splatting.layers import NEIGHBOURS, OFFSETS, Depths, bordered, nothing
+from rts.splatting.layers import NEIGHBOURS, OFFSETS, Depths, bordered, check_settled, nothing, unpack
 from rts.trees import Array
 
 SIGMA, EPSILON = 0.5, 0.05
@@ -129,10 +129,13 @@ class Kernel(Splatter):
 
 
 def settled(image: Array, splats: Splats) -> Array:
-    """The image of all cells (H, W, 4), with the one colour of all samples where cells are settled."""
+    """The image of all cells (H, W, 4), with the colours of samples that settled cells show."""
     if splats.settled is None:
         return image
-    return namespace(image).where(splats.settled[..., None], splats.rgba[0], image)
+    check_settled(splats.settled, image.shape[:2], splats.rgba.shape[0])
+    xp = namespace(image)
+    row = xp.astype(splats.settled, splats.row.dtype)
+    return xp.where((row >= 0)[..., None], unpack(splats.rgba, row), image)
 
 
 def exact_calibration(sigma: float, reach: int = 1) -> float:

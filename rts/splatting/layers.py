@@ -23,16 +23,25 @@ Steps = tuple[int, int]
 """Cells along x and y."""
 
 
-def check_rows(row: Array, count: int) -> None:
-    """Raise an InputError where `row`, on the host and not traced, refers to none of so many samples."""
+def check_rows(row: Array, count: int, name: str = "row") -> None:
+    """Raise an InputError where rows, on the host and not traced, refer to none of so many samples."""
     value = known_value(row)
     if value is None or not value.size:
         return
     low, high = value.min(), value.max()
     if high >= count:
-        raise InputError(f"row refers to sample {high} of {count}; expected indices below, or -1 for an empty cell")
+        raise InputError(f"{name} refers to sample {high} of {count}; expected indices below, or -1 for an empty cell")
     if low < -1:
-        raise InputError(f"row refers to sample {low}; expected indices of samples, or -1 for an empty cell")
+        raise InputError(f"{name} refers to sample {low}; expected indices of samples, or -1 for an empty cell")
+
+
+def check_settled(settled: Array, shape: tuple[int, ...], count: int) -> None:
+    """Raise an InputError where `Splats.settled` is not of a grid's shape, or names none of so many samples."""
+    if tuple(settled.shape) != tuple(shape):
+        raise InputError(f"settled has shape {tuple(settled.shape)}; expected {tuple(shape)}, as row says")
+    if not namespace(settled).isdtype(settled.dtype, "integral"):
+        raise InputError(f"settled is {settled.dtype}; expected integers: the sample whose colour a cell shows, or -1")
+    check_rows(settled, count, "settled")
 
 
 class Depths:

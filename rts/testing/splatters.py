@@ -19,6 +19,7 @@ from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating
 
 HEIGHT, WIDTH, LAYERS = 8, 9, 2
 CELLS = HEIGHT * WIDTH * LAYERS
+SEAM, LEFT, RIGHT = 5, (0.9, 0.3, 0.1, 1.0), (0.2, 0.4, 0.8, 1.0)
 TOLERANCE = 1e-5
 
 
@@ -115,6 +116,27 @@ class SplatterConformance(Conformance):
             along = np.random.default_rng(0).normal(size=splats.positions.shape).astype(np.float32)
             found, expected = (_along(engine, splatter, s, along) for s in (pruned, splats))
             claim_close(found, expected, 1e-4, "the derivative of needed samples")
+
+    def test_settled_cells_show_the_colors_that_they_name(self, splatter: Any) -> None:
+        """Settled cells show the colour of the sample that they name; what only they need may be missing."""
+        chosen = _instance(splatter)
+        if not chosen.settles:
+            pytest.skip("the splatter does not read which cells are settled")
+        splats, settled = two_colors()
+        loose = settled < 0
+        for _ in range(chosen.reach):
+            wide = np.pad(loose, 1)
+            near = [wide[v : v + HEIGHT, u : u + WIDTH] for v in range(3) for u in range(3)]
+            loose = np.logical_or.reduce(near)
+        row = np.where(loose, splats.row, -1).astype(np.int32)
+        known = splats.replace(row=row, settled=settled)
+        claim_close(_splat(splatter, known), _splat(splatter, splats), TOLERANCE, "the image of settled cells")
+        for engine in map(differentiating, DIFFERENTIABLE[:1]):
+            along = np.random.default_rng(0).normal(size=splats.positions.shape).astype(np.float32)
+            found, expected = (_along(engine, splatter, s, along) for s in (known, splats))
+            claim_close(found, expected, 1e-4, "the derivative of settled cells")
+            found, expected = (_gradients_of_colors(engine, splatter, s) for s in (known, splats))
+            claim_close(found, expected, 1e-4, "the gradients of the colours that settled cells show")
 
     def test_cells_of_the_border_only_splat(self, splatter: Any) -> None:
         """`cropped` gives the image of all cells, without the border."""
@@ -224,6 +246,20 @@ def steps() -> Splats:
     return Splats(positions, rgba, row)
 
 
+def two_colors() -> tuple[Splats, np.ndarray]:
+    """Opaque samples on centres, of one colour on the left and of another, and `Splats.settled` amid either."""
+    splats, settled = everywhere(1), np.full((HEIGHT, WIDTH), -1, np.int32)
+    rgba = np.where(_on_the_left(splats)[:, None], LEFT, RIGHT).astype(np.float32)
+    settled[1:-1, 1 : SEAM - 1] = splats.row[0, 0, SEAM - 1]
+    settled[1:-1, SEAM + 1 : -1] = splats.row[0, -1, SEAM]
+    return splats.replace(rgba=rgba), settled
+
+
+def _on_the_left(splats: Splats) -> np.ndarray:
+    """Which samples (N,) of `two_colors` have the colour on the left."""
+    return splats.positions[:, 0] < SEAM
+
+
 def square() -> Splats:
     """A white square of one layer, from cell (2, 3) to (4, 5)."""
     splats = everywhere(LAYERS)
@@ -257,6 +293,16 @@ def _of_positions_and_colors(splatter: Any, row: np.ndarray) -> Callable[[list],
 
 def _along(engine: Any, splatter: Any, splats: Splats, along: np.ndarray) -> np.ndarray:
     """The image's derivative when positions move along a direction."""
-    rgba, row = derivatives.on(engine, (splats.rgba, splats.row))
-    at, d = derivatives.on(engine, ([splats.positions], [along]))
-    return engine.to_numpy(engine.jvp(lambda x: _instance(splatter).cropped(Splats(x[0], rgba, row)), at, d)[1])
+    given, d = derivatives.on(engine, (splats, [along]))
+    image = _instance(splatter).cropped
+    return engine.to_numpy(engine.jvp(lambda x: image(given.replace(positions=x[0])), [given.positions], d)[1])
+
+
+def _gradients_of_colors(engine: Any, splatter: Any, splats: Splats) -> np.ndarray:
+    """(2, 4) the gradients of a sum over the image in the two colours of `two_colors`."""
+    weights, left = np.random.default_rng(0).standard_normal((HEIGHT, WIDTH, 4)), _on_the_left(splats)
+    given, w = derivatives.on(engine, (splats, weights))
+    image, xp = _instance(splatter).cropped, engine.namespace
+    _, found = engine.value_and_grad(lambda x: xp.sum(image(given.replace(rgba=x[0])) * w))([given.rgba])
+    (gradient,) = derivatives.host(engine, found)
+    return np.stack([gradient[left].sum(axis=0), gradient[~left].sum(axis=0)])

@@ -16,7 +16,7 @@ import numpy as np
 from rts.errors import InputError
 from rts.splatting import rims
 from rts.splatting.kernel import LEAST_EPSILON
-from rts.splatting.layers import OFFSETS, check_rows
+from rts.splatting.layers import OFFSETS, check_rows, check_settled
 from rts.splatting.visible import CONTINUED
 from rts.threads import parallel, read_only
 from rts_backends.fused import choices as listing
@@ -24,7 +24,7 @@ from rts_backends.fused import crossing_pairs, crossings, mixed, outlines, stenc
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
 from rts_backends.fused.pairs import BLOCK
-from rts_backends.fused.survey import EMPTY, collect, paint, survey
+from rts_backends.fused.survey import EMPTY, collect, note, paint, survey
 
 
 class Settings(NamedTuple):
@@ -86,7 +86,8 @@ class Cells:
         part: (K, H, W) integers, the part of each sample; None, or no layers, where that is not known.
         facing: (K, H, W) integers, which piece shows which side; None, or no layers, where that is not told.
         wanted: (H, W) bool, the targets to fill, others may be anything; None, or no rows, for all.
-        settled: (H, W) bool, targets that show the colour of all samples, whatever moves; None, or no rows, for none.
+        settled: (H, W) integers, targets that show the colour of a sample, whatever moves, or −1; None, or no rows, for
+            none.
         exits: (H, W) integers, the sample where the ray leaves the part of the front, or −1; None, or no rows, where
             that is not told.
 
@@ -116,16 +117,18 @@ class Cells:
             if exits is not None:
                 check_rows(exits, len(positions))
             _check_grids(shape, part=part, facing=facing)
-            _check_grids(shape[1:], exit=exits, wanted=wanted, settled=settled)
+            _check_grids(shape[1:], exit=exits, wanted=wanted)
+            if settled is not None and len(settled):
+                check_settled(settled, shape[1:], len(positions))
         self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
         self.exits = read_only(np.empty((0, row.shape[2])) if exits is None else exits, np.int32)
         self.facing = read_only(self.row[:0] if facing is None else facing, np.int16)
-        self.settled = read_only(np.empty((0, row.shape[2])) if settled is None else settled, np.bool_)
+        self._settled = np.empty((0, row.shape[2]), np.int8) if settled is None else np.asarray(settled)
         self._wanted = None if wanted is None or not len(wanted) else np.asarray(wanted, np.uint8)
-        if self._wanted is not None and len(self.settled):
+        if self._wanted is not None and len(self._settled):
             # Beside settled targets those that nobody looks at may lack their samples, and seem to end there.
-            self._wanted = self._wanted & ~self.settled
+            self._wanted = self._wanted & (self._settled < 0)
         self.visible, self.border = settings.kind == "visible", settings.border
         self.rims = self.visible and settings.rims
         self.crosses = self.visible and settings.crossings
@@ -133,6 +136,20 @@ class Cells:
         self._reach = positions.dtype.type(_reach(settings))
         if choices is not None:
             self.choices = choices
+
+    @property
+    def settled(self) -> np.ndarray:
+        """(H, W) int32, the sample whose colour a target shows, whatever moves, or −1; no rows for none."""
+        return read_only(self._settled, np.int32)
+
+    @property
+    def _shows_several(self) -> bool:
+        """Whether settled targets show the colours of other samples than that of row 0."""
+        return self._settled.max(initial=-1) > 0
+
+    def _paint(self, colors: np.ndarray, images: np.ndarray) -> None:
+        """Give settled targets of images (T, H, W, 4) the colours (T, N, 4) of samples; zeros of none."""
+        parallel(paint, images.shape[1], self.settled, self.border, read_only(colors), images, work=images.size // 8)
 
     @property
     def plain_arguments(self) -> tuple:
@@ -165,7 +182,8 @@ class Cells:
         layers, height, width = self.row.shape
         count, kind = len(self.positions), self.positions.dtype
         # The codes of targets that are not settled, and that are.
-        states = self.settled.astype(np.uint8) if len(self.settled) else np.zeros((height, width), np.uint8)
+        amid = self._settled >= 0
+        states = amid.astype(np.uint8) if len(amid) else np.zeros((height, width), np.uint8)
         hidden, seen = np.zeros((height, -(-width // BLOCK)), np.uint8), np.zeros(count, np.uint8)
         counts = np.zeros(height, np.int64)
         depths = np.zeros((height, 2), kind)
@@ -178,7 +196,7 @@ class Cells:
         seen[leaves] = 1
         repeated = int(np.count_nonzero(seen)) != int(counts.sum()) + len(leaves)
         if self._wanted is not None:
-            states *= self._wanted | self.settled if len(self.settled) else self._wanted
+            states *= self._wanted | amid if len(amid) else self._wanted
         least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
         # See `rts.splatting.layers`: nothing is nearer to what is beyond everything than to a front.
         extent = largest - least
@@ -190,8 +208,8 @@ class Cells:
         if layers > 1 and self._wanted is not None:
             found, marks = marks, np.empty_like(marks)
             parallel(listing.narrow, height, found, self._wanted, marks, marked, work=self.row[0].size)
-        if len(self.settled) and not self.visible:
-            marks &= ~self.settled
+        if len(amid) and not self.visible:
+            marks &= ~amid
             marked = marks.sum(axis=1, dtype=np.int64)
         offsets = np.concatenate([[0], np.cumsum(marked)])
         columns = np.empty(offsets[-1], np.int32)
@@ -265,16 +283,24 @@ class Cells:
             parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
             if len(self.choices.columns):
                 parallel(mixed.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10)
+            if self._shows_several:  # What has no sample of its own shows that of row 0 so far.
+                self._paint(self.rgba[None], out[None])
 
     def vjp(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
         """Fill the gradients of positions (N, 3) and rgba (N, 4), zeros or None, from the image's (H, W, 4)."""
         if not self.row.size:
             return
         self._pull(g, g_positions, g_rgba)
-        if len(self.settled) and g_rgba is not None:
-            sums = np.zeros((len(g), 4), g.dtype)
-            parallel(collect, len(g), self.settled, self.border, read_only(g), sums, work=g.size // 4)
-            g_rgba[0] += sums.sum(axis=0)
+        if len(self._settled) and g_rgba is not None:
+            settled, noted, number = self.settled, np.zeros(len(g_rgba), bool), np.zeros(len(g_rgba), np.int32)
+            noted[0] = True
+            if self._shows_several:
+                parallel(note, len(settled), settled, noted, work=settled.size // 8)
+            shown = np.flatnonzero(noted)
+            number[shown] = np.arange(len(shown))
+            sums = np.zeros((len(g), len(shown), 4), g.dtype)
+            parallel(collect, len(g), settled, number, self.border, read_only(g), sums, work=g.size // 4)
+            g_rgba[shown] += sums.sum(axis=0)
 
     def _pull(self, g: np.ndarray, g_positions: np.ndarray | None, g_rgba: np.ndarray | None) -> None:
         """`vjp` of the targets that are not settled."""
@@ -333,9 +359,8 @@ class Cells:
             arrays = self.positions, self.rgba, self.row, *self._numbers
             given = *arrays, self.choices.ranges, self.choices.sums, self.crossings, *tangents, self.border
             parallel(crossings.push, out.shape[1], *given, out, work=80 * count * len(out))
-        if len(self.settled):
-            colors = np.zeros((len(out), 4), out.dtype) if t_rgba is None else t_rgba[:, 0]
-            parallel(paint, out.shape[1], self.settled, self.border, read_only(colors), out, work=out.size // 8)
+        if len(self._settled):
+            self._paint(tangents[1], out)
 
     def _vjp_of_repeated(self, g: np.ndarray, *results: np.ndarray | None) -> None:
         """`vjp` with a copy of the sample for each cell, whose gradients are then added in the order of the cells."""

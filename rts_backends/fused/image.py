@@ -74,7 +74,12 @@ def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings,
 
 def used(operands: Arrays) -> int:
     """How many rows cells refer to."""
-    return max(1, int(operands[2].max(initial=0)) + 1, int(operands[7].max(initial=0)) + 1)
+    return rows_of(operands[2], *operands[6:8])
+
+
+def rows_of(*cells: np.ndarray | None) -> int:
+    """How many rows of samples there are at least, at least one, where cells name samples."""
+    return 1 + max(int(x.max(initial=0)) for x in cells if x is not None)
 
 
 _OPTIONS: dict[str, Any] = {"differentiable": 2, "packed": (0, 1), "used": used, "even": (1,)}

@@ -22,6 +22,7 @@ from rts.threads import parallel, read_only
 from rts.trees import Array
 from rts_backends.fused.cells import Cells, Settings
 from rts_backends.fused.crossings import change_of
+from rts_backends.fused.image import rows_of
 from rts_backends.fused.losses import LINEAR, cost_and_weight, curvature, in_numbers
 from rts_backends.fused.mixed import changes_of, composited
 from rts_backends.fused.outlines import gain
@@ -77,11 +78,9 @@ def equations(settings: Settings, engine: Engine, loss: Loss, *given: Any) -> tu
         it = iter(arrays)
         whole: list[Any] = [next(it) if there else None for there in present]
         positions, rgba, row, *known = whole[:8]
-        rest, exits = whole[8:], known[-1]
-        used = int(row.max(initial=0)) if exits is None else int(max(row.max(initial=0), exits.max(initial=0)))
-        used += 1  # Under `jit` many more rows may be allotted.
+        used = rows_of(row, *known[3:])  # Under `jit` many more rows may be allotted.
         cells = Cells(settings, positions[:used], rgba[:used], row, None, *known)
-        return tuple(np.asarray(x, kind) for x in normal_equations(cells, *rest, loss=loss))
+        return tuple(np.asarray(x, kind) for x in normal_equations(cells, *whole[8:], loss=loss))
 
     count = t_positions.shape[0]
     specs = ArraySpec((), kind), ArraySpec((count, count), kind), ArraySpec((count,), kind)
@@ -289,17 +288,18 @@ def _settle(change, value, rgba, t_rgba, settled, moving):
     """Values and tangents of the settled targets of a row of a tile; whether any of these changes."""
     some, colored = False, t_rgba.shape[1] > 0
     for j in range(len(settled)):
-        some |= settled[j]
+        some |= settled[j] >= 0
     if not some:
         return False
     if colored and not moving:
         change[:] = change.dtype.type(0)
     for j in range(len(settled)):
-        if settled[j]:
+        i = settled[j]
+        if i >= 0:
             for c in range(4):
-                value[c * PITCH + j] = rgba[0, c]
+                value[c * PITCH + j] = rgba[i, c]
                 for n in range(len(change) if colored or moving else 0):
-                    change[n, c * PITCH + j] = t_rgba[n, 0, c] if colored else change.dtype.type(0)
+                    change[n, c * PITCH + j] = t_rgba[n, i, c] if colored else change.dtype.type(0)
     return colored
 
 

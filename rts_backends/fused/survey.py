@@ -8,8 +8,8 @@ from rts.compiling import compiled, kernel
 from rts_backends.fused.pairs import BLOCK, mark
 
 EMPTY, SETTLED, FLAT, BUSY = 0, 1, 2, 3
-"""Targets that no splat reaches, that are told to show the colour of all, that are amid splats of one colour, and all
-others."""
+"""Targets that no splat reaches, that are told to show the colour of a sample, that are amid splats of one colour, and
+all others."""
 
 
 @kernel
@@ -158,22 +158,58 @@ def _decide(states, covered0, covered1, covered2, calm0, calm1, calm2, joins1, j
 
 @kernel
 def paint(start, stop, settled, border, colors, images):
-    """Give settled targets of rows [start, stop) of images (T, H, W, 4), which have no border, their colours (T, 4)."""
+    """Give settled targets of rows [start, stop) of images (T, H, W, 4), which have no border, colours (T, N, 4).
+
+    They are zero where there are none.
+    """
+    zero, some = images.dtype.type(0), colors.shape[1] > 0
     for n in range(len(images)):
-        red, green, blue, alpha = colors[n, 0], colors[n, 1], colors[n, 2], colors[n, 3]
         for y in range(start, stop):
             image = images[n, y]
             cells = settled[y + border, border : border + len(image)]
             for x in range(len(image)):
-                if cells[x]:
-                    image[x, 0], image[x, 1], image[x, 2], image[x, 3] = red, green, blue, alpha
+                i = cells[x]
+                if i >= 0:
+                    for c in range(4):
+                        image[x, c] = colors[n, i, c] if some else zero
 
 
 @kernel
-def collect(start, stop, settled, border, g, sums):
-    """Sums (H, 4) of the gradient (H, W, 4) of an image without a border at settled targets of rows [start, stop)."""
+def note(start, stop, settled, shown):
+    """Mark the samples (N,) bool whose colours settled targets of rows [start, stop) show."""
+    last = -1
     for y in range(start, stop):
-        for x in range(g.shape[1]):
-            if settled[y + border, x + border]:
-                for c in range(4):
-                    sums[y, c] += g[y, x, c]
+        for x in range(settled.shape[1]):
+            if settled[y, x] != last:
+                last = settled[y, x]
+                if last >= 0:
+                    shown[last] = True
+
+
+@kernel
+def collect(start, stop, settled, number, border, g, sums):
+    """Sums (H, S, 4) of the gradient (H, W, 4) of an image without a border at settled targets of rows [start, stop).
+
+    Those of the samples whose colours are shown, which have numbers (N,).
+    """
+    width = g.shape[1]
+    for y in range(start, stop):
+        end = 0
+        while end < width:
+            first, i = end, settled[y + border, end + border]
+            while end < width and settled[y + border, end + border] == i:
+                end += 1
+            if i >= 0:
+                _add(sums[y, number[i]], g[y, first:end])
+
+
+@compiled(fastmath={"contract", "reassoc"})
+def _add(to, g):
+    """Add the sums of (n, 4), in an order that suits vector instructions."""
+    a, b, c, d = to[0], to[1], to[2], to[3]
+    for x in range(len(g)):
+        a += g[x, 0]
+        b += g[x, 1]
+        c += g[x, 2]
+        d += g[x, 3]
+    to[0], to[1], to[2], to[3] = a, b, c, d

@@ -1,0 +1,75 @@
+"""Samples that are left out, and the numbers of those that stay, compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from rts.compiling import kernel
+from rts.threads import parallel, read_only
+
+
+class Numbering:
+    """New numbers for those rows of samples of several parts that are used.
+
+    Args:
+        sizes: how many rows each part has.
+    """
+
+    def __init__(self, sizes: list[int]):
+        self._firsts = np.cumsum([0, *sizes])
+        self._used = np.zeros(self._firsts[-1], bool)
+        self._numbers, self._index = (np.empty(self._firsts[-1], np.int32) for _ in range(2))
+
+    def use(self, row: np.ndarray, kept: np.ndarray) -> None:
+        """Use the rows that cells (K, H, W) name, counted over all parts, where these are kept; −1 names none."""
+        row, kept = (read_only(x, kind).reshape(-1, x.shape[-1]) for x, kind in ((row, np.int32), (kept, bool)))
+        parallel(_mark, len(row), row, kept, self._used, work=row.size)
+
+    def indices(self) -> list[np.ndarray]:
+        """The rows of each part that are used, int32, in their order, so that neighbours stay neighbours in memory."""
+        counts = np.zeros(len(self._firsts) - 1, np.int64)
+        parallel(
+            _number, len(counts), self._used, self._firsts, self._numbers, self._index, counts, work=len(self._used)
+        )
+        return [self._index[first : first + n] for first, n in zip(self._firsts, counts, strict=False)]
+
+    def renumbered(self, row: np.ndarray, part: int | None = None) -> np.ndarray:
+        """Cells (…, W) with the new number of each row within its part, −1 where it is not used; after `indices`.
+
+        Args:
+            row: rows counted over all parts, or of one part; −1 for none.
+            part: whose rows they are; None for those of all.
+        """
+        given = read_only(row, np.int32).reshape(-1, row.shape[-1])
+        found, first = np.empty(given.shape, np.int32), self._firsts[part or 0]
+        parallel(_renumber, len(given), given, self._numbers[first:], found, work=given.size)
+        return found.reshape(row.shape)
+
+
+@kernel
+def _mark(start, stop, row, kept, used):
+    for y in range(start, stop):
+        for x in range(row.shape[1]):
+            if kept[y, x] and row[y, x] >= 0:
+                used[row[y, x]] = True
+
+
+@kernel
+def _number(start, stop, used, firsts, numbers, index, counts):
+    """Number the rows of parts [start, stop)."""
+    for part in range(start, stop):
+        first, count = firsts[part], 0
+        for i in range(first, firsts[part + 1]):
+            numbers[i] = -1
+            if used[i]:
+                numbers[i], index[first + count] = count, i - first
+                count += 1
+        counts[part] = count
+
+
+@kernel
+def _renumber(start, stop, row, numbers, found):
+    for y in range(start, stop):
+        for x in range(row.shape[1]):
+            i = row[y, x]
+            found[y, x] = numbers[i] if i >= 0 else -1
