@@ -149,7 +149,7 @@ class Fine:
         shift: (M, 3) float32, from pixel positions in the grid of fine cells to those in the layout.
         row: (K, h, w) int32, the splat in each place of the layout, or −1.
         part: (K, h, w) int32, the part seen there, or −1.
-        kinds: (h, w) uint8, bit 0 at the cells of active pixels, bit 1 within two cells of them.
+        wanted: (h, w) bool, the cells of active pixels.
         pixel: (H, W) int32, for each pixel of the image which pixel of the layout it is, counted along its lines
             without the apron; −1 where it is not active.
         coarse: (h', w') bool, the cells of the coarse grid, with its apron, whose pixels are not active.
@@ -167,7 +167,7 @@ class Fine:
     shift: Array
     row: Array
     part: Array
-    kinds: Array
+    wanted: Array
     pixel: Array
     coarse: Array
     overflow: Array
@@ -176,11 +176,6 @@ class Fine:
     facing: Array | None = None
     settled: Array | None = None
     flat: bool = False
-
-    @property
-    def wanted(self) -> Array:
-        """(h, w) bool, the cells of active pixels."""
-        return (self.kinds & 1) > 0
 
 
 @record(static=("supersample", "apron", "colors"))

@@ -27,7 +27,7 @@ from rts.engines import (
 from rts.errors import EmptyImageWarning, InputError, warn
 from rts.evaluating import to_fine_splats, to_splats
 from rts.interfaces import Splatter
-from rts.operations.inset import averaged, with_inset
+from rts.operations.inset import averaged, painted_inset, with_inset
 from rts.parts import Part
 from rts.records import Sampled, Splats
 from rts.sampling.adaptive import Adaptive, finest
@@ -310,21 +310,12 @@ def splatted(
         image = cropped_image(splatter, splats)
         return image if sampled.supersample == 1 else averaged(image, sampled.supersample)
     finer = to_fine_splats(fine, scene.parts, scene.camera, *suited)
+    small = cropped_image(splatter, finer)
     if splats is None:
-        image = _painted(sampled, finer.rgba[0, ...])
-    else:
-        image = cropped_image(splatter, splats.replace(wanted=constants(fine.coarse, *suiting(splats.rgba))))
-    finer = cropped_image(splatter, finer)
-    return with_inset(image, finer, constants(fine.pixel, engine_of(image), image), fine.supersample)
-
-
-def _painted(sampled: Sampled, color: Array) -> Array:
-    """The image (H, W, C) of cells that show a colour (C,) where anything is."""
-    rows, columns = (slice(sampled.apron, n - sampled.apron) for n in sampled.row.shape[1:])
-    assert sampled.settled is not None
-    covered = (sampled.row[0, rows, columns] >= 0) | (sampled.settled[rows, columns] >= 0)
-    there = constants(covered, *suiting(color))[..., None]
-    return namespace(color).astype(there, color.dtype) * color
+        told = constants((fine.pixel, sampled.row[0], sampled.settled), engine_of(small), small)
+        return painted_inset(finer.rgba[0, ...], small, *told, fine.supersample)
+    image = cropped_image(splatter, splats.replace(wanted=constants(fine.coarse, *suiting(splats.rgba))))
+    return with_inset(image, small, constants(fine.pixel, engine_of(image), image), fine.supersample)
 
 
 def bands_of(

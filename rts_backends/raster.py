@@ -26,7 +26,7 @@ from rts.sampling.triangle_sampler import TriangleSampler
 from rts.threads import parallel, read_only
 from rts_backends.raster_cells import EVERYTHING, Blocks, touching
 from rts_backends.raster_clusters import BACKS, FRONTS, SIZE, Clusters
-from rts_backends.raster_drawing import BAND_ROWS, LISTED, draw, draw_cells
+from rts_backends.raster_drawing import BAND_ROWS, LISTED, clear, draw, draw_cells
 from rts_backends.triangles import facing, pixel_matrix, to_corner
 
 LONG_BLOCK = SIZE
@@ -219,20 +219,26 @@ class _Seen:
     def draw(self, listed: _List, layers: int) -> Fragments:
         """Fragments (layers, H, W)."""
         fragments = _empty((layers, *self.size))
-        given = self.vertices, self.matrix, self.depth_row, EVERYTHING.bits
-        parallel(draw, len(listed.turns), listed, *given, tuple(fragments))
+        given = self.vertices, self.matrix, self.depth_row, tuple(EVERYTHING), self.size
+        parallel(draw, len(listed.turns), listed, *given, _flat(fragments))
         return fragments
 
     def draw_cells(self, listed: _List, layers: int, cells: np.ndarray, blocks: Blocks) -> Fragments:
         """Fragments (layers, L, C) of some cells, which the blocks are of."""
         fragments = _empty((layers, *cells.shape))
-        flat = tuple(x.reshape(layers, cells.size, *x.shape[3:]) for x in fragments)
-        absent = np.flatnonzero(cells.reshape(-1) < 0)
-        for x, nothing in zip(flat, (-1, 0, 0), strict=True):
-            x[:, absent] = nothing
-        given = self.vertices, self.matrix, self.depth_row, blocks.bits, blocks.table, blocks.numbers
-        parallel(draw_cells, len(listed.turns), listed, *given, flat)
+        flat, nearest = _flat(fragments), np.empty((layers, cells.size))
+        parallel(clear, cells.size, nearest, flat, False, work=nearest.size)
+        given = self.vertices, self.matrix, self.depth_row, tuple(blocks), self.asked is EVERYTHING
+        parallel(draw_cells, len(listed.turns), listed, *given, nearest, flat)
+        parallel(clear, cells.size, nearest, flat, True, work=nearest.size // 8)
         return fragments
+
+
+def _flat(fragments: Fragments) -> tuple[np.ndarray, ...]:
+    """Arrays (K, M), and (K, M, 2), of all cells."""
+    triangle_ids, barycentrics, depth = fragments
+    layers, count = len(depth), depth[0].size
+    return triangle_ids.reshape(layers, count), barycentrics.reshape(layers, count, 2), depth.reshape(layers, count)
 
 
 def _empty(shape: tuple[int, ...]) -> Fragments:

@@ -57,28 +57,48 @@ def _fill(cells, width, table, numbers, bits):
 
     With it comes the place of a cell that is not in the grid or there twice, at which it stops, or −1.
     """
-    count, last, y, x, side, size = 0, -2, 0, 0, np.uint32(SIDE), len(bits) * width
-    for m in range(len(cells)):
+    count, m, side, size = 0, 0, np.uint32(SIDE), len(bits) * width
+    while m < len(cells):
         cell = cells[m]
         if cell < 0:
+            m += 1
             continue
         if cell >= size:
             return count, m
-        x += 1
-        if cell != last + 1 or x == width:  # Most follow on each other.
-            y, x = cell // width, cell % width
-        last = cell
-        v, u = np.uint32(y), np.uint32(x)
-        if table[v // side, u // side] < 0:
-            table[v // side, u // side] = count
+        # Most follow on each other: as many at once as do so in a line of a block.
+        y, x = np.uint32(cell) // np.uint32(width), np.uint32(cell) % np.uint32(width)
+        first = np.int64(x % side)
+        some = _following(cells[m : m + min(SIDE - first, width - np.int64(x))], cell)
+        if table[y // side, x // side] < 0:
+            table[y // side, x // side] = count
             numbers[count] = -1
             count += 1
-        number = np.uint32(table[v // side, u // side])
-        if numbers[number, v % side, u % side] >= 0:
+        own = numbers[table[y // side, x // side], y % side]
+        asked = ((1 << some) - 1) << first
+        twice = np.int64(bits[y, x // side]) & asked
+        if twice:
+            while not twice >> first & 1:
+                first, m = first + 1, m + 1
             return count, m
-        numbers[number, v % side, u % side] = m
-        bits[v, u // side] |= np.uint16(1 << u % side)
+        bits[y, x // side] |= np.uint16(asked)
+        for n in range(some):
+            own[first + n] = m + n
+        m += some
     return count, -1
+
+
+@compiled
+def _following(cells, first):
+    """How many cells follow on each other from the first one on."""
+    same = True
+    for n in range(len(cells)):
+        same &= cells[n] == first + n
+    if same:
+        return len(cells)
+    some = 1
+    while cells[some] == first + some:
+        some += 1
+    return some
 
 
 @compiled

@@ -24,88 +24,83 @@ NUMBERS = 18
 
 
 @kernel(error_model="numpy")
-def draw(first, last, listed, vertices, matrix, view_depth, bits, fragments):
-    """Fill the three fragment arrays, band by band.
+def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragments):
+    """Fill the three fragment arrays (K, H · W), band by band.
 
     `listed` is the sign of determinants to draw, the order of bands, where the items of each begin, these, and what is
-    known of each triangle; `bits` are those of `Blocks` for all cells.
+    known of each triangle; `asked` are the arrays of `Blocks` for all cells, and `size` is (H, W).
     """
     triangle_ids, barycentrics, depths = fragments
-    layers, height, width = triangle_ids.shape
-    nearest = np.empty((layers, BAND_ROWS, width))
+    layers, (height, width), (table, numbers, bits) = len(triangle_ids), size, asked
+    nearest = np.empty((layers, BAND_ROWS * width))
     keep, turns, offsets, items, rows = listed
-    given = rows, vertices, matrix, view_depth, keep, bits
+    given = rows, vertices, matrix, view_depth, keep
     for band in turns[first:last]:
         top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
-        nearest[:], triangle_ids[:, top:end], barycentrics[:, top:end] = np.inf, -1, 0
-        _draw(items[offsets[band] : offsets[band + 1]], given, top, end, top, nearest, triangle_ids, barycentrics)
+        start, stop = top * width, end * width
+        nearest[:], triangle_ids[:, start:stop], barycentrics[:, start:stop] = np.inf, -1, 0
+        here, layered = items[offsets[band] : offsets[band + 1]], (start, nearest, triangle_ids, barycentrics)
+        _draw(here, given, top, end, width, (table, numbers, bits), layered)
         for k in range(layers):
-            for j in range(top, end):
-                for i in range(width):
-                    z = nearest[k, j - top, i]
-                    depths[k, j, i] = z if z < np.inf else 0.0
+            _depths(depths[k, start:stop], nearest[k])
 
 
 @kernel(error_model="numpy")
-def draw_cells(first, last, listed, vertices, matrix, view_depth, bits, table, numbers, fragments):
-    """As `draw`, of some cells: arrays (K, M) are of their list; `bits`, `table` and `numbers` are those of `Blocks`.
+def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows, nearest, fragments):
+    """As `draw`, of some cells: arrays (K, M), which `clear` has emptied, are of their list; depths are left to it.
 
-    Each band is drawn as a picture, of which only what is near such cells is touched.
+    `asked` are the arrays of `Blocks`. Where it `narrows`, triangles may touch none of these cells.
     """
-    triangle_ids, barycentrics, depths = fragments
-    layers, height, width = len(triangle_ids), len(bits), table.shape[1] * BAND_ROWS
-    nearest, drawn = np.empty((layers, BAND_ROWS, width)), np.empty((layers, BAND_ROWS, width), np.int32)
-    within = np.empty((layers, BAND_ROWS, width, 2), np.float32)
+    triangle_ids, barycentrics, _ = fragments
+    table, numbers, bits = asked
     keep, turns, offsets, items, rows = listed
-    given = rows, vertices, matrix, view_depth, keep, bits
+    given, layered = (rows, vertices, matrix, view_depth, keep), (0, nearest, triangle_ids, barycentrics)
+    height, width = len(bits), table.shape[1] * BAND_ROWS
     for band in turns[first:last]:
         top, end = band * BAND_ROWS, min(height, (band + 1) * BAND_ROWS)
-        for j in range(top, end):
-            for column in range(table.shape[1]):
-                if bits[j, column] != 0:
-                    _clear(column * BAND_ROWS, nearest[:, j - top], drawn[:, j - top], within[:, j - top])
         here = items[offsets[band] : offsets[band + 1]]
-        here = here[: touching(here, rows[:, 4:].T, top, end, bits)]
-        _draw(here, given, top, end, 0, nearest, drawn, within)
-        for j in range(top, end):
-            for column in range(table.shape[1]):
-                if bits[j, column] == 0:
-                    continue
-                for u in range(BAND_ROWS):
-                    m, i = numbers[table[band, column], j - top, u], column * BAND_ROWS + u
-                    if m < 0:
-                        continue
-                    for k in range(layers):
-                        z = nearest[k, j - top, i]
-                        triangle_ids[k, m], depths[k, m] = drawn[k, j - top, i], z if z < np.inf else 0.0
-                        barycentrics[k, m, 0] = within[k, j - top, i, 0]
-                        barycentrics[k, m, 1] = within[k, j - top, i, 1]
+        if narrows:
+            here = here[: touching(here, rows[:, 4:].T, top, end, bits)]
+        _draw(here, given, top, end, width, (table[band : band + 1], numbers, bits), layered)
+
+
+@kernel
+def clear(start, stop, nearest, fragments, drawn):
+    """Empty the layers of cells [start, stop) of arrays (K, M), or, once they are drawn, fill in the depths."""
+    triangle_ids, barycentrics, depths = fragments
+    infinity = nearest.dtype.type(np.inf)
+    for k in range(len(nearest)):
+        if drawn:
+            _depths(depths[k, start:stop], nearest[k, start:stop])
+            continue
+        for m in range(start, stop):
+            nearest[k, m], triangle_ids[k, m] = infinity, -1
+        for m in range(start, stop):
+            barycentrics[k, m, 0] = barycentrics[k, m, 1] = np.float32(0)
 
 
 @compiled
-def _clear(first, nearest, triangle_ids, barycentrics):
-    """Empty the layers (K, W) of as many cells of a row as a block has."""
-    for k in range(len(nearest)):
-        for i in range(first, first + BAND_ROWS):
-            nearest[k, i], triangle_ids[k, i] = np.inf, -1
-            barycentrics[k, i, 0] = barycentrics[k, i, 1] = np.float32(0)
+def _depths(depths, nearest):
+    """Fill in the depths of cells, 0 where they are empty."""
+    for i in range(len(depths)):
+        depths[i] = nearest[i] if nearest[i] < np.inf else 0.0
 
 
 @compiled(error_model="numpy")
-def _draw(items, given, top, end, shift, nearest, triangle_ids, barycentrics):
-    """Insert the triangles of a band of rows from `top` to the one before `end` into layers of pixels.
+def _draw(items, given, top, end, width, asked, layered):
+    """Insert the triangles of a band of rows from `top` to the one before `end`, `width` wide, into layers of cells.
 
-    Arrays (K, ·, ·) begin with row `shift` of the band's; `nearest` with its first.
+    Of `layered` arrays (K, M, ·) the first begins with the cell whose number comes before all.
     """
-    rows, vertices, matrix, view_depth, keep, bits = given
+    rows, vertices, matrix, view_depth, keep = given
     entries, points = np.empty((LISTED, BLOCK), np.int32), np.empty((3, 3, BLOCK), np.float32)
     numbers, clips, covers = np.empty((NUMBERS, BLOCK)), np.empty(BLOCK, np.bool_), np.empty(BLOCK, np.int32)
     most = 4 * BLOCK
     # What is left from a row, four of each small triangle, and one more row.
-    room = 2 * most + nearest.shape[2]
-    hits, sure = np.empty((room, 2), np.int32), np.empty(room, np.bool_)
-    met = sure, np.empty(room), np.empty((2, room), np.float32)
-    drawn = top, shift, entries, numbers, clips, nearest, triangle_ids, barycentrics
+    room = 2 * most + width
+    hits, cells, sure = np.empty((room, 2), np.int32), np.empty(room, np.uint32), np.empty(room, np.bool_)
+    met = cells, sure, np.empty(room), np.empty((2, room), np.float32)
+    drawn = top, np.uint32(0 if len(asked[0]) > 0 else width), entries, numbers, clips
     for start in range(0, len(items), BLOCK):
         block = items[start : start + BLOCK]
         _gather(block, rows, vertices, entries, points)
@@ -131,21 +126,24 @@ def _draw(items, given, top, end, shift, nearest, triangle_ids, barycentrics):
                     found += (ea >= 0) & (eb >= 0) & (ec >= 0)
                 place += 1
                 if found > most - 4:
-                    _insert(hits[: _asked(hits, found, top, bits)], met, drawn)
+                    _insert(hits[: _asked(hits, found, top, asked, cells)], met, drawn, layered)
                     found = 0
-        _insert(hits[: _asked(hits, found, top, bits)], met, drawn)
+        _insert(hits[: _asked(hits, found, top, asked, cells)], met, drawn, layered)
 
 
 @compiled
-def _asked(hits, found, top, bits):
-    """Leave out hits (n, 2) in cells that are not asked for; how many are left."""
+def _asked(hits, found, top, asked, cells):
+    """Leave out hits (n, 2) in cells that are not asked for, and number the others if some are; how many are left."""
+    table, numbers, bits = asked
+    side, top = np.uint32(BAND_ROWS), np.uint32(top)
     if len(bits) == 0:
         return found
-    kept, side = 0, np.uint32(BAND_ROWS)
+    kept = 0
     for h in range(found):
         place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
-        hits[kept, 0], hits[kept, 1] = place, i
-        kept += (bits[np.uint32(top) + place % side, i // side] >> (i % side)) & 1
+        row, block = place % side, np.uint32(max(table[0, i // side], 0))
+        hits[kept, 0], hits[kept, 1], cells[kept] = place, i, numbers[block, row, i % side]
+        kept += (bits[top + row, i // side] >> (i % side)) & 1
     return kept
 
 
@@ -221,18 +219,19 @@ def _cover(count, entries, numbers, covers):
 
 
 @compiled(error_model="numpy")
-def _insert(hits, met, drawn):
-    """Insert the block's triangles into the layers of pixels; hits (n, 2) are triangle and row of the band, column."""
-    top, shift, entries, numbers, clips, nearest, triangle_ids, barycentrics = drawn
-    sure, depths, within = met
+def _insert(hits, met, drawn, layered):
+    """Insert the block's triangles into the layers of cells; hits (n, 2) are triangle and row of the band, column."""
+    top, width, entries, numbers, clips = drawn
+    cells, sure, depths, within = met
+    first, nearest, triangle_ids, barycentrics = layered
     _meet(hits, np.uint32(top), numbers, clips, sure, depths, within)
     for h in range(len(hits)):
         place, i = np.uint32(hits[h, 0]), np.uint32(hits[h, 1])
         b, row = place // np.uint32(BAND_ROWS), place % np.uint32(BAND_ROWS)
-        j = row + np.uint32(shift)
         if sure[h] or _covers(b, i + 0.5, row + np.uint32(top) + 0.5, numbers, clips):
-            p, q = within[0, h], within[1, h]
-            _put(depths[h], entries[0, b], p, q, row, j, i, nearest, triangle_ids, barycentrics)
+            place = cells[h] if width == 0 else row * width + i
+            p, q, cell = within[0, h], within[1, h], place + np.uint32(first)
+            _put(depths[h], entries[0, b], p, q, place, cell, nearest, triangle_ids, barycentrics)
 
 
 @compiled(error_model="numpy")
@@ -266,17 +265,17 @@ def _covers(b, x, y, numbers, clips):
 
 
 @compiled(inline="always")
-def _put(z, t, p, q, row, j, i, nearest, triangle_ids, barycentrics):
-    """Put a hit into the layers of a cell, at its row of `nearest` and of the rest: behind what is as near."""
+def _put(z, t, p, q, place, cell, nearest, triangle_ids, barycentrics):
+    """Put a hit into the layers of a cell, at its place of `nearest` and of the rest: behind what is as near."""
     moved, own = z, t
     for k in range(len(nearest)):
-        old, old_t = nearest[k, row, i], triangle_ids[k, j, i]
-        old_p, old_q = barycentrics[k, j, i, 0], barycentrics[k, j, i, 1]
+        old, old_t = nearest[k, place], triangle_ids[k, cell]
+        old_p, old_q = barycentrics[k, cell, 0], barycentrics[k, cell, 1]
         before = z < old  # A branch would be foreseen every other time.
         if z == old:  # Of clusters triangles come in another order than that of their indices.
             before = own < old_t
-        nearest[k, row, i], triangle_ids[k, j, i] = moved if before else old, t if before else old_t
-        barycentrics[k, j, i, 0], barycentrics[k, j, i, 1] = p if before else old_p, q if before else old_q
+        nearest[k, place], triangle_ids[k, cell] = moved if before else old, t if before else old_t
+        barycentrics[k, cell, 0], barycentrics[k, cell, 1] = p if before else old_p, q if before else old_q
         moved, t = old if before else moved, old_t if before else t
         p, q = old_p if before else p, old_q if before else q
 

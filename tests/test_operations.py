@@ -6,7 +6,7 @@ from helpers import ALL, DIFFERENTIABLE, arrays, derivative, finite_difference, 
 
 import rts
 from rts.operations.combine import COMBINE, combine, interpolate
-from rts.operations.inset import with_inset
+from rts.operations.inset import painted_inset, with_inset
 from rts.operations.linear import affine_map, affine_map_of_views, matmul
 from rts.operations.projection import projective_map, projective_map_of_views
 from rts.operations.take import take
@@ -127,6 +127,34 @@ def test_an_inset_is_the_mean_of_cells_where_there_is_one(target):
         sum((a * b).sum() for a, b in zip(pulled, moves, strict=True)), (factors * along).sum(), rtol=1e-4
     )
     assert (np.abs(pulled[1]).max(axis=2) > 0).sum() == 4 * 4
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_a_painted_inset_is_the_inset_of_an_image_of_one_color(target):
+    color, fine = RNG.normal(size=2), RNG.normal(size=(4, 6, 2))
+    pixel = np.array([[-1, 5, 0, -1], [-1, -1, 1, -1], [4, -1, -1, -1]], np.int32)
+    row, settled = RNG.integers(-3, 3, size=(5, 6), dtype=np.int32), RNG.integers(-2, 1, size=(5, 6), dtype=np.int8)
+    shown = ((row >= 0) | (settled >= 0))[1:-1, 1:-1]
+    assert 0 < shown[pixel < 0].sum() < (pixel < 0).sum()
+
+    def expected(color, fine):
+        means = fine.reshape(2, 2, 3, 2, 2).mean(axis=(1, 3)).reshape(6, 2)
+        return np.where((pixel >= 0)[..., None], means[np.maximum(pixel, 0)], shown[..., None] * color)
+
+    beside = arrays(target, (pixel, row, settled))
+    paint = lambda x: painted_inset(x[0], x[1], *beside, 2)  # noqa: E731
+    given = list(arrays(target, (color, fine)))
+    np.testing.assert_allclose(to_numpy(paint(given)), expected(color, fine), atol=1e-6)
+    if target == "numpy":
+        return
+    moves, factors = [RNG.normal(size=x.shape) for x in (color, fine)], RNG.normal(size=(3, 4, 2))
+    along = derivative(target, paint, given, list(arrays(target, moves)))[1]
+    np.testing.assert_allclose(along, expected(*moves), atol=1e-6)
+    pulled = gradient(target, lambda x: (paint(x) * arrays(target, factors)).sum(), given)
+    np.testing.assert_allclose(pulled[0], factors[shown & (pixel < 0)].sum(axis=0), rtol=1e-4)
+    np.testing.assert_allclose(
+        sum((a * b).sum() for a, b in zip(pulled, moves, strict=True)), (factors * along).sum(), rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize("target", ALL)

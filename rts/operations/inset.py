@@ -1,4 +1,4 @@
-"""An image of which some pixels are means of a finer one."""
+"""An image of which some pixels are means of a finer one, and the others given, or of one colour."""
 
 from __future__ import annotations
 
@@ -23,6 +23,20 @@ def with_inset(image: Array, fine: Array, pixel: Array, side: int) -> Array:
     return INSET(image, fine, pixel, side=side)
 
 
+def painted_inset(color: Array, fine: Array, pixel: Array, row: Array, settled: Array, side: int) -> Array:
+    """(H, W, C): as `with_inset`, of an image that shows a colour where anything is.
+
+    Args:
+        color: (C,).
+        fine: as in `with_inset`.
+        pixel: as in `with_inset`.
+        row: (H', W') integers, the image's pixels and as many more on each side; not negative where anything is.
+        settled: (H', W') integers, not negative where anything is as well.
+        side: as in `with_inset`.
+    """
+    return PAINTED(color, fine, pixel, row, settled, side=side)
+
+
 def averaged(image: Array, side: int) -> Array:
     """(h, w, C) of (h · side, w · side, C): each pixel the mean of `side`² cells."""
     # One axis after the other: over both at once, torch takes three times as long.
@@ -38,28 +52,111 @@ def _specification(image: Array, fine: Array, pixel: Array, *, side: int) -> Arr
     return xp.where((pixel >= 0)[..., None], xp.reshape(taken, image.shape), image)
 
 
+def _painted(color: Array, fine: Array, pixel: Array, row: Array, settled: Array, *, side: int) -> Array:
+    rows, columns = (slice(*_inside(n, wide)) for n, wide in zip(pixel.shape, row.shape, strict=True))
+    there = (row[rows, columns] >= 0) | (settled[rows, columns] >= 0)
+    return _specification(namespace(color).astype(there[..., None], color.dtype) * color, fine, pixel, side=side)
+
+
+def _inside(size: int, wide: int) -> tuple[int, int]:
+    """First and end of the pixels of an image, of those that are more on each side."""
+    return (wide - size) // 2, (wide + size) // 2
+
+
 def _shape(image: tuple[int, ...], fine: tuple[int, ...], pixel: tuple[int, ...], *, side: int) -> tuple[int, ...]:
     return image
 
 
+def _painted_shape(
+    color: tuple[int, ...], fine: tuple[int, ...], pixel: tuple[int, ...], *beside: tuple[int, ...], side: int
+) -> tuple[int, ...]:
+    return *pixel, *color
+
+
+def _no_colors(like: np.ndarray) -> tuple[np.ndarray, ...]:
+    """What stands for no colour, and for where it is."""
+    return (
+        read_only(np.empty(0, like.dtype)),
+        read_only(np.empty((0, 0), np.int32)),
+        read_only(np.empty((0, 0), np.int8)),
+    )
+
+
 def _forward(operands: Arrays, out: np.ndarray, *, side: int) -> None:
+    image, fine, pixel = map(read_only, operands)
+    _put(image, *_no_colors(out), fine, pixel, side, out)
+
+
+def _forward_painted(operands: Arrays, out: np.ndarray, *, side: int) -> None:
+    color, fine, pixel, row, settled = map(read_only, operands)
+    image = read_only(np.empty((0, 0, len(color)), out.dtype))
+    _put(image, color, read_only(row, np.int32), settled, fine, pixel, side, out)
+
+
+def _put(
+    image: np.ndarray,
+    color: np.ndarray,
+    row: np.ndarray,
+    settled: np.ndarray,
+    fine: np.ndarray,
+    pixel: np.ndarray,
+    side: int,
+    out: np.ndarray,
+) -> None:
     from rts.operations import inset_kernels
 
-    image, fine, pixel = map(read_only, operands)
-    parallel(inset_kernels.put, len(out), image, fine, pixel, side, out, work=out.size)
+    parallel(inset_kernels.put, len(out), image, color, row, settled, fine, pixel, side, out, work=out.size)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, side: int) -> None:
-    image, fine, pixel = operands
-    moved = [np.zeros_like(x) if t is None else t for x, t in zip((image, fine), tangents, strict=True)]
-    _forward((*moved, pixel), out, side=side)
+    moved = [np.zeros_like(x) if t is None else t for x, t in zip(operands[:2], tangents, strict=True)]
+    _forward((*moved, *operands[2:]), out, side=side)
+
+
+def _push_painted(operands: Arrays, tangents: Some, out: np.ndarray, *, side: int) -> None:
+    moved = [np.zeros_like(x) if t is None else t for x, t in zip(operands[:2], tangents, strict=True)]
+    _forward_painted((*moved, *operands[2:]), out, side=side)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some, *, side: int) -> None:
+    image, fine = (np.empty((0, 0, g.shape[2]), g.dtype) if x is None else x for x in results)
+    _pulled(g, operands[2], *_no_colors(g)[1:], side, image, np.empty((0, 0), g.dtype), fine)
+
+
+def _pull_painted(operands: Arrays, g: np.ndarray, results: Some, *, side: int) -> None:
+    color, fine = results
+    # Of each line by itself, so that the sum does not depend on the number of threads.
+    sums, none = np.zeros((0 if color is None else len(g), g.shape[2]), g.dtype), np.empty((0, 0, g.shape[2]), g.dtype)
+    row, settled = read_only(operands[3], np.int32), read_only(operands[4])
+    _pulled(g, operands[2], row, settled, side, none, sums, none if fine is None else fine)
+    if color is not None:
+        color[:] = sums.sum(axis=0)
+
+
+def _pulled(
+    g: np.ndarray,
+    pixel: np.ndarray,
+    row: np.ndarray,
+    settled: np.ndarray,
+    side: int,
+    image: np.ndarray,
+    sums: np.ndarray,
+    fine: np.ndarray,
+) -> None:
     from rts.operations import inset_kernels
 
-    image, fine = (np.empty((0, 0, g.shape[2]), g.dtype) if x is None else x for x in results)
-    parallel(inset_kernels.pull, len(g), read_only(g), read_only(operands[2]), side, image, fine, work=g.size)
+    given = read_only(g), read_only(pixel), row, settled, side
+    parallel(inset_kernels.pull, len(g), *given, image, sums, fine, work=g.size)
 
 
 INSET = Operation("rts.inset", _specification, (3, 3, 2), _shape, _forward, _push, _pull, differentiable=2)
+PAINTED = Operation(
+    "rts.painted_inset",
+    _painted,
+    (1, 3, 2, 2, 2),
+    _painted_shape,
+    _forward_painted,
+    _push_painted,
+    _pull_painted,
+    differentiable=2,
+)

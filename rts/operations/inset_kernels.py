@@ -2,18 +2,28 @@
 
 from __future__ import annotations
 
-from rts.compiling import kernel
+import numpy as np
+
+from rts.compiling import compiled, kernel
 
 
 @kernel
-def put(start, stop, image, fine, pixel, side, out):
-    """Fill rows [start, stop) of out (H, W, C); see `rts.operations.inset.with_inset`."""
+def put(start, stop, image, color, row, settled, fine, pixel, side, out):
+    """Fill rows [start, stop) of out (H, W, C); see `rts.operations.inset`.
+
+    Where there is no `image`, there is a `color`, `row` and `settled`.
+    """
     _, width, channels = out.shape
     across, share = fine.shape[1] // side, out.dtype.type(1) / out.dtype.type(side)
+    over, down, there = (row.shape[1] - width) // 2, (len(row) - len(out)) // 2, np.empty(width, np.uint8)
     for y in range(start, stop):
+        if len(image) == 0:
+            _look(there, row[y + down, over : over + width], settled[y + down, over : over + width])
+            for c in range(channels):
+                _paint(out[y], c, color[c], there)
         for x in range(width):
             if pixel[y, x] < 0:
-                for c in range(channels):
+                for c in range(channels if len(image) > 0 else 0):
                     out[y, x, c] = image[y, x, c]
                 continue
             top, left = pixel[y, x] // across * side, pixel[y, x] % across * side
@@ -28,17 +38,39 @@ def put(start, stop, image, fine, pixel, side, out):
                 out[y, x, c] = total * share
 
 
+@compiled
+def _look(there, row, settled):
+    """Where anything is seen in a row of cells."""
+    for x in range(len(there)):
+        there[x] = np.uint8(row[x] >= 0) | np.uint8(settled[x] >= 0)
+
+
+@compiled
+def _paint(out, c, value, there):
+    """Fill a channel of a row of an image."""
+    nothing = out.dtype.type(0)
+    for x in range(len(there)):
+        out[x, c] = value if there[x] else nothing
+
+
 @kernel
-def pull(start, stop, g, pixel, side, image, fine):
-    """Gradients of both images, zeros to be filled, from rows [start, stop) of the result's; none without rows."""
+def pull(start, stop, g, pixel, row, settled, side, image, sums, fine):
+    """Gradients of both images, zeros to be filled, from rows [start, stop) of the result's; none without rows.
+
+    Of the colour they are sums (H, C), of each row.
+    """
     _, width, channels = g.shape
     across, share = fine.shape[1] // side, g.dtype.type(1) / g.dtype.type(side * side)
+    over, down = (row.shape[1] - width) // 2, (len(row) - len(g)) // 2
     for y in range(start, stop):
         for x in range(width):
             if pixel[y, x] < 0:
-                if len(image):
+                if len(image) > 0:
                     for c in range(channels):
                         image[y, x, c] = g[y, x, c]
+                elif len(sums) > 0 and (row[y + down, x + over] >= 0 or settled[y + down, x + over] >= 0):
+                    for c in range(channels):
+                        sums[y, c] += g[y, x, c]
             elif len(fine):
                 top, left = pixel[y, x] // across * side, pixel[y, x] % across * side
                 for v in range(top, top + side):

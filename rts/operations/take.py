@@ -10,6 +10,7 @@ import numpy as np
 from rts.engines import engine_of, namespace
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some, known_value
+from rts.threads import parallel, read_only
 from rts.trees import Array
 
 
@@ -41,13 +42,26 @@ def _shape(rows: tuple[int, ...], index: tuple[int, ...]) -> tuple[int, ...]:
 
 def _forward(operands: Arrays, out: np.ndarray) -> None:
     rows, index = operands
-    _check(index, len(rows))
-    np.take(rows, index, axis=0, out=out, mode="clip")
+    _put(rows, index, np.empty((0, rows.shape[1]), rows.dtype), out)
+
+
+def _put(rows: np.ndarray, index: np.ndarray, shift: np.ndarray, out: np.ndarray) -> None:
+    """Fill in the rows that are named, plus a shift (M, C), or no rows of it.
+
+    Raises:
+        InputError: there is no such row.
+    """
+    from rts.operations import take_kernels
+
+    index, bad = read_only(index, np.int32 if index.dtype.itemsize < 8 else np.int64), np.zeros(1, np.bool_)
+    parallel(take_kernels.put, len(index), read_only(rows), index, read_only(shift), out, bad, work=2 * out.size)
+    if bad[0]:
+        _check(index, len(rows))
 
 
 def _push(operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray) -> None:
     # Only this operand has a derivative, so its tangent is always there.
-    np.take(tangents[0], operands[1], axis=0, out=out, mode="clip")
+    _forward((tangents[0], operands[1]), out)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
@@ -72,8 +86,7 @@ def _shifted_shape(rows: tuple[int, ...], index: tuple[int, ...], shift: tuple[i
 
 def _shifted(operands: Arrays, out: np.ndarray) -> None:
     rows, index, shift = operands
-    _forward((rows, index), out)
-    out += shift
+    _put(rows, index, shift, out)
 
 
 SHIFTED = Operation(

@@ -1,8 +1,24 @@
-"""Sums of rows that share an index, compiled."""
+"""Rows by index, and sums of rows that share one, compiled."""
 
 from __future__ import annotations
 
 from rts.compiling import kernel
+
+
+@kernel
+def put(start, stop, rows, index, shift, out, bad):
+    """Fill rows [start, stop) of out (M, C) with those of (V, C) that (M,) integers name, plus a shift if it has rows.
+
+    `bad` (1,) is marked where there is no such row.
+    """
+    count, channels = rows.shape
+    for m in range(start, stop):
+        i = index[m]
+        if not 0 <= i < count:
+            bad[0] = True
+            continue
+        for c in range(channels):
+            out[m, c] = rows[i, c] + shift[m, c] if len(shift) > 0 else rows[i, c]
 
 
 @kernel

@@ -111,15 +111,19 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
     from rts.sampling import adaptive_kernels
     from rts.splatting.visible import CONTINUED
 
-    if settled is not None:
-        # None of their layers is hidden, nor is any beside them: depths there are not looked at.
-        row = np.concatenate([np.maximum(row[:1], settled), row[1:]])
+    settled = np.empty((0, row.shape[2]), np.int8) if settled is None else settled
     depth, kind = read_only(depth), depth.dtype.type
     extent = max(depth.max(initial=0), 0) - min(depth.min(initial=0), 0)
     marks = np.empty(row.shape[1:], np.uint8)
-    given = read_only(row, np.int32), depth, np.cumsum(sizes)[:-1], kind(2 * extent if extent > 0 else 1)
+    given = (
+        read_only(row, np.int32),
+        read_only(settled, np.int8),
+        depth,
+        np.cumsum(sizes)[:-1],
+        kind(2 * extent if extent > 0 else 1),
+    )
     parallel(adaptive_kernels.mark, len(marks), *given, kind(CONTINUED), marks, work=4 * row.size)
-    return marks.astype(bool)
+    return marks.view(bool)
 
 
 def contrasts(row: np.ndarray, rgba: np.ndarray, least: float) -> np.ndarray:

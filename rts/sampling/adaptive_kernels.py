@@ -8,13 +8,14 @@ from rts.compiling import compiled, kernel
 
 
 @kernel
-def mark(start, stop, row, depth, firsts, beyond, continued, marks):
+def mark(start, stop, row, settled, depth, firsts, beyond, continued, marks):
     """Mark the cells of rows [start, stop) whose front ends towards a neighbour, or a neighbour's towards them.
 
     Args:
         start: first row.
         stop: end of the rows.
         row: (K, H, W) int32.
+        settled: (H, W) int8, 0 at cells that are covered by the only part, with a sample or without; or no rows.
         depth: (K, H, W).
         firsts: (P − 1,) the first row of each part but the first.
         beyond: depth of layers that are not covered; no two layers are farther apart than each is from it.
@@ -24,11 +25,14 @@ def mark(start, stop, row, depth, firsts, beyond, continued, marks):
     layers, height, width = row.shape
     # Of three rows of cells, repeated at the ends: the part seen, −1 for none, and whether there is a hidden layer.
     parts, hidden = np.empty((3, width + 2), np.int32), np.empty((3, width + 2), np.uint8)
+    near = np.empty(width, np.uint8)
     for y in range(start - 1, stop + 1):
         at = min(max(y, 0), height - 1)
         seen, behind = parts[(y + 3) % 3], hidden[(y + 3) % 3]
         for x in range(width):
             i = row[0, at, x]
+            if len(settled) > 0:
+                i = max(i, np.int32(settled[at, x]))
             part = np.int32(-1 if i < 0 else 0)
             for first in firsts:
                 part += i >= first
@@ -39,11 +43,9 @@ def mark(start, stop, row, depth, firsts, beyond, continued, marks):
         above, level, below = (y + 1) % 3, (y + 2) % 3, y % 3
         _differ(marks[y - 1], parts[above], parts[level], parts[below])
         if layers > 1:
-            for x in range(width):
-                near = hidden[above, x] | hidden[above, x + 1] | hidden[above, x + 2] | hidden[level, x]
-                near |= hidden[level, x + 1] | hidden[level, x + 2] | hidden[below, x]
-                near |= hidden[below, x + 1] | hidden[below, x + 2]
-                if near and not marks[y - 1, x] and row[0, y - 1, x] >= 0:
+            some = _unite(near, hidden[above], hidden[level], hidden[below])
+            for x in range(width if some else 0):
+                if near[x] and not marks[y - 1, x] and row[0, y - 1, x] >= 0:
                     marks[y - 1, x] = _ends(row, depth, y - 1, x, beyond, continued)
 
 
@@ -55,6 +57,18 @@ def _differ(marks, above, level, below):
         found = (above[x] != own) | (above[x + 1] != own) | (above[x + 2] != own) | (level[x] != own)
         found |= (level[x + 2] != own) | (below[x] != own) | (below[x + 1] != own) | (below[x + 2] != own)
         marks[x] = found
+
+
+@compiled
+def _unite(near, above, level, below):
+    """Fill in where any of nine cells is marked; whether there are such."""
+    some = np.uint8(0)
+    for x in range(len(near)):
+        around = above[x] | above[x + 1] | above[x + 2] | level[x] | level[x + 1] | level[x + 2]
+        near[x] = around | below[x] | below[x + 1] | below[x + 2]
+    for x in range(len(near)):
+        some |= near[x]
+    return some != 0
 
 
 @compiled

@@ -109,6 +109,7 @@ class Layout(NamedTuple):
         cells: (L, LINE) int32, the cells to sample, as flat indices in the grid with its apron; −1 for none.
         place: (h, w) int32, which of these each place of the layout shows, or −1.
         kinds: (h, w) uint8, bits of `strips_kernels`.
+        wanted: (h, w) bool, the cells of active pixels.
         pixel: (H, W) int32, where in the layout, in pixels, an active pixel is; −1 for pixels that are not active.
         coarse: (H', W') bool, with the apron, the pixels of the image that are not active.
         dropped: () int32, pixels that there was no room for.
@@ -117,6 +118,7 @@ class Layout(NamedTuple):
     cells: Array
     place: Array
     kinds: Array
+    wanted: Array
     pixel: Array
     coarse: Array
     dropped: Array
@@ -127,8 +129,8 @@ class Layout(NamedTuple):
         place = _shape(grid, *_lines(grid, room.columns))
         lines = -(-room.cells // LINE), LINE
         coarse = tuple(n + 2 * grid.apron for n in grid.size)
-        kinds = np.int32, np.int32, np.uint8, np.int32, np.bool_, np.int32
-        shapes = lines, place, place, grid.size, coarse, ()
+        kinds = np.int32, np.int32, np.uint8, np.bool_, np.int32, np.bool_, np.int32
+        shapes = lines, place, place, place, grid.size, coarse, ()
         return tuple(itertools.starmap(ArraySpec, zip(shapes, kinds, strict=True)))
 
 
@@ -182,7 +184,8 @@ def lay_out(
     coarse = np.ones([n + 2 * grid.apron for n in grid.size], bool)
     inner = tuple(slice(grid.apron, grid.apron + n) for n in grid.size)
     np.less(pixel, 0, out=coarse[inner])
-    return Layout(cells.reshape(-1, LINE), place, kinds, pixel, coarse, np.asarray(left, np.int32))
+    wanted = (kinds & strips_kernels.WANTED).view(np.bool_)
+    return Layout(cells.reshape(-1, LINE), place, kinds, wanted, pixel, coarse, np.asarray(left, np.int32))
 
 
 def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: Grid, most: int | None) -> tuple[np.ndarray, np.ndarray]:
@@ -191,8 +194,8 @@ def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: Grid, most: int | None
 
     def counted(n: int) -> np.ndarray:
         counts = np.zeros(grid.fine[0], np.int64)
-        given = marks, pieces[:n], _firsts(pieces[:n], grid), grid.side, grid.apron, grid.high, grid.gap
-        parallel(strips_kernels.count, len(counts), *given, grid.fine[1], counts, work=2000 * len(counts))
+        given = marks, pieces[:n], _firsts(pieces[:n], grid), grid.side, grid.apron, grid.high
+        parallel(strips_kernels.count, len(counts), *given, grid.fine[1], counts, work=500 * len(counts))
         return counts
 
     counts = counted(len(pieces))
@@ -244,11 +247,9 @@ class InStrips(Needed):
         part: np.ndarray | None = None,
     ) -> np.ndarray:
         """See `Needed`; (L, LINE), of the samples that were asked about last. Active pixels alone are wanted."""
-        from rts.sampling import strips_kernels
-
         laid, deep, left = self._shown
         left = left.copy() if left is laid else left
-        wanted = (self._layout.kinds & strips_kernels.WANTED) > 0
+        wanted = self._layout.wanted
         found = self._needed.settled(laid, deep, left, size, wanted)
         kept &= self._listed(left, kept)
         # The places beside a wanted one are the cells that lie beside it, those beside others may not be.
@@ -303,7 +304,7 @@ def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
         shift,
         row,
         part,
-        layout.kinds,
+        layout.wanted,
         layout.pixel,
         layout.coarse,
         sampled.overflow + layout.dropped,
@@ -331,7 +332,8 @@ def _arranged(
     counts = np.empty(lines, np.int64)
     parallel(strips_kernels.count_samples, lines, row, place, counts, work=len(row) * place.size)
     offsets, total = np.cumsum(counts) - counts, int(counts.sum())
-    index, shift = np.zeros(max(1, total), np.int32), np.zeros((max(1, total), 3), np.float32)
+    make = np.empty if total else np.zeros
+    index, shift = make(max(1, total), np.int32), make((max(1, total), 3), np.float32)
     laid, part = (np.empty((len(row), *place.shape), np.int32) for _ in range(2))
     shown = np.empty(place.shape if len(amid) else (0, 0), np.int8)
     given = row, place, cells, amid, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part, shown

@@ -14,9 +14,6 @@ from rts.compiling import compiled, kernel
 WANTED, NEAR = 1, 2
 """Bits of cells: inside of an active pixel, and within two cells of one."""
 
-NEEDED = 4
-"""Bit of cells in an active pixel or its apron."""
-
 
 @kernel
 def find(active, high, gap):
@@ -85,32 +82,35 @@ def number(active, pieces, high, pitch, across, pixel):
 
 @compiled
 def _needs(needs, active, line, strip, first, columns, side, apron, high):
-    """Bits of what the columns of a piece need of a line of cells of the grid; whether they need any."""
+    """Which columns of a piece need a line of cells of the grid; whether any do."""
     needs[:columns] = 0
     top, bottom = strip * high, min(len(active), (strip + 1) * high)
-    any_needed = False
-    for y in range(max(top, (line - 2 * apron) // side), min(bottom, line // side + 1)):
-        v = line - y * side - apron
-        bits = np.uint8(NEEDED)
-        if -2 <= v < side + 2:
-            bits |= np.uint8(NEAR)
-        if 0 <= v < side:
-            bits |= np.uint8(WANTED)
-        any_needed |= _join(needs, active[y, first : first + columns], bits)
-    return any_needed
-
-
-@compiled
-def _join(needs, active, bits):
+    begin, end = _pixels(line, side, apron)
     some = np.uint8(0)
-    for j in range(len(active)):
-        needs[j] |= bits * active[j]
-        some |= active[j]
+    for y in range(max(top, begin), min(bottom, end)):
+        _unite(needs[:columns], active[y, first : first + columns])
+    for j in range(columns):
+        some |= needs[j]
     return some != 0
 
 
+@compiled
+def _pixels(line, side, apron):
+    """First and end of the lines of pixels that have a line of cells of the grid, their aprons included."""
+    return (line - 2 * apron) // side, line // side + 1
+
+
+@compiled
+def _end(marks, first):
+    """Where a run of marks that begins at the first ends."""
+    end = first + 1
+    while end < len(marks) and marks[end]:
+        end += 1
+    return end
+
+
 @kernel
-def count(start, stop, active, pieces, firsts, side, apron, high, gap, width, counts):
+def count(start, stop, active, pieces, firsts, side, apron, high, width, counts):
     """Count the cells of lines [start, stop) of the grid that active pixels need: counts (H',).
 
     Args:
@@ -122,27 +122,25 @@ def count(start, stop, active, pieces, firsts, side, apron, high, gap, width, co
         side: s, cells along each side of a pixel.
         apron: cells around active pixels that are needed.
         high: pixels from top to bottom of a strip.
-        gap: pixels that aprons take.
         width: of the grid.
         counts: to be filled.
     """
     needs, seen = np.empty(active.shape[1], np.uint8), np.zeros(width, np.uint8)
     for line in range(start, stop):
-        found, (begin, end) = 0, _strips(line, side, apron, high, len(firsts) - 1)
+        if line > start and _pixels(line, side, apron) == _pixels(line - 1, side, apron):
+            counts[line] = counts[line - 1]
+            continue
+        (begin, end), found = _strips(line, side, apron, high, len(firsts) - 1), 0
         for p in range(firsts[begin], firsts[end]):
             strip, first, columns = pieces[p, 0], pieces[p, 1], pieces[p, 2]
-            if not _needs(needs, active, line, strip, first, columns, side, apron, high):
-                continue
-            until = 0
-            for j in range(columns + gap):
-                if j < columns and needs[j]:
-                    until = j * side + side + 2 * apron
-                for u in range((first + j) * side, first * side + min(j * side + side, until)):
-                    found += seen[u] == 0
-                    seen[u] = 1
+            if _needs(needs, active, line, strip, first, columns, side, apron, high):
+                for j in range(columns):
+                    if needs[j]:
+                        seen[(first + j) * side : (first + j + 1) * side + 2 * apron] = 1
+        for u in range(width if begin < end else 0):
+            found += np.int64(seen[u])
+            seen[u] = 0
         counts[line] = found
-        for p in range(firsts[begin], firsts[end]):
-            seen[pieces[p, 1] * side : (pieces[p, 1] + pieces[p, 2]) * side + 2 * apron] = 0
 
 
 @compiled
@@ -174,36 +172,93 @@ def fill(start, stop, active, pieces, firsts, side, apron, high, gap, offsets, c
     needs, numbers = np.empty(active.shape[1], np.uint8), np.full(width, -1, np.int32)
     for line in range(start, stop):
         n, (begin, end) = offsets[line], _strips(line, side, apron, high, len(firsts) - 1)
+        # Lines of one pixel differ in their numbers alone.
+        again = line > start and _pixels(line, side, apron) == _pixels(line - 1, side, apron)
+        more = n - offsets[line - 1] if again else 0
+        near = _near(line, side, apron)
+        alike = line > start and near == _near(line - 1, side, apron)
         for p in range(firsts[begin], firsts[end]):
             strip, first, columns = pieces[p, 0], pieces[p, 1], pieces[p, 2]
-            if not _needs(needs, active, line, strip, first, columns, side, apron, high):
-                continue
             down, over = pieces[p, 3] * (high + gap) * side + line - strip * high * side, pieces[p, 4] * side
-            until = 0
-            for j in range(columns + gap):
-                if j < columns and needs[j]:
-                    until = j * side + side + 2 * apron
-                for u in range(j * side, min(j * side + side, until)):
-                    x = first * side + u
-                    if numbers[x] < 0:
-                        numbers[x], cells[n] = n, line * width + x
-                        n += 1
-                    place[down, over + u] = numbers[x]
-            _tell(kinds[down, over : over + columns * side + 2 * apron], needs, columns, side, apron)
-        for p in range(firsts[begin], firsts[end]):
+            left, right = first * side, (first + columns) * side + 2 * apron
+            if again:
+                _repeat(place[down, over : over + right - left], place[down - 1, over : over + right - left], more)
+            elif _needs(needs, active, line, strip, first, columns, side, apron, high):
+                j, until = 0, 0
+                while j < columns:
+                    if not needs[j]:
+                        j += 1
+                        continue
+                    u, j = max(j * side, until), _end(needs[:columns], j)
+                    until = j * side + 2 * apron
+                    n = _number(numbers[left + u : left + until], cells, line * width + left + u, n)
+                    _copy(place[down, over + u : over + until], numbers[left + u : left + until])
+            if alike and line > strip * high * side:
+                _copy(kinds[down, over : over + right - left], kinds[down - 1, over : over + right - left])
+            else:
+                _tell(kinds[down, over : over + right - left], active, near, strip, first, columns, side, apron, high)
+        if again:
+            _repeat(cells[n : n + more], cells[n - more : n], width)
+        for p in range(firsts[begin], firsts[end] if not again else 0):
             numbers[pieces[p, 1] * side : (pieces[p, 1] + pieces[p, 2]) * side + 2 * apron] = -1
 
 
 @compiled
-def _tell(kinds, needs, columns, side, apron):
-    """Bits of a line of cells of a piece, from what its columns need."""
+def _repeat(to, given, more):
+    """Numbers that are larger by so much than given ones, −1 apart."""
+    more = to.dtype.type(more)
+    for u in range(len(to)):
+        to[u] = given[u] + more if given[u] >= 0 else given[u]
+
+
+@compiled
+def _number(numbers, cells, first, n):
+    """Number the cells of a run that have no number yet, the first of which is told; what comes after the last."""
+    known = False
+    for u in range(len(numbers)):
+        known |= numbers[u] >= 0
+    if not known:
+        own = cells[n : n + len(numbers)]
+        for u in range(len(numbers)):
+            numbers[u], own[u] = n + u, first + u
+        return n + len(numbers)
+    for u in range(len(numbers)):
+        if numbers[u] < 0:
+            numbers[u], cells[n] = n, first + u
+            n += 1
+    return n
+
+
+@compiled
+def _copy(to, given):
+    for u in range(len(to)):
+        to[u] = given[u]
+
+
+@compiled
+def _near(line, side, apron):
+    """First and end of the lines of pixels to which a line of cells of the grid is near, and the one that it is of."""
+    begin, end = _pixels(line, side, apron)
+    own = line - apron
+    return max(begin, (own - side - 2) // side + 1), min(end, (own + 2) // side + 1), own // side
+
+
+@compiled
+def _tell(kinds, active, near, strip, first, columns, side, apron, high):
+    """Bits of a line of cells of a piece, `near` lines of pixels."""
     around = min(apron, 2)
-    for j in range(columns):
-        if needs[j] & NEAR:
-            for u in range(j * side + apron - around, (j + 1) * side + apron + around):
+    begin, end, own = near
+    for y in range(max(strip * high, begin), min(len(active), (strip + 1) * high, end)):
+        marks, j = active[y, first : first + columns], 0
+        while j < columns:
+            if not marks[j]:
+                j += 1
+                continue
+            left, j = j * side + apron, _end(marks, j)
+            right = j * side + apron
+            for u in range(left - around, right + around):
                 kinds[u] |= np.uint8(NEAR)
-        if needs[j] & WANTED:
-            for u in range(j * side + apron, (j + 1) * side + apron):
+            for u in range(left, right if y == own else left):
                 kinds[u] |= np.uint8(WANTED)
 
 
@@ -238,7 +293,7 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
         part: (K, h, w) int32, to be filled: its part.
         shown: (h, w) int8, to be filled with what is settled; no rows for nothing.
     """
-    height = len(place)
+    height, across = len(place), np.uint32(width)
     for line in range(start, stop):
         k, y, n = line // height, line % height, offsets[line]
         if k == 0 and len(shown) > 0:
@@ -254,7 +309,8 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
             index[n], laid[k, y, x], part[k, y, x] = i, n, 0
             for first in firsts:
                 part[k, y, x] += i >= first
-            shift[n, 0], shift[n, 1], shift[n, 2] = x - cells[m] % width, y - cells[m] // width, 0
+            cell = np.uint32(cells[m])
+            shift[n, 0], shift[n, 1], shift[n, 2] = x - cell % across, y - cell // across, 0
             n += 1
 
 

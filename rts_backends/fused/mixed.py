@@ -82,6 +82,16 @@ def adjoint(start, stop, offsets, columns, sums, border, g, adjoints):
                 a[b, 4] = zero if total[b, 4] < one else -dot * over
 
 
+@compiled
+def _any(adjoints, d):
+    """Whether any adjoint of a target's sums is not zero: beside wanted targets many are."""
+    some = False
+    for b in range(3):
+        for c in range(5):
+            some |= adjoints[d, b, c] != 0
+    return some
+
+
 @kernel
 def pull(
     start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, adjoints, g_positions, g_rgba
@@ -92,7 +102,7 @@ def pull(
     for y in range(start, stop):
         for v in range(-1 if y > 0 else 0, 2 if y < height - 1 else 1):
             for d in range(offsets[y + v], offsets[y + v + 1]):
-                for u in range(-1, 2):
+                for u in range(-1, 2 if _any(adjoints, d) else -1):
                     x, n = columns[d] - u, 3 * (v + 1) + u + 1
                     if not 0 <= x < width:
                         continue
