@@ -312,8 +312,9 @@ def splatted(
     finer = to_fine_splats(fine, scene.parts, scene.camera, *suited)
     small = cropped_image(splatter, finer)
     if splats is None:
-        told = constants((fine.pixel, sampled.row[0], sampled.settled), engine_of(small), small)
-        return painted_inset(finer.rgba[0, ...], small, *told, fine.supersample)
+        told = fine.pixel, sampled.row[0], sampled.settled
+        pixel, row, settled = constants(told, engine_of(small), small)
+        return painted_inset(finer.rgba[0, ...], small, pixel, row, settled, fine.supersample)
     image = cropped_image(splatter, splats.replace(wanted=constants(fine.coarse, *suiting(splats.rgba))))
     return with_inset(image, small, constants(fine.pixel, engine_of(image), image), fine.supersample)
 

@@ -73,7 +73,7 @@ def _painted_shape(
     return *pixel, *color
 
 
-def _no_colors(like: np.ndarray) -> tuple[np.ndarray, ...]:
+def _no_colors(like: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What stands for no colour, and for where it is."""
     return (
         read_only(np.empty(0, like.dtype)),
