@@ -57,7 +57,13 @@ class CheckedPart(Part):
     @property
     def uniform_by(self) -> tuple[str, ...] | None:
         """Where all its samples have one colour, the entries of θ that this depends on; see `Shader`."""
-        return self.shader.uniform_by(self.theta, self.surface.gives(self.theta))
+        names = self.shader.uniform_by(self.theta, self.surface.gives(self.theta))
+        if names is not None and (isinstance(names, str) or not all(isinstance(name, str) for name in names)):
+            raise InputError(
+                f"uniform_by of {self.shader!r} gave {quoted(names)}; expected a tuple of names of entries of theta, "
+                f"or None"
+            )
+        return None if names is None else tuple(names)
 
     @property
     def uniform(self) -> bool:
@@ -69,7 +75,7 @@ class CheckedPart(Part):
         names = self.uniform_by
         if names is None or names != other.uniform_by or not _alike(unwrapped(self.shader), unwrapped(other.shader)):
             return False
-        return all(_same(self.theta[name], other.theta[name]) for name in names)
+        return all(_same(self.theta.get(name), other.theta.get(name)) for name in names)
 
 
 def _alike(a: Any, b: Any) -> bool:

@@ -201,7 +201,7 @@ class Sampled:
         exit: (H, W) int32, as in `Samples`, of the part that is seen, counted over all parts in order. None where
             nothing is told.
         colors: where cells are settled, of each part the number of its one colour, or −1 where it may have several;
-            None where all parts have one and the same.
+            None where all parts have one and the same, or no cell is settled.
     """
 
     samples: tuple[Samples, ...]
@@ -245,7 +245,8 @@ class Splats:
         facing: (K, H, W) integers, the number of the piece of surface in each cell, negative where it is seen from
             behind, 0 where that is not told; or None. See `Samples`.
         settled: (H, W) integers, the sample whose colour the cell shows, whatever moves; −1 where it may change; or
-            None. Settled cells may have no sample, as cells around them that affect no others.
+            None. Settled cells may have no sample, as cells around them that affect no others. Where they or the eight
+            around them have some, these have that colour.
         sentinel: () float, the depth that stands for empty layers, beyond all samples; None for one of the scene's
             scale.
         wanted: (H, W) bool, the targets that are looked at; others may have any finite colour. None for all.

@@ -2,6 +2,7 @@
 
 import itertools
 import re
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -598,13 +599,77 @@ def test_settled_of_the_wrong_kind_is_refused(make):
     none = np.full((6, 7), -1, np.int32)
     wrong = {
         "settled has shape (6, 6); expected (6, 7)": none[:, :-1],
-        "settled is bool; expected integers": none < 0,
+        "settled is bool; expected signed integers": none < 0,
+        "settled is uint8; expected signed integers": (none + 1).astype(np.uint8),
         "settled refers to sample 42 of 42": none + 43,
         "settled refers to sample -2": none - 1,
     }
     for message, settled in wrong.items():
         with pytest.raises(rts.InputError, match=re.escape(message)):
             make().image(splats.replace(settled=settled))
+
+
+def test_the_gradient_of_many_colors_is_that_of_the_specification():
+    """Each of some hundred settled cells shows the colour of its own sample."""
+    import torch
+
+    y, x = np.indices((18, 20))
+    positions = torch.from_numpy(np.stack([x + 0.5, y + 0.5, np.full(x.shape, 2.0)], -1).reshape(-1, 3))
+    row = np.arange(360, dtype=np.int32).reshape(1, 18, 20)
+    weights = torch.from_numpy(np.random.default_rng(0).normal(size=(14, 16, 4)))
+    found = []
+    for make in (splatting.Visible, fused.Visible):
+        rgba = torch.ones((360, 4), dtype=torch.float64, requires_grad=True)
+        splats = rts.Splats(positions, rgba, torch.from_numpy(row), settled=torch.from_numpy(row[0]), border=2)
+        found.append(torch.autograd.grad((make().cropped(splats) * weights).sum(), rgba)[0])
+    expected = torch.zeros((18, 20, 4), dtype=torch.float64)
+    expected[2:-2, 2:-2] = weights
+    for gradient_of_colors in found:
+        torch.testing.assert_close(gradient_of_colors, expected.reshape(360, 4))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"exit": np.array(10**8, np.int32)}, "exit refers to sample 100000000"),
+        ({"facing": np.ones((2, 3, 3), np.int16)}, "facing has shape (2, 3, 3)"),
+        ({"depth": np.ones((1, 64, 56), np.float32)}, "depth has shape (1, 64, 56)"),
+        ({"exit": np.array(0, np.uint8)}, "exit is uint8; expected signed integers"),
+        ({"settled": np.array(False)}, "settled is bool; expected signed integers"),
+    ],
+)
+@pytest.mark.parametrize("supersample", [1, rts.Adaptive(2)])
+def test_samples_that_do_not_fit_are_refused(changes, message, supersample):
+    raster = type(rts.plugin("rts.samplers", "raster")())
+
+    class Odd(raster):
+        def sample(self, part, camera, size, layers, **options):
+            found = super().sample(part, camera, size, layers, **options)
+            return replace(found, **{k: np.broadcast_to(v, size) if v.ndim == 0 else v for k, v in changes.items()})
+
+    parts = [mesh_part(mesh) for mesh in (box(0.5), quad(-1.0, 1.0, -1.0, 1.0, -0.8))]
+    with pytest.raises(rts.InputError, match=re.escape(message)):
+        rts.render(parts, CAMERA, SIZE, sampler=Odd(), supersample=supersample)
+
+
+@pytest.mark.parametrize(
+    ("given", "settles"), [(["color"], True), (("colour of its own",), True), ("color", None), ((3,), None)]
+)
+def test_what_one_color_depends_on(given, settles):
+    """Entries that θ lacks are the same of all parts; names come in a tuple or a list."""
+
+    class Own(Unlit):
+        def uniform_by(self, theta, given_by_surface):
+            return given
+
+    vertices, faces = box(0.5)
+    theta = {"vertices": vertices, "color": np.float32((1, 0, 0))}
+    parts = [rts.Part(MESH(faces), theta, Own(), transform=at(x, 0, 0)) for x in (-0.3, 0.3)]
+    if settles is None:
+        with pytest.raises(rts.InputError, match="uniform_by of"):
+            rts.render(parts, CAMERA, SIZE)
+    else:
+        assert rts.render(parts, CAMERA, SIZE)[..., 0].max() == 1
 
 
 @pytest.mark.parametrize("kind", ["single", "multi", "visible"])

@@ -67,7 +67,7 @@ def colors_of(parts: Sequence[CheckedPart]) -> tuple[int, ...]:
         if names is None:
             found.append(-1)
             continue
-        alike = known.setdefault((names, *(_hint(part.theta[name]) for name in names)), [])
+        alike = known.setdefault((names, *(_hint(part.theta.get(name)) for name in names)), [])
         first = next((i for i in alike if part.shows_color_of(parts[i])), index)
         if first == index:
             alike.append(index)
@@ -276,6 +276,8 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
         last = len(rest) - len(front)
         own_rows, exits, whose = rest[: len(sizes)], rest[len(sizes) : last], rest[last:]
         if exits:
+            if (most := exits[0].max(initial=-1)) >= total:
+                raise InputError(f"exit refers to sample {most} of {total}; sample this scene anew")
             near = np.full(exits[0].size, -1, np.int32)
             cells = beside_outlines(kept)[0]
             near[cells] = exits[0].reshape(-1)[cells]

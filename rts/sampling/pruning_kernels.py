@@ -50,7 +50,7 @@ class Numbering:
 def _mark(start, stop, row, kept, used):
     for y in range(start, stop):
         for x in range(row.shape[1]):
-            if kept[y, x] and row[y, x] >= 0:
+            if kept[y, x] and 0 <= row[y, x] < len(used):
                 used[row[y, x]] = True
 
 
@@ -72,4 +72,4 @@ def _renumber(start, stop, row, numbers, found):
     for y in range(start, stop):
         for x in range(row.shape[1]):
             i = row[y, x]
-            found[y, x] = numbers[i] if i >= 0 else -1
+            found[y, x] = numbers[i] if 0 <= i < len(numbers) else -1

@@ -13,9 +13,9 @@ from rts.camera import Camera
 from rts.checks import check_memory, check_ratio, check_sampler, check_scene, check_size, check_splatter, suited_sampler
 from rts.engines import Engine, constants, is_traced, suiting_scene, uncompiled
 from rts.errors import InputError
-from rts.interfaces import AnyNeeded, Needed, Splatter
+from rts.interfaces import AnyNeeded, Needed, Sampler, Splatter
 from rts.parts import CheckedPart, Part
-from rts.records import Sampled
+from rts.records import Sampled, Samples
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.cache import Entry
 from rts.sampling.fine import Where, fine_samples
@@ -23,6 +23,8 @@ from rts.sampling.merging import merge
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.pruning import Everything, as_needed, needed_by, planned, prune
 from rts.sampling.strips import Grid, at_cells
+from rts.sampling.triangle_sampler import TriangleSampler
+from rts.sampling.validation import check_samples
 from rts.splatting.visible import Visible
 from rts.trees import Array, Tree
 
@@ -219,15 +221,24 @@ def _taken(
         if exits and chosen.tells_exits:
             known["exits"] = True
         if cells is not None and not chosen.takes_cells:
-            samples.append(at_cells(chosen.sample(part, seen, wide.grid, count, **known), cells, capacity))
+            samples.append(at_cells(_found(chosen, part, seen, wide.grid, count, **known), cells, capacity))
             continue
         if needed is not None and chosen.prunes:
             pruned = len(scene.parts) == 1
             known["needed"] = needed if pruned else Everything(needed)
-        samples.append(chosen.sample(part, seen, wide.grid, count, capacity=capacity, **known, **listed))
+        samples.append(_found(chosen, part, seen, wide.grid, count, capacity=capacity, **known, **listed))
     sampled = merge(samples, count)
     # Traced arrays have the shape of the worst case, pruned or not.
     return sampled if needed is None or pruned or is_traced(sampled.row) else prune(sampled, needed)
+
+
+def _found(sampler: Sampler, part: Part, camera: Camera, grid: tuple[int, int], count: int, **options: Any) -> Samples:
+    """What `sample` of a sampler gives, refused where it does not fit; arguments as there."""
+    found = sampler.sample(part, camera, grid, count, **options)
+    if type(sampler).sample is TriangleSampler.sample:  # It has made them of fragments that are checked.
+        return found
+    cells = options.get("cells")
+    return check_samples(found, grid if cells is None else tuple(cells.shape), sampler)
 
 
 def with_fine(

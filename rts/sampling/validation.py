@@ -1,4 +1,4 @@
-"""What is refused of cameras, proxies, fragments and refined samples, on the host."""
+"""What is refused of cameras, proxies, fragments, samples and refined samples, on the host."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import numpy as np
 
 from rts.arguments import is_invertible
 from rts.camera import Camera
+from rts.engines import namespace
 from rts.errors import InputError
 from rts.interfaces import TriangleSurface
 from rts.records import Fragments, Proxy, Samples
 from rts.sampling.extremes import largest
+from rts.splatting.layers import check_rows
 from rts.topology import extent
 from rts.trees import Tree
 
@@ -85,6 +87,32 @@ def checked_pieces(surface: TriangleSurface, proxy: Proxy) -> np.ndarray:
             f"of (1,)"
         )
     return pieces
+
+
+def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samples:
+    """The samples of a part that `sample` of a sampler gave, refused where they do not fit its cells, or one another.
+
+    Args:
+        samples: the samples; values that are traced are not looked at.
+        grid: (H, W) of the cells.
+        sampler: the sampler.
+    """
+    count, shape = samples.ids.shape[-2], tuple(samples.row.shape)
+    own = {"row": shape[:1] + tuple(grid), "depth": shape, "facing": shape, "settled": shape[1:], "exit": shape[1:]}
+    try:
+        for name, expected in own.items():
+            array: Any = getattr(samples, name)
+            if array is None:
+                continue
+            if tuple(array.shape) != expected:
+                raise InputError(f"{name} has shape {tuple(array.shape)}; expected {expected}")
+            if name != "depth" and not namespace(array).isdtype(array.dtype, "signed integer"):
+                raise InputError(f"{name} is {array.dtype}; expected signed integers")
+            if name not in ("depth", "facing"):
+                check_rows(array, count, name)
+    except InputError as error:
+        raise InputError(f"sample of {sampler!r} gave samples that do not fit: {error}") from None
+    return samples
 
 
 def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sampler: Any) -> None:

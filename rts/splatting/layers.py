@@ -39,8 +39,10 @@ def check_settled(settled: Array, shape: tuple[int, ...], count: int) -> None:
     """Raise an InputError where `Splats.settled` is not of a grid's shape, or names none of so many samples."""
     if tuple(settled.shape) != tuple(shape):
         raise InputError(f"settled has shape {tuple(settled.shape)}; expected {tuple(shape)}, as row says")
-    if not namespace(settled).isdtype(settled.dtype, "integral"):
-        raise InputError(f"settled is {settled.dtype}; expected integers: the sample whose colour a cell shows, or -1")
+    if not namespace(settled).isdtype(settled.dtype, "signed integer"):
+        raise InputError(
+            f"settled is {settled.dtype}; expected signed integers: the sample whose colour a cell shows, or -1"
+        )
     check_rows(settled, count, "settled")
 
 

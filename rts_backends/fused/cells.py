@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rts.arrays import without_border
 from rts.errors import InputError
 from rts.splatting import rims
 from rts.splatting.kernel import LEAST_EPSILON
@@ -25,6 +26,9 @@ from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
 from rts_backends.fused.pairs import BLOCK
 from rts_backends.fused.survey import EMPTY, collect, note, paint, survey
+
+MANY = 256
+"""Samples whose colours settled targets show, beyond which gradients are added one by one."""
 
 
 class Settings(NamedTuple):
@@ -297,6 +301,11 @@ class Cells:
             if self._shows_several:
                 parallel(note, len(settled), settled, noted, work=settled.size // 8)
             shown = np.flatnonzero(noted)
+            if len(shown) > MANY:  # Sums of each line take their memory. Those of parts are few.
+                inner = without_border(settled, self.border)
+                there = inner >= 0
+                np.add.at(g_rgba, inner[there], g[there])
+                return
             number[shown] = np.arange(len(shown))
             sums = np.zeros((len(g), len(shown), 4), g.dtype)
             parallel(collect, len(g), settled, number, self.border, read_only(g), sums, work=g.size // 4)
