@@ -63,7 +63,7 @@ def kernel(function: Callable | None = None, **options: Any) -> Any:
 
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
-    """Compile a function that only compiled loops call; Python cannot. `options` are numba's."""
+    """Compile a function that only compiled loops call, not Python, nor itself. `options` are numba's."""
     options |= {"nogil": True} | PART
 
     def decorate(function: Callable) -> Any:

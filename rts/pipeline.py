@@ -5,8 +5,8 @@ makes machine code of each of these all the same, with two wrappers where it is 
 code, which is optimised in the kernels. It saves a quarter of the time.
 
 numba also counts references to every array that a function is handed, by calls that stay in code with branches. Where
-a function of ours makes no array and returns none, whoever calls it holds them all, and nothing is counted: such code
-runs in half the time.
+a function of ours is certain to make no array and to return none, whoever calls it holds them all, and nothing is
+counted: such code runs in half the time.
 
 numba is told by classes of pipelines, and by a target of ours that inherits all from the processor. This depends on
 parts of numba that it does not promise to keep, so nothing but `rts.compiling` imports it, which does without it where
@@ -19,7 +19,7 @@ import inspect
 from typing import Any
 
 import numba
-from numba.core import ir, typed_passes
+from numba.core import ir, typed_passes, types
 from numba.core.base import BaseContext
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler, Flags
@@ -138,6 +138,14 @@ class _Parts(_Kernels):
         """numba's, which put the code in the library that is there."""
         if self.state.library is None:
             self.state.library = _Part(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        return super().define_pipelines()
+
+
+class _OwnParts(_Parts):
+    """Compiles those that are ours."""
+
+    def define_pipelines(self) -> list[Any]:
+        """Those of all parts, in which references are not counted without need."""
         found = super().define_pipelines()
         for passes in found:
             passes.add_pass_after(_Uncounted, typed_passes.IRLegalization)
@@ -149,11 +157,17 @@ _HARMLESS = ir.Assign, ir.Del, ir.Jump, ir.Branch, ir.Return, ir.StaticRaise
 _VIEWS = {"getitem", "static_getitem", "getattr", "cast", "phi", "build_tuple", "exhaust_iter", "getiter", "iternext"}
 _VIEWS |= {"pair_first", "pair_second"}
 """Statements that make nothing, and operations that refer to arrays which are there."""
+_DESCRIBING = {"shape", "size", "ndim", "strides", "dtype", "T"}
+"""Attributes of arrays that make none."""
 
 
 @register_pass(mutates_CFG=False, analysis_only=True)
 class _Uncounted(AnalysisPass):
-    """Has references not counted in a function that is handed all the arrays it works on, and returns none."""
+    """Has references not counted in a function that is handed all the arrays it works on, and returns none.
+
+    Where there is any doubt they are counted: where it knows other objects than numbers, arrays and tuples of these, or
+    hands arrays to functions of numba's.
+    """
 
     _name = "rts_uncounted"
 
@@ -162,27 +176,51 @@ class _Uncounted(AnalysisPass):
 
     def run_pass(self, state: Any) -> Any:
         """Change how the function is lowered, not the function."""
+        kinds, models = state.typemap, state.targetctx.data_model_manager
 
-        def counted(kind: Any) -> bool:
-            return state.targetctx.data_model_manager[kind].contains_nrt_meminfo()
+        def counted(*variables: Any) -> bool:
+            return any(models[kinds[x.name]].contains_nrt_meminfo() for x in variables if isinstance(x, ir.Var))
 
-        made = counted(state.return_type)
-        for block in state.func_ir.blocks.values():
-            for statement in block.body:
-                if isinstance(statement, (ir.SetItem, ir.StaticSetItem)):  # An array may be copied first.
-                    made |= counted(state.typemap[statement.value.name])
-                elif isinstance(statement, ir.Assign) and isinstance(value := statement.value, ir.Expr):
-                    name = value.index.name if value.op == "getitem" else statement.target.name
-                    made |= value.op not in _VIEWS - {"getitem"} and counted(state.typemap[name])
-                else:
-                    made |= not isinstance(statement, _HARMLESS)
-        if not made:
+        def plain(kind: Any) -> bool:
+            members: Any = kind
+            if isinstance(kind, types.BaseTuple):
+                return all(map(plain, members))
+            known = isinstance(kind, types.Array) or not models[kind].contains_nrt_meminfo()
+            return known and not isinstance(kind, types.Generator)
+
+        def makes(target: ir.Var, value: Any) -> bool:
+            if not isinstance(value, ir.Expr):
+                return False
+            if value.op == "call":
+                called = kinds[value.func.name]
+                if isinstance(called, types.Dispatcher) or getattr(called, "typing_key", None) is len:
+                    return counted(target)
+                return counted(target, value.func, *value.args, *(x for _, x in value.kws), value.vararg)
+            if value.op == "getattr" and isinstance(kinds[value.value.name], types.Array):
+                return value.attr not in _DESCRIBING
+            if value.op in ("getitem", "static_getitem"):
+                return counted(value.index if value.op == "getitem" else value.index_var)
+            return value.op not in _VIEWS and counted(target, *value.list_vars())
+
+        def harmless(statement: Any) -> bool:
+            if isinstance(statement, ir.SetItem):  # An array may be copied first.
+                return not counted(statement.value, statement.index)
+            if isinstance(statement, ir.StaticSetItem):
+                return not counted(statement.value, statement.index_var)
+            if isinstance(statement, ir.Assign):
+                return not makes(statement.target, statement.value)
+            return isinstance(statement, _HARMLESS)
+
+        body = (statement for block in state.func_ir.blocks.values() for statement in block.body)
+        returns = models[state.return_type].contains_nrt_meminfo()
+        made = state.func_ir.is_generator or returns or not all(map(plain, kinds.values()))
+        if not made and all(map(harmless, body)):
             state.targetctx = state.targetctx.subtarget(enable_nrt=False)
         return False
 
 
 KERNEL = {"no_cfunc_wrapper": True, "pipeline_class": _Kernels}
-PART = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": _Parts}
+PART = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": _OwnParts}
 
 
 class _Target(CPU):
@@ -191,7 +229,7 @@ class _Target(CPU):
 
 def _for_kernels(*args: Any, **options: Any) -> Any:
     """Numba's decorator, as it is used for its own functions where kernels call them."""
-    return numba.jit(*args, **(options | PART))
+    return numba.jit(*args, **(options | PART | {"pipeline_class": _Parts}))
 
 
 dispatcher_registry[_Target] = dispatcher_registry[CPU]

@@ -282,6 +282,8 @@ def cast(
                     + c * depth_of(row, near_vertices, 3 * n + 2)
                 )
                 n += 1
+    # Compiled code lets go of an array after its last use, and of these Embree has the addresses.
+    context[0] = len(depths) + len(sure) + len(ids) + len(state) + len(work) + len(ray) + len(options)
 
 
 @compiled
