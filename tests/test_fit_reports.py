@@ -184,13 +184,13 @@ def test_the_floor_of_point_sampling_is_told_from_a_minimum():
     # From some starts the last gradient happens to promise nothing, and then it is called a minimum.
     point, told = silhouette(1), "no step lowers the loss: it is at the floor of point sampling; supersample=2, 3"
     starts = [arrays("torch-cpu", 0.05 * np.random.default_rng(seed).normal(size=6)) for seed in range(6)]
-    fits = [rts.fit(point, start, method="lm", tolerance=0) for start in starts]
+    fits = [rts.fit(point, start, method="lm", tolerance=0, steps=300) for start in starts]
     assert all(fit.reason.startswith("no step lowers the loss") for fit in fits)
     start, coarse = next((start, fit) for start, fit in zip(starts, fits, strict=True) if fit.reason.startswith(told))
-    finer = rts.fit(silhouette(3), start, method="lm", tolerance=0)
+    finer = rts.fit(silhouette(3), start, method="lm", tolerance=0, steps=300)
     assert finer.loss < coarse.loss / 4
     # A function does not say that it is an image.
-    unknown = (rts.fit(lambda p: point(p), start, method="lm", tolerance=0).reason for start in starts)
+    unknown = (rts.fit(lambda p: point(p), start, method="lm", tolerance=0, steps=300).reason for start in starts)
     told = next(reason for reason in unknown if "though the gradient promises it" in reason)
     assert told.startswith("no step lowers the loss") and "of point-sampled images" in told
 

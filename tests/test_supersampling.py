@@ -119,7 +119,7 @@ def test_between_forward_and_backward_bands_keep_next_to_nothing(monkeypatch):
     whole, _ = memory(lambda s, size: image(vertices, s, size))
     monkeypatch.setattr(rendering, "BAND", 2**15)
     banded, _ = memory(lambda s, size: image(vertices, s, size))
-    assert banded < 0.2 * whole
+    assert banded < 0.25 * whole  # What splatters have decided of each cell, four bytes.
 
 
 @pytest.mark.parametrize("splatter", ["multi", "visible"])
