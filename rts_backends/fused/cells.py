@@ -65,7 +65,7 @@ class Choices(NamedTuple):
         sums: (M, 3, 5), of each buffer the colours over the weight, taken as at least one, and the weight.
         states: (H, W) uint8, states of targets (`survey.py`); mixed ones are EMPTY here.
         ends: (H, W) uint16, where fronts end, and targets that outlines may cover in part (`survey.py`); or no rows.
-        partial: (H,) int64, the number of these in each row.
+        listed: (H,) int64, the number of these targets in each row.
         repeated: whether several cells name a sample, and would add to its gradient at the same time.
         extent: of the depths, the camera's included.
     """
@@ -77,7 +77,7 @@ class Choices(NamedTuple):
     sums: np.ndarray
     states: np.ndarray
     ends: np.ndarray
-    partial: np.ndarray
+    listed: np.ndarray
     repeated: bool
     extent: float
 
@@ -197,10 +197,10 @@ class Cells:
         depths = np.zeros((height, 2), kind)
         fronts = self.visible or layers == 1
         marks, marked = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
-        ends, partial = np.empty((height if self.rims else 0, width), np.uint16), np.zeros(height, np.int64)
+        ends, listed = np.empty((height if self.rims else 0, width), np.uint16), np.zeros(height, np.int64)
         noted = states, hidden, depths, seen, counts, marks if self.visible and layers > 1 else marks[:0], marked
         given = self.positions, self.rgba, self.row, self.exits, fronts, self._reach
-        parallel(survey, height, *given, *noted, ends, partial, work=3 * self.row.size)
+        parallel(survey, height, *given, *noted, ends, listed, work=3 * self.row.size)
         repeated = int(np.count_nonzero(seen)) != int(counts.sum())
         if self._wanted is not None:
             states *= self._wanted | amid if len(amid) else self._wanted
@@ -227,14 +227,14 @@ class Cells:
             given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states, ends
             arrays = self.positions, self.rgba, self.row, *self._numbers
             parallel(listing.choose, height, *arrays, *given, work=500 * len(columns))
-        return Choices(marks, offsets, columns, ranges, sums, states, ends, partial, repeated, extent)
+        return Choices(marks, offsets, columns, ranges, sums, states, ends, listed, repeated, extent)
 
     @cached_property
     def outlines(self) -> Outlines:
         """How outlines move, and what that changes; nothing without rims."""
         _, height, width = self.row.shape
         choices, kind = self.choices, self.positions.dtype
-        ends, counts = choices.ends, choices.partial
+        ends, counts = choices.ends, choices.listed
         if self.rims and self._wanted is not None:
             ends, counts = np.empty_like(ends), np.empty_like(counts)
             given = choices.ends, self._wanted, ends, counts

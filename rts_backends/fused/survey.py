@@ -239,14 +239,14 @@ def _unite(partial, mixed, y):
 
 
 @compiled
-def _fill_ends(ends, listed, above, level, below):
+def _fill_ends(ends, partial, above, level, below):
     """Fill a row of `ends`."""
     for x in range(len(ends)):
         bits = _empty(above, x, 0) | _empty(above, x + 1, 1) | _empty(above, x + 2, 2)
         bits |= _empty(level, x, 3) | _empty(level, x + 2, 5)
         bits |= _empty(below, x, 6) | _empty(below, x + 1, 7) | _empty(below, x + 2, 8)
-        fronts = listed[x] & (level[x + 1] >> 1)
-        ends[x] = np.uint16(listed[x]) << 9 | bits * fronts
+        fronts = partial[x] & (level[x + 1] >> 1)
+        ends[x] = np.uint16(partial[x]) << 9 | bits * fronts
 
 
 @compiled
