@@ -19,6 +19,32 @@ def largest(x: np.ndarray) -> float:
     return float(found.max().view(np.float32))
 
 
+def extent(x: np.ndarray) -> tuple[int, int]:
+    """The least and the largest of an array of integers that is not empty."""
+    if x.dtype != np.int32:
+        return int(x.min()), int(x.max())
+    return _ends(x, np.empty(0, np.bool_))
+
+
+def named(x: np.ndarray) -> tuple[np.ndarray, int, int]:
+    """Where an array of indices is not negative, bool; and the least and the largest of them, and −1."""
+    if x.dtype != np.int32 or not x.size:
+        return x >= 0, int(x.min(initial=-1)), int(x.max(initial=-1))
+    there = np.empty(x.shape, np.bool_)
+    least, most = _ends(x, there)
+    return there, min(least, -1), max(most, -1)
+
+
+def _ends(x: np.ndarray, there: np.ndarray) -> tuple[int, int]:
+    """The least and the largest of int32; `there`, of their shape or empty, is filled with which are not negative."""
+    from rts.sampling import extremes_kernels
+
+    numbers = read_only(x).reshape(-1)
+    found = np.empty((-(-numbers.size // extremes_kernels.CHUNK), 2), np.int32)
+    parallel(extremes_kernels.ends, len(found), numbers, found, there.reshape(-1), work=numbers.size // 8)
+    return int(found[:, 0].min()), int(found[:, 1].max())
+
+
 def bounds(x: np.ndarray, covered: np.ndarray) -> tuple[float, float]:
     """The least and the largest of those numbers of an array of floats that are covered, and zero; none is NaN."""
     if x.dtype != np.float32:

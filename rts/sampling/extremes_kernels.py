@@ -25,6 +25,23 @@ def find(first, last, bits, found):
 
 
 @kernel
+def ends(first, last, numbers, found, named):
+    """Fill `found` (·, 2) with the least and the largest of each chunk of int32, and `named`, if any, with which name.
+
+    Those do that are not negative.
+    """
+    for chunk in range(first, last):
+        block = numbers[chunk * CHUNK : (chunk + 1) * CHUNK]
+        low = high = block[0]
+        for i in range(len(block)):
+            low, high = np.int32(min(low, block[i])), np.int32(max(high, block[i]))
+        found[chunk, 0], found[chunk, 1] = low, high
+        there = named[chunk * CHUNK : (chunk + 1) * CHUNK]
+        for i in range(len(there)):
+            there[i] = block[i] >= 0
+
+
+@kernel
 def bounds(first, last, bits, covered, found):
     """Fill `found` (·, 2) with how far floats of each chunk are below and above zero at most, as bits.
 

@@ -45,14 +45,15 @@ def facing_of_views(
     """As `facing`, of views (height, width) that lie side by side, line after line; each has a camera."""
     from rts.sampling import facing_kernels
 
-    found = np.zeros(kept.shape, np.int16)
     behind = np.count_nonzero(kept[1:])
-    if behind:
-        given = (np.ascontiguousarray(x) for x in (kept, fragments.triangle_ids))
-        triangles = read_only(proxy.vertices), read_only(proxy.faces, np.int32), read_only(pieces, np.int16)
-        eyes = np.stack([eye(camera) for camera in cameras])
-        arrays = *given, *triangles, eyes, *view, listed, MORE
-        parallel(facing_kernels.fill, kept.shape[1], *arrays, found, work=kept[0].size + 100 * behind)
+    if not behind:
+        return np.zeros(kept.shape, np.int16)
+    found = np.empty(kept.shape, np.int16)
+    given = (np.ascontiguousarray(x) for x in (kept, fragments.triangle_ids))
+    triangles = read_only(proxy.vertices), read_only(proxy.faces, np.int32), read_only(pieces, np.int16)
+    eyes = np.stack([eye(camera) for camera in cameras])
+    arrays = *given, *triangles, eyes, *view, listed, MORE
+    parallel(facing_kernels.fill, kept.shape[1], *arrays, found, work=kept[0].size + 100 * behind)
     return found
 
 

@@ -10,7 +10,7 @@ from rts.sampling.windows_kernels import add, spread
 
 @kernel
 def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eyes, rows, columns, listed, more, found):
-    """Fill lines [start, stop) of `found` (K, H, W) int16, zeros; see `rts.sampling.facing`.
+    """Fill lines [start, stop) of `found` (K, H, W) int16; see `rts.sampling.facing`.
 
     `eyes` (B, 4) are those of views of so many rows and columns of cells, which lie side by side, line after line.
     """
@@ -25,6 +25,8 @@ def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eyes, rows, c
                 add(level[1:-1], kept[k, y])
         if y <= start:
             continue
+        for k in range(layers):
+            found[k, y - 1, :] = 0
         spread(near, hidden[(y + 1) % 3], hidden[(y + 2) % 3], level)
         for x in range(width):
             if listed or near[x]:

@@ -9,7 +9,7 @@ import numpy as np
 from rts.errors import InputError
 from rts.records import Fragments, Proxy, Samples
 from rts.sampling.exits import Exits
-from rts.sampling.extremes import largest
+from rts.sampling.extremes import largest, named
 
 FAR = 20
 """How many times larger than the farthest depth coordinates may be, so that depths, computed of them in float32, differ
@@ -19,6 +19,18 @@ from those that were sampled by less than splatters allow for."""
 def too_far(size: float, depth: np.ndarray) -> bool:
     """Whether coordinates of a size are so large that rounding may reorder depths (0 where there is none)."""
     return size > 0 and size > FAR * largest(depth)
+
+
+def covered_cells(triangle_ids: np.ndarray) -> tuple[np.ndarray, int]:
+    """Where `Fragments.triangle_ids` name a triangle, bool, and the largest that they name, or −1.
+
+    Raises:
+        InputError: some are neither indices nor −1.
+    """
+    covered, least, last = named(np.asarray(triangle_ids))
+    if least < -1:
+        raise InputError(f"the sampler gave triangle {least} to a cell; expected indices, or -1 where it is empty")
+    return covered, last
 
 
 def of_first_row(settled: np.ndarray) -> np.ndarray:
@@ -41,16 +53,14 @@ def lift(
 
     Samples are numbered layer by layer, each in rows and columns of the image. There is always at least one row, so
     that what follows stays connected to θ; a row that no cell refers to has no effect. `kept` (K, H, W) bool says which
-    of the covered cells to take, None for all; all are taken, too, where depths are too rough to tell (`too_far`).
+    of the `covered_cells` to take, None for all; all are taken, too, where depths are too rough to tell (`too_far`).
     `size` is that of the largest coordinate, if it is known. `exits` come last, as many as there is room for, in as
     many rows as there are cells and layers at most.
     """
     from rts.sampling import packing_kernels
 
-    if (least := fragments.triangle_ids.min(initial=-1)) < -1:
-        raise InputError(f"the sampler gave triangle {least} to a cell; expected indices, or -1 where it is empty")
     if kept is None or (len(kept) > 1 and too_far(largest(proxy.vertices) if size is None else size, fragments.depth)):
-        kept = fragments.triangle_ids >= 0
+        kept, _ = covered_cells(fragments.triangle_ids)
     table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
     beside = () if exits is None else ((exits.fragments, exits.there),)

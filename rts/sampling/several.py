@@ -122,11 +122,11 @@ class Sampling(NamedTuple):
         }
 
         def find(own: Sequence[Camera], inputs: Any) -> tuple[Samples, dict[str, np.ndarray]]:
-            def drawn(known: Entry) -> tuple[Entry, Fragments]:
-                return known, _drawn(sampler, known, own, picture, layers, part.cull)
+            def drawn(known: Entry) -> tuple[Entry, Fragments, np.ndarray]:
+                return known, *_drawn(sampler, known, own, picture, layers, part.cull)
 
-            known, fragments = sampler.working_on(surface, inputs, own[0], picture.view, entry, drawn)
-            kept, more = pruning.asked(fragments, known.size or largest(known.proxy.vertices))
+            known, fragments, covered = sampler.working_on(surface, inputs, own[0], picture.view, entry, drawn)
+            kept, more = pruning.asked(covered, fragments.depth, known.size or largest(known.proxy.vertices))
             if tells:
                 pieces = checked_pieces(surface, known.proxy) if kept[1:].any() else np.zeros(1, np.int16)
                 more["facing"] = facing_of_views(fragments, kept, known.proxy, pieces, own, picture.view)
@@ -273,21 +273,25 @@ def _is_plain(sampler: Any, part: CheckedPart, exits: bool) -> bool:
 
 def _drawn(
     sampler: TriangleSampler, known: Entry, cameras: Sequence[Camera], picture: Picture, layers: int, cull: str
-) -> Fragments:
-    """The fragments (K, height, width) of the picture: views on all cores, if the sampler is `concurrent`."""
+) -> tuple[Fragments, np.ndarray]:
+    """The fragments (K, height, width) of the picture, and where there are any, bool.
+
+    Views are drawn on all cores, if the sampler is `concurrent`.
+    """
     shape, faces, places = (layers, *picture.size), len(known.proxy.faces), picture.places()
     # One array for them all: where such are allotted anew in each call, the system gives fewer pages.
     numbers = np.empty((4, *shape), np.float32)
     found = Fragments(numbers[0].view(np.int32), numbers[1:3].reshape(*shape, 2), numbers[3])
+    covered = np.zeros(shape, np.bool_)
     if not faces or len(places) < picture.down * picture.across:
         for x, nothing in zip(found, (-1, 0, 0), strict=True):
             x[...] = nothing
     if not faces:
-        return found
+        return found, covered
 
     def draw(b: int) -> None:
         own = sampler.rasterize(known.prepared, cameras[b], picture.view, layers, cull)
-        check_fragments(own, (layers, *picture.view), faces, sampler)
+        covered[:, *places[b]] = check_fragments(own, (layers, *picture.view), faces, sampler)
         for to, x in zip(found, own, strict=True):
             to[:, *places[b]] = x
 
@@ -296,7 +300,7 @@ def _drawn(
     else:
         for b in range(len(cameras)):
             draw(b)
-    return found
+    return found, covered
 
 
 class _Pruning:
@@ -319,21 +323,21 @@ class _Pruning:
         """See `Needed`."""
         return self._asked(covered, depth, 0.0)[0]
 
-    def asked(self, fragments: Fragments, size: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Which fragments (K, height, width) are needed; and "scales" (B,) of depths, and "settled", if it `settles`.
+    def asked(self, covered: np.ndarray, depth: np.ndarray, size: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Which samples (K, height, width) are needed; and "scales" (B,) of depths, and "settled", if it `settles`.
 
         Args:
-            fragments: of the picture.
+            covered: (K, height, width) bool, where the picture has samples.
+            depth: (K, height, width), their depths.
             size: of the largest coordinate.
         """
-        covered = fragments.triangle_ids >= 0
-        kept, depth, scales = self._asked(covered, fragments.depth, size)
+        kept, scaled, scales = self._asked(covered, depth, size)
         if not self.settles:
             return kept, {"scales": scales}
         settled = np.zeros(covered.shape[1:], bool)
-        if depth is not None:
+        if scaled is not None:
             assert self._near is not None
-            settled = self._near.settled(covered, depth, kept, 0.0)
+            settled = self._near.settled(covered, scaled, kept, 0.0)
         return kept, {"scales": scales, "settled": of_first_row(settled)}
 
     def _asked(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 
@@ -274,18 +274,16 @@ class TriangleSampler(Sampler):
         grid = max(shape.layers + 1, LEAST_LAYERS) if more else shape.layers, *shape.size
         moves = surface.refines and surface.refine_moves
 
-        def keep(fragments: Fragments) -> np.ndarray:
+        def keep(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
             """Which of the fragments, where nothing moves them any more, are samples."""
-            covered = fragments.triangle_ids >= 0
-            return covered if needed is None else needed(covered, fragments.depth)
+            return covered if needed is None else needed(covered, depth)
 
         asked = keep if exits else None
-        found, fragments, kept, behind = self._fragments(
+        found, fragments, covered, kept, behind = self._fragments(
             surface, cull, inputs, camera, shape.view, grid, entry, cells, asked
         )
-        covered = fragments.triangle_ids >= 0
         if not moves:
-            kept = keep(fragments) if kept is None else kept
+            kept = keep(covered, fragments.depth) if kept is None else kept
             settled, size = None, found.size
             if needed is not None and not surface.refines:
                 if size is None:
@@ -326,40 +324,41 @@ class TriangleSampler(Sampler):
         grid: tuple[int, int, int],
         entry: Entry | None,
         cells: np.ndarray | None,
-        keep: Callable[[Fragments], np.ndarray] | None,
-    ) -> tuple[Entry, Fragments, np.ndarray | None, Exits | None]:
+        keep: Callable[[np.ndarray, np.ndarray], np.ndarray] | None,
+    ) -> _Found:
         """What is prepared of a surface, and the fragments (K, ·, ·) of a grid of the size `view`, or of some cells.
 
         With what says which of them to `keep` also that, and the exits beside outlines.
         """
 
-        def drawn(found: Entry) -> Fragments:
+        def drawn(found: Entry) -> tuple[Fragments, np.ndarray]:
             if not len(found.proxy.faces):
-                return _no_fragments(grid)
+                return _no_fragments(grid), np.zeros(grid, np.bool_)
             given = found.prepared, camera, view, grid[0], cull
             fragments = self.rasterize(*given) if cells is None else self.rasterize_cells(*given, cells)
-            check_fragments(fragments, grid, len(found.proxy.faces), self)
-            return fragments
+            return fragments, check_fragments(fragments, grid, len(found.proxy.faces), self)
 
-        def all_of(found: Entry) -> tuple[Entry, Fragments, np.ndarray | None, Exits | None]:
+        def all_of(found: Entry) -> _Found:
             if keep is None:
-                return found, drawn(found), None, None
+                return _Found(found, *drawn(found))
             if not (count := len(found.proxy.faces)):
-                fragments = drawn(found)
+                fragments, covered = drawn(found)
                 nowhere = np.empty((1, 0), np.int32)
-                return found, fragments, None, Exits.of(fragments, nowhere, _no_fragments((1, 1, 0)))
-            wanted, kept = keep, None
+                return _Found(found, fragments, covered, None, Exits.of(fragments, nowhere, _no_fragments((1, 1, 0))))
+            wanted, looked_at, covered, kept = keep, None, None, None
 
             def beside(fragments: Fragments) -> np.ndarray:
-                nonlocal kept
-                check_fragments(fragments, grid, count, self)
-                kept = wanted(fragments)
+                nonlocal looked_at, covered, kept
+                looked_at, covered = fragments, check_fragments(fragments, grid, count, self)
+                kept = wanted(covered, fragments.depth)
                 return beside_outlines(kept)
 
             fragments, asked, backs = self.rasterize_exits(found.prepared, camera, view, grid[0], beside)
+            if covered is None or fragments is not looked_at:
+                covered, kept = check_fragments(fragments, grid, count, self), None
             if asked.size:
                 check_fragments(backs, (1, *asked.shape), count, self)
-            return found, fragments, kept, Exits.of(fragments, asked, backs)
+            return _Found(found, fragments, covered, kept, Exits.of(fragments, asked, backs))
 
         return self.working_on(surface, inputs, camera, view, entry, all_of)
 
@@ -392,6 +391,24 @@ class TriangleSampler(Sampler):
     def draws_at_once(self) -> bool:
         """Whether several threads may draw what is prepared of one surface at once."""
         return self.concurrent and not self.follows
+
+
+class _Found(NamedTuple):
+    """What a sampler has found of a surface.
+
+    Attributes:
+        entry: what is prepared of it.
+        fragments: (K, ·, ·).
+        covered: (K, ·, ·) bool, which cells have one.
+        kept: (K, ·, ·) bool, which of them are to be samples, if that was asked.
+        exits: those beside outlines, if they were asked for.
+    """
+
+    entry: Entry
+    fragments: Fragments
+    covered: np.ndarray
+    kept: np.ndarray | None = None
+    exits: Exits | None = None
 
 
 def _of_triangles(given: Any) -> TriangleSurface:

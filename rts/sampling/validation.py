@@ -15,6 +15,7 @@ from rts.errors import InputError
 from rts.interfaces import TriangleSurface
 from rts.records import Fragments, Proxy, Samples
 from rts.sampling.extremes import largest
+from rts.sampling.packing import covered_cells
 from rts.splatting.layers import check_rows
 from rts.topology import extent
 from rts.trees import Tree
@@ -115,8 +116,8 @@ def check_samples(samples: Samples, grid: tuple[int, ...], sampler: Any) -> Samp
     return samples
 
 
-def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sampler: Any) -> None:
-    """Refuse what `rasterize` of a sampler should not have returned."""
+def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sampler: Any) -> np.ndarray:
+    """Which cells (K, H, W) bool are covered; what `rasterize` of a sampler should not have returned is refused."""
     if isinstance(fragments, Fragments):
         ids, barycentrics, depth = fragments
         fits = np.shape(ids) == np.shape(depth) == shape and np.shape(barycentrics) == (*shape, 2)
@@ -128,9 +129,10 @@ def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sam
             f"rasterize of {type(sampler).__name__} returned {given}; expected rts.Fragments of "
             f"{(shape, (*shape, 2), shape)}"
         )
-    last = int(np.asarray(fragments.triangle_ids).max())
+    covered, last = covered_cells(fragments.triangle_ids)
     if last >= faces:
         raise InputError(f"rasterize of {type(sampler).__name__} returned triangle {last} of {faces}")
+    return covered
 
 
 WELL_CONDITIONED = 1e-6

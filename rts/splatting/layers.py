@@ -13,6 +13,7 @@ from rts.engines import namespace, stopped
 from rts.errors import InputError
 from rts.operations.operation import known_value
 from rts.records import MORE, Splats
+from rts.sampling.extremes import extent
 from rts.trees import Array
 
 OFFSETS = (-1, 0, 1)
@@ -28,7 +29,7 @@ def check_rows(row: Array, count: int, name: str = "row") -> None:
     value = known_value(row)
     if value is None or not value.size:
         return
-    low, high = value.min(), value.max()
+    low, high = extent(value)
     if high >= count:
         raise InputError(f"{name} refers to sample {high} of {count}; expected indices below, or -1 for an empty cell")
     if low < -1:

@@ -150,7 +150,7 @@ class Cells:
         """(H, W) int32, the sample whose colour a target shows, whatever moves, or −1; no rows for none."""
         return read_only(self._settled, np.int32)
 
-    @property
+    @cached_property
     def _shows_several(self) -> bool:
         """Whether settled targets show the colours of other samples than that of row 0."""
         return self._settled.max(initial=-1) > 0
@@ -191,8 +191,8 @@ class Cells:
         count, kind = len(self.positions), self.positions.dtype
         # The codes of targets that are not settled, and that are.
         amid = self._settled >= 0
-        states = amid.astype(np.uint8) if len(amid) else np.zeros((height, width), np.uint8)
-        hidden, seen = np.zeros((height, -(-width // BLOCK)), np.uint8), np.zeros(count, np.uint8)
+        states = amid.view(np.uint8).copy() if len(amid) else np.zeros((height, width), np.uint8)
+        hidden, seen = np.zeros((height, -(-width // BLOCK)), np.uint8), np.zeros(count, np.bool_)
         counts = np.zeros(height, np.int64)
         depths = np.zeros((height, 2), kind)
         fronts = self.visible or layers == 1
@@ -252,7 +252,7 @@ class Cells:
         if len(found.columns):
             rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
             arrays = self.positions, self.rgba, self.row, *self._numbers
-            decide = self.part, self.exits, kind.type(choices.extent), rules, self._pairs
+            decide = self.part, self.exits, kind.type(choices.extent), rules, self._pairs[0]
             listed = choices.columns, choices.offsets, choices.ranges, choices.sums
             given = *arrays, *decide, *listed, ends
             parallel(outlines.fill, height, *given, found, work=90 * len(found.columns))
@@ -261,19 +261,23 @@ class Cells:
         return found
 
     @cached_property
-    def _pairs(self) -> np.ndarray:
-        """Bits (H, W) of pairs beside lines of crossing (`crossing_pairs.py`); no rows where there are none."""
+    def _pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bits (H, W) of pairs beside lines of crossing, and which rows (H,) have some; no rows where there are none.
+
+        See `crossing_pairs.py`.
+        """
         if not self.crosses:
-            return read_only(np.empty((0, self.row.shape[2]), np.uint8))
+            return crossing_pairs.nothing(self.row.shape[2])
         return crossing_pairs.pairs(self.positions, self.row, self.positions.dtype.type(self.choices.extent))
 
     @cached_property
     def crossings(self) -> Crossings:
         """The targets whose derivative is that of a line where surfaces cross."""
-        if not len(self._pairs):
+        bits, some = self._pairs
+        if not len(bits):
             return crossings.nothing(self.row.shape[1], self.positions.dtype)
         arrays = self.positions, self.rgba, self.row, *self._numbers
-        return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent), self._pairs)
+        return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent), bits, some)
 
     @cached_property
     def _crossed(self) -> np.ndarray | None:
@@ -324,7 +328,8 @@ class Cells:
         )
         g, states = read_only(g), self.choices.states
         if self._crossed is not None:
-            states = read_only(np.where(self._crossed, np.uint8(EMPTY), states))
+            states = states.copy()
+            states[self.crossings.cells()] = EMPTY
         plain = *self.plain_arguments, states, self.border
         parallel(stencil.pull, height, *plain, g, *found, work=self._plain_work)
         self._pull_mixed(g, *found)

@@ -56,8 +56,10 @@ def _no_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
     return np.zeros((height, width), np.uint8), np.zeros(height, np.bool_)
 
 
-def pairs(positions: np.ndarray, row: np.ndarray, extent: np.floating) -> np.ndarray:
-    """Bits (H, W) uint8 of the steps from each cell to the other of a pair; no rows where there are no pairs.
+def pairs(positions: np.ndarray, row: np.ndarray, extent: np.floating) -> tuple[np.ndarray, np.ndarray]:
+    """Bits (H, W) uint8 of the steps from each cell to the other of a pair, and whether there are any in a row (H,).
+
+    There are no rows where there are no pairs.
 
     Args:
         positions: (N, 3).
@@ -65,12 +67,17 @@ def pairs(positions: np.ndarray, row: np.ndarray, extent: np.floating) -> np.nda
         extent: of the depths, the camera's included.
     """
     _, height, width = row.shape
-    if len(row) > 1 and (row[1] >= 0).any():
+    if len(row) > 1:
         bits, some = _no_pairs(height, width)
         parallel(find_in_cells, height, positions, row, Rules.of(extent), bits, some, work=3 * row[0].size)
         if some.any():
-            return read_only(bits)
-    return read_only(np.empty((0, width), np.uint8))
+            return read_only(bits), some
+    return nothing(width)
+
+
+def nothing(width: int) -> tuple[np.ndarray, np.ndarray]:
+    """What `pairs` gives where there are none."""
+    return read_only(np.empty((0, width), np.uint8)), np.empty(0, np.bool_)
 
 
 @kernel

@@ -42,10 +42,15 @@ class Crossings(NamedTuple):
     colors: np.ndarray
     slopes: np.ndarray
 
+    def cells(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows and columns of these targets."""
+        own = self.columns >= 0
+        return rows_of(self.offsets)[own], self.columns[own]
+
     def places(self, width: int) -> np.ndarray:
         """(H, W) bool, where these targets are."""
-        there, own = np.zeros((len(self.offsets) - 1, width), np.bool_), self.columns >= 0
-        there[rows_of(self.offsets)[own], self.columns[own]] = True
+        there = np.zeros((len(self.offsets) - 1, width), np.bool_)
+        there[self.cells()] = True
         return there
 
     def among_mixed(self) -> np.ndarray:
@@ -71,7 +76,7 @@ def _empty(offsets: np.ndarray, kind: np.dtype) -> Crossings:
     return Crossings(offsets, *listed, *arrays)
 
 
-def listed(arrays: tuple, choices: Any, extent: np.floating, bits: np.ndarray) -> Crossings:
+def listed(arrays: tuple, choices: Any, extent: np.floating, bits: np.ndarray, some: np.ndarray) -> Crossings:
     """The targets beside lines.
 
     Args:
@@ -79,10 +84,11 @@ def listed(arrays: tuple, choices: Any, extent: np.floating, bits: np.ndarray) -
         choices: see `rts_backends.fused.cells.Choices`.
         extent: of the depths, the camera's included.
         bits: the pairs of `crossing_pairs.py`.
+        some: (H,) bool, whether there are any in a row.
     """
     positions, _, row = arrays[:3]
     height, width = bits.shape
-    kind, rules, some = positions.dtype, Rules.of(extent), bits.any(axis=1)
+    kind, rules = positions.dtype, Rules.of(extent)
     rows = height + 2 * BORDER
     z, gap = np.empty((2, rows, width), kind), np.empty((rows, width + 2 * BORDER), kind)
     parallel(gather, rows, positions, row, some, z, gap, work=row[0].size)

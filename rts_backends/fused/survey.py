@@ -60,7 +60,7 @@ def survey(
         states: (H, W) uint8, EMPTY or SETTLED, to be filled where they are EMPTY.
         hidden: (H, B) uint8, zeros, to be marked: the blocks of columns in or beside which hidden layers are covered.
         depths: (H, 2) zeros, for the least and the largest depth of each row, and zero.
-        seen: (N,) uint8, zeros, to be marked: samples that some cell refers to.
+        seen: (N,) bool, zeros, to be marked: samples that some cell refers to.
         counts: (H,) zeros, for the number of such cells, of `row` and `exits`.
         mixed: (H, W) uint8, to be filled with marks of the mixed targets of `Visible`; no rows where nobody asks.
         marked: (H,) zeros, to be filled with their number in each row.
@@ -163,7 +163,7 @@ def _note(cells, positions, behind, hidden, depths, seen):
         i = cells[x]
         if i >= 0:
             count += 1
-            seen[i] = 1
+            seen[i] = True
             least, largest = min(least, positions[i, 2]), max(largest, positions[i, 2])
             if behind:
                 hidden[max(x - 1, 0) // BLOCK] = hidden[min(x + 1, last) // BLOCK] = 1
@@ -178,7 +178,7 @@ def _note_exits(cells, seen):
     for x in range(len(cells)):
         if cells[x] >= 0:
             count += 1
-            seen[cells[x]] = 1
+            seen[cells[x]] = True
     return count
 
 

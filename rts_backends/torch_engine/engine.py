@@ -101,10 +101,13 @@ class TorchEngine(Engine):
 
     def constant(self, value: Any, like: torch.Tensor | None = None) -> torch.Tensor:
         """`value` on the device of `like`, floats in its dtype."""
-        tensor = _tensor(value, None if like is None else like.device)
-        if not tensor.is_floating_point():
-            return tensor
-        return tensor.to(torch.float64 if like is not None and like.dtype == torch.float64 else torch.float32)
+        array = np.asarray(value)
+        if array.dtype.kind == "f":
+            # A number too large for float32 becomes infinity. torch takes ten times as long for a matrix.
+            with np.errstate(over="ignore"):
+                wide = like is not None and like.dtype == torch.float64
+                array = array.astype(np.float64 if wide else np.float32, copy=False)
+        return _tensor(array, None if like is None else like.device)
 
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[torch.Tensor, ...]:
         """Call `fn` on NumPy views or copies of `args`; under vmap once an item, packed rows padded alike."""

@@ -27,7 +27,8 @@ def apply(operation: Operation, operands: Sequence[Tensor], params: Mapping[str,
     """The result of an operation."""
     if not _fits(operands) or _specifying.on or torch.compiler.is_compiling():
         return operation.specification(*operands, **params)
-    return applied(_Value, _Call(operation, params), *operands)
+    # Repeated rows are written out once, and not for each derivative anew.
+    return applied(_Value, _Call(operation, params), *[x.contiguous() for x in operands])
 
 
 class _Specifying(threading.local):
