@@ -550,8 +550,14 @@ class Camera:
         """
         (height, width), (top, left), (rows, columns) = size, corner, extent
         self = self.for_size(size)
-        change = np.diag([width / columns, height / rows, 1.0, 1.0])
-        change[:2, 3] = (width - 2 * left) / columns - 1, 1 - (height - 2 * top) / rows
+        change = np.array(
+            [
+                [width / columns, 0, 0, (width - 2 * left) / columns - 1],
+                [0, height / rows, 0, 1 - (height - 2 * top) / rows],
+                [0, 0, 1, 0],
+                [0, 0, 0, 1],
+            ]
+        )
         change = engine_of(self.projection).constant(change, self.projection)
         aspect = self.aspect
         if isinstance(aspect, float):

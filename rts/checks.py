@@ -15,7 +15,7 @@ from rts.adapting import adapted
 from rts.arguments import check_pixels, quoted
 from rts.arrays import described, from_numbers, is_finite, shape_of
 from rts.camera import Camera
-from rts.engines import namespace, value_of
+from rts.engines import floating_bits, value_of
 from rts.errors import AspectWarning, InputError, warn
 from rts.gbuffer import GBuffer
 from rts.interfaces import Sampler, Shader, Splatter, as_surface
@@ -79,7 +79,7 @@ def _check_camera(camera: Camera) -> Camera:
     if view is not camera.view or projection is not camera.projection:
         camera = camera.replace(view=view, projection=projection)
     known = projection[3, 2] if isinstance(projection, np.ndarray) else value_of(projection[3, 2])
-    return camera.turned() if known is not None and np.all(known > 0) else camera
+    return camera.turned() if known is not None and (known > 0).all() else camera
 
 
 def _check_part(index: int, part: Part) -> CheckedPart:
@@ -234,7 +234,7 @@ def check_memory(height: int, width: int, layers: int, capacity: int | None, *, 
 
 def is_count(value: Any) -> bool:
     """Whether a value is an integer of at least 1, Python's or NumPy's."""
-    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1
+    return isinstance(value, (int, Integral)) and not isinstance(value, bool) and int(value) >= 1
 
 
 def is_real(value: Any) -> bool:
@@ -262,7 +262,7 @@ def check_background(background: Any, size: tuple[int, int], channels: int) -> A
 
 def check_floating(name: str, value: Array) -> None:
     """Refuse integers: some would mean 0 to 255 by them, others 0 to 1."""
-    if not namespace(value).isdtype(value.dtype, "real floating"):
+    if not floating_bits(value):
         raise InputError(f"{name} has dtype {value.dtype}; expected floating numbers")
 
 
@@ -273,7 +273,8 @@ def check_shaded(rgba: Any, count: int, shader: Shader) -> None:
         other = len(shape) == 2 and shape[0] == count and shape[1] > 4
         hint = f": {shader.channels} channels and alpha, as its attribute `channels` says" if other else ""
         raise InputError(f"what the shader {quoted(shader)} returned {described(rgba)}; expected {expected}{hint}")
-    check_floating(f"what the shader {quoted(shader)} returned", rgba)
+    if not floating_bits(rgba):  # Else there is no need of words, which take longer.
+        check_floating(f"what the shader {quoted(shader)} returned", rgba)
 
 
 def check_splats(

@@ -437,13 +437,19 @@ def _widest(found: Sequence[Any]) -> Array | None:
     for x in found:
         if isinstance(x, CONSTANT_TYPES):
             continue
-        own = _BITS.get(x.dtype)
-        if own is None:
-            xp = namespace(x)
-            own = _BITS[x.dtype] = xp.finfo(x.dtype).bits if xp.isdtype(x.dtype, "real floating") else 0
+        own = floating_bits(x)
         if own > bits:
             widest, bits = x, own
     return widest
+
+
+def floating_bits(x: Array) -> int:
+    """How many bits the numbers of an array have, of real floating ones; 0 for others. It is known for each dtype."""
+    own = _BITS.get(x.dtype)
+    if own is None:
+        xp = namespace(x)
+        own = _BITS[x.dtype] = xp.finfo(x.dtype).bits if xp.isdtype(x.dtype, "real floating") else 0
+    return own
 
 
 def namespace(*arrays: Array) -> Any:

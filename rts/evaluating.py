@@ -111,11 +111,12 @@ def _places_of(pictures: Sequence[Views], engine: Engine, like: Array) -> Array:
 
 def _splats(sampled: Sampled, positions: Array, rgba: Array, engine: Engine) -> Splats:
     """The splats of samples whose positions and colours are known."""
-    cells = sampled.row, sampled.part, sampled.facing, sampled.settled, sampled.exit
+    part = None if sampled.one_part else sampled.part
+    cells = sampled.row, part, sampled.facing, sampled.settled, sampled.exit
     if not engine.owns(rgba):
         cells = constants(cells, *suiting(positions, rgba))
     *cells, exits = cells
-    return Splats(positions, rgba, *cells, exit=exits)
+    return Splats(positions, rgba, *cells, exit=exits, one_part=sampled.one_part)
 
 
 def to_fine_splats(

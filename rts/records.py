@@ -217,11 +217,16 @@ class Sampled:
     colors: tuple[int, ...] | None = None
 
     @property
+    def one_part(self) -> bool:
+        """Whether it is the scene of one part."""
+        return len(self.samples) == 1
+
+    @property
     def part(self) -> Array:
         """(K, H, W) int32, the part seen in each cell, or −1."""
+        if self.one_part:
+            return _first_part(self.row)
         xp, first = namespace(self.row), 0
-        if len(self.samples) == 1:
-            return xp.clip(self.row, None, 0)
         part = xp.astype(self.row >= 0, self.row.dtype) - 1
         for samples in self.samples[:-1]:
             first += samples.ids.shape[-2]
@@ -229,7 +234,12 @@ class Sampled:
         return part
 
 
-@record(static=("border",))
+def _first_part(row: Array) -> Array:
+    """The part of samples (K, H, W) that are all of the first."""
+    return namespace(row).clip(row, None, 0)
+
+
+@record(static=("border", "one_part"))
 class Splats:
     """Shaded samples in their cells: what a splatter takes.
 
@@ -241,7 +251,8 @@ class Splats:
         rgba: (N, 4) premultiplied, of the engine of the positions; differentiable. Where shaders give other numbers of
             channels, (N, C + 1): splatters are given three of them at a time, and alpha.
         row: (K, H, W) int32, the sample of each cell front to back, or −1; an array of the positions' engine.
-        part: (K, H, W) int32, the part of each sample, or −1; None if that is not known.
+        part: (K, H, W) int32, the part of each sample, or −1; None if that is not known, or where all samples are of
+            `one_part`. See `parts`.
         facing: (K, H, W) integers, the number of the piece of surface in each cell, negative where it is seen from
             behind, 0 where that is not told; or None. See `Samples`.
         settled: (H, W) integers, the sample whose colour the cell shows, whatever moves; −1 where it may change; or
@@ -253,6 +264,7 @@ class Splats:
         exit: (H, W) int32, the sample where the ray leaves the part of the cell's front, or −1; or None. It is not
             seen: it only says how outlines move. See `Samples`.
         border: cells at each side that splat into the image but are no part of it.
+        one_part: whether all samples are of one part.
     """
 
     positions: Array
@@ -265,6 +277,12 @@ class Splats:
     wanted: Array | None = None
     exit: Array | None = None
     border: int = 0
+    one_part: bool = False
+
+    @property
+    def parts(self) -> Array | None:
+        """`part` of any scene: made of `row` where all samples are of one part. None if parts are not known."""
+        return _first_part(self.row) if self.part is None and self.one_part else self.part
 
     def replace(self, **changes: Any) -> Splats:
         """A copy with some fields changed."""

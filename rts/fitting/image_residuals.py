@@ -356,14 +356,16 @@ class ImageResiduals(Residuals):
 
             (positions, rgba), (t_positions, t_rgba) = engine.jacobian(splats)(vector)
             return splatter.normal_equations(
-                Splats(positions, rgba, **constants(known, engine, vector), border=sampled.apron),
+                Splats(positions, rgba, **constants(known, engine, vector), **alike),
                 t_positions,
                 t_rgba if colored else None,
                 **fields._asdict(),
                 **self._loss_beside(),
             )
 
-        known = {name: getattr(sampled, name) for name in ("row", "part", "facing", "settled", "exit")}
+        alike: dict[str, Any] = {"border": sampled.apron, "one_part": sampled.one_part}
+        known = {name: getattr(sampled, name) for name in ("row", "facing", "settled", "exit")}
+        known["part"] = None if sampled.one_part else sampled.part
         if sampled.fine is None:
             return swept(partial(to_splats, sampled), fields, **known)
         # A pixel counts on one of the grids alone.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -19,7 +18,7 @@ from rts.parts import CheckedPart
 from rts.records import ArraySpec, Sampled, Samples
 from rts.sampling.exits import beside_outlines
 from rts.sampling.extremes import largest
-from rts.sampling.packing import FAR, of_first_row
+from rts.sampling.packing import of_first_row, too_far
 from rts.trees import Tree, leaves
 
 LAYER_LIMIT = 8
@@ -110,7 +109,7 @@ def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float 
 
 
 class _BySplatter(Needed):
-    """What a splatter needs of a scene. Arrays of depths are not to change from call to call.
+    """What a splatter needs of a scene.
 
     Args:
         splatter: the splatter.
@@ -122,11 +121,10 @@ class _BySplatter(Needed):
         self._splatter, self.size = splatter, size
         self.settles = any(color >= 0 for color in colors)
         self.colors = colors if any(colors) else None
-        self._asked: tuple[weakref.ref[np.ndarray], float] | None = None
 
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `Needed`."""
-        if len(covered) == 1 or (self.size is not None and self.size > FAR * self._largest(depth)):
+        if len(covered) == 1 or (self.size is not None and too_far(self.size, depth)):
             return covered
         kept = self._splatter.needed(covered, depth)
         if not (isinstance(kept, np.ndarray) and kept.shape == covered.shape and kept.dtype == bool):
@@ -146,20 +144,13 @@ class _BySplatter(Needed):
         part: np.ndarray | None = None,
     ) -> np.ndarray:
         """See `Needed`."""
-        if max(size, self.size or 0.0) > FAR * self._largest(depth):
+        if too_far(max(size, self.size or 0.0), depth):
             return np.zeros(covered.shape[1:], bool)
         from rts.sampling import interiors_kernels
 
         # Beside cells that are not wanted, what decides for others is not settled, and may look at one cell more.
         reach = self._splatter.reach + (wanted is not None)
         return interiors_kernels.settle(covered, depth, kept, reach, wanted, part, self.colors or ())
-
-    def _largest(self, depth: np.ndarray) -> float:
-        """The largest of some depths; of an array that was asked for last it is known."""
-        asked = self._asked
-        if asked is None or asked[0]() is not depth:
-            asked = self._asked = weakref.ref(depth), largest(depth)
-        return asked[1]
 
 
 class Inspection(Needed):

@@ -93,7 +93,7 @@ class Visible(Kernel):
                 behind = behind + xp.where((hidden == k)[..., None], given, 0.0)
         colors = [normalised(b, xp) for b in (front, surface, behind)]
         if self.rims and differentiates:
-            gains = rims.gains(self, layers, shift, splats.part, crossed)
+            gains = rims.gains(self, layers, shift, splats.parts, crossed)
             for i, (total, gain) in enumerate(zip((front, surface), gains, strict=True)):
                 colors[i] = colors[i] + rims.spread(total, gain if still is None else xp.where(still, 0.0, gain))
         image = over(colors[0], over(*colors[1:]))

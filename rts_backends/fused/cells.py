@@ -40,6 +40,7 @@ class Settings(NamedTuple):
         epsilon: excess of the weights' sum over one.
         gamma: the calibration.
         border: rows and columns at each side of the cells that are no part of the image.
+        one_part: whether all samples are known to be of one part.
         rims: whether coverage moves as outlines do, in `visible`.
         crossings: whether lines where surfaces cross move as their depths say, in `visible`.
     """
@@ -49,6 +50,7 @@ class Settings(NamedTuple):
     epsilon: float
     gamma: float
     border: int = 0
+    one_part: bool = False
     rims: bool = False
     crossings: bool = False
 
@@ -91,7 +93,8 @@ class Cells:
         rgba: (N, 4), of the same dtype, premultiplied colours.
         row: (K, H, W) signed integers, the sample of each cell, or −1.
         choices: the choices for the same samples, if they are known.
-        part: (K, H, W) integers, the part of each sample; None, or no layers, where that is not known.
+        part: (K, H, W) integers, the part of each sample; None, or no layers, where that is not known, or where all are
+            of one.
         facing: (K, H, W) integers, which piece shows which side; None, or no layers, where that is not told.
         wanted: (H, W) bool, the targets to fill, others may be anything; None, or no rows, for all.
         settled: (H, W) integers, targets that show the colour of a sample, whatever moves, or −1; None, or no rows, for
@@ -137,7 +140,7 @@ class Cells:
         if self._wanted is not None and len(self._settled):
             # Beside settled targets those that nobody looks at may lack their samples, and seem to end there.
             self._wanted = self._wanted & (self._settled < 0)
-        self.visible, self.border = settings.kind == "visible", settings.border
+        self.visible, self.border, self.one_part = settings.kind == "visible", settings.border, settings.one_part
         self.rims = self.visible and settings.rims
         self.crosses = self.visible and settings.crossings
         self._numbers = tuple(map(positions.dtype.type, _scale_and_peak(settings) + (settings.gamma,)))
@@ -252,12 +255,12 @@ class Cells:
         if len(found.columns):
             rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
             arrays = self.positions, self.rgba, self.row, *self._numbers
-            decide = self.part, self.exits, kind.type(choices.extent), rules, self._pairs[0]
+            decide = self.part, self.one_part, self.exits, kind.type(choices.extent), rules, self._pairs[0]
             listed = choices.columns, choices.offsets, choices.ranges, choices.sums
             given = *arrays, *decide, *listed, ends
             parallel(outlines.fill, height, *given, found, work=90 * len(found.columns))
-            if self._crossed is not None:
-                found.changes[self._crossed[crossings.rows_of(found.offsets), found.columns]] = 0
+            if self._crossed:
+                self.crossings.still(found.offsets, found.columns, found.changes)
         return found
 
     @cached_property
@@ -279,10 +282,10 @@ class Cells:
         arrays = self.positions, self.rgba, self.row, *self._numbers
         return crossings.listed(arrays, self.choices, self.positions.dtype.type(self.choices.extent), bits, some)
 
-    @cached_property
-    def _crossed(self) -> np.ndarray | None:
-        """(H, W) bool, the targets of `crossings`; None where there are none."""
-        return self.crossings.places(self.row.shape[2]) if len(self.crossings.columns) else None
+    @property
+    def _crossed(self) -> bool:
+        """Whether there may be targets of `crossings`."""
+        return len(self.crossings.columns) > 0
 
     def image(self, out: np.ndarray) -> None:
         """Fill the image (H, W, 4), premultiplied, H and W less than those of the cells by both borders."""
@@ -327,13 +330,13 @@ class Cells:
             np.empty((0, 4), kind) if g_rgba is None else g_rgba,
         )
         g, states = read_only(g), self.choices.states
-        if self._crossed is not None:
+        if self._crossed:
             states = states.copy()
             states[self.crossings.cells()] = EMPTY
         plain = *self.plain_arguments, states, self.border
         parallel(stencil.pull, height, *plain, g, *found, work=self._plain_work)
         self._pull_mixed(g, *found)
-        if self._crossed is not None:
+        if self._crossed:
             crossings.pull(self.rgba, self.row, self.crossings, self.border, g, *found)
         if self.rims and g_positions is not None:
             outlines.pull(self.row, self.outlines, self.border, g, g_positions)
@@ -346,7 +349,7 @@ class Cells:
         adjoints, work = np.empty((count, 3, 5), g.dtype), self._mixed_work
         parallel(mixed.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=work // 5)
         given = height, *self.mixed_arguments, adjoints
-        if self._crossed is not None:
+        if self._crossed:
             # Lines of crossing take the place of what samples would give to positions, but not to colours.
             if len(g_rgba):
                 parallel(mixed.pull, *given, g_positions[:0], g_rgba, work=work)
@@ -388,7 +391,6 @@ class Cells:
         copy.row, copy.exits = read_only(own), read_only(exits)
         copy.__dict__.pop("outlines", None)  # They name samples.
         copy.__dict__.pop("crossings", None)
-        copy.__dict__.pop("_crossed", None)
         copy.positions, copy.rgba = read_only(self.positions[index]), read_only(self.rgba[index])
         found = [None if x is None else np.zeros((len(index), x.shape[1]), x.dtype) for x in results]
         copy._pull(g, *found)

@@ -44,23 +44,22 @@ class Crossings(NamedTuple):
 
     def cells(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows and columns of these targets."""
-        own = self.columns >= 0
-        return rows_of(self.offsets)[own], self.columns[own]
+        own, rows = self.columns >= 0, np.arange(len(self.offsets) - 1)
+        return np.repeat(rows, np.diff(self.offsets))[own], self.columns[own]
 
-    def places(self, width: int) -> np.ndarray:
-        """(H, W) bool, where these targets are."""
-        there = np.zeros((len(self.offsets) - 1, width), np.bool_)
-        there[self.cells()] = True
-        return there
+    def still(self, offsets: np.ndarray, columns: np.ndarray, changes: np.ndarray) -> None:
+        """Have the colours of these targets not change with their coverage, where they are in the list of `Outlines`.
+
+        Args:
+            offsets: (H + 1,), where the targets of each row begin in the list.
+            columns: (M,) of the list.
+            changes: (M, 2, 4), changed in place.
+        """
+        parallel(_still, len(offsets) - 1, *self[:2], offsets, columns, changes, work=4 * len(columns))
 
     def among_mixed(self) -> np.ndarray:
         """Places in the list of mixed targets of those that are mixed."""
         return self.mixed[(self.columns >= 0) & (self.mixed >= 0)]
-
-
-def rows_of(offsets: np.ndarray) -> np.ndarray:
-    """The row of each item of a list, where those of each row begin (H + 1,)."""
-    return np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
 
 
 def nothing(height: int, kind: np.dtype) -> Crossings:
@@ -98,6 +97,18 @@ def listed(arrays: tuple, choices: Any, extent: np.floating, bits: np.ndarray, s
     found = _empty(np.concatenate([[0], np.cumsum(counts)]), kind)
     parallel(_fill, height, *arrays, *seen[1:], rules, around, found, work=1000 * len(found.columns))
     return found
+
+
+@kernel
+def _still(start, stop, firsts, crossed, offsets, columns, changes):
+    """`Crossings.still` of rows [start, stop)."""
+    for y in range(start, stop):
+        d = offsets[y]
+        for i in range(firsts[y], firsts[y + 1]):
+            while d < offsets[y + 1] and columns[d] < crossed[i]:
+                d += 1
+            if d < offsets[y + 1] and columns[d] == crossed[i]:
+                changes[d, :, :] = 0
 
 
 @kernel

@@ -32,7 +32,7 @@ def specification(
     given = settings.sigma, settings.epsilon, settings.gamma
     options = {"rims": settings.rims, "crossings": settings.crossings} if settings.kind == "visible" else {}
     part, facing, settled, exits = (x if x.shape[0] else None for x in (part, facing, settled, exits))
-    splats = Splats(positions, rgba, row, part, facing, settled, exit=exits)
+    splats = Splats(positions, rgba, row, part, facing, settled, exit=exits, one_part=settings.one_part)
     return without_border(_SPECIFICATIONS[settings.kind](*given, **options).image(splats), settings.border)
 
 

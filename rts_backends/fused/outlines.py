@@ -115,12 +115,12 @@ def narrow(start, stop, ends, wanted, kept, counts):
 
 
 @compiled
-def _rule(positions, row, part, exits, ends, y, x, extent, rules):
+def _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules):
     """β and the partner's sample of a cell whose front ends somewhere."""
     zero, one, two = positions.dtype.type(0), positions.dtype.type(1), positions.dtype.type(2)
     bits = ends[y, x] & DIRECTIONS
     leaves = len(exits) > 0 and exits[y, x] >= 0
-    if leaves or (len(part) > 1 and part[0, y, x] == part[1, y, x]):
+    if leaves or _has_chord(row, part, one_part, y, x):
         own = _gap(positions, row, exits, leaves, y, x)
         least, m = rules.converging * own * own, 0
         while OUTWARD[bits, m] >= 0:
@@ -145,6 +145,14 @@ def _rule(positions, row, part, exits, ends, y, x, extent, rules):
             root = (one + two * ratio - ratio * ratio) / (two * ratio * (ratio - one))
             return min(max(root, zero), rules.largest), row[0, y - v, x - u]
     return beta, partner
+
+
+@compiled
+def _has_chord(row, part, one_part, y, x):
+    """Whether the second layer of a cell that has a front is known to be of the front's part."""
+    if one_part:
+        return len(row) > 1 and row[1, y, x] >= 0
+    return len(part) > 1 and part[0, y, x] == part[1, y, x]
 
 
 @compiled
@@ -189,6 +197,7 @@ def fill(
     peak,
     gamma,
     part,
+    one_part,
     exits,
     extent,
     rules,
@@ -212,6 +221,7 @@ def fill(
         peak: of the weights, along one axis.
         gamma: the calibration.
         part: (K, H, W), the part of each sample, or no layers.
+        one_part: whether all are known to be of one.
         exits: (H, W), where rays leave the part of the front, or no rows.
         extent: of the depths.
         rules: numbers of the rules.
@@ -242,7 +252,7 @@ def fill(
                 if covered:
                     beta[y, x] = positions.dtype.type(0)
                     if ends[y, x] & DIRECTIONS:
-                        rule = _rule(positions, row, part, exits, ends, y, x, extent, rules)
+                        rule = _rule(positions, row, part, one_part, exits, ends, y, x, extent, rules)
                         beta[y, x], partner[y, x] = rule
                 if not ends[y, x] & LISTED:
                     continue

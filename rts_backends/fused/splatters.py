@@ -32,7 +32,7 @@ class _Fused(splatting.Kernel):
         """See `rts.splatting.Kernel`."""
         if splats.rgba.shape[0] == 0:
             return super().image(splats)
-        return self._of(splats, 0)
+        return self._of(splats.replace(border=0))
 
     def cropped(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
@@ -40,11 +40,11 @@ class _Fused(splatting.Kernel):
             return super().cropped(splats)
         if splats.rgba.shape[0] == 0:
             return without_border(super().image(splats), splats.border)
-        return self._of(splats, splats.border)
+        return self._of(splats)
 
-    def _of(self, splats: Splats, border: int) -> Array:
-        """The image without a border."""
-        return IMAGE(*self._operands(splats), settings=self._settings(border))
+    def _of(self, splats: Splats) -> Array:
+        """The image without the border."""
+        return IMAGE(*self._operands(splats), settings=self._settings(splats.border, splats.one_part))
 
     def _operands(self, splats: Splats) -> tuple[Array, ...]:
         """Those of `IMAGE`."""
@@ -67,8 +67,8 @@ class _Fused(splatting.Kernel):
         kind = type(self)
         return kind.image is _Fused.image and kind.cropped is _Fused.cropped
 
-    def _settings(self, border: int) -> Settings:
-        return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border)
+    def _settings(self, border: int, one_part: bool = False) -> Settings:
+        return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border, one_part)
 
     def normal_equations(
         self,
@@ -88,7 +88,8 @@ class _Fused(splatting.Kernel):
         own = splats.positions, splats.rgba, splats.row, splats.part, self._facing(splats)
         own += splats.wanted, splats.settled, self._exits(splats)
         given = *own, t_positions, t_rgba, target, weights, background
-        return normal_equations.equations(self._settings(splats.border), engine_of(given), loss or SQUARE, *given)
+        settings = self._settings(splats.border, splats.one_part)
+        return normal_equations.equations(settings, engine_of(given), loss or SQUARE, *given)
 
     def mean_loss(
         self,
@@ -102,7 +103,7 @@ class _Fused(splatting.Kernel):
         if not self._sweeps or splats.rgba.shape[0] == 0:
             return None
         given = self._operands(splats), target, weights, background
-        return mean_loss.mean_loss(self._settings(splats.border), loss or SQUARE, *given)
+        return mean_loss.mean_loss(self._settings(splats.border, splats.one_part), loss or SQUARE, *given)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`."""
@@ -132,5 +133,5 @@ class Visible(_Fused, splatting.Visible):
     kind = "visible"
     follows_outlines = True
 
-    def _settings(self, border: int) -> Settings:
-        return super()._settings(border)._replace(rims=self.rims, crossings=self.crossings)
+    def _settings(self, border: int, one_part: bool = False) -> Settings:
+        return super()._settings(border, one_part)._replace(rims=self.rims, crossings=self.crossings)

@@ -102,11 +102,11 @@ class TorchEngine(Engine):
     def constant(self, value: Any, like: torch.Tensor | None = None) -> torch.Tensor:
         """`value` on the device of `like`, floats in its dtype."""
         array = np.asarray(value)
-        if array.dtype.kind == "f":
-            # A number too large for float32 becomes infinity. torch takes ten times as long for a matrix.
+        dtype = np.float64 if like is not None and like.dtype == torch.float64 else np.float32
+        if array.dtype != dtype and array.dtype.kind == "f":
+            # What is too large becomes infinite. torch takes longer for a matrix.
             with np.errstate(over="ignore"):
-                wide = like is not None and like.dtype == torch.float64
-                array = array.astype(np.float64 if wide else np.float32, copy=False)
+                array = array.astype(dtype)
         return _tensor(array, None if like is None else like.device)
 
     def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Any) -> tuple[torch.Tensor, ...]:
