@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,7 @@ def to_splats(
     if not engine.owns(sampled.row):
         sampled = constants(sampled, engine, like if engine.differentiates else None)
     positions, rgba = _together(*_shown(sampled.samples, sampled.row, parts, camera, wide, engine, like))
-    return _splats(sampled, positions, rgba, engine).replace(border=apron)
+    return _splats(sampled, positions, rgba, engine, border=apron)
 
 
 def views_to_splats(
@@ -81,7 +82,7 @@ def views_to_splats(
         of_parts = [_of_views(tables, pictures, index, here) for index, tables in enumerate(shown)]
         positions, rgba = _together(*zip(*of_parts, strict=True))
         wanted = engine_of(positions).constant(picture.picture.inside(border), positions)
-        made.append(_splats(whole, positions, rgba, engine).replace(wanted=wanted))
+        made.append(_splats(whole, positions, rgba, engine, wanted=wanted))
     return made
 
 
@@ -109,14 +110,14 @@ def _places_of(pictures: Sequence[Views], engine: Engine, like: Array) -> Array:
     return xp.concat([constants(corners, engine, like), xp.concat(scales)[:, None]], axis=1)
 
 
-def _splats(sampled: Sampled, positions: Array, rgba: Array, engine: Engine) -> Splats:
-    """The splats of samples whose positions and colours are known."""
+def _splats(sampled: Sampled, positions: Array, rgba: Array, engine: Engine, **more: Any) -> Splats:
+    """The splats of samples whose positions and colours are known; `more` of their fields are given."""
     part = None if sampled.one_part else sampled.part
     cells = sampled.row, part, sampled.facing, sampled.settled, sampled.exit
     if not engine.owns(rgba):
         cells = constants(cells, *suiting(positions, rgba))
     *cells, exits = cells
-    return Splats(positions, rgba, *cells, exit=exits, one_part=sampled.one_part)
+    return Splats(positions, rgba, *cells, exit=exits, one_part=sampled.one_part, **more)
 
 
 def to_fine_splats(

@@ -69,7 +69,7 @@ def places(x: np.ndarray, covered: np.ndarray) -> list[tuple[int, ...]]:
             first = int(sizes.argmax()) * length
             chunk = slice(first, first + length)
             flat.append(first + int(((numbers[chunk] == sign * size) & there[chunk]).argmax()))
-    return [tuple(int(i) for i in np.unravel_index(place, x.shape)) for place in flat]
+    return list(zip(*(i.tolist() for i in np.unravel_index(np.array(flat, np.int64), x.shape)), strict=True))
 
 
 def _sizes(x: np.ndarray, covered: np.ndarray) -> np.ndarray:

@@ -68,7 +68,12 @@ class _Fused(splatting.Kernel):
         return kind.image is _Fused.image and kind.cropped is _Fused.cropped
 
     def _settings(self, border: int, one_part: bool = False) -> Settings:
-        return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border, one_part)
+        return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border, one_part, *self._motions)
+
+    @property
+    def _motions(self) -> tuple[bool, ...]:
+        """Whether outlines, and lines of crossing, have motions of their own, where the splatter knows of these."""
+        return ()
 
     def normal_equations(
         self,
@@ -133,5 +138,6 @@ class Visible(_Fused, splatting.Visible):
     kind = "visible"
     follows_outlines = True
 
-    def _settings(self, border: int, one_part: bool = False) -> Settings:
-        return super()._settings(border, one_part)._replace(rims=self.rims, crossings=self.crossings)
+    @property
+    def _motions(self) -> tuple[bool, ...]:
+        return self.rims, self.crossings

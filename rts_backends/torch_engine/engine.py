@@ -130,12 +130,12 @@ class TorchEngine(Engine):
 
     def on_host(self, *arrays: torch.Tensor) -> bool:
         """Whether all are in the memory of the host."""
-        return all(x.device.type == "cpu" for x in arrays)
+        return all([x.is_cpu for x in arrays])
 
     def exact_products(self, *arrays: torch.Tensor) -> bool:
         """True for two arrays of one dtype on the CPU, outside of `torch.autocast`."""
         a, b = arrays
-        return a.device.type == b.device.type == "cpu" and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
+        return a.is_cpu and b.is_cpu and a.dtype == b.dtype and not torch.is_autocast_enabled("cpu")
 
     def plain(self, x: torch.Tensor) -> bool:
         """Whether it is dense, of real numbers, has values, and no tangent."""

@@ -49,7 +49,7 @@ def _fits(operands: Sequence[Tensor]) -> bool:
     if real not in _DTYPES:
         return False
     for x in operands:
-        if x.device.type != "cpu" or (x.dtype != real and x.dtype not in _INTEGERS):
+        if not x.is_cpu or (x.dtype != real and x.dtype not in _INTEGERS):
             return False
     return True
 
