@@ -203,6 +203,22 @@ def test_triangles_that_are_not_there_are_refused(wrong):
         rts.render(card(0.0), CAMERA, SIZE, sampler=of(True, change))
 
 
+@pytest.mark.parametrize("target", [t for t in DIFFERENTIABLE if t.startswith("torch")])
+@pytest.mark.parametrize("wrong", [-2, 2])
+def test_triangles_that_are_not_there_are_refused_beside_exits(wrong, target):
+    class Wrong(rts.plugin("rts.samplers", "raster")):
+        def rasterize_exits(self, *args):
+            fragments, *exits = super().rasterize_exits(*args)
+            ids = fragments.triangle_ids.copy()
+            ids[0, 4, 4] = wrong
+            return fragments._replace(triangle_ids=ids), *exits
+
+    part = card(0.0)
+    part = part.replace(theta=arrays(target, dict(part.theta)), cull="back")
+    with refused(f"triangle {wrong}"):
+        rts.render(part, CAMERA, SIZE, sampler=Wrong())
+
+
 def test_triangles_that_are_not_there_are_refused_when_they_are_packed():
     ids = np.full((1, 1, 2), -7, np.int32)
     with refused("triangle -7 to a cell"):

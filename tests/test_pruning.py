@@ -11,7 +11,7 @@ import rts
 from rts import splatting
 from rts.records import ArraySpec
 from rts.sampling import pruning
-from rts.sampling.extremes import largest
+from rts.sampling.extremes import extent, largest, named
 from rts.sampling.scenes import sample
 from rts.trees import map_leaves
 
@@ -363,3 +363,17 @@ def test_the_largest_number_of_an_array_is_that_of_its_sizes(dtype):
     assert largest(x[:0]) == 0
     assert largest(np.append(x, dtype(-np.inf))) == np.inf
     assert np.isnan(largest(np.append(x, dtype(-np.nan))))
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.int64, np.int8])
+def test_indices_are_told_from_what_is_none_with_the_least_and_the_largest(dtype):
+    x = np.full((2, 150, 123), -1, dtype)
+    assert named(x)[1:] == extent(x) == (-1, -1) and not named(x)[0].any()
+    x[1, 149, 120:] = 7, 0, 99
+    there, *ends = named(x[:, ::-1])
+    assert ends == [-1, 99] and extent(x) == (-1, 99)
+    np.testing.assert_array_equal(there, x[:, ::-1] >= 0)
+    x[0, 0, 0] = -5
+    assert named(x)[1:] == extent(x) == (-5, 99)
+    assert named(x[:0])[1:] == (-1, -1) and named(x[1, 149:, 120:])[1:] == (-1, 99)
+    assert extent(x[1, 149:, 120:]) == (0, 99)

@@ -210,6 +210,24 @@ def test_forward_and_reverse_mode_are_adjoint(layers, exits):
     np.testing.assert_allclose((found * tangent).sum(), (along * change).sum(), rtol=1e-12)
 
 
+@pytest.mark.parametrize("target", TORCH)
+@pytest.mark.parametrize("splatter", [Visible, fused.Visible])
+@pytest.mark.parametrize("layers, exits", [(1, False), (2, False), (2, True)])
+def test_splats_of_one_part_need_no_array_of_parts(splatter, layers, exits, target):
+    splats = rough(layers, 7, exits=exits)
+    along = arrays(target, np.random.default_rng(7).normal(size=(*splats.row.shape[1:], 4)))
+    given = arrays(target, (splats.positions, splats.rgba), np.float64)
+
+    def slope(**told):
+        own = cells(splats.replace(part=told.pop("part", None)), target)
+        return gradient(target, lambda x: (splatter().image(rts.Splats(*x, **own, **told)) * along).sum(), given)
+
+    expected, found, unknown = slope(part=np.minimum(splats.row, 0)), slope(one_part=True), slope()
+    for x, y in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert (np.abs(found[0] - unknown[0]).max() > 1e-3) == (layers > 1)
+
+
 # ----------------------------------------------------------------------------------------------- compiled code
 
 

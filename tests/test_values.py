@@ -5,10 +5,11 @@ import pickle
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, to_numpy
+from helpers import ALL, DIFFERENTIABLE, arrays, to_numpy
 
 import rts
 from rts import Camera, InputError, Part
+from rts.arrays import is_finite
 
 pytestmark = pytest.mark.rendering
 
@@ -37,6 +38,21 @@ def with_nan(array, value=np.nan):
 
 
 # ---------------------------------------------------------------------------------------------- not a number
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_one_number_that_is_not_finite_is_found_wherever_it_is(target):
+    x = np.random.default_rng(0).normal(size=(7, 5)).astype(np.float32)
+    repeated = arrays(target, np.broadcast_to(x[:1], (9, 5))), arrays(target, np.broadcast_to(x[:, :1], (7, 9)))
+    assert is_finite(arrays(target, x), arrays(target, x[:0]), arrays(target, x[0, 0]), *repeated)
+    for value in (np.nan, -np.nan, np.inf, -np.inf):
+        for at in ((0, 0), (6, 4), (3, 0)):
+            bad = x.copy()
+            bad[at] = value
+            assert not is_finite(arrays(target, bad))
+            assert not is_finite(arrays(target, np.broadcast_to(bad[at[0]], (9, 5))))
+            assert is_finite(arrays(target, np.delete(bad, at[0], axis=0)))
+
 
 HOLED = {
     "colours": lambda nan: made(colors=with_nan(PART.theta["colors"], nan)),
