@@ -9,7 +9,7 @@ import numpy as np
 
 from rts.adapting import adapted
 from rts.camera import Camera
-from rts.engines import is_constant, namespace, stopped, suiting
+from rts.engines import floating_bits, is_constant, stopped, suiting
 from rts.interfaces import Shader, TriangleSurface
 from rts.parts import CheckedPart, Part
 from rts.records import ArraySpec, Samples
@@ -159,7 +159,7 @@ def _attribute_specs(
     """The attributes to evaluate on the host for a surface that is constant: those its shader reads."""
     if host_theta is None:
         return {}
-    real = np.float64 if like is not None and namespace(like).finfo(like.dtype).bits == 64 else np.float32
+    real = np.float64 if like is not None and floating_bits(like) == 64 else np.float32
     if asked is not None and not asked:
         return {"position": shape.row_spec(real, 3)}
     i, p = surface.sample_widths
