@@ -17,7 +17,7 @@ from those that were sampled by less than splatters allow for."""
 
 
 EVERY = 16
-"""Of so many rows of depths one is looked at before the others: where there is anything, it often tells enough."""
+"""One of so many rows of depths is looked at before the others: where there is anything, it often tells enough."""
 
 
 def too_far(size: float, depth: np.ndarray) -> bool:
