@@ -81,8 +81,7 @@ class Raster(TriangleSampler):
     ) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         with self._seen(prepared, camera, size, facing(camera, cull)) as mesh:
-            listed, _ = mesh.select()
-            return mesh.draw(listed, layers)
+            return mesh.draw(*mesh.select(), layers)
 
     def rasterize_cells(
         self,
@@ -96,8 +95,7 @@ class Raster(TriangleSampler):
         """See `TriangleSampler.rasterize_cells`: triangles that touch none of these cells are passed over."""
         blocks = Blocks.of(cells, size)
         with self._seen(prepared, camera, size, facing(camera, cull), asked=blocks) as mesh:
-            listed, _ = mesh.select()
-            return mesh.draw_cells(listed, layers, cells, blocks)
+            return mesh.draw_cells(*mesh.select(), layers, cells, blocks)
 
     def rasterize_exits(
         self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
@@ -192,7 +190,7 @@ class _Seen:
         # With unsigned indices compiled code need not look for negative ones, which count from the end.
         self.vertices, self.faces = read_only(mesh.vertices), read_only(mesh.faces, np.int32).view(np.uint32)
         self.matrix, self.depth_row, self.size, self.keep = pixel_matrix(camera, size), -camera.view[2], size, keep
-        self.screen, self.listed, self.behind = screen, listed, behind if both else behind[:0]
+        self.screen, self.listed, self.behind, self.both = screen, listed, behind if both else behind[:0], both
         self.asked, self.step = asked, (max(size) / 2 + 2) / float(LIMIT)
         if isinstance(mesh, Clusters):
             self.order = mesh.order
@@ -205,8 +203,8 @@ class _Seen:
         to_steps[:2, 3] = -size[1] / 2 / self.step, -size[0] / 2 / self.step
         parallel(_project, len(used), used, self.vertices, to_steps @ self.matrix, screen, work=4 * SIZE * len(used))
 
-    def select(self) -> tuple[_List, _List]:
-        """The triangles that may cover cells that are asked for; and those that face the other way, if these are."""
+    def select(self) -> list[_List]:
+        """The triangles that may cover cells that are asked for; and those that face the other way, if `both` are."""
         chunks, bands = -(-len(self.blocks) // PER_CHUNK), -(-self.size[0] // BAND_ROWS)
         # Threads do not write side by side.
         spans, counts = np.empty((2, chunks, 2), np.int64), np.zeros((2, chunks, bands), np.int64)
@@ -214,7 +212,8 @@ class _Seen:
         triangles = self.blocks, self.sides, self.faces, self.vertices, self.screen
         given = *triangles, self.matrix, *self.size, self.step, self.keep, self.asked.bits
         parallel(_select, chunks, *given, *lists, work=10 * SIZE * len(self.blocks))
-        return _sorted(self.keep, self.order, *lists[0]), _sorted(-self.keep, self.order, *lists[1])
+        fronts = _sorted(self.keep, self.order, *lists[0])
+        return [fronts, _sorted(-self.keep, self.order, *lists[1])] if self.both else [fronts]
 
     def draw(self, listed: _List, layers: int) -> Fragments:
         """Fragments (layers, H, W)."""
@@ -242,7 +241,8 @@ def _flat(fragments: Fragments) -> tuple[np.ndarray, ...]:
 
 
 def _empty(shape: tuple[int, ...]) -> Fragments:
-    return Fragments(np.empty(shape, np.int32), np.empty((*shape, 2), np.float32), np.empty(shape, np.float32))
+    numbers = np.empty((4, *shape), np.float32)  # The system clears fewer pages of one array than of three.
+    return Fragments(numbers[0].view(np.int32), numbers[1:3].reshape(*shape, 2), numbers[3])
 
 
 def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray, counts: np.ndarray) -> _List:
