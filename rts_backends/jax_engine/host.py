@@ -13,6 +13,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import itertools
+import math
 import mmap
 import os
 import sys
@@ -69,14 +70,17 @@ def call(function: HostFunction, shapes: Shapes, *operands: Any) -> list[jax.Arr
 
 
 def zeros(shape: tuple[int, ...], dtype: Any, number: int = 0) -> jax.Array:
-    """Zeros, in a traced program; on the CPU their memory is not touched before they are overwritten.
+    """Zeros, in a traced program; on the CPU the memory of large arrays is not touched before they are overwritten.
 
     Args:
         shape: of the array.
         dtype: of the array.
         number: tells apart arrays of one shape, so that XLA does not make copies of one.
     """
-    return _zeros.bind(shape=tuple(shape), dtype=np.dtype(dtype), number=number)
+    dtype = np.dtype(dtype)
+    if dtype.itemsize * math.prod(shape) < _LEAST:
+        return jnp.zeros(shape, dtype)
+    return _zeros.bind(shape=tuple(shape), dtype=dtype, number=number)
 
 
 class _Selected:
@@ -189,18 +193,27 @@ def fill(out: np.ndarray, value: np.ndarray | np.generic) -> None:
         if value.ndim != out.ndim or any(n > size for n, size in zip(value.shape, out.shape, strict=True)):
             raise ValueError(f"a host function returned an array of shape {value.shape}, where {out.shape} was said")
         for axis, n in enumerate(value.shape):
-            clear(out[(*map(slice, value.shape[:axis]), slice(n, None))])
+            clear(out[(*map(slice, value.shape[:axis]), slice(n, None))], PIECE)
     out[tuple(map(slice, value.shape))] = value
 
 
-def clear(out: np.ndarray) -> None:
-    """Fill with zeros. A large array's pages are handed back: the system gives empty ones when they are touched."""
+def clear(out: np.ndarray, read: int = 0) -> None:
+    """Fill with zeros. A large array's pages are handed back: the system gives empty ones when they are touched.
+
+    Args:
+        out: the array.
+        read: how many of its first rows may be read all the same; their pages stay.
+    """
     if out.nbytes < _LEAST or not out.flags.c_contiguous or _give_back is None:
         out[...] = 0
         return
     data = out.reshape(-1).view(np.uint8)
-    start = -data.ctypes.data % mmap.PAGESIZE
+    start = min(read, len(out)) * (out.nbytes // len(out))
+    start += -(data.ctypes.data + start) % mmap.PAGESIZE
     stop = start + (len(data) - start) // mmap.PAGESIZE * mmap.PAGESIZE
+    if stop <= start:
+        out[...] = 0
+        return
     # Shared memory would come back as it was; the mark at `start` tells.
     data[:start], data[stop:], data[start] = 0, 0, 1
     if _give_back(data[start:].ctypes.data, stop - start, mmap.MADV_DONTNEED) or data[start]:
@@ -209,6 +222,11 @@ def clear(out: np.ndarray) -> None:
 
 _LEAST = 1 << 17
 """Bytes, below which a call to the system is not worth it."""
+
+PIECE = 1 << 11
+"""Rows that functions of rows in use take at a time (`rows_in_use.py`): so many that calls of XLA's are worth it, and so
+few that intermediate arrays stay in caches, and that XLA does not wake its other threads for each. They read on to the
+end of a piece, masked; where there is no page, that takes a microsecond a row."""
 
 _give_back: Callable[[int, int, int], int] | None = None
 if sys.platform == "linux":  # Elsewhere the advice promises no zeros.

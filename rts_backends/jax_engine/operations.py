@@ -29,7 +29,7 @@ from jax.interpreters import ad
 
 from rts.operations.operation import Arrays, Operation
 from rts.threads import read_only
-from rts_backends.jax_engine.host import clear
+from rts_backends.jax_engine.host import PIECE, clear
 from rts_backends.jax_engine.primitives import HostPrimitive
 
 Wanted = tuple[bool, ...]
@@ -176,7 +176,7 @@ class _Differentiable:
         out = results[0]
         if self.operation.packed_result:
             out = out[:used]
-            clear(results[0][used:])
+            clear(results[0][used:], PIECE)
         kept = self.operation.forward(operands, out, **params)
         if self.operation.keeps:
             results[1][...] = -1 if kept is None else _kept.add(kept)
@@ -191,7 +191,7 @@ class _Differentiable:
         if self.operation.packed_result:
             out = out[:, :used]
             for result in results[0]:
-                clear(result[used:])
+                clear(result[used:], PIECE)
         self.operation.push_on_host(operands, tangents, out, kept, params)
 
     def _host_pull(self, given: Arrays, results: Arrays, wanted: Wanted, **params: Any) -> None:
@@ -203,7 +203,7 @@ class _Differentiable:
                 if x is None:
                     continue
                 if i in self.operation.packed:
-                    clear(x[used:])
+                    clear(x[used:], PIECE)
                     x[:used] = 0
                     found[i] = x[:used]
                 else:
