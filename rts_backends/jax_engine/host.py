@@ -204,7 +204,7 @@ def clear(out: np.ndarray, read: int = 0) -> None:
         out: the array.
         read: how many of its first rows may be read all the same; their pages stay.
     """
-    if out.nbytes < _LEAST or not out.flags.c_contiguous or _give_back is None:
+    if out.nbytes < _LEAST or not out.flags.c_contiguous or _advise is None:
         out[...] = 0
         return
     data = out.reshape(-1).view(np.uint8)
@@ -216,9 +216,28 @@ def clear(out: np.ndarray, read: int = 0) -> None:
         return
     # Shared memory would come back as it was; the mark at `start` tells.
     data[:start], data[stop:], data[start] = 0, 0, 1
-    if _give_back(data[start:].ctypes.data, stop - start, mmap.MADV_DONTNEED) or data[start]:
+    if _advise(data[start:].ctypes.data, stop - start, mmap.MADV_DONTNEED) or data[start]:
         out[...] = 0
 
+
+def large_pages(results: Sequence[np.ndarray]) -> None:
+    """Ask the system for pages of megabytes where results of a call are, and between them.
+
+    What a program computes with lies side by side. Beyond some 32 MB it is new memory in each call, of which the system
+    gives a page whenever one is touched first; to be given small ones takes longer than to fill them.
+    """
+    places = [(x.__array_interface__["data"][0], x.nbytes) for x in results if x.nbytes >= _LEAST]
+    if not places or _advise is None:
+        return
+    first, last = min(start for start, _ in places), max(start + size for start, size in places)
+    # What is far apart has been allotted apart.
+    if _SPARSE * sum(size for _, size in places) >= last - first >= _LARGE:
+        first -= first % mmap.PAGESIZE
+        _advise(first, last - first, mmap.MADV_HUGEPAGE)
+
+
+_LARGE, _SPARSE = 1 << 23, 4
+"""Bytes from which on large pages are asked for, and how many times more they may be than those of the results."""
 
 _LEAST = 1 << 17
 """Bytes, below which a call to the system is not worth it."""
@@ -228,10 +247,10 @@ PIECE = 1 << 11
 few that intermediate arrays stay in caches, and that XLA does not wake its other threads for each. They read on to the
 end of a piece, masked; where there is no page, that takes a microsecond a row."""
 
-_give_back: Callable[[int, int, int], int] | None = None
-if sys.platform == "linux":  # Elsewhere the advice promises no zeros.
-    _give_back = ctypes.CDLL(None).madvise
-    _give_back.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+_advise: Callable[[int, int, int], int] | None = None
+if sys.platform == "linux":  # Elsewhere `MADV_DONTNEED` promises no zeros.
+    _advise = ctypes.CDLL(None).madvise
+    _advise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
 
 
 @functools.cache
@@ -324,8 +343,9 @@ def _handle(address: int) -> int | None:
         operands = [_array(arguments.items[i]) for i in range(arguments.count)]
         for operand in operands:
             operand.flags.writeable = False
-        name = _name(frame.attributes)
-        (_named.get(name) or _passing[name])(operands, [_array(results.items[i]) for i in range(results.count)])
+        name, found = _name(frame.attributes), [_array(results.items[i]) for i in range(results.count)]
+        large_pages(found)
+        (_named.get(name) or _passing[name])(operands, found)
     except BaseException as error:  # XLA cannot pass on an exception, only its text.
         message = f"{type(error).__name__}: {error}".encode()
         given = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, _INTERNAL)
