@@ -97,8 +97,8 @@ class _Kept:
 
 
 def _size(kept: Any) -> int:
-    """Bytes of the arrays in a tuple, or of one array."""
-    return sum(x.nbytes for x in (kept if isinstance(kept, tuple) else (kept,)) if isinstance(x, np.ndarray))
+    """Bytes of the arrays in tuples, or of one array."""
+    return sum(map(_size, kept)) if isinstance(kept, tuple) else getattr(kept, "nbytes", 0)
 
 
 _kept = _Kept()
