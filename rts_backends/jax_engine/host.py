@@ -19,7 +19,7 @@ import os
 import sys
 import warnings
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -44,7 +44,9 @@ _passing: weakref.WeakValueDictionary[str, _Selected] = weakref.WeakValueDiction
 _numbers = itertools.count()
 
 
-def call_named(name: str, function: Filler, shapes: Shapes, *operands: jax.Array) -> list[jax.Array]:
+def call_named(
+    name: str, function: Filler, shapes: Shapes, *operands: jax.Array, in_place: Mapping[int, int] | None = None
+) -> list[jax.Array]:
     """The results of a host function, in a traced program for the CPU.
 
     Args:
@@ -53,11 +55,13 @@ def call_named(name: str, function: Filler, shapes: Shapes, *operands: jax.Array
         function: kept as long as the process lives.
         shapes: shapes and dtypes of the results.
         operands: of the function.
+        in_place: the indices of operands that lie where a result is to be, and of these results, alike in shape and
+            dtype. XLA makes copies of such operands where something else reads them later.
     """
     if not _available():
         return _copying(function, shapes, *operands)
     _named[name] = function
-    return list(jax.ffi.ffi_call(TARGET, shapes)(*operands, function=name))
+    return list(jax.ffi.ffi_call(TARGET, shapes, input_output_aliases=in_place)(*operands, function=name))
 
 
 def call(function: HostFunction, shapes: Shapes, *operands: Any) -> list[jax.Array]:

@@ -139,7 +139,10 @@ class _Differentiable:
         self._push = HostPrimitive(
             f"{name}_push", swept, count, pushed, self._host_push, self._specified_push, even, some=True
         )
-        self._pull = HostPrimitive(f"{name}_pull", backward, count, pulled, self._host_pull, self._specified_pull, even)
+        own = tuple(i for i in operation.packed if i < varied)
+        self._pull = HostPrimitive(
+            f"{name}_pull", backward, count, pulled, self._host_pull, self._specified_pull, even, in_place=own
+        )
         ad.primitive_jvps[self._value.primitive] = self._value_jvp
         ad.primitive_jvps[self._push.primitive] = self._push_jvp
         ad.primitive_jvps[self._pull.primitive] = self._pull_jvp
@@ -199,16 +202,23 @@ class _Differentiable:
         places = _spread(results, wanted)
         for t, g in enumerate(given[-1]):
             found: list[Any] = [None if x is None else x[t, ...] for x in places]
+            apart = {}
             for i, x in enumerate(found):
                 if x is None:
                     continue
-                if i in self.operation.packed:
+                if i not in self.operation.packed:
+                    clear(x)
+                    continue
+                found[i] = x[:used]
+                if np.may_share_memory(x, given[i]):  # It is to take the place of what is still read.
+                    apart[i], found[i] = x, np.zeros((used, *x.shape[1:]), x.dtype)
+                else:
                     clear(x[used:], PIECE)
                     x[:used] = 0
-                    found[i] = x[:used]
-                else:
-                    clear(x)
             self.operation.pull_on_host(operands, g[:used] if self.operation.packed_result else g, found, kept, params)
+            for i, x in apart.items():
+                x[:used] = found[i]
+                clear(x[used:], PIECE)
 
     # --------------------------------------------------------------------------------------------- by specification
 
