@@ -79,19 +79,25 @@ class Task:
         image = rts.render(parts, self.view, self.size, sampler=sampler, splatter=self.splatter, layers=self.layers)
         return self.reduction(image[..., self.channels] - target)
 
-    def swept_loss(self, pose: Any, vertices: Any, target: Any, sampler: str) -> Any:
-        """`loss`, made as the image is: `rts.ImageResiduals.mean_loss`."""
+    def residuals(self, scene: Callable[[Any], Any], target: Any, sampler: str) -> rts.ImageResiduals:
+        """The differences of `scene(pose)`; their `mean_loss` is `loss`, made as the image is."""
         options: dict[str, Any] = {"sampler": sampler, "splatter": self.splatter, "layers": self.layers}
         options |= {"loss": self.reduction.name, "f_scale": self.reduction.f_scale}
-        residuals = rts.ImageResiduals(lambda pose: self.posed(pose, vertices), self.view, self.size, target, **options)
-        return residuals.mean_loss(pose)
+        return rts.ImageResiduals(scene, self.view, self.size, target, **options)
+
+    def prepared(self) -> Callable[[Any], Any]:
+        """The part at a pose (6,), of triangles that the sampler has once and for all."""
+        held = rts.prepare(self.part)
+        return lambda pose: held.replace(transform=rts.rigid(pose))
 
 
 # ------------------------------------------------------------------------------------------------------- iterations
 
 
-def torch_iteration(task: Task, mode: str = "pose", sampler: str = "auto", swept: bool = False) -> Callable[[], object]:
-    """One eager iteration a call; the loss `swept`, or of an image."""
+def torch_iteration(
+    task: Task, mode: str = "pose", sampler: str = "auto", swept: bool = False, prepared: bool = False
+) -> Callable[[], object]:
+    """One eager iteration a call; the loss of an image, or `swept`, then also of a `prepared` part at a pose."""
     import torch
 
     pose = torch.tensor(START, requires_grad=True)
@@ -101,12 +107,14 @@ def torch_iteration(task: Task, mode: str = "pose", sampler: str = "auto", swept
         groups.append({"params": [vertices], "lr": VERTEX_RATE})
     optimizer = torch.optim.Adam(groups)
     target = torch.from_numpy(task.target)
+    scene = task.prepared() if prepared else lambda pose: task.posed(pose, vertices)
+    residuals = task.residuals(scene, target, sampler) if swept else None
 
     def step() -> float:
         pose.grad = None
         if vertices is not None:
             vertices.grad = None
-        loss = (task.swept_loss if swept else task.loss)(pose, vertices, target, sampler)
+        loss = task.loss(pose, vertices, target, sampler) if residuals is None else residuals.mean_loss(pose)
         loss.backward()
         optimizer.step()
         return loss.item()

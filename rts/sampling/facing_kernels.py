@@ -17,6 +17,7 @@ def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eyes, rows, c
     layers, height, width = kept.shape
     across = width // columns
     hidden, near = np.zeros((3, width + 2), np.uint8), np.empty(width, np.uint8)
+    asked = np.empty(width, np.int32)
     for y in range(start - 1, stop + 1):
         level = hidden[(y + 3) % 3]
         level[:] = 0
@@ -26,22 +27,26 @@ def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eyes, rows, c
         if y <= start:
             continue
         spread(near, hidden[(y + 1) % 3], hidden[(y + 2) % 3], level)
-        for x in range(width):
-            if listed or near[x]:
+        for view in range(across):
+            eye = eyes[(y - 1) // rows * across + view]
+            count = 0
+            for x in range(view * columns, (view + 1) * columns):  # Most cells are not asked for: a branch less each.
+                asked[count] = x
+                count += listed or near[x] > 0
+            for x in asked[:count]:
                 for k in range(layers):
                     if kept[k, y - 1, x]:
-                        t = triangle_ids[k, y - 1, x]
+                        t = np.uint32(triangle_ids[k, y - 1, x])
                         piece = pieces[t] if len(pieces) > 1 else pieces[0]
                         if piece > 0 and k == layers - 1:
                             piece += more
-                        eye = eyes[(y - 1) // rows * across + x // columns]
                         found[k, y - 1, x] = piece if _front(vertices, faces, t, eye) else -piece
 
 
 @compiled
 def _front(vertices, faces, t, eye):
     """Whether a triangle is seen from the side from which its corners go round counter-clockwise."""
-    a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
+    a, b, c = np.uint32(faces[t, 0]), np.uint32(faces[t, 1]), np.uint32(faces[t, 2])
     x, y, z = np.float64(vertices[a, 0]), np.float64(vertices[a, 1]), np.float64(vertices[a, 2])
     bx, by, bz = vertices[b, 0] - x, vertices[b, 1] - y, vertices[b, 2] - z
     cx, cy, cz = vertices[c, 0] - x, vertices[c, 1] - y, vertices[c, 2] - z
