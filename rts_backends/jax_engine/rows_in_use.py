@@ -21,8 +21,8 @@ from jax.extend.core import Jaxpr, Primitive
 from jax.interpreters import ad, batching, mlir
 
 from rts_backends.jax_engine import host
-from rts_backends.jax_engine.host import PIECE
 from rts_backends.jax_engine.columns import summed_by_columns, variables
+from rts_backends.jax_engine.host import PIECE
 
 LEAST = 1 << 15
 """Rows, below which all are computed: a loop would take as long as it saves."""
