@@ -19,7 +19,7 @@ import os
 import sys
 import warnings
 import weakref
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -45,7 +45,7 @@ _numbers = itertools.count()
 
 
 def call_named(
-    name: str, function: Filler, shapes: Shapes, *operands: jax.Array, in_place: Mapping[int, int] | None = None
+    name: str, function: Filler, shapes: Shapes, *operands: jax.Array, in_place: dict[int, int] | None = None
 ) -> list[jax.Array]:
     """The results of a host function, in a traced program for the CPU.
 
@@ -247,9 +247,9 @@ _LEAST = 1 << 17
 """Bytes, below which a call to the system is not worth it."""
 
 PIECE = 1 << 11
-"""Rows that functions of rows in use take at a time (`rows_in_use.py`): so many that calls of XLA's are worth it, and so
-few that intermediate arrays stay in caches, and that XLA does not wake its other threads for each. They read on to the
-end of a piece, masked; where there is no page, that takes a microsecond a row."""
+"""Rows that functions of rows in use take at a time (`rows_in_use.py`): so many that calls of XLA's are worth it, and
+so few that intermediate arrays stay in caches, and that XLA does not wake its other threads for each. They read on to
+the end of a piece, masked; where there is no page, that takes a microsecond a row."""
 
 _advise: Callable[[int, int, int], int] | None = None
 if sys.platform == "linux":  # Elsewhere `MADV_DONTNEED` promises no zeros.
