@@ -283,7 +283,59 @@ def test_cleared_memory_is_zero_shared_or_not():
     shared = np.frombuffer(mmap.mmap(-1, 2**20), np.uint8)
     for whole in (np.ones(2**20, np.uint8), np.ones((2**18, 1), np.float32), np.ones((2, 1, 2**15)), shared):
         for part in (whole, whole[1:], whole[: 2**17 + 5], whole[3:9], whole[:0], whole[::2]):
-            whole[...] = 1
-            jax_host.clear(part)
-            assert not part.any()
-            assert np.count_nonzero(whole) == whole.size - part.size
+            for read in (0, 3, 2**13):
+                whole[...] = 1
+                jax_host.clear(part, read)
+                assert not part.any()
+                assert np.count_nonzero(whole) == whole.size - part.size
+
+
+SPLATTER = test_fused_jax.KINDS["visible"]()
+VIEW = jnp.asarray([[1, 0, 0, 0.02], [0, 1, 0, -0.01], [0, 0, 0, 1], [0, 0, 1, 0]], jnp.float32)
+
+
+def test_a_projection_is_a_part_of_the_splat_in_programs():
+    positions, rgba, row = test_fused_jax.scene32(2, (6, 8))
+    weights = numbers(6, 8, 4)
+
+    def image(view, points, rgba):
+        return SPLATTER.splat(projective_map(view, points), rgba, row)
+
+    def loss(*given):
+        return (weights * image(*given) ** 2).sum()
+
+    given = VIEW, positions, rgba
+    program = jax.jit(jax.grad(loss, (0, 1, 2)))
+    names = program.lower(*given).as_text()
+    assert "rts.image of rts.projection" in names and '"rts.projection ' not in names
+    along = tuple(numbers(*x.shape, seed=i) for i, x in enumerate(given))
+    many = jnp.stack([VIEW, VIEW.at[0, 3].add(0.05)])
+    for f in (
+        image,
+        jax.grad(loss, (0, 1, 2)),
+        jax.grad(loss, 2),
+        lambda *given: jax.jvp(image, given, along),
+        lambda view, *rest: jax.jvp(lambda view: image(view, *rest), (view,), along[:1]),
+        lambda _, *rest: jax.vmap(jax.grad(loss, (0, 1)), (0, None, None))(many, *rest),
+        lambda view, *rest: jax.jvp(jax.grad(lambda view: loss(view, *rest)), (view,), along[:1]),
+    ):
+        found, expected = (jax.tree.leaves(mode(f)(*given)) for mode in (jax.jit, lambda f: f))
+        for x, y in zip(found, expected, strict=True):
+            close(x, y, 1e-5)
+
+
+def test_gradients_in_the_place_of_operands_leave_what_is_read_later():
+    positions, rgba, row = test_fused_jax.scene32(2, (6, 8))
+    weights = numbers(6, 8, 4)
+
+    def both(positions, rgba, later):
+        moved, shade = positions + 0.01 * jnp.sin(positions), rgba * rgba
+        found = jax.grad(lambda *given: (weights * SPLATTER.splat(*given, row)).sum(), (0, 1))(moved, shade)
+        return (found, jnp.cos(moved), jnp.cos(shade)) if later else found
+
+    for later in (False, True):
+        program = jax.jit(lambda *given, later=later: both(*given, later))
+        found, expected = program(positions, rgba), both(positions, rgba, later)
+        for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(x, y, atol=1e-6)
+    assert "output_operand_alias" in jax.jit(lambda *given: both(*given, False)).lower(positions, rgba).as_text()

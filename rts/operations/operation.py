@@ -65,6 +65,8 @@ class Operation:
             then take a keyword `kept`: that object, or None if it is no longer known.
         sweeps: whether `push` takes tangents (T, ·) of T directions at once, and `out` (T, ·). If not, it is called
             for each direction.
+        cheap: whether a compiling engine may compute its value once more, inside of an operation that takes it, rather
+            than keep it.
     """
 
     name: str
@@ -81,6 +83,7 @@ class Operation:
     even: tuple[int, ...] = ()
     keeps: bool = False
     sweeps: bool = False
+    cheap: bool = False
 
     def __post_init__(self):
         object.__setattr__(self, "ranks", tuple(self.ranks))

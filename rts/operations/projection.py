@@ -95,6 +95,7 @@ PROJECTION = Operation(
     differentiable=2,
     packed=(1,),
     packed_result=True,
+    cheap=True,
 )
 
 

@@ -17,6 +17,7 @@ from rts.operations.operation import Operation
 from rts.records import ArraySpec
 from rts.trees import STATIC_FIELDS, Tree, join_record, split_record
 from rts_backends.jax_engine import host, operations, rows_in_use
+from rts_backends.jax_engine.chained import chained, may_chain
 
 for _cls in STATIC_FIELDS:
     jax.tree_util.register_pytree_node(
@@ -49,6 +50,7 @@ class JaxEngine(Engine):
 
     def __init__(self):
         self._used: dict[int, tuple[weakref.ref, jax.Array]] = {}
+        self._made: dict[int, tuple[weakref.ref, Operation, Sequence[jax.Array]]] = {}
 
     def owns(self, x: Any) -> bool:
         """Whether `x` is a jax array or a tracer."""
@@ -147,9 +149,23 @@ class JaxEngine(Engine):
         """The result by compiled code on CPUs, if all floats are float32 or all float64; else by specification."""
         if not operations.fits(operation, operands):
             return operation.specification(*operands, **params)
-        used = self._used_of([operands[i] for i in operation.packed])
-        result = operations.apply(operation, operands, params, used)
+        whole, given = self._with_first(operation, operands)
+        used = self._used_of([given[i] for i in whole.packed])
+        result = operations.apply(whole, given, params, used)
+        if operation.cheap and not params and self.traced(result) and self.known(result) is None:
+            key = id(result)
+            self._made[key] = weakref.ref(result, lambda _: self._made.pop(key, None)), operation, operands
         return self._note(result, used) if operation.packed_result else result
+
+    def _with_first(self, operation: Operation, operands: Sequence[jax.Array]) -> tuple[Operation, Sequence[jax.Array]]:
+        """An operation with the cheap one that gives its first operand in a program, and the operands of both.
+
+        Where nothing else reads it, that operand is then no array of the program, nor is its gradient.
+        """
+        known = self._made.get(id(operands[0]))
+        if known is None or known[0]() is not operands[0] or not may_chain(known[1], operation):
+            return operation, operands
+        return chained(known[1], operation), (*known[2], *operands[1:])
 
     def padded(self, x: jax.Array) -> bool:
         """True: packed arrays may be padded to a bucket, or to the capacity."""

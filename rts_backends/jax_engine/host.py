@@ -13,6 +13,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import itertools
+import math
 import mmap
 import os
 import sys
@@ -43,7 +44,9 @@ _passing: weakref.WeakValueDictionary[str, _Selected] = weakref.WeakValueDiction
 _numbers = itertools.count()
 
 
-def call_named(name: str, function: Filler, shapes: Shapes, *operands: jax.Array) -> list[jax.Array]:
+def call_named(
+    name: str, function: Filler, shapes: Shapes, *operands: jax.Array, in_place: dict[int, int] | None = None
+) -> list[jax.Array]:
     """The results of a host function, in a traced program for the CPU.
 
     Args:
@@ -52,11 +55,13 @@ def call_named(name: str, function: Filler, shapes: Shapes, *operands: jax.Array
         function: kept as long as the process lives.
         shapes: shapes and dtypes of the results.
         operands: of the function.
+        in_place: the indices of operands that lie where a result is to be, and of these results, alike in shape and
+            dtype. XLA makes copies of such operands where something else reads them later.
     """
     if not _available():
         return _copying(function, shapes, *operands)
     _named[name] = function
-    return list(jax.ffi.ffi_call(TARGET, shapes)(*operands, function=name))
+    return list(jax.ffi.ffi_call(TARGET, shapes, input_output_aliases=in_place)(*operands, function=name))
 
 
 def call(function: HostFunction, shapes: Shapes, *operands: Any) -> list[jax.Array]:
@@ -69,14 +74,17 @@ def call(function: HostFunction, shapes: Shapes, *operands: Any) -> list[jax.Arr
 
 
 def zeros(shape: tuple[int, ...], dtype: Any, number: int = 0) -> jax.Array:
-    """Zeros, in a traced program; on the CPU their memory is not touched before they are overwritten.
+    """Zeros, in a traced program; on the CPU the memory of large arrays is not touched before they are overwritten.
 
     Args:
         shape: of the array.
         dtype: of the array.
         number: tells apart arrays of one shape, so that XLA does not make copies of one.
     """
-    return _zeros.bind(shape=tuple(shape), dtype=np.dtype(dtype), number=number)
+    dtype = np.dtype(dtype)
+    if dtype.itemsize * math.prod(shape) < _LEAST:
+        return jnp.zeros(shape, dtype)
+    return _zeros.bind(shape=tuple(shape), dtype=dtype, number=number)
 
 
 class _Selected:
@@ -189,31 +197,64 @@ def fill(out: np.ndarray, value: np.ndarray | np.generic) -> None:
         if value.ndim != out.ndim or any(n > size for n, size in zip(value.shape, out.shape, strict=True)):
             raise ValueError(f"a host function returned an array of shape {value.shape}, where {out.shape} was said")
         for axis, n in enumerate(value.shape):
-            clear(out[(*map(slice, value.shape[:axis]), slice(n, None))])
+            clear(out[(*map(slice, value.shape[:axis]), slice(n, None))], PIECE)
     out[tuple(map(slice, value.shape))] = value
 
 
-def clear(out: np.ndarray) -> None:
-    """Fill with zeros. A large array's pages are handed back: the system gives empty ones when they are touched."""
-    if out.nbytes < _LEAST or not out.flags.c_contiguous or _give_back is None:
+def clear(out: np.ndarray, read: int = 0) -> None:
+    """Fill with zeros. A large array's pages are handed back: the system gives empty ones when they are touched.
+
+    Args:
+        out: the array.
+        read: how many of its first rows may be read all the same; their pages stay.
+    """
+    if out.nbytes < _LEAST or not out.flags.c_contiguous or _advise is None:
         out[...] = 0
         return
     data = out.reshape(-1).view(np.uint8)
-    start = -data.ctypes.data % mmap.PAGESIZE
+    start = min(read, len(out)) * (out.nbytes // len(out))
+    start += -(data.ctypes.data + start) % mmap.PAGESIZE
     stop = start + (len(data) - start) // mmap.PAGESIZE * mmap.PAGESIZE
+    if stop <= start:
+        out[...] = 0
+        return
     # Shared memory would come back as it was; the mark at `start` tells.
     data[:start], data[stop:], data[start] = 0, 0, 1
-    if _give_back(data[start:].ctypes.data, stop - start, mmap.MADV_DONTNEED) or data[start]:
+    if _advise(data[start:].ctypes.data, stop - start, mmap.MADV_DONTNEED) or data[start]:
         out[...] = 0
 
+
+def large_pages(results: Sequence[np.ndarray]) -> None:
+    """Ask the system for pages of megabytes where results of a call are, and between them.
+
+    What a program computes with lies side by side. Beyond some 32 MB it is new memory in each call, of which the system
+    gives a page whenever one is touched first; to be given small ones takes longer than to fill them.
+    """
+    places = [(x.__array_interface__["data"][0], x.nbytes) for x in results if x.nbytes >= _LEAST]
+    if not places or _advise is None:
+        return
+    first, last = min(start for start, _ in places), max(start + size for start, size in places)
+    # What is far apart has been allotted apart.
+    if _SPARSE * sum(size for _, size in places) >= last - first >= _LARGE:
+        first -= first % mmap.PAGESIZE
+        _advise(first, last - first, mmap.MADV_HUGEPAGE)
+
+
+_LARGE, _SPARSE = 1 << 23, 4
+"""Bytes from which on large pages are asked for, and how many times more they may be than those of the results."""
 
 _LEAST = 1 << 17
 """Bytes, below which a call to the system is not worth it."""
 
-_give_back: Callable[[int, int, int], int] | None = None
-if sys.platform == "linux":  # Elsewhere the advice promises no zeros.
-    _give_back = ctypes.CDLL(None).madvise
-    _give_back.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
+PIECE = 1 << 11
+"""Rows that functions of rows in use take at a time (`rows_in_use.py`): so many that calls of XLA's are worth it, and
+so few that intermediate arrays stay in caches, and that XLA does not wake its other threads for each. They read on to
+the end of a piece, masked; where there is no page, that takes a microsecond a row."""
+
+_advise: Callable[[int, int, int], int] | None = None
+if sys.platform == "linux":  # Elsewhere `MADV_DONTNEED` promises no zeros.
+    _advise = ctypes.CDLL(None).madvise
+    _advise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
 
 
 @functools.cache
@@ -306,8 +347,9 @@ def _handle(address: int) -> int | None:
         operands = [_array(arguments.items[i]) for i in range(arguments.count)]
         for operand in operands:
             operand.flags.writeable = False
-        name = _name(frame.attributes)
-        (_named.get(name) or _passing[name])(operands, [_array(results.items[i]) for i in range(results.count)])
+        name, found = _name(frame.attributes), [_array(results.items[i]) for i in range(results.count)]
+        large_pages(found)
+        (_named.get(name) or _passing[name])(operands, found)
     except BaseException as error:  # XLA cannot pass on an exception, only its text.
         message = f"{type(error).__name__}: {error}".encode()
         given = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, _INTERNAL)

@@ -29,7 +29,7 @@ from jax.interpreters import ad
 
 from rts.operations.operation import Arrays, Operation
 from rts.threads import read_only
-from rts_backends.jax_engine.host import clear
+from rts_backends.jax_engine.host import PIECE, clear
 from rts_backends.jax_engine.primitives import HostPrimitive
 
 Wanted = tuple[bool, ...]
@@ -97,8 +97,8 @@ class _Kept:
 
 
 def _size(kept: Any) -> int:
-    """Bytes of the arrays in a tuple, or of one array."""
-    return sum(x.nbytes for x in (kept if isinstance(kept, tuple) else (kept,)) if isinstance(x, np.ndarray))
+    """Bytes of the arrays in tuples, or of one array."""
+    return sum(map(_size, kept)) if isinstance(kept, tuple) else getattr(kept, "nbytes", 0)
 
 
 _kept = _Kept()
@@ -139,7 +139,10 @@ class _Differentiable:
         self._push = HostPrimitive(
             f"{name}_push", swept, count, pushed, self._host_push, self._specified_push, even, some=True
         )
-        self._pull = HostPrimitive(f"{name}_pull", backward, count, pulled, self._host_pull, self._specified_pull, even)
+        own = tuple(i for i in operation.packed if i < varied)
+        self._pull = HostPrimitive(
+            f"{name}_pull", backward, count, pulled, self._host_pull, self._specified_pull, even, in_place=own
+        )
         ad.primitive_jvps[self._value.primitive] = self._value_jvp
         ad.primitive_jvps[self._push.primitive] = self._push_jvp
         ad.primitive_jvps[self._pull.primitive] = self._pull_jvp
@@ -176,7 +179,7 @@ class _Differentiable:
         out = results[0]
         if self.operation.packed_result:
             out = out[:used]
-            clear(results[0][used:])
+            clear(results[0][used:], PIECE)
         kept = self.operation.forward(operands, out, **params)
         if self.operation.keeps:
             results[1][...] = -1 if kept is None else _kept.add(kept)
@@ -191,7 +194,7 @@ class _Differentiable:
         if self.operation.packed_result:
             out = out[:, :used]
             for result in results[0]:
-                clear(result[used:])
+                clear(result[used:], PIECE)
         self.operation.push_on_host(operands, tangents, out, kept, params)
 
     def _host_pull(self, given: Arrays, results: Arrays, wanted: Wanted, **params: Any) -> None:
@@ -199,16 +202,23 @@ class _Differentiable:
         places = _spread(results, wanted)
         for t, g in enumerate(given[-1]):
             found: list[Any] = [None if x is None else x[t, ...] for x in places]
+            apart = {}
             for i, x in enumerate(found):
                 if x is None:
                     continue
-                if i in self.operation.packed:
-                    clear(x[used:])
-                    x[:used] = 0
-                    found[i] = x[:used]
-                else:
+                if i not in self.operation.packed:
                     clear(x)
+                    continue
+                found[i] = x[:used]
+                if np.may_share_memory(x, given[i]):  # It is to take the place of what is still read.
+                    apart[i], found[i] = x, np.zeros((used, *x.shape[1:]), x.dtype)
+                else:
+                    clear(x[used:], PIECE)
+                    x[:used] = 0
             self.operation.pull_on_host(operands, g[:used] if self.operation.packed_result else g, found, kept, params)
+            for i, x in apart.items():
+                x[:used] = found[i]
+                clear(x[used:], PIECE)
 
     # --------------------------------------------------------------------------------------------- by specification
 

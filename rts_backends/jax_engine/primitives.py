@@ -35,6 +35,9 @@ class HostPrimitive:
         even: see `Operation`.
         noted: whether the last result is a note.
         some: whether of the operands after the samples there are only those that a parameter `wanted` says.
+        in_place: indices of operands whose gradients may take their places; the results are gradients of those of the
+            first operands that the parameter `wanted` says, with an axis before. `host` finds then that they share
+            memory.
     """
 
     def __init__(
@@ -48,10 +51,11 @@ class HostPrimitive:
         even: tuple[int, ...],
         noted: bool = False,
         some: bool = False,
+        in_place: tuple[int, ...] = (),
     ):
         self.name, self.ranks, self.samples, self._even, self._noted = name, ranks, samples, even, noted
         self._shapes, self._host, self._specified = shapes, host, specified
-        self._some = some
+        self._some, self._in_place = some, in_place
         self.primitive = primitive = Primitive(f"rts_{name}")
         primitive.multiple_results = True
         primitive.def_impl(self._eager)
@@ -111,9 +115,21 @@ class HostPrimitive:
             if row is not None:
                 values[i], avals[i] = row, avals[i].update(shape=(1, *avals[i].shape[1:]))
 
+        places = {}
+        for i in self._in_place:
+            at = sum(params["wanted"][:i])
+            if params["wanted"][i] and shapes[at].shape == (1, *avals[i].shape) and _read_once(values[i]):
+                places[i] = at
+        alike = set(places.values())
+        own = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) if i in alike else x for i, x in enumerate(shapes)]
+
         def call(*given: jax.Array) -> list[jax.Array]:
-            name = f"{self.name} {sorted(params.items())}"
-            return host.call_named(name, lambda i, o: self._on_host(i, o, params), shapes, *given)
+            name = f"{self.name} {sorted(params.items())} {sorted(places)}"
+            found = host.call_named(name, filler, tuple(own), *given, in_place=places)
+            return [x[None] if i in alike else x for i, x in enumerate(found)]
+
+        def filler(operands: Arrays, results: Arrays) -> None:
+            self._on_host(operands, [x[None] if i in alike else x for i, x in enumerate(results)], params)
 
         return mlir.lower_fun(call, multiple_results=True)(ctx.replace(avals_in=avals), *values)
 
@@ -182,6 +198,12 @@ def _only_row(value: Any) -> Any:
         if all(row is not None for row in rows):
             return hlo.concatenate(rows, operation.attributes["dimension"])
     return None
+
+
+def _read_once(value: Any) -> bool:
+    """Whether an array in a program that is about to be compiled is made there, and one operation reads it so far."""
+    name = getattr(value.owner, "name", "stablehlo.constant")  # An argument's owner has no name.
+    return name != "stablehlo.constant" and sum(1 for _ in value.uses) == 1
 
 
 def _cpu_of(operands: Sequence[jax.Array]) -> Any:

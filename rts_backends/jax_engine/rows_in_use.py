@@ -22,13 +22,10 @@ from jax.interpreters import ad, batching, mlir
 
 from rts_backends.jax_engine import host
 from rts_backends.jax_engine.columns import summed_by_columns, variables
+from rts_backends.jax_engine.host import PIECE
 
 LEAST = 1 << 15
 """Rows, below which all are computed: a loop would take as long as it saves."""
-
-PIECE = 1 << 11
-"""Rows of a piece: so many that calls of XLA's are worth it, and so few that intermediate arrays stay in caches, and
-that XLA does not wake its other threads for each."""
 
 CLOSED = 1 << 16
 """The most numbers that a function may close over: their gradients are as large as they are, for each piece."""

@@ -1,0 +1,83 @@
+"""Two operations as one: what the first hands to the second is no array of the program."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.operations.operation import Arrays, Operation, Some
+from rts.threads import read_only
+from rts.trees import Array
+
+
+class _Kept(NamedTuple):
+    """What the value leaves to the derivatives: the first result, and what the second operation keeps."""
+
+    between: np.ndarray
+    kept: Any
+
+
+def may_chain(first: Operation, second: Operation) -> bool:
+    """Whether `second` can take what `first` gives as its first operand inside of one operation."""
+    rows = first.packed_result and 0 in second.packed
+    return first.cheap and rows and not first.keeps and first.differentiable == len(first.ranks)
+
+
+@functools.cache
+def chained(first: Operation, second: Operation) -> Operation:
+    """`second` of what `first`, which has no parameters, gives as its first operand, and of its other operands."""
+    count = len(first.ranks)
+    used = second.used
+
+    def specification(*operands: Array, **params: Any) -> Array:
+        return second.specification(first.specification(*operands[:count]), *operands[count:], **params)
+
+    def shape(*shapes: tuple[int, ...], **params: Any) -> tuple[int, ...]:
+        return second.shape(first.shape(*shapes[:count]), *shapes[count:], **params)
+
+    def between(operands: Arrays) -> np.ndarray:
+        return read_only(first.value_on_host(operands[:count], {})[0])
+
+    def forward(operands: Arrays, out: np.ndarray, **params: Any) -> _Kept:
+        made = between(operands)
+        return _Kept(made, second.forward((made, *operands[count:]), out, **params))
+
+    def push(operands: Arrays, tangents: Some, out: np.ndarray, *, kept: _Kept | None, **params: Any) -> None:
+        made, own = kept or (between(operands), None)
+        moved = None
+        if any(t is not None for t in tangents[:count]):
+            moved = np.empty((len(out), *made.shape), made.dtype)
+            first.push_on_host(operands[:count], tangents[:count], moved, None, {})
+        second.push_on_host((made, *operands[count:]), [moved, *tangents[count:]], out, own, params)
+
+    def pull(operands: Arrays, g: np.ndarray, results: Some, *, kept: _Kept | None, **params: Any) -> None:
+        made, own = kept or (between(operands), None)
+        wanted = any(x is not None for x in results[:count])
+        g_made = np.zeros_like(made) if wanted else None
+        second.pull_on_host((made, *operands[count:]), g, [g_made, *results[count:]], own, params)
+        if g_made is not None:
+            first.pull_on_host(operands[:count], g_made, results[:count], None, {})
+
+    return Operation(
+        f"{second.name} of {first.name}",
+        specification,
+        (*first.ranks, *second.ranks[1:]),
+        shape,
+        forward,
+        push,
+        pull,
+        differentiable=count + second.differentiable - 1,
+        packed=_shifted(first.packed, second.packed, count),
+        packed_result=second.packed_result,
+        used=None if used is None else lambda operands: used((operands[first.packed[0]], *operands[count:])),
+        even=_shifted(first.even, second.even, count),
+        keeps=True,
+        sweeps=True,
+    )
+
+
+def _shifted(first: tuple[int, ...], second: tuple[int, ...], count: int) -> tuple[int, ...]:
+    """Indices of operands of both operations; the first has so many, and gives that of index 0 of the second."""
+    return *first, *(i + count - 1 for i in second if i > 0)
