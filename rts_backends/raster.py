@@ -81,7 +81,7 @@ class Raster(TriangleSampler):
     ) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         with self._seen(prepared, camera, size, facing(camera, cull)) as mesh:
-            return mesh.draw(*mesh.select(), layers)
+            return mesh.draw(mesh.select()[0], layers)
 
     def rasterize_cells(
         self,
@@ -95,7 +95,7 @@ class Raster(TriangleSampler):
         """See `TriangleSampler.rasterize_cells`: triangles that touch none of these cells are passed over."""
         blocks = Blocks.of(cells, size)
         with self._seen(prepared, camera, size, facing(camera, cull), asked=blocks) as mesh:
-            return mesh.draw_cells(*mesh.select(), layers, cells, blocks)
+            return mesh.draw_cells(mesh.select()[0], layers, cells, blocks)
 
     def rasterize_exits(
         self, prepared: Proxy | Clusters, camera: Camera, size: tuple[int, int], layers: int, beside: Callable
