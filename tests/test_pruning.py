@@ -20,6 +20,7 @@ pytestmark = pytest.mark.sampling
 MESH = rts.plugin("rts.surfaces", "mesh")
 CAMERA = rts.Camera.look_at((0.3, 0.4, 4.0), (0, 0, 0), fov_y=50)
 SIZE = (24, 28)
+MESH_OF_BOX = box(0.5)
 SPLATTERS = ["none", "single", "multi", "visible"]
 
 
@@ -377,3 +378,15 @@ def test_indices_are_told_from_what_is_none_with_the_least_and_the_largest(dtype
     assert named(x)[1:] == extent(x) == (-5, 99)
     assert named(x[:0])[1:] == (-1, -1) and named(x[1, 149:, 120:])[1:] == (-1, 99)
     assert extent(x[1, 149:, 120:]) == (0, 99)
+
+
+def test_indices_without_a_sign_are_all_named():
+    there, *ends = named(np.array([0, 2**32 - 1], np.uint32))
+    assert there.all() and ends == [-1, 2**32 - 1]
+
+
+def test_what_is_not_covered_is_no_sample_whatever_is_asked_for():
+    part = rts.Part(MESH(MESH_OF_BOX[1]), {"vertices": MESH_OF_BOX[0]})
+    sampler, given = rts.plugin("rts.samplers", "raster")(), (part, CAMERA, SIZE, 2)
+    everything = sampler.sample(*given, needed=lambda covered, depth: np.ones_like(covered), facing=True)
+    np.testing.assert_array_equal(everything.row, sampler.sample(*given).row)

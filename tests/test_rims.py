@@ -226,6 +226,9 @@ def test_splats_of_one_part_need_no_array_of_parts(splatter, layers, exits, targ
     for x, y in zip(found, expected, strict=True):
         np.testing.assert_array_equal(x, y)
     assert (np.abs(found[0] - unknown[0]).max() > 1e-3) == (layers > 1)
+    apart = np.where(splats.row < 0, -1, np.arange(layers)[:, None, None])  # Parts that are told count.
+    for x, y in zip(slope(part=apart, one_part=True), slope(part=apart), strict=True):
+        np.testing.assert_array_equal(x, y)
 
 
 # ----------------------------------------------------------------------------------------------- compiled code

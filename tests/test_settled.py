@@ -131,8 +131,11 @@ def test_only_cells_that_are_wanted_need_samples(reach):
 
 
 @pytest.mark.parametrize("name", ["box before a card", "spheres that cross"])
-@pytest.mark.parametrize("splatter", ["single", "multi", "visible", splatting.Visible()])
-def test_so_are_those_of_active_pixels(name, splatter):
+@pytest.mark.parametrize(
+    ("splatter", "layers"),
+    [("single", 2), ("multi", 2), ("visible", 2), (splatting.Visible(), 2), ("single", 1), ("visible", 1)],
+)
+def test_so_are_those_of_active_pixels(name, splatter, layers):
     import torch
 
     results, counts = [], []
@@ -140,7 +143,7 @@ def test_so_are_those_of_active_pixels(name, splatter):
         vertices = torch.tensor(SCENES[name][0], dtype=torch.float64, requires_grad=True)
         color = torch.tensor([0.3, 0.6, 0.2], dtype=torch.float64, requires_grad=True)
         part = part_of(vertices, name, color)
-        image, sampled = sampled_image(part, settles, splatter, supersample=rts.Adaptive(4))
+        image, sampled = sampled_image(part, settles, splatter, supersample=rts.Adaptive(4), layers=layers)
         weights = torch.from_numpy(np.random.default_rng(2).normal(size=(*SIZE, 4)))
         (image * weights).sum().backward()
         results.append((image.detach().numpy(), vertices.grad.numpy(), color.grad.numpy()))
@@ -167,6 +170,17 @@ def test_pixels_that_are_not_active_are_flat_where_hidden_samples_have_no_effect
         sampled = sample(options.pop("parts", part), CAMERA, SIZE, settles=True, **options)
         flat[case] = sampled.fine.flat
     assert flat == {case: case in ("visible", "single") for case in cases}
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_the_farthest_front_stays_amid_one_colour(layers):
+    # A card with a hole, through which another one is seen.
+    sides, ends = [(-1.2, -0.4), (0.4, 1.2)], [(-1.2, 1.2), (-0.4, 0.4)]
+    card = [quad(*x, *ends[0], 0.0) for x in sides] + [quad(*ends[1], *y, 0.0) for y in sides]
+    vertices, faces = joined(*card, quad(-2.5, 2.5, -2.5, 2.5, -9.0))
+    part = rts.Part(MESH(faces), {"vertices": vertices}, "silhouette")
+    sampled = sample(part, CAMERA, SIZE, splatter="visible", settles=True, layers=layers)
+    assert (sampled.settled >= 0).any() and sampled.depth.max() > 10
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)

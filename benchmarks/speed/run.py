@@ -46,7 +46,7 @@ def iterations(task: Task, args: argparse.Namespace) -> dict[str, Callable[[], o
             for sampler in ("auto", "embree") if mode == "pose" else ("auto",):
                 found[f"{NAMES[mode]}, {engine}, {sampler}"] = make(task, mode, sampler)
     found["RtS-pose, torch, auto, one sweep"] = torch_iteration(task, swept=True)
-    found["RtS-pose, torch, prepared, one sweep"] = torch_iteration(task, swept=True, prepared=True)
+    found["RtS-pose, torch, prepared, one sweep"] = torch_iteration(task, prepared=True)
     if args.peers:
         from benchmarks.speed import other_renderers
 

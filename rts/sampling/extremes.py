@@ -28,10 +28,13 @@ def extent(x: np.ndarray) -> tuple[int, int]:
 
 def named(x: np.ndarray) -> tuple[np.ndarray, int, int]:
     """Where an array of indices is not negative, bool; and the least and the largest of them, and −1."""
-    if x.dtype != np.int32 or not x.size:
-        return x >= 0, int(x.min(initial=-1)), int(x.max(initial=-1))
-    there = np.empty(x.shape, np.bool_)
-    least, most = _ends(x, there)
+    if not x.size:
+        return np.zeros(x.shape, np.bool_), -1, -1
+    if x.dtype == np.int32:
+        there = np.empty(x.shape, np.bool_)
+        least, most = _ends(x, there)
+    else:
+        there, (least, most) = x >= 0, extent(x)
     return there, min(least, -1), max(most, -1)
 
 

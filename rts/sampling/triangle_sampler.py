@@ -137,7 +137,8 @@ class TriangleSampler(Sampler):
             camera: see `rasterize`.
             size: see `rasterize`.
             layers: see `rasterize`.
-            beside: gives the cells (1, M) int32, flat indices in the grid, of the fragments (K, H, W).
+            beside: gives the cells (1, M) int32, flat indices in the grid, of the fragments (K, H, W), which are not to
+                be changed from then on.
 
         Returns:
             Fragments (K, H, W), the cells, and the fragments (1, 1, M) of cull="front" in these.
@@ -276,7 +277,8 @@ class TriangleSampler(Sampler):
 
         def keep(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
             """Which of the fragments, where nothing moves them any more, are samples."""
-            return covered if needed is None else needed(covered, depth)
+            kept = covered if needed is None else needed(covered, depth)
+            return kept if kept is covered else kept & covered
 
         asked = keep if exits else None
         found, fragments, covered, kept, behind = self._fragments(
@@ -291,6 +293,7 @@ class TriangleSampler(Sampler):
                     read = any(np.may_share_memory(x, found.proxy.vertices) for x in leaves(inputs))
                     size = needed.size if read and needed.size is not None else largest(found.proxy.vertices)
                 if needed.settles:
+                    kept = kept.copy() if kept is covered else kept  # It is changed in place.
                     settled = of_first_row(needed.settled(covered, fragments.depth, kept, size))
             sides = None
             if tells:

@@ -44,7 +44,7 @@ class _Fused(splatting.Kernel):
 
     def _of(self, splats: Splats) -> Array:
         """The image without the border."""
-        return IMAGE(*self._operands(splats), settings=self._settings(splats.border, splats.one_part))
+        return IMAGE(*self._operands(splats), settings=self._settings_of(splats))
 
     def _operands(self, splats: Splats) -> tuple[Array, ...]:
         """Those of `IMAGE`."""
@@ -70,6 +70,10 @@ class _Fused(splatting.Kernel):
     def _settings(self, border: int, one_part: bool = False) -> Settings:
         return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border, one_part, *self._motions)
 
+    def _settings_of(self, splats: Splats) -> Settings:
+        # Parts that are told count, as they do in `Splats.parts`.
+        return self._settings(splats.border, splats.one_part and splats.part is None)
+
     @property
     def _motions(self) -> tuple[bool, ...]:
         """Whether outlines, and lines of crossing, have motions of their own, where the splatter knows of these."""
@@ -93,8 +97,7 @@ class _Fused(splatting.Kernel):
         own = splats.positions, splats.rgba, splats.row, splats.part, self._facing(splats)
         own += splats.wanted, splats.settled, self._exits(splats)
         given = *own, t_positions, t_rgba, target, weights, background
-        settings = self._settings(splats.border, splats.one_part)
-        return normal_equations.equations(settings, engine_of(given), loss or SQUARE, *given)
+        return normal_equations.equations(self._settings_of(splats), engine_of(given), loss or SQUARE, *given)
 
     def mean_loss(
         self,
@@ -108,7 +111,7 @@ class _Fused(splatting.Kernel):
         if not self._sweeps or splats.rgba.shape[0] == 0:
             return None
         given = self._operands(splats), target, weights, background
-        return mean_loss.mean_loss(self._settings(splats.border, splats.one_part), loss or SQUARE, *given)
+        return mean_loss.mean_loss(self._settings_of(splats), loss or SQUARE, *given)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`."""
