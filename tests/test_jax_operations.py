@@ -1,6 +1,9 @@
 """Projection and interpolation of packed samples in jax: the same as in plain jax, in every transform."""
 
 import mmap
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -339,3 +342,25 @@ def test_gradients_in_the_place_of_operands_leave_what_is_read_later():
         for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(x, y, atol=1e-6)
     assert "output_operand_alias" in jax.jit(lambda *given: both(*given, False)).lower(positions, rgba).as_text()
+
+
+@pytest.mark.parametrize("devices", [1, 2])
+def test_a_process_ends_though_nobody_waits_for_its_last_program(devices):
+    code = """
+import jax, jax.numpy as jnp
+import numpy as np
+from rts.operations.projection import projective_map
+
+@jax.jit
+def program(x, points):
+    for _ in range(3):
+        x = jnp.sin(x @ x)
+    return projective_map(x[:4, :4], points)
+
+mesh = jax.sharding.Mesh(np.array(jax.devices()), ("a",))
+given = jax.device_put((jnp.ones((600, 600)), jnp.ones((5, 3))), jax.NamedSharding(mesh, jax.P()))
+program.lower(*given).compile()
+program(*given)
+"""
+    variables = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}", "JAX_PLATFORMS": "cpu"}
+    subprocess.run([sys.executable, "-c", code], env=os.environ | variables, check=True, timeout=60)

@@ -67,6 +67,8 @@ class Operation:
             for each direction.
         cheap: whether a compiling engine may compute its value once more, inside of an operation that takes it, rather
             than keep it.
+        takes_cheap: whether its `used` does without the first operand, so that a cheap operation that gives it may be
+            computed inside of this one. `used` finds another array of as many rows there.
     """
 
     name: str
@@ -84,6 +86,7 @@ class Operation:
     keeps: bool = False
     sweeps: bool = False
     cheap: bool = False
+    takes_cheap: bool = False
 
     def __post_init__(self):
         object.__setattr__(self, "ranks", tuple(self.ranks))

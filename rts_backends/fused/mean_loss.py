@@ -163,6 +163,7 @@ MEAN_LOSS = Operation(
     differentiable=2,
     packed=(0, 1),
     used=used,
+    takes_cheap=True,
     even=(1,),
     keeps=True,
     sweeps=True,

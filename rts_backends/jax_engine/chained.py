@@ -21,8 +21,9 @@ class _Kept(NamedTuple):
 
 def may_chain(first: Operation, second: Operation) -> bool:
     """Whether `second` can take what `first` gives as its first operand inside of one operation."""
-    rows = first.packed_result and 0 in second.packed
-    return first.cheap and rows and not first.keeps and first.differentiable == len(first.ranks)
+    rows = first.packed_result and 0 in second.packed and len(first.packed) > 0
+    told = second.used is None or second.takes_cheap  # The rows in use are counted before the first is computed.
+    return first.cheap and rows and told and not first.keeps and first.differentiable == len(first.ranks)
 
 
 @functools.cache

@@ -10,6 +10,8 @@ its memory (`clear`): where nobody reads it, it takes neither time nor room.
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import ctypes
 import functools
 import itertools
@@ -228,16 +230,17 @@ def large_pages(results: Sequence[np.ndarray]) -> None:
     """Ask the system for pages of megabytes where results of a call are, and between them.
 
     What a program computes with lies side by side. Beyond some 32 MB it is new memory in each call, of which the system
-    gives a page whenever one is touched first; to be given small ones takes longer than to fill them.
+    gives a page whenever one is touched first; to be given small ones takes longer than to fill them. What else lies
+    between the results may get large pages, too: it stays as it is, but may take more memory.
     """
     places = [(x.__array_interface__["data"][0], x.nbytes) for x in results if x.nbytes >= _LEAST]
-    if not places or _advise is None:
+    if not places or _advise is None or _HUGE is None:
         return
     first, last = min(start for start, _ in places), max(start + size for start, size in places)
     # What is far apart has been allotted apart.
     if _SPARSE * sum(size for _, size in places) >= last - first >= _LARGE:
         first -= first % mmap.PAGESIZE
-        _advise(first, last - first, mmap.MADV_HUGEPAGE)
+        _advise(first, last - first, _HUGE)
 
 
 _LARGE, _SPARSE = 1 << 23, 4
@@ -251,6 +254,7 @@ PIECE = 1 << 11
 so few that intermediate arrays stay in caches, and that XLA does not wake its other threads for each. They read on to
 the end of a piece, masked; where there is no page, that takes a microsecond a row."""
 
+_HUGE: int | None = getattr(mmap, "MADV_HUGEPAGE", None)
 _advise: Callable[[int, int, int], int] | None = None
 if sys.platform == "linux":  # Elsewhere `MADV_DONTNEED` promises no zeros.
     _advise = ctypes.CDLL(None).madvise
@@ -261,13 +265,33 @@ if sys.platform == "linux":  # Elsewhere `MADV_DONTNEED` promises no zeros.
 def _available() -> bool:
     """Whether the handler is registered; XLA asks it for its version on the way."""
     try:
-        jax.local_devices(backend="cpu")  # jax registers late what it is given before there are devices.
+        # jax registers late what it is given before there are devices.
+        client = jax.local_devices(backend="cpu")[0].client
         handler = jax.ffi.pycapsule(ctypes.cast(_HANDLER, ctypes.c_void_p).value)
         jax.ffi.register_ffi_target(TARGET, handler, platform="cpu", api_version=1)
+        # Where `_settle` does not help: its destructor would wait without end for threads that Python has ended.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(client))
+        atexit.register(_settle, os.getpid())  # Before jax's own, which has been registered before.
     except Exception as error:
         warnings.warn(f"host functions in jax programs are slower than they could be: {error}", stacklevel=2)
         return False
     return _versions == [MAJOR]
+
+
+def _settle(process: int) -> None:
+    """Let programs come to their end that nobody has waited for, when a process ends.
+
+    Once Python is about to end, it ends all threads that ask for the interpreter lock, XLA's as well.
+    """
+    if os.getpid() != process:  # A forked child has none of the threads.
+        return
+    with contextlib.suppress(Exception):
+        devices = jax.local_devices(backend="cpu")
+        # A program begins after those before it: of one device after all that the thread has started, of several after
+        # those of several.
+        for own in dict.fromkeys([*((device,) for device in devices), tuple(devices)]):
+            sharding = jax.sharding.NamedSharding(jax.sharding.Mesh(own, "a"), jax.sharding.PartitionSpec())
+            jax.block_until_ready(jax.jit(jnp.negative)(jax.device_put(np.float32(0), sharding)))
 
 
 # ------------------------------------------------------ the interface: xla/ffi/api/c_api.h in jaxlib's include folder
