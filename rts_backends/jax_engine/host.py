@@ -243,7 +243,7 @@ def large_pages(results: Sequence[np.ndarray]) -> None:
         _advise(first, last - first, _HUGE)
 
 
-_LARGE, _SPARSE = 1 << 23, 4
+_LARGE, _SPARSE = 1 << 25, 4
 """Bytes from which on large pages are asked for, and how many times more they may be than those of the results."""
 
 _LEAST = 1 << 17
