@@ -234,7 +234,7 @@ def check_memory(height: int, width: int, layers: int, capacity: int | None, *, 
 
 def is_count(value: Any) -> bool:
     """Whether a value is an integer of at least 1, Python's or NumPy's."""
-    return isinstance(value, (int, Integral)) and not isinstance(value, bool) and int(value) >= 1
+    return isinstance(value, Integral) and not isinstance(value, bool) and int(value) >= 1
 
 
 def is_real(value: Any) -> bool:

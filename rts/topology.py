@@ -12,6 +12,7 @@ from rts.arrays import shape_of
 from rts.engines import value_of
 from rts.errors import EngineError, InputError
 from rts.records import MORE
+from rts.sampling.extremes import extent
 from rts.trees import leaves
 
 
@@ -105,13 +106,13 @@ def pieces(faces: np.ndarray) -> np.ndarray:
 _extent: dict[int, tuple[weakref.ref, tuple[int, int]]] = {}
 
 
-def extent(array: np.ndarray) -> tuple[int, int]:
+def table_extent(array: np.ndarray) -> tuple[int, int]:
     """The least and the largest number in a table that is not empty; of a fixed one it is looked for but once."""
     kept = not array.flags.writeable and array.flags.owndata
     key = id(array)
     if kept and key in _extent and _extent[key][0]() is array:
         return _extent[key][1]
-    found = int(array.min()), int(array.max())
+    found = extent(array)
     if kept:
         _extent[key] = weakref.ref(array, lambda _: _extent.pop(key, None)), found
     return found

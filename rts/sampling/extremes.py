@@ -1,4 +1,4 @@
-"""How large the numbers of an array are, and how small."""
+"""How large the numbers of an array are, where the largest lie, and which indices name something."""
 
 from __future__ import annotations
 

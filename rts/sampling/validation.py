@@ -17,7 +17,7 @@ from rts.records import Fragments, Proxy, Samples
 from rts.sampling.extremes import largest
 from rts.sampling.packing import covered_cells
 from rts.splatting.layers import check_rows
-from rts.topology import extent
+from rts.topology import table_extent
 from rts.trees import Tree
 
 
@@ -56,7 +56,7 @@ def check_faces(proxy: Proxy, surface: Any = None) -> None:
     """Refuse triangles that name no vertex, before compiled code reads there."""
     if not len(proxy.faces):
         return
-    least, most = extent(proxy.faces)
+    least, most = table_extent(proxy.faces)
     if not 0 <= least <= most < len(proxy.vertices):
         name = "the proxy" if surface is None else f"the proxy of {surface!r}"
         raise InputError(f"{name} has faces from {least} to {most}, but {len(proxy.vertices)} vertices")
