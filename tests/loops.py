@@ -11,9 +11,13 @@ class Pairing:
 
     def __init__(self, positions, row, visible):
         self.positions, self.row, self.visible = positions, row, visible
-        seen = [positions[i, 2] for i in row.ravel() if i >= 0]
-        self.extent = max(*seen, 0) - min(*seen, 0) if seen else 0.5
+        self.beyond = 2 * self._extent(row) or 1.0
+        self.extent = self._extent(row[0])
         self.cells = list(itertools.product(*map(range, row.shape[1:])))
+
+    def _extent(self, row):
+        seen = [0.0, *(self.positions[i, 2] for i in row.ravel() if i >= 0)]
+        return max(seen) - min(seen)
 
     def inside(self, y, x):
         return 0 <= y < self.row.shape[1] and 0 <= x < self.row.shape[2]
@@ -22,7 +26,7 @@ class Pairing:
         return self.inside(y, x) and self.row[0, y, x] >= 0
 
     def depth(self, k, y, x):
-        return self.positions[self.row[k, y, x], 2] if self.row[k, y, x] >= 0 else 2 * self.extent
+        return self.positions[self.row[k, y, x], 2] if self.row[k, y, x] >= 0 else self.beyond
 
     def depths(self, y, x):
         return [self.depth(k, y, x) for k in range(len(self.row))]

@@ -29,8 +29,8 @@ def settle(
 ) -> np.ndarray:
     """Cells (H, W) bool amid nine fronts of one colour and no hidden sample that is kept; other samples are left out.
 
-    Those stay that are within reach of a cell that is wanted and not settled. So do the nearest and the farthest, since
-    the depth of what is empty goes by them.
+    Those stay that are within reach of a cell that is wanted and not settled. So do the nearest and the farthest front,
+    since splatters measure differences of depth by these.
 
     Args:
         covered: (K, H, W) bool.
@@ -48,10 +48,10 @@ def settle(
     told = read_only(np.empty((0, width)) if part is None else part, np.int32), read_only(np.array(colors, np.int32))
     given = covered, kept, wanted, *told, reach, found, near
     parallel(_settle, height, *given, work=LONG * covered.size)
-    farthest = places(depth, kept)
+    ends = places(depth[:1], kept[:1])
     parallel(_drop, height, near, kept, work=covered.size // 8)
-    for k, y, x in farthest:
-        kept[: k + 1, y, x] = covered[: k + 1, y, x]
+    for end in ends:
+        kept[end] = True
     return found
 
 

@@ -48,7 +48,9 @@ DIRECT = 0.5
 FIT = 0.5
 """How far a source may be from the planes of both sheets, in terms of the change of g on the way."""
 KEPT = 2
-"""Cells around a pair whose first two layers are kept."""
+"""Cells around what may be a pair whose first two layers are kept."""
+SLACK = 0.01
+"""Rounding of depths, in terms of the least sum of gaps of a pair."""
 
 HALF = [(1, 0), (0, 1), (1, 1), (1, -1)]
 """Steps from one cell of each pair to the other."""
@@ -151,7 +153,7 @@ def pairs(z0: Array, z1: Array, two: Array, extent: Array | float) -> dict[Steps
         z0: depths of the first layer (H, W), finite.
         z1: of the second.
         two: where there are both.
-        extent: of all depths, the camera's included.
+        extent: of the fronts' depths, the camera's included.
     """
     xp, found = namespace(two, z0), {}
     ratios = {m: _ratio(z0, z1, two, TIE * extent, m) for m in HALF}
@@ -164,14 +166,20 @@ def pairs(z0: Array, z1: Array, two: Array, extent: Array | float) -> dict[Steps
 
 
 def sheets(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """The first two layers (K, H, W) near pairs, of covered (K, H, W) bool and depth (K, H, W)."""
+    """The first two layers (K, H, W) near what may be pairs, of covered (K, H, W) bool and depth (K, H, W).
+
+    Whatever other hidden layers are left out, `pairs` finds the same.
+    """
     if len(covered) < 2 or not covered[1].any():
         return covered & False
-    seen = depth[covered]
+    seen = depth[0][covered[0]]
     extent = max(seen.max(), 0) - min(seen.min(), 0)
     two = covered[0] & covered[1]
     first, second = np.where(two, depth[:2], 0)
-    near = np.logical_or.reduce(list(pairs(first, second, two, extent).values()))
+    near = two & False
+    for m in HALF:
+        found = _candidates(first, second, two, TIE * extent, m)
+        near = near | found | ahead(found, opposite(m), False)
     for _ in range(KEPT):
         near = near | np.logical_or.reduce([ahead(near, m, False) for m in AROUND])
     return covered & near & (np.arange(len(covered)) < 2)[:, None, None]
@@ -197,25 +205,76 @@ def _depths(layers: Layers) -> tuple[list[Array], Array]:
     return [stopped(layers.xp.where(two, layers.target[k], 0.0)) for k in (0, 1)], two
 
 
-def _ratio(z0: Array, z1: Array, two: Array, least: Array | float, m: Steps) -> Array:
-    """R / (h(q) + h(p)) of cells and those a step m farther on; infinity where they are no pair."""
+class _Step(NamedTuple):
+    """Two cells of two layers each, q and the one p a step farther on, with what lies beyond them.
+
+    Attributes:
+        both: (H, W) bool, where these are.
+        gaps: h(q) + h(p), (H, W).
+        before: where the cell before q has two layers, too.
+        after: where the one after p does.
+        changes: q's share of R, and p's.
+        directs: q's share of D, and p's.
+    """
+
+    both: Array
+    gaps: Array
+    before: Array
+    after: Array
+    changes: tuple[Array, Array]
+    directs: tuple[Array, Array]
+
+
+def _step(z0: Array, z1: Array, two: Array, m: Steps) -> _Step:
+    """All cells and those a step m farther on."""
     xp, back, twice = namespace(two, z0), opposite(m), (2 * m[0], 2 * m[1])
     (b0, b1), (p0, p1), (f0, f1) = ((ahead(z0, n, 0.0), ahead(z1, n, 0.0)) for n in (back, m, twice))
-    before, after = ahead(two, back, False), ahead(two, twice, False)
+    gap = z1 - z0
+    return _Step(
+        both=two & ahead(two, m, False),
+        gaps=gap + ahead(gap, m, 0.0),
+        before=ahead(two, back, False),
+        after=ahead(two, twice, False),
+        changes=(
+            xp.abs(b0 - 2 * z0 + p1) + xp.abs(b1 - 2 * z1 + p0),
+            xp.abs(f0 - 2 * p0 + z1) + xp.abs(f1 - 2 * p1 + z0),
+        ),
+        directs=(
+            xp.abs(b0 - 2 * z0 + p0) + xp.abs(b1 - 2 * z1 + p1),
+            xp.abs(f0 - 2 * p0 + z0) + xp.abs(f1 - 2 * p1 + z1),
+        ),
+    )
 
-    def both(here: Array, there: Array) -> Array:
+
+def _ratio(z0: Array, z1: Array, two: Array, least: Array | float, m: Steps) -> Array:
+    """R / (h(q) + h(p)) of cells and those a step m farther on; infinity where they are no pair."""
+    xp, step = namespace(two, z0), _step(z0, z1, two, m)
+    before, after = step.before, step.after
+
+    def both(sides: tuple[Array, Array]) -> Array:
+        here, there = sides
         return xp.where(before & after, here + there, xp.where(before, here + here, there + there))
 
-    change = both(
-        xp.abs(b0 - 2 * z0 + p1) + xp.abs(b1 - 2 * z1 + p0), xp.abs(f0 - 2 * p0 + z1) + xp.abs(f1 - 2 * p1 + z0)
-    )
-    direct = both(
-        xp.abs(b0 - 2 * z0 + p0) + xp.abs(b1 - 2 * z1 + p1), xp.abs(f0 - 2 * p0 + z0) + xp.abs(f1 - 2 * p1 + z1)
-    )
-    gap = z1 - z0
-    total = gap + ahead(gap, m, 0.0)
-    here = two & ahead(two, m, False) & (before | after) & (total > least) & (change < DIRECT * direct)
-    return xp.where(here, change / xp.where(here, total, 1.0), xp.inf)
+    change, direct = both(step.changes), both(step.directs)
+    here = step.both & (before | after) & (step.gaps > least) & (change < DIRECT * direct)
+    return xp.where(here, change / xp.where(here, step.gaps, 1.0), xp.inf)
+
+
+def _candidates(z0: np.ndarray, z1: np.ndarray, two: np.ndarray, least: float, m: Steps) -> np.ndarray:
+    """Cells q (H, W) that may form a pair with q + m, whichever of the cells beyond these two have two layers.
+
+    Rounding decides nothing: pairs are found among depths of another precision.
+    """
+    step, slack = _step(z0, z1, two, m), SLACK * least
+    (change0, change1), (direct0, direct1) = step.changes, step.directs
+    found = two & False
+    for known, change, direct in (
+        (step.before, change0 + change0, direct0 + direct0),
+        (step.after, change1 + change1, direct1 + direct1),
+        (step.before & step.after, change0 + change1, direct0 + direct1),
+    ):
+        found = found | (known & (change < DIRECT * direct + slack) & (change < LARGEST * step.gaps + slack))
+    return found & step.both & (step.gaps > least - slack)
 
 
 def _slope(

@@ -53,12 +53,13 @@ class Depths:
     def __init__(self, depth: list[Array], covered: Array, facing: list[Array] | None = None):
         """Depths of each layer (h, w), finite, where they are covered (K, h, w), and `Splats.facing`, with the border.
 
-        Without the last, any two layers may pair.
+        Without the last, any two layers may pair. `extent` is that of the fronts' depths, since hidden samples may have
+        been left out.
         """
         self.xp = namespace(covered, depth[0])
         self.size = covered.shape[1] - 2, covered.shape[2] - 2
         self.covered, self._facing = covered, facing
-        self._depth, self.extent = _beyond(depth, covered)
+        self._depth, self.extent = _beyond(depth, covered), _extent(depth[0], covered[0])
         front = self._depth[0][None], self.xp.where(covered[0], 0, -1)[None]
         self._front = bordered(front[0])[0], bordered(front[1])[0] >= 0
         self.target = self.source(0, 0)
@@ -208,18 +209,23 @@ def normalised(total: Array, xp: Any) -> Array:
     return total[..., :4] / xp.clip(total[..., 4:], 1.0, None)
 
 
-def _beyond(depth: list[Array], covered: Array) -> tuple[list[Array], Array]:
-    """Depths of each layer, and their extent, the camera's included.
+def _beyond(depth: list[Array], covered: Array) -> list[Array]:
+    """Depths of each layer, finite where it is not covered.
 
     An empty cell lies beyond everything, at a distance of the scene's own scale. It is at least as far from any layer
     as two layers are from each other, so that none pairs with it for being near.
     """
     xp = namespace(covered, depth[0])
-    depth = [xp.where(covered[k], z, 0.0) for k, z in enumerate(depth)]
-    every = xp.stack(depth)
-    extent = xp.clip(xp.max(every), 0.0, None) - xp.clip(xp.min(every), None, 0.0)
+    extent = _extent(xp.stack(depth), covered)
     beyond = xp.where(extent > 0, 2 * extent, 1.0)
-    return [xp.where(covered[k], z, beyond) for k, z in enumerate(depth)], extent
+    return [xp.where(covered[k], z, beyond) for k, z in enumerate(depth)]
+
+
+def _extent(depth: Array, covered: Array) -> Array:
+    """The extent of the depths that are covered, the camera's included."""
+    xp = namespace(covered, depth)
+    depth = xp.where(covered, depth, 0.0)
+    return xp.clip(xp.max(depth), 0.0, None) - xp.clip(xp.min(depth), None, 0.0)
 
 
 def opposite(n: Steps) -> Steps:

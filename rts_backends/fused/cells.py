@@ -69,7 +69,7 @@ class Choices(NamedTuple):
         ends: (H, W) uint16, where fronts end, and targets that outlines may cover in part (`survey.py`); or no rows.
         listed: (H,) int64, the number of these targets in each row.
         repeated: whether several cells name a sample, and would add to its gradient at the same time.
-        extent: of the depths, the camera's included.
+        extent: of the fronts' depths, the camera's included.
     """
 
     mixed: np.ndarray
@@ -197,7 +197,7 @@ class Cells:
         states = amid.view(np.uint8).copy() if len(amid) else np.zeros((height, width), np.uint8)
         hidden, seen = np.zeros((height, -(-width // BLOCK)), np.uint8), np.zeros(count, np.bool_)
         counts = np.zeros(height, np.int64)
-        depths = np.zeros((height, 2), kind)
+        depths = np.zeros((height, 2, 2), kind)
         fronts = self.visible or layers == 1
         marks, marked = np.zeros((height, width), np.uint8), np.zeros(height, np.int64)
         ends, listed = np.empty((height if self.rims else 0, width), np.uint16), np.zeros(height, np.int64)
@@ -207,10 +207,10 @@ class Cells:
         repeated = int(np.count_nonzero(seen)) != int(counts.sum())
         if self._wanted is not None:
             states *= self._wanted | amid if len(amid) else self._wanted
-        least, largest = depths[:, 0].min(initial=0), depths[:, 1].max(initial=0)
+        least, largest = depths[..., 0].min(axis=0, initial=0), depths[..., 1].max(axis=0, initial=0)
+        extent = (largest - least)[0]
         # See `rts.splatting.layers`: nothing is nearer to what is beyond everything than to a front.
-        extent = largest - least
-        beyond = 2 * extent if least < 0 or largest > 0 else kind.type(1)
+        beyond = 2 * (largest.max() - least.min()) or kind.type(1)
         if layers > 1 and not self.visible:
             given = self.positions, self.row, beyond, hidden, states
             parallel(listing.find, height, *given, marks, marked, work=self.row.size)

@@ -33,20 +33,21 @@ class Rules(NamedTuple):
     largest: float
     direct: float
     fit: float
+    slack: float
 
     @classmethod
     def of(cls, extent: Any) -> Rules:
-        """For depths of an extent, the camera's included, in their dtype."""
+        """For fronts whose depths have an extent, the camera's included, in their dtype."""
         kind = type(extent)
-        numbers = specification.LARGEST, specification.DIRECT, specification.FIT
-        return cls(kind(TIE) * extent, *map(kind, numbers))
+        least, numbers = kind(TIE) * extent, (specification.LARGEST, specification.DIRECT, specification.FIT)
+        return cls(least, *map(kind, numbers), kind(specification.SLACK) * least)
 
 
 def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np.ndarray) -> None:
     """Mark in `kept` (K, H, W) what `rts.splatting.crossings.sheets` keeps."""
     _, height, width = covered.shape
     bits, some = _no_pairs(height, width)
-    parallel(_find_in_depths, height, covered, depth, Rules.of(extent), bits, some, work=3 * covered[0].size)
+    parallel(_find_candidates, height, covered, depth, Rules.of(extent), bits, some, work=3 * covered[0].size)
     if some.any():
         _keep(covered, bits, some, specification.KEPT, kept)
 
@@ -64,7 +65,7 @@ def pairs(positions: np.ndarray, row: np.ndarray, extent: np.floating) -> tuple[
     Args:
         positions: (N, 3).
         row: (K, H, W).
-        extent: of the depths, the camera's included.
+        extent: of the fronts' depths, the camera's included.
     """
     _, height, width = row.shape
     if len(row) > 1:
@@ -116,12 +117,12 @@ def find_in_cells(start, stop, positions, row, rules, bits, some):
             if 0 <= y < height:
                 there |= _load_cells(z[:, at], gap[at], positions, row, y)
         if there:
-            _find(top, bottom, z, gap, most, rules, bits, some)
+            _find(top, bottom, z, gap, most, rules, False, bits, some)
 
 
 @kernel
-def _find_in_depths(start, stop, covered, depth, rules, bits, some):
-    """Find pairs whose first cell lies in rows [start, stop)."""
+def _find_candidates(start, stop, covered, depth, rules, bits, some):
+    """Find what may be pairs, whatever hidden layers are left out, whose first cell lies in rows [start, stop)."""
     _, height, width = covered.shape
     z, gap, most = _window(width, depth.dtype)
     for top in range(start, stop, ROWS):
@@ -136,7 +137,7 @@ def _find_in_depths(start, stop, covered, depth, rules, bits, some):
                 _copy(z[1, at], depth[1, y])
                 _subtract(gap[at, BORDER:-BORDER], covered[0, y], covered[1, y], depth[0, y], depth[1, y])
         if there:
-            _find(top, bottom, z, gap, most, rules, bits, some)
+            _find(top, bottom, z, gap, most, rules, True, bits, some)
 
 
 @compiled
@@ -190,8 +191,8 @@ def _any(flags):
 
 
 @compiled
-def _find(start, stop, z, gap, most, rules, bits, some):
-    """Find pairs in a window of rows, the first cells of which lie in rows [start, stop)."""
+def _find(start, stop, z, gap, most, rules, candidates, bits, some):
+    """Find pairs, or `candidates`, in a window of rows, the first cells of which lie in rows [start, stop)."""
     width = z.shape[2]
     rows, marks = stop - start + 2 * BORDER, np.empty(width, np.uint8)
     for y in range(BORDER - 2, rows - BORDER + 2):
@@ -201,18 +202,25 @@ def _find(start, stop, z, gap, most, rules, bits, some):
         if not _any(marks):
             continue
         for left in range(0, width, CHUNK):
-            right, found = min(left + CHUNK, width), np.uint8(0)
+            right, suspected = min(left + CHUNK, width), np.uint8(0)
             for x in range(left, right):
-                found |= marks[x]
-            for x in range(left, right if found else left):
+                suspected |= marks[x]
+            for x in range(left, right if suspected else left):
                 # The cell as the first and as the second of pairs. Calls with arrays are dear: few come so far.
                 for n in range(8 if marks[x] else 0):
                     u, v = STEPS[n & 3, 0], STEPS[n & 3, 1]
                     qy, at = (y - v, x - u + BORDER) if n > 3 else (y, x + BORDER)
-                    if not _grows(gap[qy - v, at - u], gap[qy, at], gap[qy + v, at + u], gap[qy + 2 * v, at + 2 * u]):
+                    gaps = gap[qy - v, at - u], gap[qy, at], gap[qy + v, at + u], gap[qy + 2 * v, at + 2 * u]
+                    if not _grows(*gaps, candidates):
                         continue
                     inside = BORDER <= qy < rows - BORDER and BORDER <= at < width + BORDER
-                    if inside and _crosses(z, gap, rules, qy, at - BORDER, v, u):
+                    if not inside:
+                        continue
+                    if candidates:
+                        found = _may_cross(z, gap, rules, qy, at - BORDER, v, u)
+                    else:
+                        found = _crosses(z, gap, rules, qy, at - BORDER, v, u)
+                    if found:
                         bits[start + qy - BORDER, at - BORDER] |= np.uint8(1 << (n & 3))
                         some[start + qy - BORDER] = True
 
@@ -253,12 +261,17 @@ def _crosses(z, gap, rules, y, x, v, u):
 
 
 @compiled
-def _grows(b, h, t, a):
-    """Whether the gap grows on either side of a pair's two cells as it must (see `_suspect`), but for rounding."""
+def _grows(b, h, t, a, candidates):
+    """Whether the gap grows beyond a pair's two cells as it must (see `_suspect`), but for rounding.
+
+    It does so on either side or, of `candidates`, on one.
+    """
     infinity, most = np.float32(np.inf), np.float32(0.52) * (h + t)
     before, after = abs(b - h - h - t), abs(a - t - t - h)
     # What is not known is infinite, and the other side counts twice; without either gap all is infinite, or no number.
     before, after = before if b < infinity else after, after if a < infinity else before
+    if candidates:
+        before = after = min(before, after)
     return (before + after < most) & (most < infinity)
 
 
@@ -271,26 +284,57 @@ def has_two(gap, y, x):
 @compiled
 def _ratio(z, gap, rules, y, x, v, u):
     """R / (h(q) + h(p)) of a cell q and the one p a step (u, v) farther on; infinity where they are no pair."""
+    two = gap.dtype.type(2)
+    total, before, after, change0, change1, direct0, direct1 = _step(z, gap, y, x, v, u)
+    change = change0 + change1 if before and after else two * min(change0, change1)
+    direct = direct0 + direct1 if before and after else two * min(direct0, direct1)
+    known = (before or after) and total > rules.least and change < rules.direct * direct
+    return change / total if known else gap.dtype.type(np.inf)
+
+
+@compiled
+def _may_cross(z, gap, rules, y, x, v, u):
+    """Whether two cells may form a pair, whichever of the cells beyond them have two layers."""
+    two = gap.dtype.type(2)
+    total, before, after, change0, change1, direct0, direct1 = _step(z, gap, y, x, v, u)
+    if not total > rules.least - rules.slack:
+        return False
+    return (
+        (before and _is_small(two * change0, two * direct0, total, rules))
+        or (after and _is_small(two * change1, two * direct1, total, rules))
+        or (before and after and _is_small(change0 + change1, direct0 + direct1, total, rules))
+    )
+
+
+@compiled
+def _is_small(change, direct, total, rules):
+    return change < rules.direct * direct + rules.slack and change < rules.largest * total + rules.slack
+
+
+@compiled
+def _step(z, gap, y, x, v, u):
+    """What a pair is told by (see `rts.splatting.crossings`), of a cell q and the one p a step (u, v) farther on.
+
+    Returns:
+        h(q) + h(p); whether the cells before q and after p have two layers; the shares in R of q and p, and those in D:
+        infinite where these cells do not. No cell has, unless q and p have.
+    """
     infinity, two = gap.dtype.type(np.inf), gap.dtype.type(2)
-    if not (has_two(gap, y, x) and has_two(gap, y + v, x + u)):
-        return infinity
-    before, after = has_two(gap, y - v, x - u), has_two(gap, y + 2 * v, x + 2 * u)
+    here = has_two(gap, y, x) and has_two(gap, y + v, x + u)
+    before, after = here and has_two(gap, y - v, x - u), here and has_two(gap, y + 2 * v, x + 2 * u)
     total = gap[y, x + BORDER] + gap[y + v, x + u + BORDER]
-    if not (before or after) or not total > rules.least:
-        return infinity
-    q0, q1, p0, p1 = z[0, y, x], z[1, y, x], z[0, y + v, x + u], z[1, y + v, x + u]
     change0, change1, direct0, direct1 = infinity, infinity, infinity, infinity
     if before:
+        q0, q1, p0, p1 = z[0, y, x], z[1, y, x], z[0, y + v, x + u], z[1, y + v, x + u]
         b0, b1 = z[0, y - v, x - u], z[1, y - v, x - u]
         change0 = abs(b0 - two * q0 + p1) + abs(b1 - two * q1 + p0)
         direct0 = abs(b0 - two * q0 + p0) + abs(b1 - two * q1 + p1)
     if after:
+        q0, q1, p0, p1 = z[0, y, x], z[1, y, x], z[0, y + v, x + u], z[1, y + v, x + u]
         f0, f1 = z[0, y + 2 * v, x + 2 * u], z[1, y + 2 * v, x + 2 * u]
         change1 = abs(f0 - two * p0 + q1) + abs(f1 - two * p1 + q0)
         direct1 = abs(f0 - two * p0 + q0) + abs(f1 - two * p1 + q1)
-    change = change0 + change1 if before and after else two * min(change0, change1)
-    direct = direct0 + direct1 if before and after else two * min(direct0, direct1)
-    return change / total if change < rules.direct * direct else infinity
+    return total, before, after, change0, change1, direct0, direct1
 
 
 @compiled

@@ -81,7 +81,7 @@ def listed(arrays: tuple, choices: Any, extent: np.floating, bits: np.ndarray, s
     Args:
         arrays: positions (N, 3), rgba (N, 4), row (K, H, W), and the splatter's scale, peak and gamma.
         choices: see `rts_backends.fused.cells.Choices`.
-        extent: of the depths, the camera's included.
+        extent: of the fronts' depths, the camera's included.
         bits: the pairs of `crossing_pairs.py`.
         some: (H,) bool, whether there are any in a row.
     """

@@ -31,7 +31,8 @@ def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.nda
     numbers = kind(2 * (largest - least)), kind(TIE * max(largest, -least)), kind(CONTINUED)
     parallel(_keep, height, covered, depth, visible, rims, *numbers, kept, work=2 * covered.size)
     if settings.crossings:
-        crossing_pairs.sheets(covered, depth, kind(largest - least), kept)
+        least, largest = map(kind, bounds(depth[0], covered[0]))
+        crossing_pairs.sheets(covered, depth, largest - least, kept)
     return kept
 
 

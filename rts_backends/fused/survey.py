@@ -59,7 +59,7 @@ def survey(
         reach: pixels that a sample may lie off its cell's centre, so that the weights are sure to add up to one.
         states: (H, W) uint8, EMPTY or SETTLED, to be filled where they are EMPTY.
         hidden: (H, B) uint8, zeros, to be marked: the blocks of columns in or beside which hidden layers are covered.
-        depths: (H, 2) zeros, for the least and the largest depth of each row, and zero.
+        depths: (H, 2, 2) zeros, for the least and the largest depth, and zero, of each row's fronts and hidden layers.
         seen: (N,) bool, zeros, to be marked: samples that some cell refers to.
         counts: (H,) zeros, for the number of such cells, of `row` and `exits`.
         mixed: (H, W) uint8, to be filled with marks of the mixed targets of `Visible`; no rows where nobody asks.
@@ -89,7 +89,7 @@ def survey(
                 if k > 0 and not fronts:
                     _cover(covered[now], row[k, y])
                 if start <= y < stop:
-                    counts[y] += _note(row[k, y], positions, k > 0, hidden[y], depths[y], seen)
+                    counts[y] += _note(row[k, y], positions, k > 0, hidden[y], depths[y, min(k, 1)], seen)
                 elif asks and k > 0:
                     _hide(row[k, y], near[now])
             if start <= y < stop:
