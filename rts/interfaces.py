@@ -331,14 +331,11 @@ class Needed(Plugin):
     Attributes:
         settles: whether it also says which cells are `settled`; True in a class with its own method.
         size: of the largest number that surfaces read, if it is known.
-        colors: of each part the number of its one colour, or −1 where it may have several; None where all parts have
-            one and the same.
     """
 
     FLAGS = {"settled": "settles"}
     settles: bool = False
     size: float | None = None
-    colors: tuple[int, ...] | None = None
 
     @abc.abstractmethod
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -351,7 +348,6 @@ class Needed(Plugin):
         kept: np.ndarray,
         size: float,
         wanted: np.ndarray | None = None,
-        part: np.ndarray | None = None,
     ) -> np.ndarray:
         """Cells (H, W) bool whose colour is that of their front; samples that only such cells need leave `kept`.
 

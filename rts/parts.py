@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields, is_dataclass, replace
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
-from rts.adapting import unwrapped
 from rts.arguments import quoted
 from rts.errors import InputError
 from rts.interfaces import Shader, Surface
@@ -69,23 +66,3 @@ class CheckedPart(Part):
     def uniform(self) -> bool:
         """Whether all its samples have one colour, through whatever camera."""
         return self.uniform_by is not None
-
-    def shows_color_of(self, other: CheckedPart) -> bool:
-        """Whether both are certain to show one and the same colour, whatever arrays that are not NumPy's hold."""
-        names = self.uniform_by
-        if names is None or names != other.uniform_by or not _alike(unwrapped(self.shader), unwrapped(other.shader)):
-            return False
-        return all(_same(self.theta.get(name), other.theta.get(name)) for name in names)
-
-
-def _alike(a: Any, b: Any) -> bool:
-    """Whether two shaders are one, or equal data classes that hold nothing but their fields."""
-    if a is b:
-        return True
-    known = {f.name for f in fields(a)} if is_dataclass(a) else set()
-    return type(a) is type(b) and a == b and set(getattr(a, "__dict__", {})) <= known
-
-
-def _same(a: Tree, b: Tree) -> bool:
-    """Whether two entries of θ are one object, or constants of one value."""
-    return a is b or (isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b))

@@ -178,7 +178,7 @@ class Fine:
     flat: bool = False
 
 
-@record(static=("supersample", "apron", "colors"))
+@record(static=("supersample", "apron"))
 class Sampled:
     """A whole scene, sampled: what `rts.sample` returns and `rts.render_samples` takes.
 
@@ -194,14 +194,11 @@ class Sampled:
         supersample: s; each pixel has s² cells.
         apron: cells at each side of the image; a splatter that reaches r cells needs r + 1.
         fine: further samples where outlines are (`rts.Adaptive`), or None.
-        settled: (H, W) integers, see `Splats`, counted over all parts in order; None where no samples were left out
-            for it.
+        settled: (H, W) integers, see `Splats`; None where no samples were left out for it, as of several parts.
         facing: (K, H, W) int16, as in `Samples`; pieces of different parts have different numbers. None where nothing
             is told.
         exit: (H, W) int32, as in `Samples`, of the part that is seen, counted over all parts in order. None where
             nothing is told.
-        colors: where cells are settled, of each part the number of its one colour, or −1 where it may have several;
-            None where all parts have one and the same, or no cell is settled.
     """
 
     samples: tuple[Samples, ...]
@@ -214,7 +211,6 @@ class Sampled:
     settled: Array | None = None
     facing: Array | None = None
     exit: Array | None = None
-    colors: tuple[int, ...] | None = None
 
     @property
     def one_part(self) -> bool:

@@ -33,7 +33,7 @@ from rts.records import Sampled, Splats
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.emptiness import why_empty
 from rts.sampling.prepared import PreparedParts
-from rts.sampling.pruning import keep_colors, planned
+from rts.sampling.pruning import planned
 from rts.sampling.scenes import Scene, apron_of, sampled_scene, with_fine
 from rts.trees import Array
 
@@ -257,7 +257,7 @@ def render_samples(
             f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
             f"{apron_of(splatter)}; give it to rts.sample, too"
         )
-    if sampled.settled is not None and not (splatter.settles and keep_colors(scene.parts, sampled.colors)):
+    if sampled.settled is not None and not (splatter.settles and scene.parts[0].uniform):
         shaders = ", ".join(dict.fromkeys(repr(part.shader) for part in scene.parts))
         raise InputError(
             f"samples of cells amid one colour were left out (settles=True), which {splatter!r} and "

@@ -13,7 +13,6 @@ import rts
 from rts import splatting
 from rts.checks import check_scene
 from rts.sampling.interiors_kernels import settle
-from rts.sampling.pruning import colors_of
 from rts.sampling.scenes import sample
 from rts.shading import Unlit
 from rts.splatting.layers import dilated
@@ -85,30 +84,20 @@ def sampled_image(part, settles, splatter="visible", **options):
 @pytest.mark.parametrize(("layers", "reach"), [(1, 3), (3, 3), (2, 1), (2, 2), (2, 4)])
 def test_settled_cells_are_amid_fronts_and_what_is_left_out_is_far_from_all_others(layers, reach):
     rng = np.random.default_rng(layers)
-    for shape, several in itertools.product(((30, 41), (1, 9), (70, 3)), (False, True)):
+    for shape in ((30, 41), (1, 9), (70, 3)):
         front = ~dilated(rng.random(shape) < 0.01)
         covered = np.logical_and.accumulate(np.stack([front, *(rng.random((layers - 1, *shape)) < 0.5)]), axis=0)
         kept = covered & np.stack([front, *(dilated(rng.random(shape) < 0.01) for _ in range(layers - 1))])
         depth = np.sort(rng.random(covered.shape).astype(np.float32), axis=0)
         loose = np.pad(~front | kept[1:].any(axis=0), 9, constant_values=True)
-        told = {}
-        if several:  # Four parts in large patches, of which the last has no one colour, and two share theirs.
-            y, x = np.indices(shape)
-            part, colors = np.where(front, (y // 9 + x // 7) % 4, -1).astype(np.int32), (0, 1, 0, -1)
-            color = np.pad(np.where(front, np.array(colors)[part], -1), 9, constant_values=-1)
-            loose |= color < 0
-            shifted = [np.roll(color, (v, u), (0, 1)) for v in (-1, 0, 1) for u in (-1, 0, 1)]
-            loose = dilated(loose) | (np.min(shifted, axis=0) != np.max(shifted, axis=0))
-            told = {"part": part, "colors": colors}
-        else:
-            loose = dilated(loose)
+        loose = dilated(loose)
         expected = ~loose[9:-9, 9:-9]
         for _ in range(reach):
             loose = dilated(loose)
         left = kept & loose[9:-9, 9:-9]
         if kept.any():  # The farthest front stays, which sets the scale of depths.
             left[0].flat[np.where(kept[0], depth[0], -1).argmax()] = True
-        found = settle(covered, depth, kept, reach, **told)
+        found = settle(covered, depth, kept, reach)
         np.testing.assert_array_equal(found, expected)
         np.testing.assert_array_equal(kept, left)
 
@@ -230,166 +219,6 @@ def test_the_specification_agrees(name, make):
 
 
 SPHERE = icosphere(2, 0.8)
-SEVERAL = {
-    "overlapping": [(SPHERE, at(0.4, 0.1, 0.3)), (SPHERE, at(-0.3, 0, -0.6))],
-    "crossing": [(SPHERE, at(0.3, 0, 0)), (SPHERE, at(-0.3, 0, 0.1))],
-    "out of sight": [(SPHERE, at(30, 0, 0)), (SPHERE, at(0, 0, 0))],
-    "hidden": [(SPHERE, at(0, 0, 0)), (icosphere(1, 0.2), at(0, 0, -1))],
-    "a box before a card": [(box(0.5), at(0, 0, 0.2)), (quad(-1.0, 1.0, -1.0, 1.0, -0.8), at(0, 0, 0))],
-    "side by side": [(quad(-0.9, 0.0, -0.8, 0.8, 0.0), at(0, 0, 0)), (quad(0.0, 0.9, -0.8, 0.8, 0.0), at(0, 0, 0))],
-    "three": [(SPHERE, at(0.4, 0.1, 0.3)), (SPHERE, at(-0.3, 0, -0.6)), (box(0.4), at(0, -0.3, 1))],
-}
-
-
-SHADED = -1
-"""Stands for `lambert` among the colours of a scene."""
-
-
-def several_of(name, poses=None, colors=(), shows=(), grown=None, **options):
-    """The parts of a scene, moved by poses (P, 6), all silhouettes or of colours (C, 3) that they share or not.
-
-    Args:
-        name: of the scene.
-        poses: (P, 6), or None.
-        colors: a list of arrays (3,); none for silhouettes.
-        shows: for each part the number of its colour, or SHADED; nothing for the first one.
-        grown: by how much vertices are off, for their gradient.
-        **options: of the parts.
-    """
-    parts = []
-    for i, ((vertices, faces), place) in enumerate(SEVERAL[name]):
-        theta = {"vertices": vertices}
-        if grown is not None:
-            theta["vertices"] = grown.new_tensor(vertices) + grown * grown.new_tensor(np.sin(7 * vertices))
-        shader, show = "unlit" if len(colors) else "silhouette", shows[i] if shows else 0
-        if show == SHADED:
-            shader = "lambert"
-        elif len(colors):
-            theta["color"] = colors[show]
-        transform = place if poses is None else poses.new_tensor(place) @ rts.rigid(poses[i])
-        parts.append(rts.Part(MESH(faces), theta, shader, transform, **options))
-    return parts
-
-
-@pytest.mark.parametrize(
-    ("name", "shows", "splatter", "options"),
-    [
-        *((name, (), "visible", {}) for name in SEVERAL),
-        ("overlapping", (), "visible", {"layers": 1}),
-        ("overlapping", (), "visible", {"layers": "auto"}),
-        ("overlapping", (), "visible", {"supersample": 2}),
-        ("crossing", (), "visible", {"cull": "back"}),
-        ("crossing", (), splatting.Visible(), {"cull": "back", "layers": 3}),
-        ("three", (), "multi", {}),
-        ("three", (), splatting.Multi(), {"layers": 3}),
-        ("a box before a card", (), "single", {}),
-        *((name, (0, 1), "visible", {}) for name in SEVERAL if name != "three"),
-        ("overlapping", (1, 0), "visible", {"layers": 1}),
-        ("overlapping", (0, 1), "visible", {"layers": "auto"}),
-        ("overlapping", (0, SHADED), "visible", {"supersample": 2}),
-        ("overlapping", (0, SHADED), "visible", {"cull": "back"}),
-        ("crossing", (0, 1), "visible", {"cull": "back"}),
-        ("crossing", (SHADED, 0), splatting.Visible(), {"layers": 3}),
-        ("side by side", (0, SHADED), "visible", {}),
-        ("side by side", (0, 1), splatting.Visible(rims=False), {}),
-        ("three", (0, 1, 0), "visible", {}),
-        ("three", (SHADED, 0, 0), splatting.Visible(), {}),
-        ("three", (0, SHADED, 1), "multi", {}),
-        ("three", (0, 0, 1), splatting.Multi(), {"layers": 3}),
-        ("a box before a card", (0, 1), "single", {}),
-        ("a box before a card", (0, 1), splatting.Single(), {}),
-    ],
-)
-def test_so_are_those_of_several_parts(name, shows, splatter, options):
-    import torch
-
-    options, cull = dict(options), options.get("cull", "none")
-    options.pop("cull", None)
-    count = len(SEVERAL[name])
-    rng, weights = np.random.default_rng(5), np.random.default_rng(2).normal(size=(*SIZE, 4))
-    poses = 0.02 * rng.normal(size=6 * count)
-    start = torch.from_numpy(np.concatenate([poses, [0.01], [0.3, 0.6, 0.2, 0.9, 0.1, 0.5]]))
-    along, results, counts = torch.from_numpy(rng.normal(size=len(start))), [], []
-    for settles in (False, True):
-
-        def scene(x):
-            return several_of(name, x[:-7].reshape(-1, 6), list(x[-6:].reshape(2, 3)), shows, x[-7], cull=cull)
-
-        sampled = sample(scene(start), CAMERA, SIZE, splatter=splatter, settles=settles, **options)
-
-        def image(x, sampled=sampled, scene=scene):
-            return rts.render_samples(sampled, scene(x), CAMERA, splatter=splatter)
-
-        def loss(x, image=image):
-            return (image(x) * torch.from_numpy(weights)).sum()
-
-        results.append([*derivative("torch", image, start, along), gradient("torch", loss, start)])
-        counts.append(sum(len(s.ids) for s in sampled.samples))
-    assert (sampled.settled >= 0).any() and (counts[1] < counts[0] or splatter == "multi")
-    assert np.abs(results[0][2]).max() > 1
-    for whole, settled in zip(*results, strict=True):
-        np.testing.assert_allclose(settled, whole, rtol=0, atol=1e-10 * max(1, np.abs(whole).max()))
-
-
-def two_colored(target, x, kind=np.float32):
-    """Two spheres, one before the other, of colours x[:3] and x[3:6], the first moved by x[6:]."""
-    xp = rts.namespace(x)
-    transforms = rts.rigid(xp.concat([x[6:], 0 * x[6:]])), None
-    vertices = [arrays(target, (v + t[:3, 3]).astype(kind)) for (v, _), t in SEVERAL["overlapping"]]
-    colors = x[:3], x[3:6]
-    return [
-        rts.Part(MESH(SPHERE[1]), {"vertices": v, "color": c}, "unlit", t)
-        for v, c, t in zip(vertices, colors, transforms, strict=True)
-    ]
-
-
-@pytest.mark.parametrize("target", ["numpy", *DIFFERENTIABLE])
-def test_so_are_those_of_two_colours_in_every_engine(target):
-    weights = arrays(target, np.random.default_rng(0).normal(size=(*SIZE, 4)).astype(np.float32))
-    start = arrays(target, np.array([0.3, 0.6, 0.2, 0.9, 0.1, 0.5, 0.02, -0.01, 0.03], np.float32))
-    sampled = [sample(two_colored(target, start), CAMERA, SIZE, splatter="visible", settles=s) for s in (False, True)]
-    settled = to_numpy(sampled[1].settled)
-    assert settled.dtype == np.int32 and len(np.unique(settled)) == 3
-
-    def loss(x, given):
-        return rts.namespace(x).sum(rts.render_samples(given, two_colored(target, x), CAMERA) * weights)
-
-    images = [to_numpy(rts.render_samples(s, two_colored(target, start), CAMERA)) for s in sampled]
-    np.testing.assert_allclose(images[1], images[0], rtol=0, atol=3e-7)
-    if target != "numpy":
-        whole, found = (to_numpy(gradient(target, partial(loss, given=s), start)) for s in sampled)
-        assert np.abs(whole).max() > 1
-        np.testing.assert_allclose(found, whole, rtol=0, atol=1e-5 * np.abs(whole).max())
-
-
-def test_the_sum_of_gradients_of_each_colour_has_one_order(monkeypatch):
-    import torch
-
-    found = []
-    for threads in ("1", "2"):
-        monkeypatch.setenv("RTS_NUM_THREADS", threads)
-        x = torch.tensor([0.3, 0.6, 0.2, 0.9, 0.1, 0.5, 0.02, -0.01, 0.03], requires_grad=True)
-        image = rts.render(two_colored("torch-cpu", x), CAMERA, (300, 260))
-        (image * torch.linspace(-1, 2, image.numel()).reshape(image.shape).sin()).sum().backward()
-        found.append(x.grad.numpy())
-    np.testing.assert_array_equal(*found)
-
-
-def test_views_that_are_sampled_one_by_one_show_each_its_colours():
-    import torch
-
-    cameras = [rts.Camera.look_at((x, 0.4, 4.0), (0, 0, 0), fov_y=40) for x in (0.3, -0.5, 1.0)]
-    found = []
-    for whole in (False, True):
-        x = torch.tensor([0.3, 0.6, 0.2, 0.9, 0.1, 0.5, 0.02, -0.01, 0.03], requires_grad=True)
-        parts = [part.replace(cull="back") for part in two_colored("torch-cpu", x)]  # Exits are found view by view.
-        parts.append(rts.Part(MESH(SPHERE[1]), {"vertices": SPHERE[0]}, "lambert", at(0, -0.9, 0)))
-        images = rts.render_views(parts, cameras, SIZE) if whole else [rts.render(parts, c, SIZE) for c in cameras]
-        images = images if whole else torch.stack(images)
-        (images * torch.linspace(-1, 2, images.numel()).reshape(images.shape)).sum().backward()
-        found.append((images.detach().numpy(), x.grad.numpy()))
-    for one, other in zip(*found, strict=True):
-        np.testing.assert_allclose(one, other, rtol=0, atol=1e-5 * max(1, np.abs(one).max()))
 
 
 def test_fine_samples_see_a_gap_between_parts_that_coarse_ones_do_not():
@@ -438,11 +267,11 @@ def test_unlit_parts_of_one_colour_are_settled_and_their_colour_has_its_gradient
     np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-5 * np.abs(found[1]).max())
 
 
-def test_which_scenes_are_of_one_colour():
+def test_which_parts_are_of_one_colour():
     import torch
 
     vertices, rng = SPHERE[0], np.random.default_rng(0)
-    red, green = np.array([1.0, 0, 0], np.float32), np.array([0, 1.0, 0], np.float32)
+    red = np.array([1.0, 0, 0], np.float32)
 
     def part(shader="unlit", indices=None, **theta):
         return rts.Part(MESH(SPHERE[1], indices), {"vertices": vertices, **theta}, shader)
@@ -464,7 +293,7 @@ def test_which_scenes_are_of_one_colour():
             return super().__call__(theta, gbuffer, camera) * gbuffer["position"][:, :1]
 
     ball = rts.plugin("rts.surfaces", "sdf")(lambda theta, p: p[:, 0])
-    free, colors, uv = torch.tensor(red), rng.random((len(vertices), 3)), rng.random((len(vertices), 2))
+    colors, uv = rng.random((len(vertices), 3)), rng.random((len(vertices), 2))
     texture = rng.random((4, 4, 3))
     of_one = {
         "white": [part()],
@@ -472,9 +301,8 @@ def test_which_scenes_are_of_one_colour():
         "red": [part(color=red)],
         "texture without uv": [part(texture=texture)],
         "uv without texture": [part(uv=uv)],
-        "alike": [part(color=red), part(color=red.copy()), part(Unlit(), color=red)],
-        "one tensor": [part(color=free), part(color=free)],
-        "silhouettes": [part("silhouette"), part("silhouette", colors=colors)],
+        "a tensor": [part(color=torch.tensor(red))],
+        "a silhouette": [part("silhouette", colors=colors)],
     }
     of_more = {
         "colours": [part(colors=colors)],
@@ -485,47 +313,28 @@ def test_which_scenes_are_of_one_colour():
         "own colours": [part(Shaded())],
         "a call of its own": [part(Moved())],
         "a function": [part(lambda theta, gbuffer, camera: gbuffer["normal"])],
-        "red and green": [part(color=red), part(color=green)],
-        "white and red": [part(), part(color=red)],
-        "two tensors": [part(color=free), part(color=free.clone())],
-        "two of one class": [part(Painted(), color=red), part(Painted(), color=red)],
-        "silhouette and white": [part("silhouette"), part()],
     }
     for expected, scenes in ((True, of_one), (False, of_more)):
-        for name, parts in scenes.items():
-            assert (set(colors_of(check_scene(parts, CAMERA)[0])) == {0}) is expected, name
+        for name, (part,) in scenes.items():
+            assert check_scene(part, CAMERA)[0][0].uniform is expected, name
 
 
-@pytest.mark.parametrize(
-    ("several", "color", "supersample"),
-    [
-        *itertools.product([(), (0, 0)], [None, "free"], [1, 2, rts.Adaptive(3)]),
-        *(((0, shown), "free", supersample) for shown in (1, SHADED) for supersample in (1, 2)),
-    ],
-)
-def test_normal_equations_are_those_of_all_samples(several, color, supersample, monkeypatch):
+@pytest.mark.parametrize(("color", "supersample"), itertools.product([None, (0.3, 0.6, 0.2)], [1, 2, rts.Adaptive(3)]))
+def test_normal_equations_are_those_of_all_samples(color, supersample, monkeypatch):
     import torch
 
     from rts.fitting import image_residuals
 
     parameters = {"pose": torch.tensor([0.1, 0.2, 0.0, 0.02, 0.0, 0.0], dtype=torch.float64)}
     if color:
-        count = max(several, default=0) + 1
-        parameters["color"] = torch.tensor([[0.3, 0.6, 0.2], [0.9, 0.1, 0.5]][:count], dtype=torch.float64)
+        parameters["color"] = torch.tensor(color, dtype=torch.float64)
 
     def scene(p):
-        colors = list(p.get("color", ()))
-        if several:
-            poses = p["pose"][None] * p["pose"].new_tensor([[1.0], [0.5]])
-            return several_of("overlapping", poses, colors, several)
-        return part_of(SCENES["sphere"][0], "sphere", *colors, transform=rts.rigid(p["pose"]))
+        return part_of(SCENES["sphere"][0], "sphere", p.get("color"), transform=rts.rigid(p["pose"]))
 
     target = np.random.default_rng(3).random((*SIZE, 4 if color else 1))
     sampled = sample(scene(parameters), CAMERA, SIZE, splatter="visible", supersample=supersample, settles=True)
-    if several and isinstance(supersample, rts.Adaptive):  # Parts are told apart.
-        assert sampled.settled is None and sampled.fine.settled is None
-    else:
-        assert ((sampled.fine or sampled).settled >= 0).any()
+    assert ((sampled.fine or sampled).settled >= 0).any()
     residuals = rts.ImageResiduals(scene, CAMERA, SIZE, target, supersample=supersample)
     found = residuals.normal_equations(parameters)
     monkeypatch.setattr(image_residuals, "sample", lambda *a, settles, **k: sample(*a, **k))
@@ -570,7 +379,7 @@ def test_samples_are_left_out_only_where_nothing_can_depend_on_them():
             (part, splatting.Visible(epsilon=0.0)),
         )
     ]
-    assert settled == [True, True, False, True, True, False, False, False]
+    assert settled == [True, True, False, False, False, False, False, False]
 
 
 def test_what_needs_the_samples_that_were_left_out_is_refused():
@@ -579,29 +388,6 @@ def test_what_needs_the_samples_that_were_left_out_is_refused():
     for given, splatter in ((part, "none"), (part, Twice()), (part.replace(shader="normals"), "visible")):
         with pytest.raises(rts.InputError, match="were left out"):
             rts.render_samples(sampled, given, CAMERA, splatter=splatter)
-
-
-def test_parts_that_showed_one_colour_must_still():
-    red, green, blue = np.eye(3, dtype=np.float32)
-
-    def scene(*colors):
-        return several_of("overlapping", colors=list(colors), shows=(0, 1))
-
-    def normals(parts):
-        return [parts[0], parts[1].replace(shader="normals")]
-
-    one, two, half = (
-        sample(parts, CAMERA, SIZE, splatter="visible", settles=True)
-        for parts in (scene(red, red), scene(red, green), normals(scene(red, green)))
-    )
-    assert (one.colors, two.colors, half.colors) == (None, (0, 1), (0, -1))
-    for sampled, parts in ((one, scene(blue, blue)), (two, scene(green, blue)), (half, normals(scene(blue, red)))):
-        fresh = sample(parts, CAMERA, SIZE, splatter="visible")
-        images = [rts.render_samples(s, parts, CAMERA) for s in (sampled, fresh)]
-        np.testing.assert_allclose(*images, rtol=0, atol=3e-7)
-    for sampled, parts in ((one, scene(red, green)), (two, normals(scene(red, green)))):
-        with pytest.raises(rts.InputError, match="were left out"):
-            rts.render_samples(sampled, parts, CAMERA)
 
 
 @pytest.mark.parametrize("make", [splatting.Visible, fused.Visible])
@@ -666,10 +452,9 @@ def test_samples_that_do_not_fit_are_refused(changes, message, supersample):
 
 
 @pytest.mark.parametrize(
-    ("given", "settles"), [(["color"], True), (("colour of its own",), True), ("color", None), ((3,), None)]
+    ("given", "right"), [(["color"], True), (("colour of its own",), True), ("color", False), ((3,), False)]
 )
-def test_what_one_color_depends_on(given, settles):
-    """Entries that θ lacks are the same of all parts; names come in a tuple or a list."""
+def test_names_of_what_one_color_depends_on_come_in_a_tuple_or_a_list(given, right):
 
     class Own(Unlit):
         def uniform_by(self, theta, given_by_surface):
@@ -677,12 +462,12 @@ def test_what_one_color_depends_on(given, settles):
 
     vertices, faces = box(0.5)
     theta = {"vertices": vertices, "color": np.float32((1, 0, 0))}
-    parts = [rts.Part(MESH(faces), theta, Own(), transform=at(x, 0, 0)) for x in (-0.3, 0.3)]
-    if settles is None:
-        with pytest.raises(rts.InputError, match="uniform_by of"):
-            rts.render(parts, CAMERA, SIZE)
+    part = rts.Part(MESH(faces), theta, Own())
+    if right:
+        assert rts.render(part, CAMERA, SIZE)[..., 0].max() == 1
     else:
-        assert rts.render(parts, CAMERA, SIZE)[..., 0].max() == 1
+        with pytest.raises(rts.InputError, match="uniform_by of"):
+            rts.render(part, CAMERA, SIZE)
 
 
 @pytest.mark.parametrize("kind", ["single", "multi", "visible"])

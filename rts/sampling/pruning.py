@@ -18,8 +18,8 @@ from rts.parts import CheckedPart
 from rts.records import ArraySpec, Sampled, Samples
 from rts.sampling.exits import beside_outlines
 from rts.sampling.extremes import largest
-from rts.sampling.packing import of_first_row, too_far
-from rts.trees import Tree, leaves
+from rts.sampling.packing import too_far
+from rts.trees import leaves
 
 LAYER_LIMIT = 8
 """The largest number of layers that `layers="auto"` takes."""
@@ -46,49 +46,16 @@ def needed_by(
         splatter: the splatter.
         parts: checked parts.
         sizes: of each part the largest number of those that its surface reads, or None where it is to be looked for.
-        settles: whether samples may be left out that only cells amid one colour need. Where samples are to be evaluated
-            at other values of θ than they were found for, they may not.
+        settles: whether samples of a scene of one part may be left out that only cells amid its one colour need. Where
+            samples are to be evaluated at other values of θ than they were found for, they may not.
     """
     if not splatter.prunes or not all(p.shader.opaque and p.surface.centered for p in parts):
         return None
     size = _size(parts, sizes or [None] * len(parts))
     if size is None and not all(isinstance(p.surface, TriangleSurface) and not p.surface.refines for p in parts):
         return None
-    return _BySplatter(splatter, size, colors_of(parts) if settles and splatter.settles else ())
-
-
-def colors_of(parts: Sequence[CheckedPart]) -> tuple[int, ...]:
-    """(P,) the first part that is certain to show the one colour of each part; −1 for parts that may have several."""
-    found: list[int] = []
-    known: dict[Any, list[int]] = {}  # The first of each colour, by what is quick to compare.
-    for index, part in enumerate(parts):
-        names = part.uniform_by
-        if names is None:
-            found.append(-1)
-            continue
-        alike = known.setdefault((names, *(_hint(part.theta.get(name)) for name in names)), [])
-        first = next((i for i in alike if part.shows_color_of(parts[i])), index)
-        if first == index:
-            alike.append(index)
-        found.append(first)
-    return tuple(found)
-
-
-def _hint(entry: Tree) -> Any:
-    """What is the same of entries of θ that are one object, or constants of one value."""
-    return (entry.shape, *entry.flat[:3].tolist()) if isinstance(entry, np.ndarray) else id(entry)
-
-
-def keep_colors(parts: Sequence[CheckedPart], before: Sequence[int] | None) -> bool:
-    """Whether parts still promise what was known of them: one colour each, and those that shared one share it.
-
-    Args:
-        parts: as they are now.
-        before: what `colors_of` gave; None where all had one colour.
-    """
-    now = colors_of(parts)
-    pairs = {(old, new) for old, new in zip(before or [0] * len(now), now, strict=True) if old >= 0}
-    return len({old for old, _ in pairs}) == len(pairs) and all(new >= 0 for _, new in pairs)
+    # Where parts meet, rounding decides which of them a cell shows.
+    return _BySplatter(splatter, size, settles and splatter.settles and len(parts) == 1 and parts[0].uniform)
 
 
 def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float | None:
@@ -114,13 +81,11 @@ class _BySplatter(Needed):
     Args:
         splatter: the splatter.
         size: of the largest number that surfaces read, if it is known.
-        colors: what `colors_of` gave, if the splatter makes use of it; else nothing.
+        settles: whether all samples have one colour, and the splatter makes use of it.
     """
 
-    def __init__(self, splatter: Splatter, size: float | None, colors: tuple[int, ...]):
-        self._splatter, self.size = splatter, size
-        self.settles = any(color >= 0 for color in colors)
-        self.colors = colors if any(colors) else None
+    def __init__(self, splatter: Splatter, size: float | None, settles: bool):
+        self._splatter, self.size, self.settles = splatter, size, settles
 
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `Needed`."""
@@ -141,7 +106,6 @@ class _BySplatter(Needed):
         kept: np.ndarray,
         size: float,
         wanted: np.ndarray | None = None,
-        part: np.ndarray | None = None,
     ) -> np.ndarray:
         """See `Needed`."""
         if too_far(max(size, self.size or 0.0), depth):
@@ -150,7 +114,7 @@ class _BySplatter(Needed):
 
         # Beside cells that are not wanted, what decides for others is not settled, and may look at one cell more.
         reach = self._splatter.reach + (wanted is not None)
-        return interiors_kernels.settle(covered, depth, kept, reach, wanted, part, self.colors or ())
+        return interiors_kernels.settle(covered, depth, kept, reach, wanted)
 
 
 class Inspection(Needed):
@@ -165,7 +129,7 @@ class Inspection(Needed):
     def __init__(self, needed: AnyNeeded | None):
         self._needed, self._lock = None if needed is None else adapted(needed, Needed), threading.Lock()
         self.settles = self._needed is not None and self._needed.settles
-        self.size, self.colors = (None, None) if self._needed is None else (self._needed.size, self._needed.colors)
+        self.size = None if self._needed is None else self._needed.size
         self.short = 0
         self.most: int | None = None
         self.beyond = np.zeros(0, np.int64)
@@ -189,11 +153,10 @@ class Inspection(Needed):
         kept: np.ndarray,
         size: float,
         wanted: np.ndarray | None = None,
-        part: np.ndarray | None = None,
     ) -> np.ndarray:
         """See `Needed`."""
         assert self._needed is not None
-        return self._needed.settled(covered, depth, kept, size, wanted, part)
+        return self._needed.settled(covered, depth, kept, size, wanted)
 
     def ran_out(self, cells: int) -> None:
         """See `Needed`."""
@@ -249,13 +212,10 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: AnyNeeded | None)
 
 
 def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
-    """The scene without the samples that are not needed, with `settled` cells if these are told; one host call."""
+    """The scene without the samples that are not needed; one host call."""
     asked: Needed = adapted(needed, Needed)
-    # Where numbers are traced, nobody knows how rounding orders depths.
-    settles = asked.settles and asked.size is not None
     sizes = [s.ids.shape[0] for s in sampled.samples]
     total, part = sum(sizes), sampled.part
-    front = [part[0, ...]] if settles and len(sizes) > 1 else []
 
     def host(row: np.ndarray, depth: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
         from rts.sampling.pruning_kernels import Numbering
@@ -264,8 +224,7 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
             raise InputError(f"row refers to sample {row.max()} of {total}; sample this scene anew")
         numbering, covered = Numbering(sizes), row >= 0
         kept = asked(covered, depth)
-        last = len(rest) - len(front)
-        own_rows, exits, whose = rest[: len(sizes)], rest[len(sizes) : last], rest[last:]
+        own_rows, exits = rest[: len(sizes)], rest[len(sizes) :]
         if exits:
             if (most := exits[0].max(initial=-1)) >= total:
                 raise InputError(f"exit refers to sample {most} of {total}; sample this scene anew")
@@ -274,37 +233,27 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
             near[cells] = exits[0].reshape(-1)[cells]
             exits = (near.reshape(exits[0].shape),)
             numbering.use(exits[0], exits[0] >= 0)
-        amid = ()
-        if settles:
-            kept = kept.copy() if kept is covered else kept
-            told = {} if asked.colors is None else {"part": whose[0]}
-            found = asked.settled(covered, depth, kept, 0.0, **told)
-            amid = (np.where(found, whose[0], np.int32(-1)) if front else of_first_row(found),)
         numbering.use(row, kept)
         indices = [index if len(index) else np.zeros(1, np.int32) for index in numbering.indices()]
         own_rows = [numbering.renumbered(own, part=i) for i, own in enumerate(own_rows)]
-        return numbering.renumbered(row), *own_rows, *map(numbering.renumbered, exits), *amid, *indices
+        return numbering.renumbered(row), *own_rows, *map(numbering.renumbered, exits), *indices
 
     rows = sampled.row, *(s.row for s in sampled.samples), *([] if sampled.exit is None else [sampled.exit])
     shapes = [ArraySpec(tuple(r.shape), np.int32) for r in rows]
-    amid = [ArraySpec(tuple(sampled.row.shape[1:]), np.int32 if front else np.int8)] if settles else []
     packed = [ArraySpec((n,), np.int32, packed=True) for n in sizes]
-    found = engine_of(sampled).call_host(host, (*shapes, *amid, *packed), rows[0], sampled.depth, *rows[1:], *front)
-    row, own_rows, indices = found[0], found[1 : 1 + len(sizes)], found[len(rows) + len(amid) :]
+    found = engine_of(sampled).call_host(host, (*shapes, *packed), rows[0], sampled.depth, *rows[1:])
+    row, own_rows, indices = found[0], found[1 : 1 + len(sizes)], found[len(rows) :]
     exits = None if sampled.exit is None else found[1 + len(sizes)]
     samples = [_selected(*z) for z in zip(sampled.samples, own_rows, indices, strict=True)]
-    xp, settled = namespace(row), found[len(rows)] if settles else None
-    whose = settled  # The part whose colour a cell shows, by its first row.
+    xp = namespace(row)
     # Row numbers are within parts up to here, since an engine may have padded what comes before.
     start = indices[0].shape[0]
     for i, index in enumerate(indices[1:], start=1):
         row = xp.where((row >= 0) & (part == i), row + start, row)
         exits = None if exits is None else xp.where((exits >= 0) & (part[0] == i), exits + start, exits)
-        settled = None if settled is None else xp.where(whose == i, start, settled)
         start += index.shape[0]
     depth = xp.where(row >= 0, sampled.depth, 0.0)
-    told = {"settled": settled, "colors": asked.colors if settles else None, "exit": exits}
-    return replace(sampled, samples=tuple(samples), row=row, depth=depth, **told)
+    return replace(sampled, samples=tuple(samples), row=row, depth=depth, exit=exits)
 
 
 def _selected(samples: Samples, row: Any, index: Any) -> Samples:

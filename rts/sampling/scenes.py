@@ -56,7 +56,7 @@ def sample(
         supersample: as in `render`.
         capacity: as in `render`.
         engine: as in `render`.
-        settles: leave out samples of parts of one colour that only cells amid them need, which show this colour
+        settles: leave out samples of a single part of one colour that only cells amid it need, which show this colour
             whatever moves. What renders them must be given the values of θ, transform and camera that are given here.
             `render` does so.
 
@@ -149,8 +149,6 @@ def sampled_scene(
     See `sample`; where `settles`, samples that only cells of one colour need may be left out.
     """
     options: dict[str, Any] = dict(splatter=splatter, layers=layers, capacity=capacity)
-    # Fine cells may see a gap between parts that coarse ones do not: there parts are told apart.
-    settles = settles and (len(scene.parts) == 1 or not isinstance(supersample, Adaptive))
     needed = scene.needed_by(splatter, settles)
     if not isinstance(supersample, Adaptive):
         return _on_one_grid(scene, camera, size, int(supersample), needed=needed, **options)

@@ -96,7 +96,7 @@ class Sampling(NamedTuple):
         height, width = (self.side * n for n in self.size)
         first = self.scenes[0]
         check_memory(height, width, self.layers, self.capacity, gradient=first.suited[0].differentiates)
-        return first.needed_by(self.splatter, settles=len(first.parts) == 1)
+        return first.needed_by(self.splatter, settles=True)
 
     def of_part(
         self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None, pruning: _Pruning
@@ -241,7 +241,7 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
         row=laid_out([view.row for view in views], -1, shifts),
         depth=laid_out([view.depth for view in views], 0),
         overflow=sum(view.overflow for view in views),
-        settled=laid_out([view.settled for view in views], -1, shifts if counts.shape[1] > 1 else None),
+        settled=laid_out([view.settled for view in views], -1),
         facing=laid_out([view.facing for view in views], 0),
         exit=laid_out([view.exit for view in views], -1, shifts),
     )

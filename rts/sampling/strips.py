@@ -244,7 +244,6 @@ class InStrips(Needed):
         kept: np.ndarray,
         size: float,
         wanted: np.ndarray | None = None,
-        part: np.ndarray | None = None,
     ) -> np.ndarray:
         """See `Needed`; (L, LINE), of the samples that were asked about last. Active pixels alone are wanted."""
         laid, deep, left = self._shown
