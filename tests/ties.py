@@ -19,7 +19,7 @@ class Ties(NamedTuple):
     cull: str
 
 
-KINDS = ("plates", "crossing", "centers", "needles", "depths", "stacks")
+KINDS = ("plates", "crossing", "centers", "needles", "depths", "stacks", "grids")
 
 
 def ties_of(number):
@@ -31,7 +31,7 @@ def ties_of(number):
     meshes, snapped = _MAKERS[kind](rng, size)
     if snapped:  # Corners on centres of pixels, and on their corners.
         meshes = [(np.round((v * max(size) / 2 + [size[1] / 2, size[0] / 2, 0]) * 2) / 2, f) for v, f in meshes]
-    camera = _straight(size) if snapped or kind == "centers" else _camera(rng, size, kind)
+    camera = _straight(size) if snapped or kind in ("centers", "grids") else _camera(rng, size, kind)
     return Ties([(v.astype(np.float32), f) for v, f in meshes], camera, size, layers, cull)
 
 
@@ -89,6 +89,20 @@ def _centers(rng, size):
     return _parts(rng, triangles), False
 
 
+def _grids(rng, size):
+    """Sheets of triangles with a vertex on every pixel's centre, or on every other, at depths that often tie."""
+    sheets = []
+    for _ in range(rng.integers(1, 4)):
+        (height, width), step = rng.integers(2, 8, 2), rng.choice([1.0, 1.0, 2.0, 0.5])
+        y, x = np.indices((height, width)).reshape(2, -1)
+        start = rng.integers(0, 2 * np.array(size[::-1])) / 2 - rng.choice([0, 2])
+        z = rng.choice([0.5, 1, 4]) * rng.integers(-2, 3, height * width) + rng.choice([0, 0, 0.3]) * x
+        first = (y * width + x).reshape(height, width)[:-1, :-1].reshape(-1, 1)
+        faces = np.concatenate([first + [0, 1, width + 1], first + [0, width + 1, width]]).astype(np.int32)
+        sheets.append((np.stack([start[0] + step * x, start[1] + step * y, z], 1), faces))
+    return _parts(rng, sheets), False
+
+
 def _needles(rng, size):
     """Long triangles that are thinner than a pixel, before and through a sheet."""
     sheets = [_sheet(rng, _unit(rng), 0.2 * rng.normal(size=3), 1.0)]
@@ -123,7 +137,7 @@ def _stacks(rng, size):
     return _parts(rng, sheets), rng.random() < 0.2
 
 
-_MAKERS = dict(zip(KINDS, (_plates, _crossing, _centers, _needles, _depths, _stacks), strict=True))
+_MAKERS = dict(zip(KINDS, (_plates, _crossing, _centers, _needles, _depths, _stacks, _grids), strict=True))
 
 
 def _parts(rng, sheets):
