@@ -8,7 +8,7 @@ import warnings
 
 import numpy as np
 import pytest
-from helpers import to_numpy
+from helpers import derivative, gradient
 from ties import KINDS, ties_of
 
 import rts
@@ -28,60 +28,58 @@ LIMIT = 1e-6
 """Of the largest gradient, in float64: what is left out adds zeros in another order."""
 
 
-def parts_of(scene, number, vertices, shader):
-    colors = np.random.default_rng(number).random
-    return [
-        rts.Part(MESH(f), {"vertices": v, "colors": colors((len(v), 3))}, shader, cull=scene.cull)
-        for v, (_, f) in zip(vertices, scene.meshes, strict=True)
-    ]
-
-
-def rendered(scene, number, needed, splatter, shader="unlit", **options):
-    """The image of what a splatter needs, and a gradient of all vertices."""
+def rendered(number, needed, splatter, shader="unlit", **options):
+    """The image of what a splatter needs; a gradient of all vertices, and a derivative in forward mode."""
+    scene, colors = ties_of(number), np.random.default_rng(number)
+    meshes = [(MESH(f), {"colors": colors.random((len(v), 3))}) for v, f in scene.meshes]
     vertices = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v, _ in scene.meshes]
-    along = torch.tensor(np.random.default_rng(number).normal(size=(*scene.size, 4)))
-    parts = parts_of(scene, number, vertices, shader)
+    along = [torch.tensor(colors.normal(size=v.shape)) for v in vertices]
+    weights = torch.tensor(colors.normal(size=(*scene.size, 4)))
+
+    def parts(vertices):
+        pairs = zip(meshes, vertices, strict=True)
+        return [rts.Part(mesh, {**theta, "vertices": v}, shader, cull=scene.cull) for (mesh, theta), v in pairs]
+
+    def image(vertices):
+        return rts.render_samples(sampled, parts(vertices), scene.camera, splatter=splatter)
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rts.EmptyImageWarning)
-        options |= {"sampler": "raster", "layers": scene.layers}
-        sampled = sample(parts, scene.camera, scene.size, splatter=needed, **options)
-        image = rts.render_samples(sampled, parts, scene.camera, splatter=splatter)
-    gradients = torch.autograd.grad((image * along).sum() + sum(0 * v.sum() for v in vertices), vertices)
-    return to_numpy(image), np.concatenate([to_numpy(g).ravel() for g in gradients])
+        options |= {"sampler": "raster", "splatter": needed, "layers": scene.layers}
+        sampled = sample(parts(vertices), scene.camera, scene.size, **options)
+        slopes = gradient("torch", lambda v: (image(v) * weights).sum(), vertices)
+        value, push = derivative("torch", image, vertices, along)
+    return value, np.concatenate([g.ravel() for g in slopes]), push
 
 
 def differences(found, expected):
-    """Words for how an image and a gradient differ from what they should be."""
-    (image, gradient), (whole, slopes) = found, expected
-    if not all(np.isfinite(x).all() for x in (*found, *expected)):
-        return "not finite"
-    off, largest = np.abs(gradient - slopes).max(), np.abs(slopes).max()
-    if np.abs(image - whole).max() > LIMIT or off > LIMIT * max(largest, LIMIT):
-        return f"image off by {np.abs(image - whole).max():.2g}, gradient by {off:.2g} of {largest:.2g}"
-    return ""
+    """Words for how an image and its derivatives differ from what they should be."""
+    said = [] if all(np.isfinite(x).all() for x in (*found, *expected)) else ["not finite"]
+    for name, own, other, least in zip(("image", "gradient", "push"), found, expected, (1, LIMIT, LIMIT), strict=True):
+        off, largest = np.abs(own - other).max(), np.abs(other).max()
+        if off > LIMIT * max(largest, least):
+            said.append(f"{name} off by {off:.2g} of {largest:.2g}")
+    return said
 
 
-def settings(scene, number, name):
+def settings(number, name):
     """Pairs of renders that should be equal, by what they differ in."""
-    every, pruned = (rendered(scene, number, needed, name) for needed in (EVERY[name], name))
+    every, pruned = (rendered(number, needed, name) for needed in (EVERY[name], name))
     yield "pruned", pruned, every
-    yield "compiled", every, rendered(scene, number, EVERY[name], SPECIFICATIONS[name])
+    yield "compiled", every, rendered(number, EVERY[name], SPECIFICATIONS[name])
     for options in ({}, {"supersample": rts.Adaptive(2)}):
-        settled, whole = (
-            rendered(scene, number, name, name, "silhouette", settles=on, **options) for on in (True, False)
-        )
+        settled, whole = (rendered(number, name, name, "silhouette", settles=on, **options) for on in (True, False))
         yield f"settled {options or ''}", settled, whole
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("name", SPECIFICATIONS)
-def test_images_and_gradients_are_those_of_the_specification_pruned_settled_or_not(name, kind):
+def test_images_and_derivatives_are_those_of_the_specification_pruned_settled_or_not(name, kind):
     wrong, steepest = {}, 0.0
     for number in range(FIRST, LAST):
         if KINDS[number % len(KINDS)] != kind:
             continue
-        scene = ties_of(number)
-        for setting, found, expected in settings(scene, number, name):
+        for setting, found, expected in settings(number, name):
             steepest = max(steepest, np.abs(expected[1]).max())
             if said := differences(found, expected):
                 wrong[number, setting] = said
