@@ -32,6 +32,7 @@ def two_sheets(seed):
     height, width = 9, 11
     y, x = np.indices((height, width))
     sheets = np.stack([3 + 0.2 * x + 0 * y, 3.9 + 0.1 * y, 5 - 0.15 * x])
+    sheets = sheets + 0.05 * rng.random(sheets.shape)  # No two depths tie.
     sheets = np.where(rng.random(sheets.shape) < 0.4, np.inf, sheets)
     depth = np.sort(sheets, axis=0)[:2]
     covered = np.isfinite(depth)
@@ -52,6 +53,15 @@ def test_active_are_cells_at_either_side_of_where_fronts_end(seed):
     found = outlines(row, depth, [positions.shape[0]])
     np.testing.assert_array_equal(found, expected)
     assert 0.2 < found.mean() < 1
+
+
+def test_where_layers_tie_cells_are_active():
+    row = np.arange(60, dtype=np.int32).reshape(2, 5, 6)
+    left = np.arange(6) < 3
+    for gap, active in ((0.0, True), (1e-9, True), (0.01, False)):
+        depth = np.stack([np.where(left, 1.0, 1.5), np.where(left, 2.0 + gap, 2.5)])
+        found = outlines(row, np.repeat(depth[:, None], 5, axis=1), [60])
+        assert found[:, 2:4].all() == found.any() == active
 
 
 def test_where_another_part_is_seen_both_sides_are_active():

@@ -99,7 +99,7 @@ def finest(supersample: Any) -> Any:
 
 
 def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: np.ndarray | None = None) -> np.ndarray:
-    """Cells (H, W) bool whose fronts end towards a neighbour, or a neighbour's towards them.
+    """Cells (H, W) bool whose fronts end towards a neighbour, or a neighbour's towards them, or may by rounding.
 
     Args:
         row: (K, H, W) int32 of one sample a pixel.
@@ -109,20 +109,22 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
             None for none.
     """
     from rts.sampling import adaptive_kernels
+    from rts.splatting.kernel import TIE
     from rts.splatting.visible import CONTINUED
 
     settled = np.empty((0, row.shape[2]), np.int8) if settled is None else settled
     depth, kind = read_only(depth), depth.dtype.type
-    extent = max(depth.max(initial=0), 0) - min(depth.min(initial=0), 0)
+    least, largest = depth.min(initial=0), depth.max(initial=0)
+    beyond = 2 * (largest - least) or 1
     marks = np.empty(row.shape[1:], np.uint8)
     given = (
         read_only(row, np.int32),
         read_only(settled, np.int8),
         depth,
         np.cumsum(sizes)[:-1],
-        kind(2 * extent if extent > 0 else 1),
+        *map(kind, (beyond, TIE * max(largest, -least), CONTINUED)),
     )
-    parallel(adaptive_kernels.mark, len(marks), *given, kind(CONTINUED), marks, work=4 * row.size)
+    parallel(adaptive_kernels.mark, len(marks), *given, marks, work=4 * row.size)
     return marks.view(bool)
 
 

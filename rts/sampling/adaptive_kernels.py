@@ -8,7 +8,7 @@ from rts.compiling import compiled, kernel
 
 
 @kernel
-def mark(start, stop, row, settled, depth, firsts, beyond, continued, marks):
+def mark(start, stop, row, settled, depth, firsts, beyond, margin, continued, marks):
     """Mark the cells of rows [start, stop) whose front ends towards a neighbour, or a neighbour's towards them.
 
     Args:
@@ -19,6 +19,7 @@ def mark(start, stop, row, settled, depth, firsts, beyond, continued, marks):
         depth: (K, H, W).
         firsts: (P − 1,) the first row of each part but the first.
         beyond: depth of layers that are not covered; no two layers are farther apart than each is from it.
+        margin: by how much rounding may change differences of depth.
         continued: share of the error of plain pairing below which a front continues another.
         marks: (H, W) uint8, to be filled.
     """
@@ -46,7 +47,7 @@ def mark(start, stop, row, settled, depth, firsts, beyond, continued, marks):
             some = _unite(near, hidden[above], hidden[level], hidden[below])
             for x in range(width if some else 0):
                 if near[x] and not marks[y - 1, x] and row[0, y - 1, x] >= 0:
-                    marks[y - 1, x] = _ends(row, depth, y - 1, x, beyond, continued)
+                    marks[y - 1, x] = _ends(row, depth, y - 1, x, beyond, margin, continued)
 
 
 @compiled
@@ -72,32 +73,32 @@ def _unite(near, above, level, below):
 
 
 @compiled
-def _ends(row, depth, y, x, beyond, continued):
+def _ends(row, depth, y, x, beyond, margin, continued):
     """Whether the front of a cell, whose neighbours are covered, too, ends towards one of them."""
     _, height, width = row.shape
     for n in range(9):
         v, u = n // 3 - 1, n % 3 - 1
         py, px = y - v, x - u
-        if n != 4 and 0 <= py < height and 0 <= px < width and _parted(row, depth, y, x, v, u, beyond, continued):
+        inside = n != 4 and 0 <= py < height and 0 <= px < width
+        if inside and _parted(row, depth, y, x, v, u, beyond, margin, continued):
             return True
     return False
 
 
 @compiled
-def _parted(row, depth, y, x, v, u, beyond, continued):
-    """Whether the front of a covered target (y, x) and that of the source from which (u, v) leads to it do not pair."""
+def _parted(row, depth, y, x, v, u, beyond, margin, continued):
+    """Whether the front of a covered target (y, x) may not pair with the source's, from which (u, v) leads to it."""
     layers, height, width = row.shape
     py, px = y - v, x - u
     source, target = depth[0, py, px], depth[0, y, x]
-    plain = abs(source - target)
-    best = plain
+    plain, hidden = abs(source - target), depth.dtype.type(np.inf)
     for k in range(1, layers):
         p = depth[k, py, px] if row[k, py, px] >= 0 else beyond
         q = depth[k, y, x] if row[k, y, x] >= 0 else beyond
-        best = min(best, abs(p - target), abs(q - source))
-    if not best < plain:
+        hidden = min(hidden, abs(p - target), abs(q - source))
+    if hidden >= plain + margin:
         return False
-    limit = continued * best
+    limit = continued * min(plain, hidden) - margin
     for steps in (-1, 2):
         end, start = (source, target) if steps < 0 else (target, source)
         by, bx = y - steps * v, x - steps * u
