@@ -319,7 +319,9 @@ def test_which_parts_are_of_one_colour():
             assert check_scene(part, CAMERA)[0][0].uniform is expected, name
 
 
-@pytest.mark.parametrize(("color", "supersample"), itertools.product([None, (0.3, 0.6, 0.2)], [1, 2, rts.Adaptive(3)]))
+@pytest.mark.parametrize(
+    ("color", "supersample"), [*itertools.product([None, (0.3, 0.6, 0.2)], [1, 2, rts.Adaptive(3)])]
+)
 def test_normal_equations_are_those_of_all_samples(color, supersample, monkeypatch):
     import torch
 
