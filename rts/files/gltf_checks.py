@@ -20,16 +20,8 @@ from rts.files.gltf_accessors import QUANTIZATION, TYPES, check_accessor, check_
 from rts.files.gltf_scenes import check_scenes
 from rts.files.images import is_image
 
-EXTENSIONS = (
-    "KHR_materials_",
-    "KHR_lights_",
-    "EXT_lights_",
-    "KHR_texture_",
-    "EXT_texture_",
-    "KHR_xmp",
-    "KHR_animation",
-)
-"""How extensions begin that say nothing of shapes."""
+APPEARANCE = re.compile(r"[A-Z]+_(materials|lights|texture|xmp|animation)")
+"""How names of extensions begin that say nothing of shapes."""
 PROPERTIES = {
     "accessors": "bufferView byteOffset componentType normalized count type max min sparse",
     "bufferViews": "buffer byteOffset byteLength byteStride target",
@@ -102,7 +94,7 @@ def _checked(path: Path, text: bytes, binary: bytes | None, file: Callable[[str]
         buffers, views, changes = [], [], {}
         for i, buffer in enumerate(tree.get("buffers", [])):
             place = f"buffer {i}"
-            buffers.append(_buffer(buffer, binary if i == 0 else None, file, fail))
+            buffers.append(_buffer(i, buffer, binary if i == 0 else None, file, fail))
         for i, view in enumerate(tree.get("bufferViews", [])):
             place = f"bufferView {i}"
             views.append(_view(i, view, buffers, fail))
@@ -172,12 +164,12 @@ def _changed(tree: dict[str, Any], views: list[bytes], changes: dict[int, str]) 
     )
 
 
-def _buffer(buffer: dict[str, Any], binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes:
+def _buffer(index: int, buffer: dict[str, Any], binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes:
     uri = buffer.get("uri")
     content = (binary or b"") if uri is None else _content(uri, file, fail)
     promised = count_of(buffer["byteLength"])
     if promised > len(content):
-        raise fail(f"a buffer promises {promised} bytes, and has {len(content)}")
+        raise fail(f"buffer {index} promises {promised} bytes, and has {len(content)}")
     return content
 
 
@@ -229,9 +221,9 @@ def _check_extensions(tree: dict[str, Any], fail: Any) -> None:
     asset = tree.get("asset", {})
     if not str(asset.get("version", "2")).startswith("2") or str(asset.get("minVersion", "2.0")) != "2.0":
         raise fail(f"it is of version {asset.get('minVersion', asset.get('version'))!r} of glTF; expected 2.0")
-    known = (*EXTENSIONS, QUANTIZATION, *(["KHR_draco_"] if importlib.util.find_spec("DracoPy") else []))
     required = tree.get("extensionsRequired", [])
-    unknown = [name for name in required if not str(name).startswith(known)]
+    read = {QUANTIZATION, *(["KHR_draco_mesh_compression"] if importlib.util.find_spec("DracoPy") else [])}
+    unknown = [name for name in required if name not in read and not APPEARANCE.match(str(name))]
     if unknown or not isinstance(required, list):
         raise fail(f"it requires the extension {(unknown or [required])[0]!r}, which is not read")
 

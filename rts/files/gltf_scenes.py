@@ -17,9 +17,18 @@ _WIDTHS = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
 def check_scenes(path: Path, tree: dict[str, Any], fail: Any) -> None:
     """Refuse nodes that are not of a forest, or have no sound place, and scenes that are not of its roots."""
     nodes, meshes = tree.get("nodes", []), tree.get("meshes", [])
-    inner = _check_forest(nodes, fail)
+    parents = _check_forest(nodes, fail)
+    shown = {index for index, node in enumerate(nodes) if "mesh" in node}
+    ahead = list(shown)
+    while ahead:
+        above = {parents[index] for index in ahead if index in parents} - shown
+        shown |= above
+        ahead = list(above)
     for index, node in enumerate(nodes):
-        _check_place(f"node {index}", node, fail)
+        matrix = _matrix(f"node {index}", node, fail)
+        fault = fault_of(matrix) if index in shown else ""
+        if fault:
+            raise fail(f"the transform of node {index} {fault}")
         if "mesh" in node and count_of(node["mesh"]) >= len(meshes):
             raise fail(f"node {index} is of mesh {node['mesh']}, and there are {len(meshes)}")
         if "skin" in node:
@@ -33,30 +42,36 @@ def check_scenes(path: Path, tree: dict[str, Any], fail: Any) -> None:
         raise fail(f"its scene is number {tree['scene']}, and there are {len(scenes)}")
     for index, scene in enumerate(scenes):
         roots = [count_of(root) for root in scene.get("nodes", [])]
-        wrong = [root for root in roots if root >= len(nodes) or root in inner or roots.count(root) > 1]
+        wrong = [root for root in roots if root >= len(nodes) or root in parents or roots.count(root) > 1]
         if wrong:
             raise fail(
                 f"scene {index} has node {wrong[0]}, which is there twice, is the child of another, or is missing"
             )
 
 
-def _check_forest(nodes: list[dict[str, Any]], fail: Any) -> set[int]:
-    """The nodes that are children. Whoever walked among nodes that are no forest would never end."""
-    children = [count_of(child) for node in nodes for child in node.get("children", [])]
-    if len(set(children)) < len(children) or any(child >= len(nodes) for child in children):
-        raise fail("a node is the child of two, or there is no such node")
-    inner, reached = set(children), 0
-    ahead = [i for i in range(len(nodes)) if i not in inner]
+def _check_forest(nodes: list[dict[str, Any]], fail: Any) -> dict[int, int]:
+    """The parents of nodes. Whoever walked among nodes that are no forest would never end."""
+    parents: dict[int, int] = {}
+    for index, node in enumerate(nodes):
+        for child in map(count_of, node.get("children", [])):
+            if child in parents or child >= len(nodes):
+                what = (
+                    f"is one of node {parents[child]}, too" if child in parents else f"is not one of {len(nodes)} nodes"
+                )
+                raise fail(f"node {child}, a child of node {index}, {what}")
+            parents[child] = index
+    reached: set[int] = set()
+    ahead = [i for i in range(len(nodes)) if i not in parents]
     while ahead:
-        reached += 1
+        reached.add(ahead[-1])
         ahead += nodes[ahead.pop()].get("children", [])
-    if reached < len(nodes):
-        raise fail("a node is among its own children")
-    return inner
+    if len(reached) < len(nodes):
+        raise fail(f"node {min(set(parents) - reached)} is among its own children, or below one that is")
+    return parents
 
 
-def _check_place(name: str, node: dict[str, Any], fail: Any) -> None:
-    """Refuse a node whose transform is none that can be undone."""
+def _matrix(name: str, node: dict[str, Any], fail: Any) -> np.ndarray:
+    """The transform (4, 4) of a node, but for its rotation, which changes no volume. Its numbers are checked."""
     given = {key: node[key] for key in _WIDTHS if key in node}
     for key, values in given.items():
         numbers = isinstance(values, list) and all(isinstance(x, (int, float)) and x is not True for x in values)
@@ -71,9 +86,7 @@ def _check_place(name: str, node: dict[str, Any], fail: Any) -> None:
         matrix = np.array(given["matrix"], np.float64).reshape(4, 4).T
     matrix[:3, 3] += given.get("translation", 0)
     matrix[:3, :3] *= given.get("scale", 1)
-    fault = fault_of(matrix)
-    if fault:
-        raise fail(f"the transform of {name} {fault}")
     length = np.linalg.norm(np.array(given.get("rotation", [0, 0, 0, 1]), np.float64))
     if not abs(length - 1) <= 0.01:
         raise fail(f"rotation of {name} is {given['rotation']}; expected a quaternion of length 1")
+    return matrix

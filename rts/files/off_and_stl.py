@@ -13,9 +13,9 @@ from rts.files.damage import COUNT, lines_of, unreadable, warn, without_comment
 from rts.files.ply_tables import Fail, Mesh, numbers_of, written
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|\.\d+(?:e[-+]?\d+)?|nan|inf(?:inity)?)"
-_VERTEX = rf"vertex\s+{_NUMBER}\s+{_NUMBER}\s+{_NUMBER}[ \t]*\n\s*"
+_VERTEX = rf"vertex(?:[ \t]+{_NUMBER}){{3}}[ \t]*\n\s*"
 _FACET = re.compile(
-    rf"facet(?:\s+normal\s+\S+\s+\S+\s+\S+)?\s+outer\s+loop\s+{_VERTEX * 3}endloop\s+endfacet\b\s*",
+    rf"facet(?:\s+normal(?:[ \t]+\S+){{3}})?\s+outer\s+loop\s+{_VERTEX * 3}endloop\s+endfacet\b\s*",
     re.IGNORECASE | re.ASCII,
 )
 _SOLID = re.compile(r"\s*solid\b([^\n]*)\n\s*", re.IGNORECASE | re.ASCII)
@@ -58,12 +58,14 @@ def plain_off(path: Path, data: bytes) -> bytes:
     ]
     first = numbered.pop(0)[1].split() if numbered else [""]
     # The case of an n among capitals counts: nOFF is of n axes, NOFF has normals.
-    kind = re.fullmatch(r"(ST)?(C)?(N)?OFF", first[0].upper() if first[0].islower() else first[0])
+    # Files of ModelNet have no space after the word.
+    kind = re.fullmatch(r"(ST)?(C)?(N)?OFF([0-9]*)", first[0].upper() if first[0].islower() else first[0])
     if kind is None or first[1:2] == ["BINARY"]:
         raise fail(
             f"it begins with {' '.join(first)[:40]!r}; expected OFF, perhaps with ST, C or N before it, and text"
         )
-    counts = first[1:] or (numbered.pop(0)[1].split() if numbered else [])
+    counts = [kind[4], *first[1:]] if kind[4] else first[1:]
+    counts = counts or (numbered.pop(0)[1].split() if numbered else [])
     if len(counts) not in (2, 3) or not all(COUNT.fullmatch(c) for c in counts):
         raise fail(f"{' '.join(counts)[:40]!r} are no counts; expected those of vertices, faces and edges")
     vertex_count, face_count = int(counts[0]), int(counts[1])
