@@ -19,6 +19,8 @@ from rts.files.pieces import Piece
 
 LENGTHS = {"v": {3, 4, 6, 7}, "vt": {1, 2, 3}, "vn": {3}}
 """How many numbers rows may have: a position may have a weight, or a colour, and that an alpha."""
+FACES = ("f", "fo")
+"""Statements of faces; "fo" is what "f" was called once."""
 LEFT_OUT = frozenset(
     "vp deg bmat step cstype p l curv curv2 surf parm trim hole scrv sp end con g s mg o bevel c_interp d_interp lod "
     "shadow_obj trace_obj ctech stech call csh maplib usemap bzp bsp cdc cdp res".split()
@@ -48,14 +50,14 @@ class _Lines:
         plain = is_plain("".join(lines))
         for number, line in _statements(lines):
             key, _, rest = without_comment(line).replace("\t", " ").strip(" \f\v").partition(" ")
-            is_row, is_face = key in self.rows, key in ("f", "fo")  # "fo" is what "f" was called once.
-            odd = not (plain or is_plain(rest))
-            if ((is_row or is_face) and (odd or "_" in rest)) or (key == "t" and odd):  # Python takes 1_0 for 10.
+            row = key in self.rows or key in FACES
+            # Python takes 1_0 for 10.
+            if (row and "_" in rest) or (not plain and (row or key == "t") and not is_plain(rest)):
                 raise self.fail(number, f"{rest.strip()[:60]!r} are not numbers")
-            if is_row:
+            if key in self.rows:
                 self.rows[key].append(rest)
                 self.numbers[key].append(number)
-            elif is_face:
+            elif row:
                 self.faces.append((number, self._absolute(rest, number) if "-" in rest else rest, material))
             elif key == "t":
                 self.tags.append((number, rest))
