@@ -74,7 +74,7 @@ ASIDES = [
     "l 1 2",
     "usemtl a",
     "usemtl b",
-    "curv 0 1 1 2",
+    "curv 0 1 2",
 ]
 
 

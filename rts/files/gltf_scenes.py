@@ -31,10 +31,12 @@ def check_scenes(path: Path, tree: dict[str, Any], fail: Any) -> None:
             raise fail(f"the transform of node {index} {fault}")
         if "mesh" in node and count_of(node["mesh"]) >= len(meshes):
             raise fail(f"node {index} is of mesh {node['mesh']}, and there are {len(meshes)}")
-        if "skin" in node:
-            warn(f"{path}: node {index} is bent by a skin, which is not read; it is loaded as it is without")
-        if "EXT_mesh_gpu_instancing" in node.get("extensions", {}):
-            warn(f"{path}: node {index} stands for several instances, which are not read; it is loaded once")
+    bent = [index for index, node in enumerate(nodes) if "skin" in node]
+    if bent:
+        warn(f"{path}: node {bent[0]} is bent by a skin, which is not read; it is loaded as it is without")
+    repeated = [index for index, node in enumerate(nodes) if "EXT_mesh_gpu_instancing" in node.get("extensions", {})]
+    if repeated:
+        warn(f"{path}: node {repeated[0]} stands for several instances, which are not read; it is loaded once")
     if any(np.any(mesh.get("weights", [])) for mesh in (*meshes, *nodes)):
         warn(f"{path} has morph targets, which are not read; meshes are loaded as they are without")
     scenes = tree.get("scenes", [])
