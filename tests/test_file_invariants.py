@@ -62,7 +62,20 @@ KINDS = {"v": 3, "vt": 2, "vn": 3}
 STYLES = [("v",), ("v", "vt"), ("v", "vn"), ("v", "vt", "vn")]
 EIGHTHS = st.integers(-40, 40).map(lambda n: f"{n / 8:g}")
 NUMBERS = EIGHTHS | reals(-1e6, 1e6).map(repr) | st.sampled_from(["-0", "+.5", "1e-3", "1.0001"])
-ASIDES = ["", "# f 1 2 3", "#", "o name", "g a b", "s 1", "\t ", "vp 0.5", "l 1 2", "usemtl a", "usemtl b", "V 1 1 1"]
+ASIDES = [
+    "",
+    "# f 1 2 3",
+    "#",
+    "o name",
+    "g a b",
+    "s 1",
+    "\t ",
+    "vp 0.5",
+    "l 1 2",
+    "usemtl a",
+    "usemtl b",
+    "curv 0 1 2",
+]
 
 
 @st.composite

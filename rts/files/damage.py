@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
 import threading
 import warnings
 from collections.abc import Iterator
@@ -12,6 +13,10 @@ from pathlib import Path
 from rts import errors
 from rts.errors import FileWarning, InputError
 
+COUNT = re.compile(r"\+?[0-9]+")
+"""A count in a header. Python's own rules take digits of any script."""
+_PLAIN = b"\t" + bytes(range(32, 127))
+_COMMENT = re.compile(r"(?<!\.)#.*")
 _ONE_AT_A_TIME = threading.RLock()  # Filters of warnings belong to the whole process.
 
 
@@ -29,6 +34,22 @@ def contents(path: Path) -> bytes:
     except (OSError, MemoryError) as error:
         reason = getattr(error, "strerror", None) or "it does not fit into memory"
         raise InputError(f"{path} cannot be read ({reason}); check the file and who may read it") from error
+
+
+def lines_of(data: bytes) -> list[str]:
+    """The lines of a text. They end in LF, CR LF or CR; Unicode's other ends of lines are no ends here."""
+    text = data.decode("utf-8-sig", "replace")
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def without_comment(line: str) -> str:
+    """The line up to its "#". In 1.#QNAN, as C once wrote NaN, there is no comment."""
+    return _COMMENT.sub("", line) if "#" in line else line
+
+
+def is_plain(text: str) -> bool:
+    """True for ASCII, spaces and tabs. Python reads numbers in digits of any script, between spaces of any kind."""
+    return text.isascii() and not text.encode().translate(None, _PLAIN)
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ import base64
 import binascii
 import importlib.util
 import json
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -15,16 +16,23 @@ import numpy as np
 
 from rts.errors import InputError
 from rts.files.damage import unreadable, warn
+from rts.files.gltf_accessors import QUANTIZATION, TYPES, check_accessor, check_attributes, count_of, rows_of
+from rts.files.gltf_scenes import check_scenes
 from rts.files.images import is_image
 
-TYPES = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-ATTRIBUTES = {
-    **{"POSITION": ("VEC3",), "NORMAL": ("VEC3",), "TEXCOORD_0": ("VEC2",), "COLOR_0": ("VEC3", "VEC4")},
-    "indices": ("SCALAR",),
+APPEARANCE = re.compile(r"[A-Z]+_(materials|lights|texture|xmp|animation)")
+"""How names of extensions begin that say nothing of shapes."""
+PROPERTIES = {
+    "accessors": "bufferView byteOffset componentType normalized count type max min sparse",
+    "bufferViews": "buffer byteOffset byteLength byteStride target",
+    "meshes": "primitives weights",
+    "primitives": "attributes indices material mode targets",
+    "nodes": "camera children skin matrix mesh rotation scale translation weights",
+    "scenes": "nodes",
 }
-MOST = 2**24
-"""Rows of an accessor without data, all zero, which a damaged file could otherwise have any number of."""
+"""What objects of the format may have, beside a name, extensions and extras."""
+ATTRIBUTE = re.compile(r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_[0-9]+|_.*")
+MODES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
 
 
 def sound_glb(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
@@ -44,7 +52,9 @@ def sound_glb(path: Path, data: bytes, file: Callable[[str], bytes]) -> bytes:
 
     if len(data) < 20 or data[:4] != b"glTF":
         raise fail("it does not begin with 'glTF' and a header of 20 bytes")
-    length = struct.unpack_from("<I", data, 8)[0]
+    version, length = struct.unpack_from("<II", data, 4)
+    if version != 2:
+        raise fail(f"its header says version {version}; expected 2")
     if length > len(data):
         raise fail(f"its header promises {length} bytes, and it has {len(data)}")
     if length < len(data):
@@ -75,26 +85,49 @@ def sound_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> tuple[s
 
 def _checked(path: Path, text: bytes, binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes | None:
     """Refuse what is not sound. A GLB of the same, if there are numbers that trimesh would misread."""
+    place = "its tree"
     try:
-        tree = json.loads(text)
+        tree = json.loads(text, parse_constant=_no_number, object_pairs_hook=_unique)
         if not isinstance(tree, dict):
             raise ValueError("the whole is no object")
-        buffers = [_buffer(b, binary if i == 0 else None, file, fail) for i, b in enumerate(tree.get("buffers", []))]
-        views = [_view(i, v, buffers, fail) for i, v in enumerate(tree.get("bufferViews", []))]
-        for index, accessor in enumerate(tree.get("accessors", [])):
-            _check_accessor(index, accessor, tree.get("bufferViews", []), views, fail)
-        changes: dict[int, str] = {}
-        for m, mesh in enumerate(tree.get("meshes", [])):
+        _check_extensions(tree, fail)
+        buffers, views, changes = [], [], {}
+        for i, buffer in enumerate(tree.get("buffers", [])):
+            place = f"buffer {i}"
+            buffers.append(_buffer(i, buffer, binary if i == 0 else None, file, fail))
+        for i, view in enumerate(tree.get("bufferViews", [])):
+            place = f"bufferView {i}"
+            views.append(_view(i, view, buffers, fail))
+        for i, accessor in enumerate(tree.get("accessors", [])):
+            place = f"accessor {i}"
+            check_accessor(i, accessor, tree.get("bufferViews", []), views, fail)
+        for i, mesh in enumerate(tree.get("meshes", [])):
+            place = f"mesh {i}"
             for primitive in mesh["primitives"]:
-                changes |= _check_primitive(path, f"mesh {m}", primitive, tree, views, fail)
-        for m, material in enumerate(tree.get("materials", [])):
-            _check_material(path, f"material {m}", material, tree, views, file, fail)
-        _check_nodes(tree.get("nodes", []), fail)
+                changes |= _check_primitive(path, place, primitive, tree, views, fail)
+        for i, material in enumerate(tree.get("materials", [])):
+            place = f"material {i}"
+            _check_material(path, place, material, tree, views, file, fail)
+        place = "its scene"
+        check_scenes(path, tree, fail)
+        _check_names(path, tree)
         return _changed(tree, views, changes) if changes else None
     except InputError:
         raise
     except Exception as error:  # Anything may be missing, or of another kind.
-        raise fail(f"{type(error).__name__}: {error}") from error
+        said = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        raise fail(f"{place}: {f'{error} is missing' if isinstance(error, KeyError) else said}") from error
+
+
+def _no_number(name: str) -> float:
+    raise ValueError(f"{name} is no number in JSON")
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        raise ValueError(f"one of {', '.join(found)[:60]} is there twice")
+    return found
 
 
 def _changed(tree: dict[str, Any], views: list[bytes], changes: dict[int, str]) -> bytes:
@@ -103,7 +136,7 @@ def _changed(tree: dict[str, Any], views: list[bytes], changes: dict[int, str]) 
     descriptions = [dict(view, buffer=0) for view in tree["bufferViews"]]
     for index, kind in sorted(changes.items()):
         accessor = tree["accessors"][index]
-        values = _rows(accessor, tree["bufferViews"], views)
+        values = rows_of(accessor, tree["bufferViews"], views)
         if values.dtype.kind != "f":
             values = np.maximum(values / np.float32(np.iinfo(values.dtype).max), -1)
         if kind == "u1":
@@ -131,18 +164,12 @@ def _changed(tree: dict[str, Any], views: list[bytes], changes: dict[int, str]) 
     )
 
 
-def _count(value: Any) -> int:
-    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-        raise ValueError(f"{value!r} is no count")
-    return value
-
-
-def _buffer(buffer: dict[str, Any], binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes:
+def _buffer(index: int, buffer: dict[str, Any], binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes:
     uri = buffer.get("uri")
     content = (binary or b"") if uri is None else _content(uri, file, fail)
-    promised = _count(buffer["byteLength"])
+    promised = count_of(buffer["byteLength"])
     if promised > len(content):
-        raise fail(f"a buffer promises {promised} bytes, and has {len(content)}")
+        raise fail(f"buffer {index} promises {promised} bytes, and has {len(content)}")
     return content
 
 
@@ -156,75 +183,63 @@ def _content(uri: str, file: Callable[[str], bytes], fail: Any) -> bytes:
 
 
 def _view(index: int, view: dict[str, Any], buffers: list[bytes], fail: Any) -> bytes:
-    start, length = _count(view.get("byteOffset", 0)), _count(view["byteLength"])
-    content = buffers[_count(view["buffer"])]
+    start, length = count_of(view.get("byteOffset", 0)), count_of(view["byteLength"])
+    content = buffers[count_of(view["buffer"])]
     if start + length > len(content):
         raise fail(f"bufferView {index} ends at byte {start + length} of {len(content)}")
     return content[start : start + length]
-
-
-def _layout(accessor: dict[str, Any], descriptions: list[dict[str, Any]]) -> tuple[int, int, int]:
-    """Where the rows of an accessor begin in its view, from one to the next, and the bytes of one."""
-    row = np.dtype(TYPES[accessor["componentType"]]).itemsize * WIDTHS[accessor["type"]]
-    stride = descriptions[accessor["bufferView"]].get("byteStride", row)
-    return _count(accessor.get("byteOffset", 0)), _count(stride), row
-
-
-def _check_accessor(
-    index: int, accessor: dict[str, Any], descriptions: list[dict[str, Any]], views: list[bytes], fail: Any
-) -> None:
-    count = _count(accessor["count"])
-    if "bufferView" not in accessor:
-        if count > MOST:
-            raise fail(f"accessor {index} promises {count} rows, and has no data")
-        return
-    content = views[_count(accessor["bufferView"])]
-    start, stride, row = _layout(accessor, descriptions)
-    end = start + max(count - 1, 0) * stride + row
-    if count and end > len(content):
-        raise fail(f"accessor {index} promises {count} rows, which end at byte {end} of {len(content)}")
-
-
-def _rows(accessor: dict[str, Any], descriptions: list[dict[str, Any]], views: list[bytes]) -> np.ndarray:
-    """The rows (N, C) of an accessor that has data, in its own type."""
-    start, stride, row = _layout(accessor, descriptions)
-    content = np.frombuffer(views[accessor["bufferView"]], np.uint8)[start:]
-    rows = np.lib.stride_tricks.as_strided(content, (accessor["count"], row), (stride, 1))
-    return np.ascontiguousarray(rows).view("<" + TYPES[accessor["componentType"]])
 
 
 def _check_primitive(
     path: Path, name: str, primitive: dict[str, Any], tree: dict[str, Any], views: list[bytes], fail: Any
 ) -> dict[int, str]:
     """Refuse attributes that do not fit; which accessors trimesh would misread, and as what it would not."""
-    attributes = primitive["attributes"]
-    used = {**attributes, **({"indices": primitive["indices"]} if "indices" in primitive else {})}
-    found = {kind: tree["accessors"][_count(index)] for kind, index in used.items()}
-    sparse = [kind for kind, accessor in found.items() if "sparse" in accessor]
-    if sparse:
-        raise fail(f"{sparse[0]} of {name} is sparse, which is not read")
-    for kind, accessor in found.items():
-        if accessor["type"] not in ATTRIBUTES.get(kind, WIDTHS):
-            raise fail(f"{kind} of {name} is of {accessor['type']}; expected {' or '.join(ATTRIBUTES[kind])}")
-    count = found["POSITION"]["count"]
-    different = [kind for kind in attributes if found[kind]["count"] != count]
-    if different:
-        raise fail(f"{different[0]} of {name} has {found[different[0]]['count']} rows, and POSITION {count}")
-    if "bufferView" not in found["POSITION"] and not importlib.util.find_spec("DracoPy"):
-        extensions = ", ".join(primitive.get("extensions", {})) or "none is named"
-        raise fail(f"{name} has no data of its own, and the extension that has them is not read: {extensions}")
-    read = {kind: a for kind, a in found.items() if kind in ATTRIBUTES and "bufferView" in a and count > 0}
-    colors = read.get("COLOR_0")
+    mode = count_of(primitive.get("mode", 4))
+    if mode > 5:
+        raise fail(f"{name} has mode {mode}{', a fan' if mode == 6 else ''}; expected triangles (4) or a strip (5)")
+    if mode in MODES:
+        warn(f"{path}: {name} is of {MODES[mode]}, which are left out")
+    if "material" in primitive and count_of(primitive["material"]) >= len(tree.get("materials", [])):
+        raise fail(f"{name} has material {primitive['material']}, which is not there")
+    read = check_attributes(path, name, primitive, tree, views, fail)
+    found = {kind: tree["accessors"][index] for kind, index in read.items()}
+    colors = found.get("COLOR_0")
     if colors is not None and colors["componentType"] == 5126:
-        _check_colors(path, f"COLOR_0 of {name}", _rows(colors, tree["bufferViews"], views), fail)
+        _check_colors(path, f"COLOR_0 of {name}", rows_of(colors, tree["bufferViews"], views), fail)
     changes = {}
-    for kind, accessor in read.items():
+    for kind, accessor in found.items():
         if kind == "COLOR_0":
             if accessor["componentType"] != 5121:
-                changes[used[kind]] = "u1"
+                changes[read[kind]] = "u1"
         elif kind != "indices" and accessor.get("normalized") and accessor["componentType"] != 5126:
-            changes[used[kind]] = "f4"
+            changes[read[kind]] = "f4"
     return changes
+
+
+def _check_extensions(tree: dict[str, Any], fail: Any) -> None:
+    """Refuse other versions, and extensions that are needed and not read."""
+    asset = tree.get("asset", {})
+    if not str(asset.get("version", "2")).startswith("2") or str(asset.get("minVersion", "2.0")) != "2.0":
+        raise fail(f"it is of version {asset.get('minVersion', asset.get('version'))!r} of glTF; expected 2.0")
+    required = tree.get("extensionsRequired", [])
+    read = {QUANTIZATION, *(["KHR_draco_mesh_compression"] if importlib.util.find_spec("DracoPy") else [])}
+    unknown = [name for name in required if name not in read and not APPEARANCE.match(str(name))]
+    if unknown or not isinstance(required, list):
+        raise fail(f"it requires the extension {(unknown or [required])[0]!r}, which is not read")
+
+
+def _check_names(path: Path, tree: dict[str, Any]) -> None:
+    """Warn of properties that the format does not know, which may be others misspelt."""
+    lists = {kind: tree.get(kind, []) for kind in PROPERTIES}
+    lists["primitives"] = [p for mesh in lists["meshes"] for p in mesh["primitives"]]
+    found = []
+    for kind, objects in lists.items():
+        known = {*PROPERTIES[kind].split(), "name", "extensions", "extras"}
+        found += [f"{name!r} of {kind} {i}" for i, entry in enumerate(objects) for name in entry if name not in known]
+    for i, primitive in enumerate(lists["primitives"]):
+        found += [f"{name!r} of primitives {i}" for name in primitive["attributes"] if not ATTRIBUTE.fullmatch(name)]
+    if found:
+        warn(f"{path} has properties that glTF does not know, and that are left out: {', '.join(found[:5])}")
 
 
 def _check_material(
@@ -247,14 +262,14 @@ def _check_material(
     reference = look["baseColorTexture"]
     if "KHR_texture_transform" in reference.get("extensions", {}) or reference.get("texCoord", 0) != 0:
         warn(f"{path}: the texture of {name} has a transform or coordinates of its own, which are not read")
-    texture = tree["textures"][_count(reference["index"])]
+    texture = tree["textures"][count_of(reference["index"])]
     webp = texture.get("extensions", {}).get("EXT_texture_webp", {})
     source = webp.get("source", texture.get("source"))
     if source is None:
         warn(f"{path}: the texture of {name} is of a kind that is not read; it is loaded without")
         return
-    image = tree["images"][_count(source)]
-    content = views[_count(image["bufferView"])] if "bufferView" in image else _content(image["uri"], file, fail)
+    image = tree["images"][count_of(source)]
+    content = views[count_of(image["bufferView"])] if "bufferView" in image else _content(image["uri"], file, fail)
     if not is_image(content):
         raise fail(f"the texture of {name} cannot be read as an image")
 
@@ -267,17 +282,3 @@ def _check_colors(path: Path, name: str, colors: np.ndarray, fail: Any) -> None:
         raise fail(f"row {at} of {name} is {colors[at].tolist()}; expected colours from 0 to 1")
     if ((colors < 0) | (colors > 1)).any():
         warn(f"{path}: {name} has colours that are not from 0 to 1, which are clipped")
-
-
-def _check_nodes(nodes: list[dict[str, Any]], fail: Any) -> None:
-    """Refuse nodes that are not of a forest: whoever walks among them would never end, or go to one many times."""
-    children = [_count(child) for node in nodes for child in node.get("children", [])]
-    if len(set(children)) < len(children) or any(child >= len(nodes) for child in children):
-        raise fail("a node is the child of two, or there is no such node")
-    inner, reached = set(children), 0
-    ahead = [i for i in range(len(nodes)) if i not in inner]
-    while ahead:
-        reached += 1
-        ahead += nodes[ahead.pop()].get("children", [])
-    if reached < len(nodes):
-        raise fail("a node is among its own children")

@@ -27,13 +27,13 @@ from rts.shading import Lambert, Textured
 def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "mesh") -> list[Part]:
     """The parts of a model file: OBJ with MTL and textures, PLY, STL, GLB, glTF, OFF, what trimesh reads.
 
-    There is one part for each mesh of the scene or, in an OBJ, for each material. θ holds NumPy float32 arrays:
-    "vertices", and where the file has them "uv", "normals", "colors", "texture" and "color". Vertices are in
-    the order of the file; those that no face refers to are left out, and those that coincide exactly are
-    welded: where uv or normals differ between the faces around a vertex they have an index table of their
-    own, so that moving vertices opens no seams. Normals of the file do not follow moving vertices: drop them
-    from θ, and smooth ones are computed that do. The shader is `textured` where there are uv and a texture, else
-    `lambert`.
+    There is one part for each mesh of the scene or, in an OBJ, for each material; in an STL as text, for each solid;
+    `merge=True` makes them one. θ holds NumPy float32 arrays: "vertices", and where the file has them "uv",
+    "normals", "colors", "texture" and "color". Vertices are in the order of the file; those that no face refers to
+    are left out, and those that coincide exactly are welded: where uv or normals differ between the faces around a
+    vertex they have an index table of their own, so that moving vertices opens no seams. Normals of the file do not
+    follow moving vertices: drop them from θ, and smooth ones are computed that do. The shader is `textured` where
+    there are uv and a texture, else `lambert`.
 
     Polygons of n corners, as OBJ, PLY and OFF have them, are cut into n − 2 triangles: convex ones into the fan
     about their first corner, concave ones so that the triangles do not overlap. A material of an OBJ is as opaque
@@ -57,7 +57,8 @@ def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "m
             ones included; or `merge` or `weld` is neither True nor False.
 
     Warns:
-        FileWarning: something was left out or guessed, such as a library of materials that is not there.
+        FileWarning: something was left out or guessed, such as a library of materials that is not there, a statement or
+            property that is not known, or positions that are not within the bounds that a glTF gives them.
     """
     path = as_path(path)
     for name, flag in (("merge", merge), ("weld", weld)):

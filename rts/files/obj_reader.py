@@ -1,4 +1,4 @@
-"""Reading Wavefront OBJ files and their MTL materials."""
+"""Reading Wavefront OBJ files."""
 
 from __future__ import annotations
 
@@ -11,33 +11,23 @@ import numpy as np
 
 from rts.errors import InputError
 from rts.files import polygons
-from rts.files.damage import contents, warn
+from rts.files.damage import contents, is_plain, lines_of, warn, without_comment
 from rts.files.images import read_texture
+from rts.files.mtl_reader import Material, read_mtl
 from rts.files.paths import inside
 from rts.files.pieces import Piece
 
-# Options of a map statement, such as "-s 2 2 1 -clamp on"; the rest is the file's name, spaces and all.
-_VALUE = r"(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?[\d.][-+.\deE]*)"
-_MAP_OPTIONS = re.compile(rf"^(?:-[a-z]+\s+(?:{_VALUE}\s+)*)+", re.IGNORECASE)
-_MESHLAB = re.compile(r"^\s*#.*(?:meshlab|vcglib)", re.IGNORECASE | re.MULTILINE)
-"""A comment by which MeshLab signs; its Tr is 1 for what is opaque."""
-_MAPS = ("map_", "bump", "disp", "decal", "refl", "norm")
-
 LENGTHS = {"v": {3, 4, 6, 7}, "vt": {1, 2, 3}, "vn": {3}}
 """How many numbers rows may have: a position may have a weight, or a colour, and that an alpha."""
-
-
-class Material(NamedTuple):
-    """What is used of an MTL material.
-
-    Attributes:
-        color: (3,) Kd, sRGB, or (4,) where d or Tr make it translucent; None where there is no Kd. Without d, alpha is
-            1 − Tr, unless Tr is at least 1 or MeshLab wrote the file: then Tr is what others call d.
-        texture: file of map_Kd, or None. It replaces Kd.
-    """
-
-    color: np.ndarray | None = None
-    texture: Path | None = None
+FACES = ("f", "fo")
+"""Statements of faces; "fo" is what "f" was called once."""
+LEFT_OUT = frozenset(
+    "vp deg bmat step cstype p l curv curv2 surf parm trim hole scrv sp end con g s mg o bevel c_interp d_interp lod "
+    "shadow_obj trace_obj ctech stech call csh maplib usemap bzp bsp cdc cdp res".split()
+)
+"""Statements of the format that say nothing about polygons."""
+_WORD = re.compile(r"[A-Za-z_][A-Za-z_0-9]*")
+_NUMERIC = re.compile(r"[-+./eE\s]*\d[-+./eE\d\s]*")
 
 
 class _Lines:
@@ -51,18 +41,23 @@ class _Lines:
         self.tags: list[tuple[int, str]] = []
         self.libraries: list[str] = []
         self.materials: dict[str | None, int] = {}
+        self.unknown: dict[str, int] = {}
 
     def read(self) -> _Lines:
         """Sort the lines of the file."""
         material = self.materials.setdefault(None, 0)
-        for number, line in _statements(_text(self.path)):
-            key, _, rest = line.partition("#")[0].replace("\t", " ").strip().partition(" ")
-            if "_" in rest and (key in self.rows or key == "f"):  # Python takes 1_0 for 10.
+        lines = lines_of(contents(self.path))
+        plain = is_plain("".join(lines))
+        for number, line in _statements(lines):
+            key, _, rest = without_comment(line).replace("\t", " ").strip(" \f\v").partition(" ")
+            row = key in self.rows or key in FACES
+            # Python takes 1_0 for 10.
+            if (row and "_" in rest) or (not plain and (row or key == "t") and not is_plain(rest)):
                 raise self.fail(number, f"{rest.strip()[:60]!r} are not numbers")
             if key in self.rows:
                 self.rows[key].append(rest)
                 self.numbers[key].append(number)
-            elif key == "f":
+            elif row:
                 self.faces.append((number, self._absolute(rest, number) if "-" in rest else rest, material))
             elif key == "t":
                 self.tags.append((number, rest))
@@ -71,7 +66,19 @@ class _Lines:
             elif key == "mtllib":
                 # The whole line: names may hold spaces and, however unwisely, "#".
                 self.libraries.append(line.strip()[len("mtllib") :].strip())
+            elif key and key not in LEFT_OUT:
+                self._check_key(key, rest, number)
+        if self.unknown:
+            keys = ", ".join(f"{key[:20]!r} (line {number})" for key, number in list(self.unknown.items())[:5])
+            warn(f"{self.path} has statements that are not known, and left out: {keys}")
         return self
+
+    def _check_key(self, key: str, rest: str, number: int) -> None:
+        """Refuse a word that may have been the key of a row: one of its letters only, or no word before numbers."""
+        letters = {c for c in key.lower() if "a" <= c <= "z"}
+        if letters and letters <= set("vtnf") or not _WORD.fullmatch(key) and _NUMERIC.fullmatch(rest or key):
+            raise self.fail(number, f"it begins with {key[:20]!r}; expected v, vt, vn or f, and a space after it")
+        self.unknown.setdefault(key, number)
 
     def fail(self, number: int, what: str) -> InputError:
         """The error of a line."""
@@ -118,6 +125,9 @@ class _Lines:
             expected = " or ".join(map(str, sorted(LENGTHS[key])))
             raise self.fail(number, f"{key!r} has {len(row)} numbers; expected {expected}")
         width = max((w for w in widths if w <= min(lengths)), default=widths[0])
+        if key == "v" and {3, 4} <= lengths:
+            number = next(n for n, row in zip(self.numbers[key], split, strict=True) if len(row) == 4)
+            warn(f"{self.path}, line {number}: 'v' has 4 numbers and others 3; the fourth, a weight, is not used")
         if max(widths) > width and max(lengths) >= max(widths):
             warn(f"{self.path}: some {key!r} have {max(lengths)} numbers and some {min(lengths)}; colours are left out")
         if min(lengths) < width:
@@ -161,9 +171,11 @@ class _Lines:
         return table[cut], np.array([material for _, _, material in self.faces], np.int64)[owner]
 
     def _corner(self, token: str, number: int, counts: tuple[int, int, int]) -> tuple[int, ...]:
-        indices = []
+        indices, parts = [], token.split("/")
+        if len(parts) > 3:
+            raise self.fail(number, f"{token[:60]!r} has {len(parts)} indices; expected at most 3 a corner")
         for part, count, name in zip(
-            [*token.split("/"), "", ""][:3],
+            [*parts, "", ""][:3],
             counts,
             ("vertices", "texture coordinates", "normals"),
             strict=True,
@@ -270,7 +282,7 @@ def _materials(lines: _Lines) -> dict[str | None, Material]:
     for name in lines.libraries:
         library = inside(lines.path.parent, name, lines.path)
         if library.is_file():
-            found.update(_read_mtl(library, lines.path.parent))
+            found.update(read_mtl(library, lines.path.parent))
         else:
             warn(
                 f"{lines.path} names the material library {name!r}, but there is no file {library}; it is "
@@ -285,67 +297,21 @@ def _materials(lines: _Lines) -> dict[str | None, Material]:
     return found
 
 
-def _read_mtl(library: Path, folder: Path) -> dict[str, Material]:
-    found: dict[str, dict[str, Any]] = {}
-    current: dict[str, Any] = {}
-    text = _text(library)
-    of_meshlab = _MESHLAB.search(text) is not None
-    for number, line in enumerate(text.splitlines(), start=1):
-        key, _, rest = line.replace("\t", " ").strip().partition(" ")
-        key, rest = key.lower(), rest.strip()
-        values = _numbers(library, number, rest) if key in ("kd", "d", "tr") else []
-        if key == "newmtl":
-            current = found.setdefault(rest, {})
-        elif key == "kd" and len(values) in (1, 3):
-            current["color"] = np.resize(values, 3)
-        elif key == "d" and len(values) == 1:
-            current["alpha"] = values[0]
-        elif key == "tr" and len(values) == 1:
-            current.setdefault("alpha", values[0] if of_meshlab or values[0] >= 1 else 1 - values[0])
-        elif key.startswith(_MAPS) and rest:
-            file = inside(folder, _MAP_OPTIONS.sub("", rest), library)
-            if key == "map_kd":
-                current["texture"] = file
-    return {name: _material(values) for name, values in found.items()}
+def _statements(lines: list[str]) -> Iterator[tuple[int, str]]:
+    """Lines with their numbers, those that end in a backslash joined with the next.
 
-
-def _numbers(library: Path, number: int, text: str) -> list[float]:
-    """The numbers of a line; none where it is of another kind, such as "Kd spectral file.rfl"."""
-    try:
-        values = [float(x) for x in text.split()]
-    except ValueError:
-        return []
-    if not np.isfinite(values).all():
-        raise InputError(f"{library}, line {number}: {text!r} is not finite; expected numbers from 0 to 1")
-    return values
-
-
-def _statements(text: str) -> Iterator[tuple[int, str]]:
-    """The lines of a text with their numbers, those that end in a backslash joined with the next."""
+    A comment ends with its line: a backslash there is the end of a folder's name.
+    """
     start, joined = 0, ""
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(lines, start=1):
         start = start or number
-        if line.endswith("\\"):
+        if line.endswith("\\") and "#" not in line:
             joined += line[:-1] + " "
             continue
         yield start, joined + line
         start, joined = 0, ""
     if joined:
         yield start, joined
-
-
-def _text(path: Path) -> str:
-    """The text of a file, without the mark of its encoding that some editors put first."""
-    return contents(path).decode("utf-8-sig", errors="replace")
-
-
-def _material(values: dict[str, Any]) -> Material:
-    color, alpha = values.get("color"), values.get("alpha", 1.0)
-    if "texture" in values:
-        color = None if alpha >= 1 else np.ones(3)
-    if alpha < 1:
-        color = np.append(np.ones(3) if color is None else color, max(alpha, 0.0))
-    return Material(color, values.get("texture"))
 
 
 def _is_number(text: str) -> bool:

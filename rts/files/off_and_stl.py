@@ -9,17 +9,19 @@ from pathlib import Path
 import numpy as np
 
 from rts.errors import InputError
-from rts.files.damage import unreadable, warn
+from rts.files.damage import COUNT, lines_of, unreadable, warn, without_comment
 from rts.files.ply_tables import Fail, Mesh, numbers_of, written
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*(?:e[-+]?\d+)?|\.\d+(?:e[-+]?\d+)?|nan|inf(?:inity)?)"
-_VERTEX = rf"vertex\s+{_NUMBER}\s+{_NUMBER}\s+{_NUMBER}[ \t]*\r?\n\s*"
+_VERTEX = rf"vertex(?:[ \t]+{_NUMBER}){{3}}[ \t]*\n\s*"
 _FACET = re.compile(
-    rf"facet(?:\s+normal\s+\S+\s+\S+\s+\S+)?\s+outer\s+loop\s+{_VERTEX * 3}endloop\s+endfacet\b\s*", re.IGNORECASE
+    rf"facet(?:\s+normal(?:[ \t]+\S+){{3}})?\s+outer\s+loop\s+{_VERTEX * 3}endloop\s+endfacet\b\s*",
+    re.IGNORECASE | re.ASCII,
 )
-_SOLID = re.compile(r"\s*solid\b([^\n]*)\n\s*", re.IGNORECASE)
-_END = re.compile(r"endsolid\b[^\n]*\n?\s*", re.IGNORECASE)
-TRIANGLE = 50
+_SOLID = re.compile(r"\s*solid\b([^\n]*)\n\s*", re.IGNORECASE | re.ASCII)
+_END = re.compile(r"endsolid\b[^\n]*\n?\s*", re.IGNORECASE | re.ASCII)
+_RECORD = np.dtype([("normal", "<f4", 3), ("corners", "<f4", 9), ("more", "<u2")])
+TRIANGLE = _RECORD.itemsize
 """Bytes of a triangle of a binary STL, after 84 of a header that ends in their number."""
 
 
@@ -48,19 +50,23 @@ def plain_off(path: Path, data: bytes) -> bytes:
     def fail(what: str) -> InputError:
         return unreadable(path, "OFF", what)
 
+    text_of(path, "OFF", data)
     numbered = [
         (number, row)
-        for number, line in enumerate(text_of(path, "OFF", data).splitlines(), start=1)
-        if (row := line.partition("#")[0].strip())
+        for number, line in enumerate(lines_of(data), start=1)
+        if (row := without_comment(line).strip(" \t\f\v"))
     ]
     first = numbered.pop(0)[1].split() if numbered else [""]
-    kind = re.fullmatch(r"(ST)?(C)?(N)?OFF", first[0])
+    # The case of an n among capitals counts: nOFF is of n axes, NOFF has normals.
+    # Files of ModelNet have no space after the word.
+    kind = re.fullmatch(r"(ST)?(C)?(N)?OFF([0-9]*)", first[0].upper() if first[0].islower() else first[0])
     if kind is None or first[1:2] == ["BINARY"]:
         raise fail(
             f"it begins with {' '.join(first)[:40]!r}; expected OFF, perhaps with ST, C or N before it, and text"
         )
-    counts = first[1:] or (numbered.pop(0)[1].split() if numbered else [])
-    if len(counts) not in (2, 3) or not all(c.isdecimal() for c in counts):
+    counts = [kind[4], *first[1:]] if kind[4] else first[1:]
+    counts = counts or (numbered.pop(0)[1].split() if numbered else [])
+    if len(counts) not in (2, 3) or not all(COUNT.fullmatch(c) for c in counts):
         raise fail(f"{' '.join(counts)[:40]!r} are no counts; expected those of vertices, faces and edges")
     vertex_count, face_count = int(counts[0]), int(counts[1])
     if len(numbered) != vertex_count + face_count:
@@ -122,6 +128,7 @@ def sound_stl(path: Path, data: bytes) -> bytes:
         InputError: it is longer or shorter, or the text departs from the format.
     """
     if len(data) >= 84 and len(data) == 84 + TRIANGLE * struct.unpack_from("<I", data, 80)[0]:
+        _check_records(path, np.frombuffer(data, _RECORD, offset=84))
         return data
     if b"\0" in data:
         promised = struct.unpack_from("<I", data, 80)[0] if len(data) >= 84 else 0
@@ -130,7 +137,8 @@ def sound_stl(path: Path, data: bytes) -> bytes:
             "STL",
             f"its header promises {promised} triangles, {84 + TRIANGLE * promised} bytes, and it has {len(data)}",
         )
-    text = text_of(path, "STL", data)
+    text_of(path, "STL", data)
+    text = "\n".join([*lines_of(data), ""])
     solids, at = [], 0
     while found := _SOLID.match(text, at):
         at = begin = found.end()
@@ -147,3 +155,24 @@ def sound_stl(path: Path, data: bytes) -> bytes:
         there = " ".join(text[at : at + 200].split())[:40]
         raise unreadable(path, "STL", f"line {line}, {there!r}, is no solid, facet of three vertices, or endsolid")
     return "".join(solids).encode()
+
+
+def _check_records(path: Path, records: np.ndarray) -> None:
+    """Refuse triangles whose bytes are not where they ought to be.
+
+    Their numbers are of any size, then: coordinates are too small or too large to be any, and normals have no length
+    of 1, nor of 0.
+    """
+    sizes = np.abs(records["corners"])
+    strange = ((sizes > 0) & (sizes < 1e-30)) | (sizes > 1e30)
+    odd = np.flatnonzero(strange.any(axis=1))
+    lengths = np.linalg.norm(records["normal"][odd].astype(np.float64), axis=1)
+    odd = odd[~((np.abs(lengths - 1) < 0.1) | (lengths == 0))]
+    if len(odd):
+        at = odd[0]
+        raise unreadable(
+            path,
+            "STL",
+            f"triangle {at} has the coordinate {records['corners'][at][strange[at]][0]:.3g}, and a normal that is "
+            "none: bytes before it are missing, or are too many",
+        )

@@ -11,6 +11,9 @@ from rts.errors import InputError
 
 WIDTHS = {"vertices": (3,), "uv": (2,), "normals": (3,), "colors": (3, 4)}
 """How many numbers the rows of each table have."""
+LARGEST = float(np.finfo(np.float32).max)
+SINGULAR = 1e-9
+"""The least volume of a parallelepiped for the product of its edges."""
 
 
 class Piece(NamedTuple):
@@ -54,5 +57,26 @@ def check_piece(path: Path, piece: Piece) -> None:
                 f"{path}: {len(wrong)} of {len(rows)} rows of {name} are NaN, infinite or too large for "
                 f"float32, the first is row {wrong[0]}; repair the file"
             )
-    if piece.transform is not None and not np.isfinite(piece.transform).all():
-        raise InputError(f"{path}: a transform of its scene holds NaN or infinity; repair the file")
+    if piece.transform is not None:
+        fault = fault_of(piece.transform)
+        with np.errstate(over="ignore", invalid="ignore"):
+            reach = np.abs(piece.transform[:3]) @ np.append(np.abs(piece.vertices).max(axis=0), 1)
+        if not fault and not reach.max() <= LARGEST:
+            fault = "takes vertices beyond float32"
+        if fault:
+            raise InputError(f"{path}: a transform of its scene {fault}; repair the file")
+
+
+def fault_of(matrix: np.ndarray) -> str:
+    """What is wrong with a transform (4, 4), as the end of a sentence; "" if it can be applied, and undone."""
+    if not np.isfinite(matrix).all():
+        return "holds NaN or infinity"
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-5:
+        return f"has the last row {matrix[3].tolist()}; expected 0, 0, 0, 1"
+    linear = matrix[:3, :3]
+    lengths = np.linalg.norm(linear, axis=0)
+    if np.abs(matrix).max() > LARGEST or 0 < lengths.min() < 1 / LARGEST:
+        return "is too large or too small for float32"
+    if not abs(np.linalg.det(linear)) > SINGULAR * np.prod(lengths):
+        return "is singular: it makes things flat"
+    return ""

@@ -6,6 +6,7 @@ polygons of different sizes in binary files, and cuts concave ones wrongly.
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 
 from rts.errors import InputError
 from rts.files import polygons
-from rts.files.damage import unreadable, warn
+from rts.files.damage import COUNT, is_plain, lines_of, unreadable, warn
 from rts.files.images import is_image
 
 Lists = tuple[np.ndarray, np.ndarray]
@@ -182,7 +183,7 @@ def _with_colors(columns: dict[str, np.ndarray], element: str, fail: Fail) -> di
 def _mesh(path: Path, data: bytes, fail: Fail) -> Mesh:
     elements, layout, texture, start = _header(data, fail)
     if layout == "ascii":
-        tables = _text_tables(elements, data[:start].count(b"\n"), data[start:], fail)
+        tables = _text_tables(elements, len(lines_of(data[:start])) - 1, data[start:], fail)
     else:
         tables = _binary_tables(elements, data, start, ">" if "big" in layout else "<", fail)
     vertex = {n: c for n, c in tables.get("vertex", {}).items() if isinstance(c, np.ndarray)}
@@ -210,11 +211,13 @@ def _mesh(path: Path, data: bytes, fail: Fail) -> Mesh:
 
 def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:
     """What is promised: elements, layout, the name of a texture; and where the data begin."""
-    end = data.find(b"\nend_header") + 1
-    after = data.find(b"\n", end)
+    # Lines of a Macintosh end in CR alone.
+    newline = b"\r" if re.match(rb"ply[ \t]*\r(?!\n)", data) else b"\n"
+    end = data.find(newline + b"end_header") + 1
+    after = data.find(newline, end)
     if not data.startswith(b"ply") or end == 0 or after < 0 or data[end:after].strip() != b"end_header":
         raise fail("it does not begin with a header from 'ply' to 'end_header'")
-    lines = data[:end].decode("utf-8", "replace").splitlines()
+    lines = lines_of(data[:end])
     elements: list[Element] = []
     layout = texture = ""
     for number, line in enumerate(lines[1:], start=2):
@@ -225,7 +228,7 @@ def _header(data: bytes, fail: Fail) -> tuple[list[Element], str, str, int]:
                 pass
             case ["format", ("ascii" | "binary_little_endian" | "binary_big_endian") as layout, "1.0"]:
                 pass
-            case ["element", name, count] if count.isdecimal() and name not in {e.name for e in elements}:
+            case ["element", name, count] if COUNT.fullmatch(count) and name not in {e.name for e in elements}:
                 elements.append(Element(name, int(count), []))
             case ["property", "list", length, kind, name] if (
                 elements and TYPES.get(length, "f")[0] != "f" and kind in TYPES
@@ -255,8 +258,8 @@ def _joined(sizes: Any, entries: list[np.ndarray], dtype: str) -> Lists:
 
 def _text_tables(elements: list[Element], before: int, data: bytes, fail: Fail) -> dict[str, dict[str, Any]]:
     """The tables of a file in text, one row a line; blank lines do not count."""
-    lines = data.decode("ascii", "replace").split("\n")
-    numbered = [(number, line) for number, line in enumerate(lines, start=before + 1) if line.strip()]
+    lines = enumerate(lines_of(data), start=before + 1)
+    numbered = [(number, line) for number, line in lines if line.strip(" \t\f\v")]
     if len(numbered) != sum(element.rows for element in elements):
         counts = " + ".join(f"{e.rows} ({e.name})" for e in elements)
         raise fail(f"its header promises {counts} rows, and it has {len(numbered)}")
@@ -271,13 +274,17 @@ def _text_tables(elements: list[Element], before: int, data: bytes, fail: Fail) 
 def numbers_of(rows: list[tuple[int, str]], fail: Fail) -> np.ndarray | list[list[float]]:
     """The numbers of lines, given with their places in the file: as an array (R, C) where all are as many."""
     try:
-        return np.loadtxt([line for _, line in rows], comments=None, ndmin=2)
+        lines = [line for _, line in rows]
+        if is_plain("".join(lines)):
+            return np.loadtxt(lines, comments=None, ndmin=2)
     except ValueError:
         pass
     found = []
     for number, line in rows:
         try:
-            found.append([float(word.replace("_", "?")) for word in line.split()])  # Python takes 1_0 for 10.
+            if "_" in line or not is_plain(line):  # Python takes 1_0 for 10.
+                raise ValueError
+            found.append([float(word) for word in line.split()])
         except ValueError:
             raise fail(f"line {number}, {' '.join(line.split())[:60]!r}, is not of numbers") from None
     return found

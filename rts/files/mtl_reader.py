@@ -1,0 +1,82 @@
+"""Reading MTL, the materials of Wavefront OBJ files."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rts.errors import InputError
+from rts.files.damage import contents, lines_of
+from rts.files.paths import inside
+
+# Options of a map statement, such as "-s 2 2 1 -clamp on"; the rest is the file's name, spaces and all.
+_VALUE = r"(?:on|off|[rgbmlz]|sphere|cube_\w+|[-+]?[\d.][-+.\deE]*)"
+_MAP_OPTIONS = re.compile(rf"^(?:-[a-z]+\s+(?:{_VALUE}\s+)*)+", re.IGNORECASE)
+_MESHLAB = re.compile(r"\s*#.*(?:meshlab|vcglib)", re.IGNORECASE)
+"""A comment by which MeshLab signs; its Tr is 1 for what is opaque."""
+_MAPS = ("map_", "bump", "disp", "decal", "refl", "norm")
+
+
+class Material(NamedTuple):
+    """What is used of an MTL material.
+
+    Attributes:
+        color: (3,) Kd, sRGB, or (4,) where d or Tr make it translucent; None where there is no Kd. Without d, alpha is
+            1 − Tr, unless Tr is at least 1 or MeshLab wrote the file: then Tr is what others call d.
+        texture: file of map_Kd, or None. It replaces Kd.
+    """
+
+    color: np.ndarray | None = None
+    texture: Path | None = None
+
+
+def read_mtl(library: Path, folder: Path) -> dict[str, Material]:
+    """The materials of a library by name. Textures are looked for in the folder.
+
+    Raises:
+        InputError: it cannot be read, a number is not finite, or it refers to a file outside the folder.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    current: dict[str, Any] = {}
+    lines = lines_of(contents(library))
+    of_meshlab = any(_MESHLAB.match(line) for line in lines)
+    for number, line in enumerate(lines, start=1):
+        key, _, rest = line.replace("\t", " ").strip().partition(" ")
+        key, rest = key.lower(), rest.strip()
+        values = _numbers(library, number, rest) if key in ("kd", "d", "tr") else []
+        if key == "newmtl":
+            current = found.setdefault(rest, {})
+        elif key == "kd" and len(values) in (1, 3):
+            current["color"] = np.resize(values, 3)
+        elif key == "d" and len(values) == 1:
+            current["alpha"] = values[0]
+        elif key == "tr" and len(values) == 1:
+            current.setdefault("alpha", values[0] if of_meshlab or values[0] >= 1 else 1 - values[0])
+        elif key.startswith(_MAPS) and rest:
+            file = inside(folder, _MAP_OPTIONS.sub("", rest), library)
+            if key == "map_kd":
+                current["texture"] = file
+    return {name: _material(values) for name, values in found.items()}
+
+
+def _numbers(library: Path, number: int, text: str) -> list[float]:
+    """The numbers of a line; none where it is of another kind, such as "Kd spectral file.rfl"."""
+    try:
+        values = [float(x) for x in text.split()]
+    except ValueError:
+        return []
+    if not np.isfinite(values).all():
+        raise InputError(f"{library}, line {number}: {text!r} is not finite; expected numbers from 0 to 1")
+    return values
+
+
+def _material(values: dict[str, Any]) -> Material:
+    color, alpha = values.get("color"), values.get("alpha", 1.0)
+    if "texture" in values:
+        color = None if alpha >= 1 else np.ones(3)
+    if alpha < 1:
+        color = np.append(np.ones(3) if color is None else color, max(alpha, 0.0))
+    return Material(color, values.get("texture"))
