@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rts import registry
 from rts.adapting import unwrapped
 from rts.arguments import quoted
 from rts.errors import InputError
@@ -38,6 +39,8 @@ class Part:
             raise InputError(f'cull is {quoted(self.cull)}; expected "none" or "back"')
         if not isinstance(self.theta, Mapping):
             raise InputError(f"theta is {quoted(self.theta)}; expected a dict of arrays")
+        if isinstance(self.shader, str):
+            registry.check_name("rts.shaders", self.shader)
 
     def replace(self, **changes: Any) -> Part:
         """A copy with some fields changed."""

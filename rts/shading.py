@@ -24,7 +24,7 @@ from typing import Any
 from rts.arguments import quoted
 from rts.arrays import described, dot, is_finite, shape_of, unit
 from rts.camera import Camera
-from rts.engines import engine_of, is_constant, namespace
+from rts.engines import engine_of, is_constant, namespace, value_of
 from rts.errors import InputError
 from rts.footprints import FOOTPRINT
 from rts.gbuffer import GBuffer
@@ -253,6 +253,9 @@ def _lit(
     if "color" in given:
         colors = _listed(given["color"])
     if "direction" in given:
+        known = value_of(given["direction"])
+        if known is not None and not known.any(axis=-1).all():
+            raise InputError("theta['light']['direction'] is zero; expected vectors towards the lights, of any length")
         directions = _listed(unit(given["direction"]))
     else:
         directions = [camera.to_world(DEFAULT_LIGHT)]

@@ -207,6 +207,7 @@ def test_silhouettes_through_poses_cameras_and_batches_are_those_of_a_loop(targe
     np.testing.assert_allclose(to_numpy(together)[0], expected, atol=2e-5)
 
 
+@pytest.mark.filterwarnings("ignore::rts.InputWarning")  # A telephoto lens.
 def test_views_are_the_same_on_any_number_of_threads_and_in_any_company(monkeypatch):
     found = []
     for threads in ("1", "2", "2"):

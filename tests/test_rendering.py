@@ -11,6 +11,7 @@ from helpers import (
     DIFFERENTIABLE,
     FRONT,
     SIZE,
+    TORCH,
     arrays,
     box,
     gradient,
@@ -303,7 +304,7 @@ BAD = {
         ("splatter", "mean 'multi'"),
     ),
     "unknown shader": (
-        lambda: rts.render(PART.replace(shader="lambart"), CAMERA, SIZE),
+        lambda: PART.replace(shader="lambart"),
         ("shader", "mean 'lambert'"),
     ),
     "cull typo": (lambda: PART.replace(cull="backs"), ("cull", "'backs'", '"back"')),
@@ -456,6 +457,17 @@ def test_plain_lists_of_numbers_are_arrays():
     np.testing.assert_allclose(
         rts.render(PART.replace(theta=lists, shader="lambert"), camera, SIZE), expected, atol=1e-6
     )
+
+
+@pytest.mark.parametrize("target", ["numpy", *TORCH])
+def test_samples_in_front_that_find_no_room_are_warned_of(target):
+    part = PART.replace(theta=arrays(target, dict(PART.theta)))
+    for options in {}, {"supersample": 2}:
+        with pytest.warns(rts.InputWarning, match="capacity is 1, and [0-9]+ samples find no room, .* image has holes"):
+            rts.render(part, CAMERA, SIZE, capacity=1, **options)
+    # Hidden ones are left out first, as it is documented.
+    row = rts.sample(part, CAMERA, SIZE).row
+    rts.render(part, CAMERA, SIZE, capacity=int((row[0] >= 0).sum()) + 5)
 
 
 # ------------------------------------------------------------------------- what one call leaves to the next

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rts.arguments import check_numbers
-from rts.arrays import promote, shape_of
+from rts.arrays import is_finite, promote, shape_of
 from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
@@ -28,15 +28,15 @@ def rigid(pose: Any, center: Any = ORIGIN) -> Array:
         (4, 4), usable as `Part.transform`.
 
     Raises:
-        InputError: the pose has another shape.
+        InputError: the pose has another shape, or is not finite.
     """
-    if shape_of(pose) != (6,):
+    if shape_of(pose) != (6,) or not is_finite(pose):
         check_numbers("pose", pose, (6,))
         if is_constant(pose):
             pose = np.asarray(pose, np.float64)
     if center is ORIGIN:
         center = engine_of(pose).constant(np.zeros(3), pose)
-    elif shape_of(center) != (3,):
+    elif shape_of(center) != (3,) or not is_finite(center):
         check_numbers("center", center, (3,))
     _, (pose, center) = promote(pose, center)
     return RIGID(pose, center)
