@@ -30,15 +30,18 @@ def rigid(pose: Any, center: Any = ORIGIN) -> Array:
     Raises:
         InputError: the pose has another shape, or is not finite.
     """
-    if shape_of(pose) != (6,) or not is_finite(pose):
+    if shape_of(pose) != (6,):
         check_numbers("pose", pose, (6,))
         if is_constant(pose):
             pose = np.asarray(pose, np.float64)
     if center is ORIGIN:
         center = engine_of(pose).constant(np.zeros(3), pose)
-    elif shape_of(center) != (3,) or not is_finite(center):
+    elif shape_of(center) != (3,):
         check_numbers("center", center, (3,))
     _, (pose, center) = promote(pose, center)
+    for name, value in ("pose", pose), ("center", center):
+        if not is_finite(value):
+            raise InputError(f"{name} of rts.rigid holds NaN or infinity; expected finite numbers")
     return RIGID(pose, center)
 
 
