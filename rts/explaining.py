@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -10,12 +10,14 @@ import numpy as np
 from rts.camera import Camera
 from rts.checks import check_scene
 from rts.engines import engine_of
-from rts.parts import Part
+from rts.parts import CheckedPart, Part
 from rts.records import Samples
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.auto import Choice, choose, is_static
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.scenes import sample
+from rts.sampling.winding import INSIDE_OUT, is_inside_out
+from rts.unread import likely_name, unread
 
 
 def explain(
@@ -38,14 +40,17 @@ def explain(
         supersample: as in `rts.render`.
 
     Returns:
-        For each part the name of the `sampler`, and the `reason`; with a size also the number of `samples`, apron
-        included, and with `rts.Adaptive` how many of them are `fine`, and how many pixels are `active`.
+        For each part the name of the `sampler`, the `reason`, and `remarks` on what looks like a mistake; with a size
+        also the number of `samples`, apron included, and with `rts.Adaptive` how many of them are `fine`, and how many
+        pixels are `active`.
 
     Raises:
         InputError: what was given cannot be sampled.
     """
     checked, seen = check_scene(parts.parts if isinstance(parts, PreparedParts) else parts, camera)
-    choices = [choose(part, static=is_static(part, seen)) for part in checked]
+    choices = [
+        choose(part, static=is_static(part, seen))._replace(remarks=tuple(_remarks(part, seen))) for part in checked
+    ]
     if size is None:
         return choices
     found = sample(parts, camera, size, splatter=splatter, layers=layers, supersample=supersample)
@@ -56,6 +61,15 @@ def explain(
     finer, active = map(_count, found.fine.samples), int(np.count_nonzero(pixel >= 0))
     counts = zip(choices, coarse, finer, strict=True)
     return [choice._replace(samples=n + m, fine=m, active=active) for choice, n, m in counts]
+
+
+def _remarks(part: CheckedPart, camera: Camera) -> Iterator[str]:
+    """What of a part looks like a mistake."""
+    for name in unread(part):
+        meant = likely_name(part, name)
+        yield f"theta[{name!r}] is not read" + ("" if meant is None else f"; did you mean {meant!r}?")
+    if is_inside_out(part, camera):
+        yield INSIDE_OUT
 
 
 def _count(samples: Samples) -> int:
