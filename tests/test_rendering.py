@@ -593,6 +593,24 @@ def test_shaders_that_do_not_say_what_they_read_are_not_spoken_of():
         assert rts.explain(part, CAMERA)[0].remarks == ()
 
 
+@pytest.mark.parametrize("target", ALL)
+def test_explain_at_a_size_observes_what_functions_read(target):
+    def shader(theta, gbuffer, camera):
+        tint = theta.get("tint", {"color": 1.0})["color"] * (2 if "double" in theta else 1)
+        return gbuffer["position"][:, [0, 0, 0, 0]] * 0 + tint
+
+    theta = {"vertices": BOX[0], "tint": {"color": np.float32(0.5)}, "tints": np.ones(3), "Double": np.ones(1)}
+    part = Part(Mesh(BOX[1]), arrays(target, theta), shader)
+    (lambert, own) = rts.explain([PART.replace(shader="lambert"), part], CAMERA, SIZE)
+    assert lambert.remarks == ()
+    assert {*own.remarks} == {"theta['tints'] is not read", "theta['Double'] is not read; did you mean 'double'?"}
+
+    def all_of_it(theta, gbuffer, camera):
+        return shader({**theta}, gbuffer, camera)
+
+    assert rts.explain(part.replace(shader=all_of_it), CAMERA, SIZE)[0].remarks == ()
+
+
 def seams(vertices, faces):
     """A mesh whose triangles share no vertices."""
     return vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)

@@ -26,7 +26,7 @@ def warn_of_winding(parts: Sequence[CheckedPart], camera: Camera) -> None:
     """Warn of culled parts that are wound inside out; each surface is looked at but once."""
     for index, part in enumerate(parts):
         surface = unwrapped(part.surface)
-        if part.cull != "back" or not _may_be(part) or surface in _looked_at:
+        if part.cull != "back" or _triangles_of(part) is None or surface in _looked_at:
             continue
         found = is_inside_out(part, camera)
         if found is not None:
@@ -43,13 +43,14 @@ def is_inside_out(part: CheckedPart, camera: Camera) -> bool | None:
 
     Seen from within, such as a room, it is as it should be.
     """
-    if part.cull != "back" or not _may_be(part):
+    surface = _triangles_of(part)
+    if part.cull != "back" or surface is None:
         return False
-    known = known_tree((part.surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))
+    known = known_tree((surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))
     if known is None:
         return None
     inputs, local = known
-    proxy = part.surface.proxy(inputs, local, (1, 1))
+    proxy = surface.proxy(inputs, local, (1, 1))
     if not len(proxy.faces):
         return False
     low, high = (f(proxy.vertices[proxy.faces], axis=(0, 1)) for f in (np.min, np.max))
@@ -57,10 +58,11 @@ def is_inside_out(part: CheckedPart, camera: Camera) -> bool | None:
     return not ((low < eye) & (eye < high)).all() and _encloses_less_than_nothing(proxy.vertices, proxy.faces)
 
 
-def _may_be(part: CheckedPart) -> bool:
-    """Whether how a part is wound is the user's to say, and is known at no cost."""
+def _triangles_of(part: CheckedPart) -> TriangleSurface | None:
+    """The surface of a part, if how it is wound is the user's to say, and is known at no cost."""
     surface = part.surface
-    return isinstance(surface, TriangleSurface) and surface.proxy_is_cheap and not surface.depends_on_view
+    own = isinstance(surface, TriangleSurface) and surface.proxy_is_cheap and not surface.depends_on_view
+    return surface if own else None
 
 
 def _encloses_less_than_nothing(vertices: np.ndarray, faces: np.ndarray) -> bool:
