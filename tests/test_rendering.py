@@ -654,6 +654,14 @@ def test_rooms_and_open_meshes_may_be_wound_inwards():
         assert rts.explain(part, CAMERA)[0].remarks == ()
 
 
+def test_surfaces_that_cannot_be_remembered_are_not_looked_at():
+    class Unhashable(Mesh):
+        __hash__ = None
+
+    vertices, faces = icosphere(1)
+    rts.render(Part(Unhashable(faces[:, ::-1]), {"vertices": vertices}, cull="back"), CAMERA, SIZE)
+
+
 def test_vertices_that_are_traced_are_not_looked_at():
     jax = pytest.importorskip("jax")
     vertices, faces = icosphere(1)

@@ -25,14 +25,23 @@ _looked_at: weakref.WeakSet[Any] = weakref.WeakSet()
 def warn_of_winding(parts: Sequence[CheckedPart], camera: Camera) -> None:
     """Warn of culled parts that are wound inside out; each surface is looked at but once."""
     for index, part in enumerate(parts):
-        surface = unwrapped(part.surface)
-        if part.cull != "back" or _triangles_of(part) is None or surface in _looked_at:
+        if part.cull != "back" or _triangles_of(part) is None or not _is_new(surface := unwrapped(part.surface)):
             continue
         found = is_inside_out(part, camera)
-        if found is not None:
-            _looked_at.add(surface)
+        if found is None:
+            _looked_at.discard(surface)
         if found:
             warn(f"part {index} {INSIDE_OUT}; give it faces[:, ::-1]", InputWarning)
+
+
+def _is_new(surface: Any) -> bool:
+    """Whether a surface was not looked at so far; from now on it was."""
+    try:
+        new = surface not in _looked_at
+        _looked_at.add(surface)
+    except TypeError:  # A surface that cannot be hashed, or referred to weakly, is not looked at.
+        return False
+    return new
 
 
 INSIDE_OUT = "is closed and wound inside out: cull='back' leaves out the side that faces the viewer"
@@ -61,8 +70,9 @@ def is_inside_out(part: CheckedPart, camera: Camera) -> bool | None:
 def _triangles_of(part: CheckedPart) -> TriangleSurface | None:
     """The surface of a part, if how it is wound is the user's to say, and is known at no cost."""
     surface = part.surface
-    own = isinstance(surface, TriangleSurface) and surface.proxy_is_cheap and not surface.depends_on_view
-    return surface if own else None
+    if isinstance(surface, TriangleSurface) and surface.proxy_is_cheap and not surface.depends_on_view:
+        return surface
+    return None
 
 
 def _encloses_less_than_nothing(vertices: np.ndarray, faces: np.ndarray) -> bool:
