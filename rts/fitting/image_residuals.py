@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeGuard
@@ -24,13 +24,14 @@ from rts.checks import (
     check_splatter,
     is_count,
 )
-from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting, value_of
-from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
+from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting
+from rts.errors import EmptyImageWarning, InputError, warn
 from rts.evaluating import to_fine_splats, to_splats
 from rts.fitting.least_squares import flatten, normal_equations
 from rts.fitting.losses import Loss
 from rts.fitting.names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
+from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
 from rts.interfaces import Residuals, Splatter
 from rts.parts import CheckedPart, Part
 from rts.records import ArraySpec, Fine, Splats
@@ -132,10 +133,10 @@ class ImageResiduals(Residuals):
         self._views: list[ImageResiduals] = []
         several = camera is not None and (not isinstance(camera, Camera) or camera.is_stacked)
         cameras = len(check_cameras(camera)) if several else None
-        _warn_of_gradients({"target": target, "weights": weights, "background": background})
+        warn_of_gradients({"target": target, "weights": weights, "background": background})
         if (count := _view_count(target, self.size, several)) is None:
             self._take(target, weights)
-            _refuse_zero([self._weights])
+            refuse_zero([self._weights])
             if several:
                 raise InputError(
                     f"there are {cameras} cameras for a target of one view; expected targets (B, H, W, ·), one for each"
@@ -150,7 +151,7 @@ class ImageResiduals(Residuals):
             self._views.append(view)
         if len(kinds := {tuple(view._target.shape[2:]) for view in self._views}) > 1:
             raise InputError(f"targets of views have the channels {sorted(kinds)}; expected one kind for all views")
-        _refuse_zero([view._weights for view in self._views])
+        refuse_zero([view._weights for view in self._views])
 
     @property
     def loss(self) -> Loss:  # pyright: ignore[reportIncompatibleVariableOverride]  # Never None, nor set.
@@ -516,52 +517,8 @@ def _checked_target(target: Any, size: tuple[int, int], channels: int) -> tuple[
     check_floating("target", target)
     _check_finite("target", target)
     count = shape[2] if len(shape) > 2 else 1
-    _check_range(target, count, channels)
+    check_range(target, count, channels)
     return target, count
-
-
-LARGEST = 2.0
-"""Numbers of pictures from 0 to 1 that were filtered or interpolated are not above this."""
-
-
-def _check_range(target: Array, count: int, channels: int) -> None:
-    """Refuse alpha from 0 to 255, and warn of such colours; features have any value.
-
-    Args:
-        target: (H, W) or (H, W, C).
-        count: its number of channels.
-        channels: those of the image besides alpha.
-    """
-    alpha = target if count == 1 else target[..., -1:] if count == channels + 1 else None
-    most = 0.0 if alpha is None else _largest(alpha)
-    if most > LARGEST:
-        raise InputError(f"target's alpha goes up to {most:g}; expected 0 to 1: divide one from 0 to 255 by 255")
-    if channels == 3 and count > 1 and (most := _largest(target[..., :3])) > LARGEST:
-        warn(
-            f"target's colours go up to {most:g}, and those of shaders from 0 to 1: divide a picture from 0 to 255 by "
-            f"255, or let rts.load_image read it",
-            InputWarning,
-        )
-
-
-def _largest(values: Array) -> float:
-    """The largest of some values, zero where they are traced."""
-    known = value_of(namespace(values).max(values))
-    return 0.0 if known is None else float(known.max())
-
-
-def _warn_of_gradients(given: Mapping[str, Any]) -> None:
-    """Warn of arrays of torch that are taken for constants, and of which it would have a derivative."""
-    for name, value in given.items():
-        if any(getattr(x, "requires_grad", False) for x in (value if isinstance(value, (list, tuple)) else [value])):
-            warn(f"{name} requires a gradient, and is taken as a constant; give {name}.detach()", InputWarning)
-
-
-def _refuse_zero(weights: Sequence[Array | None]) -> None:
-    """Refuse weights of all views under which nothing is compared, where they are known."""
-    known = [None if own is None else value_of(namespace(own).any(own != 0)) for own in weights]
-    if not any(own is None or own.any() for own in known):
-        raise InputError("weights are all zero, so that nothing is compared; expected some above zero")
 
 
 def _checked_weights(weights: Any, shape: tuple[int, ...], size: tuple[int, int]) -> Array | None:
@@ -576,7 +533,7 @@ def _checked_weights(weights: Any, shape: tuple[int, ...], size: tuple[int, int]
         return xp.astype(weights, xp.float32)
     check_floating("weights", weights)
     _check_finite("weights", weights)
-    if (least := -_largest(-weights)) < 0:
+    if (least := -largest(-weights)) < 0:
         raise InputError(f"weights go down to {least:g}; expected none below zero: only their squares count")
     return weights
 
