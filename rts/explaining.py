@@ -57,7 +57,8 @@ def explain(
     if size is not None:
         found = sample(parts, camera, size, splatter=splatter, layers=layers, supersample=supersample)
         if None in shaded:
-            shaded = _observed(checked, camera, size)
+            seen_to_read = _observed(checked, camera, size)
+            shaded = [b if a is None else a for a, b in zip(shaded, seen_to_read, strict=True)]
     choices = [
         choose(part, static=is_static(part, seen))._replace(remarks=tuple(_remarks(part, seen, own)))
         for part, own in zip(checked, shaded, strict=True)
