@@ -32,12 +32,16 @@ from rts.operations.linear import affine, matmul, specified_affine_map
 from rts.operations.projection import projective_map
 from rts.records import Rays
 from rts.transforms import (
+    ROUNDING,
     affine_matrix,
+    check_product,
+    is_parallel_product,
     look_at,
     matrix_of,
     orthographic,
     perspective,
     scaled_rows,
+    warn_of_radians,
 )
 from rts.trees import Array, map_leaves, record
 
@@ -152,7 +156,7 @@ class Camera:
         Args:
             eye: (3,) world.
             target: (3,) world.
-            up: (3,) direction that is up in the image.
+            up: (3,) direction that is up in the image. Where the camera looks along it, +x is to the right instead.
             fov_y: vertical field of view, degrees.
             aspect: width over height of the image; None for that of the size it is rendered at.
             near: near plane; default 1/100 of the distance to the target.
@@ -160,7 +164,10 @@ class Camera:
             principal_point: (2,) where the axis meets the image, NDC.
 
         Raises:
-            InputError: eye and target coincide, the direction of view is parallel to `up`, or planes are out of order.
+            InputError: eye and target coincide, `up` is zero, or planes are out of order.
+
+        Warns:
+            InputWarning: a field of view below 2, likely to be in radians.
         """
         view = look_at(eye, target, up)
         if near is None or far is None:
@@ -169,6 +176,7 @@ class Camera:
             near = NEAR_OVER_DISTANCE * distance if near is None else near
             far = FAR_OVER_DISTANCE * distance if far is None else far
         projection = perspective(fov_y, 1.0 if aspect is None else aspect, near, far, principal_point)
+        warn_of_radians(fov_y)
         return cls(*_alike(view, projection), _known_ratio(aspect))
 
     @classmethod
@@ -196,12 +204,16 @@ class Camera:
 
         Raises:
             InputError: a field of view, ratio or view that makes no image, or planes are out of order.
+
+        Warns:
+            InputWarning: a field of view below 2, likely to be in radians.
         """
         known = None if view is None else check_numbers("view", view, (4, 4))
         if known is not None and not (_is_affine(known) and is_invertible(known[:3, :3])):
             raise InputError("view is singular, or its last row is not (0, 0, 0, 1); expected a camera-from-world map")
         _, (view,) = promote(np.eye(4) if view is None else view)
         projection = perspective(fov_y, 1.0 if aspect is None else aspect, near, far, principal_point)
+        warn_of_radians(fov_y)
         return cls(*_alike(view, projection), _known_ratio(aspect))
 
     @classmethod
@@ -222,7 +234,7 @@ class Camera:
         Args:
             eye: (3,) world.
             target: (3,) world.
-            up: (3,) direction that is up in the image.
+            up: (3,) direction that is up in the image. Where the camera looks along it, +x is to the right instead.
             height: what the image shows from bottom to top, world units.
             aspect: width over height of the image; None for that of the size it is rendered at.
             near: depth of the near plane; may be negative.
@@ -230,7 +242,7 @@ class Camera:
             principal_point: (2,) where the axis meets the image, NDC.
 
         Raises:
-            InputError: eye and target coincide, the direction of view is parallel to `up`, or planes are out of order.
+            InputError: eye and target coincide, `up` is zero, or planes are out of order.
         """
         view = look_at(eye, target, up)
         projection = orthographic(height, 1.0 if aspect is None else aspect, near, far, principal_point)
@@ -294,18 +306,25 @@ class Camera:
         the world, if the matrix is the product of any projection, perspective or parallel, and of a view that does
         not scale.
 
+        A matrix that is transposed (for row vectors), or multiplied in the other order, is refused where it shows: not
+        if the view does not turn, nor does more than that. Depths from 0 to 1, of Direct3D and Vulkan, look like those
+        of a near plane at about half its depth; pictures are the same. Where they run backwards, from 1 to 0, they are
+        refused.
+
         Args:
             matrix: (4, 4) OpenGL clip space from world space, acting on column vectors; `projection @ view`.
 
         Raises:
-            InputError: the matrix is singular.
+            InputError: the matrix is singular, transposed, in the other order, or has a plane behind the camera.
         """
         known = check_numbers("matrix", matrix, (4, 4))
         if known is not None and not is_invertible(known):
             raise InputError("matrix is singular; expected an invertible product projection @ view")
+        if known is not None:
+            check_product(known)
         xp, (m,) = promote(matrix)
         x, y, z, w = (m[i, :3] for i in range(4))
-        parallel = known is not None and np.linalg.norm(known[3, :3]) <= PARALLEL * np.linalg.norm(known[:2, :3])
+        parallel = known is not None and is_parallel_product(known)
         if parallel:  # Depth grows along the rays, from the near plane on.
             along = xp.linalg.cross(x, y)
             axis, start = unit(along * xp.sign(xp.sum(along * z))), m[2, :] + m[3, :]
@@ -682,12 +701,6 @@ def toward_rows(view: Array, projection: Array) -> Array:
 def world_vectors(view: Array, direction: Sequence[float]) -> Array:
     """Unit vectors (…, 3) in the world of a direction (3,) in the space of cameras with these views (…, 4, 4)."""
     return unit(sum(c * view[..., i, :3] for i, c in enumerate(direction)))
-
-
-ROUNDING = 1e-5
-"""What entries of matrices that are to be zero or one may be off by."""
-PARALLEL = 1e-12
-"""Rays are parallel if w changes by less than this share over lengths in which x or y do by one."""
 
 
 def _alike(view: Array, projection: Array) -> tuple[Array, Array]:

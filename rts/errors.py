@@ -1,7 +1,7 @@
 """Every error that the library raises on purpose.
 
 Each message says what was given, what was expected, and what to do next. Warnings say what an image lacks that was
-rendered nevertheless.
+rendered nevertheless, or what in the input looks like a mistake.
 """
 
 from __future__ import annotations
@@ -44,6 +44,10 @@ class EmptyImageWarning(RtsWarning):
 
 class ToleranceWarning(RtsWarning):
     """No setting is as accurate as was asked for."""
+
+
+class InputWarning(RtsWarning):
+    """Input that is allowed, and is likely to mean something else than was meant."""
 
 
 class FileWarning(RtsWarning):

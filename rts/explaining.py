@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -10,12 +10,18 @@ import numpy as np
 from rts.camera import Camera
 from rts.checks import check_scene
 from rts.engines import engine_of
-from rts.parts import Part
+from rts.parts import CheckedPart, Part
 from rts.records import Samples
+from rts.rendering import render_samples
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.auto import Choice, choose, is_static
 from rts.sampling.prepared import PreparedParts
 from rts.sampling.scenes import sample
+from rts.sampling.winding import INSIDE_OUT, is_inside_out
+from rts.unread import Observed, likely_name, unread
+
+FEW = 32
+"""Pixels along each side of the image that shows what shaders read."""
 
 
 def explain(
@@ -38,17 +44,27 @@ def explain(
         supersample: as in `rts.render`.
 
     Returns:
-        For each part the name of the `sampler`, and the `reason`; with a size also the number of `samples`, apron
-        included, and with `rts.Adaptive` how many of them are `fine`, and how many pixels are `active`.
+        For each part the name of the `sampler`, the `reason`, and `remarks` on what looks like a mistake; with a size
+        also the number of `samples`, apron included, and with `rts.Adaptive` how many of them are `fine`, and how many
+        pixels are `active`.
 
     Raises:
         InputError: what was given cannot be sampled.
     """
     checked, seen = check_scene(parts.parts if isinstance(parts, PreparedParts) else parts, camera)
-    choices = [choose(part, static=is_static(part, seen)) for part in checked]
-    if size is None:
+    found = None
+    shaded: list[Any] = [part.shader.reads_theta for part in checked]
+    if size is not None:
+        found = sample(parts, camera, size, splatter=splatter, layers=layers, supersample=supersample)
+        if None in shaded:
+            seen_to_read = _observed(checked, camera, size)
+            shaded = [b if a is None else a for a, b in zip(shaded, seen_to_read, strict=True)]
+    choices = [
+        choose(part, static=is_static(part, seen))._replace(remarks=tuple(_remarks(part, seen, own)))
+        for part, own in zip(checked, shaded, strict=True)
+    ]
+    if found is None:
         return choices
-    found = sample(parts, camera, size, splatter=splatter, layers=layers, supersample=supersample)
     coarse = map(_count, found.samples)
     if found.fine is None:
         return [choice._replace(samples=n) for choice, n in zip(choices, coarse, strict=True)]
@@ -56,6 +72,25 @@ def explain(
     finer, active = map(_count, found.fine.samples), int(np.count_nonzero(pixel >= 0))
     counts = zip(choices, coarse, finer, strict=True)
     return [choice._replace(samples=n + m, fine=m, active=active) for choice, n, m in counts]
+
+
+def _observed(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int]) -> list[set[str]]:
+    """The entries of θ that the shader of each part reads, as it shades a few samples."""
+    shaders = [Observed(part.shader) for part in parts]
+    watched = [part.replace(shader=own) for part, own in zip(parts, shaders, strict=True)]
+    small = min(size[0], FEW), min(size[1], FEW)
+    sampled = sample(watched, camera.for_size(size).replace(aspect=None), small, layers=1)
+    render_samples(sampled, watched, camera.for_size(size).replace(aspect=None))
+    return [own.read for own in shaders]
+
+
+def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) -> Iterator[str]:
+    """What of a part looks like a mistake, whose shader reads these entries of θ; None where that is not known."""
+    for name in unread(part, shaded):
+        meant = likely_name(part, name, shaded or ())
+        yield f"theta[{name!r}] is not read" + ("" if meant is None else f"; did you mean {meant!r}?")
+    if is_inside_out(part, camera):
+        yield INSIDE_OUT
 
 
 def _count(samples: Samples) -> int:

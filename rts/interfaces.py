@@ -439,6 +439,8 @@ class Shader(Plugin):
         uniform: a promise that all samples of a part have one colour, through whatever camera. Where that depends on
             the part, the class has a method `uniform_by` instead.
         reads: the entries of the G-buffer that it needs besides position; None for all.
+        reads_theta: the entries of θ that it reads where they are there; None if it does not say. `rts.explain` lists
+            entries that nobody reads, and what is almost one of these is warned of.
         takes_views: whether a call may be of samples of several views, as `rts.render_views` then makes it: `camera` is
             an `rts.RowCameras`, whose methods give a row for each sample. A shader that says so also says what it
             `reads`, without "uv_footprint". A subclass with its own `__call__` has to say so itself.
@@ -450,11 +452,12 @@ class Shader(Plugin):
     uniform: bool = False
     takes_views: bool = False
     reads: tuple[str, ...] | None = None
+    reads_theta: tuple[str, ...] | None = None
 
     def __init_subclass__(cls, **options: Any) -> None:
         """What another `__call__` does is promised anew."""
         super().__init_subclass__(**options)
-        _promise_anew(cls, "__call__", ["takes_views", "uniform", "uniform_by"], Shader)
+        _promise_anew(cls, "__call__", ["takes_views", "uniform", "uniform_by", "reads_theta"], Shader)
 
     def uniform_by(self, theta: Mapping[str, Tree], given: Sequence[str] | None) -> tuple[str, ...] | None:
         """Where all samples of a part have one colour, the entries of θ that it depends on; None where they may not.

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
+from rts import registry
 from rts.arguments import quoted
 from rts.errors import InputError
 from rts.interfaces import Shader, Surface
@@ -35,6 +36,8 @@ class Part:
             raise InputError(f'cull is {quoted(self.cull)}; expected "none" or "back"')
         if not isinstance(self.theta, Mapping):
             raise InputError(f"theta is {quoted(self.theta)}; expected a dict of arrays")
+        if isinstance(self.shader, str):
+            registry.check_name("rts.shaders", self.shader)
 
     def replace(self, **changes: Any) -> Part:
         """A copy with some fields changed."""

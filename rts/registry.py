@@ -118,6 +118,17 @@ def _entry(group: str, name: str) -> EntryPoint:
     return found[0]
 
 
+def check_name(group: str, name: str) -> None:
+    """Refuse a name that no plugin of a group has, or several have; nothing is imported.
+
+    Args:
+        group: such as "rts.shaders".
+        name: the name.
+    """
+    if len(_entries(group).get(name, ())) != 1:
+        _entry(group, name)
+
+
 def plugin(group: str, name: str) -> Any:
     """Load one plugin: what its entry point names, usually a class.
 

@@ -24,7 +24,7 @@ from rts.engines import (
     uncompiled,
     value_of,
 )
-from rts.errors import EmptyImageWarning, InputError, warn
+from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
 from rts.evaluating import to_fine_splats, to_splats
 from rts.interfaces import Splatter
 from rts.operations.inset import averaged, painted_inset, with_inset
@@ -92,6 +92,7 @@ def render(
     Warns:
         EmptyImageWarning: nothing is seen; it says why.
         AspectWarning: the camera is for images of another ratio of width to height.
+        InputWarning: samples in front find no room in `capacity`, outside of `jax.jit`.
     """
     scene = Scene.of(parts, camera, sampler, engine)
     size = check_size(size, layers, capacity, finest(supersample))
@@ -179,14 +180,29 @@ def image_of(
     if isinstance(supersample, Adaptive) and supersample.contrast is not None:
         return _of_contrast(scene, size, suited, **options)
     if len(bands) == 1:
-        sampled = sampled_scene(scene, scene.camera, size, settles=True, **options)
+        sampled = _sampled(scene, scene.camera, size, **options)
         return splatted(sampled, scene, scene.camera, suited, splatter)
     images = []
     for top, rows in bands:
         window = scene.camera.window(size, (top, 0), (rows, size[1]))
-        take = partial(sampled_scene, scene, window, (rows, size[1]), settles=True, **options)
+        take = partial(_sampled, scene, window, (rows, size[1]), **options)
         images.append(suited[0].checkpoint(take, lambda s, w=window: splatted(s, scene, w, suited, splatter)))
     return namespace(*images).concat(images)
+
+
+def _sampled(scene: Scene, window: Camera, size: tuple[int, int], *, capacity: int | None, **options: Any) -> Sampled:
+    """The samples of a window of the image, with a warning if some that are in front find no room."""
+    sampled = sampled_scene(scene, window, size, settles=True, capacity=capacity, **options)
+    if capacity is not None:
+        left_out, row = value_of(sampled.overflow), value_of(sampled.row)
+        # Layers are left out from the deepest on.
+        if left_out is not None and left_out.any() and row is not None and not (row[..., 1:, :, :] >= 0).any():
+            warn(
+                f"capacity is {capacity}, and {int(left_out.max())} samples find no room, some of them in front: the "
+                f"image has holes; give a larger capacity, or None",
+                InputWarning,
+            )
+    return sampled
 
 
 def _of_contrast(

@@ -24,7 +24,7 @@ from typing import Any
 from rts.arguments import quoted
 from rts.arrays import described, dot, is_finite, shape_of, unit
 from rts.camera import Camera
-from rts.engines import engine_of, is_constant, namespace
+from rts.engines import engine_of, is_constant, namespace, value_of
 from rts.errors import InputError
 from rts.footprints import FOOTPRINT
 from rts.gbuffer import GBuffer
@@ -46,6 +46,7 @@ class Silhouette(Shader):
     opaque = True
     uniform = True
     reads = ()
+    reads_theta = ()
 
     def uniform_by(self, theta: Mapping[str, Tree], given: Sequence[str] | None) -> tuple[str, ...]:
         """See `rts.Shader`: nothing."""
@@ -65,6 +66,7 @@ class Normals(Shader):
     opaque = True
     takes_views = True
     reads = ("normal",)
+    reads_theta = ()
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -78,6 +80,7 @@ class Depth(Shader):
     opaque = True
     takes_views = True
     reads = ()
+    reads_theta = ("depth_range",)
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -107,6 +110,13 @@ class Unlit(Shader):
     mip: bool = False
     takes_views = True
     reads = ("color", "uv")
+    reads_theta = ("texture", "color")
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Another base colour may read other entries."""
+        super().__init_subclass__(**options)
+        if "base_color" in vars(cls) and "reads_theta" not in vars(cls):
+            cls.reads_theta = None
 
     def __post_init__(self):
         if not isinstance(self.wrap, str) or self.wrap not in WRAPS:
@@ -166,6 +176,7 @@ class Textured(Unlit):
 
     takes_views = True
     reads = ("uv",)
+    reads_theta = ("texture", "color")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -181,6 +192,7 @@ class Lambert(Unlit):
 
     takes_views = True
     reads = ("normal", "color", "uv")
+    reads_theta = ("texture", "color", "light")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -200,6 +212,7 @@ class BlinnPhong(Unlit):
 
     takes_views = True
     reads = ("normal", "color", "uv")
+    reads_theta = ("texture", "color", "light", "specular", "shininess")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -253,6 +266,9 @@ def _lit(
     if "color" in given:
         colors = _listed(given["color"])
     if "direction" in given:
+        known = value_of(given["direction"])
+        if known is not None and not known.any(axis=-1).all():
+            raise InputError("theta['light']['direction'] is zero; expected vectors towards the lights, of any length")
         directions = _listed(unit(given["direction"]))
     else:
         directions = [camera.to_world(DEFAULT_LIGHT)]

@@ -12,8 +12,8 @@ import numpy as np
 
 from rts.arguments import check_numbers, check_planes, check_positive, quoted
 from rts.arrays import promote, unit
-from rts.engines import namespace
-from rts.errors import InputError
+from rts.engines import namespace, value_of
+from rts.errors import InputError, InputWarning, warn
 from rts.operations.linear import matmul
 from rts.trees import Array
 
@@ -111,23 +111,124 @@ def orthographic(
 def look_at(eye: Any, target: Any, up: Any = (0.0, 1.0, 0.0)) -> Array:
     """(4, 4) view matrix of a camera at `eye` (3,) that faces `target` (3,), world space.
 
+    Where the direction of view is parallel to `up`, +x points to the right; +y where `up` is along x.
+
     Raises:
-        InputError: eye and target coincide, or the direction of view is parallel to `up`.
+        InputError: eye and target coincide, or `up` is zero.
     """
     known = [check_numbers(name, x, (3,)) for name, x in (("eye", eye), ("target", target), ("up", up))]
-    if not any(x is None for x in known):
-        _check_upright(*(np.asarray(x, np.float64) for x in known))
+    values = None if any(x is None for x in known) else [np.asarray(x, np.float64) for x in known]
+    if values is not None:
+        _check_upright(*values)
     xp, (eye, target, up) = promote(eye, target, up)
     back = unit(eye - target)
+    # In most cases it is known that nothing is parallel, and takes no time.
+    if values is None or _is_parallel(values[2], unit(values[0] - values[1])):
+        up = xp.where(_is_parallel(up, back), _level_up(up, back), up)
     right = unit(xp.linalg.cross(up, back))
     linear = xp.stack([right, xp.linalg.cross(back, right), back])
     return affine_matrix(linear, -matmul(linear, eye[:, None])[:, 0])
 
 
 def _check_upright(eye: np.ndarray, target: np.ndarray, up: np.ndarray) -> None:
-    sideways = np.linalg.norm(np.cross(target - eye, up))
-    if not sideways > 1e-12 * np.linalg.norm(target - eye) * np.linalg.norm(up):
+    if (eye == target).all() or not up.any():
         raise InputError(
             f"a camera at {eye.tolist()} that looks at {target.tolist()} has no upright with up = {up.tolist()}; "
             f"move the eye or give another up"
         )
+
+
+def _is_parallel(up: Array, back: Array) -> Any:
+    """Whether two vectors (3,), the second of unit length, are parallel up to rounding."""
+    xp = namespace(up, back)
+    sideways, rounding = xp.linalg.cross(up, back), 4 * float(xp.finfo(up.dtype).eps)
+    return xp.sum(sideways * sideways) <= rounding**2 * xp.sum(up * up)
+
+
+def _level_up(up: Array, back: Array) -> Array:
+    """(3,) upright of a camera that looks along `up` or against it, with +x to its right, or +y."""
+    xp = namespace(up, back)
+    x, y, zero = up * up, back[1:2] * 0 + 1, back[:1] * 0
+    along_x = x[0] > 0.5 * xp.sum(x)
+    right = xp.where(along_x, xp.concat([zero, y, zero]), xp.concat([y, zero, zero]))
+    return xp.linalg.cross(back, right)
+
+
+PARALLEL = 1e-12
+"""Rays are parallel if w changes by less than this share over lengths in which x or y do by one."""
+ROUNDING = 1e-5
+"""What entries of matrices that are to be zero or one may be off by."""
+RADIANS = 2.0
+"""A field of view below this is likely to be one in radians, given for degrees."""
+
+
+def warn_of_radians(fov_y: Any) -> None:
+    """Warn of a field of view that is likely not to be in degrees, where its value is known."""
+    known = value_of(fov_y)
+    if known is not None and (known < RADIANS).all():
+        warn(
+            f"fov_y is {quoted(fov_y)}, and is in degrees: of radians give math.degrees(fov_y); a telephoto lens is "
+            f"seen as it is",
+            InputWarning,
+        )
+
+
+def check_product(matrix: np.ndarray) -> None:
+    """Refuse a matrix (4, 4) that seems to be another product than `projection @ view`.
+
+    In that product clip z and w grow along one axis, and both planes of a perspective one lie before the camera.
+    """
+    # A transposed projection alone may look like another one, but for its scale: views do not scale.
+    rows = _is_product(matrix.T) and _is_unscaled(matrix.T) and not _is_unscaled(matrix)
+    if _is_product(matrix) and not rows:
+        return
+    if _is_product(matrix.T) or (_planes(matrix) is None and _planes(matrix.T) is not None):
+        raise InputError("matrix is transposed, for points that are rows; expected projection @ view: give matrix.T")
+    if _is_other_order(matrix):
+        raise InputError("matrix is view @ projection; expected projection @ view, in this order")
+    if (planes := _planes(matrix)) is not None:
+        raise InputError(
+            f"matrix has a near or far plane behind the camera, at the depth {min(planes):.3g}; expected projection @ "
+            f"view, in this order, with depths from -1 to 1 as in OpenGL"
+        )
+
+
+def is_parallel_product(matrix: np.ndarray) -> bool:
+    """Whether a matrix (4, 4) from the world to clip space has parallel rays."""
+    return bool(np.linalg.norm(matrix[3, :3]) <= PARALLEL * np.linalg.norm(matrix[:2, :3]))
+
+
+def _is_product(matrix: np.ndarray) -> bool:
+    """Whether a matrix may be `projection @ view`."""
+    return is_parallel_product(matrix) or min(_planes(matrix) or (0.0,)) > 0
+
+
+def _is_unscaled(matrix: np.ndarray) -> bool:
+    """Whether clip w grows as fast as depth, or is 1 everywhere."""
+    w = matrix[3, 3:] if is_parallel_product(matrix) else matrix[3, :3]
+    return bool(abs(np.linalg.norm(w) - 1) < ROUNDING)
+
+
+def _planes(matrix: np.ndarray) -> tuple[float, float] | None:
+    """Depths at which clip z is −w and w, as multiples of w's; None where z and w do not grow along one axis."""
+    z, w = matrix[2], matrix[3]
+    length = np.linalg.norm(w[:3])
+    if not length or np.linalg.norm(np.cross(z[:3], w[:3])) > ROUNDING * np.linalg.norm(z[:3]) * length:
+        return None
+    slope = z[:3] @ w[:3] / length**2
+    offset = z[3] - slope * w[3]
+
+    def depth(sign: int) -> float:
+        infinite = abs(slope - sign) <= 1e-6
+        return math.inf if infinite else float(-offset / (slope - sign) / length)
+
+    return depth(-1), depth(1)
+
+
+def _is_other_order(matrix: np.ndarray) -> bool:
+    """Whether a matrix may be `view @ projection` of a perspective one."""
+    columns = matrix[:, [0, 1, 3]]
+    products = columns[:3].T @ columns[:3]
+    lengths = np.sqrt(np.diag(products))
+    apart = np.abs(products - np.diag(lengths**2)) <= ROUNDING * np.outer(lengths, lengths)
+    return bool((np.abs(columns[3]) <= ROUNDING * np.abs(matrix[3, 2])).all() and apart.all())

@@ -1,6 +1,7 @@
 """Which pixels take many samples: those beside outlines, and where colours change."""
 
 import itertools
+import math
 
 import numpy as np
 import pytest
@@ -141,7 +142,8 @@ def test_contrast_is_refused_where_colours_are_not_known():
         ({"samples": 1}, "samples of Adaptive is 1; expected an integer of at least 2"),
         ({"samples": 2.5}, "samples of Adaptive is 2.5"),
         ({"samples": 4, "dilated": 1}, "dilated of Adaptive is 1; expected True, False or None"),
-        ({"samples": 4, "contrast": 0}, "contrast of Adaptive is 0; expected a positive number"),
+        ({"samples": 4, "contrast": 0}, "contrast of Adaptive is 0; expected a positive finite number"),
+        ({"samples": 4, "contrast": math.inf}, "contrast of Adaptive is inf; expected a positive finite number"),
     ],
 )
 def test_what_cannot_be_is_refused(wrong, told):

@@ -1,11 +1,23 @@
 """Cameras: conventions of space, converters from other libraries, derivatives of the constructors."""
 
 import copy
+import math
 import pickle
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, derivative, finite_difference, gradient, moved, rigid, rotation
+from helpers import (
+    ALL,
+    DIFFERENTIABLE,
+    arrays,
+    derivative,
+    finite_difference,
+    gradient,
+    moved,
+    rigid,
+    rotation,
+    to_numpy,
+)
 
 import rts
 from rts import Camera, InputError
@@ -94,6 +106,57 @@ def test_the_view_is_a_rotation_that_puts_the_eye_at_the_origin_and_looks_along_
     np.testing.assert_allclose(moved(view, eye), 0, atol=1e-12)
     np.testing.assert_allclose(moved(view, target), (0, 0, -np.linalg.norm(eye - target)), atol=1e-12)
     np.testing.assert_array_equal(view[3], (0, 0, 0, 1))
+
+
+# The direction of view, `up`, and what is then to the right and on top.
+ALONG_UP = [
+    ((0, -5, 0), (0, 1, 0), (1, 0, 0), (0, 0, -1)),
+    ((0, 5, 0), (0, 3, 0), (1, 0, 0), (0, 0, 1)),
+    ((0, 0, -2), (0, 0, 1), (1, 0, 0), (0, 1, 0)),
+    ((0, 0, -2), (0, 0, -1), (1, 0, 0), (0, 1, 0)),
+    ((4, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, -1)),
+    ((1, 1, 1), (2, 2, 2), (2 / 6**0.5, -1 / 6**0.5, -1 / 6**0.5), (0, -(0.5**0.5), 0.5**0.5)),
+]
+
+
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize("direction, up, right, top", ALONG_UP)
+def test_a_view_along_up_has_x_to_the_right(direction, up, right, top, target):
+    eye = np.array((0.5, -1, 2))
+    given = arrays(target, (eye, eye + direction, np.array(up, np.float64)))
+    view = to_numpy(look_at(*given))
+    np.testing.assert_allclose(view[:2, :3], (right, top), atol=1e-6)
+    np.testing.assert_allclose(view[:3, :3] @ view[:3, :3].T, np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(view @ [*eye, 1], (0, 0, 0, 1), atol=1e-6)
+
+
+@pytest.mark.parametrize("target", DIFFERENTIABLE)
+def test_derivatives_of_a_view_along_up_are_finite(target):
+    weights, target_at = arrays(target, VIEW_WEIGHTS), np.zeros(3)
+    given = arrays(target, {"eye": np.array((0.0, 5, 0)), "target": target_at, "up": np.array((0.0, 1, 0))})
+    found = gradient(target, lambda a: (weights * look_at(a["eye"], a["target"], a["up"])).sum(), given)
+    assert all(np.isfinite(x).all() for x in found.values())
+    # Eye and target that move together move the world alone: −W of the translation, in the world.
+    linear = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
+    np.testing.assert_allclose(found["eye"] + found["target"], -linear.T @ VIEW_WEIGHTS[:3, 3], atol=1e-5)
+
+
+def test_views_near_up_are_continuous():
+    # From in front, and ever steeper: the view comes nearer to that from above.
+    above = look_at((0, 5, 0), (0, 0, 0))
+    for slope in 1e-3, 1e-6, 1e-9, 1e-12:
+        np.testing.assert_allclose(look_at((0, 5, 5 * slope), (0, 0, 0)), above, atol=10 * slope)
+    np.testing.assert_allclose(look_at((5e-9, 5, 0), (0, 0, 0))[:2, :3], [(0, 0, -1), (-1, 0, 0)], atol=1e-8)
+
+
+@pytest.mark.parametrize("make", [Camera.look_at, Camera.perspective])
+def test_a_field_of_view_in_radians_is_warned_of(make):
+    places = ((0, 0, 5), (0, 0, 0)) if make == Camera.look_at else ()
+    for radians in 0.1, np.float32(math.pi / 4), math.pi / 2:
+        with pytest.warns(rts.InputWarning, match=r"fov_y is .*, and is in degrees: of radians give math.degrees"):
+            make(*places, fov_y=radians)
+    make(*places, fov_y=2.0)
+    Camera.from_blender(np.eye(4), SIZE, focal=5000.0)  # Of half a degree, which nobody gave as an angle.
 
 
 @pytest.mark.parametrize("make", [Camera.look_at, lambda *a, **k: Camera.orthographic(*a, height=2.0, **k)])
@@ -457,7 +520,6 @@ def test_project_gradient_is_finite_on_the_plane_of_the_camera(target):
         (lambda: orthographic(0), ("height", "positive")),
         (lambda: orthographic(2, 1, 3.0, 2.0), ("near", "far")),
         (lambda: look_at((1, 2, 3), (1, 2, 3)), ("upright", "[1.0, 2.0, 3.0]")),
-        (lambda: look_at((0, 5, 0), (0, 0, 0)), ("upright", "up")),
         (lambda: look_at((0, 5, 0), (0, 0, 1), (0, 0, 0)), ("upright",)),
         (lambda: look_at((0, 5), (0, 0, 0)), ("eye has shape (2,)", "expected (3,)")),
         (lambda: look_at((0, float("nan"), 1), (0, 0, 0)), ("eye", "nan", "finite")),
@@ -534,6 +596,59 @@ def test_from_mvp_has_the_pixels_depths_and_planes_of_the_camera_whose_product_i
     np.testing.assert_allclose(pixels[:, 2], expected[:, 2], rtol=1e-7)
     np.testing.assert_allclose(found.depth_range(), (near, far), rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(found.view[:3, :3] @ found.view[:3, :3].T, np.eye(3), atol=1e-12)
+
+
+def views():
+    """Poses (4, 4): turned and moved, each alone and both; none that a product with it does not show."""
+    turned = [rotation(axis, angle) for axis, angle in (((1, 2, 3), 40), ((0, 1, 0), 170), ((3, -1, 1), 95))]
+    for linear in (np.eye(3), *turned):
+        for shift in (0.0, 0, -5), (1.0, 2, -3):
+            yield np.block([[linear, np.array(shift)[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+def with_depths(projection, z):
+    """A projection with another row of clip z."""
+    return np.stack([projection[0], projection[1], np.array([0, 0, *z]), projection[3]])
+
+
+LENS = perspective(45, 1.3, 0.1, 100.0)
+PRODUCTS = {
+    "centred": LENS,
+    "off-centre": perspective(30, 1.3, 0.5, 20.0, (0.3, -0.2)),
+    "infinite": with_depths(LENS, (-1, -0.2)),
+    "infinite, reversed": with_depths(LENS, (1, 0.2)),
+    "parallel": orthographic(3, 1.3, 0.1, 10.0),
+    "depths from 0 to 1": with_depths(LENS, (-100 / 99.9, -10 / 99.9)),
+}
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("name", PRODUCTS)
+def test_from_mvp_tells_other_products_apart(name, dtype):
+    for view in views():
+        projection, view = PRODUCTS[name].astype(dtype), view.astype(dtype)
+        Camera.from_mvp(projection @ view)
+        Camera.from_mvp(np.float32(3.7) * (projection @ view))
+        with pytest.raises(InputError, match="matrix is transposed, .* give matrix.T"):
+            Camera.from_mvp((projection @ view).T)
+        turns = not np.array_equal(view[:3, :3], np.eye(3))
+        if name != "parallel" and turns:
+            with pytest.raises(InputError, match="matrix is view @ projection; expected projection @ view"):
+                Camera.from_mvp(view @ projection)
+
+
+@pytest.mark.parametrize("z", [(0.1 / 99.9, 10 / 99.9), (0.0, 0.1)], ids=["finite", "infinite"])
+def test_from_mvp_refuses_depths_from_1_to_0(z):
+    for view in views():
+        with pytest.raises(InputError, match="plane behind the camera, at the depth -.* depths from -1 to 1"):
+            Camera.from_mvp(with_depths(LENS, z) @ view)
+
+
+def test_from_mvp_of_depths_from_0_to_1_has_the_same_picture():
+    camera = Camera.look_at((0.5, 1, 3), (0, 0, 0), fov_y=45, near=0.1, far=100, aspect=1.3)
+    found = Camera.from_mvp(PRODUCTS["depths from 0 to 1"] @ camera.view)
+    points = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+    np.testing.assert_allclose(found.project(points, SIZE), camera.project(points, SIZE), rtol=1e-9)
 
 
 def test_from_mvp_keeps_the_order_of_depth_of_a_clip_space_picture():
@@ -709,7 +824,7 @@ NONSENSE = {
     ),
     "singular pose": (lambda a: Camera.from_blender(a(np.diag([1.0, 1, 0, 1])), SIZE, focal=9.0), "is singular"),
     "singular product": (lambda a: Camera.from_mvp(a(np.diag([1.0, 0, 1, 1]))), "matrix is singular"),
-    "upright": (lambda a: Camera.look_at(a(np.array([0.0, 4, 0])), (0, 0, 0)), "has no upright"),
+    "upright": (lambda a: Camera.look_at(a(np.array([0.0, 4, 0])), (0, 0, 0), (0, 0, 0)), "has no upright"),
     "orthographic": (
         lambda a: Camera.orthographic(a(np.array([0.0, 1, 4])), (0, 0, 0), height=2.0, aspect=1.5).to_opencv(SIZE),
         "the camera is orthographic; to_opencv needs a perspective one",

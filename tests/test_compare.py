@@ -15,13 +15,15 @@ from hypothesis import strategies as st
 
 import rts
 from rts import registry
+from rts.cli.comparison import summary
 from rts.diagnostics import compare
 from rts.diagnostics.comparison import measure, truth, turns
+from rts.diagnostics.comparison.compare import Comparison
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.scene import moving
 from rts.diagnostics.comparison.scores import loss_weights, scores
 from rts.diagnostics.comparison.search import Search
-from rts.diagnostics.comparison.settings import Setting, _no_worse, limited, worth_timing
+from rts.diagnostics.comparison.settings import Setting, _no_worse, engines, limited, worth_timing
 from rts.diagnostics.tune import tune
 from rts.engines import engine_named
 from rts.errors import InputError, PluginError, ToleranceWarning
@@ -675,6 +677,15 @@ class TestMisuse:
         with pytest.raises(PluginError, match="no engine with derivatives is installed"):
             compare("thin wires", progress=False)
 
+    def test_engines_without_derivatives(self):
+        with pytest.raises(
+            InputError, match=r"engines is \['numpy'\], without derivatives, .*; expected some of torch"
+        ):
+            compare("thin wires", engines=["numpy"], progress=False)
+        found, left_out = engines(["numpy", "torch"])
+        assert [engine.name for engine in found] == ["torch"]
+        assert left_out == ["engine 'numpy': it has no derivatives"]
+
     def test_python_file(self, tmp_path):
         path = tmp_path / "mine.py"
         path.write_text("def other():\n    return None\n")
@@ -726,6 +737,31 @@ class TestCommandLine:
     def test_list(self):
         code, told = run("compare", "list")
         assert code == 0 and "thin wires" in told and "meshes/bunny.obj" in told
+
+    def test_missing_charts_are_told_before_anything_is_measured(self, monkeypatch, tmp_path):
+        def interrupted(*args, **options):
+            raise KeyboardInterrupt
+
+        monkeypatch.setattr("rts.diagnostics.compare", interrupted)
+        for missing, said in (
+            (["matplotlib"], "no PNG, which needs matplotlib"),
+            (["plotly"], "no HTML, which needs plotly"),
+            (["matplotlib", "plotly"], "no PNG or HTML, which needs matplotlib and plotly"),
+        ):
+            with monkeypatch.context() as without:
+                for package in missing:
+                    without.setitem(sys.modules, package, None)
+                code, told = run("compare", "thin wires", "-o", tmp_path)
+            assert code == 130 and told.startswith(
+                f"{said}: pip install 'rasterize-then-splat[plots]'. What is measured"
+            )
+
+    def test_times_are_written_without_powers_of_ten(self):
+        for ms, text in {0.25: "0.25 ms", 47.53: "47.5 ms", 999.7: "1 s", 4750.0: "4.75 s", 4.75e6: "4750 s"}.items():
+            settings = Setting("visible", 2, 1, "", "raster", "torch")._asdict()
+            row = {"mode": "x", "error": 0.0, "ms": {"median": ms}, "settings": settings}
+            table = summary(Comparison({"name": "s"}, {}, {"x": {}}, [row], []))
+            assert [*table.columns[1].cells] == [f"visible K=2 raster torch\n{text}"]
 
     def test_tune(self, model):
         code, told = run("tune", model, "--size", SIDE, "--mode", "translation", "--tolerance", 0.5)

@@ -789,6 +789,7 @@ SHADERS = {
     "it_reads_what_it_says": {
         "color unsaid": shading(reads=("uv",)),
         "normal unsaid": shading(by_length, reads=("color",)),
+        "θ unsaid": shading(reads_theta=("texture",)),
     },
     "samples_of_several_views_are_shaded_as_by_each": {
         "one view": one_view,

@@ -540,6 +540,20 @@ def test_normal_equations_of_another_form_are_refused(target):
         (np.full((*SIZE, 3), np.inf), {}, "target holds NaN or infinity"),
         (np.zeros(SIZE), {"weights": np.full(SIZE, np.nan)}, "weights holds NaN or infinity"),
         (np.zeros(SIZE), {"weights": "mask"}, "weights is 'mask'; expected an array"),
+        (np.full(SIZE, 255.0), {}, r"target's alpha goes up to 255; expected 0 to 1: divide one from 0 to 255 by 255"),
+        (np.full((*SIZE, 4), 255.0), {}, "target's alpha goes up to 255"),
+        (np.full((*SIZE, 6), 7.0), {"channels": 5}, "target's alpha goes up to 7"),
+        (np.zeros(SIZE), {"weights": np.full(SIZE, -0.5)}, "weights go down to -0.5; expected none below zero"),
+        (np.zeros(SIZE), {"weights": np.zeros(SIZE)}, "weights are all zero, so that nothing is compared"),
+        (np.zeros(SIZE), {"weights": np.zeros(SIZE, bool)}, "weights are all zero"),
+        (np.zeros((2, *SIZE)), {"camera": [CAMERA] * 2, "weights": np.zeros((2, *SIZE))}, "weights are all zero"),
+        (np.zeros(SIZE), {"camera": [CAMERA] * 2}, "there are 2 cameras for a target of one view; expected targets"),
+        (np.zeros(SIZE), {"camera": rts.Camera.stack([CAMERA] * 3)}, "there are 3 cameras for a target of one view"),
+        (
+            np.zeros((2, *SIZE)),
+            {"camera": [CAMERA] * 3},
+            "there are 3 cameras for targets of 2 views; expected as many",
+        ),
         (np.zeros(SIZE), {"background": [np.nan, 0.0, 0.0]}, "background holds NaN or infinity"),
         (np.zeros(SIZE), {"scene": None}, "scene is None; expected a function: parameters → parts"),
         (np.zeros(SIZE), {"scene": mesh(*box(0.5))}, "scene is Part.*; expected a function"),
@@ -556,6 +570,31 @@ def test_wrong_arguments_say_what_was_expected(target, options, expected):
     with pytest.raises(InputError, match=expected) as error:
         rts.ImageResiduals(given.pop("scene"), given.pop("camera"), given.pop("size"), target, **given)
     assert "\n" not in str(error.value)
+
+
+@targets
+def test_colours_far_beyond_one_are_warned_of_and_features_are_not(target):
+    picture = arrays(target, np.full((*SIZE, 3), 254.0))
+    with pytest.warns(
+        rts.InputWarning, match="target's colours go up to 254, .* divide a picture from 0 to 255 by 255"
+    ):
+        rts.ImageResiduals(scene, CAMERA, SIZE, picture)
+    rts.ImageResiduals(scene, CAMERA, SIZE, picture / 200)  # A filter may overshoot.
+    features = arrays(target, np.concatenate([np.full((*SIZE, 5), 254.0), np.ones((*SIZE, 1))], axis=2))
+    rts.ImageResiduals(scene, CAMERA, SIZE, features, channels=5)
+    rts.ImageResiduals(scene, CAMERA, SIZE, features[..., :5], channels=5)
+    # A view may be left out of a fit.
+    masks = arrays(target, np.stack([np.zeros(SIZE), np.ones(SIZE)]))
+    rts.ImageResiduals(scene, [CAMERA] * 2, SIZE, masks, weights=masks)
+
+
+@pytest.mark.parametrize("name", ["target", "weights", "background"])
+def test_what_requires_a_gradient_is_warned_of(name):
+    torch = pytest.importorskip("torch")
+    given = {"target": torch.zeros(SIZE), "weights": torch.ones(SIZE), "background": torch.ones(3)}
+    given[name].requires_grad_(True)
+    with pytest.warns(rts.InputWarning, match=f"^{name} requires a gradient, .* as a constant; give {name}.detach"):
+        rts.ImageResiduals(scene, CAMERA, SIZE, **given)
 
 
 @targets

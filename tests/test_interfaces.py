@@ -194,6 +194,14 @@ def test_a_method_that_is_one_letter_off_is_refused_when_first_used(base, name, 
         show(part, **options)
 
 
+def test_an_update_without_a_prepare_is_refused_where_the_class_is_made():
+    own = {"update": method, "rasterize": method}
+    with pytest.raises(rts.PluginError, match="^Lone has an update, .* and no prepare; write prepare, or leave update"):
+        type("Lone", (rts.TriangleSampler,), own)
+    complete = type("Complete", (rts.TriangleSampler,), {**own, "prepare": method})
+    assert type("Derived", (complete,), {"update": method}).follows
+
+
 def test_a_duck_typed_class_is_read_as_closely():
     class Duck(Ellipsoid):
         def read(self, theta):

@@ -273,6 +273,17 @@ def test_a_misspelt_name_lists_the_names_and_suggests_one():
     assert "did you mean 'raster'?" in message
 
 
+def test_a_misspelt_shader_is_refused_where_the_part_is_made_and_nothing_is_imported():
+    loaded = modules_after("import rts; rts.Part(None, {}, 'lambert').replace(shader='radiance')")
+    assert not {m for m in loaded if m.startswith(("rts_backends", "rts_surfaces"))} and not loaded & set(HEAVY)
+    part = rts.Part(None, {}, "lambert")
+    for make in lambda: rts.Part(None, {}, "lamber"), lambda: part.replace(shader="lamber"):
+        with pytest.raises(rts.InputError) as error:
+            make()
+        assert "no shader named 'lamber'; there are blinn_phong, " in one_line(error)
+        assert "did you mean 'lambert'?" in one_line(error)
+
+
 def test_a_name_like_no_other_gets_no_suggestion():
     with pytest.raises(rts.InputError) as error:
         rts.plugin("rts.samplers", "qqqqqq")

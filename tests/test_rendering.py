@@ -11,6 +11,7 @@ from helpers import (
     DIFFERENTIABLE,
     FRONT,
     SIZE,
+    TORCH,
     arrays,
     box,
     gradient,
@@ -26,7 +27,7 @@ from helpers import (
 
 import rts
 from rts import Camera, Part
-from rts.shading import Textured
+from rts.shading import Lambert, Textured
 from rts.testing.compatibility import APRON
 
 pytestmark = pytest.mark.rendering
@@ -147,6 +148,7 @@ def test_a_mirroring_transform_keeps_the_outside_outside(target):
     assert image[..., 3].sum() > 50
 
 
+@pytest.mark.filterwarnings("ignore:part 0 is closed and wound inside out:rts.InputWarning")
 def test_culling_hides_the_inside_and_nothing_else():
     vertices, faces = icosphere(2)
     outside = mesh_part((vertices, faces), cull="back")
@@ -303,7 +305,7 @@ BAD = {
         ("splatter", "mean 'multi'"),
     ),
     "unknown shader": (
-        lambda: rts.render(PART.replace(shader="lambart"), CAMERA, SIZE),
+        lambda: PART.replace(shader="lambart"),
         ("shader", "mean 'lambert'"),
     ),
     "cull typo": (lambda: PART.replace(cull="backs"), ("cull", "'backs'", '"back"')),
@@ -458,6 +460,17 @@ def test_plain_lists_of_numbers_are_arrays():
     )
 
 
+@pytest.mark.parametrize("target", ["numpy", *TORCH])
+def test_samples_in_front_that_find_no_room_are_warned_of(target):
+    part = PART.replace(theta=arrays(target, dict(PART.theta)))
+    for options in {}, {"supersample": 2}:
+        with pytest.warns(rts.InputWarning, match="capacity is 1, and [0-9]+ samples find no room, .* image has holes"):
+            rts.render(part, CAMERA, SIZE, capacity=1, **options)
+    # Hidden ones are left out first, as it is documented.
+    row = rts.sample(part, CAMERA, SIZE).row
+    rts.render(part, CAMERA, SIZE, capacity=int((row[0] >= 0).sum()) + 5)
+
+
 # ------------------------------------------------------------------------- what one call leaves to the next
 
 
@@ -521,3 +534,135 @@ def test_a_projective_transform_is_refused():
     projective[3] = [0, 0, 0.5, 1]
     with pytest.raises(rts.InputError, match="last row"):
         rts.render(PART.replace(transform=projective), CAMERA, SIZE)
+
+
+# ------------------------------------------------------------------------------------- what is wrong in silence
+
+TEXTURED = {"uv": UV, "texture": np.ones((2, 2, 3), np.float32), "normals": BOX[0], "colors": np.abs(BOX[0])}
+LIGHT = {"direction": np.array((0.0, 1, 1)), "ambient": np.full(3, 0.5)}
+# Shader, name and what is meant by it.
+MISSPELT = [
+    ("lambert", "lights", "light"),
+    ("lambert", "Light", "light"),
+    ("unlit", "colour", "color"),
+    ("silhouette", "colour", "colors"),
+    ("blinn_phong", "shinyness", "shininess"),
+    ("unlit", "uvs", "uv"),
+    ("unlit", "textures", "texture"),
+    ("normals", "normal", "normals"),
+    ("depth", "depthrange", "depth_range"),
+]
+
+
+@pytest.mark.parametrize("shader, name, meant", MISSPELT)
+def test_entries_that_nobody_reads_are_warned_of_with_the_nearest_name(shader, name, meant):
+    theta = {"vertices": BOX[0], name: np.ones(3, np.float32)}
+    part = Part(Mesh(BOX[1]), theta, shader)
+    with pytest.warns(rts.InputWarning) as found:
+        rts.render([PART, part], CAMERA, SIZE)
+    assert [str(w.message) for w in found] == [
+        f"theta[{name!r}] of part 1 is not read; did you mean {meant!r}? rts.explain lists all such entries"
+    ]
+    assert f"theta[{name!r}] is not read; did you mean {meant!r}?" in rts.explain(part, CAMERA)[0].remarks
+
+
+@pytest.mark.parametrize("shader", ["silhouette", "normals", "depth", "unlit", "textured", "lambert", "blinn_phong"])
+def test_what_files_bring_and_other_shaders_read_is_not_warned_of(shader):
+    more = {"light": LIGHT, "specular": np.ones(3), "shininess": np.array(9.0), "depth_range": np.array((1.0, 9.0))}
+    offsets = {"my_offsets": np.zeros(3), "texture_2": np.zeros(3)}
+    part = Part(Mesh(BOX[1]), {"vertices": BOX[0], "color": np.ones(3), **TEXTURED, **more, **offsets}, shader)
+    rts.render(part, CAMERA, SIZE)
+    remarks = rts.explain(part, CAMERA)[0].remarks
+    assert "theta['my_offsets'] is not read" in remarks and "theta['texture_2'] is not read" in remarks
+    assert ("theta['light'] is not read" in remarks) == (shader not in ("lambert", "blinn_phong"))
+
+
+def test_shaders_that_do_not_say_what_they_read_are_not_spoken_of():
+    def shader(theta, gbuffer, camera):
+        return np.ones((len(gbuffer["position"]), 4)) * theta["colour"][0]
+
+    class Tinted(Lambert):
+        def base_color(self, theta, gbuffer):
+            return np.ones_like(gbuffer["position"]) * theta["colour"], np.ones_like(gbuffer["position"][:, :1])
+
+    for own in shader, Tinted():
+        part = Part(Mesh(BOX[1]), {"vertices": BOX[0], "colour": np.ones(3, np.float32)}, own)
+        rts.render(part, CAMERA, SIZE)
+        assert rts.explain(part, CAMERA)[0].remarks == ()
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_explain_at_a_size_observes_what_functions_read(target):
+    def shader(theta, gbuffer, camera):
+        tint = theta.get("tint", {"color": 1.0})["color"] * (2 if "double" in theta else 1)
+        return gbuffer["position"][:, [0, 0, 0, 0]] * 0 + tint
+
+    theta = {"vertices": BOX[0], "tint": {"color": np.float32(0.5)}, "tints": np.ones(3), "Double": np.ones(1)}
+    part = Part(Mesh(BOX[1]), arrays(target, theta), shader)
+    (lambert, own) = rts.explain([PART.replace(shader="lambert"), part], CAMERA, SIZE)
+    assert lambert.remarks == ()
+    assert {*own.remarks} == {"theta['tints'] is not read", "theta['Double'] is not read; did you mean 'double'?"}
+
+    def all_of_it(theta, gbuffer, camera):
+        return shader({**theta}, gbuffer, camera)
+
+    assert rts.explain(part.replace(shader=all_of_it), CAMERA, SIZE)[0].remarks == ()
+
+
+def seams(vertices, faces):
+    """A mesh whose triangles share no vertices."""
+    return vertices[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
+
+
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize("name", ["sphere", "far away", "with seams", "mirrored box", "with a hollow"])
+def test_closed_meshes_that_are_wound_inside_out_are_warned_of_once(name, target):
+    vertices, faces = icosphere(2)
+    if name == "mirrored box":  # A transform that mirrors keeps the outside; vertices that are mirrored do not.
+        vertices, faces = BOX[0] * np.float32([-1, 1, 1]), BOX[1][:, ::-1]
+    elif name == "far away":
+        vertices = vertices + np.float32([0, 0, -30])
+    elif name == "with seams":
+        vertices, faces = seams(vertices, faces)
+    elif name == "with a hollow":
+        vertices = np.concatenate([vertices, 0.5 * vertices])
+        faces = np.concatenate([faces, faces[:, ::-1] + len(vertices) // 2])
+    given, inward = arrays(target, vertices), faces[:, ::-1]
+    for right in mesh_part((given, faces), cull="back"), mesh_part((given, inward)):
+        rts.render(right, CAMERA, SIZE)
+        assert rts.explain(right, CAMERA)[0].remarks == ()
+    wrong = mesh_part((given, inward), cull="back")
+    with pytest.warns(rts.InputWarning, match="part 0 is closed and wound inside out: .*; give it faces"):
+        rts.render(wrong, CAMERA, SIZE)
+    rts.render(wrong, CAMERA, SIZE)
+    assert "is closed and wound inside out" in rts.explain(wrong, CAMERA)[0].remarks[0]
+
+
+def test_rooms_and_open_meshes_may_be_wound_inwards():
+    vertices, faces = icosphere(2)
+    room = mesh_part((9 * vertices, faces[:, ::-1]), cull="back")
+    rts.render(room, CAMERA, SIZE)
+    # Half a sphere, a tube that is open at both ends, and a sphere with one triangle turned.
+    half, tube = faces[(vertices[faces][..., 2] > 0).all(axis=1)], box()[1][:8]
+    turned = np.concatenate([faces[:1], faces[1:, ::-1]])
+    pairs = [(v, f) for v, f in ((vertices, half), (box()[0], tube)) for f in (f, f[:, ::-1])]
+    for v, f in [*pairs, (vertices, turned)]:
+        part = mesh_part((v, f), cull="back")
+        rts.sample(part, CAMERA, SIZE)
+        assert rts.explain(part, CAMERA)[0].remarks == ()
+
+
+def test_surfaces_that_cannot_be_remembered_are_not_looked_at():
+    class Unhashable(Mesh):
+        __hash__ = None
+
+    vertices, faces = icosphere(1)
+    rts.render(Part(Unhashable(faces[:, ::-1]), {"vertices": vertices}, cull="back"), CAMERA, SIZE)
+
+
+def test_vertices_that_are_traced_are_not_looked_at():
+    jax = pytest.importorskip("jax")
+    vertices, faces = icosphere(1)
+    wrong = mesh_part((vertices, faces[:, ::-1]), cull="back")
+    draw = jax.jit(lambda v: rts.render(wrong.replace(theta={"vertices": v}), CAMERA, SIZE))
+    assert draw(jax.numpy.asarray(vertices))[..., 3].sum() > 10

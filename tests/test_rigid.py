@@ -1,7 +1,10 @@
 """The compiled rigid matrix of torch against the array code."""
 
+import math
+
 import numpy as np
 import pytest
+from helpers import ALL, arrays
 
 import rts
 from rts.operations.projection import projective_map
@@ -103,3 +106,11 @@ def test_the_older_batches_of_torch_are_known(strategy):
     for f, x in functions.values():
         found = torch.autograd.functional.jacobian(f, x, vectorize=True, strategy=strategy)
         torch.testing.assert_close(found, torch.func.jacrev(f)(x))
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_a_pose_or_center_of_nan_is_refused(target):
+    for name, wrong in ("pose", [0, 0, math.nan, 0, 0, 0]), ("center", [0, math.inf, 0]):
+        given = arrays(target, {"pose": np.zeros(6), "center": np.zeros(3), name: np.array(wrong)})
+        with pytest.raises(rts.InputError, match=f"{name} .*; expected finite numbers"):
+            rts.rigid(given["pose"], given["center"])

@@ -352,6 +352,7 @@ def test_a_mesh_far_from_the_origin_has_no_holes(sampler, offset, lens):
     np.testing.assert_allclose(found.depth[inside], expected.depth[inside], rtol=1e-4)
 
 
+@pytest.mark.filterwarnings("ignore::rts.InputWarning")  # A telephoto lens.
 def test_a_camera_far_from_the_mesh_sees_it_as_the_reference_does(sampler):
     vertices, faces = icosphere(3)
     camera = Camera.look_at((1e4, 2e4, 3e4), (0, 0, 0), fov_y=0.004, aspect=1.25, near=1e3, far=1e5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import ALL, DIFFERENTIABLE, FRONT, TORCH, arrays, gradient, mesh_part, moved, quad, rigid, show, to_numpy
 
-from rts import Camera, GBuffer
+from rts import Camera, GBuffer, InputError
 from rts.shading import BlinnPhong, Depth, Lambert, Normals, Silhouette, Unlit, sample_texture
 
 pytestmark = pytest.mark.rendering
@@ -133,6 +133,14 @@ def test_lambert_adds_several_lights_and_saturates_at_one():
         "ambient": np.zeros(3),
     }
     np.testing.assert_allclose(shade(Lambert(), light=both), (0.1, 1.0, 0.4, 1), atol=1e-12)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_a_light_of_direction_zero_is_refused(target):
+    for direction in np.zeros(3), np.array([(0, 0, 1.0), (0, 0, 0)]):
+        for shader in Lambert(), BlinnPhong():
+            with pytest.raises(InputError, match=r"theta\['light'\]\['direction'\] is zero; expected vectors"):
+                shade(shader, light=arrays(target, {"direction": direction}))
 
 
 def test_the_default_light_is_fixed_to_the_camera():

@@ -193,7 +193,7 @@ VIEWS = {
     "near": Camera.look_at((0.9, 0.3, 0.9), (0, 0.3, 0), fov_y=30),
     "inside": Camera.look_at((0, 0.2, 0), (0.4, 0.3, 0.1), fov_y=70, near=1e-3),
     "parallel": Camera.orthographic((1.5, 1.8, 3.0), (0, 0, 0), height=3.0),
-    "far": Camera.look_at((100.0, 150.0, 200.0), (0, 0, 0), fov_y=1.0),
+    "far": Camera.look_at((100.0, 150.0, 200.0), (0, 0, 0), fov_y=2.0),
 }
 
 

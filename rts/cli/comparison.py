@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
+
 from rich.table import Table
 
 from rts.diagnostics.comparison import builtin
 from rts.diagnostics.comparison.compare import Comparison
 from rts.diagnostics.comparison.front import LEVELS
-from rts.diagnostics.comparison.style import label
+from rts.diagnostics.comparison.style import label, time_label
 
 
 def scene_list() -> Table:
@@ -18,6 +20,18 @@ def scene_list() -> Table:
     return table
 
 
+def missing_charts() -> str | None:
+    """What cannot be drawn for want of a package, in a line; None where all can."""
+    kinds = {"matplotlib": "PNG", "plotly": "HTML"}
+    missing = [package for package in kinds if find_spec(package) is None]
+    if not missing:
+        return None
+    return (
+        f"no {' or '.join(kinds[package] for package in missing)}, which needs {' and '.join(missing)}: pip install "
+        f"'rasterize-then-splat[plots]'. What is measured is kept: the same command draws it later"
+    )
+
+
 def summary(comparison: Comparison) -> Table:
     """For each mode the fastest setting within some errors."""
     title = f"{comparison.scene['name']}: fastest settings by the error of derivatives"
@@ -26,6 +40,6 @@ def summary(comparison: Comparison) -> Table:
         cells = []
         for error in LEVELS:
             row = comparison.best(mode, error)
-            cells.append("none" if row is None else f"{label(row)}\n{row['ms']['median']:.3g} ms")
+            cells.append("none" if row is None else f"{label(row)}\n{time_label(row['ms']['median'])}")
         table.add_row(mode, *cells)
     return table

@@ -432,7 +432,7 @@ def compare(
 
     Writes SCENE.json, SCENE.png and SCENE.html, which is interactive. A run that is interrupted goes on where it was.
     """
-    from rts.cli.comparison import scene_list, summary
+    from rts.cli.comparison import missing_charts, scene_list, summary
     from rts.diagnostics import compare as measured
 
     if scene == "list":
@@ -442,6 +442,8 @@ def compare(
     options: dict[str, Any] = {name: value or None for name, value in wanted.items()}
     options["supersample"] = [_supersample(text) for text in supersample or []] or None
     shape = None if size is None else _size(size)
+    if (missing := missing_charts()) is not None:
+        _say(escape(missing))
     with _interrupted("what was measured is kept: the same command goes on from there"):
         found = measured(
             scene, size=shape, peers=peers, quick=quick, surface=surface, output=output, fresh=fresh, **options
@@ -450,8 +452,6 @@ def compare(
     for line in found.left_out:
         _say(escape(f"left out: {line}"))
     _say_written(found.files(output))
-    if len(found.files(output)) < 3:
-        _say("no charts, which need matplotlib and plotly: pip install 'rasterize-then-splat\\[plots]'")
 
 
 @app.command(epilog="Example: rts tune bunny.obj --tolerance 0.05 --mode translation --mode rotation")
@@ -466,13 +466,14 @@ def tune(
 ) -> None:
     """Find the cheapest settings whose derivatives are accurate enough on a scene, and say why."""
     import rts
+    from rts.diagnostics.comparison.style import time_label
 
     shape, chosen = None if size is None else _size(size), None if engine == "auto" else engine
     options: dict[str, Any] = dict(tolerance=tolerance, budget_s=budget, modes=modes or None)
     with _interrupted("the truth is kept, other measurements are not"):
         found = rts.tune(scene, size=shape, engine=chosen, surface=surface, **options)
     _say(escape(f"rts.render(parts, camera, size, {', '.join(f'{k}={v!r}' for k, v in found.settings.items())})"))
-    _say(f"error {100 * found.error:.2g} %, {1e3 * found.seconds:.3g} ms for a render and gradient")
+    _say(f"error {100 * found.error:.2g} %, {time_label(1e3 * found.seconds)} for a render and gradient")
     if found.rate:
         _say(escape(f"with surfaces of {found.rate}: rts.tune(...).parts and .scene have them"))
     for reason in found.reasons:

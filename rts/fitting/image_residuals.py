@@ -31,6 +31,7 @@ from rts.fitting.least_squares import flatten, normal_equations
 from rts.fitting.losses import Loss
 from rts.fitting.names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
+from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
 from rts.interfaces import Residuals, Splatter
 from rts.parts import CheckedPart, Part
 from rts.records import ArraySpec, Fine, Splats
@@ -87,7 +88,11 @@ class ImageResiduals(Residuals):
 
     Raises:
         InputError: an argument of the wrong kind, shapes that do not fit, integers as target, or a target, weights or
-            background that are not finite; another `loss`, or a scale that is no number from 1e-10 to 1e10.
+            background that are not finite; alpha from 0 to 255; weights below zero, or all zero; another `loss`, or a
+            scale that is no number from 1e-10 to 1e10.
+
+    Warns:
+        InputWarning: the target's colours are far beyond 1; or target, weights or background require a gradient.
     """
 
     def __init__(
@@ -127,9 +132,18 @@ class ImageResiduals(Residuals):
         self._view: int | None = None
         self._views: list[ImageResiduals] = []
         several = camera is not None and (not isinstance(camera, Camera) or camera.is_stacked)
+        cameras = len(check_cameras(camera)) if several else None
+        warn_of_gradients({"target": target, "weights": weights, "background": background})
         if (count := _view_count(target, self.size, several)) is None:
             self._take(target, weights)
+            refuse_zero([self._weights])
+            if several:
+                raise InputError(
+                    f"there are {cameras} cameras for a target of one view; expected targets (B, H, W, ·), one for each"
+                )
             return
+        if cameras not in (None, count):
+            raise InputError(f"there are {cameras} cameras for targets of {count} views; expected as many")
         for b, (own, factors) in enumerate(zip(target, _of_views(weights, count), strict=True)):
             view = copy(self)
             view._view, view._views = b, []
@@ -137,6 +151,7 @@ class ImageResiduals(Residuals):
             self._views.append(view)
         if len(kinds := {tuple(view._target.shape[2:]) for view in self._views}) > 1:
             raise InputError(f"targets of views have the channels {sorted(kinds)}; expected one kind for all views")
+        refuse_zero([view._weights for view in self._views])
 
     @property
     def loss(self) -> Loss:  # pyright: ignore[reportIncompatibleVariableOverride]  # Never None, nor set.
@@ -501,7 +516,9 @@ def _checked_target(target: Any, size: tuple[int, int], channels: int) -> tuple[
         )
     check_floating("target", target)
     _check_finite("target", target)
-    return target, shape[2] if len(shape) > 2 else 1
+    count = shape[2] if len(shape) > 2 else 1
+    check_range(target, count, channels)
+    return target, count
 
 
 def _checked_weights(weights: Any, shape: tuple[int, ...], size: tuple[int, int]) -> Array | None:
@@ -516,6 +533,8 @@ def _checked_weights(weights: Any, shape: tuple[int, ...], size: tuple[int, int]
         return xp.astype(weights, xp.float32)
     check_floating("weights", weights)
     _check_finite("weights", weights)
+    if (least := -largest(-weights)) < 0:
+        raise InputError(f"weights go down to {least:g}; expected none below zero: only their squares count")
     return weights
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rts.arguments import check_numbers
-from rts.arrays import promote, shape_of
+from rts.arrays import is_finite, promote, shape_of
 from rts.engines import engine_of, is_constant, namespace
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
@@ -28,7 +28,7 @@ def rigid(pose: Any, center: Any = ORIGIN) -> Array:
         (4, 4), usable as `Part.transform`.
 
     Raises:
-        InputError: the pose has another shape.
+        InputError: the pose has another shape, or is not finite.
     """
     if shape_of(pose) != (6,):
         check_numbers("pose", pose, (6,))
@@ -39,6 +39,9 @@ def rigid(pose: Any, center: Any = ORIGIN) -> Array:
     elif shape_of(center) != (3,):
         check_numbers("center", center, (3,))
     _, (pose, center) = promote(pose, center)
+    for name, value in ("pose", pose), ("center", center):
+        if not is_finite(value):
+            raise InputError(f"{name} of rts.rigid holds NaN or infinity; expected finite numbers")
     return RIGID(pose, center)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -42,9 +43,10 @@ class Adaptive:
             )
         if self.dilated is not None and not isinstance(self.dilated, bool):
             raise InputError(f"dilated of Adaptive is {quoted(self.dilated)}; expected True, False or None")
-        if self.contrast is not None and not (is_real(self.contrast) and 0 < self.contrast):
+        if self.contrast is not None and not (is_real(self.contrast) and 0 < self.contrast < math.inf):
             raise InputError(
-                f"contrast of Adaptive is {quoted(self.contrast)}; expected a positive number, such as 0.2, or None"
+                f"contrast of Adaptive is {quoted(self.contrast)}; expected a positive finite number, such as 0.2, "
+                f"or None"
             )
         object.__setattr__(self, "samples", int(self.samples))
 

@@ -29,6 +29,7 @@ class Choice(NamedTuple):
         samples: how many samples are taken, at a size that is given; None where that is not known.
         fine: how many of them are fine ones, of `rts.Adaptive`; None without.
         active: how many pixels of the image take fine samples, for all parts together; None without.
+        remarks: what looks like a mistake, a line each: entries of θ that nobody reads, a mesh wound inside out.
     """
 
     sampler: str
@@ -36,6 +37,7 @@ class Choice(NamedTuple):
     samples: int | None = None
     fine: int | None = None
     active: int | None = None
+    remarks: tuple[str, ...] = ()
 
 
 def choose(part: Part, *, static: bool) -> Choice:

@@ -27,7 +27,7 @@ def why_empty(parts: Sequence[CheckedPart], camera: Camera) -> str:
 def _cause(part: CheckedPart, camera: Camera) -> str:
     if not isinstance(part.surface, TriangleSurface):
         return "no ray meets {}, or its shader gives an alpha of 0"
-    known = _known((part.surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))
+    known = known_tree((part.surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))
     if known is None:
         return "{} is not in sight, or its shader gives an alpha of 0"
     inputs, local = known
@@ -48,7 +48,7 @@ def out_of_view(part: CheckedPart, camera: Camera) -> str | None:
     """Where a part lies if not in the view, beginning with a verb; None where some of it may be, or nobody knows."""
     if not isinstance(part.surface, TriangleSurface):
         return None
-    known = _known((part.surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))
+    known = known_tree((part.surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))
     if known is None:
         return None
     inputs, local = known
@@ -73,7 +73,7 @@ def _outside(proxy: Proxy, local: Camera) -> str | None:
     return None
 
 
-def _known(tree: Tree) -> Tree | None:
+def known_tree(tree: Tree) -> Tree | None:
     """A tree with NumPy arrays, None if one of them is traced or of a batch."""
     found = []
 

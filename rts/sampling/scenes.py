@@ -25,8 +25,10 @@ from rts.sampling.pruning import Everything, as_needed, needed_by, planned, prun
 from rts.sampling.strips import Grid, at_cells
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.sampling.validation import check_samples
+from rts.sampling.winding import warn_of_winding
 from rts.splatting.visible import Visible
 from rts.trees import Array, Tree
+from rts.unread import warn_of_unread
 
 
 @uncompiled
@@ -113,6 +115,8 @@ class Scene(NamedTuple):
         """The scene of what the user gave."""
         prepared = isinstance(parts, PreparedParts)
         checked, camera = check_scene(parts.parts if prepared else parts, camera)
+        warn_of_unread(checked)
+        warn_of_winding(checked, camera)
         chosen = parts.samplers if prepared else [check_sampler(sampler)] * len(checked)
         entries = parts.entries if prepared else [None] * len(checked)
         return cls(checked, camera, chosen, entries, suiting_scene(checked, camera, engine=engine))

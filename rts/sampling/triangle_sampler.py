@@ -12,7 +12,7 @@ import numpy as np
 from rts.adapting import adapted, unwrapped
 from rts.camera import Camera
 from rts.engines import engine_of, stopped
-from rts.errors import InputError
+from rts.errors import InputError, PluginError
 from rts.interfaces import AnyNeeded, Needed, Sampler, TriangleSurface, as_surface
 from rts.parts import Part
 from rts.records import ArraySpec, Fragments, Proxy, Samples
@@ -56,6 +56,15 @@ class TriangleSampler(Sampler):
     tells_facing = True
     _keeper: Keeper
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Refuse what would never be called."""
+        super().__init_subclass__(**options)
+        if cls.follows and not cls.builds:
+            raise PluginError(
+                f"{cls.__qualname__} has an update, which adapts what prepare built, and no prepare; write prepare, or "
+                f"leave update out"
+            )
+
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
         """Give every instance a keeper, whatever `__init__` a subclass has."""
         self = super().__new__(cls)
@@ -72,7 +81,10 @@ class TriangleSampler(Sampler):
         return proxy
 
     def update(self, prepared: Any, proxy: Proxy) -> Any:
-        """Adapt what was prepared to moved vertices of the same faces, and return it; None if it must be made anew."""
+        """Adapt what was prepared to moved vertices of the same faces, and return it; None if it must be made anew.
+
+        A class with this method has its own `prepare`, too.
+        """
         return None
 
     def arrange(self, prepared: Any) -> Any:

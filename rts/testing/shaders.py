@@ -103,8 +103,15 @@ class ShaderConformance(Conformance):
             pytest.skip("the shader does not promise one colour")
 
     def test_it_reads_what_it_says(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """Given only position and the entries that `reads` names, a shader gives the same colours."""
-        reads = _instance(shader).reads
+        """Given only position and the entries that `reads` names, a shader gives the same colours.
+
+        So it does given only the entries of θ that `reads_theta` names.
+        """
+        reads, of_theta = _instance(shader).reads, _instance(shader).reads_theta
+        if of_theta is not None:
+            with no_error(f"shading with no θ but {', '.join(of_theta)}, as `reads_theta` says"):
+                found = _shaded(shader, {name: x for name, x in theta.items() if name in of_theta}, gbuffer)
+            claim_close(found, _shaded(shader, theta, gbuffer), 0, "the colour without what is not in `reads_theta`")
         if reads is None:
             pytest.skip("the shader does not say what it reads")
         fewer = {name: value for name, value in gbuffer.items() if name in ("position", *reads)}

@@ -41,6 +41,7 @@ class RadianceShader(Shader):
     opaque = True
     takes_views = True
     reads = ()
+    reads_theta = ("weights",)
 
     def __post_init__(self):
         if self.ndc is not None and not isinstance(self.ndc, Ndc):

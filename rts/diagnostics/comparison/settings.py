@@ -101,8 +101,15 @@ def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], 
 def engines(chosen: Sequence[str] | None = None) -> tuple[list[Engine], list[str]]:
     """The engines that have derivatives, the one that errors are measured with first; and why others are not there."""
     names, left_out = usable("rts.engines", chosen)
-    found = [engine_named(name) for name in names]
-    found = [engine for engine in found if engine.differentiates]
+    loaded = [engine_named(name) for name in names]
+    found = [engine for engine in loaded if engine.differentiates]
+    if chosen is not None:
+        left_out += [f"engine {engine.name!r}: it has no derivatives" for engine in loaded if not engine.differentiates]
+    if not found and chosen is not None:
+        installed = ", ".join(engine.name for engine in engines()[0])
+        raise InputError(
+            f"engines is {quoted(chosen)}, without derivatives, which are compared; expected some of {installed}"
+        )
     if not found:
         raise PluginError(
             "no engine with derivatives is installed, and derivatives are compared: pip install "

@@ -91,6 +91,14 @@ def drawn(row: Row) -> bool:
     return timed(row) and milliseconds(row) > 0 and row["error"] > 0
 
 
+def time_label(milliseconds: float) -> str:
+    """A time in three digits: "0.25 ms", "47.5 ms", "4.75 s", "475 s"."""
+    if milliseconds < 999.5:
+        return f"{milliseconds:.3g} ms"
+    seconds = milliseconds / 1e3
+    return f"{seconds:.3g} s" if seconds < 999.5 else f"{seconds:.0f} s"
+
+
 def side_length(supersample: int | str) -> float:
     """How large a row is drawn, by how many samples it takes along the side of a pixel; in pixels of a screen."""
     return 5.0 + 2.5 * min(finest(samples_of(supersample)), 6)

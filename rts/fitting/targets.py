@@ -1,0 +1,53 @@
+"""Targets and weights of images whose values are likely to mean something else: refused, or warned of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rts.engines import namespace, value_of
+from rts.errors import InputError, InputWarning, warn
+from rts.trees import Array
+
+LARGEST = 2.0
+"""Numbers of pictures from 0 to 1 that were filtered or interpolated are not above this."""
+
+
+def check_range(target: Array, count: int, channels: int) -> None:
+    """Refuse alpha from 0 to 255, and warn of such colours; features have any value.
+
+    Args:
+        target: (H, W) or (H, W, C).
+        count: its number of channels.
+        channels: those of the image besides alpha.
+    """
+    alpha = target if count == 1 else target[..., -1:] if count == channels + 1 else None
+    most = 0.0 if alpha is None else largest(alpha)
+    if most > LARGEST:
+        raise InputError(f"target's alpha goes up to {most:g}; expected 0 to 1: divide one from 0 to 255 by 255")
+    if channels == 3 and count > 1 and (most := largest(target[..., :3])) > LARGEST:
+        warn(
+            f"target's colours go up to {most:g}, and those of shaders from 0 to 1: divide a picture from 0 to 255 by "
+            f"255, or let rts.load_image read it",
+            InputWarning,
+        )
+
+
+def largest(values: Array) -> float:
+    """The largest of some values, zero where they are traced."""
+    known = value_of(namespace(values).max(values))
+    return 0.0 if known is None else float(known.max())
+
+
+def warn_of_gradients(given: Mapping[str, Any]) -> None:
+    """Warn of arrays of torch that are taken for constants, and of which it would have a derivative."""
+    for name, value in given.items():
+        if any(getattr(x, "requires_grad", False) for x in (value if isinstance(value, (list, tuple)) else [value])):
+            warn(f"{name} requires a gradient, and is taken as a constant; give {name}.detach()", InputWarning)
+
+
+def refuse_zero(weights: Sequence[Array | None]) -> None:
+    """Refuse weights of all views under which nothing is compared, where they are known."""
+    known = [None if own is None else value_of(namespace(own).any(own != 0)) for own in weights]
+    if not any(own is None or own.any() for own in known):
+        raise InputError("weights are all zero, so that nothing is compared; expected some above zero")

@@ -1,0 +1,94 @@
+"""Closed meshes that are wound inside out: culling leaves out the side of them that would be seen."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from rts.adapting import unwrapped
+from rts.camera import Camera
+from rts.engines import stopped
+from rts.errors import InputWarning, warn
+from rts.interfaces import TriangleSurface
+from rts.parts import CheckedPart
+from rts.sampling.emptiness import known_tree
+
+FLAT = 1e-6
+"""A mesh whose volume is below this share of that of a cube of its area has no inside."""
+
+_looked_at: weakref.WeakSet[Any] = weakref.WeakSet()
+
+
+def warn_of_winding(parts: Sequence[CheckedPart], camera: Camera) -> None:
+    """Warn of culled parts that are wound inside out; each surface is looked at but once."""
+    for index, part in enumerate(parts):
+        if part.cull != "back" or _triangles_of(part) is None or not _is_new(surface := unwrapped(part.surface)):
+            continue
+        found = is_inside_out(part, camera)
+        if found is None:
+            _looked_at.discard(surface)
+        if found:
+            warn(f"part {index} {INSIDE_OUT}; give it faces[:, ::-1]", InputWarning)
+
+
+def _is_new(surface: Any) -> bool:
+    """Whether a surface was not looked at so far; from now on it was."""
+    try:
+        new = surface not in _looked_at
+        _looked_at.add(surface)
+    except TypeError:  # A surface that cannot be hashed, or referred to weakly, is not looked at.
+        return False
+    return new
+
+
+INSIDE_OUT = "is closed and wound inside out: cull='back' leaves out the side that faces the viewer"
+
+
+def is_inside_out(part: CheckedPart, camera: Camera) -> bool | None:
+    """Whether a culled part is closed, seen from outside, and its triangles face its inside; None where it is traced.
+
+    Seen from within, such as a room, it is as it should be.
+    """
+    surface = _triangles_of(part)
+    if part.cull != "back" or surface is None:
+        return False
+    known = known_tree((surface.proxy_inputs(stopped(part.theta)), camera.within(part.transform)))
+    if known is None:
+        return None
+    inputs, local = known
+    proxy = surface.proxy(inputs, local, (1, 1))
+    if not len(proxy.faces):
+        return False
+    low, high = (f(proxy.vertices[proxy.faces], axis=(0, 1)) for f in (np.min, np.max))
+    eye = np.linalg.inv(local.view)[:3, 3]
+    return not ((low < eye) & (eye < high)).all() and _encloses_less_than_nothing(proxy.vertices, proxy.faces)
+
+
+def _triangles_of(part: CheckedPart) -> TriangleSurface | None:
+    """The surface of a part, if how it is wound is the user's to say, and is known at no cost."""
+    surface = part.surface
+    if isinstance(surface, TriangleSurface) and surface.proxy_is_cheap and not surface.depends_on_view:
+        return surface
+    return None
+
+
+def _encloses_less_than_nothing(vertices: np.ndarray, faces: np.ndarray) -> bool:
+    """Whether a mesh is closed and has a negative volume."""
+    points = vertices.astype(np.float64)
+    points -= points[faces].mean(axis=(0, 1))
+    a, b, c = (points[faces[:, i]] for i in range(3))
+    doubled = np.cross(b - a, c - a)
+    area = np.linalg.norm(doubled, axis=1).sum() / 2
+    volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+    # The areas of a closed mesh add up to nothing, as vectors; of most others they do not.
+    if not volume < -FLAT * area**1.5 or np.linalg.norm(doubled.sum(axis=0)) > 1e-3 * area:
+        return False
+    # Vertices in one place, as along the seam of a texture, are one.
+    places, at = np.unique(vertices, axis=0, return_inverse=True)
+    start = at.reshape(-1)[faces].astype(np.int64)
+    end = np.roll(start, -1, axis=1)
+    there, back = start * len(places) + end, end * len(places) + start
+    return np.array_equal(np.sort(there, axis=None), np.sort(back, axis=None))

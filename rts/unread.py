@@ -1,0 +1,108 @@
+"""Entries of θ that nobody reads, such as a misspelt one: what an image lacks is not seen in it."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any
+
+from rts.errors import InputWarning, warn
+from rts.gbuffer import GBuffer
+from rts.interfaces import Shader
+from rts.parts import CheckedPart
+from rts.trees import Array, Tree
+
+SURFACE_ENTRIES = ("vertices", "points", "normals", "colors", "uv")
+SHADER_ENTRIES = ("color", "texture", "light", "specular", "shininess", "depth_range", "weights")
+"""Names that built-in surfaces and shaders give a meaning: files bring them, and not every shader reads them."""
+
+ALIKE = 0.8
+"""The least ratio of `difflib` of two names that one may be meant by the other: "lights" and "light" have 0.9."""
+
+
+def unread(part: CheckedPart, shaded: Collection[str] | None) -> tuple[str, ...]:
+    """The entries of θ that neither surface nor shader reads.
+
+    Args:
+        part: the part.
+        shaded: those that its shader reads; None where that is not known, so that none are found.
+    """
+    if shaded is None:
+        return ()
+    shaped = part.surface.reads(part.theta)
+    return tuple(name for name in part.theta if name not in shaped and name not in shaded)
+
+
+def likely_name(part: CheckedPart, name: str, shaded: Collection[str]) -> str | None:
+    """The name that was likely to be meant by that of an entry that is not read, or None; arguments as in `unread`."""
+    rest = dict(part.theta)
+    value = rest.pop(name)
+    shaped = (n for n in SURFACE_ENTRIES if n in part.surface.reads({**rest, n: value}))
+    # Who gives both means two things.
+    known = {*shaded, *shaped} - rest.keys()
+    return next(iter(difflib.get_close_matches(name.lower(), sorted(known), n=1, cutoff=ALIKE)), None)
+
+
+def warn_of_unread(parts: Sequence[CheckedPart]) -> None:
+    """Warn of entries of θ that are not read, and whose names are almost those of others that would be."""
+    for index, part in enumerate(parts):
+        shaded = part.shader.reads_theta
+        for name in unread(part, shaded):
+            if name in SURFACE_ENTRIES or name in SHADER_ENTRIES:
+                continue
+            meant = likely_name(part, name, shaded or ())
+            if meant is not None:
+                warn(
+                    f"theta[{name!r}] of part {index} is not read; did you mean {meant!r}? rts.explain lists all such "
+                    f"entries",
+                    InputWarning,
+                )
+
+
+class Observed:
+    """A shader that notes which entries of θ another one reads.
+
+    Attributes:
+        channels: those of the other.
+        read: the names so far.
+    """
+
+    def __init__(self, shader: Shader):
+        self._shader, self.channels = shader, shader.channels
+        self.read: set[str] = set()
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
+        """What the other gives."""
+        return self._shader(_Noting(theta, self.read), gbuffer, camera)
+
+
+class _Noting(dict):
+    """A dict that notes which names it is asked for, there or not; all of them, where it is gone through."""
+
+    def __init__(self, entries: Mapping[str, Any], read: set[str]):
+        super().__init__(entries)
+        self._read = read
+
+    def __getitem__(self, name: str) -> Any:
+        self._read.add(name)
+        return super().__getitem__(name)
+
+    def __contains__(self, name: object) -> bool:
+        self._read.add(str(name))
+        return super().__contains__(name)
+
+    def get(self, name: str, default: Any = None) -> Any:
+        return self[name] if name in self else default
+
+    def __iter__(self) -> Iterator[str]:
+        self._read.update(super().__iter__())
+        return super().__iter__()
+
+    def keys(self) -> Any:
+        return dict.fromkeys(self).keys()
+
+    def items(self) -> Any:
+        return {name: self[name] for name in self}.items()
+
+    def values(self) -> Any:
+        return dict(self.items()).values()
