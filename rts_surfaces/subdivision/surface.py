@@ -27,7 +27,7 @@ from rts.sampling.cache import fingerprint
 from rts.topology import fixed
 from rts.trees import Array, Tree
 from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows, in_g_buffer
-from rts_surfaces.parametric import BEYOND, LARGEST_STEP, RESIDUAL, STEPS, TOLERANCE, Geometry, Parametric
+from rts_surfaces.parametric import BEYOND, CROSSINGS, LARGEST_STEP, RESIDUAL, STEPS, TOLERANCE, Geometry, Parametric
 from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.binding import BOUNDARIES, UV, UV_RULES, VERTEX, Limit, Points, Rules
 from rts_surfaces.subdivision.cage import checked_cage, checked_lists
@@ -38,8 +38,6 @@ library.find()  # Without OpenSubdiv there is no such plugin.
 BESIDE = 1 / 16
 """How far from the border of a tile it is looked at how it bends. At extraordinary vertices second derivatives have no
 bound, and at creases they are large, but both on so little of a tile that triangles are off by less than that."""
-CROSSINGS = 4
-"""Edges of faces that Newton's method may cross."""
 LIMITS = RESIDUAL, STEPS + CROSSINGS, LARGEST_STEP, BEYOND, CROSSINGS
 
 VERTEX_ATTRIBUTES = ("colors", "uv")
