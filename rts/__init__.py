@@ -25,6 +25,7 @@ from rts.errors import (
     PluginError,
     RtsError,
     RtsWarning,
+    SamplerWarning,
     ToleranceWarning,
 )
 from rts.explaining import explain
@@ -122,6 +123,7 @@ __all__ = [
     "RtsWarning",
     "Sampled",
     "Sampler",
+    "SamplerWarning",
     "Samples",
     "Shader",
     "Splats",
