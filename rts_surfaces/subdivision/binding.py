@@ -62,6 +62,8 @@ class _Description(ctypes.Structure):
         *((name, ctypes.c_int) for name in ("creases", "corners")),
         *((name, ctypes.c_void_p) for name in ("crease_pairs", "crease_sharpness")),
         *((name, ctypes.c_void_p) for name in ("corner_vertices", "corner_sharpness")),
+        ("holes", ctypes.c_int),
+        ("hole_faces", ctypes.c_void_p),
         ("uv_rows", ctypes.c_int),
         ("uv_indices", ctypes.c_void_p),
     ]
@@ -102,6 +104,7 @@ class Limit:
             "crease_sharpness": cage.crease_sharpness,
             "corner_vertices": place[cage.corners],
             "corner_sharpness": cage.corner_sharpness,
+            "hole_faces": cage.holes,
         }
         if uv_indices is not None:
             arrays["uv_indices"] = uv_indices.reshape(-1).astype(np.int32)
@@ -117,6 +120,7 @@ class Limit:
             faces=len(cage.sizes),
             creases=len(cage.creases),
             corners=len(cage.corners),
+            holes=len(cage.holes),
             uv_rows=0 if uv_used is None else len(uv_used),
             **{name: array.ctypes.data for name, array in arrays.items()},
         )

@@ -77,6 +77,7 @@ class Subdivision(Parametric):
         creases: rows (a, b, sharpness): edges by their vertices. Sharpness s is sharp for s steps of subdivision; 10 is
             for ever.
         corners: rows (vertex, sharpness).
+        holes: numbers of faces that shape the surface, and are no part of it.
         boundary: what becomes of edges with one face: "edge_and_corner" (the surface ends there, and vertices of one
             face are corners), "edge_only" (no corners), "none" (faces at the boundary have no surface).
         chaikin: whether the sharpness of creases is smoothed along them.
@@ -100,6 +101,7 @@ class Subdivision(Parametric):
         *,
         creases: Any = (),
         corners: Any = (),
+        holes: Any = (),
         boundary: str = "edge_and_corner",
         chaikin: bool = False,
         indices: Mapping[str, Any] | None = None,
@@ -112,7 +114,7 @@ class Subdivision(Parametric):
         if not isinstance(chaikin, (bool, np.bool_)):
             raise InputError(f"chaikin is {quoted(chaikin)}; expected True or False")
         self._rules = Rules(boundary, bool(chaikin), uv_rule)
-        self.cage = checked_cage(faces, scheme, creases, corners)
+        self.cage = checked_cage(faces, scheme, creases, corners, holes)
         self._declared, self._uv = self._attribute_indices(indices)
         self._count = int(self.cage.indices.max()) + 1
         self._uv_count = self._count if self._uv is None else int(self._uv.max()) + 1
@@ -140,7 +142,10 @@ class Subdivision(Parametric):
         """Make what is not kept in a copy."""
         self.limit = Limit(self.cage, self._rules, self._uv)
         if not len(self.limit.table) or (self.limit.kinds < 0).all():
-            raise InputError("no face of the cage has a surface: all are at its boundary; use another boundary rule")
+            raise InputError(
+                "no face of the cage has a surface: all are holes, or at its boundary; leave out holes, or use another "
+                "boundary rule"
+            )
         self._points: tuple[tuple, Points] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -165,7 +170,7 @@ class Subdivision(Parametric):
 
     @classmethod
     def load(cls, path: Path) -> list[Part]:
-        """One part: the cage in an OBJ file, with its uv, and OpenSubdiv's statements "t" for creases and corners.
+        """One part: the cage in an OBJ file, with uv, and OpenSubdiv's statements "t" for creases, corners and holes.
 
         Raises:
             InputError: the file is no OBJ, is damaged, or its cage is not sound.
