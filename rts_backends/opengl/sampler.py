@@ -145,7 +145,20 @@ def _depths(camera: Camera, prepared: Buffers) -> tuple[float, float]:
     near, far = (float(z) for z in camera.depth_range())
     middle = -(camera.view[2, :3] @ prepared.center + camera.view[2, 3])
     reach = 1.01 * prepared.radius * np.linalg.norm(camera.view[2, :3])
-    return max(near, middle - reach), min(far, middle + reach)
+    first, last = max(near, middle - reach), min(far, middle + reach)
+    if first < last and _ratio(camera, first, last) > MOST_RATIO:
+        # The sphere around an object reaches farther than the object: its corners are worth a look.
+        depth = (prepared.proxy.vertices @ -camera.view[2, :3] - camera.view[2, 3])[prepared.proxy.faces]
+        first, last = max(first, float(depth.min())), min(last, float(depth.max()))
+        reach = max(1e-3 * (last - first), 1e-3 * abs(first))
+        first, last = max(near, first - reach), min(far, last + reach)
+    return first, last
+
+
+def _ratio(camera: Camera, near: float, far: float) -> float:
+    """How many times as wide a pixel is at one depth as at another; infinity where it is a point there."""
+    first, last = (camera.projection[3, 3] - camera.projection[3, 2] * z for z in (near, far))
+    return float(last / first) if first > 0 else np.inf
 
 
 def _beyond_float32(camera: Camera, prepared: Buffers, size: tuple[int, int]) -> bool:
@@ -156,10 +169,9 @@ def _beyond_float32(camera: Camera, prepared: Buffers, size: tuple[int, int]) ->
     near, far = _depths(camera, prepared)
     if not near < far:
         return False
-    w_near, w_far = (p[3, 3] - p[3, 2] * z for z in (near, far))
     width, by_depth = camera.spread(size)
     rounding = prepared.radius * np.finfo(np.float32).eps / 2
-    return bool(w_far > MOST_RATIO * w_near or rounding > MOST_ROUNDING * abs(width + by_depth * near))
+    return _ratio(camera, near, far) > MOST_RATIO or rounding > MOST_ROUNDING * float(abs(width + by_depth * near))
 
 
 def _tight(projection: np.ndarray, view: np.ndarray, prepared: Buffers) -> np.ndarray:
