@@ -63,6 +63,21 @@ def test_limit_points_are_those_of_subdivision(name):
     np.testing.assert_allclose(np.einsum("nw,nwc->nc", weights, vertices[limit.table[face]]), found, atol=1e-12)
 
 
+@pytest.mark.parametrize("creases", [[], [(4, 5, 7)], [(4, 5, 7), (5, 7, 7), (5, 1, 7)]])
+def test_limit_points_close_to_a_vertex_are_those_of_subdivision(creases):
+    # Ten steps, of which faces at one vertex are kept; later than Bfr's defaults, and than semi-sharp creases end.
+    vertices, faces = cube()
+    cage, at = Cage(vertices, faces, "catmark", creases), 5
+    for _ in range(10):
+        cage, at = cage.refined().around(at)
+    vertex, face, params = cage.samples(len(cage.vertices))
+    beside = np.isin(vertex, [v for f in cage.faces if at in f for v in f])
+    expected = cage.limit()[vertex[beside]]
+    found = Limit(checked_cage(faces, "catmark", creases)).points(vertices).evaluate(face[beside], params[beside])[:, 0]
+    assert len(expected) > 20
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
+
+
 @pytest.mark.parametrize("name", ["torus", "tent_creases0", "chaikin0", "nonquads"])
 def test_limit_points_of_real_cages_are_those_of_subdivision(name, data):
     (part,) = rts.load(data / "cages" / f"catmark_{name}.obj", surface="subdivision")

@@ -17,10 +17,11 @@ from rts.topology import fixed
 from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.cage import Cage
 
-SMOOTH, SHARP = 8, 8
-"""Levels to which Bfr isolates extraordinary vertices and creases, 10 at most. Its defaults are 2 and 6, which are off
-by up to 5e-3 of the extent. It isolates nothing further than the second says: 8 and 6 are as good as 6 and 6, off by up
-to 4e-4 at spot's ears; 8 and 8 by 1e-4, on a hundredth of a face."""
+SMOOTH, SHARP = 10, 10
+"""Levels to which Bfr isolates extraordinary vertices and creases: as many as it has. It isolates nothing further than
+the second says. Its defaults, 2 and 6, are off by up to 5e-3 of the extent; 8 and 8 by 1e-4, at spot's ears and at
+semi-sharp creases of sharpness 7; 10 and 10 by 2e-5 there, at the same cost, and by nothing farther than 2⁻¹⁰ of a face
+from such vertices."""
 MOST_NUMBERS = 2**28
 """Numbers that the table of control points may have: a gigabyte."""
 

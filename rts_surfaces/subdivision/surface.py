@@ -71,6 +71,9 @@ class Subdivision(Parametric):
     "colors" (1, 3 or 4 wide) and "uv" (2 wide) are known, others are declared by `indices`; they are subdivided as
     positions are. In the G-buffer "colors" becomes "color". Normals are those of the limit surface.
 
+    Points are those of the limit but for rounding, except within 2⁻¹⁰ of a face from an extraordinary vertex, where
+    OpenSubdiv's patches end: there they are off by less than 1e-4 of the cage's extent.
+
     Args:
         faces: lists of integers into θ["vertices"], counter-clockwise seen from outside; or an array (F, n).
         scheme: "catmark" (Catmull–Clark, any polygons) or "loop" (triangles).
