@@ -105,13 +105,11 @@ def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, or
                 near = residual * abs(spread[0] + spread[1] * z)
                 cx, cy, cz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
                 met = cx * cx + cy * cy + cz * cz <= near * near * square
-                ended = met or step == steps
-                if not ended:
-                    # Where the ray meets the tangent plane, by Cramer's rule.
-                    hx, hy, hz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
-                    determinant = ax * hx + ay * hy + az * hz
-                    scale = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz) * square
-                    ended = not determinant * determinant > 1e-24 * scale
+                # Where the ray meets the tangent plane, by Cramer's rule.
+                hx, hy, hz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
+                determinant = ax * hx + ay * hy + az * hz
+                scale = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz) * square
+                ended = met or step == steps or not determinant * determinant > 1e-24 * scale
                 if not ended:
                     qx, qy, qz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
                     du = (rx * hx + ry * hy + rz * hz) / determinant
