@@ -26,6 +26,7 @@ from rts.errors import (
     PluginError,
     RtsError,
     RtsWarning,
+    SamplerWarning,
     ToleranceWarning,
 )
 from rts.explaining import explain
@@ -124,6 +125,7 @@ __all__ = [
     "RtsWarning",
     "Sampled",
     "Sampler",
+    "SamplerWarning",
     "Samples",
     "Shader",
     "Splats",

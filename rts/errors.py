@@ -34,6 +34,10 @@ class LayersWarning(RtsWarning):
     """`layers="auto"` came to its limit."""
 
 
+class SamplerWarning(RtsWarning):
+    """Another sampler stands in for the one that was chosen."""
+
+
 class AspectWarning(RtsWarning):
     """An image of another ratio of width to height than its camera is for: it is stretched."""
 

@@ -1,4 +1,4 @@
-"""Bicubic patches on the host, compiled: points, where rays meet them, values and gradients.
+"""Bicubic patches on the host, compiled: points, values and gradients.
 
 Patches come in two forms. *Powers* (n, 3, 4, 4) float64 are the coefficients of uⁱvʲ of each coordinate, for geometry
 without derivatives. A *table* (n, 16) names rows of Bézier control points, first along u, then along v, for values that
@@ -7,7 +7,6 @@ are differentiated. It imports numba.
 
 from __future__ import annotations
 
-import math
 from functools import partial
 
 import numpy as np
@@ -37,7 +36,7 @@ def _slope(a, t):
 
 
 @compiled
-def _first(p, u, v):
+def first(p, u, v):
     """A coordinate, and its derivatives along u and v."""
     a, b, c, d = _cubic(p[0], v), _cubic(p[1], v), _cubic(p[2], v), _cubic(p[3], v)
     along_v = _slope(p[0], v) + u * (_slope(p[1], v) + u * (_slope(p[2], v) + u * _slope(p[3], v)))
@@ -59,7 +58,7 @@ def points(start, stop, powers, patch, params, out):
     """Fill `out` (N, 1, 3): points of patches (N,) at params (N, 2)."""
     for n in range(start, stop):
         for c in range(3):
-            out[n, 0, c] = _first(powers[patch[n], c], params[n, 0], params[n, 1])[0]
+            out[n, 0, c] = first(powers[patch[n], c], params[n, 0], params[n, 1])[0]
 
 
 @kernel
@@ -68,100 +67,8 @@ def expansions(start, stop, powers, patch, params, out):
     for n in range(start, stop):
         p, u, v, to = powers[patch[n]], params[n, 0], params[n, 1], out[n]
         for c in range(3):
-            to[0, c], to[1, c], to[2, c] = _first(p[c], u, v)
+            to[0, c], to[1, c], to[2, c] = first(p[c], u, v)
             to[3, c], to[4, c], to[5, c] = _second(p[c], u, v)
-
-
-@kernel
-def bounds(nets, out):
-    """Fill `out` (n, 3): bounds of the lengths of second derivatives: in u, in u and v, in v."""
-    for n in range(len(nets)):
-        out[n] = 0
-        for i in range(4):
-            for j in range(4):
-                uu, uv, vv = 0.0, 0.0, 0.0
-                for c in range(3):
-                    if i < 2:
-                        uu += (nets[n, i, j, c] - 2 * nets[n, i + 1, j, c] + nets[n, i + 2, j, c]) ** 2
-                    if j < 2:
-                        vv += (nets[n, i, j, c] - 2 * nets[n, i, j + 1, c] + nets[n, i, j + 2, c]) ** 2
-                    if i < 3 and j < 3:
-                        low, high = nets[n, i, j, c], nets[n, i + 1, j, c]
-                        uv += (low - high - nets[n, i, j + 1, c] + nets[n, i + 1, j + 1, c]) ** 2
-                out[n, 0] = max(out[n, 0], 6 * math.sqrt(uu))
-                out[n, 1] = max(out[n, 1], 9 * math.sqrt(uv))
-                out[n, 2] = max(out[n, 2], 6 * math.sqrt(vv))
-
-
-# ------------------------------------------------------------------------------------------- where rays meet
-
-
-@kernel
-def meet(start, stop, powers, bounds, ids, params, row, depth, origins, directions, spread, limits):
-    """Newton's method: move params so that points lie on their rays; see `rts_surfaces.parametric`.
-
-    Args:
-        start: first line of cells.
-        stop: one after the last.
-        powers: (n, 3, 4, 4).
-        bounds: (n, 3), see above: where they say that a step ends near enough, the surface is not looked at again.
-        ids: (N, 1) int32, the patches.
-        params: (N, 2) float32, where to start; changed.
-        row: (L, W) int32, the sample in each cell; becomes −1 where it does not meet its ray.
-        depth: (L, W) float32, changed.
-        origins: (N, 3) float64.
-        directions: (N, 3) float64; the point at depth z is `origin + z direction`.
-        spread: (2,), a pixel at depth z is `spread[0] + spread[1] z` wide.
-        limits: (4,): residual in pixels, largest number of steps, largest step in params, how far beyond the edge.
-    """
-    residual, steps, largest, beyond = limits[0], int(limits[1]), limits[2], limits[3]
-    for y in range(start, stop):
-        for x in range(row.shape[1]):
-            n = row[y, x]
-            if n < 0:
-                continue
-            row[y, x] = -1
-            patch, u, v = ids[n, 0], float(params[n, 0]), float(params[n, 1])
-            p, bound = powers[patch], bounds[patch]
-            dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
-            square = dx * dx + dy * dy + dz * dz
-            for step in range(steps + 1):
-                sx, ax, bx = _first(p[0], u, v)
-                sy, ay, by = _first(p[1], u, v)
-                sz, az, bz = _first(p[2], u, v)
-                # From the point to the ray's origin.
-                rx, ry, rz = origins[n, 0] - sx, origins[n, 1] - sy, origins[n, 2] - sz
-                z = -(rx * dx + ry * dy + rz * dz) / square
-                near = residual * abs(spread[0] + spread[1] * z)
-                cx, cy, cz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
-                met = cx * cx + cy * cy + cz * cz <= near * near * square
-                if not met:
-                    if step == steps:
-                        break
-                    # Where the ray meets the tangent plane, by Cramer's rule.
-                    hx, hy, hz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
-                    determinant = ax * hx + ay * hy + az * hz
-                    scale = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz) * square
-                    if not determinant * determinant > 1e-24 * scale:
-                        break
-                    qx, qy, qz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
-                    du = (rx * hx + ry * hy + rz * hz) / determinant
-                    dv = (dx * qx + dy * qy + dz * qz) / determinant
-                    size = max(abs(du), abs(dv))
-                    if size > largest:
-                        du, dv = du * largest / size, dv * largest / size
-                    else:
-                        off = bound[0] * du * du + 2 * bound[1] * abs(du * dv) + bound[2] * dv * dv
-                        if off <= 2 * near:
-                            met, z = True, (bx * qx + by * qy + bz * qz) / determinant
-                    u, v = u + du, v + dv
-                if met:
-                    if -beyond <= u <= 1 + beyond and -beyond <= v <= 1 + beyond:
-                        row[y, x], depth[y, x], params[n, 0], params[n, 1] = n, z, u, v
-                    break
-                u, v = min(max(u, -0.25), 1.25), min(max(v, -0.25), 1.25)
-            if row[y, x] < 0:
-                depth[y, x], params[n, 0], params[n, 1] = 0, 0, 0
 
 
 # ------------------------------------------------------------------------------------- values and gradients

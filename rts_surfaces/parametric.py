@@ -30,10 +30,10 @@ TOLERANCE = 0.1
 TOLERANCES = (0.8, 0.3, 0.1, 0.05)
 """Those of `rates`."""
 
-RESIDUAL, STEPS, LARGEST_STEP, BEYOND = 1e-4, 6, 0.25, 0.02
-"""Newton's method: pixels a sample may be off its ray, the number of steps, the largest one, and how far a sample may
-lie beyond the edge of its patch, in units of the patch."""
-LIMITS = np.array([RESIDUAL, STEPS, LARGEST_STEP, BEYOND])
+RESIDUAL, STEPS, LARGEST_STEP, BEYOND, CROSSINGS = 1e-4, 6, 0.25, 0.02, 8
+"""Newton's method: pixels a sample may be off its ray, the number of steps, the largest one, how far a sample may lie
+beyond the edge of its patch, in units of the patch, and how many edges of patches may be crossed."""
+LIMITS = np.array([RESIDUAL, STEPS, LARGEST_STEP, BEYOND, CROSSINGS])
 
 
 class Geometry(abc.ABC):

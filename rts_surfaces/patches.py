@@ -25,12 +25,19 @@ ATTRIBUTES = ("colors", "uv")
 
 
 class Bicubic(Geometry):
-    """Patches of Bézier control points (n, 4, 4, 3) float64."""
+    """Patches of Bézier control points (n, 4, 4, 3) float64.
 
-    def __init__(self, nets: np.ndarray):
+    Args:
+        nets: the control points.
+        across: (n, 4), what `across` gives.
+        flips: (n, 4), those of the patches as tiles.
+    """
+
+    def __init__(self, nets: np.ndarray, across: np.ndarray, flips: np.ndarray):
         from rts_surfaces import bicubic_kernels
 
         self.nets, self.powers = nets, bicubic_kernels.powers(nets)
+        self.across, self.flips = across, flips
 
     def points(self, patch: np.ndarray, params: np.ndarray, order: int) -> np.ndarray:
         """See `Geometry`."""
@@ -43,16 +50,16 @@ class Bicubic(Geometry):
 
     def meet(self, samples: Samples, rays: Rays) -> Samples:
         """See `Geometry`."""
-        from rts_surfaces import bicubic_kernels
+        from rts_surfaces import meeting_kernels
 
         bounds = np.empty((len(self.nets), 3))
-        bicubic_kernels.bounds(self.nets, bounds)
-        params, row, depth = (np.array(x) for x in (samples.params, samples.row, samples.depth))
+        meeting_kernels.bounds(self.nets, bounds)
+        ids, params, row, depth = (np.array(x) for x in (samples.ids, samples.params, samples.row, samples.depth))
         lines = row.reshape(-1, row.shape[2]), depth.reshape(-1, row.shape[2])
         ends = (np.ascontiguousarray(x, np.float64) for x in (rays.origins, rays.directions, rays.spread))
-        given = self.powers, bounds, samples.ids, params, *lines, *ends, LIMITS
-        parallel(bicubic_kernels.meet, len(lines[0]), *given, work=200 * len(samples.ids))
-        return replace(samples, params=params, row=row, depth=depth)
+        given = self.powers, bounds, self.across, self.flips, ids, params, *lines, *ends, LIMITS
+        parallel(meeting_kernels.meet, len(lines[0]), *given, work=200 * len(samples.ids))
+        return replace(samples, ids=ids, params=params, row=row, depth=depth)
 
 
 class Patches(Parametric):
@@ -73,6 +80,7 @@ class Patches(Parametric):
     def __init__(self, table: np.ndarray, tolerance: float, used: np.ndarray | None = None):
         self.table = fixed(np.array(table, np.int32))
         super().__init__(_tiles(self.table), tolerance, used)
+        self.across = fixed(across(self.whole.sides))
 
     @abc.abstractmethod
     def bezier_rows(self, values: Array) -> Array:
@@ -115,7 +123,7 @@ class Patches(Parametric):
 
     def geometry(self, points: np.ndarray) -> Geometry:
         """See `Parametric`."""
-        return Bicubic(self.nets(points))
+        return Bicubic(self.nets(points), self.across, self.whole.flips)
 
     def evaluate(self, theta: Mapping[str, Tree], samples: Samples) -> GBuffer:
         """Positions, normals, and the attributes of control points."""
@@ -136,6 +144,25 @@ class Patches(Parametric):
 
     def _attribute(self, attribute: Array, where: tuple[Array, Array, Array]) -> Array:
         return values(self.bezier_rows(attribute), *where)
+
+
+def across(sides: np.ndarray) -> np.ndarray:
+    """The side beyond each side, (n, 4) int32: 4 × patch + side, or −1 at the border of the surface.
+
+    Where more than two patches share an edge it is the one half way round. So a side that is a single point leads to
+    the patch on the other side of the point.
+
+    Args:
+        sides: (n, 4), the edges of `Tiles`.
+    """
+    flat = sides.reshape(-1)
+    order = np.argsort(flat, kind="stable")
+    count = np.bincount(flat)[flat[order]]
+    first = np.searchsorted(flat[order], flat[order])
+    other = order[first + (np.arange(len(flat)) - first + count // 2) % count]
+    found = np.empty(len(flat), np.int32)
+    found[order] = np.where(count > 1, other, -1)
+    return found.reshape(sides.shape)
 
 
 def _tiles(table: np.ndarray) -> Tiles:

@@ -108,6 +108,19 @@ def _camera(rng, place, scale, size):
     return Camera(view, perspective(opening, aspect, near, far if rng.random() < 0.7 else 1e3 * far))
 
 
+def deepened(soup, number):
+    """A soup with some corners up to 1e7 times as far off, and a near plane as much nearer to the camera."""
+    rng = np.random.default_rng(number)
+    vertices, (near, far) = soup.vertices.astype(np.float64), soup.camera.depth_range()
+    middle, some = vertices.mean(axis=0), rng.random(len(vertices)) < 0.3
+    vertices[some] = middle + (vertices[some] - middle) * 10 ** rng.uniform(0, 7)
+    projection, far = soup.camera.projection.copy(), 1e4 * far
+    if projection[3, 2]:
+        near *= 10 ** rng.uniform(-7, 0)
+        projection[2, 2:] = -(far + near) / (far - near), -2 * far * near / (far - near)
+    return soup._replace(vertices=vertices.astype(np.float32), camera=Camera(soup.camera.view, projection))
+
+
 class Hits(NamedTuple):
     """What float64 says of every triangle at every pixel's centre, and how sure it is; (T, H, W) each.
 

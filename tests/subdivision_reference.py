@@ -145,6 +145,24 @@ class Cage:
                 out[x] = (n * n * v[x] + 4 * ends.sum(axis=0) + v[opposite[x]].sum(axis=0)) / (n * (n + 5))
         return out
 
+    def around(self, vertex, rings=6):
+        """The faces in so many rings around a vertex, as a cage of their own; and the vertex's number there.
+
+        A step of subdivision is wrong in one ring more: those near the vertex stay right if each is followed by this.
+        """
+        near = {vertex}
+        for _ in range(rings):
+            kept = [i for i, face in enumerate(self.faces) if near & set(face)]
+            near = {v for i in kept for v in self.faces[i]}
+        used = sorted(near)
+        number, child = {v: i for i, v in enumerate(used)}, Cage.__new__(Cage)
+        child.scheme, child.vertices = self.scheme, self.vertices[used]
+        child.faces = [[number[v] for v in self.faces[i]] for i in kept]
+        child.places = [self.places[i] for i in kept]
+        child.creases = {frozenset(number[v] for v in e): s for e, s in self.creases.items() if e <= near}
+        child.corners = {number[v]: s for v, s in self.corners.items() if v in near}
+        return child, number[vertex]
+
     def samples(self, count):
         """Vertices below a number, faces (N,) and parameters (N, 2) of every corner at one of them."""
         rows = [

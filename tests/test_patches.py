@@ -1,11 +1,13 @@
 """What patches are made of: values and normals as operations, tiles that meet, samples that are moved and pruned."""
 
 import copy
+import os
 import pickle
 
 import numpy as np
 import pytest
 from helpers import ALL, DIFFERENTIABLE, arrays, derivative, gradient, to_numpy
+from thin_patches import lacking, thin_patches
 
 import rts
 from rts import Camera, InputError, Part, Samples
@@ -239,6 +241,35 @@ def test_newells_teapot_has_no_holes(data, layers):
             for step in (-1, 1):
                 inner &= np.roll(rows[1], step, axis)
         assert not (inner & ~rows[0]).any()
+
+
+THIN = int(os.environ.get("RTS_THIN", "24"))
+"""How many shapes of thin patches are tried."""
+
+
+@pytest.mark.parametrize("name", ["bezier", "bspline", "subdivision"])
+def test_no_pixel_lacks_the_sheet_in_front_where_patches_are_thin(name):
+    if name == "subdivision":
+        example(name)
+    wrong, pixels = {}, 0
+    for number in range(1, 1 + THIN // (1 if name == "bezier" else 4)):
+        view = thin_patches(number, name)
+        lacks, known = lacking(view, rts.sample(view.part, view.camera, view.size, layers=1))
+        pixels += known
+        if lacks.any():
+            wrong[number] = int(lacks.sum())
+    assert not wrong
+    assert pixels > 100
+
+
+def test_the_side_of_a_patch_leads_to_the_one_beside_it_and_a_point_to_the_one_opposite():
+    # Four patches around a point, their sides v = 0; each side u = 1 is the next one's u = 0.
+    rim = 1 + np.arange(4 * 9).reshape(4, 3, 3)
+    nets = [np.stack([np.full(4, 0), *np.concatenate([rim[k].T, rim[(k + 1) % 4].T[:, :1]], axis=1)]) for k in range(4)]
+    surface = Bezier([net.T.reshape(-1) for net in nets])
+    assert surface.across.tolist() == [
+        [4 * ((k + 2) % 4), 4 * ((k + 1) % 4) + 3, -1, 4 * ((k + 3) % 4) + 1] for k in range(4)
+    ]
 
 
 @pytest.mark.parametrize("name", PARTS)

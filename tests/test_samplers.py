@@ -1,5 +1,6 @@
 """Embree and OpenGL against the reference sampler: real meshes, soups, and what is hard for rays or for hardware."""
 
+import warnings
 from functools import cache
 
 import numpy as np
@@ -533,3 +534,32 @@ def test_rays_find_moved_triangles_that_have_become_thin():
         expected = rasterize("reference", moved, faces, CAMERAS["perspective"], SIZE, 60)
         assert (expected.triangle_ids >= 0).sum() > 3000
         np.testing.assert_array_equal(found.triangle_ids, expected.triangle_ids)
+
+
+def ground(half, near):
+    """A ground to the horizon, and a camera close above it."""
+    corners = np.array([(x, 0, z) for x in (-half, half) for z in (-half, half)], np.float32)
+    camera = Camera.look_at((0, 1, 3), (0, 0.3, 0), fov_y=50, near=near, far=max(1e6, 3 * half))
+    return corners, np.array([(0, 1, 3), (0, 3, 2)], np.int32), camera
+
+
+@pytest.mark.parametrize("half, near", [(1e5, 1e-3), (1e9, 1.0), (1e9, 1e-3)])
+def test_a_ground_to_the_horizon_is_seen_and_opengl_says_once_that_it_does_not_draw_it(half, near, sampler):
+    vertices, faces, camera = ground(half, near)
+    chosen = rts.plugin("samplers", sampler)()
+    prepared, size = chosen.prepare(Proxy(vertices, faces)), (64, 64)
+    expected = rasterize("reference", vertices, faces, camera, size)
+    assert 2000 < (expected.triangle_ids >= 0).sum() < 64 * 64
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        found = [chosen.rasterize(prepared, host(camera).for_size(size), size, 1, "none") for _ in range(2)]
+    for each in found:
+        assert ((each.triangle_ids >= 0) != (expected.triangle_ids >= 0)).sum() <= (sampler == "embree")
+    assert [w.category for w in caught] == [rts.SamplerWarning] * (sampler == "opengl")
+
+
+def test_opengl_draws_itself_what_is_no_larger_than_a_room():
+    usable("opengl")
+    vertices, faces, camera = ground(100.0, 0.1)
+    found = rasterize("opengl", vertices, faces, camera, (64, 64))  # Warnings are errors.
+    assert (found.triangle_ids >= 0).sum() > 2000

@@ -20,6 +20,7 @@ try:
 except rts.PluginError as missing:
     pytest.skip(str(missing), allow_module_level=True)
 
+from rts.testing.compatibility import APRON  # noqa: E402
 from rts_surfaces.subdivision.binding import UV, Limit, Rules  # noqa: E402
 from rts_surfaces.subdivision.cage import checked_cage  # noqa: E402
 
@@ -60,6 +61,21 @@ def test_limit_points_are_those_of_subdivision(name):
     # Weights give the points too.
     weights = limit.stencils(face, params)
     np.testing.assert_allclose(np.einsum("nw,nwc->nc", weights, vertices[limit.table[face]]), found, atol=1e-12)
+
+
+@pytest.mark.parametrize("creases", [[], [(4, 5, 7)], [(4, 5, 7), (5, 7, 7), (5, 1, 7)]])
+def test_limit_points_close_to_a_vertex_are_those_of_subdivision(creases):
+    # Ten steps, of which faces at one vertex are kept; later than Bfr's defaults, and than semi-sharp creases end.
+    vertices, faces = cube()
+    cage, at = Cage(vertices, faces, "catmark", creases), 5
+    for _ in range(10):
+        cage, at = cage.refined().around(at)
+    vertex, face, params = cage.samples(len(cage.vertices))
+    beside = np.isin(vertex, [v for f in cage.faces if at in f for v in f])
+    expected = cage.limit()[vertex[beside]]
+    found = Limit(checked_cage(faces, "catmark", creases)).points(vertices).evaluate(face[beside], params[beside])[:, 0]
+    assert len(expected) > 20
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ["torus", "tent_creases0", "chaikin0", "nonquads"])
@@ -257,17 +273,76 @@ def test_a_cage_from_a_file_has_its_tags_polygons_and_map(tmp_path):
     lines += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in f) for f in faces]
     lines += ["t crease 2/1/0 0 1 2.5", "t crease 4/2/0 5 6 6 7 3.0 10.0", "t corner 1/1/0 3 1.5"]
     lines += ["t interpolateboundary 1/0/0 2", "t creasemethod 0/0/1 chaikin", "t hole 1/0/0 3"]
+    lines += ["t smoothtriangles 0/0/0"]
     path.write_text("\n".join(lines))
-    with pytest.warns(rts.FileWarning, match="line 33: the tag 'hole' is not followed"):
+    with pytest.warns(rts.FileWarning, match="line 34: the tag 'smoothtriangles' is not followed"):
         (part,) = rts.load(path, surface="subdivision")
     cage = part.surface.cage
     assert cage.sizes.tolist() == [5, 5, 4, 4, 4, 4, 4]
     assert cage.creases.tolist() == [[0, 1], [5, 6], [6, 7]] and cage.crease_sharpness.tolist() == [2.5, 3, 10]
     assert cage.corners.tolist() == [3] and cage.corner_sharpness.tolist() == [1.5]
+    assert cage.holes.tolist() == [3]
     assert part.surface._rules == Rules("edge_only", True)
     assert part.theta["uv"].shape == (10, 2)
     image = rts.render(part, CAMERA, SIZE)
     assert 0.05 < image[..., 3].mean() < 0.9
+
+
+def test_a_hole_of_a_flat_sheet_is_empty_and_all_else_as_without_it(tmp_path):
+    # The limit of an even flat grid is the plane, and each face its own square.
+    path, (vertices, faces) = tmp_path / "cage.obj", sheet(4, 4)
+    vertices[:, 2] = 0.25 * vertices[:, 0]
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices] + ["f " + " ".join(str(i + 1) for i in f) for f in faces]
+    path.write_text("\n".join([*lines, "t hole 1/0/0 4"]))
+    (loaded,) = rts.load(path, surface="subdivision")
+    camera, size = rts.Camera.orthographic((1.5, 1.5, 5), (1.5, 1.5, 0), height=4), (41, 41)
+    rays = camera.with_apron(size, APRON).rays((41 + 2 * APRON, 41 + 2 * APRON))
+    x, y = rays.origins[..., 0], rays.origins[..., 1]
+    inside = (np.abs(x - 1.5) < 1.5) & (np.abs(y - 1.5) < 1.5)
+    hole = (np.abs(x - 1.5) < 0.5) & (np.abs(y - 1.5) < 0.5)
+    assert hole.sum() > 90
+    for surface in (loaded.surface, Subdivision(faces, holes=[4]), Subdivision(faces, holes=np.array([4, 4]))):
+        samples = rts.sample(loaded.replace(surface=surface), camera, size, layers=1, splatter=None)
+        np.testing.assert_array_equal(samples.row[0] >= 0, inside & ~hole)
+        np.testing.assert_allclose(samples.depth[0][inside & ~hole], (5 - 0.25 * x)[inside & ~hole], atol=1e-5)
+    again = pickle.loads(pickle.dumps(loaded.surface))
+    assert again.cage.holes.tolist() == [4]
+
+
+def test_a_hole_leaves_the_surface_beside_it_as_it_is():
+    vertices, faces = cube()
+    part = rts.Part(Subdivision(faces), {"vertices": vertices.astype(np.float32)}, "normals")
+    holed = part.replace(surface=Subdivision(faces, holes=[1]))
+    found = []
+    for given in (part, holed):
+        samples = rts.sample(given, CAMERA, SIZE, layers=4, splatter=None).samples[0]
+        layer, y, x = np.nonzero(samples.row >= 0)
+        row = samples.row[layer, y, x]
+        position = given.surface.evaluate(given.theta, samples)["position"][row]
+        found.append({(*at, f): p for *at, f, p in zip(y, x, samples.ids[row, 0].tolist(), position, strict=True)})
+    left = {key: p for key, p in found[0].items() if key[2] != 1}
+    assert len(left) < len(found[0]) and len(found[1]) > 100
+    # On edges either face may have the sample.
+    same = left.keys() & found[1].keys()
+    assert len(same) > 0.99 * len(left) and len(same) > 0.99 * len(found[1])
+    assert not any(key[2] == 1 for key in found[1])
+    np.testing.assert_allclose([left[k] for k in same], [found[1][k] for k in same], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "holes, message",
+    [
+        ([6], "from 0 to 5"),
+        ([-1], "from 0 to 5"),
+        ([[0]], "expected numbers of faces"),
+        ([0.5], "expected numbers of faces"),
+        (3, "expected numbers of faces"),
+        (list(range(6)), "all are holes"),
+    ],
+)
+def test_holes_that_are_no_faces_are_refused(holes, message):
+    with pytest.raises(InputError, match=message):
+        Subdivision(cube()[1], holes=holes)
 
 
 @pytest.mark.parametrize(
@@ -279,6 +354,8 @@ def test_a_cage_from_a_file_has_its_tags_polygons_and_map(tmp_path):
         ("t crease 2/1/0 0 1 nan", "is no tag"),
         ("t crease 1/1/0 0 2", "is no tag"),
         ("t", "is no tag"),
+        ("t hole 0/0/0", "is no tag"),
+        ("t hole 1/0/0 5", r"holes is \[5\]; expected numbers of faces, from 0 to 4"),
         ("t crease 2/1/0 0 7 2", "creases name the edge of vertices 0 and 7"),
         ("t interpolateboundary 1/0/0 7", "is no tag"),
         ("f 1 2", "a face has 2 corners"),

@@ -4,6 +4,9 @@ Each pass draws the triangles beyond those of the pass before and keeps the near
 triangle and its quantised depth. The order (depth, triangle) is total, so coplanar triangles peel one by one. Hardware
 snaps vertices to fractions of a pixel; so each hit is then decided in float64 by the edge functions of
 `rts_backends.triangles`, and passed on to the neighbour that truly covers the pixel's centre.
+
+All of this is in float32. It does not do for triangles that are very large beside a pixel, or reach from very near to
+very far, such as a ground from the camera to the horizon: the sampler "raster" draws such views.
 """
 
 from __future__ import annotations
@@ -16,13 +19,14 @@ import moderngl
 import numpy as np
 
 from rts.camera import Camera
-from rts.errors import InputError
+from rts.errors import InputError, SamplerWarning, warn
 from rts.records import Fragments, Proxy
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.sampling.validation import check_faces
 from rts.threads import parallel
 from rts_backends.neighbours import corner_lists, places, settle
 from rts_backends.opengl.worker import LESS, Worker
+from rts_backends.raster import Raster
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 
 TARGETS = 4
@@ -30,6 +34,10 @@ TARGETS = 4
 
 DEPTH_STEPS = 2**22
 """Quantised depths; the 24 bits of a depth buffer hold each exactly."""
+
+MOST_RATIO, MOST_ROUNDING = 1e4, 0.1
+"""Limits of float32: how many times as far as the nearest point the farthest may be, and how many pixels rounding may
+move a vertex. Beyond them hits are lost."""
 
 VERTEX = """
 #version 330
@@ -90,6 +98,7 @@ class OpenGL(TriangleSampler):
 
     def __init__(self) -> None:
         self._worker = Worker()
+        self._warned = False
 
     def prepare(self, proxy: Proxy) -> Buffers:
         """Move the triangles to the device."""
@@ -99,6 +108,9 @@ class OpenGL(TriangleSampler):
     def rasterize(self, prepared: Buffers, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         height, width = size
+        if _beyond_float32(camera, prepared, size):
+            self._warn()
+            return Raster().rasterize(prepared.proxy, camera, size, layers, cull)
         keep = facing(camera, cull)
         clip = _tight(camera.projection, camera.view, prepared) @ camera.view
         # Read from below, the image has its top row first.
@@ -116,16 +128,58 @@ class OpenGL(TriangleSampler):
         parallel(settle, height, *scene, *fragments)
         return fragments
 
+    def _warn(self) -> None:
+        """Say once that another sampler draws."""
+        if not self._warned:
+            self._warned = True
+            warn(
+                f"triangles reach from the camera to more than {MOST_RATIO:g} times as far, or are too large beside a "
+                "pixel, for OpenGL's float32: the sampler 'raster' draws such views instead of 'opengl'; move the near "
+                "plane away from the camera, or choose 'raster'",
+                SamplerWarning,
+            )
+
+
+def _depths(camera: Camera, prepared: Buffers) -> tuple[float, float]:
+    """Depths between which an object may be seen; the first is not less than the second where it is out of view."""
+    near, far = (float(z) for z in camera.depth_range())
+    middle = -(camera.view[2, :3] @ prepared.center + camera.view[2, 3])
+    reach = 1.01 * prepared.radius * np.linalg.norm(camera.view[2, :3])
+    first, last = max(near, middle - reach), min(far, middle + reach)
+    if first < last and _ratio(camera, first, last) > MOST_RATIO:
+        # The sphere around an object reaches farther than the object: its corners are worth a look.
+        depth = (prepared.proxy.vertices @ -camera.view[2, :3] - camera.view[2, 3])[prepared.proxy.faces]
+        first, last = max(first, float(depth.min())), min(last, float(depth.max()))
+        reach = max(1e-3 * (last - first), 1e-3 * abs(first))
+        first, last = max(near, first - reach), min(far, last + reach)
+    return first, last
+
+
+def _ratio(camera: Camera, near: float, far: float) -> float:
+    """How many times as wide a pixel is at one depth as at another; infinity where it is a point there."""
+    first, last = (camera.projection[3, 3] - camera.projection[3, 2] * z for z in (near, far))
+    return float(last / first) if first > 0 else np.inf
+
+
+def _beyond_float32(camera: Camera, prepared: Buffers, size: tuple[int, int]) -> bool:
+    """True where hardware would lose hits of a view, see `MOST_RATIO`."""
+    p = camera.projection
+    if p[2, 0] or p[2, 1] or p[3, 0] or p[3, 1]:
+        return False
+    near, far = _depths(camera, prepared)
+    if not near < far:
+        return False
+    width, by_depth = camera.spread(size)
+    rounding = prepared.radius * np.finfo(np.float32).eps / 2
+    return _ratio(camera, near, far) > MOST_RATIO or rounding > MOST_ROUNDING * float(abs(width + by_depth * near))
+
 
 def _tight(projection: np.ndarray, view: np.ndarray, prepared: Buffers) -> np.ndarray:
     """The projection with its planes drawn close around the object, so that depth is quantised finely."""
     p = projection.copy()
     if p[2, 0] or p[2, 1] or p[3, 0] or p[3, 1]:
         return p
-    near, far = Camera(view, projection).depth_range()
-    middle = -(view[2, :3] @ prepared.center + view[2, 3])
-    reach = 1.01 * prepared.radius * np.linalg.norm(view[2, :3])
-    near, far = max(near, middle - reach), min(far, middle + reach)
+    near, far = _depths(Camera(view, projection), prepared)
     if not near < far:
         return projection
     # Row 2 so that z = −w at depth near and z = w at depth far.

@@ -17,10 +17,11 @@ from rts.topology import fixed
 from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.cage import Cage
 
-SMOOTH, SHARP = 8, 8
-"""Levels to which Bfr isolates extraordinary vertices and creases, 10 at most. Its defaults are 2 and 6, which are off
-by up to 5e-3 of the extent. It isolates nothing further than the second says: 8 and 6 are as good as 6 and 6, off by up
-to 4e-4 at spot's ears; 8 and 8 by 1e-4, on a hundredth of a face."""
+SMOOTH, SHARP = 10, 10
+"""Levels to which Bfr isolates extraordinary vertices and creases: as many as it has. It isolates nothing further than
+the second says. Its defaults, 2 and 6, are off by up to 5e-3 of the extent; 8 and 8 by 1e-4, at spot's ears and at
+semi-sharp creases of sharpness 7; 10 and 10 by 2e-5 there, at the same cost, and by nothing farther than 2⁻¹⁰ of a face
+from such vertices."""
 MOST_NUMBERS = 2**28
 """Numbers that the table of control points may have: a gigabyte."""
 
@@ -62,6 +63,8 @@ class _Description(ctypes.Structure):
         *((name, ctypes.c_int) for name in ("creases", "corners")),
         *((name, ctypes.c_void_p) for name in ("crease_pairs", "crease_sharpness")),
         *((name, ctypes.c_void_p) for name in ("corner_vertices", "corner_sharpness")),
+        ("holes", ctypes.c_int),
+        ("hole_faces", ctypes.c_void_p),
         ("uv_rows", ctypes.c_int),
         ("uv_indices", ctypes.c_void_p),
     ]
@@ -102,6 +105,7 @@ class Limit:
             "crease_sharpness": cage.crease_sharpness,
             "corner_vertices": place[cage.corners],
             "corner_sharpness": cage.corner_sharpness,
+            "hole_faces": cage.holes,
         }
         if uv_indices is not None:
             arrays["uv_indices"] = uv_indices.reshape(-1).astype(np.int32)
@@ -117,6 +121,7 @@ class Limit:
             faces=len(cage.sizes),
             creases=len(cage.creases),
             corners=len(cage.corners),
+            holes=len(cage.holes),
             uv_rows=0 if uv_used is None else len(uv_used),
             **{name: array.ctypes.data for name, array in arrays.items()},
         )

@@ -40,6 +40,7 @@ class Cage(NamedTuple):
         crease_sharpness: (C,) float32.
         corners: (D,) int32, sharp vertices.
         corner_sharpness: (D,) float32.
+        holes: (E,) int32, faces that shape the surface and are no part of it.
     """
 
     scheme: str
@@ -51,6 +52,7 @@ class Cage(NamedTuple):
     crease_sharpness: np.ndarray
     corners: np.ndarray
     corner_sharpness: np.ndarray
+    holes: np.ndarray
 
     def next(self) -> np.ndarray:
         """(H,) int64, the half edge that follows each in its face."""
@@ -63,7 +65,7 @@ class Cage(NamedTuple):
         return np.repeat(np.arange(len(self.sizes)), self.sizes)
 
 
-def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = ()) -> Cage:
+def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = (), holes: Any = ()) -> Cage:
     """The cage of these faces.
 
     Args:
@@ -71,6 +73,7 @@ def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = ()) 
         scheme: "catmark" or "loop".
         creases: rows (a, b, sharpness), an edge by its vertices.
         corners: rows (vertex, sharpness).
+        holes: numbers of faces.
 
     Raises:
         InputError: the cage is none that has a limit surface; one line that says what is wrong where.
@@ -81,7 +84,7 @@ def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = ()) 
     first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)
     none = np.zeros(0, np.int32)
     tagged = none.reshape(0, 2), none.astype(np.float32), none, none.astype(np.float32)
-    cage = Cage(scheme, sizes, first, indices, none, *tagged)
+    cage = Cage(scheme, sizes, first, indices, none, *tagged, _checked_holes(holes, len(sizes)))
     _check_faces(cage)
     order, keys = _sorted_edges(cage)
     cage = cage._replace(twins=_twins(cage, order, keys))
@@ -280,6 +283,22 @@ def _tags(name: str, rows: Any, columns: tuple[str, ...]) -> tuple[np.ndarray, n
     if sharpness.min() < 0:
         raise InputError(f"{name} have the sharpness {sharpness.min():g}; expected 0 or more, 10 for infinitely sharp")
     return indices.astype(np.int64), np.minimum(sharpness, INFINITE).astype(np.float32)
+
+
+def _checked_holes(holes: Any, faces: int) -> np.ndarray:
+    """Numbers of faces (E,) int32."""
+    if isinstance(holes, (list, tuple)) and not holes:
+        return np.zeros(0, np.int32)
+    wrong = InputError(f"holes is {quoted(holes)}; expected numbers of faces, from 0 to {faces - 1}")
+    try:
+        known = _known("holes", np.asarray(holes) if isinstance(holes, (list, tuple)) else holes, wrong)
+    except (TypeError, ValueError):  # Lists of different lengths, traced values in lists.
+        raise wrong from None
+    if known.ndim != 1 or (known.size and not np.issubdtype(known.dtype, np.integer)):
+        raise wrong
+    if known.size and not 0 <= known.min() <= known.max() < faces:
+        raise wrong
+    return np.unique(known).astype(np.int32)
 
 
 def _check_tags(cage: Cage, keys: np.ndarray, edges: np.ndarray, corners: np.ndarray) -> None:

@@ -1,6 +1,6 @@
-"""Cages from OBJ files: polygons, uv, and the statements "t" by which OpenSubdiv's files tag edges and vertices.
+"""Cages from OBJ files: polygons, uv, and the statements "t" by which OpenSubdiv's files tag what these are made of.
 
-`t name i/f/s …` has so many integers, floats and words. The vertices in them count from 0, those of faces from 1.
+`t name i/f/s …` has so many integers, floats and words. Vertices and faces in them count from 0, those of "f" from 1.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from rts_surfaces.subdivision.binding import UV_RULES
 
 _BOUNDARIES = ("none", "edge_and_corner", "edge_only")
 """What interpolateboundary 0, 1 and 2 stand for."""
+_TAGS = ("crease", "corner", "hole", "interpolateboundary", "facevaryinginterpolateboundary", "creasemethod")
 
 
 class CageFile(NamedTuple):
@@ -90,7 +91,7 @@ def _material(found: Polygons, theta: dict[str, Any]) -> bool:
 
 def _tagged(path: Path, tags: list[tuple[int, str]]) -> dict[str, Any]:
     """Keywords of `Subdivision` that tags stand for."""
-    options: dict[str, Any] = {"creases": [], "corners": []}
+    options: dict[str, Any] = {"creases": [], "corners": [], "holes": []}
     for number, text in tags:
         name, whole, real, words = _split(path, number, text)
         if name == "crease" and len(whole) >= 2 and len(whole) % 2 == 0 and len(real) in (1, len(whole) // 2):
@@ -100,13 +101,15 @@ def _tagged(path: Path, tags: list[tuple[int, str]]) -> dict[str, Any]:
         elif name == "corner" and whole and len(real) in (1, len(whole)):
             sharp = real * (len(whole) // len(real))
             options["corners"] += [(v, max(s, 0.0)) for v, s in zip(whole, sharp, strict=True)]
+        elif name == "hole" and whole:
+            options["holes"] += whole
         elif name == "interpolateboundary" and len(whole) == 1 and 0 <= whole[0] < 3:
             options["boundary"] = _BOUNDARIES[whole[0]]
         elif name == "facevaryinginterpolateboundary" and len(whole) == 1 and 0 <= whole[0] < len(UV_RULES):
             options["uv_rule"] = list(UV_RULES)[whole[0]]
         elif name == "creasemethod" and words in (["normal"], ["chaikin"]):
             options["chaikin"] = words == ["chaikin"]
-        elif name in ("crease", "corner", "interpolateboundary", "facevaryinginterpolateboundary", "creasemethod"):
+        elif name in _TAGS:
             raise _damaged(path, number, text)
         else:
             warn(f"{path}, line {number}: the tag {name[:40]!r} is not followed", FileWarning)

@@ -59,6 +59,8 @@ struct Description {
     float const* crease_sharpness;
     int const* corner_vertices;
     float const* corner_sharpness;
+    int holes;
+    int const* hole_faces;
     int uv_rows;            // 0 where there is no face-varying data.
     int const* uv_indices;  // (H,)
 };
@@ -77,6 +79,8 @@ void build(Cage& cage, Description const& d) {
     topology.numCorners = d.corners;
     topology.cornerVertexIndices = d.corner_vertices;
     topology.cornerWeights = d.corner_sharpness;
+    topology.numHoles = d.holes;
+    topology.holeIndices = d.hole_faces;
     Far::TopologyDescriptor::FVarChannel channel;
     channel.numValues = d.uv_rows;
     channel.valueIndices = d.uv_indices;
@@ -106,7 +110,7 @@ void build(Cage& cage, Description const& d) {
         for (int f = 0; f < d.faces; ++f) {
             bool made = channel ? factory.InitFaceVaryingSurface(f, &surfaces[f], 0)
                                 : factory.InitVertexSurface(f, &surfaces[f]);
-            if (!made) continue;  // Such as a face on a boundary that is not interpolated.
+            if (!made) continue;  // A hole, or a face on a boundary that is not interpolated.
             cage.width[channel] = std::max(cage.width[channel], surfaces[f].GetNumControlPoints());
             if (!channel) cage.kinds[f] = surfaces[f].GetParameterization().GetType();
         }

@@ -27,7 +27,7 @@ from rts.sampling.cache import fingerprint
 from rts.topology import fixed
 from rts.trees import Array, Tree
 from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows, in_g_buffer
-from rts_surfaces.parametric import BEYOND, LARGEST_STEP, RESIDUAL, STEPS, TOLERANCE, Geometry, Parametric
+from rts_surfaces.parametric import BEYOND, CROSSINGS, LARGEST_STEP, RESIDUAL, STEPS, TOLERANCE, Geometry, Parametric
 from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.binding import BOUNDARIES, UV, UV_RULES, VERTEX, Limit, Points, Rules
 from rts_surfaces.subdivision.cage import checked_cage, checked_lists
@@ -38,8 +38,6 @@ library.find()  # Without OpenSubdiv there is no such plugin.
 BESIDE = 1 / 16
 """How far from the border of a tile it is looked at how it bends. At extraordinary vertices second derivatives have no
 bound, and at creases they are large, but both on so little of a tile that triangles are off by less than that."""
-CROSSINGS = 4
-"""Edges of faces that Newton's method may cross."""
 LIMITS = RESIDUAL, STEPS + CROSSINGS, LARGEST_STEP, BEYOND, CROSSINGS
 
 VERTEX_ATTRIBUTES = ("colors", "uv")
@@ -73,12 +71,16 @@ class Subdivision(Parametric):
     "colors" (1, 3 or 4 wide) and "uv" (2 wide) are known, others are declared by `indices`; they are subdivided as
     positions are. In the G-buffer "colors" becomes "color". Normals are those of the limit surface.
 
+    Points are those of the limit but for rounding, except within 2⁻¹⁰ of a face from an extraordinary vertex, where
+    OpenSubdiv's patches end: there they are off by less than 1e-4 of the cage's extent.
+
     Args:
         faces: lists of integers into θ["vertices"], counter-clockwise seen from outside; or an array (F, n).
         scheme: "catmark" (Catmull–Clark, any polygons) or "loop" (triangles).
         creases: rows (a, b, sharpness): edges by their vertices. Sharpness s is sharp for s steps of subdivision; 10 is
             for ever.
         corners: rows (vertex, sharpness).
+        holes: numbers of faces that shape the surface, and are no part of it.
         boundary: what becomes of edges with one face: "edge_and_corner" (the surface ends there, and vertices of one
             face are corners), "edge_only" (no corners), "none" (faces at the boundary have no surface).
         chaikin: whether the sharpness of creases is smoothed along them.
@@ -102,6 +104,7 @@ class Subdivision(Parametric):
         *,
         creases: Any = (),
         corners: Any = (),
+        holes: Any = (),
         boundary: str = "edge_and_corner",
         chaikin: bool = False,
         indices: Mapping[str, Any] | None = None,
@@ -114,7 +117,7 @@ class Subdivision(Parametric):
         if not isinstance(chaikin, (bool, np.bool_)):
             raise InputError(f"chaikin is {quoted(chaikin)}; expected True or False")
         self._rules = Rules(boundary, bool(chaikin), uv_rule)
-        self.cage = checked_cage(faces, scheme, creases, corners)
+        self.cage = checked_cage(faces, scheme, creases, corners, holes)
         self._declared, self._uv = self._attribute_indices(indices)
         self._count = int(self.cage.indices.max()) + 1
         self._uv_count = self._count if self._uv is None else int(self._uv.max()) + 1
@@ -142,7 +145,10 @@ class Subdivision(Parametric):
         """Make what is not kept in a copy."""
         self.limit = Limit(self.cage, self._rules, self._uv)
         if not len(self.limit.table) or (self.limit.kinds < 0).all():
-            raise InputError("no face of the cage has a surface: all are at its boundary; use another boundary rule")
+            raise InputError(
+                "no face of the cage has a surface: all are holes, or at its boundary; leave out holes, or use another "
+                "boundary rule"
+            )
         self._points: tuple[tuple, Points] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -167,7 +173,7 @@ class Subdivision(Parametric):
 
     @classmethod
     def load(cls, path: Path) -> list[Part]:
-        """One part: the cage in an OBJ file, with its uv, and OpenSubdiv's statements "t" for creases and corners.
+        """One part: the cage in an OBJ file, with uv, and OpenSubdiv's statements "t" for creases, corners and holes.
 
         Raises:
             InputError: the file is no OBJ, is damaged, or its cage is not sound.

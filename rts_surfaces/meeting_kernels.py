@@ -1,0 +1,142 @@
+"""Where rays meet bicubic patches, on the host, compiled: Newton's method, across the edges of patches.
+
+Patches are in the form of powers, see `rts_surfaces.bicubic_kernels`. It imports numba.
+"""
+
+from __future__ import annotations
+
+import math
+
+from rts_surfaces.bicubic_kernels import compiled, first, kernel
+
+
+@kernel
+def bounds(nets, out):
+    """Fill `out` (n, 3): bounds of the lengths of second derivatives: in u, in u and v, in v."""
+    for n in range(len(nets)):
+        out[n] = 0
+        for i in range(4):
+            for j in range(4):
+                uu, uv, vv = 0.0, 0.0, 0.0
+                for c in range(3):
+                    if i < 2:
+                        uu += (nets[n, i, j, c] - 2 * nets[n, i + 1, j, c] + nets[n, i + 2, j, c]) ** 2
+                    if j < 2:
+                        vv += (nets[n, i, j, c] - 2 * nets[n, i, j + 1, c] + nets[n, i, j + 2, c]) ** 2
+                    if i < 3 and j < 3:
+                        low, high = nets[n, i, j, c], nets[n, i + 1, j, c]
+                        uv += (low - high - nets[n, i, j + 1, c] + nets[n, i + 1, j + 1, c]) ** 2
+                out[n, 0] = max(out[n, 0], 6 * math.sqrt(uu))
+                out[n, 1] = max(out[n, 1], 9 * math.sqrt(uv))
+                out[n, 2] = max(out[n, 2], 6 * math.sqrt(vv))
+
+
+@compiled
+def _crossed(across, flips, patch, u, v, inside):
+    """The patch beyond the side that u and v are farthest beyond, or -1, and u and v in it, so far inside of it."""
+    side, most = 0, -v
+    if u - 1 > most:
+        side, most = 1, u - 1
+    if v - 1 > most:
+        side, most = 2, v - 1
+    if -u > most:
+        side, most = 3, -u
+    other = across[patch, side]
+    if most <= 0 or other < 0:
+        return -1, u, v
+    u, v = min(max(u, 0.0), 1.0), min(max(v, 0.0), 1.0)
+    # Sides run around a patch.
+    t = u if side == 0 else v if side == 1 else 1 - u if side == 2 else 1 - v
+    to, to_side = other // 4, other % 4
+    if flips[patch, side] != flips[to, to_side]:
+        t = 1 - t
+    if to_side == 0:
+        return to, t, inside
+    if to_side == 1:
+        return to, 1 - inside, t
+    if to_side == 2:
+        return to, 1 - t, 1 - inside
+    return to, inside, 1 - t
+
+
+@kernel
+def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, origins, directions, spread, limits):
+    """Newton's method: move params so that points lie on their rays; see `rts_surfaces.parametric`.
+
+    Where it ends beyond the edge of a patch, it goes on in the patch beside it: triangles are off the surface by more
+    than thin patches are wide.
+
+    Args:
+        start: first line of cells.
+        stop: one after the last.
+        powers: (n, 3, 4, 4).
+        bounds: (n, 3), see above: where they say that a step ends near enough, the surface is not looked at again.
+        across: (n, 4) int32, see `rts_surfaces.patches.across`.
+        flips: (n, 4) bool, as in `rts_surfaces.tiles.Tiles`.
+        ids: (N, 1) int32, the patches; changed.
+        params: (N, 2) float32, where to start; changed.
+        row: (L, W) int32, the sample in each cell; becomes −1 where it does not meet its ray.
+        depth: (L, W) float32, changed.
+        origins: (N, 3) float64.
+        directions: (N, 3) float64; the point at depth z is `origin + z direction`.
+        spread: (2,), a pixel at depth z is `spread[0] + spread[1] z` wide.
+        limits: (5,): residual in pixels, largest number of steps on a patch, largest step in params, how far beyond the
+            edge, how many edges may be crossed.
+    """
+    residual, steps, largest, beyond, crossings = limits[0], int(limits[1]), limits[2], limits[3], int(limits[4])
+    for y in range(start, stop):
+        for x in range(row.shape[1]):
+            n = row[y, x]
+            if n < 0:
+                continue
+            row[y, x] = -1
+            patch, u, v = ids[n, 0], float(params[n, 0]), float(params[n, 1])
+            dx, dy, dz = directions[n, 0], directions[n, 1], directions[n, 2]
+            square, step, crossed = dx * dx + dy * dy + dz * dz, 0, 0
+            out_u, out_v = u, v
+            while True:
+                p, bound = powers[patch], bounds[patch]
+                sx, ax, bx = first(p[0], u, v)
+                sy, ay, by = first(p[1], u, v)
+                sz, az, bz = first(p[2], u, v)
+                # From the point to the ray's origin.
+                rx, ry, rz = origins[n, 0] - sx, origins[n, 1] - sy, origins[n, 2] - sz
+                z = -(rx * dx + ry * dy + rz * dz) / square
+                near = residual * abs(spread[0] + spread[1] * z)
+                cx, cy, cz = ry * dz - rz * dy, rz * dx - rx * dz, rx * dy - ry * dx
+                met = cx * cx + cy * cy + cz * cz <= near * near * square
+                # Where the ray meets the tangent plane, by Cramer's rule.
+                hx, hy, hz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
+                determinant = ax * hx + ay * hy + az * hz
+                scale = (ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz) * square
+                ended = met or step == steps or not determinant * determinant > 1e-24 * scale
+                if not ended:
+                    qx, qy, qz = ry * az - rz * ay, rz * ax - rx * az, rx * ay - ry * ax
+                    du = (rx * hx + ry * hy + rz * hz) / determinant
+                    dv = (dx * qx + dy * qy + dz * qz) / determinant
+                    size = max(abs(du), abs(dv))
+                    if size > largest:
+                        du, dv = du * largest / size, dv * largest / size
+                    else:
+                        off = bound[0] * du * du + 2 * bound[1] * abs(du * dv) + bound[2] * dv * dv
+                        if off <= 2 * near:
+                            met, z = True, (bx * qx + by * qy + bz * qz) / determinant
+                    u, v, step = u + du, v + dv, step + 1
+                if met and -beyond <= u <= 1 + beyond and -beyond <= v <= 1 + beyond:
+                    row[y, x], depth[y, x] = n, z
+                    ids[n, 0], params[n, 0], params[n, 1] = patch, u, v
+                    break
+                if u < 0 or u > 1 or v < 0 or v > 1:
+                    out_u, out_v = u, v
+                if met or ended:
+                    if crossed == crossings:
+                        break
+                    # Beside a fold what lies beyond the edge attracts: each time it begins farther within a patch.
+                    patch, u, v = _crossed(across, flips, patch, out_u, out_v, min(beyond * 2.0**crossed, 0.5))
+                    if patch < 0:
+                        break
+                    step, crossed, out_u, out_v = 0, crossed + 1, u, v
+                else:
+                    u, v = min(max(u, -0.25), 1.25), min(max(v, -0.25), 1.25)
+            if row[y, x] < 0:
+                depth[y, x], params[n, 0], params[n, 1] = 0, 0, 0
