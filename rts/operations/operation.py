@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.arrays import from_numbers
+from rts.arguments import one_line, quoted
+from rts.arrays import from_numbers, kind_of
 from rts.engines import OWNERS, constants, engine_of, suiting, value_of
 from rts.errors import InputError, RtsError
 from rts.trees import Array
@@ -166,7 +166,10 @@ class Operation:
             if kind in OWNERS or kind is np.ndarray:
                 self.check_ranks(operands)
                 return engine_of(operands[0]).apply(self, operands, params)
-        operands = tuple([from_numbers(x) for x in operands])
+        operands = tuple([from_numbers(x, f"an operand of {self.name}") for x in operands])
+        if any(isinstance(x, (Mapping, list, tuple)) or x is None for x in operands):
+            given = ", ".join(map(kind_of, operands))
+            raise InputError(f"the operation {self.name} was given {given} as operands; expected arrays")
         engine, like = suiting(operands)
         operands = constants(operands, engine, like)
         self.check_ranks(operands)
@@ -267,7 +270,7 @@ class Operation:
             return error
         return InputError(
             f"{function} of the operation {self.name} cannot take operands of shapes {_listed(shapes)}: "
-            f"{' '.join(str(error).split())}; give it operands of shapes that fit"
+            f"{one_line(error)}; give it operands of shapes that fit"
         )
 
     def push_on_host(self, operands: Arrays, tangents: Some, out: np.ndarray, kept: Any, params: dict) -> None:
