@@ -11,7 +11,7 @@ from typing import Any
 
 from rts.arguments import check_pixels, check_positive
 from rts.arrays import described, from_numbers, shape_of
-from rts.engines import namespace
+from rts.engines import constants, namespace, suiting
 from rts.errors import InputError
 from rts.trees import Array
 
@@ -74,7 +74,11 @@ class Ndc:
             Origins and directions, (N, 3) each; equal steps of t are equal steps of disparity.
         """
         origins, directions = _checked("origins", origins), _checked("directions", directions)
-        xp = namespace(origins, directions)
+        if origins.shape != directions.shape:
+            raise InputError(f"origins {described(origins)} and directions {described(directions)}; expected one shape")
+        engine, like = suiting(origins, directions)
+        origins, directions = constants((origins, directions), engine, like)
+        xp = engine.namespace
         at_near = origins - directions * ((self.near + origins[:, 2:]) / directions[:, 2:])
         start = self.from_world(at_near)
         x, y = (-s * directions[:, i] / directions[:, 2] for i, s in enumerate(self.scale))

@@ -136,13 +136,6 @@ def subdivided(**options):
     return rts.Subdivision(**{"faces": FACES, **options})
 
 
-def of_rows(**options):
-    views = np.stack([CAMERA.view] * 2)
-    given = {"views": views, "projections": np.stack([CAMERA.for_size(SIZE).projection] * 2)}
-    cameras = rts.RowCameras(**{**given, "number": np.array([1, 2], np.int32), **options})
-    return cameras.directions(POINTS) if hasattr(cameras, "directions") else cameras
-
-
 def residuals(**options):
     return rts.ImageResiduals(lambda p: scene(p)[0], CAMERA, SIZE, np.ones(SIZE, np.float32), **options)(pose())
 
@@ -194,7 +187,6 @@ GROUPS = {
     "Proxy": open_in(lambda **o: drawn(Card(**o)), "vertices", "faces", "ids", "corner_params"),
     "RayHits": open_in(lambda **o: drawn(Ball(**o), {}), "hit", "distance", "params", "ids"),
     "Revolution": open_in(rts.Revolution, "ends", "tolerance", heights=np.arange(5.0)),
-    "RowCameras": open_in(of_rows, "views", "projections", "number"),
     "Samples": open_in(
         lambda **o: rts.render_samples(replace(SAMPLED, samples=[replace(SAMPLES, **o)]), PART, CAMERA),
         *("ids", "params", "row", "depth"),
@@ -203,7 +195,7 @@ GROUPS = {
     "Subdivision": open_in(
         subdivided, "faces", "scheme", "creases", "corners", "boundary", "chaikin", "indices", "uv_rule", "tolerance"
     ),
-    "check_gradient": open_in(checked, "loss", "samples", "tolerance", "budget_s", "progress"),
+    "check_gradient": open_in(checked, "loss", "samples", "tolerance", "budget_s"),
     "engine_of": {"trees": rts.engine_of},
     "exact_calibration": {"reach": lambda v: rts.exact_calibration(0.5, v)},
     "explain": open_in(
@@ -238,12 +230,10 @@ GROUPS = {
     "tune": open_in(
         tuned,
         *("scene", "parameters", "tolerance", "budget_s", "directions", "size", "modes", "engine", "samplers"),
-        *("splatters", "surface", "truths", "truth_samples", "progress"),
+        *("splatters", "truths", "truth_samples"),
     ),
     "unwrapped": {"plugin": rts.unwrapped},
-    "volume_render": open_in(
-        volume, "field", "camera", "size", "near", "far", "samples", "background", "ndc", "progress"
-    ),
+    "volume_render": open_in(volume, "field", "camera", "size", "near", "far", "samples", "background", "ndc"),
     "warmup": {"processes": rts.warmup},
     "ARAP": open_in(lambda **o: energy(regularizers.ARAP, **o), "vertices", "faces", "weights"),
     "EdgeLength": open_in(lambda **o: energy(regularizers.EdgeLength, **o), "vertices", "faces", "target"),
@@ -258,3 +248,9 @@ GROUPS = {
     "stability": open_in(broken, "rows", "methods", "seeds", "steps", "truth_samples", "output", "more"),
 }
 CALLS = {f"{group}.{name}": call for group, calls in GROUPS.items() for name, call in calls.items()}
+
+ALL = "stability.rows warmup.processes compare.samplers tune.samplers tune.splatters check_gradient.loss".split()
+"""Where None is right, and takes long."""
+
+RECORDS = "ArraySpec Fine Fit Rate Rays RowCameras Sampled Splats Tuned View Comparison Stability".split()
+"""What the library gives, and users read; functions that take one are in the tables."""
