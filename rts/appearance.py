@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
-from rts.arrays import described, shape_of
+from rts.arrays import described, kind_of, shape_of
 from rts.camera import Camera
 from rts.checks import check_shaded
 from rts.engines import Engine, constants, is_constant, namespace
@@ -31,6 +31,9 @@ def evaluate(part: CheckedPart, samples: Samples, engine: Engine, like: Array | 
         if samples.asked is None or (wanted is not None and set(wanted) <= set(samples.asked)):
             return GBuffer(samples.gbuffer)
     gbuffer = part.surface.evaluate(constants(theta, engine, like), samples)
+    if not isinstance(gbuffer, Mapping) or "position" not in gbuffer:
+        what = f"one with {sorted(gbuffer)}" if isinstance(gbuffer, Mapping) else kind_of(gbuffer)
+        raise InputError(f"evaluate of {part.surface!r} gave {what}; expected an rts.GBuffer with 'position'")
     gbuffer = gbuffer if isinstance(gbuffer, GBuffer) else GBuffer(gbuffer)
     if shape_of(gbuffer["position"]) != (samples.ids.shape[0], 3):
         position = described(gbuffer["position"])

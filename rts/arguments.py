@@ -26,6 +26,12 @@ def quoted(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
+def one_line(error: Exception) -> str:
+    """The message of an error that is not the library's, in one line, and not a long one."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 120 else f"{text[:117]}..."
+
+
 def check_numbers(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:
     """Refuse what is not a finite real array, or list of numbers, of one of these shapes.
 
@@ -61,6 +67,12 @@ def _shape_and_dtype(value: Any) -> tuple[Shape, Any]:
         first = next(x for x in leaves(value) if not isinstance(x, CONSTANT_TYPES))
         return (len(value), *{shape_of(x) for x in value}.pop()), first.dtype
     return shape_of(value), value.dtype
+
+
+def check_flag(name: str, value: Any) -> None:
+    """Refuse what is neither True nor False."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise InputError(f"{name} is {quoted(value)}; expected True or False")
 
 
 def check_positive(name: str, value: Any, *shapes: Shape) -> np.ndarray | None:

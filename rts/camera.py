@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from numbers import Real
 from typing import Any, Literal
 
 import numpy as np
@@ -24,6 +25,7 @@ from rts.arguments import (
     check_positive,
     check_rotation,
     is_invertible,
+    quoted,
 )
 from rts.arrays import described, from_numbers, promote, shape_of, unit
 from rts.engines import constants, engine_of, is_constant, load_engines, namespace, value_of
@@ -534,8 +536,10 @@ class Camera:
 
     def for_size(self, size: tuple[int, int]) -> Camera:
         """The camera for images of a size (height, width), if it leaves the ratio open; else the camera itself."""
-        if self.aspect != "open":
+        if self.aspect is None or isinstance(self.aspect, Real):
             return self
+        if not (isinstance(self.aspect, str) and self.aspect == "open"):
+            raise InputError(f"aspect is {quoted(self.aspect)}; expected width over height, 'open' or None")
         height, width = check_pixels(size)
         aspect = width / height
         columns = engine_of(self.projection).constant(np.array([1 / aspect, 1, 1, 1]), self.projection)

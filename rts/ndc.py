@@ -7,9 +7,12 @@ infinity to z = 1 (Mildenhall et al. 2020, appendix C). Straight lines stay stra
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from rts.arguments import check_pixels, check_positive
-from rts.engines import namespace
+from rts.arrays import described, from_numbers, shape_of
+from rts.engines import constants, namespace, suiting
+from rts.errors import InputError
 from rts.trees import Array
 
 NEAREST, FARTHEST = 1e-6, 1e6
@@ -28,6 +31,10 @@ class Ndc:
     scale: tuple[float, float]
     near: float = 1.0
 
+    def __post_init__(self):
+        check_positive("scale", self.scale, (2,))
+        check_positive("near", self.near)
+
     @classmethod
     def of_images(cls, size: tuple[int, int], focal: float, near: float = 1.0) -> Ndc:
         """NDC of images of a size (height, width) and a focal length in their pixels.
@@ -42,6 +49,7 @@ class Ndc:
 
     def from_world(self, points: Array) -> Array:
         """NDC (N, 3) of world points (N, 3); those behind the camera as if they were just before it."""
+        points = _checked("points", points)
         xp = namespace(points)
         depth = _at_least(-points[:, 2], NEAREST * self.near)
         x, y = (s * points[:, i] / depth for i, s in enumerate(self.scale))
@@ -49,6 +57,7 @@ class Ndc:
 
     def to_world(self, points: Array) -> Array:
         """World points (N, 3) of NDC (N, 3); those at infinity and beyond at a depth of a million near planes."""
+        points = _checked("points", points)
         xp = namespace(points)
         depth = 2 * self.near / _at_least(1 - points[:, 2], 2 / FARTHEST)
         x, y = (points[:, i] * depth / s for i, s in enumerate(self.scale))
@@ -64,11 +73,24 @@ class Ndc:
         Returns:
             Origins and directions, (N, 3) each; equal steps of t are equal steps of disparity.
         """
-        xp = namespace(origins, directions)
+        origins, directions = _checked("origins", origins), _checked("directions", directions)
+        if origins.shape != directions.shape:
+            raise InputError(f"origins {described(origins)} and directions {described(directions)}; expected one shape")
+        engine, like = suiting(origins, directions)
+        origins, directions = constants((origins, directions), engine, like)
+        xp = engine.namespace
         at_near = origins - directions * ((self.near + origins[:, 2:]) / directions[:, 2:])
         start = self.from_world(at_near)
         x, y = (-s * directions[:, i] / directions[:, 2] for i, s in enumerate(self.scale))
         return start, xp.stack([x, y, xp.ones_like(x)], axis=1) - start
+
+
+def _checked(name: str, points: Any) -> Array:
+    """Rows of three numbers, refused where they are something else."""
+    points = from_numbers(points, name)
+    if len(shape_of(points)) != 2 or points.shape[1] != 3:
+        raise InputError(f"{name} {described(points)}; expected (N, 3)")
+    return points
 
 
 def _at_least(x: Array, low: float) -> Array:

@@ -42,7 +42,7 @@ class Proxy(NamedTuple):
     Attributes:
         vertices: (V, 3) float32, local space.
         faces: (T, 3) int32.
-        ids: (T, I) int32, handed on to the samples of the triangle; None means `faces`.
+        ids: (T, I) int32, handed on to the samples of the triangle; None means `faces`, or none where I = 0.
         corner_params: (T, 3, P) float32, interpolated with the barycentrics; None means the barycentrics themselves.
     """
 

@@ -98,6 +98,8 @@ def plugins(group: str, *, details: bool = False) -> list[str] | list[PluginInfo
         InputError: no such group.
     """
     group = _group(group)
+    if not isinstance(details, bool):
+        raise InputError(f"details is a {type(details).__name__}; expected True or False")
     return [_details(group, name) for name in sorted(_entries(group))] if details else sorted(_entries(group))
 
 

@@ -19,6 +19,7 @@ from rts.shading import Depth, Normals, Unlit
 from rts.splatting import Multi, Plain
 from rts.testing import (
     EngineConformance,
+    OperationConformance,
     SamplerConformance,
     ShaderConformance,
     SplatterConformance,
@@ -28,6 +29,7 @@ from rts.testing import (
     shaders,
     splatters,
 )
+from rts.testing.engine_examples import numbers
 
 pytestmark = pytest.mark.plugins
 
@@ -1001,6 +1003,93 @@ ODD_ENGINES = {
     "a_render_is_numpys": {"a thousandth more": engine_with(apply=of_base("apply", lambda x: x * 1.001))},
 }
 
+
+def scaled(**members):
+    """x · k of x (N, C) and k (C,), with some members altered."""
+
+    def push(operands, tangents, out):
+        out[...] = sum(t * x for t, x in zip(tangents, reversed(operands), strict=True) if t is not None)
+
+    def pull(operands, g, results):
+        if results[0] is not None:
+            results[0][...] = g * operands[1]
+        if results[1] is not None:
+            results[1][...] = (g * operands[0]).sum(axis=0)
+
+    given = {
+        "specification": lambda x, k: x * k,
+        "shape": lambda x, k: x,
+        "forward": lambda operands, out: np.multiply(*operands, out=out) is None,
+        "push": push,
+        "pull": pull,
+    }
+    options = {"differentiable": 2, "packed": (0,), "packed_result": True}
+    return rts.Operation("tests.odd", ranks=(2, 1), **{**given, **options, **members})
+
+
+def forward_of_all(operands, out):
+    np.multiply(*operands, out=out)
+    out += operands[0].sum()
+
+
+def push_that_adds(operands, tangents, out):
+    for t, x in zip(tangents, reversed(operands), strict=True):
+        if t is not None:
+            out += t * x
+
+
+def push_of_all(operands, tangents, out):
+    out[...] = tangents[0] * operands[1] + tangents[1] * operands[0]
+
+
+def push_of_kept(operands, tangents, out, kept):
+    """Right only with what forward has kept."""
+    scaled().push(operands, tangents, out)
+    out *= 1 if kept else 0.5
+
+
+def keeping(operands, out):
+    np.multiply(*operands, out=out)
+    return True
+
+
+ODD_OPERATIONS = {
+    "forward_is_the_specification": {
+        "a thousandth more": scaled(forward=lambda x, out: np.multiply(*x, out=out).__imul__(1.001) is None),
+        "nothing written": scaled(forward=lambda operands, out: operands[0] * operands[1]),
+        "a row unwritten": scaled(forward=lambda x, out: np.multiply(x[0][1:], x[1], out=out[1:]) is None),
+        "a row less": scaled(shape=lambda x, k: (x[0] - 1, x[1]), forward=lambda x, out: out.fill(1)),
+        "operands changed": scaled(forward=lambda x, out: np.multiply(*x, out=x[0]) is None),
+        "always float64": scaled(specification=lambda x, k: (x * k).astype(np.float64)),
+        "an error": scaled(forward=lambda operands: None),
+    },
+    "push_is_the_derivative_of_the_specification": {
+        "of all operands": scaled(push=push_of_all),
+        "added": scaled(push=push_that_adds),
+        "halved": scaled(push=lambda x, t, out: out.__setitem__(..., 0.5)),
+    },
+    "pull_is_the_transpose_of_push": {
+        "nothing written": scaled(pull=lambda operands, g, results: None),
+        "all results": scaled(pull=lambda x, g, results: results[0].__setitem__(..., g * x[1])),
+    },
+    "what_forward_keeps_changes_nothing": {
+        "needed": scaled(
+            keeps=True,
+            forward=keeping,
+            push=push_of_kept,
+            pull=lambda x, g, results, kept: scaled().pull(x, g, results),
+        )
+    },
+    "rows_are_computed_by_themselves": {
+        "all together": scaled(forward=forward_of_all),
+    },
+    "every_engine_gives_the_value_and_derivatives_of_the_specification": {
+        "a thousandth more": scaled(forward=lambda x, out: np.multiply(*x, out=out).__imul__(1.001) is None),
+        "no pull": scaled(pull=lambda operands, g, results: None),
+        "doubled push": scaled(push=lambda x, t, out: (scaled().push(x, t, out), out.__imul__(2))),
+    },
+}
+
 LAMBERTIAN = {"color": np.array([0.9, 0.8, 1.0], np.float32)}
 
 
@@ -1016,6 +1105,17 @@ KIT = {
         lambda shader: {"shader": shader, "theta": LAMBERTIAN, "gbuffer": shaders.random_gbuffer()},
     ),
     SplatterConformance: (SPLATTERS, lambda splatter: {"splatter": splatter}),
+    OperationConformance: (
+        ODD_OPERATIONS,
+        lambda operation: {
+            "operation": operation,
+            "operands": [numbers(6, 3).astype(float), numbers(3).astype(float)],
+            "params": {},
+            "dtype": np.float32,
+            "share": 0.5,
+            "name": "torch",
+        },
+    ),
     EngineConformance: (ODD_ENGINES, lambda make: {"engine": make(), "name": "projective_map"}),
 }
 CULLED = scenes.ball(cull="back")

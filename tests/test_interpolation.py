@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from helpers import ALL, DIFFERENTIABLE, arrays, derivative, gradient, to_numpy
+from helpers import ALL, arrays, to_numpy
 
+from rts.testing import OperationConformance
 from rts_surfaces.implicit.interpolation import DIFFERENCES, differences, interpolated
 from rts_surfaces.implicit.lattice import Lattice
 from rts_surfaces.implicit.motion import ALONG_EDGES, ALONG_NORMAL
@@ -62,39 +63,33 @@ def edges():
 
 NUMBERS, BOUNDED = edges()
 CASES = {
-    "differences": (DIFFERENCES, [VALUES, POINTS], (), STEPS),
-    "along the normal": (ALONG_NORMAL, [RNG.standard_normal(40)], (PARAMS, ROWS), {"isovalue": 0.3, "sign": -1.0}),
+    "differences": (DIFFERENCES, [VALUES, POINTS], STEPS),
+    "along the normal": (ALONG_NORMAL, [RNG.standard_normal(40), PARAMS, ROWS], {"isovalue": 0.3, "sign": -1.0}),
     "along edges": (
         ALONG_EDGES,
-        [VALUES.reshape(-1)],
-        (BOUNDED, NUMBERS, NUMBERS),
+        [VALUES.reshape(-1), BOUNDED, NUMBERS, NUMBERS],
         {"isovalue": 0.1, "lattice": LATTICE.fixed},
     ),
 }
-"""An operation, operands with and without derivatives, and parameters."""
+"""An operation, operands, and parameters."""
 
 
-@pytest.mark.parametrize("case", CASES)
-@pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_compiled_values_and_derivatives_are_those_of_the_specification(target, case):
-    operation, operands, fixed, options = CASES[case]
-    operands, fixed = arrays(target, operands), arrays(target, fixed)
-    weights = arrays(target, RNG.standard_normal((60 if case == "differences" else 30, 3)))
+class TestCompiled(OperationConformance):
+    @pytest.fixture(params=CASES)
+    def case(self, request):
+        return CASES[request.param]
 
-    def compiled(x):
-        return operation(*x, *fixed, **options)
+    @pytest.fixture
+    def operation(self, case):
+        return case[0]
 
-    def specified(x):
-        return operation.specification(*x, *fixed, **options)
+    @pytest.fixture
+    def operands(self, case):
+        return case[1]
 
-    np.testing.assert_allclose(to_numpy(compiled(operands)), to_numpy(specified(operands)), rtol=2e-5, atol=2e-5)
-    along = arrays(target, [RNG.standard_normal(x.shape) for x in operands])
-    pushed = [derivative(target, f, operands, along)[1] for f in (compiled, specified)]
-    np.testing.assert_allclose(*pushed, rtol=2e-4, atol=2e-4)
-    pulled = [gradient(target, lambda x, f=f: (f(x) * weights).sum(), operands) for f in (compiled, specified)]
-    for found, expected in zip(*pulled, strict=True):
-        assert np.abs(expected).max() > 0.1
-        np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-4)
+    @pytest.fixture
+    def params(self, case):
+        return case[2]
 
 
 def test_samples_of_another_surface_are_refused():

@@ -1,11 +1,14 @@
 """Wrong values for every argument: one line that names the argument, or an acceptance that is documented."""
 
 import math
+from inspect import isabstract
 
+import misuses
 import numpy as np
 import pytest
 
 import rts
+import rts.diagnostics
 from rts import Camera
 from rts_surfaces.implicit.narrow_band import NarrowBand
 
@@ -336,3 +339,150 @@ def test_a_wrong_value_is_one_line_that_names_the_argument_or_accepted(call, val
     assert "\n" not in message
     assert len(message) < 300, message
     assert named(call, message)
+
+
+@pytest.mark.filterwarnings("ignore::rts.RtsWarning", "ignore::RuntimeWarning", "ignore::DeprecationWarning")
+@pytest.mark.parametrize("call", misuses.CALLS)
+def test_a_wrong_value_is_one_line_or_works(call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    raw = []
+    for value, given in {**WRONG, "integers": np.ones((2, 3), int), "a tuple": (1, 2, 3)}.items():
+        if value == "a class" or (value == "None" and call in misuses.ALL):
+            continue  # The error of a class that is called is its author's.
+        try:
+            misuses.CALLS[call](given)
+        except rts.RtsError as error:
+            message = str(error)
+            if "\n" in message or len(message) > 400:
+                raw.append(f"{value}: {message}")
+        except Exception as error:
+            raw.append(f"{value}: {type(error).__name__}: {error}")
+    assert not raw
+
+
+def public():
+    """Names that users call."""
+    modules = (rts, rts.regularizers, rts.diagnostics)
+    names = {name: getattr(module, name) for module in modules for name in module.__all__}
+    names |= {name: getattr(rts, name) for name in rts.registry.built_in_surfaces()}
+    return {name for name, value in names.items() if callable(value) and not is_base(value)}
+
+
+def is_base(value):
+    """Whether it is an error, or a base that a plugin subclasses."""
+    return isinstance(value, type) and (issubclass(value, Exception) or isabstract(value))
+
+
+def test_every_public_name_is_tried():
+    tried = {call.partition(".")[0] for call in {**CALLS, **misuses.CALLS}}
+    assert public() - tried == set(misuses.RECORDS) - tried
+    assert not tried & set(misuses.RECORDS)
+
+
+def test_arrays_of_two_engines_are_refused():
+    torch, jnp = pytest.importorskip("torch"), pytest.importorskip("jax.numpy")
+    part, points = theta(vertices=torch.tensor(PART.theta["vertices"])), torch.zeros(4, 3)
+    eye, ndc = jnp.eye(4), rts.Ndc((1.0, 1.0))
+    for call in (
+        lambda: rts.render(part.replace(transform=eye), CAMERA, SIZE),
+        lambda: rts.render(part, Camera(eye, CAMERA.projection), SIZE),
+        lambda: rts.render(part, CAMERA, SIZE, background=eye[0, :3]),
+        lambda: rts.render_samples(SAMPLED, part.replace(transform=eye), CAMERA),
+        lambda: rts.render_views(part.replace(transform=eye), [CAMERA] * 2, SIZE),
+        lambda: rts.sample(part.replace(transform=eye), CAMERA, SIZE),
+        lambda: rts.combine(points, np.zeros((1, 1), np.int32), eye[:1, :1]),
+        lambda: rts.rigid(torch.zeros(6), eye[0, :3]),
+        lambda: CAMERA.replace(view=eye).project(points, SIZE),
+        lambda: ndc.rays(points, jnp.ones((4, 3))),
+        lambda: misuses.DOUBLE(points, eye),
+        lambda: rts.namespace(points, eye),
+        lambda: rts.engine_of(points, {"a": eye}),
+        lambda: rts.fit(lambda p: p["a"], {"a": points, "b": eye}),
+        lambda: rts.check_gradient(lambda p: (part, CAMERA), {"a": points, "b": eye}, SIZE),
+    ):
+        with pytest.raises(rts.RtsError) as refused:
+            call()
+        assert "\n" not in str(refused.value)
+
+
+def flat(**changes):
+    """A card of two barycentrics a sample, with a table of its proxy altered, and other widths."""
+    widths = changes.pop("widths", (3, 2))
+    card = misuses.Card(**changes)
+    card.sample_widths = widths
+    return misuses.drawn(card)
+
+
+class Plane(misuses.Card):
+    """A card whose samples have no integers: its corners are in its params."""
+
+    sample_widths = (0, 3)
+
+    def __init__(self):
+        super().__init__(corner_params=misuses.VERTICES[misuses.FACES])
+
+    def evaluate(self, theta, samples):
+        return rts.GBuffer(position=samples.params)
+
+    def image(self):
+        return misuses.drawn(self)
+
+
+def of_numpy(theta, points):
+    return np.sqrt((points * points).sum(-1)) - theta["r"]
+
+
+def tensor(*shape):
+    return pytest.importorskip("torch").zeros(shape)
+
+
+def prepared_in_jit():
+    jax = pytest.importorskip("jax")
+    vertices = jax.numpy.asarray(PART.theta["vertices"])
+    jax.jit(lambda v: rts.render(rts.prepare(theta(vertices=v)), CAMERA, SIZE))(vertices)
+
+
+FAULTS = {
+    "narrow corners": (
+        lambda: flat(corner_params=np.zeros((2, 3, 1), np.float32)),
+        "corner_params of 1 numbers a corner, but sample_widths says 2",
+    ),
+    "no corners": (lambda: flat(widths=(3, 4)), "no corner_params, and so 2 barycentrics a corner, but .* says 4"),
+    "a number for NDC": (lambda: rts.Ndc(2.0), r"scale is 2.0; expected \(2,\)"),
+    "points of NDC": (lambda: misuses.NDC.from_world(np.zeros((4, 2))), r"points has shape \(4, 2\); expected"),
+    "a stacked camera": (lambda: misuses.volume(camera=Camera.stack([CAMERA] * 2)), "camera is of several views"),
+    "nothing depends": (
+        lambda: misuses.tuned(scene=lambda p: (PART, CAMERA)),
+        "nothing in the image of '<lambda>' changes with 'parameters",
+    ),
+    "a field of points alone": (lambda: Sdf(lambda points: points[:, 0]), "expected a function of two arguments"),
+    "a field of NumPy": (
+        lambda: rendered(Sdf(of_numpy), {"r": tensor().requires_grad_(True)}),
+        "of_numpy fails on points .* of torch .* write it in array code|numpy.ndarray",
+    ),
+    "prepared in jit": (prepared_in_jit, "rts.prepare was given a traced array"),
+    "an energy of other vertices": (
+        lambda: rts.regularizers.NormalConsistency(misuses.VERTICES, misuses.FACES)(np.zeros((5, 3))),
+        "vertices have 5 rows; expected 4",
+    ),
+    "faces of other vertices": (
+        lambda: rts.regularizers.NormalConsistency(misuses.VERTICES[:3], misuses.FACES),
+        "faces name vertex 3, but there are 3 vertices",
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_is_told_before_any_work(fault):
+    call, words = FAULTS[fault]
+    with pytest.raises(rts.InputError, match=words) as refused:
+        call()
+    assert "\n" not in str(refused.value)
+
+
+def test_what_may_be_left_out_is():
+    assert Plane().image()[..., 3].max() > 0.5
+    energy, faces = rts.regularizers.NormalConsistency, misuses.FACES
+    both = energy(misuses.VERTICES, faces), energy(faces), energy(faces=faces)
+    assert len({float(e(misuses.VERTICES)) for e in both}) == 1

@@ -1,15 +1,24 @@
 """Operations: the library's and a stranger's, in every engine, against closed forms and the specification."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 from helpers import ALL, DIFFERENTIABLE, arrays, derivative, finite_difference, gradient, relative_error, to_numpy
 
 import rts
+from rts.fitting.losses import Loss
+from rts.operations import linear, projection
 from rts.operations.combine import COMBINE, combine, interpolate
-from rts.operations.inset import painted_inset, with_inset
+from rts.operations.inset import INSET, PAINTED, painted_inset, with_inset
 from rts.operations.linear import affine_map, affine_map_of_views, matmul
 from rts.operations.projection import projective_map, projective_map_of_views
-from rts.operations.take import take
+from rts.operations.rigid import RIGID
+from rts.operations.take import SHIFTED, TAKE, take
+from rts.testing import OperationConformance
+from rts.testing.splatters import scattered
+from rts_backends.fused.image import IMAGE
+from rts_backends.fused.mean_loss import MEAN_LOSS
 
 pytestmark = pytest.mark.engines
 
@@ -66,31 +75,6 @@ def combine_kernels_read(*given):
     from rts.threads import read_only
 
     return [read_only(x) for x in given]
-
-
-@pytest.mark.parametrize("affine", [False, True])
-def test_the_adjoint_of_combine_is_its_transpose(affine):
-    from rts.operations import combine_kernels
-
-    rows, weights = combine_kernels_read(RNG.normal(size=(9, 4)), RNG.normal(size=(60, 6)))
-    (ids,) = combine_kernels_read(RNG.integers(0, 9, (60, 8)).astype(np.int32))
-    params = {"column": 2, "count": 5, "affine": affine}
-    t_rows, t_weights, g = RNG.normal(size=rows.shape), RNG.normal(size=weights.shape), RNG.normal(size=(60, 4))
-    out, g_rows, g_weights = np.empty((60, 4)), np.zeros_like(rows), np.zeros_like(weights)
-    combine_kernels.push(rows, weights, ids, t_rows, t_weights, out, **params)
-    combine_kernels.pull(rows, weights, ids, g, g_rows, g_weights, **params)
-    np.testing.assert_allclose((out * g).sum(), (g_rows * t_rows).sum() + (g_weights * t_weights).sum(), rtol=1e-12)
-    step = 1e-6
-    ends = []
-    for s in (step, -step):
-        end = np.empty((60, 4))
-        combine_kernels.forward(*combine_kernels_read(rows + s * t_rows, weights + s * t_weights, ids), end, **params)
-        ends.append(end)
-    np.testing.assert_allclose(out, (ends[0] - ends[1]) / (2 * step), rtol=1e-6, atol=1e-7)
-    specified = COMBINE.specification(rows, weights, ids, **params)
-    found = np.empty((60, 4))
-    combine_kernels.forward(rows, weights, ids, found, **params)
-    np.testing.assert_allclose(found, specified, rtol=1e-12, atol=1e-12)
 
 
 def test_combine_refuses_what_does_not_fit_in_one_line():
@@ -237,14 +221,14 @@ CLAMP = rts.Operation(
 )
 
 
+def operands():
+    return [RNG.normal(size=(6, 3)), RNG.uniform(0.8, 1.5, 3)]
+
+
 @pytest.fixture
 def calls():
     CALLS.clear()
     return CALLS
-
-
-def operands():
-    return [RNG.normal(size=(6, 3)), RNG.uniform(0.8, 1.5, 3)]
 
 
 @pytest.mark.parametrize("target", ALL)
@@ -316,7 +300,6 @@ def test_other_dtypes_are_left_to_its_specification(calls):
 
 def test_operations_of_one_name_do_not_take_each_other_s_place():
     jax = pytest.importorskip("jax")
-    from dataclasses import replace
 
     def doubled(operands, out, *, power):
         forward(operands, out, power=power)
@@ -333,6 +316,68 @@ def test_take_adds_gradients_of_rows_that_are_taken_twice(target):
     index = np.array([2, 0, 2, 2], np.int32)
     found = gradient(target, lambda r: take(r, arrays(target, index)).sum(), arrays(target, np.ones((4, 2))))
     np.testing.assert_array_equal(found[:, 0], [1, 0, 3, 0])
+
+
+# ------------------------------------------------------------------------------------------- all of them, by the kit
+
+
+def splatted():
+    """Operands of the image of two layers with holes, and settings, whose specification jax compiles fast."""
+    splatter, splats = rts.plugin("splatters", "single")(), scattered()
+    return splatter._operands(splats), {"settings": splatter._settings_of(splats)}
+
+
+def cases():
+    """Each operation with operands and parameters; those of surfaces are in tests of these."""
+    rng = np.random.default_rng(3)
+    ids, index = rng.integers(0, 7, (20, 6)).astype(np.int32), rng.integers(0, 7, 20).astype(np.int32)
+    rows, ahead = rng.normal(size=(7, 3)), rng.normal(size=(3, 4, 4)) * 0.3 + np.diag([0, 0, 0, 6])[[0, 1, 3, 2]]
+    points, places = rng.normal(size=(20, 3)), np.array([[0, 0, 1], [9, 9, 9], [20, 10, 0.5]])
+    view = np.array([1] * 8 + [3] * 12, np.int32)
+    image, fine = rng.normal(size=(3, 4, 2)), rng.normal(size=(4, 6, 2))
+    pixel = np.array([[-1, 5, 0, -1], [-1, -1, 1, -1], [4, -1, -1, -1]], np.int32)
+    row, settled = rng.integers(-3, 3, size=(5, 6), dtype=np.int32), rng.integers(-2, 1, size=(5, 6), dtype=np.int8)
+    given, options = splatted()
+    size = given[2].shape[1:]
+    target, weights = rng.random((*size, 3)), rng.random((*size, 1))
+    backdrop = np.ones((*size, 4)) * 0.3
+    return {
+        "combine": (COMBINE, [rows, rng.normal(size=(20, 6)), ids], {"column": 2, "count": 4, "affine": False}),
+        "interpolate": (COMBINE, [rows, rng.random((20, 2)), ids], {"column": 1, "count": 3, "affine": True}),
+        "take": (TAKE, [rows, index], {}),
+        "take_shifted": (SHIFTED, [rows, index, points], {}),
+        "rigid": (RIGID, [rng.normal(size=6), rng.normal(size=3)], {}),
+        "affine": (linear.AFFINE, [rng.normal(size=(5, 4)), points], {}),
+        "affine_of_views": (linear.VIEWS, [rng.normal(size=(3, 2, 4)), points, view], {}),
+        "projection": (projection.PROJECTION, [ahead[0], points], {}),
+        "projection_of_views": (projection.VIEWS, [ahead, points, view, places], {}),
+        "inset": (INSET, [image, fine, pixel], {"side": 2}),
+        "painted_inset": (PAINTED, [rng.normal(size=2), fine, pixel, row, settled], {"side": 2}),
+        "image": (IMAGE, given, options),
+        "mean_loss": (MEAN_LOSS, [*given, target, weights, backdrop], {**options, "loss": Loss("huber", 0.3)}),
+        "a stranger's": (CLAMP, operands(), {"power": 2}),
+    }
+
+
+CASES = cases()
+
+
+class TestEachOperation(OperationConformance):
+    @pytest.fixture(params=CASES)
+    def case(self, request):
+        return CASES[request.param]
+
+    @pytest.fixture
+    def operation(self, case):
+        return case[0]
+
+    @pytest.fixture
+    def operands(self, case):
+        return case[1]
+
+    @pytest.fixture
+    def params(self, case):
+        return case[2]
 
 
 # ------------------------------------------------------------------------------------- gradients of functions of points
@@ -410,8 +455,6 @@ def test_operands_of_another_rank_are_refused(target):
 
 
 def test_what_is_no_operation_is_refused_when_it_is_made():
-    from dataclasses import replace
-
     for change, words in (
         ({"name": ""}, "an operation is named ''"),
         ({"differentiable": 3}, "has 2 operands, by its ranks, of which the first 3"),
@@ -419,6 +462,64 @@ def test_what_is_no_operation_is_refused_when_it_is_made():
     ):
         with pytest.raises(rts.InputError, match=words):
             replace(CLAMP, **change)
+
+
+@pytest.mark.parametrize("value", [None, 7, "abc", [None], np.ones(2), {1}, 0.5], ids=str)
+@pytest.mark.parametrize("name", [field.name for field in fields(rts.Operation) if field.init])
+def test_a_wrong_field_is_one_line_that_names_it(name, value):
+    if (name, repr(value)) in (("used", "None"), ("name", "'abc'")):
+        pytest.skip("it is a right one")
+    with pytest.raises(rts.InputError, match=f"{name}|first" if name != "name" else "named") as refused:
+        replace(CLAMP, **{name: value})
+    assert "\n" not in str(refused.value) and len(str(refused.value)) < 250
+
+
+@pytest.mark.parametrize("target", ALL)
+@pytest.mark.parametrize(
+    "change, words",
+    [
+        (
+            {"forward": lambda operands, out, power: operands[0]},
+            "leaves 18 of 18 numbers of its result NaN",
+        ),
+        ({"forward": lambda operands, out, power: out[1:].fill(1)}, "leaves 3 of 18 numbers"),
+        ({"shape": lambda x, scale, power: (x[0],)}, "broadcast|shape"),
+        ({"shape": lambda x, scale, power: (2, *x), "packed_result": False}, r"specification gives \(6, 3\)"),
+        ({"shape": lambda x, scale, power: [6, 3]}, r"gives \[6, 3\] .* expected a tuple of integers"),
+        ({"shape": lambda x, power: x}, "shape of the operation tests.clamp cannot take operands of shapes"),
+        ({"forward": lambda operands, out: None}, "forward of the operation tests.clamp cannot take operands"),
+    ],
+)
+def test_a_first_value_that_is_not_what_it_must_be_is_refused(target, change, words):
+    odd = replace(CLAMP, keeps=False, **change)
+    with pytest.raises(rts.InputError, match=words) as refused:
+        to_numpy(odd(*arrays(target, operands()), power=3))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("target", ALL)
+def test_operands_that_do_not_fit_each_other_are_refused(target):
+    x, scale = operands()
+    with pytest.raises(rts.InputError, match=r"tests.clamp cannot take operands of shapes \(6, 3\), \(2,\)"):
+        to_numpy(CLAMP(*arrays(target, (x, scale[:2])), power=3))
+
+
+def test_only_the_first_value_is_looked_at_and_only_of_finite_operands_and_it_compiles_nothing(calls):
+    looks = []
+
+    def counted(x, scale, *, power):
+        looks.append(len(x))
+        return CLAMP(x, scale, power=power)
+
+    operation, (x, scale) = replace(CLAMP, specification=counted), operands()
+    for _ in range(3):
+        operation(x, scale, power=3)
+    assert looks == [6] and calls == [("forward", 6)] * 3
+    operation = replace(CLAMP, specification=counted)
+    assert np.isnan(operation(np.full_like(x, np.nan), scale, power=3)).all()
+    many = np.ones((2000, 3))
+    replace(CLAMP, specification=counted)(many, scale, power=3)
+    assert looks == [6]
 
 
 def test_a_camera_of_numpy_and_of_another_engine_projects():

@@ -6,12 +6,13 @@ import pickle
 
 import numpy as np
 import pytest
-from helpers import ALL, DIFFERENTIABLE, arrays, derivative, gradient, to_numpy
+from helpers import ALL, arrays, to_numpy
 from thin_patches import lacking, thin_patches
 
 import rts
 from rts import Camera, InputError, Part, Samples
 from rts.sampling import settling
+from rts.testing import OperationConformance
 from rts.testing.compatibility import APRON
 from rts.threads import read_only
 from rts_surfaces import bicubic, tiles
@@ -40,48 +41,22 @@ def patches(width=3, count=60):
 OPERATIONS = {"values": bicubic.VALUES, "normals": bicubic.NORMALS}
 
 
-@pytest.mark.parametrize("name", OPERATIONS)
-def test_compiled_patches_are_those_of_the_specification(name):
-    operation, operands = OPERATIONS[name], [read_only(x) for x in patches()]
-    found, _ = operation.value_on_host(operands, {})
-    np.testing.assert_allclose(found, operation.specification(*operands), rtol=0, atol=1e-11)
-    if name == "normals":
-        np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-12)
+class TestPatches(OperationConformance):
+    @pytest.fixture(params=OPERATIONS)
+    def operation(self, request):
+        return OPERATIONS[request.param]
+
+    @pytest.fixture
+    def operands(self, operation):
+        rows, params, patch, table = patches()
+        if operation is bicubic.NORMALS:
+            params[4, 0] = 0  # Where one derivative is only nearly zero, roundings choose the tangent.
+        return rows, params, patch, table
 
 
-@pytest.mark.parametrize("name", OPERATIONS)
-def test_compiled_derivatives_are_those_of_differences_and_transposes_of_each_other(name):
-    operation, operands = OPERATIONS[name], [read_only(x) for x in patches()]
-    tangent, g = RNG.normal(size=(40, 3)), RNG.normal(size=(60, 3))
-    pushed, pulled = np.empty((1, 60, 3)), np.zeros((40, 3))
-    operation.push_on_host(operands, [tangent[None]], pushed, None, {})
-    operation.pull_on_host(operands, g, [pulled], None, {})
-    np.testing.assert_allclose((pushed * g).sum(), (pulled * tangent).sum(), rtol=1e-10)
-    ends = [operation.value_on_host([operands[0] + s * tangent, *operands[1:]], {})[0] for s in (1e-6, -1e-6)]
-    # Where one derivative is only nearly zero, a difference may choose the other tangent.
-    steady = np.ones(60, bool)
-    steady[3:6] = name == "values"
-    difference = (ends[0] - ends[1]) / 2e-6
-    np.testing.assert_allclose(pushed[0][steady], difference[steady], rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize("target", DIFFERENTIABLE)
-@pytest.mark.parametrize("name", OPERATIONS)
-def test_engines_differentiate_patches_alike(name, target):
-    operation, (rows, params, patch, table) = OPERATIONS[name], patches()
-    tangent, g = RNG.normal(size=(40, 3)), RNG.normal(size=(60, 3))
-    rest = arrays(target, [params, patch, table])
-    factors = arrays(target, g)
-    pulled = gradient(target, lambda r: (operation(r, *rest) * factors).sum(), arrays(target, rows))
-    value, pushed = derivative(target, lambda r: operation(r, *rest), arrays(target, rows), arrays(target, tangent))
-    operands = [read_only(x) for x in (rows, params.astype(np.float32).astype(np.float64), patch, table)]
-    np.testing.assert_allclose(to_numpy(value), operation.value_on_host(operands, {})[0], atol=2e-4)
-    expected, expected_pull = np.empty((1, 60, 3)), np.zeros((40, 3))
-    operation.push_on_host(operands, [tangent[None]], expected, None, {})
-    operation.pull_on_host(operands, g, [expected_pull], None, {})
-    scale = np.abs(expected).max(), np.abs(expected_pull).max()
-    np.testing.assert_allclose(to_numpy(pushed), expected[0], atol=2e-3 * scale[0])
-    np.testing.assert_allclose(to_numpy(pulled), expected_pull, atol=2e-3 * scale[1])
+def test_normals_are_of_unit_length():
+    found, _ = bicubic.NORMALS.value_on_host([read_only(x) for x in patches()], {})
+    np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, rtol=1e-12)
 
 
 @pytest.mark.parametrize("target", ALL)

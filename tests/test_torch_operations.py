@@ -1,5 +1,10 @@
 """Compiled projection and interpolation in torch: the same as in plain torch, in every transform."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -165,3 +170,27 @@ def test_gradients_do_not_depend_on_the_number_of_threads(case, monkeypatch):
         monkeypatch.setenv("RTS_NUM_THREADS", threads)
         found.append(torch.func.grad(lambda a, b: f(a, b).square().mean(), (0, 1))(*args))
     assert all(map(torch.equal, *found))
+
+
+MEAN_LOSS = """
+import numpy as np, torch, rts
+part, camera = rts.Mesh.example(), rts.Camera.look_at((0.4, 0.5, 4), (0, 0, 0))
+for target in (np.ones((12, 16), np.float32), torch.ones(12, 16)):
+    compare = rts.ImageResiduals(lambda pose: part.replace(transform=rts.rigid(pose)), camera, (12, 16), target)
+    found = [compare.mean_loss(torch.zeros(6)), compare.mean_loss(np.zeros(6, np.float32))]
+    assert abs(float(found[0]) - float(found[1])) < 1e-6, found
+    assert compare(np.zeros(6, np.float32)).shape == (12, 16)
+    rts.fit(compare, torch.zeros(6), steps=1)
+"""
+KIT = ["pytest", "-q", "-c", os.devnull, "-p", "no:cacheprovider", "tests/plugin_example/tests", "-k"]
+
+
+@pytest.mark.parametrize(
+    "command", [["-c", MEAN_LOSS], ["-m", *KIT, "TestHeightfield and agree"]], ids=["mean_loss", "a plugin's kit"]
+)
+def test_what_torch_or_numpy_calls_deprecated_is_not_used(command):
+    root = Path(__file__).parents[1]
+    given = {"capture_output": True, "text": True, "cwd": root, "env": {**os.environ, "PYTHONPATH": str(root)}}
+    done = subprocess.run([sys.executable, "-W", "error::DeprecationWarning", *command], **given)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    assert not done.stderr and "Warning" not in done.stdout

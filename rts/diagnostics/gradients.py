@@ -78,7 +78,7 @@ def gradient_image(
         if [math.prod(p.shape) for p in leaves(parameters)] != [1]:
             raise InputError("parameters holds more than one number; give the direction along which to differentiate")
         direction = map_leaves(lambda p: engine.namespace.ones_like(p), parameters)
-    direction = _like(from_numbers(direction), parameters, engine)
+    direction = _like(from_numbers(direction, "direction"), parameters, engine)
     if scale is not None and not (is_real(scale) and 0 < scale < math.inf):
         raise InputError(f"scale is {quoted(scale)}; expected a positive number, or None for the largest change")
 

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from rts.engines import Engine, namespace
+from rts.engines import Engine, constants, namespace
 from rts.interfaces import Splatter
 from rts.records import Splats
 from rts.trees import Array, Tree
@@ -38,6 +38,11 @@ class _Probe(Splatter):
         return total
 
 
+def _of_engine(engine: Engine, image: Callable[[Tree], Array], parameters: Tree) -> Array:
+    """The image as an array of the engine."""
+    return constants(image(parameters), engine, None)
+
+
 def pixel_step(
     engine: Engine, image: Callable[..., Array], parameters: Tree, direction: Tree, *, deep: bool = False
 ) -> float | None:
@@ -54,6 +59,8 @@ def pixel_step(
     """
     for color, wanted in ((False, STEP_PIXELS), (True, STEP_COLOR)):
         probe = partial(image, splatter=_Probe(color, deep), supersample=1, background=None)
+        # What nothing moves may be of NumPy.
+        probe = partial(_of_engine, engine, probe)
         speed = np.abs(engine.to_numpy(engine.jvp(probe, parameters, direction)[1])).max(initial=0.0)
         if speed > 1e-6:
             return float(wanted / speed)

@@ -110,6 +110,8 @@ def tune(
     check_positive("budget_s", budget_s)
     if truth_samples is not None and not is_count(truth_samples):
         raise InputError(f"truth_samples is {quoted(truth_samples)}; expected an integer of at least 1")
+    if engine is not None and not isinstance(engine, str):
+        raise InputError(f"engine is {quoted(engine)}; expected a name, such as 'torch', or None")
     found = some_modes(scene_of(scene, parameters, directions, size, surface=surface), modes)
     kept = None if truths is None else output_folder(truths)
     named = usable("rts.splatters", splatters)[0]

@@ -170,7 +170,7 @@ def _checked(path: Path, split: Any, downscale: Any, pixel_center: Any, frame: A
         raise InputError(f"downscale is {quoted(downscale)}; expected an integer of at least 1")
     if not (is_real(pixel_center) and -1 <= pixel_center <= 2):
         raise InputError(f"pixel_center is {quoted(pixel_center)}; expected a number such as 0.5, in pixels")
-    if frame not in ("file", "nerf"):
+    if not isinstance(frame, str) or frame not in ("file", "nerf"):
         raise InputError(f"frame is {quoted(frame)}; expected 'file' or 'nerf'")
     if not isinstance(split, str):
         raise InputError(f"split is {quoted(split)}; expected a name such as 'train'")

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.adapting import adapted, unwrapped
-from rts.arguments import quoted
+from rts.arguments import check_flag, quoted
 from rts.arrays import kind_of
 from rts.checks import is_count, is_real
 from rts.engines import Engine
@@ -121,6 +121,7 @@ def fit(
     known = _check_functions(residuals, loss, callback)
     _check_method(method, loss, steps, learning_rate)
     _check_limits(tolerance, patience)
+    check_flag("jit", jit)
     stages = _stages(known, schedule)
     taken = [_taken(stage, known, loss) for stage in stages]
     engine = _checked_engine(parameters)

@@ -178,7 +178,7 @@ class ImageResiduals(Residuals):
 
     def _difference(self, image: Array, parameters: Tree) -> Array:
         """`weights * (image − target)` of one view."""
-        image = constants(image, engine_of(image, parameters), exemplar(parameters))
+        image = self._beside_target(image, parameters)
         target, weights, _ = self._constants(image)
         self._refuse_other(image.shape[-1] - 1)
         # Alpha is last; a target of one channel is one of it alone.
@@ -311,11 +311,10 @@ class ImageResiduals(Residuals):
         options |= {"splatter": splatter, "supersample": 1, "settles": True}
         sampled = sampled_scene(scene, scene.camera, self.size, **options)
         splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, *scene.suited)
-        engine = engine_of(splats.rgba, parameters)
-        splats = constants(splats, engine, exemplar(parameters))
+        splats = self._beside_target(splats, parameters)
         target, weights, background = self._constants(splats.positions)
         found = splatter.mean_loss(splats, target, weights, background, **self._loss_beside())
-        row = None if found is None else engine.known(splats.row)
+        row = None if found is None else engine_of(splats.row).known(splats.row)
         if row is not None and not (row >= 0).any():
             warn(f"nothing is seen in the image: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
         return found
@@ -396,6 +395,11 @@ class ImageResiduals(Residuals):
         share = finer.target.shape[0] * finer.target.shape[1] / (rows * self.size[1])
         value, matrix, gradient = (a + share * b for a, b in zip(found[0], found[1], strict=True))
         return value, matrix, gradient
+
+    def _beside_target(self, tree: Tree, parameters: Tree) -> Any:
+        """A tree in the engine of the parameters and of the target: each may be NumPy's, and the other not."""
+        own, like = (self._target, self._weights, self._background), exemplar(parameters)
+        return constants(tree, engine_of(tree, parameters, own), exemplar(own) if like is None else like)
 
     def _constants(self, like: Array) -> tuple[Array, Array | None, Array | None]:
         """Target (H, W, C), weights (H, W, 1 or C) and background, with alpha, in the engine of an array."""

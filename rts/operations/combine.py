@@ -54,9 +54,11 @@ def interpolate(rows: Array, ids: Array, column: int, weights: Array) -> Array:
     Raises:
         InputError: these are no samples of the surface that the rows belong to.
     """
-    if not 0 <= column <= ids.shape[1] - 3 or weights.shape[1] < 2 or ids.shape[0] != weights.shape[0]:
+    given, wanted = shape_of(ids), shape_of(weights)
+    plain = len(given) == len(wanted) == 2
+    if not plain or not 0 <= column <= given[1] - 3 or wanted[1] < 2 or given[0] != wanted[0]:
         raise InputError(
-            f"samples have ids of shape {tuple(ids.shape)} and parameters of shape {tuple(weights.shape)}; expected "
+            f"samples have ids of shape {given} and parameters of shape {wanted}; expected "
             f"(N, {column + 3}) and (N, 2), or more columns: sample this surface anew"
         )
     return COMBINE(*_alike(rows, weights), ids, column=column, count=3, affine=True)

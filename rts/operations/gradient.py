@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from rts.arguments import quoted
-from rts.engines import engine_of
+from rts.arrays import from_numbers, kind_of, shape_of
+from rts.engines import engine_of, namespace
 from rts.errors import InputError
 from rts.trees import Array
 
@@ -30,6 +31,9 @@ def gradient(f: Callable[[Array], Array], points: Array) -> Array:
     """
     if not callable(f) or isinstance(f, type):
         raise InputError(f"f is {quoted(f)}; expected a function of points (N, 3)")
+    points = from_numbers(points, "points")
+    if len(shape_of(points)) != 2 or not namespace(points).isdtype(points.dtype, "real floating"):
+        raise InputError(f"points is {kind_of(points)}; expected floating numbers (N, 3)")
     engine = engine_of(points)
     if not engine.differentiates:
         return _differences(f, points)

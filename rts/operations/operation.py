@@ -2,19 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
-from rts.arrays import from_numbers
+from rts.arguments import one_line, quoted
+from rts.arrays import from_numbers, kind_of
 from rts.engines import OWNERS, constants, engine_of, suiting, value_of
-from rts.errors import InputError
+from rts.errors import InputError, RtsError
 from rts.trees import Array
 
 _SHAPE = attrgetter("shape")
+
+
+SMALL = 4096
+"""Numbers of operands and result, up to which the shape of a result is compared with that of the specification."""
+
+
+class _Specifying(threading.local):
+    """Whether a specification is being looked at: operations in it are array code, too, and compile nothing."""
+
+    on = False
+
+
+specifying = _Specifying()
+
+
+def _listed(shapes: Iterable[tuple[int, ...]]) -> str:
+    return ", ".join(str(tuple(shape)) for shape in shapes)
 
 
 def known_value(x: Array) -> np.ndarray | None:
@@ -88,18 +107,43 @@ class Operation:
     cheap: bool = False
     takes_cheap: bool = False
 
+    _seen: set[tuple] = field(default_factory=set, init=False, repr=False)
+    """The dtype and the parameters' names of calls whose first value has been looked at."""
+
     def __post_init__(self):
-        object.__setattr__(self, "ranks", tuple(self.ranks))
-        count = len(self.ranks)
         if not (isinstance(self.name, str) and self.name):
-            raise InputError(f"an operation is named {self.name!r}; expected a name such as 'my_package.warp'")
-        if not 1 <= self.differentiable <= count:
+            raise InputError(f"an operation is named {quoted(self.name)}; expected a name such as 'my_package.warp'")
+        for name in ("specification", "shape", "forward", "push", "pull", "used"):
+            function = getattr(self, name)
+            if not callable(function) and not (name == "used" and function is None):
+                raise InputError(f"{name} of the operation {self.name} is {quoted(function)}; expected a function")
+        for name in ("ranks", "packed", "even"):
+            object.__setattr__(self, name, self._integers(name))
+        for name in ("packed_result", "keeps", "sweeps", "cheap", "takes_cheap"):
+            if type(getattr(self, name)) is not bool:
+                given = quoted(getattr(self, name))
+                raise InputError(f"{name} of the operation {self.name} is {given}; expected True or False")
+        self._check_indices()
+
+    def _integers(self, name: str) -> tuple[int, ...]:
+        """The field of this name as a tuple of integers."""
+        given = getattr(self, name)
+        if isinstance(given, (tuple, list)) and all(type(n) is int and n >= 0 for n in given):
+            return tuple(given)
+        raise InputError(
+            f"{name} of the operation {self.name} is {quoted(given)}; expected a tuple of integers of at least 0, one "
+            f"for each operand{'' if name == 'ranks' else ' that is meant'}"
+        )
+
+    def _check_indices(self) -> None:
+        count = len(self.ranks)
+        if type(self.differentiable) is not int or not 1 <= self.differentiable <= count:
             raise InputError(
                 f"the operation {self.name} has {count} operands, by its ranks, of which the first "
-                f"{self.differentiable} are to have derivatives; expected from 1 to {count}"
+                f"{quoted(self.differentiable)} are to have derivatives; expected from 1 to {count}"
             )
         for i in (*self.packed, *self.even):
-            if not 0 <= i < count or self.ranks[i] < 1:
+            if i >= count or self.ranks[i] < 1:
                 raise InputError(
                     f"the operation {self.name} has no operand {i} of packed rows; its ranks are {self.ranks}"
                 )
@@ -122,7 +166,10 @@ class Operation:
             if kind in OWNERS or kind is np.ndarray:
                 self.check_ranks(operands)
                 return engine_of(operands[0]).apply(self, operands, params)
-        operands = tuple([from_numbers(x) for x in operands])
+        operands = tuple([from_numbers(x, f"an operand of {self.name}") for x in operands])
+        if any(isinstance(x, (Mapping, list, tuple)) or x is None for x in operands):
+            given = ", ".join(map(kind_of, operands))
+            raise InputError(f"the operation {self.name} was given {given} as operands; expected arrays")
         engine, like = suiting(operands)
         operands = constants(operands, engine, like)
         self.check_ranks(operands)
@@ -132,7 +179,7 @@ class Operation:
         """Raise an InputError if an operand has another number of axes than `ranks` says."""
         for x, rank in zip(operands, self.ranks, strict=True):
             if x.ndim != rank:
-                shapes = ", ".join(str(tuple(x.shape)) for x in operands)
+                shapes = _listed(map(_SHAPE, operands))
                 raise InputError(f"the operation {self.name} was given shapes {shapes}; expected ranks {self.ranks}")
 
     def fits(self, dtypes: Sequence[np.dtype]) -> bool:
@@ -147,10 +194,84 @@ class Operation:
 
     # The methods below are what engines' binders call, with operands in NumPy.
 
+    def result_shape(self, *shapes: tuple[int, ...], **params: Any) -> tuple[int, ...]:
+        """The shape of the result, of operands of these shapes.
+
+        Raises:
+            InputError: `shape` fails, or gives something else.
+        """
+        try:
+            found = self.shape(*shapes, **params)
+        except (TypeError, ValueError, IndexError) as error:
+            raise self._refused("shape", shapes, error) from error
+        if type(found) is not tuple or not all(isinstance(n, (int, np.integer)) and n >= 0 for n in found):
+            raise InputError(
+                f"shape of the operation {self.name} gives {quoted(found)} for operands of shapes {_listed(shapes)}; "
+                f"expected a tuple of integers of at least 0"
+            )
+        return found
+
     def value_on_host(self, operands: Arrays, params: dict[str, Any]) -> tuple[np.ndarray, Any]:
         """The result, and what `forward` keeps for the derivatives."""
-        out = np.empty(self.shape(*map(_SHAPE, operands), **params), operands[0].dtype)
-        return out, self.forward(operands, out, **params)
+        out = np.empty(self.result_shape(*map(_SHAPE, operands), **params), operands[0].dtype)
+        return out, self.forward_on_host(operands, out, params)
+
+    def forward_on_host(self, operands: Arrays, out: np.ndarray, params: Mapping[str, Any]) -> Any:
+        """Fill `out` with the value, and return what `forward` keeps for the derivatives.
+
+        The first value of each dtype is looked at: whether all of it was written, and has the specification's shape.
+
+        Raises:
+            InputError: `forward` cannot take the operands; or its first value is not what it must be.
+        """
+        seen = (out.dtype.char, *params)
+        first = seen not in self._seen and out.size > 0
+        if first:
+            out.fill(np.nan)
+        try:
+            kept = self.forward(operands, out, **params)
+        except (TypeError, ValueError, IndexError) as error:
+            raise self._refused("forward", list(map(_SHAPE, operands)), error) from error
+        if first:
+            self._look_at(operands, out, params)
+            self._seen.add(seen)
+        return kept
+
+    def _look_at(self, operands: Arrays, out: np.ndarray, params: Mapping[str, Any]) -> None:
+        missing = np.isnan(out)
+        if missing.any():
+            if not all(np.isfinite(x).all() for x in operands if x.dtype == out.dtype):
+                return
+        elif out.size + sum(x.size for x in operands) > SMALL:
+            return
+        specifying.on = True
+        try:
+            with np.errstate(all="ignore"):
+                expected = np.asarray(self.specification(*operands, **params))
+        except Exception:  # It may be for other engines' arrays alone, and is refused where it is asked for.
+            return
+        finally:
+            specifying.on = False
+        if expected.shape != out.shape:
+            raise InputError(
+                f"the operation {self.name} has a result of shape {out.shape}, by its `shape`, but its specification "
+                f"gives {expected.shape} for operands of shapes {_listed(map(_SHAPE, operands))}; make them agree"
+            )
+        missing &= ~np.isnan(expected)
+        if missing.any():
+            raise InputError(
+                f"forward of the operation {self.name} leaves {missing.sum()} of {out.size} numbers of its result NaN, "
+                f"or unwritten, where its specification has numbers; write them all, as in `out[...] = value`"
+            )
+
+    def _refused(self, function: str, shapes: Sequence[tuple[int, ...]], error: Exception) -> Exception:
+        """The error to raise where a function fails."""
+        if isinstance(error, RtsError):
+            return error
+        return InputError(
+            f"{function} of the operation {self.name} cannot take operands of shapes {_listed(shapes)}: "
+            f"{one_line(error)}; give it operands of shapes that fit"
+        )
 
     def push_on_host(self, operands: Arrays, tangents: Some, out: np.ndarray, kept: Any, params: dict) -> None:
         """Fill `out` (T, ·) with the derivatives along tangents (T, ·)."""

@@ -9,7 +9,7 @@ import numpy as np
 from rts.engines import engine_of, namespace
 from rts.errors import InputError
 from rts.regularizers.connectivity import pairs_of
-from rts.regularizers.regularizer import Regularizer, combined
+from rts.regularizers.regularizer import Regularizer, check_count, combined, known_vertices
 from rts.topology import index_table
 from rts.trees import Array
 
@@ -27,17 +27,21 @@ class NormalConsistency(Regularizer):
     `residuals` is (P, 3): (n₁ − n₂) / √2, of squared length 1 − cos θ. There are P terms, perhaps none.
 
     Args:
+        vertices: (V, 3), as the other energies take them; only their number is kept. `NormalConsistency(faces)` will
+            do, too: normals know no shape at rest.
         faces: (T, 3) integers; copied.
 
     Attributes:
         pairs: (P, 2) int32 into faces.
 
     Raises:
-        InputError: faces are something else.
+        InputError: one of these is something else.
     """
 
-    def __init__(self, faces: Any):
+    def __init__(self, vertices: Any = None, faces: Any = None):
+        vertices, faces = (None, vertices) if faces is None else (vertices, faces)
         self.faces = index_table("faces", faces, 3)
+        self._count = None if vertices is None else len(known_vertices("vertices", vertices, self.faces))
         self.pairs, alike = pairs_of(self.faces)
         self.terms = len(self.pairs)
         self._least = int(self.faces.max()) + 1
@@ -49,6 +53,8 @@ class NormalConsistency(Regularizer):
         return f"NormalConsistency({self.terms} pairs of faces)"
 
     def _check_count(self, count: int) -> None:
+        if self._count is not None:
+            check_count(count, self._count)
         if count < self._least:
             raise InputError(f"vertices have {count} rows; expected {self._least} or more, as faces name them")
 

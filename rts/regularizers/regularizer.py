@@ -88,26 +88,31 @@ class OfRestShape(Regularizer):
 
     def __init__(self, vertices: Any, faces: Any):
         self.faces = index_table("faces", faces, 3)
-        self._rest = _known("vertices", vertices)
-        if self.faces.max() >= len(self._rest):
-            raise InputError(
-                f"faces name vertex {self.faces.max()}, but there are {len(self._rest)} vertices; check the indices "
-                f"(they count from 0)"
-            )
+        self._rest = known_vertices("vertices", vertices, self.faces)
 
     def _check_count(self, count: int) -> None:
-        if count != len(self._rest):
-            raise InputError(f"vertices have {count} rows; expected {len(self._rest)}, as the mesh at rest has")
+        check_count(count, len(self._rest))
 
 
-def _known(name: str, vertices: Any) -> np.ndarray:
-    """A copy (V, 3) float64 of the values of vertices at rest."""
+def check_count(count: int, expected: int) -> None:
+    """Raise an InputError for another number of vertices than the mesh at rest has."""
+    if count != expected:
+        raise InputError(f"vertices have {count} rows; expected {expected}, as the mesh at rest has")
+
+
+def known_vertices(name: str, vertices: Any, faces: np.ndarray) -> np.ndarray:
+    """A copy (V, 3) float64 of the values of vertices at rest, refused where faces name others."""
     shape = shape_of(vertices := from_numbers(vertices, name))
     if len(shape) != 2 or shape[1] != 3 or not shape[0]:
         raise InputError(f"{name} is {quoted(vertices)}; expected (V, 3) numbers, at least one row")
     known = check_numbers(name, vertices, shape)
     if known is None:
         raise InputError(f"{name} is traced; make the energy outside of jit and vmap, or give it NumPy arrays")
+    if faces.max() >= len(known):
+        raise InputError(
+            f"faces name vertex {faces.max()}, but there are {len(known)} vertices; check the indices (they count from "
+            f"0)"
+        )
     return np.array(known, np.float64)
 
 

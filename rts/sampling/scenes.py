@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from rts.arguments import check_flag
 from rts.camera import Camera
 from rts.checks import check_memory, check_ratio, check_sampler, check_scene, check_size, check_splatter, suited_sampler
 from rts.engines import Engine, constants, is_traced, suiting_scene, uncompiled
@@ -70,6 +71,7 @@ def sample(
         EngineError: torch and jax arrays in one scene.
     """
     scene = Scene.of(parts, camera, sampler, engine)
+    check_flag("settles", settles)
     size = check_size(size, layers, capacity, finest(supersample))
     scene = scene.at(size)
     splatter = None if splatter is None else check_splatter(splatter)

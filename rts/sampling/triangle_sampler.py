@@ -10,8 +10,9 @@ from typing import Any, NamedTuple, Self, TypeVar
 import numpy as np
 
 from rts.adapting import adapted, unwrapped
+from rts.arrays import shape_of
 from rts.camera import Camera
-from rts.engines import engine_of, stopped
+from rts.engines import stopped, value_of
 from rts.errors import InputError, PluginError
 from rts.interfaces import AnyNeeded, Needed, Sampler, TriangleSurface, as_surface
 from rts.parts import Part
@@ -168,13 +169,13 @@ class TriangleSampler(Sampler):
         if surface.depends_on_view and (camera is None or size is None):
             raise InputError(f"the triangles of {surface!r} depend on the view; give camera and size")
         inputs = surface.proxy_inputs(stopped(part.theta))
-        inputs = map_leaves(engine_of(inputs).to_numpy, inputs)
+        inputs = map_leaves(_held, inputs)
         if camera is not None:
             camera = camera if size is None else camera.for_size(size)
-            camera = camera.within(part.transform).map(lambda m: engine_of(m).to_numpy(m))
+            camera = camera.within(part.transform).map(_held)
         built = self.arranged(self._built(surface, inputs, camera, size))
         arrays = leaves(stopped({name: part.theta[name] for name in surface.reads(part.theta)}))
-        read = [engine_of(x).to_numpy(x) for x in arrays]
+        read = [_held(x) for x in arrays]
         built = built._replace(size=max([built.size or 0.0, *(largest(x) for x in read if x.dtype.kind == "f")]))
         return built._replace(inputs=map_leaves(np.copy, inputs)) if surface.refines else built
 
@@ -438,3 +439,14 @@ def _of_triangles(given: Any) -> TriangleSurface:
 
 def _no_fragments(shape: tuple[int, int, int]) -> Fragments:
     return Fragments(np.full(shape, -1, np.int32), np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32))
+
+
+def _held(x: Array) -> np.ndarray:
+    """The value of an array that is to be held on the host."""
+    value = value_of(x)
+    if value is None or value.shape != shape_of(x):
+        raise InputError(
+            f"rts.prepare was given a traced array of shape {shape_of(x)}; expected known values: call it outside of "
+            f"jit, vmap and other transforms, and give what changes to `replace`"
+        )
+    return value

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import is_invertible
+from rts.arguments import is_invertible, one_line
+from rts.arrays import shape_of
 from rts.camera import Camera
 from rts.engines import namespace
 from rts.errors import InputError
@@ -35,13 +36,22 @@ def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
     vertices = _table(surface, "vertices", proxy.vertices, (3,), np.float32)
     faces = _table(surface, "faces", proxy.faces, (3,), np.int32)
     check_faces(Proxy(vertices, faces), surface)
-    ids = None if proxy.ids is None else _table(surface, "ids", proxy.ids, (-1,), np.int32)
+    none = proxy.ids is None and not surface.refines and surface.sample_widths[0] == 0
+    ids = np.zeros((len(faces), 0), np.int32) if none else proxy.ids
+    ids = None if ids is None else _table(surface, "ids", ids, (-1,), np.int32)
     corners = proxy.corner_params
     corners = None if corners is None else _table(surface, "corner_params", corners, (3, -1), np.float32)
     width = 3 if ids is None else ids.shape[1]
     if not surface.refines and width != surface.sample_widths[0]:
         raise InputError(
             f"the proxy of {surface!r} has {width} ids a triangle, but sample_widths says {surface.sample_widths[0]}"
+        )
+    width = 2 if corners is None else corners.shape[2]
+    if not surface.refines and width != surface.sample_widths[1]:
+        given = "no corner_params, and so 2 barycentrics" if corners is None else f"corner_params of {width} numbers"
+        raise InputError(
+            f"the proxy of {surface!r} has {given} a corner, but sample_widths says {surface.sample_widths[1]}; make "
+            f"them agree"
         )
     for name, array in (("ids", ids), ("corner_params", corners)):
         if array is not None and len(array) < len(faces):
@@ -64,7 +74,10 @@ def check_faces(proxy: Proxy, surface: Any = None) -> None:
 
 def _table(surface: Any, name: str, table: Any, widths: tuple[int, ...], dtype: type) -> np.ndarray:
     """A table of a proxy, contiguous and of this dtype, refused where it has another number of columns or kind."""
-    array = np.asarray(table)
+    try:
+        array = np.asarray(table)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"the proxy of {surface!r} has {name} that are no array: {one_line(error)}") from error
     if array.dtype == dtype and array.shape[1:] == widths and array.flags.c_contiguous:
         return array
     kind = np.floating if dtype is np.float32 else np.integer
@@ -120,11 +133,11 @@ def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sam
     """Which cells (K, H, W) bool are covered; what `rasterize` of a sampler should not have returned is refused."""
     if isinstance(fragments, Fragments):
         ids, barycentrics, depth = fragments
-        fits = np.shape(ids) == np.shape(depth) == shape and np.shape(barycentrics) == (*shape, 2)
+        fits = shape_of(ids) == shape_of(depth) == shape and shape_of(barycentrics) == (*shape, 2)
     else:
         fits = False
     if not fits:
-        given = tuple(np.shape(x) for x in fragments) if isinstance(fragments, Fragments) else type(fragments).__name__
+        given = tuple(shape_of(x) for x in fragments) if isinstance(fragments, Fragments) else type(fragments).__name__
         raise InputError(
             f"rasterize of {type(sampler).__name__} returned {given}; expected rts.Fragments of "
             f"{(shape, (*shape, 2), shape)}"

@@ -19,12 +19,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rts.testing.engines import EngineConformance
+    from rts.testing.operations import OperationConformance
     from rts.testing.samplers import SamplerConformance
     from rts.testing.shaders import ShaderConformance
     from rts.testing.splatters import SplatterConformance
     from rts.testing.surfaces import SurfaceConformance
 
-__all__ = ["EngineConformance", "SamplerConformance", "ShaderConformance", "SplatterConformance", "SurfaceConformance"]
+__all__ = [
+    "EngineConformance",
+    "OperationConformance",
+    "SamplerConformance",
+    "ShaderConformance",
+    "SplatterConformance",
+    "SurfaceConformance",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -125,6 +125,18 @@ def derivatives(engine: Engine, f: Callable, at: list, along: list, weights: np.
     return Derivatives(*host(engine, (value, gradient, slope)))
 
 
+def compiled(engine: Engine, f: Callable, at: Sequence, along: Sequence, weights: np.ndarray) -> Derivatives:
+    """The same, compiled as a whole where the engine compiles."""
+    at, along, weights = on(engine, list(at)), on(engine, list(along)), on(engine, weights)
+    xp = engine.namespace
+
+    def both(x: list, d: list, w: Any) -> tuple:
+        return engine.jvp(f, x, d), engine.value_and_grad(lambda y: xp.sum(f(y) * w))(x)[1]
+
+    (value, slope), gradient = engine.jit(both)(at, along, weights)
+    return Derivatives(*host(engine, (value, gradient, slope)))
+
+
 def claim_consistent(found: Derivatives, along: list, weights: np.ndarray, what: str) -> None:
     """Fail unless forward and reverse mode agree: ⟨w, J d⟩ = ⟨Jᵀ w, d⟩."""
     claim_finite(found, f"{what} or its derivative")

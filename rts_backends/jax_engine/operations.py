@@ -115,12 +115,12 @@ class _Differentiable:
 
     def __init__(self, operation: Operation, name: str, params: Mapping[str, Any]):
         self.operation, self.varied = operation, operation.differentiable
-        self.rank = len(operation.shape(*((1,) * r for r in operation.ranks), **params))
+        self.rank = len(operation.result_shape(*((1,) * r for r in operation.ranks), **params))
         self._inputs = len(operation.ranks)
         self._told = self.told(operation)
         given = self._inputs + self._told
         count = self.count = given + operation.keeps
-        varied, shape, inputs = self.varied, operation.shape, self._inputs
+        varied, shape, inputs = self.varied, operation.result_shape, self._inputs
 
         def pulled(*shapes: tuple, wanted: Wanted, **_: Any) -> list[tuple]:
             return [(shapes[count][0], *x) for x, wish in zip(shapes[:varied], wanted, strict=True) if wish]
@@ -180,7 +180,7 @@ class _Differentiable:
         if self.operation.packed_result:
             out = out[:used]
             clear(results[0][used:], PIECE)
-        kept = self.operation.forward(operands, out, **params)
+        kept = self.operation.forward_on_host(operands, out, params)
         if self.operation.keeps:
             results[1][...] = -1 if kept is None else _kept.add(kept)
 

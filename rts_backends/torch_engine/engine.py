@@ -19,7 +19,7 @@ from rts.operations.operation import Operation
 from rts.records import ArraySpec
 from rts.trees import STATIC_FIELDS, Tree, join_record, leaves, map_leaves, split_record
 from rts_backends.torch_engine import operations
-from rts_backends.torch_engine.functions import applied, foreign, tangent_alike, transformed
+from rts_backends.torch_engine.functions import applied, foreign, quiet_forward_mode, tangent_alike, transformed
 
 for _cls in STATIC_FIELDS:
     _pytree.register_pytree_node(
@@ -254,6 +254,7 @@ class TorchEngine(Engine):
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[torch.Tensor, torch.Tensor]:
         """By forward-mode autodiff."""
+        quiet_forward_mode()
         # A third result, with `has_aux` alone, is always in torch's annotation.
         return torch.func.jvp(f, (primal,), (tangent,))  # pyright: ignore[reportReturnType]
 
@@ -261,6 +262,7 @@ class TorchEngine(Engine):
         """By forward-mode autodiff, all unknowns in one vectorised pass."""
 
         def call(vector: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+            quiet_forward_mode()
             vector = vector.detach()
             along = torch.eye(vector.numel(), dtype=vector.dtype, device=vector.device)
             # torch's annotation of axes has no None in a tuple.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -31,6 +32,18 @@ def transformed() -> bool:
     if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
         return True
     return maybe_current_level() is not None
+
+
+_loaded: list[bool] = []
+
+
+def quiet_forward_mode() -> None:
+    """Have torch load what its forward mode needs, which makes it warn of its own `torch.jit.script`; once."""
+    if not _loaded:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "`torch.jit", DeprecationWarning)
+            torch.func.jvp(torch.clone, (torch.zeros(()),), (torch.ones(()),))
+        _loaded.append(True)
 
 
 def foreign(*tensors: Tensor | None) -> bool:

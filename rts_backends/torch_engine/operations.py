@@ -229,7 +229,7 @@ class _Push(torch.autograd.Function):
     def forward(call, present, *given):
         count = sum(present)
         operands, tangents = _host(given[:-count]), _host(given[-count:])
-        shape = call.operation.shape(*(x.shape for x in operands), **call.params)
+        shape = call.operation.result_shape(*(x.shape for x in operands), **call.params)
         out = np.empty((len(tangents[0]), *shape), operands[0].dtype)
         call.operation.push_on_host(operands, _spread(tangents, present), out, call.kept, call.params)
         return torch.from_numpy(out)

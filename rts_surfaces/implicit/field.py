@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import abc
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from rts.arguments import check_numbers, quoted
+from rts.arguments import check_numbers, one_line, quoted
 from rts.arrays import kind_of, shape_of, unit
-from rts.engines import engine_of, namespace
-from rts.errors import EngineError, InputError
+from rts.engines import Engine, engine_of, namespace
+from rts.errors import EngineError, InputError, RtsError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Surface
 from rts.operations.gradient import gradient
@@ -116,17 +117,27 @@ class Field(ScalarField):
             value = self.f(theta, points)
         except KeyError as error:
             raise InputError(f"{self.name} finds no {error}; theta has {sorted(theta)}") from error
-        except (AttributeError, TypeError) as error:
-            if engine_of(points).differentiates:
+        except (AttributeError, TypeError, ValueError, IndexError, RuntimeError) as error:
+            if isinstance(error, RtsError):
                 raise
-            raise InputError(
-                f"{self.name} cannot work with arrays of NumPy ({error}); it gets these where theta has no others: put "
-                f"the weights that it reads into theta"
-            ) from error
+            raise InputError(self._why(error, engine_of(points))) from error
         if not engine_of(points).differentiates and getattr(value, "dtype", None) == np.float32:
             value = np.asarray(value, points.dtype)  # Differences for slopes are taken in float64.
         check_result("f", value, points)
         return self.sign * (value - self.isovalue)
+
+    def _why(self, error: Exception, engine: Engine) -> str:
+        """The message for an error of `f`."""
+        told = one_line(error)
+        if isinstance(error, (AttributeError, TypeError)) and not engine.differentiates:
+            return (
+                f"{self.name} cannot work with arrays of NumPy ({told}); it gets these where theta has no others: put "
+                f"the weights that it reads into theta"
+            )
+        return (
+            f"{self.name} fails on points (M, 3) of {engine.name} ({told}); write it in array code, with the functions "
+            f"of rts.namespace(points) alone"
+        )
 
     def slope(self, theta: Mapping[str, Tree], points: Array) -> Array:
         """The gradient (M, 3) of `level` at points (M, 3), towards the outside; see `rts.gradient`."""
@@ -227,6 +238,17 @@ def check_function(name: str, f: Any) -> None:
     """Refuse what is no function of θ and points; a class is none, its objects may be."""
     if not callable(f) or isinstance(f, type):
         raise InputError(f"{name} is {quoted(f)}; expected a function of theta and points (M, 3)")
+    try:
+        signature = inspect.signature(f)
+    except (TypeError, ValueError):  # Of compiled code nothing is known.
+        return
+    try:
+        signature.bind(None, None)
+    except TypeError as error:
+        raise InputError(
+            f"{name} is {quoted(f)} of {signature} ({error}); expected a function of two arguments, theta and points "
+            f"(M, 3)"
+        ) from None
 
 
 def check_result(name: str, value: Any, points: Array, columns: bool = False) -> None:

@@ -57,6 +57,8 @@ def volume_render(
         raise InputError(f"field is {quoted(field)}; expected what rts.load_radiance_field gives")
     if not isinstance(camera, Camera):
         raise InputError(f"camera is {quoted(camera)}; expected an rts.Camera")
+    if camera.is_stacked:
+        raise InputError("camera is of several views; expected that of one: camera.unstack() gives them one by one")
     counts = tuple(samples) if isinstance(samples, (tuple, list)) else ()
     if len(counts) != 2 or not all(map(is_count, counts)) or counts[0] < 3:
         raise InputError(f"samples is {quoted(samples)}; expected (coarse, fine), at least 3 and 1")

@@ -78,7 +78,7 @@ def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = (), 
     Raises:
         InputError: the cage is none that has a limit surface; one line that says what is wrong where.
     """
-    if scheme not in ("catmark", "loop"):
+    if not isinstance(scheme, str) or scheme not in ("catmark", "loop"):
         raise InputError(f"scheme is {quoted(scheme)}; expected 'catmark' or 'loop'")
     sizes, indices = checked_lists("faces", faces)
     first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int32)

@@ -190,13 +190,14 @@ def compare(
     found = some_modes(found, list(found.directions)[:1] if quick and modes is None else modes)
     layers = _counts("layers", layers, LAYERS[:2] if quick else LAYERS, ("auto",))
     samples_a_pixel = _samples(supersample)
-    (samples,) = _counts("truth_samples", truth_samples, ())
+    if not is_count(truth_samples):
+        raise InputError(f"truth_samples is {quoted(truth_samples)}; expected an integer of at least 1")
     names, without = usable("rts.splatters", splatters)
     possible, missing = usable("rts.samplers", samplers)
     used, failing = engines_for(found, engines)
     journal = _journal(folder, found, fresh)
     used = used[:1] if quick and engines is None else used
-    measured = Measurements(found, journal, used, truths=kept, samples=samples)
+    measured = Measurements(found, journal, used, truths=kept, samples=int(truth_samples))
     measured.left_out += [*failing, *without, *missing, *_unthinned()]
     measured.leave_out_what_rests()
     suited = measured.samplers(possible)
@@ -216,10 +217,10 @@ def compare(
 
 def _counts(name: str, given: Any, usual: Sequence, others: tuple[str, ...] = ()) -> list:
     found = list(usual) if given is None else list(given) if isinstance(given, (list, tuple)) else [given]
-    if not found or not all(is_count(n) or n in others for n in found):
+    if not found or not all(is_count(n) or (isinstance(n, str) and n in others) for n in found):
         expected = " or ".join(["integers of at least 1", *map(repr, others)])
         raise InputError(f"{name} is {quoted(given)}; expected {expected}")
-    return [n if n in others else int(n) for n in found]
+    return [n if isinstance(n, str) else int(n) for n in found]
 
 
 def _samples(given: Any) -> list[int | str]:

@@ -59,6 +59,8 @@ def scene_of(
     """
     if size is not None:
         size = check_size(size, 1, None, 1)
+    if directions is not None and not isinstance(directions, Mapping):
+        raise InputError(f"directions is {quoted(directions)}; expected parameters' changes by name, in a dict")
     if isinstance(scene, Scene):
         found = scene
     elif callable(scene):
@@ -83,7 +85,8 @@ def some_modes(scene: Scene, modes: Sequence[str] | None) -> Scene:
     """
     if modes is None:
         return scene
-    if isinstance(modes, str) or not modes or any(mode not in scene.directions for mode in modes):
+    known = isinstance(modes, (list, tuple)) and all(isinstance(mode, str) for mode in modes)
+    if not known or not modes or any(mode not in scene.directions for mode in modes):
         raise InputError(f"modes is {quoted(modes)}; expected some of {', '.join(scene.directions)}")
     return scene.with_modes(modes)
 
@@ -176,10 +179,10 @@ def _of_function(f: Callable, name: str, parameters: Tree, directions: Mapping[s
 
 def _float_array(x: Any) -> Any:
     """A leaf of parameters: NumPy's and Python's numbers become float32, as the engines take them."""
-    if is_constant(x):
+    if is_constant(x) and np.asarray(x).dtype.kind in "biuf":
         return np.asarray(x, np.float32)
     dtype = getattr(x, "dtype", None)
-    if dtype is None or not namespace(x).isdtype(dtype, "real floating"):
+    if dtype is None or is_constant(x) or not namespace(x).isdtype(dtype, "real floating"):
         raise InputError(f"parameters holds {quoted(x)}; expected arrays of real numbers, in nested dicts and lists")
     return engine_of(x).stop_gradient(x)
 

@@ -113,6 +113,8 @@ def stability(
     Raises:
         InputError: there is no such row or method, or an argument is wrong; before anything is measured.
     """
+    if not isinstance(more, (list, tuple)) or not all(isinstance(row, Row) for row in more):
+        raise InputError(f"more is {quoted(more)}; expected a list of rows")
     taken = [*more, *_named("rows", rows, {row.name: row for row in ROWS})]
     columns: list[Method] = _named("methods", methods, {method.name: method for method in METHODS})
     for name, value in {"seeds": seeds, "steps": steps, "truth_samples": truth_samples}.items():
@@ -144,12 +146,16 @@ def _named(what: str, wanted: Sequence[str] | None, known: Mapping[str, Any]) ->
     """What is known by these names."""
     if wanted is None:
         return list(known.values())
-    wanted = [wanted] if isinstance(wanted, str) else list(wanted)
+    wanted = [wanted] if isinstance(wanted, str) else wanted
+    if not isinstance(wanted, (list, tuple)) or not all(isinstance(name, str) for name in wanted):
+        raise InputError(f"{what} is {quoted(wanted)}; expected a list of names, or None for all")
     for name in wanted:
         if name not in known:
             close = difflib.get_close_matches(str(name), known, n=1)
             hint = f"; did you mean {close[0]!r}?" if close else ""
-            raise InputError(f"{what} has {quoted(name)}; there are {', '.join(known)}{hint}")
+            names = ", ".join(known)
+            names = names if len(names) <= 200 else f"{names[:197]}..."
+            raise InputError(f"{what} has {quoted(name)}; there are {names}{hint}")
     return [known[name] for name in wanted]
 
 
