@@ -427,7 +427,7 @@ def _guarded() -> Any:
         outcome = np.full(1, _LEFT, np.intp)
         _HANDLER(frame, outcome.ctypes.data)
         if outcome[0] == _LEFT:
-            return _abandoned(frame)
+            return _abandoned(frame)  # pyright: ignore[reportCallIssue]  # numba gives the context.
         return 0 if outcome[0] == _DONE else outcome[0]
 
     return guarded
