@@ -14,7 +14,6 @@ from rts.errors import InputError
 from rts.parts import CheckedPart
 from rts.threads import parallel, read_only
 
-
 MOST = 64
 """The most samples along each side of an active pixel. All fine samples are in memory at once."""
 
@@ -46,8 +45,8 @@ class Adaptive:
             )
         if self.samples > MOST:
             raise InputError(
-                f"samples of Adaptive is {quoted(self.samples)}; expected at most {MOST}, of which a thousand pixels at "
-                f"outlines take about 1 GB; take 4 or 8, or a number in place of Adaptive, which is rendered in bands"
+                f"samples of Adaptive is {quoted(self.samples)}; expected at most {MOST}, with which a thousand "
+                f"pixels at outlines take about 1 GB; take 4 or 8, or a number in place of Adaptive, rendered in bands"
             )
         if self.dilated is not None and not isinstance(self.dilated, bool):
             raise InputError(f"dilated of Adaptive is {quoted(self.dilated)}; expected True, False or None")
