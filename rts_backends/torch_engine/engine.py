@@ -259,7 +259,7 @@ class TorchEngine(Engine):
 
     def gradient_of_rows(self, f: Callable[[torch.Tensor], torch.Tensor], rows: torch.Tensor) -> torch.Tensor:
         """By reverse mode: it takes less time, and torch's forward mode is not for several threads at once."""
-        value, pull = torch.func.vjp(f, rows)
+        value, pull = torch.func.vjp(f, rows)[:2]
         return pull(torch.ones_like(value))[0]
 
     def jacobian(self, f: Callable) -> Callable:
