@@ -24,8 +24,8 @@ THREADS = 8
 VIEWS = [CAMERA, rts.Camera.look_at((-1.2, 0.7, 2.9), (0, 0, 0), aspect=SIZE[1] / SIZE[0])]
 SURFACES = ["mesh", "bezier", "bspline", "revolution", "subdivision", "isosurface", "isosurface of f", "sdf"]
 SAMPLERS = ["raster", "reference", "embree", "opengl", "rays"]
-FEW = ["mesh", "isosurface of f", "sdf"]
-"""Surfaces in jax, which compiles long."""
+FEW = ["mesh"]
+"""Surfaces in jax in a single round: it compiles long."""
 
 
 def scene(name):
@@ -95,7 +95,8 @@ def test_eight_threads_compute_what_one_does(name):
                 start.wait(60)
                 # Half of the threads begin with the same scene, the others where nobody else is.
                 first = number // 2 * len(given) // THREADS if number % 2 else 0
-                for label, part, sampler, expected in given[first:] + given[:first]:
+                turn = given[first:] + given[:first]
+                for label, part, sampler, expected in turn[: len(turn) // 2 + 1] if ROUNDS == 1 else turn:
                     try:
                         found = images(engine, part, sampler)
                         if not all(map(np.array_equal, found, expected)):
