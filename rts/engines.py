@@ -210,6 +210,17 @@ class Engine(Plugin):
         """The value of `f` and its derivative along `tangent`, differentiable in turn in what `f` closes over."""
         raise self._no_derivatives()
 
+    def gradient_of_rows(self, f: Callable[[Array], Array], rows: Array) -> Array:
+        """The gradient (N, C) of a function of rows (N, C), each value (N,) of which depends on its own row alone.
+
+        Differentiable in turn in the rows and in what `f` closes over. The default takes C derivatives in forward mode.
+        """
+        xp, zero, columns = self.namespace, self.namespace.zeros_like(rows), []
+        for i in range(rows.shape[1]):
+            along = xp.concat([zero[:, :i], xp.ones_like(rows[:, :1]), zero[:, i + 1 :]], axis=1)
+            columns.append(self.jvp(f, rows, along)[1])
+        return xp.stack(columns, axis=-1)
+
     def jacobian(self, f: Callable) -> Callable:
         """Turn `f(vector) -> arrays` into `vector -> (values, derivatives)`, a row an unknown, by forward mode."""
         raise self._no_derivatives()

@@ -14,7 +14,7 @@ from rts.engines import Engine, constants, engine_of, namespace, suiting
 from rts.operations.projection import projective_map_of_views
 from rts.operations.take import take, take_shifted
 from rts.parts import CheckedPart
-from rts.records import Fine, Sampled, Samples, Splats
+from rts.records import ON_RAYS, Fine, Sampled, Samples, Splats
 from rts.row_cameras import RowCameras
 from rts.sampling.scenes import Wide
 from rts.sampling.several import Views, in_one_table
@@ -167,7 +167,7 @@ def _shown(
         own = seen.within(transform)
         add_footprint(part, samples, local, own, wide.grid, engine, like)
         world, rgba = shade(part, theta, transform, samples, local, camera, engine)
-        positions.append(constants(own.project(local["position"], wide.grid), engine, dtype))
+        positions.append(constants(own.project(_on_rays(samples, local["position"]), wide.grid), engine, dtype))
         check_splats(index, part, world, positions[-1], rgba, row, first)
         colors.append(constants(rgba, engine, dtype))
         first += samples.ids.shape[-2]
@@ -213,7 +213,8 @@ def _shown_in_views(
     (view,) = _together([constants(own, engine, like) for own in view])
     seen = [w.camera.replace(view=constants(w.camera.view, engine, like)).within(transform) for w in wides]
     rows = namespace(seen[0].view).stack([own.pixel_rows(grid) for own in seen])
-    rows, points = constants((rows, gbuffer["position"]), *suiting(rows, gbuffer["position"]))
+    points = _on_rays(whole, gbuffer["position"])
+    rows, points = constants((rows, points), *suiting(rows, points))
     places = _places_of(pictures, engine_of(points), points)
     positions = constants(projective_map_of_views(rows, points, view, places), engine, dtype)
     cameras = constants(cameras, engine, dtype)
@@ -248,6 +249,18 @@ def _shown_in_views(
     every = np.arange(gbuffer["position"].shape[0], dtype=np.int32)[None, None] if counts is not None else whole.row
     check_splats(index, part, gbuffer, positions, rgba, every, 0)
     return positions, rgba
+
+
+def _on_rays(samples: Samples, position: Array) -> Array:
+    """Positions (N, 3) of samples, put on the rays of their cells where they are not, with the derivative they have.
+
+    Splatters can only tell how samples move from the centres of their cells. There, too, a projection is finite.
+    """
+    if samples.centered:
+        return position
+    engine, like = suiting(position)
+    place = namespace(position).astype(constants(samples.tables[ON_RAYS], engine, like), position.dtype, copy=False)
+    return place + (position - engine.stop_gradient(position))
 
 
 def _together(*kinds: Sequence[Array]) -> list[Array]:

@@ -94,7 +94,7 @@ class Surface(Evaluator):
 
     Attributes:
         sample_widths: (I, P), how many integers and reals a sample has, after `refine`. Every surface sets it.
-        centered: whether samples lie on the rays through cells' centres.
+        centered: whether samples lie on the rays through cells' centres. If not, splatters are given them there.
         param_step: by how much the two `params` of a sample are changed to tell how position and uv change with them,
             which mipmaps go by; larger where both are linear in them.
     """

@@ -97,6 +97,10 @@ class RayHits(NamedTuple):
     ids: Array | None = None
 
 
+ON_RAYS = "points on rays"
+"""The table (N, 3) float32 of samples that are not centred: the points of cells' rays at their depth, local space."""
+
+
 @record(static=("asked", "centered", "by_sample"))
 class Samples:
     """Where the rays of one part meet its surface: the paper's U, packed.
@@ -110,7 +114,7 @@ class Samples:
         tables: further arrays of the surface by name, filled by its `refine`.
         gbuffer: the evaluated G-buffer if the surface's θ is constant, else None.
         asked: the names of the entries that were wanted when `gbuffer` was evaluated; None for all.
-        centered: whether the samples reproject to the centres of their cells.
+        centered: whether the samples reproject to the centres of their cells. Others have a table `ON_RAYS`.
         by_sample: the names of the tables that have a row for each sample; other tables are shared by all.
         settled: (H, W) int8, see `Splats`; None where no samples were left out for it.
         facing: (K, H, W) int16, the number of the piece of surface that is seen in each cell, from 1 on, negative where

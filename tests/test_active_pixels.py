@@ -141,6 +141,7 @@ def test_contrast_is_refused_where_colours_are_not_known():
     [
         ({"samples": 1}, "samples of Adaptive is 1; expected an integer of at least 2"),
         ({"samples": 2.5}, "samples of Adaptive is 2.5"),
+        ({"samples": 65}, "samples of Adaptive is 65; expected at most 64, .* take 4 or 8"),
         ({"samples": 4, "dilated": 1}, "dilated of Adaptive is 1; expected True, False or None"),
         ({"samples": 4, "contrast": 0}, "contrast of Adaptive is 0; expected a positive finite number"),
         ({"samples": 4, "contrast": math.inf}, "contrast of Adaptive is inf; expected a positive finite number"),
@@ -149,6 +150,13 @@ def test_contrast_is_refused_where_colours_are_not_known():
 def test_what_cannot_be_is_refused(wrong, told):
     with pytest.raises(rts.InputError, match=told):
         Adaptive(**wrong)
+
+
+def test_more_fine_samples_than_memory_are_refused_before_they_are_laid_out(monkeypatch):
+    monkeypatch.setattr(rts.checks, "MEMORY", 8000 * SIZE[0] * SIZE[1])
+    monkeypatch.setattr(rts.sampling.fine, "lay_out", lambda *_: pytest.fail("laid out"))
+    with pytest.raises(rts.InputError, match=r"1 x \d+ pixels .* or fewer samples a pixel"):
+        render(scene(), Adaptive(64))
 
 
 def test_it_is_a_static_value():

@@ -542,6 +542,17 @@ def test_arguments_are_refused_in_one_line():
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("engine", DIFFERENTIABLE)
+def test_isovalues_whose_derivative_would_be_lost_are_refused(engine):
+    isovalue, refusal = arrays(engine, np.array(0.5)), "isovalue is an array of .*subtract it from the values"
+    for make in (lambda v: Isosurface(BOUNDS, v), lambda v: rts.plugin("surfaces", "sdf")(torus, isovalue=v)):
+        with pytest.raises(InputError, match=refusal) as caught:
+            make(isovalue)
+        assert "\n" not in str(caught.value)
+        make(float(isovalue))
+        make(np.float32(0.5))
+
+
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 @pytest.mark.parametrize("isovalue", [0.0, 9.0])
 def test_without_a_change_of_sign_there_is_an_empty_image_and_a_warning(target, isovalue):

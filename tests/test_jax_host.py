@@ -1,6 +1,7 @@
 """Host functions inside jax programs."""
 
 import gc
+import sys
 import weakref
 
 import numpy as np
@@ -57,6 +58,25 @@ def test_errors_carry_their_message():
     call = jax.jit(lambda x: jax_host.call(function, (shape(3),), x)[0])
     with pytest.raises(jax.errors.JaxRuntimeError, match="KeyError: 'what happened'"):
         call(jnp.zeros(3)).block_until_ready()
+
+
+def test_a_call_that_is_left_before_it_begins_fails_the_program(monkeypatch):
+    # An interrupt is raised at the next line of Python, which may be the first of what XLA calls.
+    def left(*given):
+        raise KeyboardInterrupt
+
+    ignored = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda event: ignored.append(event.exc_type))
+    call = jax.jit(lambda x: jax_host.call(lambda x: [x + 1], (shape(3),), x)[0])
+    call = call.lower(jnp.zeros(3)).compile()
+    if not jax_host._available():
+        return  # jax's own interface sees to it.
+    with monkeypatch.context() as patch:
+        patch.setattr(jax_host._handle, "__code__", left.__code__)
+        with pytest.raises(jax.errors.JaxRuntimeError, match="left before its results were complete"):
+            call(jnp.zeros(3)).block_until_ready()
+    assert ignored == [KeyboardInterrupt]
+    np.testing.assert_array_equal(call(jnp.zeros(3)), 1)
 
 
 def test_vmap_calls_for_each_item():

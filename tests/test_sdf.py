@@ -121,7 +121,7 @@ def test_rays_are_clipped_to_boxes_as_to_balls():
                 return swept_sphere(theta, p)
 
         pair = [
-            cast(level, lambda p, f=level: moving(f, p), *rays, 4, within=within, lipschitz=1.0)
+            cast(level, lambda p, hit, f=level: moving(f, p, hit), *rays, 4, within=within, lipschitz=1.0)
             for within in (ball(np.zeros(3), 1.3), box(low, high))
         ]
         first, second = ([to_numpy(x) for x in hits[:2]] for hits in pair)

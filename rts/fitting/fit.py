@@ -201,7 +201,7 @@ def _descend(
         if run.stalled():
             run.stop(f"no gain in {run.patience} steps" + ("" if any(run.mattered) else f": {_flat(run.best_loss)}"))
             return
-        parameters = step(parameters, gradient)
+        parameters = run.attempt(engine, step, parameters, gradient)
 
 
 def _flat(loss: float) -> str:

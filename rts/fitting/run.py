@@ -11,6 +11,7 @@ from typing import Any
 
 from rts.engines import Engine
 from rts.errors import EngineError, InputError, RtsError
+from rts.fitting.interrupts import interrupts_held_back
 from rts.fitting.names import listed, one_line
 from rts.trees import Tree
 
@@ -98,11 +99,15 @@ class Run:
         return len(self.history) - self._last_gain >= self.patience
 
     def attempt(self, engine: Engine, call: Callable, *args: Any) -> Any:
-        """The result of `call(*args)`, waited for. After the first step an InputError in it becomes `Astray`."""
+        """The result of `call(*args)`, waited for. After the first step an InputError in it becomes `Astray`.
+
+        Interrupts come after it.
+        """
         # jax wraps errors of host functions in one of its own; the engine keeps the original.
         engine.take_error()
         try:
-            return engine.block(call(*args))
+            with interrupts_held_back():
+                return engine.block(call(*args))
         except Exception as error:
             original = error if isinstance(error, RtsError) else engine.take_error() or untraceable(error, engine)
             if original is None:

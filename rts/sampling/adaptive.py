@@ -15,6 +15,9 @@ from rts.errors import InputError
 from rts.parts import CheckedPart
 from rts.threads import parallel, read_only
 
+MOST = 64
+"""The most samples along each side of an active pixel. All fine samples are in memory at once."""
+
 
 @dataclass(frozen=True)
 class Adaptive:
@@ -24,7 +27,7 @@ class Adaptive:
     surface), or a neighbour's towards it. Active pixels are those of `supersample=samples`, the others those of 1.
 
     Attributes:
-        samples: s, along each side of an active pixel; at least 2.
+        samples: s, along each side of an active pixel; from 2 to 64.
         dilated: whether the eight neighbours of active pixels are active too. Colours that change near outlines need
             that; None for where some part has more than one colour (`Shader.uniform_by`).
         contrast: pixels are also active whose colour, in any channel, has a second difference above this along any of
@@ -40,6 +43,11 @@ class Adaptive:
         if not is_count(self.samples) or self.samples < 2:
             raise InputError(
                 f"samples of Adaptive is {quoted(self.samples)}; expected an integer of at least 2, such as 4"
+            )
+        if self.samples > MOST:
+            raise InputError(
+                f"samples of Adaptive is {quoted(self.samples)}; expected at most {MOST}, with which a thousand "
+                f"pixels at outlines take about 1 GB; take 4 or 8, or a number in place of Adaptive, rendered in bands"
             )
         if self.dilated is not None and not isinstance(self.dilated, bool):
             raise InputError(f"dilated of Adaptive is {quoted(self.dilated)}; expected True, False or None")

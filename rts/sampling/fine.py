@@ -88,6 +88,8 @@ def fine_samples(
     else:
         pixels, few = find(*given), engine.padded(coarse.row)
         room = None if capacity is None else grid.room(capacity, most)
+        if room is None:  # Aprons come on top; but to lay out what is far too large would take for ever.
+            check_memory(1, int(pixels.sum()) * grid.side**2, most, None, gradient=engine.differentiates)
         host = lay_out(pixels, grid, room, rounded if few else int)
         check_memory(1, host.cells.size, most, capacity, gradient=engine.differentiates)
         layout, allotted = of_engine(host, engine, coarse.depth), None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,8 +13,9 @@ from rts.camera import Camera
 from rts.engines import floating_bits, is_constant, stopped, suiting
 from rts.interfaces import Shader, TriangleSurface
 from rts.parts import CheckedPart, Part
-from rts.records import ArraySpec, Samples
+from rts.records import ON_RAYS, ArraySpec, Samples
 from rts.sampling.cache import Entry
+from rts.sampling.settling import rays_of
 from rts.sampling.validation import check_camera
 from rts.trees import Array, leaves, map_leaves
 
@@ -110,7 +112,9 @@ class HostCall:
             tables: `Samples.tables` of the samples.
             arrays: what it is given beside cameras and inputs.
         """
-        tables = tables or {}
+        tables = dict(tables or {})
+        if not self._surface.centered:
+            tables[ON_RAYS] = self._shape.row_spec(np.float32, 3)._replace(by_sample=True)
 
         def host(*given: np.ndarray) -> tuple[Any, ...]:
             it = iter(given)
@@ -121,6 +125,9 @@ class HostCall:
             inputs = map_leaves(lambda _: next(it), self._inputs) if self._entry is None else self._entry.inputs
             found, more = find(cameras, inputs, *others)
             gbuffer = {} if self._theta is None else self._surface.evaluate(self._theta, found)
+            if ON_RAYS in tables:
+                on_rays = _on_rays(found, cameras[0], self._shape.view, *others)
+                found = replace(found, tables={**found.tables, ON_RAYS: on_rays})
             return (
                 *(found.ids, found.params, found.row, found.depth, found.overflow),
                 *(more[name] for name in beside),
@@ -144,6 +151,18 @@ class HostCall:
             by_sample=tuple(name for name, spec in tables.items() if spec.by_sample),
         )
         return samples, more
+
+
+def _on_rays(samples: Samples, camera: Camera, view: tuple[int, int], cells: np.ndarray | None = None) -> np.ndarray:
+    """`ON_RAYS` of samples in a view, or in some of its cells; rows that no cell has do as the first."""
+    rays, covered = rays_of(samples, camera, view, cells), samples.row >= 0
+    depth, used = np.ones(len(samples.ids)), np.zeros(len(samples.ids), bool)
+    depth[samples.row[covered]], used[samples.row[covered]] = samples.depth[covered], True
+    used[0] |= len(used) == 1
+    points = np.zeros((len(depth), 3), np.float32)
+    points[used] = rays.origins[used] + depth[used, None] * rays.directions[used]
+    points[~used] = points[:1]
+    return points
 
 
 def _allotted(table: np.ndarray, spec: ArraySpec) -> np.ndarray:

@@ -49,7 +49,7 @@ def needed_by(
         settles: whether samples of a scene of one part may be left out that only cells amid its one colour need. Where
             samples are to be evaluated at other values of θ than they were found for, they may not.
     """
-    if not splatter.prunes or not all(p.shader.opaque and p.surface.centered for p in parts):
+    if not splatter.prunes or not all(p.shader.opaque for p in parts):
         return None
     size = _size(parts, sizes or [None] * len(parts))
     if size is None and not all(isinstance(p.surface, TriangleSurface) and not p.surface.refines for p in parts):

@@ -97,13 +97,13 @@ def refined(
         name: np.zeros((len(lifted.ids) if name in by_sample else spec.shape[0], *spec.shape[1:]), spec.dtype)
         for name, spec in tables.items()
     }
-    rays = _rays_of(lifted, camera, size or lifted.row.shape[1:], cells)
+    rays = rays_of(lifted, camera, size or lifted.row.shape[1:], cells)
     lifted = replace(lifted, tables=allotted, by_sample=by_sample)
     # `refine` gets a copy of `row`, so that the check sees what it has changed.
     return checked_refined(surface.refine(inputs, replace(lifted, row=lifted.row.copy()), rays), lifted, surface), rays
 
 
-def _rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None) -> Rays:
+def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None) -> Rays:
     """The ray of each packed sample (N, 3); where no cell has any, the first row gets the first pixel's."""
     from rts.sampling import settling_kernels
 

@@ -79,8 +79,8 @@ class Sampling(NamedTuple):
     def possible(self) -> bool:
         """Whether views can be sampled so, and not one by one.
 
-        One by one are sampled surfaces that refine their samples, intersect rays or have other triangles for each view,
-        parts with exits, and what a sampler with a `sample` of its own samples.
+        One by one are sampled surfaces that refine their samples or leave them off their rays, that intersect rays or
+        have other triangles for each view, parts with exits, and what a sampler with a `sample` of its own samples.
         """
         exits = self.scenes[0].suited[0].differentiates and self.splatter.reads_exits
         return all(_is_plain(sampler, part, exits) for part, sampler, _ in self.parts())
@@ -266,7 +266,7 @@ def _is_plain(sampler: Any, part: CheckedPart, exits: bool) -> bool:
     surface = part.surface
     if not isinstance(sampler, TriangleSampler) or type(sampler).sample is not TriangleSampler.sample:
         return False
-    if not isinstance(surface, TriangleSurface) or surface.refines or surface.depends_on_view:
+    if not isinstance(surface, TriangleSurface) or surface.refines or surface.depends_on_view or not surface.centered:
         return False
     return not (exits and part.cull == "back" and sampler.tells_exits)
 

@@ -236,7 +236,8 @@ class TriangleSampler(Sampler):
             entry: what `hold` gave, to be used without a look at the surface's inputs.
             cells: as in `rts.Sampler`.
             facing: as in `rts.Sampler`; surfaces that move samples off their triangles tell nothing.
-            exits: as in `rts.Sampler`; surfaces with a `refine` tell nothing, nor do lists of cells.
+            exits: as in `rts.Sampler`; surfaces with a `refine` tell nothing, nor do those that are not `centered`, nor
+                lists of cells.
 
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
@@ -245,7 +246,7 @@ class TriangleSampler(Sampler):
         shape = Shape(layers, size if cells is None else tuple(cells.shape), capacity, size)
         tells = facing and layers > 1 and part.cull == "none" and surface.tells_pieces
         tells = tells and not (surface.refines and surface.refine_moves)
-        exits = exits and part.cull == "back" and cells is None and not surface.refines
+        exits = exits and part.cull == "back" and cells is None and not surface.refines and surface.centered
         tables = shape.tables(surface) if surface.refines else {}
         wanted: Needed | None = None if needed is None else adapted(needed, Needed)
         settles = wanted is not None and wanted.settles and not surface.refines

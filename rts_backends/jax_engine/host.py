@@ -26,10 +26,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numba
 import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir, partial_eval
+from llvmlite import ir
+from numba.extending import intrinsic
 
 TARGET = "rts_host_call"
 
@@ -267,7 +270,7 @@ def _available() -> bool:
     try:
         # jax registers late what it is given before there are devices.
         client = jax.local_devices(backend="cpu")[0].client
-        handler = jax.ffi.pycapsule(ctypes.cast(_HANDLER, ctypes.c_void_p).value)
+        handler = jax.ffi.pycapsule(_guarded().address)
         jax.ffi.register_ffi_target(TARGET, handler, platform="cpu", api_version=1)
         # Where `_settle` does not help: its destructor would wait without end for threads that Python has ended.
         ctypes.pythonapi.Py_IncRef(ctypes.py_object(client))
@@ -356,29 +359,78 @@ class _Extension(ctypes.Structure):
     ]
 
 
-def _handle(address: int) -> int | None:
-    """The handler: None, or the address of an error of XLA's."""
-    frame = ctypes.cast(address, ctypes.POINTER(_Frame)).contents
+def _handle(address: int, outcome: int) -> None:
+    """Fill the results of a call, and write at `outcome` that it is `_DONE`, or the address of an error of XLA's."""
+    frame, status = ctypes.cast(address, ctypes.POINTER(_Frame)).contents, ctypes.c_ssize_t.from_address(outcome)
     try:
-        if frame.extension:
-            extension = ctypes.cast(frame.extension, ctypes.POINTER(_Extension)).contents
-            if extension.type == _METADATA:
-                _tell_version(frame, extension.metadata.contents)
-                return None
-        if frame.stage != _EXECUTE:
-            return None
-        arguments, results = frame.arguments, frame.results
-        operands = [_array(arguments.items[i]) for i in range(arguments.count)]
-        for operand in operands:
-            operand.flags.writeable = False
-        name, found = _name(frame.attributes), [_array(results.items[i]) for i in range(results.count)]
-        large_pages(found)
-        (_named.get(name) or _passing[name])(operands, found)
+        _answer(frame)
+        status.value = _DONE
     except BaseException as error:  # XLA cannot pass on an exception, only its text.
         message = f"{type(error).__name__}: {error}".encode()
         given = _ErrorArguments(ctypes.sizeof(_ErrorArguments), None, message, _INTERNAL)
-        return frame.api.contents.error_create(ctypes.byref(given))
-    return None
+        status.value = frame.api.contents.error_create(ctypes.byref(given))
+
+
+def _answer(frame: Any) -> None:
+    if frame.extension:
+        extension = ctypes.cast(frame.extension, ctypes.POINTER(_Extension)).contents
+        if extension.type == _METADATA:
+            _tell_version(frame, extension.metadata.contents)
+            return
+    if frame.stage != _EXECUTE:
+        return
+    arguments, results = frame.arguments, frame.results
+    operands = [_array(arguments.items[i]) for i in range(arguments.count)]
+    for operand in operands:
+        operand.flags.writeable = False
+    name, found = _name(frame.attributes), [_array(results.items[i]) for i in range(results.count)]
+    large_pages(found)
+    (_named.get(name) or _passing[name])(operands, found)
+
+
+_HANDLER = ctypes.CFUNCTYPE(None, ctypes.c_ssize_t, ctypes.c_ssize_t)(_handle)
+_LEFT, _DONE = 0, 1
+"""Outcomes of a call: an exception has left the handler, as an interrupt may before its first line; all is filled."""
+
+_ABANDONED = _ErrorArguments(
+    ctypes.sizeof(_ErrorArguments), None, b"a host function was left before its results were complete", _INTERNAL
+)
+
+
+@intrinsic
+def _abandoned(context: Any, frame: Any) -> Any:
+    """The address of an error of XLA's, made without Python."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        number = ir.IntType(8 * ctypes.sizeof(ctypes.c_ssize_t))
+
+        def field(structure: Any, offset: int) -> Any:
+            address = builder.add(structure, number(offset))
+            return builder.load(builder.inttoptr(address, number.as_pointer()))
+
+        function = ir.FunctionType(number, [number]).as_pointer()
+        create = field(field(arguments[0], _Frame.api.offset), _Api.error_create.offset)
+        return builder.call(builder.inttoptr(create, function), [number(ctypes.addressof(_ABANDONED))])
+
+    return numba.intp(numba.intp), build
+
+
+@functools.cache
+def _guarded() -> Any:
+    """A compiled function, which XLA calls, that calls the handler.
+
+    ctypes ignores exceptions that leave the handler, and its result would be anything then.
+    """
+
+    @numba.cfunc(numba.intp(numba.intp))
+    def guarded(frame: int) -> int:
+        outcome = np.full(1, _LEFT, np.intp)
+        _HANDLER(frame, outcome.ctypes.data)
+        if outcome[0] == _LEFT:
+            return _abandoned(frame)  # pyright: ignore[reportCallIssue]  # numba gives the context.
+        return 0 if outcome[0] == _DONE else outcome[0]
+
+    return guarded
 
 
 def _tell_version(frame: Any, metadata: Any) -> None:
@@ -407,6 +459,3 @@ def _name(attributes: Any) -> str:
     assert attributes.count == 1 and attributes.types[0] == _STRING
     text = ctypes.cast(attributes.items[0], ctypes.POINTER(_Text)).contents
     return ctypes.string_at(text.start, text.length).decode()
-
-
-_HANDLER = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_void_p)(_handle)

@@ -23,7 +23,7 @@ CROWDED = 0.75
 """The share of rays that still go on at which the others are taken out."""
 
 FLATTEST = 1e-6
-"""The least square of a slope that points are moved by, as a share of the largest; flatter places move less."""
+"""The least square of a slope that points are moved by, as a share of the usual one; flatter places move less."""
 
 
 class Region(NamedTuple):
@@ -75,28 +75,36 @@ def box(low: np.ndarray, high: np.ndarray) -> Region:
     return Region(span, float(np.linalg.norm(high - low)))
 
 
-def moving(level: Callable[[Array], Array], points: Array) -> Array:
+def moving(level: Callable[[Array], Array], points: Array, hit: Array) -> Array:
     """(M, 6) for points (M, 3) of a surface: the points, and how they move for each unit that the level falls there.
 
     The latter is the slope over its square, w = ∇f / |∇f|²: the point x₀ − f(x₀) w is on the surface, to first order.
+    `hit` (M,) bool says which rows are such points.
     """
     engine = engine_of(points)
-    return engine.stop_gradient(engine.namespace.concat([points, per_level(gradient(level, points))], axis=-1))
+    return engine.stop_gradient(engine.namespace.concat([points, per_level(gradient(level, points), hit)], axis=-1))
 
 
-def per_level(slope: Array) -> Array:
-    """(M, 3): slopes (M, 3) over their squares."""
+def per_level(slope: Array, hit: Array) -> Array:
+    """(M, 3): slopes (M, 3) over their squares; `hit` (M,) bool says which are slopes of the surface.
+
+    A few steep places, such as those of a root, do not make the others flat: the usual slope is a geometric mean.
+    """
     xp = namespace(slope)
     # Squares of small slopes are no numbers of single precision.
-    largest = xp.max(xp.abs(slope)) if slope.shape[0] else xp.ones_like(xp.sum(slope))
-    largest = xp.where(largest > 0, largest, xp.ones_like(largest))
-    scaled = slope / largest
-    return scaled / xp.clip(xp.sum(scaled * scaled, axis=-1, keepdims=True), FLATTEST, None) / largest
+    largest = xp.max(xp.abs(slope), axis=-1, keepdims=True)
+    scaled = slope / xp.where(largest > 0, largest, xp.ones_like(largest))
+    size = largest * xp.sqrt(xp.sum(scaled * scaled, axis=-1, keepdims=True))
+    counts = hit[:, None] & (size > 0) & xp.isfinite(size)
+    logarithms = xp.log(xp.where(counts, size, xp.ones_like(size)))
+    usual = xp.exp(xp.sum(logarithms) / xp.clip(xp.sum(xp.astype(counts, size.dtype)), 1.0, None))
+    size = xp.where(size > 0, size, xp.ones_like(size))
+    return slope / size / xp.maximum(size, FLATTEST * usual * (usual / size))
 
 
 def cast(
     level: Callable[[Array], Array],
-    describe: Callable[[Array], Array],
+    describe: Callable[[Array, Array], Array],
     origins: Array,
     directions: Array,
     layers: int,
@@ -113,7 +121,7 @@ def cast(
 
     Args:
         level: points (M, 3) → (M,), negative inside, zero counts as outside.
-        describe: points (M, 3) of the surface → (M, P), the parameters of a hit.
+        describe: points (M, 3), and which of them are of the surface, (M,) bool → (M, P), the parameters of a hit.
         origins: (R, 3).
         directions: (R, 3), of any length but zero.
         layers: K.
@@ -212,8 +220,9 @@ def _cast_some(
         table[cell[1:]] = values[1:]
         return xp.reshape(table, (layers, count, *values.shape[1:]))
 
-    distance = t + xp.take(enter, cell % count, axis=0)
-    return RayHits(spread(xp.ones_like(cell, dtype=xp.bool)), spread(distance), spread(describe(met.at(t))))
+    distance, hit = t + xp.take(enter, cell % count, axis=0), xp.ones_like(cell, dtype=xp.bool)
+    hit[0] = False
+    return RayHits(spread(hit), spread(distance), spread(describe(met.at(t), hit)))
 
 
 def _cast_all(
@@ -246,7 +255,7 @@ def _cast_all(
     flat = [xp.reshape(state[n], (-1,)) for n in _Bracket._fields]
     met = map_leaves(lambda x: xp.concat([x] * layers), rays)
     t = _roots(level, free, met, _Bracket(*flat))
-    params = describe(met.at(t))
+    params = describe(met.at(t), xp.reshape(hit, (-1,)))
     params = xp.reshape(params, (*hit.shape, params.shape[-1]))
     distance = xp.reshape(t, hit.shape) + enter
     return RayHits(hit, xp.where(hit, distance, 0.0), xp.where(hit[..., None], params, 0.0))

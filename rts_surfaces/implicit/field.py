@@ -12,7 +12,7 @@ import numpy as np
 
 from rts.arguments import check_numbers, one_line, quoted
 from rts.arrays import kind_of, shape_of, unit
-from rts.engines import Engine, engine_of, namespace
+from rts.engines import Engine, engine_of, is_constant, namespace
 from rts.errors import EngineError, InputError, RtsError
 from rts.gbuffer import GBuffer
 from rts.interfaces import Surface
@@ -220,8 +220,13 @@ class Implicit(Surface):
 
 
 def check_isovalue(isovalue: Any) -> float:
-    """The isovalue; refused where it is no number of single precision, or traced."""
+    """The isovalue; refused where it is no number of single precision, or an array whose derivative would be lost."""
     value = known_number("isovalue", check_numbers("isovalue", isovalue, ()))
+    if not is_constant(isovalue):
+        raise InputError(
+            f"isovalue is an array of {engine_of(isovalue).name}; expected a number, which has no derivative. Where it "
+            f"is to have one, put it into theta, and subtract it from the values, or in f; else take float(isovalue)"
+        )
     if abs(value) > LARGEST:
         raise InputError(f"isovalue is {value:g}; expected a number of single precision")
     return value

@@ -309,13 +309,18 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             columns.append(column if self.closed else xp.zeros_like(column))
         return xp.stack(columns, axis=-1)
 
-    def _moving(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """(M, 7): points, how they move for each unit of level, and their level; in a cap only within its side."""
+    def _moving(self, theta: Mapping[str, Tree], points: Array, hit: Array) -> Array:
+        """(M, 7): points, how they move for each unit of level, and their level; in a cap only within its side.
+
+        `hit` (M,) bool says which points are those of hits.
+        """
         engine = engine_of(points)
         xp, level = engine.namespace, partial(self.field.level, theta)
         within = 1 - xp.abs(self._caps(points))
-        along, free = per_level(within * gradient(level, points)), xp.min(within, axis=-1, keepdims=True)
-        return engine.stop_gradient(xp.concat([points, along, (1 - free) * level(points)[:, None]], axis=-1))
+        slope, free = within * gradient(level, points), xp.min(within, axis=-1, keepdims=True)
+        return engine.stop_gradient(
+            xp.concat([points, per_level(slope, hit), (1 - free) * level(points)[:, None]], axis=-1)
+        )
 
     def unbounded(self) -> Isosurface | None:
         """See `rts.Surface`: with near-singular edges as they are."""

@@ -1,0 +1,47 @@
+"""Ctrl-C in a fit."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+
+@contextlib.contextmanager
+def interrupts_held_back() -> Iterator[None]:
+    """Have Ctrl-C interrupt once a computation is done; a second one interrupts it at once.
+
+    Python raises KeyboardInterrupt between any two lines, its frameworks' own included. In torch it may leave forward
+    mode switched on, and all derivatives fail from then on. A compiled program of jax that calls Python cannot pass it
+    on: it fails with an error of jax's, or does not notice. A step is short, and between steps everything is whole.
+
+    Only the main thread is interrupted. A handler of the user's own decides what an interrupt does, as ever.
+    """
+    own = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(own):
+        yield
+        return
+    held, raised = False, None
+
+    def hold(number: int, frame: Any) -> None:
+        nonlocal held, raised
+        if not held:
+            held = True
+            return
+        try:
+            own(number, frame)
+        except BaseException as error:
+            raised = error
+            raise
+
+    try:
+        signal.signal(signal.SIGINT, hold)
+        yield
+    finally:
+        signal.signal(signal.SIGINT, own)
+        if raised is not None:
+            raise raised from None
+        if held:
+            signal.raise_signal(signal.SIGINT)
