@@ -11,6 +11,7 @@ from rts.appearance import add_footprint, apart, evaluate, shade, shaded_at_once
 from rts.camera import Camera
 from rts.checks import check_splats
 from rts.engines import Engine, constants, engine_of, namespace, suiting
+from rts.errors import InputError
 from rts.operations.projection import projective_map_of_views
 from rts.operations.take import take, take_shifted
 from rts.parts import CheckedPart
@@ -258,6 +259,11 @@ def _on_rays(samples: Samples, position: Array) -> Array:
     """
     if samples.centered:
         return position
+    if ON_RAYS not in samples.tables:
+        raise InputError(
+            f"samples are not centered, and have no table {ON_RAYS!r}: expected (N, 3), where their cells' rays are at "
+            f"their depth"
+        )
     engine, like = suiting(position)
     place = namespace(position).astype(constants(samples.tables[ON_RAYS], engine, like), position.dtype, copy=False)
     return place + (position - engine.stop_gradient(position))

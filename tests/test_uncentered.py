@@ -177,3 +177,11 @@ def test_derivatives_are_not_called_unknown():
     )
     print(report)
     assert "unknown" not in str(report)
+
+
+def test_samples_without_points_on_rays_are_refused():
+    part = Part(Ball(1), {"radius": np.float32(RADIUS)}, "normals")
+    found = rts.sample(part, CAMERA, SIZE)
+    bare = dataclasses.replace(found, samples=(dataclasses.replace(found.samples[0], tables={}),))
+    with pytest.raises(rts.InputError, match="not centered, and have no table 'points on rays'"):
+        rts.render_samples(bare, part, CAMERA)
