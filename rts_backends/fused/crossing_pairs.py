@@ -40,7 +40,7 @@ class Rules(NamedTuple):
         """For fronts whose depths have an extent, the camera's included, in their dtype."""
         kind = type(extent)
         least, numbers = kind(TIE) * extent, (specification.LARGEST, specification.DIRECT, specification.FIT)
-        return cls(least, *map(kind, numbers), kind(specification.SLACK) * least)
+        return cls(least, *map(kind, numbers), slack=kind(specification.SLACK) * least)
 
 
 def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np.ndarray) -> None:
