@@ -954,6 +954,10 @@ ODD_ENGINES = {
             repeat=lambda self, body, going, state, most: type(self)._repeated(body, going, state, most)
         )
     },
+    "rows_have_gradients": {
+        "halved": engine_with(gradient_of_rows=of_base("gradient_of_rows", lambda x: x / 2)),
+        "detached": engine_with(gradient_of_rows=of_base("gradient_of_rows", lambda x: x.detach() + 0 * x)),
+    },
     "unused_rows_are_filled": {
         "left": engine_with(padded=lambda self, x: True, fill_unused=lambda self, x, row: x),
     },

@@ -10,6 +10,8 @@ from rts import Camera, Part
 from rts_surfaces.implicit.casting import per_level
 from rts_surfaces.implicit.fields import swept_sphere
 
+pytestmark = pytest.mark.rendering
+
 Sdf, Isosurface = rts.plugin("surfaces", "sdf"), rts.plugin("surfaces", "isosurface")
 CAMERA, SIZE = Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=40), (16, 20)
 BOUNDS = ((-1.5, -1.5, -1.5), (1.5, 1.5, 1.5))

@@ -25,7 +25,7 @@ SPECIFICATIONS = {"multi": splatting.Multi(), "visible": splatting.Visible()}
 # On the same cells: with a wider apron, rays through edges are rounded to either side.
 EVERY = {name: type("Every", (rts.plugin("splatters", name),), {"prunes": False})() for name in SPECIFICATIONS}
 LIMIT = 1e-6
-"""Of the largest gradient, in float64: what is left out adds zeros in another order."""
+"""Share of the largest gradient, in float64, that rounding may change: zeros are added in another order."""
 
 
 def rendered(number, needed, splatter, shader="unlit", **options):

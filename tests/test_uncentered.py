@@ -9,6 +9,8 @@ from helpers import icosphere
 import rts
 from rts import Camera, Part
 
+pytestmark = pytest.mark.rendering
+
 DISTANCE, FOV, SIZE, RADIUS = 3.0, 50.0, (32, 32), 1.0
 CAMERA = Camera.look_at((0, 0, DISTANCE), (0, 0, 0), fov_y=FOV)
 
@@ -40,7 +42,7 @@ class Ball(rts.TriangleSurface):
 
 
 class Refined(Ball):
-    """The same ball, whose samples are moved to where rays meet it."""
+    """A ball whose samples are moved to where rays meet it."""
 
     centered = True
 
