@@ -97,7 +97,11 @@ def rendered(soup, number, needed, splatter, dtype):
     part = colored(soup, number, vertices)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", rts.EmptyImageWarning)
-        sampled = sample(part, soup.camera, soup.size, sampler="raster", splatter=needed, layers=soup.layers)
+        warnings.simplefilter("ignore", rts.InputWarning)  # Some soups are closed, and wound inside out.
+        # Exits take what room samples leave: all samples leave none.
+        cells = np.prod([n + 2 * (splatting.Visible.reach + 1) for n in soup.size])
+        options = {"layers": soup.layers, "capacity": int(cells) * (soup.layers + 1)}
+        sampled = sample(part, soup.camera, soup.size, sampler="raster", splatter=needed, **options)
         image = rts.render_samples(sampled, part, soup.camera, splatter=splatter)
     return to_numpy(image), to_numpy(torch.autograd.grad((image * along).sum(), vertices)[0])
 
