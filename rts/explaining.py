@@ -85,7 +85,7 @@ def _observed(parts: Sequence[CheckedPart], camera: Camera, size: tuple[int, int
 
 
 def _remarks(part: CheckedPart, camera: Camera, shaded: Collection[str] | None) -> Iterator[str]:
-    """What of a part looks like a mistake, whose shader reads these entries of θ; None where that is not known."""
+    """Likely mistakes of a part whose shader reads these entries of θ; None where that is not known."""
     for name in unread(part, shaded):
         meant = likely_name(part, name, shaded or ())
         yield f"theta[{name!r}] is not read" + ("" if meant is None else f"; did you mean {meant!r}?")

@@ -157,7 +157,7 @@ def _level_up(up: Array, back: Array) -> Array:
 PARALLEL = 1e-12
 """Rays are parallel if w changes by less than this share over lengths in which x or y do by one."""
 ROUNDING = 1e-5
-"""What entries of matrices that are to be zero or one may be off by."""
+"""Rounding allowed in entries of matrices that are to be zero or one."""
 RADIANS = 2.0
 """A field of view below this is likely to be one in radians, given for degrees."""
 

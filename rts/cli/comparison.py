@@ -21,7 +21,7 @@ def scene_list() -> Table:
 
 
 def missing_charts() -> str | None:
-    """What cannot be drawn for want of a package, in a line; None where all can."""
+    """A line that names the charts that cannot be drawn for want of a package; None where all can."""
     kinds = {"matplotlib": "PNG", "plotly": "HTML"}
     missing = [package for package in kinds if find_spec(package) is None]
     if not missing:

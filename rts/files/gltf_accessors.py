@@ -31,7 +31,7 @@ QUANTIZED = COMPONENTS | {
     "NORMAL": ("f4", "i1 fraction", "i2 fraction"),
     "TEXCOORD_0": ("f4", *_INTEGERS),
 }
-"""Those with KHR_mesh_quantization."""
+"""Component types that KHR_mesh_quantization adds."""
 MOST = 2**24
 """Rows of an accessor without data, all zero, which a damaged file could otherwise have any number of."""
 BOUNDS_TOLERANCE = 1e-3

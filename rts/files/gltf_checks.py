@@ -30,7 +30,7 @@ PROPERTIES = {
     "nodes": "camera children skin matrix mesh rotation scale translation weights",
     "scenes": "nodes",
 }
-"""What objects of the format may have, beside a name, extensions and extras."""
+"""Properties of each kind of object, beside a name, extensions and extras."""
 ATTRIBUTE = re.compile(r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_[0-9]+|_.*")
 MODES = {0: "points", 1: "lines", 2: "lines", 3: "lines"}
 

@@ -21,7 +21,7 @@ _MAPS = ("map_", "bump", "disp", "decal", "refl", "norm")
 
 
 class Material(NamedTuple):
-    """What is used of an MTL material.
+    """The part of an MTL material that shaders use.
 
     Attributes:
         color: (3,) Kd, sRGB, or (4,) where d or Tr make it translucent; None where there is no Kd. Without d, alpha is

@@ -68,7 +68,7 @@ def check_piece(path: Path, piece: Piece) -> None:
 
 
 def fault_of(matrix: np.ndarray) -> str:
-    """What is wrong with a transform (4, 4), as the end of a sentence; "" if it can be applied, and undone."""
+    """The fault of a transform (4, 4), as the end of a sentence; "" if it can be applied, and undone."""
     if not np.isfinite(matrix).all():
         return "holds NaN or infinity"
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-5:

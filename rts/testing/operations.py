@@ -1,4 +1,4 @@
-"""What every operation must do."""
+"""Checks that every operation must pass."""
 
 from __future__ import annotations
 

@@ -313,7 +313,7 @@ def _is_small(change, direct, total, rules):
 
 @compiled
 def _step(z, gap, y, x, v, u):
-    """What a pair is told by (see `rts.splatting.crossings`), of a cell q and the one p a step (u, v) farther on.
+    """The terms of R and D (see `rts.splatting.crossings`) of a cell q and the one p a step (u, v) farther on.
 
     Returns:
         h(q) + h(p); whether the cells before q and after p have two layers; the shares in R of q and p, and those in D:
