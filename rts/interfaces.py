@@ -470,7 +470,7 @@ class Shader(Plugin):
             given: the names of the entries of the G-buffer; None where the surface does not say (`Surface.gives`).
 
         Returns:
-            Names of entries, or None. Parts whose shaders are equal, and these entries of θ, show the same colour.
+            Names of entries, or None.
         """
         return tuple(theta) if self.uniform else None
 
