@@ -50,7 +50,7 @@ def shaded_at_once(part: CheckedPart) -> bool:
     """Whether a part's shader takes the samples of several views in one call."""
     # The footprint of a sample is found by the camera of its view.
     tells = part.shader.reads is not None and FOOTPRINT not in part.shader.reads
-    return part.uniform or (part.shader.takes_views and tells)
+    return part.shader.uniform or (part.shader.takes_views and tells)
 
 
 def theta_of(part: CheckedPart, engine: Engine, like: Array | None) -> dict[str, Tree]:
@@ -98,7 +98,7 @@ def shade(
     world = _to_world(_readable(local, samples, engine), transform)
     rgba = _shaded(part, theta, world, camera)
     check_shaded(rgba, samples.ids.shape[-2], part.shader)
-    if part.uniform_by == ():  # It is constant, and takes no time.
+    if part.shader.uniform:  # One colour, of however many rows.
         return world, rgba
     rows, names = local.computed, [*local]
     if isinstance(camera, RowCameras):

@@ -103,28 +103,12 @@ class Surface(Evaluator):
     centered: bool = True
     param_step: float = 2**-8
 
-    def __init_subclass__(cls, **options: Any) -> None:
-        """What another `evaluate` gives is said anew."""
-        super().__init_subclass__(**options)
-        _promise_anew(cls, "evaluate", ["gives"], Surface)
-
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Raise an `InputError` of one line where an entry is missing or of a wrong shape; values may be traced."""
 
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
         """The names of the entries of θ that the surface reads; others are its shader's. The default is all of them."""
         return tuple(theta)
-
-    def gives(self, theta: Mapping[str, Tree]) -> tuple[str, ...] | None:
-        """The names of the entries of the G-buffer that `evaluate` gives; None where the surface does not say.
-
-        It is asked before samples are made. Shaders may promise more where they know what they will not be given. A
-        class with an `evaluate` of its own does not inherit that of another surface.
-
-        Args:
-            theta: θ; values may be traced.
-        """
-        return None
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
         """Coarser and finer forms of the surface, for whoever looks for the cheapest that will do; none by default.
@@ -436,8 +420,7 @@ class Shader(Plugin):
 
     Attributes:
         opaque: a promise that alpha is 1.
-        uniform: a promise that all samples of a part have one colour, through whatever camera. Where that depends on
-            the part, the class has a method `uniform_by` instead.
+        uniform: a promise that all samples of a part have one colour, through whatever camera. It may depend on θ.
         reads: the entries of the G-buffer that it needs besides position; None for all.
         reads_theta: the entries of θ that it reads where they are there; None if it does not say. `rts.explain` lists
             entries that nobody reads, and what is almost one of these is warned of.
@@ -457,22 +440,7 @@ class Shader(Plugin):
     def __init_subclass__(cls, **options: Any) -> None:
         """What another `__call__` does is promised anew."""
         super().__init_subclass__(**options)
-        _promise_anew(cls, "__call__", ["takes_views", "uniform", "uniform_by", "reads_theta"], Shader)
-
-    def uniform_by(self, theta: Mapping[str, Tree], given: Sequence[str] | None) -> tuple[str, ...] | None:
-        """Where all samples of a part have one colour, the entries of θ that it depends on; None where they may not.
-
-        It is asked before samples are made. The default goes by the class: all entries, where it is `uniform`. A class
-        with a `__call__` of its own does not inherit that of another shader.
-
-        Args:
-            theta: θ of the part; values may be traced.
-            given: the names of the entries of the G-buffer; None where the surface does not say (`Surface.gives`).
-
-        Returns:
-            Names of entries, or None.
-        """
-        return tuple(theta) if self.uniform else None
+        _promise_anew(cls, "__call__", ["takes_views", "uniform", "reads_theta"], Shader)
 
     @abc.abstractmethod
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:

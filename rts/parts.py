@@ -53,19 +53,3 @@ class CheckedPart(Part):
     shader: Shader  # pyright: ignore[reportGeneralTypeIssues]  # It is always given.
     transform: Array | None = None
     cull: str = "none"
-
-    @property
-    def uniform_by(self) -> tuple[str, ...] | None:
-        """Where all its samples have one colour, the entries of θ that this depends on; see `Shader`."""
-        names = self.shader.uniform_by(self.theta, self.surface.gives(self.theta))
-        if names is not None and (isinstance(names, str) or not all(isinstance(name, str) for name in names)):
-            raise InputError(
-                f"uniform_by of {self.shader!r} gave {quoted(names)}; expected a tuple of names of entries of theta, "
-                f"or None"
-            )
-        return None if names is None else tuple(names)
-
-    @property
-    def uniform(self) -> bool:
-        """Whether all its samples have one colour, through whatever camera."""
-        return self.uniform_by is not None

@@ -273,7 +273,7 @@ def render_samples(
             f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
             f"{apron_of(splatter)}; give it to rts.sample, too"
         )
-    if sampled.settled is not None and not (splatter.settles and scene.parts[0].uniform):
+    if sampled.settled is not None and not (splatter.settles and scene.parts[0].shader.uniform):
         shaders = ", ".join(dict.fromkeys(repr(part.shader) for part in scene.parts))
         raise InputError(
             f"samples of cells amid one colour were left out (settles=True), which {splatter!r} and "

@@ -17,7 +17,7 @@ The base colour is the texture where θ has one and the surface has uv, else the
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,10 +47,6 @@ class Silhouette(Shader):
     uniform = True
     reads = ()
     reads_theta = ()
-
-    def uniform_by(self, theta: Mapping[str, Tree], given: Sequence[str] | None) -> tuple[str, ...]:
-        """See `rts.Shader`: nothing."""
-        return ()
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -128,14 +124,6 @@ class Unlit(Shader):
         """See `rts.Shader`."""
         color, alpha = self.base_color(theta, gbuffer)
         return self.premultiplied(color, alpha)
-
-    def uniform_by(self, theta: Mapping[str, Tree], given: Sequence[str] | None) -> tuple[str, ...] | None:
-        """See `rts.Shader`: θ["color"], where there is neither a texture nor colours of the surface."""
-        if given is None or "color" in given or ("uv" in given and "texture" in theta):
-            return None
-        if type(self).base_color is not Unlit.base_color:
-            return None
-        return ("color",) if "color" in theta else ()
 
     def base_color(self, theta: Mapping[str, Tree], gbuffer: GBuffer) -> tuple[Array, Array]:
         """Colour (N, 3), not premultiplied, and alpha (N, 1)."""

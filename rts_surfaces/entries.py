@@ -18,11 +18,6 @@ RESERVED = ("vertices", "points", "position", "normal")
 """Names that no further attribute may have."""
 
 
-def in_g_buffer(attributes: Iterable[str]) -> tuple[str, ...]:
-    """The names in the G-buffer of positions, normals and attributes, by their names in θ."""
-    return tuple(dict.fromkeys(("position", "normal", *(G_BUFFER_NAMES.get(name, name) for name in attributes))))
-
-
 def check_names(names: Iterable[str], taken: Sequence[str] = ()) -> None:
     """Refuse names of attributes that mean something else, or are among those that are taken."""
     for name in names:

@@ -22,7 +22,7 @@ from rts.records import Proxy, Samples
 from rts.sampling.cache import fingerprint
 from rts.topology import fixed, index_table, pieces
 from rts.trees import Array, Tree
-from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows, in_g_buffer
+from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows
 
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv")
 
@@ -109,10 +109,6 @@ class Mesh(TriangleSurface):
             known = (name for name in self._columns if name in theta or name not in VERTEX_ATTRIBUTES)
             self._reads[names] = ("vertices", *known)
         return self._reads[names]
-
-    def gives(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
-        """Positions, normals and attributes."""
-        return in_g_buffer(self._attributes(theta))
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
         """Meshes of fewer faces, while no derivative is taken of the vertices; see `rts_surfaces.decimation`."""

@@ -16,7 +16,7 @@ from rts.threads import parallel
 from rts.topology import fixed
 from rts.trees import Array, Tree
 from rts_surfaces.bicubic import normals, values
-from rts_surfaces.entries import G_BUFFER_NAMES, WIDTHS, check_entry, in_g_buffer
+from rts_surfaces.entries import G_BUFFER_NAMES, WIDTHS, check_entry
 from rts_surfaces.parametric import LIMITS, Geometry, Parametric
 from rts_surfaces.tiles import Tiles
 
@@ -112,10 +112,6 @@ class Patches(Parametric):
     def reads(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
         """The entries of θ that `evaluate` needs."""
         return *self.shaped_by, *(name for name in ATTRIBUTES if name in theta)
-
-    def gives(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
-        """Positions, normals and attributes."""
-        return in_g_buffer(name for name in ATTRIBUTES if name in theta)
 
     def nets(self, points: np.ndarray) -> np.ndarray:
         """(n, 4, 4, 3) float64 control points of the Bézier patches."""

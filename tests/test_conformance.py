@@ -567,16 +567,6 @@ class OddMesh(Mesh):
         return self.alter(gbuffer, theta, samples) or gbuffer
 
 
-class Reticent(Mesh):
-    """Does not say all that it gives."""
-
-    def __init__(self):
-        super().__init__(Mesh.example().surface.faces)
-
-    def gives(self, theta):
-        return "position", "normal"
-
-
 def with_entry(name, change):
     """A mesh with an entry of its G-buffer changed."""
 
@@ -707,7 +697,6 @@ SURFACES = {
         "float64": with_entry("color", lambda x, *_: x * np.float64(1)),
         "padding": with_entry("color", over_nothing),
     },
-    "it_gives_what_it_says": {"colours unsaid": Reticent()},
     "triangles_have_their_corners_on_the_surface": {
         "inflated": Inflated(),
         "normals inward": with_entry("normal", lambda x, *_: -x),
@@ -782,10 +771,8 @@ SHADERS = {
         "by number": shading(lambda c, *_: c * (0.5 + np.arange(len(c), dtype=np.float32)[:, None] / 200)),
     },
     "opaque_is_true": {"translucent": shading(opaque=True)},
-    "it_has_one_color_where_it_says": {
+    "uniform_is_one_color": {
         "many": shading(uniform=True),
-        "many, of a part": shading(uniform_by=lambda theta, given: ("color",) if "color" in given else None),
-        "θ unsaid": shading(lambda c, t, g: 0 * c + t["color"][0], uniform_by=lambda theta, given: ()),
         "another from each view": by_camera,
     },
     "it_reads_what_it_says": {

@@ -11,10 +11,8 @@ from helpers import DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere
 
 import rts
 from rts import splatting
-from rts.checks import check_scene
 from rts.sampling.interiors_kernels import settle
 from rts.sampling.scenes import sample
-from rts.shading import Unlit
 from rts.splatting.layers import dilated
 from rts_backends.fused import splatters as fused
 
@@ -239,14 +237,14 @@ def test_what_has_its_call_from_elsewhere_promises_no_colour(base):
     kind = rts.plugin("rts.shaders", base)
     body = vars(Stripes)["__call__"]
     for shader in (type("Mixed", (Stripes, kind), {})(), type("Own", (kind,), {"__call__": body})()):
-        assert not shader.uniform and shader.uniform_by({}, ("position",)) is None and not shader.takes_views
+        assert not shader.uniform and not shader.takes_views
         alone = mesh_part(SPHERE, shader=shader)
         sampled = sample(alone, CAMERA, SIZE, splatter="visible", settles=True)
         assert sampled.settled is None
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
-def test_unlit_parts_of_one_colour_are_settled_and_their_colour_has_its_gradient(target):
+def test_parts_of_one_colour_are_settled_and_their_colour_has_its_gradient(target):
     weights = arrays(target, np.random.default_rng(0).normal(size=(*SIZE, 4)).astype(np.float32))
     start, found = arrays(target, np.array([0.3, 0.6, 0.2, 0.02, -0.01, 0.03], np.float32)), []
     for splatter in (fused.Visible(), Whole()):
@@ -255,7 +253,7 @@ def test_unlit_parts_of_one_colour_are_settled_and_their_colour_has_its_gradient
             xp = rts.namespace(x)
             pose = xp.concat([x[3:], 0 * x[3:]])
             theta = {"vertices": SPHERE[0], "color": x[:3]}
-            part = rts.Part(MESH(SPHERE[1]), theta, "unlit", rts.rigid(pose))
+            part = rts.Part(MESH(SPHERE[1]), theta, Painted(), rts.rigid(pose))
             return xp.sum(rts.render(part, CAMERA, SIZE, splatter=splatter) * weights)
 
         if target == "jax" and not found:
@@ -265,58 +263,6 @@ def test_unlit_parts_of_one_colour_are_settled_and_their_colour_has_its_gradient
         found.append(to_numpy(gradient(target, loss, start)))
     assert np.abs(found[0]).max() > 1
     np.testing.assert_allclose(found[0], found[1], rtol=0, atol=1e-5 * np.abs(found[1]).max())
-
-
-def test_which_parts_are_of_one_colour():
-    import torch
-
-    vertices, rng = SPHERE[0], np.random.default_rng(0)
-    red = np.array([1.0, 0, 0], np.float32)
-
-    def part(shader="unlit", indices=None, **theta):
-        return rts.Part(MESH(SPHERE[1], indices), {"vertices": vertices, **theta}, shader)
-
-    class Shaded(Unlit):
-        def base_color(self, theta, gbuffer):
-            return gbuffer["normal"], gbuffer["position"][:, :1]
-
-    class Odd(MESH):
-        """Does not say what it gives, any more."""
-
-        def evaluate(self, theta, samples):
-            return {**super().evaluate(theta, samples), "color": samples.params}
-
-    class Moved(Unlit):
-        """Unlit, but for what a class inherits it may not promise."""
-
-        def __call__(self, theta, gbuffer, camera):
-            return super().__call__(theta, gbuffer, camera) * gbuffer["position"][:, :1]
-
-    ball = rts.plugin("rts.surfaces", "sdf")(lambda theta, p: p[:, 0])
-    colors, uv = rng.random((len(vertices), 3)), rng.random((len(vertices), 2))
-    texture = rng.random((4, 4, 3))
-    of_one = {
-        "white": [part()],
-        "a field": [rts.Part(ball, {}, "unlit")],
-        "red": [part(color=red)],
-        "texture without uv": [part(texture=texture)],
-        "uv without texture": [part(uv=uv)],
-        "a tensor": [part(color=torch.tensor(red))],
-        "a silhouette": [part("silhouette", colors=colors)],
-    }
-    of_more = {
-        "colours": [part(colors=colors)],
-        "a table of colours": [part(indices={"color": None}, color=colors)],
-        "textured": [part(texture=texture, uv=uv)],
-        "shaded": [part("lambert")],
-        "of a surface that does not say": [part().replace(surface=Odd(SPHERE[1]))],
-        "own colours": [part(Shaded())],
-        "a call of its own": [part(Moved())],
-        "a function": [part(lambda theta, gbuffer, camera: gbuffer["normal"])],
-    }
-    for expected, scenes in ((True, of_one), (False, of_more)):
-        for name, (part,) in scenes.items():
-            assert check_scene(part, CAMERA)[0][0].uniform is expected, name
 
 
 @pytest.mark.parametrize(
@@ -451,25 +397,6 @@ def test_samples_that_do_not_fit_are_refused(changes, message, supersample):
     parts = [mesh_part(mesh) for mesh in (box(0.5), quad(-1.0, 1.0, -1.0, 1.0, -0.8))]
     with pytest.raises(rts.InputError, match=re.escape(message)):
         rts.render(parts, CAMERA, SIZE, sampler=Odd(), supersample=supersample)
-
-
-@pytest.mark.parametrize(
-    ("given", "right"), [(["color"], True), (("colour of its own",), True), ("color", False), ((3,), False)]
-)
-def test_names_of_what_one_color_depends_on_come_in_a_tuple_or_a_list(given, right):
-
-    class Own(Unlit):
-        def uniform_by(self, theta, given_by_surface):
-            return given
-
-    vertices, faces = box(0.5)
-    theta = {"vertices": vertices, "color": np.float32((1, 0, 0))}
-    part = rts.Part(MESH(faces), theta, Own())
-    if right:
-        assert rts.render(part, CAMERA, SIZE)[..., 0].max() == 1
-    else:
-        with pytest.raises(rts.InputError, match="uniform_by of"):
-            rts.render(part, CAMERA, SIZE)
 
 
 @pytest.mark.parametrize("kind", ["single", "multi", "visible"])

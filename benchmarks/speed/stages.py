@@ -89,7 +89,7 @@ class TimedShader(rts.Shader):
 
     def __init__(self, shader: Any, clock: Clock):
         self.opaque, self.uniform, self.reads = shader.opaque, shader.uniform, shader.reads
-        self._shader, self._clock, self.uniform_by = shader, clock, shader.uniform_by
+        self._shader, self._clock = shader, clock
 
     def __call__(self, theta: Any, gbuffer: Any, camera: Any) -> Any:
         """See `rts.Shader`."""

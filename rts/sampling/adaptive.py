@@ -29,7 +29,7 @@ class Adaptive:
     Attributes:
         samples: s, along each side of an active pixel; from 2 to 64.
         dilated: whether the eight neighbours of active pixels are active too. Colours that change near outlines need
-            that; None for where some part has more than one colour (`Shader.uniform_by`).
+            that; None for where some part's shader is not `uniform`.
         contrast: pixels are also active whose colour, in any channel, has a second difference above this along any of
             four directions: edges of colour on surfaces. Needs colours, which `rts.sample` does not have, nor do
             compiled programs and derivatives of several directions at once. None for not to look; 0.2 suits.
@@ -61,7 +61,7 @@ class Adaptive:
     def dilates(self, parts: Sequence[CheckedPart]) -> bool:
         """Whether active pixels of a scene are dilated."""
         if self.dilated is None:
-            return self.contrast is not None or not all(part.uniform for part in parts)
+            return self.contrast is not None or not all(part.shader.uniform for part in parts)
         return self.dilated
 
 

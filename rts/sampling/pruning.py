@@ -55,7 +55,7 @@ def needed_by(
     if size is None and not all(isinstance(p.surface, TriangleSurface) and not p.surface.refines for p in parts):
         return None
     # Where parts meet, rounding decides which of them a cell shows.
-    return _BySplatter(splatter, size, settles and splatter.settles and len(parts) == 1 and parts[0].uniform)
+    return _BySplatter(splatter, size, settles and splatter.settles and len(parts) == 1 and parts[0].shader.uniform)
 
 
 def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float | None:

@@ -111,15 +111,6 @@ class SurfaceConformance(Conformance):
                 claim(value.dtype == np.float32, f"{name!r} is {value.dtype} where θ is float32; expected float32")
                 claim_finite(value, f"{name!r} of {kind} samples")
 
-    def test_it_gives_what_it_says(self, part: Part, sampler: Any) -> None:
-        """The G-buffer has the entries that `gives` names."""
-        said = scenes.checked(part).surface.gives(part.theta)
-        if said is None:
-            pytest.skip("the surface does not say what it gives")
-        samples = map_leaves(derivatives.single, scenes.find(part, sampler=sampler).samples[0])
-        found = _evaluated(part, _single(part.theta), samples)
-        claim(set(said) == set(found), f"the G-buffer has {sorted(found)}; `gives` says {sorted(said)}")
-
     def test_triangles_have_their_corners_on_the_surface(self, part: Part) -> None:
         """The `proxy`'s ids and parameters of a corner evaluate to that corner; normals face the triangles' outside."""
         surface, proxy = scenes.checked(part).surface, _proxy(part, scenes.CAMERA)

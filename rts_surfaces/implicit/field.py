@@ -179,10 +179,6 @@ class Implicit(Surface):
         """What the field reads; all entries where there are attributes."""
         return tuple(theta) if self.attributes else self.field.names(theta)
 
-    def gives(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
-        """Positions, normals and attributes."""
-        return "position", "normal", *self.attributes
-
     def check(self, theta: Mapping[str, Tree]) -> None:
         """Refuse θ without what the field reads."""
         self.field.check(theta)

@@ -81,10 +81,6 @@ class Projected(TriangleSurface):
         """What the surface itself reads."""
         return self.surface.reads(theta)
 
-    def gives(self, theta: Mapping[str, Tree]) -> tuple[str, ...] | None:
-        """What the surface itself gives."""
-        return self.surface.gives(theta)
-
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Tree:
         """What the surface itself needs."""
         return self.surface.proxy_inputs(theta)

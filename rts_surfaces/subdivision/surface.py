@@ -26,7 +26,7 @@ from rts.records import ArraySpec, Rays, Samples
 from rts.sampling.cache import fingerprint
 from rts.topology import fixed
 from rts.trees import Array, Tree
-from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows, in_g_buffer
+from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows
 from rts_surfaces.parametric import BEYOND, CROSSINGS, LARGEST_STEP, RESIDUAL, STEPS, TOLERANCE, Geometry, Parametric
 from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.binding import BOUNDARIES, UV, UV_RULES, VERTEX, Limit, Points, Rules
@@ -201,10 +201,6 @@ class Subdivision(Parametric):
         """The entries of θ that `evaluate` needs."""
         known = (name for name in self._declared if name in theta or name not in VERTEX_ATTRIBUTES)
         return "vertices", *known
-
-    def gives(self, theta: Mapping[str, Tree]) -> tuple[str, ...]:
-        """Positions, normals and attributes."""
-        return in_g_buffer(self.reads(theta)[1:])
 
     # -------------------------------------------------------------------------------------------- sampling
 
