@@ -58,14 +58,14 @@ from rts.parts import Part
 from rts.radiance_fields import load_radiance_field, volume_render
 from rts.records import ArraySpec, Fine, Fragments, Proxy, RayHits, Rays, Sampled, Samples, Splats
 from rts.registry import plugin, plugins
-from rts.rendering import render, render_samples
+from rts.rendering.batched import render_views
+from rts.rendering.image import render, render_samples
+from rts.rendering.renderer import prepare
+from rts.rendering.samples import sample
 from rts.row_cameras import RowCameras
 from rts.sampling.adaptive import Adaptive
-from rts.sampling.prepared import prepare
-from rts.sampling.scenes import sample
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.splatting import exact_calibration
-from rts.views import render_views
 from rts.warming import warmup
 
 if TYPE_CHECKING:

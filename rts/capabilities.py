@@ -13,9 +13,7 @@ METHODS: Mapping[str, Mapping[str, str]] = {
 VARIABLES: Mapping[str, Mapping[str, Any]] = {
     "rts.engines": {"differentiates": True},
     "rts.surfaces": {"refines": False, "depends_on_view": False},
-    "rts.samplers": dict.fromkeys(
-        ("culls", "prunes", "takes_cells", "tells_facing", "tells_exits", "concurrent"), False
-    ),
+    "rts.samplers": {"concurrent": False},
     "rts.shaders": {"opaque": False, "uniform": False, "takes_views": False, "reads": None},
     "rts.splatters": {
         "layers": None,
@@ -23,7 +21,6 @@ VARIABLES: Mapping[str, Mapping[str, Any]] = {
         "reads_facing": False,
         "prunes": False,
         "sums_products": False,
-        "sums_losses": False,
         "takes_losses": False,
     },
 }

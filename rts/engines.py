@@ -7,7 +7,7 @@ import functools
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -335,13 +335,27 @@ def _engine_of_leaves(found: Sequence[Any]) -> Engine:
     return only if only is not None else _ENGINES.get("numpy") or engine_named("numpy")
 
 
-def suiting(*trees: Tree) -> tuple[Engine, Array | None]:
+class Context(NamedTuple):
+    """An engine to compute with, and an array that sets dtype and device of its constants, or None.
+
+    It is found once for a call, and handed on.
+    """
+
+    engine: Engine
+    like: Array | None
+
+    def constants(self, tree: Tree) -> Tree:
+        """A copy of a tree in which every NumPy array and number is a constant of the engine."""
+        return constants(tree, self.engine, self.like)
+
+
+def context_of(*trees: Tree) -> Context:
     """The engine of these trees, and their `exemplar`."""
     found = collected(trees)
-    return _engine_of_leaves(found), _widest(found)
+    return Context(_engine_of_leaves(found), _widest(found))
 
 
-def suiting_scene(parts: Sequence[Any], *others: Tree, engine: str | None = None) -> tuple[Engine, Array]:
+def context_of_scene(parts: Sequence[Any], *others: Tree, engine: str | None = None) -> Context:
     """The engine of a scene, and an array of its dtype: the one rule for dtypes.
 
     The dtype is the widest floating one of the torch or jax arrays. Where all is NumPy it is that of the widest array
@@ -352,7 +366,7 @@ def suiting_scene(parts: Sequence[Any], *others: Tree, engine: str | None = None
         *others: further arrays of the scene.
         engine: the name of an engine to use, whatever the arrays are; those of another are refused.
     """
-    own, like = suiting(parts, *others)
+    own, like = context_of(parts, *others)
     if engine is not None:
         if not isinstance(engine, str):
             raise InputError(f"engine is a {type(engine).__name__}; expected a name, such as 'torch' or 'jax'")
@@ -363,12 +377,12 @@ def suiting_scene(parts: Sequence[Any], *others: Tree, engine: str | None = None
             )
         own = chosen
     if like is not None:
-        return own, like
+        return Context(own, like)
     thetas = collected([part.theta for part in parts])
     wide = any(x.dtype == np.float64 for x in thetas if isinstance(x, (np.ndarray, np.generic)))
     if own.name == "numpy":
-        return own, _FLOAT64 if wide else _FLOAT32
-    return own, own.constant(np.zeros((), np.float32)) if not wide else _float64(own)
+        return Context(own, _FLOAT64 if wide else _FLOAT32)
+    return Context(own, own.constant(np.zeros((), np.float32)) if not wide else _float64(own))
 
 
 _FLOAT32, _FLOAT64 = np.zeros((), np.float32), np.zeros((), np.float64)

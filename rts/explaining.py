@@ -12,11 +12,11 @@ from rts.checks import check_scene
 from rts.engines import engine_of
 from rts.parts import CheckedPart, Part
 from rts.records import Samples
-from rts.rendering import render_samples
+from rts.rendering.image import render_samples
+from rts.rendering.samples import sample
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.auto import Choice, choose, is_static
-from rts.sampling.prepared import PreparedParts
-from rts.sampling.scenes import sample
+from rts.sampling.prepared import Prepared
 from rts.sampling.winding import INSIDE_OUT, is_inside_out
 from rts.unread import Observed, likely_name, unread
 
@@ -25,7 +25,7 @@ FEW = 32
 
 
 def explain(
-    parts: Part | Sequence[Part] | PreparedParts,
+    parts: Part | Sequence[Part] | Prepared,
     camera: Camera,
     size: tuple[int, int] | None = None,
     *,
@@ -51,7 +51,7 @@ def explain(
     Raises:
         InputError: what was given cannot be sampled.
     """
-    checked, seen = check_scene(parts.parts if isinstance(parts, PreparedParts) else parts, camera)
+    checked, seen = check_scene(parts.parts if isinstance(parts, Prepared) else parts, camera)
     found = None
     shaded: list[Any] = [part.shader.reads_theta for part in checked]
     if size is not None:

@@ -19,7 +19,7 @@ from rts.arrays import from_numbers, shape_of, without_border
 from rts.engines import constants, engine_of, exemplar, namespace, stopped
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.records import ArraySpec, Proxy, RayHits, Rays, Samples, Splats
+from rts.records import ArraySpec, Cells, Proxy, RayHits, Rays, Request, Samples, Splats
 from rts.trees import Array, Tree, map_leaves
 
 if TYPE_CHECKING:
@@ -309,90 +309,30 @@ def as_surface(given: Any) -> Any:
 # ------------------------------------------------------------------------------------------------------------ samplers
 
 
-class Needed(Plugin):
-    """Says which samples can reach the image; on the host. Any function with the signature of `__call__` will do.
-
-    Attributes:
-        settles: whether it also says which cells are `settled`; True in a class with its own method.
-        size: of the largest number that surfaces read, if it is known.
-    """
-
-    FLAGS = {"settled": "settles"}
-    settles: bool = False
-    size: float | None = None
-
-    @abc.abstractmethod
-    def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """Which samples to keep, (K, H, W) bool, where covered (K, H, W) bool lie at depth (K, H, W)."""
-
-    def settled(
-        self,
-        covered: np.ndarray,
-        depth: np.ndarray,
-        kept: np.ndarray,
-        size: float,
-        wanted: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """Cells (H, W) bool whose colour is that of their front; samples that only such cells need leave `kept`.
-
-        Args:
-            covered: (K, H, W) bool.
-            depth: (K, H, W) float.
-            kept: (K, H, W) bool, what `__call__` gave; changed in place.
-            size: of the largest coordinate.
-            wanted: (H, W) bool, the cells that are looked at; None for all.
-            part: (H, W) integers, the part of each front, or −1; given where `colors` are.
-        """
-        raise NotImplementedError
-
-    def ran_out(self, cells: int) -> None:
-        """Take note of how many cells had all layers of triangles that were looked for, and too few after `refine`."""
-
-
-AnyNeeded = Callable[[np.ndarray, np.ndarray], np.ndarray]
-"""A `Needed`, or a function of its signature."""
-
-
 class Sampler(Plugin):
     """Finds where rays meet one part: the step without derivative.
 
     Attributes:
-        culls: whether it leaves out what is seen from behind where a part has `cull="back"`; it refuses such parts
-            otherwise.
-        prunes: whether `sample` also takes the keyword `needed`, which says which samples to keep: a `Needed`, a
-            function of its signature, or None for all.
-        takes_cells: whether `sample` also takes the keyword `cells`, (L, C) int32: the only cells of the grid to
-            sample, as flat indices, none twice, or −1 for none; an array of the part's engine, perhaps traced. `row`
-            and `depth` of the samples are then (K, L, C). Without it all cells are sampled, and others left out.
-        tells_facing: whether `sample` also takes the keyword `facing`: whether to find `Samples.facing`, which is of
-            interest in cells with hidden samples, and beside them.
-        tells_exits: whether `sample` also takes the keyword `exits`: whether to find `Samples.exit` of parts that are
-            culled, which is of interest in cells at outlines, and beside them.
         concurrent: whether several threads may call `sample` at once, so that `rts.render_views` takes views at once.
     """
 
-    culls: bool = False
-    prunes: bool = False
-    takes_cells: bool = False
-    tells_facing: bool = False
-    tells_exits: bool = False
     concurrent: bool = False
 
     @abc.abstractmethod
-    def sample(
-        self, part: Part, camera: Camera, size: tuple[int, int], layers: int, *, capacity: int | None = None
-    ) -> Samples:
+    def sample(self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request) -> Samples:
         """The `layers` nearest samples of every pixel.
 
         Args:
-            part: the part; its `transform` is already in the camera.
+            part: the part; its `transform` is already in the camera. A sampler that cannot leave out what is seen from
+                behind refuses parts with `cull="back"`.
             camera: the camera, in the part's local space.
             size: (height, width) of the grid of cells.
             layers: K.
-            capacity: number of packed rows to allot, or None for as many as there are.
+            request: the number of rows to allot, and what may be found, or left out, besides.
 
         Returns:
-            Samples, without derivative, in arrays of the engine of the part and the camera.
+            Samples, without derivative, in arrays of the engine of the part and the camera. Which of their fields are
+            there depends on the sampler, the part and the request, never on values.
 
         Raises:
             InputError: this sampler cannot sample the surface.
@@ -408,7 +348,7 @@ class Sampler(Plugin):
         return self
 
     def hold(self, part: Part, camera: Camera | None, size: tuple[int, int] | None) -> Any:
-        """What `rts.prepare` is to build once of a part, and hand to `sample` as `entry`; None for nothing."""
+        """What `rts.prepare` is to build once of a part, and hand to `sample` as `Request.entry`; None for nothing."""
         return None
 
 
@@ -475,9 +415,8 @@ class Splatter(Plugin):
         reads_exits: whether it reads `Splats.exit`, which is found only then.
         prunes: whether it says which samples it needs; True in a class with its own `needed`.
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
-        sums_losses: whether it gives mean losses; True in a class with its own `mean_loss`.
-        takes_losses: whether normal equations and mean losses may be asked for with another `loss` than the square. A
-            subclass with its own of these has to say so itself.
+        takes_losses: whether normal equations may be asked for with another `loss` than the square. A subclass with its
+            own `normal_equations` has to say so itself.
         averages: whether its normal equations may be asked for with a target of fewer pixels than there are cells.
         settles: whether it reads `Splats.settled`: where all nine samples around a cell are fronts of one opaque
             colour, on cells' centres, and no hidden one beside them is `needed`, the cell has that colour, whatever
@@ -487,7 +426,7 @@ class Splatter(Plugin):
             those that have none show nothing, where `rts.Adaptive` sees no outline: hidden samples have no effect.
     """
 
-    FLAGS = {"needed": "prunes", "normal_equations": "sums_products", "mean_loss": "sums_losses"}
+    FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}
     STAND_INS = {"image": ("splat", _image_of_arrays)}
 
     layers: int | None = None
@@ -496,7 +435,6 @@ class Splatter(Plugin):
     reads_exits: bool = False
     prunes: bool = False
     sums_products: bool = False
-    sums_losses: bool = False
     takes_losses: bool = False
     averages: bool = False
     settles: bool = False
@@ -505,8 +443,7 @@ class Splatter(Plugin):
     def __init_subclass__(cls, **options: Any) -> None:
         """What other sums take is said anew."""
         super().__init_subclass__(**options)
-        for method in ("normal_equations", "mean_loss"):
-            _promise_anew(cls, method, ["takes_losses"], Splatter)
+        _promise_anew(cls, "normal_equations", ["takes_losses"], Splatter)
 
     @abc.abstractmethod
     def image(self, splats: Splats) -> Array:
@@ -577,28 +514,6 @@ class Splatter(Plugin):
         """
         return None
 
-    def mean_loss(
-        self,
-        splats: Splats,
-        target: Array,
-        weights: Array | None = None,
-        background: Array | None = None,
-        loss: Loss | None = None,
-    ) -> Array | None:
-        """Mean loss () of the residuals weight · (image − target), differentiable in the splats.
-
-        Args:
-            splats: the samples; without their border there are h × w cells, each a pixel.
-            target: (h, w, C): alpha (C = 1), colours (3) or both (4); a constant.
-            weights: (h, w, 1) or (h, w, C); None for ones. A constant.
-            background: (h, w, 4), what the image is composited onto, or None. A constant.
-            loss: of the residuals; None for the square. Given only where the class says `takes_losses`.
-
-        Returns:
-            The mean loss; None where it cannot work on these arrays.
-        """
-        return None
-
 
 def _checked_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Splats:
     """Splats of arrays, or of lists, all of one engine; wrong shapes and dtypes are refused."""
@@ -614,7 +529,7 @@ def _checked_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Spl
     if not namespace(row).isdtype(row.dtype, "signed integer"):
         raise InputError(f"row has dtype {row.dtype}; expected signed integers, -1 where a cell is empty")
     positions, rgba, row = constants((*given, row), engine_of(given, row), exemplar(given))
-    return Splats(positions, rgba, row, border=border)
+    return Splats(positions, rgba, Cells(row), border=border)
 
 
 # ------------------------------------------------------------------------------------------------------------- fitting
@@ -625,15 +540,13 @@ class Residuals(Plugin):
 
     Attributes:
         sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
-        sums_losses: whether it gives its mean loss; True in a class with its own `mean_loss`.
         has_stages: whether it can be had at other resolutions; True in a class with its own `at_stage`.
         loss: what their mean is taken of, an `rts.Loss`; None for the square. What `at_stage` gives has its own, or
             where that is None this one.
     """
 
-    FLAGS = {"normal_equations": "sums_products", "mean_loss": "sums_losses", "at_stage": "has_stages"}
+    FLAGS = {"normal_equations": "sums_products", "at_stage": "has_stages"}
     sums_products: bool = False
-    sums_losses: bool = False
     has_stages: bool = False
     loss: Loss | None = None
 
@@ -652,8 +565,4 @@ class Residuals(Plugin):
         U counts the numbers in the parameters, in the order of `rts.trees.leaves`. All are arrays of the parameters'
         engine, which may be traced. With it, Levenberg–Marquardt makes no Jacobian of its own.
         """
-        raise NotImplementedError
-
-    def mean_loss(self, parameters: Tree) -> Array:
-        """Mean loss () of the residuals, differentiable. With it, gradient descent asks for no residuals."""
         raise NotImplementedError

@@ -11,7 +11,7 @@ from typing import Any
 
 from rts.arguments import check_pixels, check_positive
 from rts.arrays import described, from_numbers, shape_of
-from rts.engines import constants, namespace, suiting
+from rts.engines import constants, context_of, namespace
 from rts.errors import InputError
 from rts.trees import Array
 
@@ -76,7 +76,7 @@ class Ndc:
         origins, directions = _checked("origins", origins), _checked("directions", directions)
         if origins.shape != directions.shape:
             raise InputError(f"origins {described(origins)} and directions {described(directions)}; expected one shape")
-        engine, like = suiting(origins, directions)
+        engine, like = context_of(origins, directions)
         origins, directions = constants((origins, directions), engine, like)
         xp = engine.namespace
         at_near = origins - directions * ((self.near + origins[:, 2:]) / directions[:, 2:])

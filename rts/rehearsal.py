@@ -13,14 +13,14 @@ from rts import companion, registry
 from rts.camera import Camera
 from rts.checks import check_splatter
 from rts.engines import engine_named
-from rts.evaluating import to_splats
-from rts.fitting.image_residuals import ImageResiduals
 from rts.operations.operation import Operation
 from rts.operations.rigid import rigid
 from rts.parts import Part
-from rts.rendering import render
+from rts.rendering.image import render
+from rts.rendering.samples import sample
+from rts.rendering.scene import Scene
+from rts.rendering.splats import to_splats
 from rts.sampling.adaptive import Adaptive
-from rts.sampling.scenes import Scene, sample
 from rts.threads import read_only
 
 if TYPE_CHECKING:
@@ -135,16 +135,9 @@ def _least_squares(
         parts = _posed(parts)
         sampled = sample(parts, camera, size, splatter=splatter, layers=layers, settles=True)
         scene = Scene.of(parts, camera, "auto", None).at(size)
-        splats = to_splats(sampled, scene.parts, camera, camera, *scene.suited)
+        splats = to_splats(sampled, scene.parts, camera, camera, scene.context)
         t_positions, t_rgba = (np.zeros((1, *x.shape), x.dtype) for x in (splats.positions, splats.rgba))
         splatter.normal_equations(splats, t_positions, t_rgba, np.zeros((*size, channels), np.float32))
-
-
-def _mean_loss(parts: list[Part], size: tuple[int, int]) -> None:
-    with _differentiating() as tape:
-        target = np.zeros((*size, 4), np.float32)
-        ImageResiduals(lambda _: _posed(parts), _camera(), size, target).mean_loss(target)
-        tape.pull()
 
 
 def _adaptive(parts: list[Part], size: tuple[int, int]) -> None:
@@ -167,7 +160,6 @@ KINDS = (
     _adaptive,
     _gradient_of_silhouette,
     _least_squares_of_silhouette,
-    _mean_loss,
 )
 EXPECTED = {
     _least_squares: companion.LEAST_SQUARES,

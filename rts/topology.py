@@ -11,7 +11,7 @@ from rts.arguments import quoted
 from rts.arrays import shape_of
 from rts.engines import value_of
 from rts.errors import EngineError, InputError
-from rts.records import MORE
+from rts.records import Cells
 from rts.sampling.extremes import extent
 from rts.trees import leaves
 
@@ -97,7 +97,7 @@ def pieces(faces: np.ndarray) -> np.ndarray:
     sizes = np.bincount(labels)
     number = np.empty(len(sizes), np.int64)
     number[np.argsort(-sizes, kind="stable")] = np.arange(1, len(sizes) + 1)
-    number[number >= MORE] = 0
+    number[number >= Cells.MORE_BEHIND] = 0
     twisted = labels[pairs[0]][~alike & (labels[pairs[0]] == labels[pairs[1]])]
     number[twisted] = 0
     return fixed(number[labels].astype(np.int16))

@@ -56,7 +56,6 @@ BEFORE, BEYOND = np.float32(2**15 - 1), np.float32(-(2**15))
 class Raster(TriangleSampler):
     """K-buffer rasterization with a top-left fill rule; ties in depth go to the lower triangle index."""
 
-    tells_exits = True
     concurrent = True
     _scratch: tuple[tuple, list[tuple]]
 

@@ -12,7 +12,7 @@ from rts.engines import constants, engine_of, exemplar, namespace
 from rts.errors import InputError
 from rts.interfaces import RaySurface, Sampler, as_surface
 from rts.parts import Part
-from rts.records import ArraySpec, RayHits, Samples
+from rts.records import ArraySpec, Cells, RayHits, Request, Samples
 from rts.sampling.validation import check_camera
 from rts.trees import Array, map_leaves
 
@@ -20,18 +20,7 @@ from rts.trees import Array, map_leaves
 class Rays(Sampler):
     """Casts a ray through every pixel's centre, on the device, so that a traced function may hold the surface."""
 
-    takes_cells = True
-
-    def sample(
-        self,
-        part: Part,
-        camera: Camera,
-        size: tuple[int, int],
-        layers: int,
-        *,
-        capacity: int | None = None,
-        cells: Array | None = None,
-    ) -> Samples:
+    def sample(self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request) -> Samples:
         """See `rts.Sampler`."""
         surface = as_surface(part.surface)
         if not isinstance(surface, RaySurface):
@@ -52,9 +41,9 @@ class Rays(Sampler):
         directions = xp.reshape(rays.directions, (-1, 3))
         origins = xp.reshape(rays.origins, (-1, 3))
         listed = True
-        if cells is not None:
-            index: Array = xp.reshape(constants(cells, engine, like), (-1,))
-            size, listed = tuple(cells.shape), index[None] >= 0
+        if request.cells is not None:
+            index: Array = xp.reshape(constants(request.cells, engine, like), (-1,))
+            size, listed = tuple(request.cells.shape), index[None] >= 0
             index = xp.where(index >= 0, index, 0)
             directions, origins = xp.take(directions, index, axis=0), xp.take(origins, index, axis=0)
         origins = origins + near * directions
@@ -62,7 +51,7 @@ class Rays(Sampler):
         depth = near + hits.distance
         hit = xp.reshape(hits.hit & (hits.distance >= 0) & (depth <= far) & listed, (layers, *size))
 
-        every = layers * size[0] * size[1]
+        every, capacity = layers * size[0] * size[1], request.capacity
         rows = every if capacity is None else capacity
 
         def pack(hit: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -83,7 +72,8 @@ class Rays(Sampler):
         else:
             ids = xp.take(xp.reshape(hits.ids, (every, width_i)), index, axis=0)
         depth = xp.where(row >= 0, xp.reshape(depth, (layers, *size)), 0.0)
-        return Samples(ids, params, row, depth, overflow)
+        followed = () if request.cells is None else ("cells",)
+        return Samples(ids, params, Cells(row, depth), overflow, followed=followed)
 
 
 def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, int]) -> RayHits:

@@ -19,8 +19,6 @@ class Reference(TriangleSampler):
     ratio g₁ × g₂ : g₂ × g₀ : g₀ × g₁. This needs no division by w, hence no clipping.
     """
 
-    tells_exits = True
-
     def rasterize(self, prepared: Proxy, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
         height, width = size

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -59,7 +58,7 @@ class Bicubic(Geometry):
         ends = (np.ascontiguousarray(x, np.float64) for x in (rays.origins, rays.directions, rays.spread))
         given = self.powers, bounds, self.across, self.flips, ids, params, *lines, *ends, LIMITS
         parallel(meeting_kernels.meet, len(lines[0]), *given, work=200 * len(samples.ids))
-        return replace(samples, ids=ids, params=params, row=row, depth=depth)
+        return samples.replace(ids=ids, params=params, row=row, depth=depth)
 
 
 class Patches(Parametric):

@@ -6,6 +6,7 @@ import numpy as np
 
 import rts
 from rts import Samples
+from rts.records import Cells
 from rts_surfaces.subdivision.binding import Limit, Rules
 from rts_surfaces.subdivision.cage import checked_cage
 from rts_surfaces.subdivision.face_tiles import tiles_of
@@ -75,4 +76,4 @@ def somewhere(limit, count, seed=0, margin=0.0):
 def samples_at(face, params):
     none = np.full((1, 1, 1), -1, np.int32)
     ids = np.asarray(face, np.int32).reshape(-1, 1)
-    return Samples(ids, np.asarray(params, np.float32), none, none.astype(np.float32), np.int32(0))
+    return Samples(ids, np.asarray(params, np.float32), Cells(none, none.astype(np.float32)), np.int32(0))

@@ -80,7 +80,7 @@ class Bezier(rts.TriangleSurface):
         off = points_at(inputs, samples.ids, params)[0] - rays.origins - depth[:, None] * rays.directions
         met = np.linalg.norm(off, axis=1) < self.met * np.abs(rays.spread[0] + rays.spread[1] * depth)
         row = np.where(cells & met[samples.row], samples.row, -1)
-        return replace(samples, params=params, row=row, depth=np.where(row >= 0, depth[row], 0))
+        return samples.replace(params=params, row=row, depth=np.where(row >= 0, depth[row], 0))
 
     @classmethod
     def example(cls):

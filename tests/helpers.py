@@ -8,6 +8,7 @@ import pytest
 import rts
 from rts import Camera, Part
 from rts.engines import is_constant
+from rts.records import Cells, Splats
 from rts.trees import map_leaves
 
 
@@ -216,3 +217,8 @@ def crooked_block(folder):
     block.vertices *= 1 + np.random.default_rng(3).uniform(-0.3, 0.3, block.vertices.shape)
     block.export(path)
     return path
+
+
+def splats_of(positions, rgba, row, part=None, facing=None, exit=None, settled=None, **more):
+    """Splats of arrays of samples and of cells."""
+    return Splats(positions, rgba, Cells(row, None, facing, exit, settled), part, **more)

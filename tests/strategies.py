@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from rts import Camera, Samples
+from rts.records import Cells
 
 PROPERTIES = settings(deadline=None, derandomize=True, max_examples=60)
 """What all properties are tried with: the same examples every time, however busy the machine is."""
@@ -55,7 +56,7 @@ def told_apart(row, total, depth, **options):
     """Samples of two integers and a real, each row of which can be told from all others."""
     number = np.arange(total)
     ids, params = np.stack([number, -number], axis=1).astype(np.int32), number[:, None].astype(np.float32) / 8
-    return Samples(ids, params, row, np.where(row >= 0, depth, 0).astype(depth.dtype), np.int32(0), **options)
+    return Samples(ids, params, Cells(row, np.where(row >= 0, depth, 0).astype(depth.dtype)), np.int32(0), **options)
 
 
 # --------------------------------------------------------------------------------------------------- space

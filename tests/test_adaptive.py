@@ -24,6 +24,7 @@ import rts
 from rts import Adaptive
 from rts.fitting.least_squares import normal_equations
 from rts.interfaces import Sampler
+from rts.records import Request
 from rts.splatting import Multi
 
 pytestmark = pytest.mark.splatting
@@ -104,8 +105,9 @@ def test_samplers_that_know_no_lists_serve_too(monkeypatch):
     class Whole(Sampler):
         """Samples all cells."""
 
-        def sample(self, part, camera, size, layers, *, capacity=None):
-            return rts.plugin("rts.samplers", "raster")().sample(part, camera, size, layers, capacity=capacity)
+        def sample(self, part, camera, size, layers, request):
+            own = Request(request.capacity)
+            return rts.plugin("rts.samplers", "raster")().sample(part, camera, size, layers, own)
 
     mask = random_mask(5)
     activate(monkeypatch, mask)

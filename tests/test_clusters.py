@@ -1,6 +1,7 @@
 """Triangles in clusters: what is passed over at once is what would not have been drawn, to the bit."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from test_raster import CAMERAS, SIZE, triangles
 
 import rts
 from rts import Camera, Part, Proxy
+from rts.records import Request
 
 pytestmark = pytest.mark.sampling
 
@@ -236,12 +238,12 @@ def test_samples_of_what_is_prepared_are_those_of_the_part(few, cull):
     part = Part(rts.plugin("surfaces", "mesh")(faces), {"vertices": vertices}, "normals", cull=cull)
     handle = rts.prepare(part, "raster")
     assert isinstance(handle.entries[0].prepared, Clusters)
-    sampler, told = handle.samplers[0], {"facing": True} if cull == "none" else {"exits": True}
+    sampler, asked = handle.samplers[0], Request(facing=True) if cull == "none" else Request(exits=True)
     for transform in moves():
         moved, posed = part.replace(transform=transform), handle.replace(transform=transform)
         found, expected = (
-            sampler.sample(moved, VIEW, (40, 40), 2, entry=posed.entries[0], **told),
-            sampler.sample(moved, VIEW, (40, 40), 2, **told),
+            sampler.sample(moved, VIEW, (40, 40), 2, replace(asked, entry=posed.entries[0])),
+            sampler.sample(moved, VIEW, (40, 40), 2, asked),
         )
         for name in ("ids", "params", "row", "depth", "overflow", "facing", "exit"):
             x, y = getattr(found, name), getattr(expected, name)

@@ -14,6 +14,7 @@ import rts
 from rts import Fragments, GBuffer, InputError, Part, PluginError, RayHits, Splats
 from rts.arrays import without_border
 from rts.engines import engine_of, namespace
+from rts.records import Request
 from rts.registry import instance
 from rts.shading import Depth, Normals, Unlit
 from rts.splatting import Multi, Plain
@@ -330,8 +331,9 @@ class OddRaster(Raster):
 class Hoarder(OddRaster):
     """A rasterizer that is told what is needed, and keeps everything."""
 
-    def sample(self, part, camera, size, layers, *, needed=None, **options):
-        return super().sample(part, camera, size, layers, **options)
+    def sample(self, part, camera, size, layers, request):
+        found = super().sample(part, camera, size, layers, replace(request, hidden=None))
+        return found.replace(followed=("hidden",))
 
 
 class OddSampler:
@@ -340,14 +342,14 @@ class OddSampler:
     def __init__(self, alter):
         self.alter = alter
 
-    def sample(self, part, camera, size, layers, *, capacity=None):
-        samples = RASTER.sample(part, camera, size, layers, capacity=capacity)
+    def sample(self, part, camera, size, layers, request):
+        samples = RASTER.sample(part, camera, size, layers, Request(request.capacity))
         return self.alter(samples, part)
 
 
 def altered(**changes):
     """A sampler with fields of its samples changed by functions of the samples."""
-    return OddSampler(lambda samples, part: replace(samples, **{k: f(samples) for k, f in changes.items()}))
+    return OddSampler(lambda samples, part: samples.replace(**{k: f(samples) for k, f in changes.items()}))
 
 
 def next_triangle(fragments, scene):
@@ -433,29 +435,29 @@ class ByIdentity(Raster):
 class Roomy:
     """Takes no notice of the capacity."""
 
-    def sample(self, part, camera, size, layers, *, capacity=None):
+    def sample(self, part, camera, size, layers, request):
         return RASTER.sample(part, camera, size, layers)
 
 
 class DropsTheFront:
-    def sample(self, part, camera, size, layers, *, capacity=None):
+    def sample(self, part, camera, size, layers, request):
         whole = RASTER.sample(part, camera, size, layers)
-        first = max(0, len(whole.ids) - (capacity or len(whole.ids)))
+        first = max(0, len(whole.ids) - (request.capacity or len(whole.ids)))
         row = np.where(whole.row >= first, whole.row - first, -1).astype(np.int32)
-        return replace(whole, ids=whole.ids[first:], params=whole.params[first:], row=row, overflow=np.int32(first))
+        return whole.replace(ids=whole.ids[first:], params=whole.params[first:], row=row, overflow=np.int32(first))
 
 
 class Complains:
     def __init__(self, error):
         self.error = error
 
-    def sample(self, part, camera, size, layers, *, capacity=None):
+    def sample(self, part, camera, size, layers, request):
         raise self.error
 
 
 class AcceptsAnything:
-    def sample(self, part, camera, size, layers, *, capacity=None):
-        return RASTER.sample(scenes.ball(), camera, size, layers, capacity=capacity)
+    def sample(self, part, camera, size, layers, request):
+        return RASTER.sample(scenes.ball(), camera, size, layers, Request(request.capacity))
 
 
 def leaking(samples, part):
@@ -465,15 +467,17 @@ def leaking(samples, part):
 
 def covering(samples, part):
     """Samples in every cell, whether something is there or not."""
-    return replace(samples, row=samples.row * 0, depth=samples.depth * 0 + 1)
+    return samples.replace(row=samples.row * 0, depth=samples.depth * 0 + 1)
 
 
 class Misplaced(type(rts.plugin("samplers", "raster")())):
     """Samples other cells than those that are listed."""
 
-    def sample(self, *args, cells=None, **options):
-        listed = {} if cells is None else {"cells": np.where(cells >= 0, cells ^ 1, cells)}
-        return super().sample(*args, **listed, **options)
+    def sample(self, part, camera, size, layers, request):
+        cells = request.cells
+        if cells is not None:
+            request = replace(request, cells=np.where(cells >= 0, cells ^ 1, cells))
+        return super().sample(part, camera, size, layers, request)
 
 
 class OddExits(type(rts.plugin("samplers", "raster")())):
@@ -482,9 +486,9 @@ class OddExits(type(rts.plugin("samplers", "raster")())):
     def __init__(self, alter):
         self.alter = alter
 
-    def sample(self, *args, **options):
-        found = super().sample(*args, **options)
-        return found if found.exit is None else replace(found, exit=self.alter(found))
+    def sample(self, *args):
+        found = super().sample(*args)
+        return found if found.exit is None else found.replace(exit=self.alter(found))
 
 
 def turned_about(x):
@@ -504,7 +508,7 @@ SAMPLERS = {
         "no perspective": OddRaster(affine_barycentrics),
         "depth of another scale": OddRaster(lambda f, _: f._replace(depth=f.depth * np.float32(1.1))),
     },
-    "it_leaves_out_what_is_not_needed": {"keeps everything": Hoarder()},
+    "hidden_samples_are_left_out_where_it_says_so": {"keeps everything": Hoarder()},
     "exits_lie_on_the_part_behind_its_front": {
         "fronts": OddExits(lambda found: found.row[0]),
         "none": OddExits(lambda found: np.full_like(found.exit, -1)),
@@ -584,17 +588,17 @@ class SwappedHits(Ellipsoid):
 
 class Refined(OddMesh):
     def refine(self, inputs, samples, rays):
-        return replace(samples, depth=np.full_like(samples.depth, 2))
+        return samples.replace(depth=np.full_like(samples.depth, 2))
 
 
 class Renumbered(OddMesh):
     def refine(self, inputs, samples, rays):
-        return replace(samples, row=np.where(samples.row > 0, samples.row - 1, samples.row))
+        return samples.replace(row=np.where(samples.row > 0, samples.row - 1, samples.row))
 
 
 class Lost(OddMesh):
     def refine(self, inputs, samples, rays):
-        return replace(samples, depth=samples.depth * np.float32(np.nan))
+        return samples.replace(depth=samples.depth * np.float32(np.nan))
 
 
 class Shy(Ellipsoid):

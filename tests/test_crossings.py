@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, derivative, gradient, icosphere, low_passed, mesh_part, quad
+from helpers import DIFFERENTIABLE, arrays, derivative, gradient, icosphere, low_passed, mesh_part, quad, splats_of
 
 import rts
-from rts import rendering
 from rts.diagnostics.comparison import shapes
 from rts.engines import constants, engine_of
+from rts.rendering import settings
 from rts.splatting import Visible, crossings
 from rts_backends.fused import splatters as fused
 from rts_surfaces.implicit import fields
@@ -40,7 +40,7 @@ class Sheets:
         positions = np.concatenate([place, depth[..., None]], axis=-1)[covered].astype(dtype)
         rgba = np.concatenate([colors[sheet], np.ones((*depth.shape, 1))], axis=-1)[covered].astype(dtype)
         part = np.where(covered, sheet, -1).astype(np.int32)
-        self.splats, self.sheet = rts.Splats(positions, rgba, row, part), sheet[covered]
+        self.splats, self.sheet = splats_of(positions, rgba, row, part), sheet[covered]
         self.depth, self.covered = np.where(covered, depth, 0).astype(dtype), covered
 
     def pairs(self):
@@ -66,7 +66,7 @@ def pulled(splatter, splats, along, target="torch-cpu"):
     """The gradients of positions and colours from that of the image, in float64."""
     own, tables = (splats.positions, splats.rgba), (splats.row, splats.part)
     given, tables, along = arrays(target, (own, tables, along), np.float64)
-    return gradient(target, lambda x: (splatter.image(rts.Splats(*x, *tables)) * along).sum(), given)
+    return gradient(target, lambda x: (splatter.image(splats_of(*x, *tables)) * along).sum(), given)
 
 
 def rough(seed, size=(20, 23), layers=2):
@@ -277,7 +277,7 @@ def test_the_image_is_the_same_bit_for_bit():
         for layers in (2, 3):
             splats = rough(layers, layers=layers)
             given = arrays("torch-cpu", (splats.positions, splats.rgba, splats.row))
-            images = [splatter(crossings=on).image(rts.Splats(*given)).numpy() for on in (True, False)]
+            images = [splatter(crossings=on).image(splats_of(*given)).numpy() for on in (True, False)]
             np.testing.assert_array_equal(*images)
 
 
@@ -384,7 +384,7 @@ def test_normal_equations_are_products_of_tangents(fine):
     given = arrays(
         "torch-cpu", (splats.positions, splats.rgba, splats.row, tangents, tints, np.zeros(shape)), np.float64
     )
-    whole = rts.Splats(*given[:3], arrays("torch-cpu", splats.part), border=border)
+    whole = splats_of(*given[:3], arrays("torch-cpu", splats.part), border=border)
     found = fused.Visible().normal_equations(whole, *given[3:])
     np.testing.assert_allclose(found[1], columns @ columns.T / image.size, rtol=1e-10)
     np.testing.assert_allclose(found[2], columns @ image / image.size, rtol=1e-10)
@@ -436,8 +436,8 @@ def test_bands_make_no_difference_to_lines(monkeypatch):
         return rts.render([cards[0].replace(transform=rts.rigid(t * axis)), cards[1]], camera, (20, 24), supersample=2)
 
     found = []
-    for band in (rendering.BAND, 500):
-        monkeypatch.setattr(rendering, "BAND", band)
+    for band in (settings.BAND, 500):
+        monkeypatch.setattr(settings, "BAND", band)
         found.append(derivative("torch-cpu", image, zero, one)[1])
-    assert len(rendering.bands_of(20, 24, 2, 2)) > 5 and np.abs(found[0]).max() > 1
+    assert len(settings.RenderSettings(None, 2, 2, None).bands((20, 24))) > 5 and np.abs(found[0]).max() > 1
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-4)

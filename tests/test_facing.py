@@ -1,14 +1,15 @@
 """What keeps the front and the back of a sheet from pairing: who tells which is which, and what it changes."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, box, icosphere, rotation, soup, to_numpy
+from helpers import DIFFERENTIABLE, arrays, box, icosphere, rotation, soup, splats_of, to_numpy
 
 import rts
 from rts import splatting
-from rts.records import MORE
+from rts.records import Cells
 from rts.sampling.facing import eye
 from rts.topology import pieces
 from rts_backends.fused.splatters import Visible
@@ -134,7 +135,7 @@ def test_order_of_parts_and_what_is_pruned_change_nothing():
     np.testing.assert_allclose(rts.render_samples(whole, parts, CAMERA), image, rtol=0, atol=1e-6)
     copy = pickle.loads(pickle.dumps(whole))
     np.testing.assert_array_equal(copy.facing, whole.facing)
-    numbers = [set((np.abs(whole.facing[whole.part == i]) % MORE).tolist()) - {0} for i in range(3)]
+    numbers = [set((np.abs(whole.facing[whole.part == i]) % Cells.MORE_BEHIND).tolist()) - {0} for i in range(3)]
     assert numbers[0] and numbers[1] and not numbers[0] & numbers[1] and not numbers[2]
     by_depth = rts.render(parts, CAMERA, SIZE, splatter=BY_DEPTH, layers=6)
     assert np.abs(by_depth - image).max() > 0.02
@@ -165,7 +166,8 @@ def test_fine_samples_are_told_too():
 
 def test_samplers_that_know_no_lists_of_cells_tell_them_too():
     class Whole(rts.plugin("rts.samplers", "raster")):
-        takes_cells = False
+        def sample(self, part, camera, size, layers, request):
+            return super().sample(part, camera, size, layers, replace(request, cells=None))
 
     options = dict(supersample=rts.Adaptive(2), layers=3)
     listed, by_depth = (
@@ -186,8 +188,8 @@ def test_the_compiled_splatter_is_the_specification(layers):
     positions = np.stack([np.broadcast_to(x, depth.shape), np.broadcast_to(y, depth.shape), depth], axis=-1)[covered]
     rgba = rng.random((len(positions), 4))
     facing = np.where(covered, rng.integers(-2, 3, covered.shape), 0).astype(np.int16)
-    facing[-1] += (np.sign(facing[-1]) * MORE).astype(np.int16)
-    splats = rts.Splats(positions, rgba, row, facing=facing)
+    facing[-1] += (np.sign(facing[-1]) * Cells.MORE_BEHIND).astype(np.int16)
+    splats = splats_of(positions, rgba, row, facing=facing)
     images = [s.image(splats) for s in (Visible(), splatting.Visible(), Visible(reads_facing=False))]
     np.testing.assert_allclose(images[0], images[1], rtol=0, atol=1e-12)
     assert np.abs(images[0] - images[2]).max() > 0.05
@@ -200,6 +202,6 @@ def test_the_compiled_splatter_is_the_specification(layers):
     found = []
     for splatter in (Visible(), splatting.Visible()):
         moved = torch.tensor(positions, requires_grad=True)
-        image = splatter.image(rts.Splats(moved, *constant[:2], facing=constant[2]))
+        image = splatter.image(splats_of(moved, *constant[:2], facing=constant[2]))
         found.append(torch.autograd.grad((image * along).sum(), moved)[0].numpy())
     np.testing.assert_allclose(*found, rtol=0, atol=1e-10)

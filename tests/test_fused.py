@@ -8,7 +8,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from helpers import DIFFERENTIABLE, arrays, gradient, to_numpy
+from helpers import DIFFERENTIABLE, arrays, gradient, splats_of, to_numpy
 
 import rts
 from rts import splatting
@@ -270,7 +270,7 @@ def test_what_is_told_of_other_cells_is_refused(name):
     positions, rgba, row = cells(2)
     other = np.zeros(row.shape if name in ("part", "facing") else row.shape[1:], np.int32)[..., :-1]
     with pytest.raises(rts.InputError, match=rf"{name} has shape .*; expected .*, as row says"):
-        KINDS["visible"]().image(rts.Splats(positions, rgba, row, **{name: other}))
+        KINDS["visible"]().image(splats_of(positions, rgba, row, **{name: other}))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -517,7 +517,7 @@ def test_other_dtypes_are_left_to_the_specification(dtypes):
 def test_other_devices_are_left_to_the_specification():
     # Tensors without values stand for those of a device that is not at hand.
     scene = (torch.tensor(x).to("meta") for x in cells(2))
-    image = fused.Visible().image(rts.Splats(*scene))
+    image = fused.Visible().image(splats_of(*scene))
     assert image.device.type == "meta" and image.shape == (9, 11, 4)
 
 

@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import tracemalloc
 
+import helpers
 import numpy as np
 import pytest
 from helpers import DIFFERENTIABLE, arrays, box, icosphere, quad, soup, to_numpy
@@ -14,6 +15,7 @@ from rts import splatting
 from rts.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
+from rts.rendering import settings
 from rts_backends.fused import normal_equations as fused_normal
 from rts_backends.fused import splatters as fused
 from rts_backends.fused.cells import Cells
@@ -194,7 +196,7 @@ def test_bands_of_a_supersampled_image_add_up(target, monkeypatch):
     residuals = rts.ImageResiduals(scene, CAMERA, SIZE, goal, weights=weights, supersample=3)
     whole = residuals.normal_equations(start(target))
     sweeps = count_sweeps(monkeypatch)
-    monkeypatch.setattr(rts.rendering, "BAND", 3000)
+    monkeypatch.setattr(settings, "BAND", 3000)
     found = check(residuals, start(target), 1e-4)
     assert len(sweeps) == 6 and {len(args[3]) for args in sweeps} == {4, 5}  # Rows of unlike number.
     for a, b in zip(map(to_numpy, found), map(to_numpy, whole), strict=True):
@@ -321,9 +323,9 @@ def test_half_precision_is_done_by_the_jacobian(monkeypatch):
     row = torch.zeros((1, 3, 3), dtype=torch.int32)
     tangents = torch.zeros((2, 5, 3), dtype=torch.bfloat16)
     goal = torch.zeros((3, 3, 1))
-    assert fused.Visible().normal_equations(rts.Splats(*splats, row), tangents, None, goal) is None
+    assert fused.Visible().normal_equations(helpers.splats_of(*splats, row), tangents, None, goal) is None
     elsewhere = [x.float().to("meta") for x in (*splats, row, tangents)]
-    assert fused.Visible().normal_equations(rts.Splats(*elsewhere[:3]), elsewhere[3], None, goal) is None
+    assert fused.Visible().normal_equations(helpers.splats_of(*elsewhere[:3]), elsewhere[3], None, goal) is None
     assert not sweeps
 
 

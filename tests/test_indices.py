@@ -14,9 +14,9 @@ from rts.operations.linear import AFFINE
 from rts.operations.projection import PROJECTION
 from rts.operations.rigid import RIGID
 from rts.operations.take import take
+from rts.rendering.samples import sample
 from rts.sampling.merging import merge
 from rts.sampling.packing import lift
-from rts.sampling.scenes import sample
 from rts_backends.fused import splatters as fused
 from rts_backends.fused.cells import Settings
 
@@ -186,8 +186,8 @@ def of(raster, change):
                 return change(super().rasterize(*args))
         else:
 
-            def sample(self, *args, **options):
-                return change(super().sample(*args, **options))
+            def sample(self, *args):
+                return change(super().sample(*args))
 
     return Wrong()
 
@@ -226,7 +226,7 @@ def test_triangles_that_are_not_there_are_refused_when_they_are_packed():
 
 
 def shifted(samples, by):
-    return replace(samples, row=np.where(samples.row >= 0, samples.row + by, -1).astype(np.int32))
+    return samples.replace(row=np.where(samples.row >= 0, samples.row + by, -1).astype(np.int32))
 
 
 @pytest.mark.parametrize("splatter", ["none", "single", "multi", "visible"])
@@ -255,7 +255,7 @@ def test_samples_made_by_hand_are_looked_at(wrong, splatter, target):
     own = sampled.samples[0]
     if wrong == "row":
         row = sampled.row + np.int32(1) * (sampled.row >= 0)
-        sampled = replace(sampled, row=row.astype(np.int32))
+        sampled = sampled.replace(row=row.astype(np.int32))
     else:
         ids = own.ids.copy()
         ids[3, 1] = 4 if wrong == "ids" else -1

@@ -13,6 +13,7 @@ import rts
 from rts import splatting
 from rts.adapting import adapted, unwrapped
 from rts.interfaces import Shader, as_surface
+from rts.records import Cells
 from rts.testing import SplatterConformance
 
 pytestmark = pytest.mark.core
@@ -68,7 +69,7 @@ def test_a_class_may_be_both_of_triangles_and_of_rays():
                 row[k][cells >= 0] = np.where(hits.hit[k, index], index, -1)
                 depth[k][cells >= 0] = hits.distance[k, index]
                 params[index] = hits.params[k, index]
-            return rts.Samples(samples.ids, params, row, depth, samples.overflow)
+            return rts.Samples(samples.ids, params, Cells(row, depth), samples.overflow)
 
     part = rts.Part(Both(), BALL, "normals")
     by_rays, by_triangles = (show(part, sampler=sampler, splatter="single") for sampler in ("rays", "raster"))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from helpers import DIFFERENTIABLE, arrays, icosphere, quad, to_numpy
 from scipy.optimize import least_squares
-from test_mean_loss import CAMERA, POSE, SIZE, goal, gradient, moving, residuals
 
 import rts
 from rts import splatting
@@ -27,6 +26,35 @@ compiled_cost = numba.njit(lambda r, loss: cost_and_weight(r, loss))
 ROBUST = ("soft_l1", "huber", "cauchy")
 targets = pytest.mark.parametrize("target", DIFFERENTIABLE)
 losses = pytest.mark.parametrize("name", ROBUST)
+SIZE = (18, 23)
+CAMERA = rts.Camera.look_at((0.7, 0.9, 3.2), (0, 0, 0), fov_y=40, aspect=23 / 18)
+POSE = np.float32([0.2, -0.3, 0.1, 0.05, -0.07, 0.1])
+
+
+def goal(channels, seed=0):
+    rng = np.random.default_rng(seed)
+    weights = rng.random((*SIZE, channels)) * (rng.random((*SIZE, channels)) > 0.3)
+    return rng.random((*SIZE, channels)).astype(np.float32), weights.astype(np.float32)
+
+
+def moving(pose, shader="silhouette"):
+    wall = rts.Part(rts.Mesh(quad()[1]), {"vertices": quad(-0.9, 0.8, -1.1, 0.6, -0.8)[0]}, shader)
+    return [rts.Mesh.example().replace(transform=rts.rigid(pose), shader=shader), wall]
+
+
+def residuals(shader="silhouette", channels=1, **options):
+    image, weights = goal(channels)
+    given = {"weights": weights, **options}
+    return rts.ImageResiduals(lambda pose: moving(pose, shader), CAMERA, SIZE, image, **given)
+
+
+def gradient(f, x):
+    return to_numpy(engine_of(x).value_and_grad(f)(x)[1])
+
+
+def mean_loss(residuals):
+    """Their mean loss, as a function of the parameters."""
+    return lambda parameters: residuals.loss(residuals(parameters))
 
 
 def cost(name, r, s):
@@ -90,7 +118,7 @@ def test_an_image_of_one_colour_has_the_loss_of_that_colour(name, target):
         **{"weights": np.full(SIZE, 0.5, np.float32), "loss": name, "f_scale": 0.1},
     )
     off = 0.5 * (color - wanted).astype(float)
-    value, found = engine_of(arrays(target, color)).value_and_grad(swept.mean_loss)(arrays(target, color))
+    value, found = engine_of(arrays(target, color)).value_and_grad(mean_loss(swept))(arrays(target, color))
     assert float(value) == pytest.approx(np.mean([cost(name, r, 0.1) for r in off]), rel=1e-5)
     np.testing.assert_allclose(to_numpy(found), [0.5 * slope(name, r, 0.1) / 3 for r in off], 1e-4)
     value, matrix, half = map(to_numpy, swept.normal_equations(arrays(target, color)))
@@ -135,7 +163,7 @@ def test_cost_and_gradient_are_those_of_scipy(name):
         lambda x: swept(torch.tensor(x)).numpy().ravel(), pose.numpy(), rows, loss=name, f_scale=0.1, max_nfev=1
     )
     count = math.prod((*SIZE, 3))
-    value, found = engine_of(pose).value_and_grad(swept.mean_loss)(pose)
+    value, found = engine_of(pose).value_and_grad(mean_loss(swept))(pose)
     assert float(value) == pytest.approx(2 * theirs.cost / count, rel=1e-9)
     np.testing.assert_allclose(found, 2 * theirs.grad / count, rtol=1e-8, atol=1e-14)
     value, _, half = swept.normal_equations(pose)
@@ -155,8 +183,8 @@ def test_the_gradient_is_that_of_finite_differences(name):
     swept = rts.ImageResiduals(scene, CAMERA, SIZE, image, weights=weights, loss=name, f_scale=0.3)
     color = torch.tensor([0.3, 0.6, 0.8], dtype=torch.float64)
     step = 1e-6 * torch.eye(3, dtype=torch.float64)
-    slopes = [float(swept.mean_loss(color + h) - swept.mean_loss(color - h)) / 2e-6 for h in step]
-    found = gradient(swept.mean_loss, color)
+    slopes = [float(mean_loss(swept)(color + h) - mean_loss(swept)(color - h)) / 2e-6 for h in step]
+    found = gradient(mean_loss(swept), color)
     np.testing.assert_allclose(found, slopes, rtol=1e-6, atol=1e-9)
     assert np.abs(found).min() > 1e-3
 
@@ -182,7 +210,7 @@ def test_normal_equations_are_those_of_the_jacobian(name, options):
     for a, b in zip(swept.normal_equations(pose), expected, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-10)
     assert float(torch.linalg.eigvalsh(expected[1]).min()) > 0
-    half = gradient(lambda p: swept.mean_loss(p) / 2, pose)
+    half = gradient(lambda p: mean_loss(swept)(p) / 2, pose)
     np.testing.assert_allclose(expected[2], half, rtol=1e-6, atol=1e-10)
 
 
@@ -198,17 +226,17 @@ def test_every_way_has_the_same_number():
     """Compiled and in array code, in NumPy, of views, and of a stage as large as the image."""
     torch = pytest.importorskip("torch")
     options = {"loss": "huber", "f_scale": 0.1}
-    expected = float(residuals("lambert", 4, **options).mean_loss(torch.tensor(POSE)))
-    assert expected < 0.7 * float(residuals("lambert", 4).mean_loss(torch.tensor(POSE)))
+    expected = float(mean_loss(residuals("lambert", 4, **options))(torch.tensor(POSE)))
+    assert expected < 0.7 * float(mean_loss(residuals("lambert", 4))(torch.tensor(POSE)))
     image, weights = goal(4)
     several = rts.ImageResiduals(
         *(lambda p: moving(p, "lambert"), [CAMERA, CAMERA], SIZE, [image] * 2), weights=[weights] * 2, **options
     )
     ways = [
-        residuals("lambert", 4, **options).mean_loss(POSE),
-        residuals("lambert", 4, splatter=splatting.Visible(), **options).mean_loss(torch.tensor(POSE)),
-        residuals("lambert", 4, **options).at_stage(rts.Stage()).mean_loss(torch.tensor(POSE)),
-        several.mean_loss(torch.tensor(POSE)),
+        mean_loss(residuals("lambert", 4, **options))(POSE),
+        mean_loss(residuals("lambert", 4, splatter=splatting.Visible(), **options))(torch.tensor(POSE)),
+        mean_loss(residuals("lambert", 4, **options).at_stage(rts.Stage()))(torch.tensor(POSE)),
+        mean_loss(several)(torch.tensor(POSE)),
         several.normal_equations(torch.tensor(POSE))[0],
         rts.Loss("huber", 0.1)(several(torch.tensor(POSE))),
     ]
@@ -222,7 +250,7 @@ def test_stages_have_the_loss_of_their_own_residuals(sigma):
     pose = torch.tensor(POSE)
     expected = float(rts.Loss("cauchy", 0.1)(stage(pose)))
     assert stage.loss == rts.Loss("cauchy", 0.1)
-    assert float(stage.mean_loss(pose)) == pytest.approx(expected, rel=1e-5)
+    assert float(mean_loss(stage)(pose)) == pytest.approx(expected, rel=1e-5)
     assert float(stage.normal_equations(pose)[0]) == pytest.approx(expected, rel=1e-5)
 
 
@@ -246,19 +274,15 @@ def test_splatters_that_know_no_losses_are_never_asked_for_them(monkeypatch):
             asked.append("equations")
             return super().normal_equations(splats, t_positions, t_rgba, target, weights, background)
 
-        def mean_loss(self, splats, target, weights=None, background=None):
-            asked.append("loss")
-            return super().mean_loss(splats, target, weights, background)
-
     pose, given = torch.tensor(POSE), {"loss": "huber", "f_scale": 0.1}
+
     swept, own = residuals("lambert", 4, **given), residuals("lambert", 4, splatter=Own(), **given)
-    torch.testing.assert_close(own.mean_loss(pose), swept.mean_loss(pose))
     for a, b in zip(own.normal_equations(pose), swept.normal_equations(pose), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-7)
     assert not asked and fused.Visible.takes_losses and not rts.Splatter.takes_losses
     square = residuals("lambert", 4, splatter=Own())
-    square.mean_loss(pose), square.normal_equations(pose)
-    assert asked == ["loss", "equations"]
+    square.normal_equations(pose)
+    assert asked == ["equations"]
 
 
 # --------------------------------------------------------------------------------------------------------- fits
@@ -348,7 +372,7 @@ def test_normal_equations_of_residuals_without_a_weight_are_finite(name):
 
 
 class Off(rts.Residuals):
-    """p less a point, with normal equations and a mean loss for the loss that it says."""
+    """p less a point, with normal equations for the loss that it says."""
 
     def __init__(self, loss):
         self.loss = loss
@@ -358,9 +382,6 @@ class Off(rts.Residuals):
 
     def normal_equations(self, p):
         return normal_equations(self, p, engine_of(p), self.loss or rts.Loss())
-
-    def mean_loss(self, p):
-        return (self.loss or rts.Loss())(self(p))
 
 
 class Staged(Off):
@@ -446,7 +467,7 @@ def test_a_subclass_with_more_residuals_has_the_normal_equations_of_all_of_them(
     given = {"weights": [weights] * 2, "loss": "huber"}
     swept = Held(lambda p: moving(p, "silhouette"), [CAMERA, CAMERA], SIZE, [image] * 2, **given)
     pose = torch.tensor(POSE)
-    value, found = engine_of(pose).value_and_grad(swept.mean_loss)(pose)
+    value, found = engine_of(pose).value_and_grad(mean_loss(swept))(pose)
     equations = swept.normal_equations(pose)
     torch.testing.assert_close(equations[0], value)
     torch.testing.assert_close(2 * equations[2], found, rtol=1e-4, atol=1e-7)
@@ -454,7 +475,7 @@ def test_a_subclass_with_more_residuals_has_the_normal_equations_of_all_of_them(
 
 def test_a_splatter_that_is_mixed_with_another_is_asked_for_what_that_takes():
     class Mixed:
-        def mean_loss(self, splats, target, weights=None, background=None):
+        def normal_equations(self, splats, t_positions, t_rgba, target, weights=None, background=None):
             raise AssertionError
 
     class Own(Mixed, fused.Visible):

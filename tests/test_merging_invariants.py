@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from strategies import PROPERTIES, masks, rows_of, steps, told_apart
 
 from rts import threads
-from rts.records import MORE
+from rts.records import Cells
 from rts.sampling import merging
 from rts.sampling.merging import merge
 
@@ -29,8 +29,8 @@ def parts(draw, least=1, most=4, reals=REALS):
         row, total = draw(rows_of(draw(masks(shape))))
         depth = np.sort(draw(steps(shape, -2, 4, dtype=draw(reals))), axis=0)
         facing = np.random.default_rng(draw(st.integers(0, 9))).integers(-3, 4, shape)
-        facing += np.where(facing > 2, MORE, np.where(facing < -2, -MORE, 0))
-        told = replace(told_apart(row, total, depth), facing=facing.astype(np.int16))
+        facing += np.where(facing > 2, Cells.MORE_BEHIND, np.where(facing < -2, -Cells.MORE_BEHIND, 0))
+        told = told_apart(row, total, depth).replace(facing=facing.astype(np.int16))
         found.append(replace(told, overflow=np.int32(draw(st.integers(0, 3)))))
     return found, draw(st.integers(1, 6))
 
@@ -49,9 +49,9 @@ def by_hand(samples, layers):
         for k, (z, i, own_layer, own) in enumerate(sorted(c for c in cell if c[3] >= 0)[:layers]):
             part[k, y, x], row[k, y, x], depth[k, y, x] = i, own, z
             told = int(samples[i].facing[own_layer, y, x])
-            number = (abs(told) % MORE) * len(samples) + i
-            more = abs(told) >= MORE or k == shape[0] - 1
-            facing[k, y, x] = np.sign(told) * (number + more * MORE)
+            number = (abs(told) % Cells.MORE_BEHIND) * len(samples) + i
+            more = abs(told) >= Cells.MORE_BEHIND or k == shape[0] - 1
+            facing[k, y, x] = np.sign(told) * (number + more * Cells.MORE_BEHIND)
     return part, row, depth, facing
 
 
@@ -157,7 +157,7 @@ def test_equal_depths_go_to_the_earlier_part(given):
 def test_where_no_depths_are_equal_the_order_of_parts_does_not_matter(given, data):
     samples, layers = given
     # What the parts add tells their depths apart.
-    samples = [replace(s, depth=np.where(s.row >= 0, s.depth + i / 64, 0)) for i, s in enumerate(samples)]
+    samples = [s.replace(depth=np.where(s.row >= 0, s.depth + i / 64, 0)) for i, s in enumerate(samples)]
     order = data.draw(st.permutations(range(len(samples))))
     found, other = merge(samples, layers), merge([samples[i] for i in order], layers)
     np.testing.assert_array_equal(np.where(other.part >= 0, np.array(order)[other.part], -1), found.part)
@@ -194,7 +194,7 @@ def test_the_layers_of_a_single_part_are_its_own(given):
 @given(parts(least=2, reals=st.just(np.float32)), st.sampled_from([-40, 40]))
 def test_the_unit_of_depth_does_not_matter(given, exponent):
     samples, layers = given
-    scaled = [replace(s, depth=s.depth * np.float32(2.0**exponent)) for s in samples]
+    scaled = [s.replace(depth=s.depth * np.float32(2.0**exponent)) for s in samples]
     found, expected = merge(scaled, layers), merge(samples, layers)
     np.testing.assert_array_equal(found.row, expected.row)
     np.testing.assert_array_equal(found.part, expected.part)

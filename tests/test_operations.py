@@ -7,7 +7,6 @@ import pytest
 from helpers import ALL, DIFFERENTIABLE, arrays, derivative, finite_difference, gradient, relative_error, to_numpy
 
 import rts
-from rts.fitting.losses import Loss
 from rts.operations import linear, projection
 from rts.operations.combine import COMBINE, combine, interpolate
 from rts.operations.inset import INSET, PAINTED, painted_inset, with_inset
@@ -18,7 +17,6 @@ from rts.operations.take import SHIFTED, TAKE, take
 from rts.testing import OperationConformance
 from rts.testing.splatters import scattered
 from rts_backends.fused.image import IMAGE
-from rts_backends.fused.mean_loss import MEAN_LOSS
 
 pytestmark = pytest.mark.engines
 
@@ -338,9 +336,6 @@ def cases():
     pixel = np.array([[-1, 5, 0, -1], [-1, -1, 1, -1], [4, -1, -1, -1]], np.int32)
     row, settled = rng.integers(-3, 3, size=(5, 6), dtype=np.int32), rng.integers(-2, 1, size=(5, 6), dtype=np.int8)
     given, options = splatted()
-    size = given[2].shape[1:]
-    target, weights = rng.random((*size, 3)), rng.random((*size, 1))
-    backdrop = np.ones((*size, 4)) * 0.3
     return {
         "combine": (COMBINE, [rows, rng.normal(size=(20, 6)), ids], {"column": 2, "count": 4, "affine": False}),
         "interpolate": (COMBINE, [rows, rng.random((20, 2)), ids], {"column": 1, "count": 3, "affine": True}),
@@ -354,7 +349,6 @@ def cases():
         "inset": (INSET, [image, fine, pixel], {"side": 2}),
         "painted_inset": (PAINTED, [rng.normal(size=2), fine, pixel, row, settled], {"side": 2}),
         "image": (IMAGE, given, options),
-        "mean_loss": (MEAN_LOSS, [*given, target, weights, backdrop], {**options, "loss": Loss("huber", 0.3)}),
         "a stranger's": (CLAMP, operands(), {"power": 2}),
     }
 

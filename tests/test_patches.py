@@ -11,6 +11,7 @@ from thin_patches import lacking, thin_patches
 
 import rts
 from rts import Camera, InputError, Part, Samples
+from rts.records import Cells
 from rts.sampling import settling
 from rts.testing import OperationConformance
 from rts.testing.compatibility import APRON
@@ -137,7 +138,7 @@ def test_rays_of_packed_samples_are_those_of_the_camera(camera):
     row = RNG.permutation(70).reshape(2, *size).astype(np.int32)
     row[row >= 50] = -1
     none = np.zeros((50, 2), np.float32)
-    samples = Samples(np.zeros((50, 1), np.int32), none, row, np.zeros(row.shape, np.float32), np.int32(0))
+    samples = Samples(np.zeros((50, 1), np.int32), none, Cells(row, np.zeros(row.shape, np.float32)), np.int32(0))
     found, expected = settling.rays_of(samples, camera, size), camera.rays(size)
     for layer in range(2):
         there = row[layer] >= 0
@@ -149,7 +150,7 @@ def test_rays_of_packed_samples_are_those_of_the_camera(camera):
 
 def test_without_a_covered_cell_there_is_a_ray_of_the_first_pixel():
     size, row = (2, 3), np.full((1, 2, 3), -1, np.int32)
-    samples = Samples(np.zeros((1, 1), np.int32), np.zeros((1, 2), np.float32), row, 0.0 * row, np.int32(0))
+    samples = Samples(np.zeros((1, 1), np.int32), np.zeros((1, 2), np.float32), Cells(row, 0.0 * row), np.int32(0))
     found, expected = settling.rays_of(samples, CAMERA.for_size(size), size), CAMERA.rays(size)
     np.testing.assert_allclose(found.directions[0], expected.directions[0, 0], atol=1e-12)
 

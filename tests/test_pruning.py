@@ -10,9 +10,9 @@ from helpers import ALL, DIFFERENTIABLE, arrays, box, derivative, gradient, icos
 import rts
 from rts import splatting
 from rts.records import ArraySpec
+from rts.rendering.samples import sample
 from rts.sampling import pruning
 from rts.sampling.extremes import extent, largest, named
-from rts.sampling.scenes import sample
 from rts.trees import map_leaves
 
 pytestmark = pytest.mark.sampling
@@ -220,13 +220,15 @@ def test_auto_layers_of_a_surface_that_the_automatic_sampler_casts_rays_at():
     assert (sample(part, CAMERA, SIZE, splatter="visible", layers=2).row >= 0).sum() == (rays.row >= 0).sum()
 
 
-def test_auto_layers_with_a_sampler_that_does_not_ask_what_is_needed():
+def test_auto_layers_with_a_sampler_that_leaves_hidden_samples_to_the_core():
     class Deaf(rts.plugin("rts.samplers", "raster")):
-        def sample(self, *args, needed=None, **options):
-            return super().sample(*args, **options)
+        def sample(self, part, camera, size, layers, request):
+            return super().sample(part, camera, size, layers, replace(request, hidden=None))
 
-    with pytest.raises(rts.InputError, match="the sampler did not ask which samples are needed; give a number"):
-        sample(SCENES["closed box"], CAMERA, SIZE, sampler=Deaf(), splatter="visible", layers="auto")
+    scene = SCENES["closed box"], CAMERA, SIZE
+    found = sample(*scene, sampler=Deaf(), splatter="visible", layers="auto")
+    expected = sample(*scene, sampler="raster", splatter="visible", layers="auto")
+    np.testing.assert_array_equal(found.row, expected.row)
 
 
 @pytest.mark.parametrize("target", ALL)
@@ -383,10 +385,3 @@ def test_indices_are_told_from_what_is_none_with_the_least_and_the_largest(dtype
 def test_indices_without_a_sign_are_all_named():
     there, *ends = named(np.array([0, 2**32 - 1], np.uint32))
     assert there.all() and ends == [-1, 2**32 - 1]
-
-
-def test_what_is_not_covered_is_no_sample_whatever_is_asked_for():
-    part = rts.Part(MESH(MESH_OF_BOX[1]), {"vertices": MESH_OF_BOX[0]})
-    sampler, given = rts.plugin("rts.samplers", "raster")(), (part, CAMERA, SIZE, 2)
-    everything = sampler.sample(*given, needed=lambda covered, depth: np.ones_like(covered), facing=True)
-    np.testing.assert_array_equal(everything.row, sampler.sample(*given).row)

@@ -7,7 +7,7 @@ from helpers import DIFFERENTIABLE, arrays, icosphere, to_numpy
 import rts
 from rts import Camera, Fragments, GBuffer, Part, Proxy, Samples
 from rts.engines import engine_of, namespace
-from rts.records import ArraySpec
+from rts.records import ArraySpec, Cells
 from rts.sampling.merging import merge
 from rts.sampling.packing import lift
 
@@ -47,7 +47,7 @@ class Ball:
         row = np.where(missed, -1, cells).reshape(samples.row.shape).astype(np.int32)
         depth = np.where(row >= 0, distance[row], 0).astype(np.float32)
         tables = {"squares": (point**2).astype(np.float32)}
-        return Samples(samples.ids, point.astype(np.float32), row, depth, samples.overflow, tables)
+        return Samples(samples.ids, point.astype(np.float32), Cells(row, depth), samples.overflow, tables)
 
     def table_specs(self, rows, capacity):
         return {"squares": ArraySpec((rows, 3), np.float32, packed=capacity is None, by_sample=True)}
@@ -119,8 +119,8 @@ def test_there_is_a_row_even_where_nothing_is_hit():
 def test_layers_of_several_parts_are_interleaved_by_depth_and_ties_go_to_the_earlier(target):
     def samples(row, depth):
         row, depth = np.array(row, np.int32).reshape(2, 1, 3), np.array(depth, np.float32).reshape(2, 1, 3)
-        fields = np.zeros((4, 1), np.int32), np.zeros((4, 2), np.float32), row, depth, np.int32(0)
-        return Samples(*fields) if target == "numpy" else Samples(*arrays(target, tuple(map(np.asarray, fields))))
+        fields = np.zeros((4, 1), np.int32), np.zeros((4, 2), np.float32), Cells(row, depth), np.int32(0)
+        return Samples(*fields) if target == "numpy" else Samples(*arrays(target, fields))
 
     first = samples([0, 1, -1, 2, -1, -1], [1, 5, 0, 3, 0, 0])
     second = samples([0, 1, 2, 3, -1, -1], [2, 5, 7, 4, 0, 0])
@@ -239,7 +239,7 @@ def test_parts_are_interleaved_alike_on_the_host_and_in_array_code(target, monke
         row = np.full(covered.shape, -1, np.int32)
         row[covered] = rng.permutation(covered.sum())
         count = int(covered.sum())
-        fields = np.zeros((count, 3), np.int32), np.zeros((count, 2), np.float32), row, depth, np.int32(0)
+        fields = np.zeros((count, 3), np.int32), np.zeros((count, 2), np.float32), Cells(row, depth), np.int32(0)
         parts.append(Samples(*(arrays(target, x) for x in fields)))
     for layers in (1, 3, 6):
         host = to_numpy(merge(parts, layers))

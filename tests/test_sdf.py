@@ -216,7 +216,7 @@ def at_some_samples(target, dtype=np.float32):
     origins, directions, _ = some_rays(60)
     hits = TORUS.intersect({"radii": RADII}, origins, directions, 2)
     params = hits.params[hits.hit].astype(np.float32)
-    return rts.Samples(np.zeros((len(params), 0), np.int32), arrays(target, params, dtype), None, None, None)
+    return rts.Samples(np.zeros((len(params), 0), np.int32), arrays(target, params, dtype), None, None)
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)

@@ -2,7 +2,6 @@
 
 import itertools
 import re
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,8 +10,9 @@ from helpers import DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere
 
 import rts
 from rts import splatting
+from rts.records import Cells
+from rts.rendering.samples import sample
 from rts.sampling.interiors_kernels import settle
-from rts.sampling.scenes import sample
 from rts.splatting.layers import dilated
 from rts_backends.fused import splatters as fused
 
@@ -342,7 +342,7 @@ def test_what_needs_the_samples_that_were_left_out_is_refused():
 def test_settled_of_the_wrong_kind_is_refused(make):
     y, x = np.indices((6, 7))
     positions = np.stack([x + 0.5, y + 0.5, np.full(x.shape, 2.0)], -1).reshape(-1, 3)
-    splats = rts.Splats(positions, np.ones((42, 4)), np.arange(42, dtype=np.int32).reshape(1, 6, 7))
+    splats = rts.Splats(positions, np.ones((42, 4)), Cells(np.arange(42, dtype=np.int32).reshape(1, 6, 7)))
     none = np.full((6, 7), -1, np.int32)
     wrong = {
         "settled has shape (6, 6); expected (6, 7)": none[:, :-1],
@@ -367,7 +367,7 @@ def test_the_gradient_of_many_colors_is_that_of_the_specification():
     found = []
     for make in (splatting.Visible, fused.Visible):
         rgba = torch.ones((360, 4), dtype=torch.float64, requires_grad=True)
-        splats = rts.Splats(positions, rgba, torch.from_numpy(row), settled=torch.from_numpy(row[0]), border=2)
+        splats = rts.Splats(positions, rgba, Cells(torch.from_numpy(row), settled=torch.from_numpy(row[0])), border=2)
         found.append(torch.autograd.grad((make().cropped(splats) * weights).sum(), rgba)[0])
     expected = torch.zeros((18, 20, 4), dtype=torch.float64)
     expected[2:-2, 2:-2] = weights
@@ -390,9 +390,9 @@ def test_samples_that_do_not_fit_are_refused(changes, message, supersample):
     raster = type(rts.plugin("rts.samplers", "raster")())
 
     class Odd(raster):
-        def sample(self, part, camera, size, layers, **options):
-            found = super().sample(part, camera, size, layers, **options)
-            return replace(found, **{k: np.broadcast_to(v, size) if v.ndim == 0 else v for k, v in changes.items()})
+        def sample(self, part, camera, size, layers, request):
+            found = super().sample(part, camera, size, layers, request)
+            return found.replace(**{k: np.broadcast_to(v, size) if v.ndim == 0 else v for k, v in changes.items()})
 
     parts = [mesh_part(mesh) for mesh in (box(0.5), quad(-1.0, 1.0, -1.0, 1.0, -0.8))]
     with pytest.raises(rts.InputError, match=re.escape(message)):

@@ -10,6 +10,7 @@ from seen import CAMERA, SIZE, VIEWS, rays_spread
 
 import rts
 from rts import Samples
+from rts.records import Cells
 from rts.sampling import packing, settling
 
 pytestmark = pytest.mark.sampling
@@ -23,7 +24,7 @@ def made(row, depth, **options):
     row, depth = np.array(row, np.int32), np.array(depth, np.float32)
     count = max(1, int(row.max(initial=-1)) + 1)
     ids = np.arange(2 * count, dtype=np.int32).reshape(-1, 2)
-    return Samples(ids, np.arange(count, dtype=np.float32)[:, None] / 8, row, depth, np.int32(0), **options)
+    return Samples(ids, np.arange(count, dtype=np.float32)[:, None] / 8, Cells(row, depth), np.int32(0), **options)
 
 
 def column(*depths, camera=PLANES):
@@ -218,7 +219,7 @@ def moved_to(heights):
     def refining(samples, rays):
         cells, depth = samples.row >= 0, samples.depth.copy()
         depth[cells] = depths[samples.ids[samples.row[cells], 0]]
-        return replace(samples, depth=depth, row=np.where(np.isfinite(depth), samples.row, -1))
+        return samples.replace(depth=depth, row=np.where(np.isfinite(depth), samples.row, -1))
 
     return refining
 
@@ -235,15 +236,15 @@ def spoiled(array, at):
     [
         (lambda s: None, "gave a NoneType; expected rts.Samples"),
         (lambda s: (s.ids, s.params), "gave a tuple; expected rts.Samples"),
-        (lambda s: replace(s, row=np.where(s.row >= 0, s.row.max() - s.row, -1)), "another number to a row"),
-        (lambda s: replace(s, row=np.where(s.row < 0, 0, s.row)), "another number to a row"),
+        (lambda s: s.replace(row=np.where(s.row >= 0, s.row.max() - s.row, -1)), "another number to a row"),
+        (lambda s: s.replace(row=np.where(s.row < 0, 0, s.row)), "another number to a row"),
         (
-            lambda s: replace(s, row=s.row[:2]),
+            lambda s: s.replace(row=s.row[:2]),
             r"gave row of shape \(2, 32, 36\) and dtype int32; expected \(3, 32, 36\)",
         ),
-        (lambda s: replace(s, depth=s.depth[0]), r"gave depth of shape \(32, 36\)"),
+        (lambda s: s.replace(depth=s.depth[0]), r"gave depth of shape \(32, 36\)"),
         (
-            lambda s: replace(s, depth=spoiled(s.depth, (0, 12, 14))),
+            lambda s: s.replace(depth=spoiled(s.depth, (0, 12, 14))),
             "gave 1 depths that are not finite; set their rows to −1",
         ),
         (
@@ -284,7 +285,7 @@ def test_what_is_dropped_may_have_any_depth_and_params():
         params = samples.params.copy()
         params[samples.row[second]] = np.nan
         row, depth = np.where(second, -1, samples.row), np.where(second, np.inf, samples.depth)
-        return replace(samples, params=params, row=row, depth=depth)
+        return samples.replace(params=params, row=row, depth=depth)
 
     whole, fewer = (layers_of(sheets(f)) for f in (lambda samples, rays: samples, refining))
     assert whole[0] == whole[1] == whole[2] > 100

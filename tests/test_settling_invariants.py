@@ -1,7 +1,5 @@
 """Settling of layers: which stay, in which order, and that nothing is lost without a reason."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -126,7 +124,7 @@ def test_what_is_dropped_lies_beyond_a_plane_or_just_behind_a_layer_that_stays(s
 def test_the_order_in_which_layers_come_does_not_matter(scene, data):
     samples, camera, spread = scene
     order = data.draw(st.permutations(range(len(samples.row))))
-    other = settle(replace(samples, row=samples.row[order], depth=samples.depth[order]), camera, spread)
+    other = settle(samples.replace(row=samples.row[order], depth=samples.depth[order]), camera, spread)
     np.testing.assert_array_equal(other.depth, settle(*scene).depth)
 
 

@@ -13,7 +13,7 @@ from soups import deepened, differences, hits_of, soup_of
 
 import rts
 from rts import splatting
-from rts.sampling.scenes import sample
+from rts.rendering.samples import sample
 
 pytestmark = pytest.mark.sampling
 

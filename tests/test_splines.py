@@ -6,6 +6,7 @@ from helpers import DIFFERENTIABLE, arrays, to_numpy
 
 import rts
 from rts import Camera, InputError, Part, Samples
+from rts.records import Cells
 from rts.testing.compatibility import APRON
 from rts_surfaces import tiles
 from rts_surfaces.bspline import extraction
@@ -169,8 +170,7 @@ def test_where_a_side_is_a_point_the_normal_is_the_limit(side):
         Samples(
             np.zeros((len(params), 1), np.int32),
             params.astype(np.float32),
-            np.full((1, 1, 1), -1, np.int32),
-            np.zeros((1, 1, 1), np.float32),
+            Cells(np.full((1, 1, 1), -1, np.int32), np.zeros((1, 1, 1), np.float32)),
             np.int32(0),
         ),
     )["normal"]
@@ -392,7 +392,7 @@ def test_a_profile_is_the_b_spline_of_its_radii_and_heights_with_normals_outside
 def at_theta(surface, theta, patch, params):
     none = np.full((1, 1, 1), -1, np.int32)
     ids = np.asarray(patch, np.int32).reshape(-1, 1)
-    return surface.evaluate(theta, Samples(ids, params, none, np.zeros((1, 1, 1), np.float32), np.int32(0)))
+    return surface.evaluate(theta, Samples(ids, params, Cells(none, np.zeros((1, 1, 1), np.float32)), np.int32(0)))
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)

@@ -7,7 +7,7 @@ import pytest
 from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, derivative, gradient, icosphere, quad, to_numpy
 
 import rts
-from rts import rendering
+from rts.rendering import settings
 from rts.splatting import Visible
 
 pytestmark = pytest.mark.splatting
@@ -32,7 +32,7 @@ def averaged(fine, s):
 @pytest.fixture
 def narrow_bands(monkeypatch):
     """Bands of a few rows."""
-    monkeypatch.setattr(rendering, "BAND", 1000)
+    monkeypatch.setattr(settings, "BAND", 1000)
 
 
 @pytest.mark.parametrize("target", ALL)
@@ -45,11 +45,11 @@ def test_a_pixel_is_the_average_of_its_samples(target, s):
 
 @pytest.mark.parametrize("target", ALL)
 def test_bands_make_no_difference_to_the_image(target, narrow_bands, monkeypatch):
-    assert len(rendering.bands_of(*SIZE, 2, 3)) == 3
+    assert len(settings.RenderSettings(None, 2, 3, None).bands(SIZE)) == 3
     vertices, background = arrays(target, (CORNERS, np.random.default_rng(0).random((*SIZE, 3))))
     found = to_numpy(image(vertices, 3, background=background))
     monkeypatch.undo()
-    assert len(rendering.bands_of(*SIZE, 2, 3)) == 1
+    assert len(settings.RenderSettings(None, 2, 3, None).bands(SIZE)) == 1
     np.testing.assert_allclose(found, to_numpy(image(vertices, 3, background=background)), rtol=0, atol=2e-5)
 
 
@@ -62,7 +62,7 @@ def test_bands_make_no_difference_to_derivatives(target, monkeypatch):
 
     found = {}
     for band in (2**20, 500):
-        monkeypatch.setattr(rendering, "BAND", band)
+        monkeypatch.setattr(settings, "BAND", band)
         slope = derivative(target, loss, vertices, arrays(target, np.ones((3, 3))))[1]
         found[band] = gradient(target, loss, vertices), slope
         np.testing.assert_allclose(found[band][0].sum(), slope, rtol=1e-3)
@@ -91,7 +91,7 @@ def test_gradients_shade_each_band_again_instead_of_keeping_it(narrow_bands):
             calls.append(splats.row.shape)
             return super().image(splats)
 
-    bands = len(rendering.bands_of(*SIZE, 2, 3))
+    bands = len(settings.RenderSettings(None, 2, 3, None).bands(SIZE))
     gradient(TORCH[0], lambda v: image(v, 3, splatter=Counting()).sum(), arrays(TORCH[0], CORNERS))
     assert len(calls) == 2 * bands
 
@@ -109,7 +109,7 @@ def memory(render, size=(32, 32), s=16):
 
 def test_memory_is_bounded_by_the_bands(monkeypatch):
     _, whole = memory(lambda s, size: image(CORNERS, s, size))
-    monkeypatch.setattr(rendering, "BAND", 2**15)
+    monkeypatch.setattr(settings, "BAND", 2**15)
     _, banded = memory(lambda s, size: image(CORNERS, s, size))
     assert banded < 0.3 * whole
 
@@ -117,7 +117,7 @@ def test_memory_is_bounded_by_the_bands(monkeypatch):
 def test_between_forward_and_backward_bands_keep_next_to_nothing(monkeypatch):
     vertices = arrays(TORCH[0], CORNERS).requires_grad_(True)
     whole, _ = memory(lambda s, size: image(vertices, s, size))
-    monkeypatch.setattr(rendering, "BAND", 2**15)
+    monkeypatch.setattr(settings, "BAND", 2**15)
     banded, _ = memory(lambda s, size: image(vertices, s, size))
     assert banded < 0.25 * whole  # What splatters have decided of each cell, four bytes.
 
@@ -128,9 +128,9 @@ def test_bands_of_a_closed_surface_have_no_seams(splatter, monkeypatch):
     part = rts.Part(MESH(faces), {"vertices": vertices, "colors": (vertices + 1) / 2}, "unlit")
     found = []
     for band in (2**30, 2**11):
-        monkeypatch.setattr(rendering, "BAND", band)
+        monkeypatch.setattr(settings, "BAND", band)
         found.append(rts.render(part, CAMERA, (24, 24), supersample=4, splatter=splatter, layers=3))
-    assert len(rendering.bands_of(24, 24, 3, 4)) > 8
+    assert len(settings.RenderSettings(None, 3, 4, None).bands((24, 24))) > 8
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-6)
 
 
@@ -143,7 +143,7 @@ def test_shaders_see_the_camera_of_the_whole_image(monkeypatch):
     part = rts.Part(MESH(FACES), {"vertices": CORNERS}, where)
     found = []
     for band in (2**30, 500):
-        monkeypatch.setattr(rendering, "BAND", band)
+        monkeypatch.setattr(settings, "BAND", band)
         found.append(rts.render(part, CAMERA, SIZE, supersample=2))
     np.testing.assert_allclose(found[1], found[0], rtol=0, atol=1e-9)
 

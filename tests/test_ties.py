@@ -13,7 +13,7 @@ from ties import KINDS, ties_of
 
 import rts
 from rts import splatting
-from rts.sampling.scenes import sample
+from rts.rendering.samples import sample
 
 pytestmark = pytest.mark.sampling
 

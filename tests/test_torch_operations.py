@@ -172,12 +172,12 @@ def test_gradients_do_not_depend_on_the_number_of_threads(case, monkeypatch):
     assert all(map(torch.equal, *found))
 
 
-MEAN_LOSS = """
+RESIDUALS = """
 import numpy as np, torch, rts
 part, camera = rts.Mesh.example(), rts.Camera.look_at((0.4, 0.5, 4), (0, 0, 0))
 for target in (np.ones((12, 16), np.float32), torch.ones(12, 16)):
     compare = rts.ImageResiduals(lambda pose: part.replace(transform=rts.rigid(pose)), camera, (12, 16), target)
-    found = [compare.mean_loss(torch.zeros(6)), compare.mean_loss(np.zeros(6, np.float32))]
+    found = [compare.loss(compare(pose)) for pose in (torch.zeros(6), np.zeros(6, np.float32))]
     assert abs(float(found[0]) - float(found[1])) < 1e-6, found
     assert compare(np.zeros(6, np.float32)).shape == (12, 16)
     rts.fit(compare, torch.zeros(6), steps=1)
@@ -186,7 +186,7 @@ KIT = ["pytest", "-q", "-c", os.devnull, "-p", "no:cacheprovider", "tests/plugin
 
 
 @pytest.mark.parametrize(
-    "command", [["-c", MEAN_LOSS], ["-m", *KIT, "TestHeightfield and agree"]], ids=["mean_loss", "a plugin's kit"]
+    "command", [["-c", RESIDUALS], ["-m", *KIT, "TestHeightfield and agree"]], ids=["residuals", "a plugin's kit"]
 )
 def test_what_torch_or_numpy_calls_deprecated_is_not_used(command):
     root = Path(__file__).parents[1]

@@ -77,7 +77,7 @@ def test_rays_meet_the_torus_where_the_quartic_is_zero():
     assert np.isfinite(params).all()
     k, i = np.nonzero(np.isfinite(expected))
     count = len(k)
-    samples = Samples(np.zeros((count, 0), np.int32), params[k, i], None, None, None)
+    samples = Samples(np.zeros((count, 0), np.int32), params[k, i], None, None)
     gbuffer = TORUS.surface.evaluate({"radii": RADII}, samples)
     point = origins[i] + expected[k, i][:, None] * directions[i]
     np.testing.assert_allclose(gbuffer["position"], point, atol=1e-6)

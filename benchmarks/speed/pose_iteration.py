@@ -80,7 +80,7 @@ class Task:
         return self.reduction(image[..., self.channels] - target)
 
     def residuals(self, scene: Callable[[Any], Any], target: Any, sampler: str) -> rts.ImageResiduals:
-        """The differences of `scene(pose)`; their `mean_loss` is `loss`, made as the image is."""
+        """The differences of `scene(pose)`; their loss is `loss`."""
         options: dict[str, Any] = {"sampler": sampler, "splatter": self.splatter, "layers": self.layers}
         options |= {"loss": self.reduction.name, "f_scale": self.reduction.f_scale}
         return rts.ImageResiduals(scene, self.view, self.size, target, **options)
@@ -114,7 +114,7 @@ def torch_iteration(
         pose.grad = None
         if vertices is not None:
             vertices.grad = None
-        loss = task.loss(pose, vertices, target, sampler) if residuals is None else residuals.mean_loss(pose)
+        loss = task.loss(pose, vertices, target, sampler) if residuals is None else residuals.loss(residuals(pose))
         loss.backward()
         optimizer.step()
         return loss.item()

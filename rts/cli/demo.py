@@ -18,7 +18,7 @@ from rts.cli.views import bounds_of, orbit
 from rts.files.paths import writing
 from rts.operations.rigid import rigid
 from rts.parts import Part
-from rts.rendering import render
+from rts.rendering.image import render
 
 SIZE = (320, 320)
 TRUE_ROTATION = (0.22, -0.38, 0.16)

@@ -16,7 +16,7 @@ from rts.cli.pose_verdict import Verdict
 from rts.files.images import save_animation, save_image
 from rts.files.paths import writing
 from rts.parts import Part
-from rts.rendering import render
+from rts.rendering.image import render
 
 PICTURE_SIDE, FRAMES = 512, 48
 PAPER, MARKED = (0.86, 0.87, 0.9), (0.95, 0.32, 0.05)

@@ -9,7 +9,7 @@ import numpy as np
 
 from rts.cli.pose_file import Pose, posed
 from rts.parts import Part
-from rts.rendering import render
+from rts.rendering.image import render
 
 GOOD = 0.9
 """Intersection over union from which on a fit is called good."""

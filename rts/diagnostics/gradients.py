@@ -26,7 +26,7 @@ from rts.files.srgb import decode_srgb
 from rts.fitting.dependence import differentiable
 from rts.fitting.names import named_leaves
 from rts.fitting.run import untraceable
-from rts.rendering import render
+from rts.rendering.image import render
 from rts.trees import Array, Tree, leaves, map_leaves
 
 NEGLIGIBLE = 0.01

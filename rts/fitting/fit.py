@@ -142,8 +142,7 @@ def fit(
                     supersample = finest(getattr(stage, "supersample", None))
                     levenberg_marquardt(checked, parameters, engine, run, jit, reduced, own, supersample)
                 else:
-                    own = stage.mean_loss if fits and stage.sums_losses else None
-                    _descend(checked, reduced, own, parameters, engine, method, rate, run, jit)
+                    _descend(checked, reduced, parameters, engine, method, rate, run, jit)
             except Astray as stop:
                 run.stop(str(stop))
         runs.append(run)
@@ -169,7 +168,6 @@ def _copied(engine: Engine, x: Array) -> Array:
 def _descend(
     residuals: Callable,
     loss: Callable,
-    own: Callable | None,
     parameters: Tree,
     engine: Engine,
     method: str,
@@ -177,9 +175,9 @@ def _descend(
     run: Run,
     jit: bool,
 ) -> None:
-    """Run Adam or SGD on the loss of residuals; `own` gives it without them, if there is one."""
+    """Run Adam or SGD on the loss of residuals."""
     xp = engine.namespace
-    value_and_grad = engine.value_and_grad(_scalar(own or (lambda p: loss(residuals(p))), engine))
+    value_and_grad = engine.value_and_grad(_scalar(lambda p: loss(residuals(p)), engine))
 
     def evaluate(p: Tree) -> tuple[Array, Tree, list[Array], list[Array]]:
         value, gradient = value_and_grad(p)
@@ -245,7 +243,7 @@ def _stages(residuals: Residuals, schedule: Any) -> list[Residuals]:
 
 def _taken(stage: Residuals, whole: Residuals, given: Callable | None) -> tuple[Callable[[Array], Array], bool]:
     """The loss at a stage of the residuals `whole`, and whether the stage's own sums are for it."""
-    if given is not None and not (stage.sums_products or stage.sums_losses):
+    if given is not None and not stage.sums_products:
         return given, False
     own = _own_loss(stage)
     taken = (own or _own_loss(whole) or SQUARE) if given is None else given

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, NamedTuple, TypeGuard
 
@@ -20,13 +21,10 @@ from rts.checks import (
     check_ratio,
     check_sampler,
     check_scene,
-    check_size,
-    check_splatter,
     is_count,
 )
-from rts.engines import Engine, constants, engine_of, exemplar, namespace, suiting
-from rts.errors import EmptyImageWarning, InputError, warn
-from rts.evaluating import to_fine_splats, to_splats
+from rts.engines import Engine, constants, context_of, engine_of, exemplar, namespace
+from rts.errors import InputError
 from rts.fitting.least_squares import flatten, normal_equations
 from rts.fitting.losses import Loss
 from rts.fitting.names import one_line
@@ -35,15 +33,16 @@ from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradi
 from rts.interfaces import Residuals, Splatter
 from rts.parts import CheckedPart, Part
 from rts.records import ArraySpec, Fine, Splats
-from rts.rendering import bands_of, render
-from rts.sampling.adaptive import Adaptive, finest
-from rts.sampling.emptiness import why_empty
-from rts.sampling.prepared import PreparedParts
-from rts.sampling.scenes import Scene, sample, sampled_scene
+from rts.rendering.batched import render_views
+from rts.rendering.image import render
+from rts.rendering.samples import sample
+from rts.rendering.settings import RenderSettings
+from rts.rendering.splats import to_fine_splats, to_splats
+from rts.sampling.adaptive import Adaptive
+from rts.sampling.prepared import Prepared
 from rts.trees import Array, Tree
-from rts.views import render_views
 
-Parts = Part | Sequence[Part] | PreparedParts
+Parts = Part | Sequence[Part] | Prepared
 Cameras = Camera | Sequence[Camera]
 SceneFunction = Callable[[Tree], "Parts | tuple[Parts, Cameras]"]
 
@@ -84,7 +83,6 @@ class ImageResiduals(Residuals):
 
     Attributes:
         size: (height, width).
-        supersample: samples a pixel along each axis, or an `rts.Adaptive`.
 
     Raises:
         InputError: an argument of the wrong kind, shapes that do not fit, integers as target, or a target, weights or
@@ -120,14 +118,12 @@ class ImageResiduals(Residuals):
             raise InputError(
                 f"camera is {quoted(camera)}; expected an rts.Camera, or None where scene gives one, or several cameras"
             )
-        self.size = check_size(size, layers, capacity, finest(supersample))
-        self._scene, self._camera, self._splatter = scene, camera, check_splatter(splatter)
+        self.size, self._settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
+        self._scene, self._camera, self._sampler = scene, camera, check_sampler(sampler)
         if not is_count(channels):
             raise InputError(f"channels is {quoted(channels)}; expected an integer of at least 1")
         self._image_channels = channels
         self._background = check_background(background, self.size, channels)
-        self.supersample = _checked_supersample(supersample)
-        self._sampling: dict[str, Any] = {"sampler": check_sampler(sampler), "layers": layers, "capacity": capacity}
         self._full, self._sigma = self.size, 0.0
         self._view: int | None = None
         self._views: list[ImageResiduals] = []
@@ -166,12 +162,10 @@ class ImageResiduals(Residuals):
     def __call__(self, parameters: Tree) -> Array:
         """`weights * (image − target)`, of the target's shape, whatever the loss."""
         parts, camera = self.scene(parameters)
-        options: dict[str, Any] = dict(
-            splatter=self._splatter, supersample=self.supersample, background=self._background, **self._sampling
-        )
+        given = vars(self._settings) | {"sampler": self._sampler, "background": self._background}
         if not self._views:
-            return self._difference(render(parts, camera, self.size, **options), parameters)
-        images = render_views(parts, camera, self.size, **options)
+            return self._difference(render(parts, camera, self.size, **given), parameters)
+        images = render_views(parts, camera, self.size, **given)
         return namespace(images).stack(
             [view._difference(images[b, ...], parameters) for b, view in enumerate(self._views)]
         )
@@ -212,7 +206,8 @@ class ImageResiduals(Residuals):
         made = copy(self)
         made._views = [view.at_stage(stage) for view in self._views]
         made._sigma = float(stage.sigma)
-        made.supersample = self.supersample if stage.supersample is None else _checked_supersample(stage.supersample)
+        if stage.supersample is not None:
+            made._settings = replace(self._settings, supersample=stage.supersample)
         made.size = stage.size(self.size)
         if made.size != self.size:
             if not self._views:
@@ -243,7 +238,7 @@ class ImageResiduals(Residuals):
         if isinstance(found, tuple) and len(found) == 2 and _are_cameras(given := found[1]):
             return found[0], given
         given = found if isinstance(found, (list, tuple)) else [found]
-        if not given or not all(isinstance(part, (Part, PreparedParts)) for part in given):
+        if not given or not all(isinstance(part, (Part, Prepared)) for part in given):
             kinds = ", ".join(map(kind_of, given)) or "nothing"
             raise InputError(
                 f"scene gave {one_line(kinds)}; expected an rts.Part or several, or a tuple (parts, camera)"
@@ -253,6 +248,11 @@ class ImageResiduals(Residuals):
                 "camera is None, and scene gives none; expected an rts.Camera, or (parts, camera) of scene"
             )
         return found, self._camera
+
+    @property
+    def supersample(self) -> int | Adaptive:
+        """Samples a pixel along each axis, or an `rts.Adaptive`."""
+        return self._settings.supersample
 
     @property
     def _ordinary(self) -> bool:
@@ -270,7 +270,7 @@ class ImageResiduals(Residuals):
             value, matrix, gradient = (sum(x[1:], x[0]) / len(x) for x in zip(*found, strict=True))
             return value, matrix, gradient
         engine = engine_of(parameters)
-        splatter, found = self._splatter, None
+        splatter, found = self._settings.reader, None
         if (
             self._ordinary
             and not self._sigma
@@ -279,45 +279,12 @@ class ImageResiduals(Residuals):
             and self._image_channels == 3
             and (splatter.takes_losses or not self.loss.robust)
             and (self.supersample == 1 or splatter.averages)
-            and not (isinstance(self.supersample, Adaptive) and self.supersample.contrast is not None)
+            and self._settings.contrast is None
         ):
             mask = self._channels == 1
             companion.expect(companion.LEAST_SQUARES_OF_MASKS if mask else companion.LEAST_SQUARES)
             found = self._swept(splatter, parameters, engine)
         return normal_equations(self, parameters, engine, self.loss) if found is None else found
-
-    def mean_loss(self, parameters: Tree) -> Array:
-        """Mean loss () of the residuals, to differentiate; it takes less time than that of an image.
-
-        The image is compared with the target as it is made, and neither it nor its gradient is kept. Where that cannot
-        be (several views, `supersample`, a blurred stage, other `channels`, splatters and devices), it is the loss of
-        what a call gives.
-
-        Args:
-            parameters: as in a call.
-        """
-        splatter = self._splatter
-        ordinary = self._ordinary and not self._views and not self._sigma and self._image_channels == 3
-        ordinary = ordinary and self.supersample == 1 and (splatter.takes_losses or not self.loss.robust)
-        found = self._compared(splatter, parameters) if ordinary and splatter.sums_losses else None
-        return self.loss(self(parameters)) if found is None else found
-
-    def _compared(self, splatter: Splatter, parameters: Tree) -> Array | None:
-        """`mean_loss` by that of the splatter; None where it gives none."""
-        parts, camera = self.scene(parameters)
-        scene = Scene.of(parts, camera, self._sampling["sampler"], None).at(self.size)
-        self._refuse_other(scene.channels)
-        options = {name: self._sampling[name] for name in ("layers", "capacity")}
-        options |= {"splatter": splatter, "supersample": 1, "settles": True}
-        sampled = sampled_scene(scene, scene.camera, self.size, **options)
-        splats = to_splats(sampled, scene.parts, scene.camera, scene.camera, *scene.suited)
-        splats = self._beside_target(splats, parameters)
-        target, weights, background = self._constants(splats.positions)
-        found = splatter.mean_loss(splats, target, weights, background, **self._loss_beside())
-        row = None if found is None else engine_of(splats.row).known(splats.row)
-        if row is not None and not (row >= 0).any():
-            warn(f"nothing is seen in the image: {why_empty(scene.parts, scene.camera)}", EmptyImageWarning)
-        return found
 
     def _loss_beside(self) -> dict[str, Loss]:
         """The argument of a splatter's sums beside those that all take."""
@@ -326,7 +293,7 @@ class ImageResiduals(Residuals):
     def _swept(self, splatter: Splatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
         """`normal_equations` by those of the splatter, in the bands that `render` takes; None where it gives none."""
         total: list[Array] = []
-        for top, rows in bands_of(*self.size, self._sampling["layers"], self.supersample):
+        for top, rows in self._settings.bands(self.size):
             found = self._swept_band(splatter, parameters, engine, top, rows)
             if found is None:
                 return None
@@ -349,46 +316,45 @@ class ImageResiduals(Residuals):
             # A window is of no ratio of its own.
             return camera if size == self.size else camera.window(self.size, (top, 0), size).replace(aspect=None)
 
-        options: dict[str, Any] = dict(splatter=splatter, supersample=self.supersample, settles=True, **self._sampling)
-        sampled = sample(parts, window(camera), size, **options)
+        sampled = sample(parts, window(camera), size, sampler=self._sampler, settles=True, **vars(self._settings))
         checked, _ = _checked(parts, camera)
         self._refuse_other(checked[0].shader.channels)
         colored = self._channels > 1 or not all(part.shader.opaque for part in checked)
         band = slice(top, top + rows)
         fields = _Fields(*(None if x is None else x[band] for x in self._constants(vector)))
 
-        def swept(shown: Callable[..., Splats], fields: _Fields, **known: Any) -> tuple[Array, Array, Array] | None:
-            """The normal equations of what `shown` makes of parts, cameras and an exemplar; `known` is constant."""
+        def swept(shown: Callable[..., Splats], fields: _Fields, known: Splats) -> tuple[Array, Array, Array] | None:
+            """The normal equations of what `shown` makes of parts, cameras and a context; of it `known` is constant."""
 
             def splats(v: Array) -> tuple[Array, Array]:
                 parts, camera = _checked(*self.scene(unflatten(v)))
                 seen = camera.for_size(self.size), window(camera)
-                moved = shown(parts, *seen, *suiting(parts, camera, sampled, v))
+                moved = shown(parts, *seen, context_of(parts, camera, sampled, v))
                 positions, rgba = constants((moved.positions, moved.rgba), engine, v)
                 # What is opaque has an alpha of one, whatever its colours.
                 return positions, rgba if colored else engine.stop_gradient(rgba)
 
             (positions, rgba), (t_positions, t_rgba) = engine.jacobian(splats)(vector)
             return splatter.normal_equations(
-                Splats(positions, rgba, **constants(known, engine, vector), **alike),
+                replace(constants(known, engine, vector), positions=positions, rgba=rgba),
                 t_positions,
                 t_rgba if colored else None,
                 **fields._asdict(),
                 **self._loss_beside(),
             )
 
-        alike: dict[str, Any] = {"border": sampled.apron, "one_part": sampled.one_part}
-        known = {name: getattr(sampled, name) for name in ("row", "facing", "settled", "exit")}
-        known["part"] = None if sampled.one_part else sampled.part
+        part = None if sampled.one_part else sampled.part
+        known = Splats(None, None, replace(sampled.cells, depth=None), part, one_part=sampled.one_part)
         if sampled.fine is None:
-            return swept(partial(to_splats, sampled), fields, **known)
+            return swept(partial(to_splats, sampled), fields, replace(known, border=sampled.apron))
         # A pixel counts on one of the grids alone.
         fine = sampled.fine
         coarse, finer = _split(fields, constants(fine.pixel, engine, vector), fine)
-        placed = {name: getattr(fine, name) for name in ("row", "part", "facing", "settled", "wanted")}
+        outside = replace(known, wanted=fine.coarse, border=sampled.apron)
+        placed = Splats(None, None, fine.cells, fine.part, wanted=fine.wanted, border=sampled.apron)
         found = (
-            swept(partial(to_splats, sampled), coarse, **known, wanted=fine.coarse),
-            swept(lambda parts, camera, _, *suited: to_fine_splats(fine, parts, camera, *suited), finer, **placed),
+            swept(partial(to_splats, sampled), coarse, outside),
+            swept(lambda parts, camera, _, own: to_fine_splats(fine, parts, camera, own), finer, placed),
         )
         if found[0] is None or found[1] is None:
             return None
@@ -458,10 +424,6 @@ def _checked_loss(loss: Any, f_scale: Any) -> Loss:
     return loss
 
 
-def _checked_supersample(given: Any) -> int | Adaptive:
-    return given if isinstance(given, Adaptive) else int(given)
-
-
 def _shrunk(target: Array, weights: Array | None, size: tuple[int, int]) -> tuple[Array, Array | None]:
     """Target and weights in fewer pixels (h, w), with as many axes and channels as before."""
     xp, kind = namespace(target, weights), target.shape
@@ -503,7 +465,7 @@ def _of_views(weights: Any, count: int) -> Sequence[Any]:
 
 
 def _checked(parts: Parts, camera: Camera) -> tuple[list[CheckedPart], Camera]:
-    return check_scene(parts.parts if isinstance(parts, PreparedParts) else parts, camera)
+    return check_scene(parts.parts if isinstance(parts, Prepared) else parts, camera)
 
 
 def _checked_target(target: Any, size: tuple[int, int], channels: int) -> tuple[Array, int]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from rts.arguments import one_line, quoted
 from rts.arrays import from_numbers, kind_of
-from rts.engines import OWNERS, constants, engine_of, suiting, value_of
+from rts.engines import OWNERS, constants, context_of, engine_of, value_of
 from rts.errors import InputError, RtsError
 from rts.trees import Array
 
@@ -170,7 +170,7 @@ class Operation:
         if any(isinstance(x, (Mapping, list, tuple)) or x is None for x in operands):
             given = ", ".join(map(kind_of, operands))
             raise InputError(f"the operation {self.name} was given {given} as operands; expected arrays")
-        engine, like = suiting(operands)
+        engine, like = context_of(operands)
         operands = constants(operands, engine, like)
         self.check_ranks(operands)
         return engine.apply(self, operands, params)

@@ -12,7 +12,7 @@ from rts.engines import engine_of, is_constant
 from rts.errors import PluginError
 from rts.interfaces import Sampler, TriangleSurface
 from rts.parts import Part
-from rts.records import Samples
+from rts.records import Request, Samples
 
 STATIC_FACES = 4_000_000
 """From so many triangles on, rays at a kept structure are faster than drawing all (benchmarks/speed/samplers.py)."""
@@ -69,16 +69,12 @@ def is_static(part: Part, camera: Camera) -> bool:
 class Auto(Sampler):
     """The sampler that suits each part."""
 
-    culls = True
-
     def suited(self, part: Part, camera: Camera | None) -> Sampler:
         """See `rts.Sampler`."""
         choice = choose(part, static=camera is None or is_static(part, camera))
         _log.debug("%s for %r: %s", choice.sampler, part.surface, choice.reason)
         return check_sampler(choice.sampler)
 
-    def sample(
-        self, part: Part, camera: Camera, size: tuple[int, int], layers: int, *, capacity: int | None = None
-    ) -> Samples:
+    def sample(self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request) -> Samples:
         """See `rts.Sampler`."""
-        return self.suited(part, camera).sample(part, camera, size, layers, capacity=capacity)
+        return self.suited(part, camera).sample(part, camera, size, layers, request)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.camera import Camera
-from rts.records import MORE, Fragments, Proxy
+from rts.records import Cells, Fragments, Proxy
 from rts.threads import parallel, read_only
 
 OTHER_COLUMNS = np.array([[j for j in range(4) if j != i] for i in range(4)])
@@ -20,7 +20,7 @@ def facing(
     """Which piece is seen, and from which side: (K, H, W) int16, see `rts.records.Samples`.
 
     It is found where splatters may compare it: in cells that have hidden layers, and beside them. It is 0 elsewhere.
-    The last layer of fragments is marked by `MORE`.
+    The last layer of fragments is marked by `MORE_BEHIND`.
 
     Args:
         fragments: what was sampled.
@@ -52,7 +52,7 @@ def facing_of_views(
     given = (np.ascontiguousarray(x) for x in (kept, fragments.triangle_ids))
     triangles = read_only(proxy.vertices), read_only(proxy.faces, np.int32), read_only(pieces, np.int16)
     eyes = np.stack([eye(camera) for camera in cameras])
-    arrays = *given, *triangles, eyes, *view, listed, MORE
+    arrays = *given, *triangles, eyes, *view, listed, Cells.MORE_BEHIND
     parallel(facing_kernels.fill, kept.shape[1], *arrays, found, work=kept[0].size + 100 * behind)
     return found
 

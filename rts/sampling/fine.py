@@ -11,11 +11,10 @@ import numpy as np
 
 from rts.checks import check_memory
 from rts.engines import engine_of
-from rts.interfaces import Needed
 from rts.records import Fine, Sampled
 from rts.sampling.adaptive import Adaptive, contrasts, outlines
-from rts.sampling.pruning import as_needed, planned
-from rts.sampling.strips import Grid, InStrips, Layout, arranged, lay_out, of_engine, rounded
+from rts.sampling.hidden import HiddenBySplatter, planned, with_layers_that_count
+from rts.sampling.strips import FineGrid, HiddenInStrips, Layout, arranged, lay_out, of_engine, rounded
 from rts.splatting.layers import dilated
 
 
@@ -52,10 +51,10 @@ def active(
 
 def fine_samples(
     coarse: Sampled,
-    grid: Grid,
+    grid: FineGrid,
     where: Where,
     take: Callable[..., Sampled],
-    needed: Needed | None,
+    hidden: HiddenBySplatter | None,
     layers: int | Literal["auto"],
     capacity: int | None,
     flat: bool,
@@ -66,8 +65,8 @@ def fine_samples(
         coarse: one sample a pixel.
         grid: the sizes.
         where: which pixels are active.
-        take: samples the fine grid: a number of layers, what is needed, `cells` and `capacity` → `Sampled`.
-        needed: says which samples of an image the splatter needs; None for all.
+        take: samples the fine grid: a number of layers, a rule for hidden samples, cells and capacity → `Sampled`.
+        hidden: the rule for those of an image; None to keep all.
         layers: K, or "auto".
         capacity: rows to allot, or None for as many as there are, or could be.
         flat: whether the samples of pixels that are not active are fronts of one colour alone, if any is settled.
@@ -93,8 +92,8 @@ def fine_samples(
         host = lay_out(pixels, grid, room, rounded if few else int)
         check_memory(1, host.cells.size, most, capacity, gradient=engine.differentiates)
         layout, allotted = of_engine(host, engine, coarse.depth), None
-        known = None if needed is None else InStrips(needed, host)
+        known = None if hidden is None else HiddenInStrips(hidden, host)
         flat = flat and bool(given[-1].any()) and not host.dropped
-    taken = partial(take, capacity=allotted, cells=layout.cells)
-    sampled = taken(layers, known) if layers != "auto" else as_needed(taken, known)
+    taken = partial(take, listed=layout.cells, capacity=allotted)
+    sampled = taken(layers, known) if layers != "auto" else with_layers_that_count(taken, known)
     return replace(arranged(sampled, layout, grid), flat=flat)

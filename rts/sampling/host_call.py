@@ -10,10 +10,10 @@ import numpy as np
 
 from rts.adapting import adapted
 from rts.camera import Camera
-from rts.engines import floating_bits, is_constant, stopped, suiting
+from rts.engines import context_of, floating_bits, is_constant, stopped
 from rts.interfaces import Shader, TriangleSurface
 from rts.parts import CheckedPart, Part
-from rts.records import ON_RAYS, ArraySpec, Samples
+from rts.records import ON_RAYS, ArraySpec, Cells, Samples
 from rts.sampling.cache import Entry
 from rts.sampling.settling import rays_of
 from rts.sampling.validation import check_camera
@@ -88,7 +88,7 @@ class HostCall:
     ):
         self._surface, self._cameras, self._shape, self._entry = surface, cameras, shape, entry
         self._transform = [] if part.transform is None else [part.transform]
-        self._engine, like = suiting(part.theta, cameras)
+        self._engine, like = context_of(part.theta, cameras)
         self._inputs = surface.proxy_inputs(stopped(part.theta)) if entry is None else None
         reads = {name: part.theta[name] for name in surface.reads(part.theta)}
         # What has no derivative is evaluated where it is sampled.
@@ -142,8 +142,12 @@ class HostCall:
         results = iter(self._engine.call_host(host, specs, *given))
         found = [next(results) for _ in own]
         more, filled, known = ({name: next(results) for name in x} for x in (beside, tables, self._attributes))
+        ids, params, row, depth, overflow = found
         samples = Samples(
-            *found,
+            ids,
+            params,
+            Cells(row, depth),
+            overflow,
             tables=filled,
             gbuffer=None if self._theta is None else known,
             asked=self._asked,
@@ -184,7 +188,7 @@ def _attribute_specs(
     i, p = surface.sample_widths
     none = np.full((1, 1, 1), -1, np.int32)
     tables = {name: np.zeros((1, *spec.shape[1:]), spec.dtype) for name, spec in shape.tables(surface).items()}
-    one = Samples(np.zeros((1, i), np.int32), np.zeros((1, p), np.float32), none, none, np.int32(0), tables)
+    one = Samples(np.zeros((1, i), np.int32), np.zeros((1, p), np.float32), Cells(none, none), np.int32(0), tables)
     gbuffer = surface.evaluate(host_theta, one)
     names = list(gbuffer) if asked is None else ["position", *(n for n in asked if n in gbuffer)]
     return {n: shape.row_spec(real, *gbuffer[n].shape[1:]) for n in dict.fromkeys(names)}

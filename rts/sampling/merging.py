@@ -9,7 +9,7 @@ import numpy as np
 
 from rts.engines import engine_of, namespace
 from rts.errors import InputError
-from rts.records import MORE, ArraySpec, Sampled, Samples
+from rts.records import ArraySpec, Cells, Sampled, Samples
 from rts.trees import Array
 
 
@@ -19,9 +19,7 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
     for s in samples[1:]:
         overflow = overflow + s.overflow
     if len(samples) == 1:
-        only = samples[0]
-        told = {name: getattr(only, name) for name in ("facing", "settled", "exit")}
-        return Sampled(tuple(samples), only.row, only.depth, overflow, **told)
+        return Sampled(tuple(samples), samples[0].cells, overflow)
     given = [*(s.row for s in samples), *(s.depth for s in samples)]
     if any(s.facing is not None for s in samples):
         given += [_nothing_told(s.row) if s.facing is None else s.facing for s in samples]
@@ -35,7 +33,7 @@ def merge(samples: Sequence[Samples], layers: int) -> Sampled:
         if s.exit is not None:
             left = exits = xp.where((part[0] == i) & (s.exit >= 0), s.exit + start, exits)
         start += s.ids.shape[0]
-    return Sampled(tuple(samples), row, depth, overflow, facing=facing[0] if facing else None, exit=left)
+    return Sampled(tuple(samples), Cells(row, depth, facing[0] if facing else None, left), overflow)
 
 
 def _nothing_told(row: Array) -> Array:
@@ -57,8 +55,8 @@ def _interleaved(layers: int, sizes: Sequence[int], *given: Array) -> tuple[Arra
     if not facing:
         return part, row, depth
     told = xp.take_along_axis(xp.concat([_of_part(f, i, count) for i, f in enumerate(facing)]), order, axis=0)
-    last = told[-1:, ...]
-    marked = xp.where((last != 0) & (xp.abs(last) < MORE), last + xp.where(last > 0, MORE, -MORE), last)
+    last, bit = told[-1:, ...], Cells.MORE_BEHIND
+    marked = xp.where((last != 0) & (xp.abs(last) < bit), last + xp.where(last > 0, bit, -bit), last)
     return part, row, depth, xp.concat([told[:-1, ...], xp.astype(marked, told.dtype)])
 
 
@@ -66,9 +64,9 @@ def _of_part(facing: Array, part: int, count: int) -> Array:
     """The numbers of a part's pieces among those of all parts; 0 where they would be too large."""
     xp = namespace(facing)
     size = xp.abs(facing)
-    more = xp.where(size >= MORE, MORE, 0)
+    more = xp.where(size >= Cells.MORE_BEHIND, Cells.MORE_BEHIND, 0)
     number = size - more
-    fits = (number > 0) & (number <= (MORE - 1 - part) // count)
+    fits = (number > 0) & (number <= (Cells.MORE_BEHIND - 1 - part) // count)
     number = xp.where(fits, number * count + part + more, 0)
     return xp.astype(xp.where(facing > 0, number, -number), facing.dtype)
 
@@ -86,7 +84,8 @@ def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *given: Array) -
         for i, (row, size) in enumerate(zip(arrays, sizes, strict=False)):
             if row.max(initial=-1) >= size:
                 raise InputError(f"row of part {i} refers to sample {row.max()} of {size}; sample this scene anew")
-        return merging_kernels.interleave(arrays[:count], arrays[count : 2 * count], arrays[2 * count :], layers, MORE)
+        given = arrays[:count], arrays[count : 2 * count], arrays[2 * count :]
+        return merging_kernels.interleave(*given, layers, Cells.MORE_BEHIND)
 
     specs = ArraySpec(shape, np.int32), ArraySpec(shape, np.int32), ArraySpec(shape, dtype)
     specs = specs if len(given) == 2 * count else (*specs, ArraySpec(shape, np.int16))

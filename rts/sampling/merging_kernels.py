@@ -24,7 +24,7 @@ def interleave(
         depths: depths of each part, (L, H, W).
         facing: `facing` of each part, (L, H, W) int16; or none.
         layers: K.
-        more: `rts.records.MORE`.
+        more: `Cells.MORE_BEHIND`.
     """
     (_, height, width), kind = rows[0].shape, np.result_type(*depths)
     shape = (min(layers, sum(r.shape[0] for r in rows)), height, width)

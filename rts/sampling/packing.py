@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from rts.errors import InputError
-from rts.records import Fragments, Proxy, Samples
+from rts.records import Cells, Fragments, Proxy, Samples
 from rts.sampling.exits import Exits
 from rts.sampling.extremes import largest, named
 
@@ -37,19 +37,11 @@ def covered_cells(triangle_ids: np.ndarray) -> tuple[np.ndarray, int]:
     return covered, last
 
 
-def of_first_row(settled: np.ndarray) -> np.ndarray:
-    """`Splats.settled` of a scene of one part, (H, W) int8, from what `Needed.settled` gives."""
-    if settled.dtype != bool:
-        raise InputError(f"settled of what says which samples are needed gave {settled.dtype}; expected bool")
-    return settled.view(np.int8) - np.int8(1)
-
-
 def lift(
     fragments: Fragments,
     proxy: Proxy,
     capacity: int | None = None,
     kept: np.ndarray | None = None,
-    size: float | None = None,
     exits: Exits | None = None,
     views: tuple[int, int] = (1, 1),
 ) -> Samples:
@@ -57,13 +49,12 @@ def lift(
 
     Samples are numbered layer by layer, each in rows and columns of the image. There is always at least one row, so
     that what follows stays connected to θ; a row that no cell refers to has no effect. `kept` (K, H, W) bool says which
-    of the `covered_cells` to take, None for all; all are taken, too, where depths are too rough to tell (`too_far`).
-    `size` is that of the largest coordinate, if it is known. `exits` come last, as many as there is room for, in as
+    of the `covered_cells` to take, None for all. `exits` come last, as many as there is room for, in as
     many rows as there are cells and layers at most.
     """
     from rts.sampling import packing_kernels
 
-    if kept is None or (len(kept) > 1 and too_far(largest(proxy.vertices) if size is None else size, fragments.depth)):
+    if kept is None:
         kept, _ = covered_cells(fragments.triangle_ids)
     table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
@@ -74,7 +65,7 @@ def lift(
         found = np.full(kept[0].shape, -1, np.int32)
         found.reshape(-1)[exits.cells[0]] = packed[5][0, 0]
     ids, params, row, depth, total = packed[:5]
-    return Samples(ids, params, row, depth, np.asarray(max(0, total - len(ids)), np.int32), exit=found)
+    return Samples(ids, params, Cells(row, depth, exit=found), np.asarray(max(0, total - len(ids)), np.int32))
 
 
 def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
@@ -100,8 +91,7 @@ def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
         samples,
         ids=packed(samples.ids),
         params=packed(samples.params),
-        row=number,
-        depth=np.where(number >= 0, samples.depth, np.float32(0)),
+        cells=replace(samples.cells, row=number, depth=np.where(number >= 0, samples.depth, np.float32(0))),
         overflow=overflow,
         tables={name: packed(x) if name in samples.by_sample else x for name, x in samples.tables.items()},
     )

@@ -6,7 +6,6 @@ Refining moves depths: layers come out of order, two of them meet at one root, a
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -64,12 +63,12 @@ def on_surface(
     added = np.where(more.row >= 0, more.row + np.int32(len(settled.ids)), -1)
     pairs = (settled.row, added), (settled.depth, more.depth)
     row, depth = (np.concatenate([a[:, *places], b[:, 0]])[:, None] for a, b in pairs)
-    both = settle(replace(settled, row=row, depth=depth), camera, rays.spread)
+    both = settle(settled.replace(row=row, depth=depth), camera, rays.spread)
     row, depth = settled.row, settled.depth
     row[:, *places], depth[:, *places] = both.row[:layers, 0], both.depth[:layers, 0]
     ids, params = (np.concatenate(x) for x in ((settled.ids, more.ids), (settled.params, more.params)))
     overflow = np.asarray(settled.overflow + more.overflow, np.int32)
-    return replace(settled, ids=ids, params=params, row=row, depth=depth, overflow=overflow)
+    return settled.replace(ids=ids, params=params, row=row, depth=depth, overflow=overflow)
 
 
 def refined(
@@ -98,9 +97,9 @@ def refined(
         for name, spec in tables.items()
     }
     rays = rays_of(lifted, camera, size or lifted.row.shape[1:], cells)
-    lifted = replace(lifted, tables=allotted, by_sample=by_sample)
+    lifted = lifted.replace(tables=allotted, by_sample=by_sample)
     # `refine` gets a copy of `row`, so that the check sees what it has changed.
-    return checked_refined(surface.refine(inputs, replace(lifted, row=lifted.row.copy()), rays), lifted, surface), rays
+    return checked_refined(surface.refine(inputs, lifted.replace(row=lifted.row.copy()), rays), lifted, surface), rays
 
 
 def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None) -> Rays:
@@ -142,7 +141,7 @@ def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
     limits = np.array([*_planes(camera), near, slope + SAME_ROOT])
     given = read_only(samples.row, np.int32), read_only(samples.depth, np.float32)
     parallel(settling_kernels.settle_lines, row.shape[1], *given, limits, row, depth, work=10 * row.size)
-    return replace(samples, row=row, depth=depth)
+    return samples.replace(row=row, depth=depth)
 
 
 def _planes(camera: Camera) -> tuple[float, float]:

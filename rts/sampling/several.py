@@ -7,7 +7,6 @@ long loops. Only the triangles are drawn view by view.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -15,19 +14,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.camera import Camera
-from rts.checks import check_memory, suited_sampler
+from rts.checks import check_memory
 from rts.engines import engine_of, is_traced, namespace, stopped, value_of
-from rts.interfaces import Needed, Splatter, TriangleSurface
+from rts.interfaces import TriangleSurface
 from rts.parts import CheckedPart
-from rts.records import ArraySpec, Fragments, Sampled, Samples
+from rts.records import ArraySpec, Cells, Decision, Fragments, Question, Sampled, Samples
+from rts.rendering.scene import Grid, Scene
+from rts.rendering.settings import RenderSettings
 from rts.sampling.cache import Entry
 from rts.sampling.extremes import largest
 from rts.sampling.facing import facing_of_views
+from rts.sampling.hidden import HiddenBySplatter, without_hidden
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.merging import merge
-from rts.sampling.packing import FAR, lift, of_first_row
-from rts.sampling.pruning import prune
-from rts.sampling.scenes import Scene, apron_of, widened
+from rts.sampling.packing import FAR, lift
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.sampling.validation import check_fragments, checked_pieces
 from rts.splatting.side_by_side import Picture, depth_scales
@@ -61,19 +61,19 @@ class Sampling(NamedTuple):
         scenes: the scene with the camera of each view, for images of the size.
         picture: where the views are to be.
         size: (height, width) of each view, pixels.
-        side: cells along each side of a pixel.
-        layers: K.
-        splatter: the splatter that samples are for.
-        capacity: as in `rts.render`, of each view.
+        settings: with a number of layers, and one of cells along each side of a pixel; the capacity is of each view.
     """
 
     scenes: Sequence[Scene]
     picture: Picture
     size: tuple[int, int]
-    side: int
-    layers: int
-    splatter: Splatter
-    capacity: int | None = None
+    settings: RenderSettings
+
+    @property
+    def cells(self) -> tuple[int, int]:
+        """(height, width) of each view in cells, without its apron."""
+        side = self.settings.side or 1
+        return side * self.size[0], side * self.size[1]
 
     @property
     def possible(self) -> bool:
@@ -82,43 +82,42 @@ class Sampling(NamedTuple):
         One by one are sampled surfaces that refine their samples or leave them off their rays, that intersect rays or
         have other triangles for each view, parts with exits, and what a sampler with a `sample` of its own samples.
         """
-        exits = self.scenes[0].suited[0].differentiates and self.splatter.reads_exits
+        exits = self.scenes[0].context.engine.differentiates and self.settings.reader.reads_exits
         return all(_is_plain(sampler, part, exits) for part, sampler, _ in self.parts())
 
     def parts(self) -> list[tuple[Any, Any, Any]]:
         """Each part, its sampler, and what that has prepared."""
         first = self.scenes[0]
-        chosen = [suited_sampler(s, part, first.camera) for s, part in zip(first.samplers, first.parts, strict=True)]
-        return list(zip(first.parts, chosen, first.entries, strict=True))
+        return list(zip(first.parts, first.chosen(), first.entries, strict=True))
 
-    def needed(self) -> Needed | None:
-        """What says which samples of a view the splatter needs."""
-        height, width = (self.side * n for n in self.size)
-        first = self.scenes[0]
-        check_memory(height, width, self.layers, self.capacity, gradient=first.suited[0].differentiates)
-        return first.needed_by(self.splatter, settles=True)
+    def hidden(self) -> HiddenBySplatter | None:
+        """The rule for hidden samples of a view."""
+        first, settings = self.scenes[0], self.settings
+        gradient = first.context.engine.differentiates
+        check_memory(*self.cells, settings.most_layers, settings.capacity, gradient=gradient)
+        return first.hidden_by(settings.splatter, settles=True)
 
     def of_part(
-        self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None, pruning: _Pruning
+        self, part: CheckedPart, sampler: TriangleSampler, entry: Entry | None, hidden: HiddenBySplatter | None
     ) -> tuple[Samples, Array, Array]:
         """The samples of a part in all views, less what is not needed, by one call to the host; and of `Views`.
 
         Returns:
             Samples, `view` and `scales`.
         """
-        apron, cells = apron_of(self.splatter), (self.side * self.size[0], self.side * self.size[1])
-        wides = [widened(scene, scene.camera, cells, apron) for scene in self.scenes]
-        cameras = [stopped(wide.camera.within(part.transform)) for wide in wides]
-        surface, picture, layers = part.surface, self.picture, self.layers
+        settings = self.settings
+        grids = [Grid.sampled(scene, scene.camera, self.cells, settings.apron) for scene in self.scenes]
+        cameras = [stopped(grid.camera.within(part.transform)) for grid in grids]
+        surface, picture, layers = part.surface, self.picture, settings.most_layers
         assert isinstance(surface, TriangleSurface)
-        tells = self.splatter.reads_facing and layers > 1 and part.cull == "none" and surface.tells_pieces
-        capacity = None if self.capacity is None else picture.views * self.capacity
+        tells = settings.reader.reads_facing and layers > 1 and part.cull == "none" and surface.tells_pieces
+        capacity = None if settings.capacity is None else picture.views * settings.capacity
         shape = Shape(layers, picture.size, capacity, picture.size)
         beside = {
             "view": shape.row_spec(np.int32),
             "scales": ArraySpec((picture.views,), np.float32),
             **({"facing": ArraySpec((layers, *picture.size), np.int16)} if tells else {}),
-            **({"settled": ArraySpec(picture.size, np.int8)} if pruning.settles else {}),
+            **({"settled": ArraySpec(picture.size, np.int8)} if hidden and hidden.settles else {}),
         }
 
         def find(own: Sequence[Camera], inputs: Any) -> tuple[Samples, dict[str, np.ndarray]]:
@@ -126,31 +125,38 @@ class Sampling(NamedTuple):
                 return known, *_drawn(sampler, known, own, picture, layers, part.cull)
 
             known, fragments, covered = sampler.working_on(surface, inputs, own[0], picture.view, entry, drawn)
-            kept, more = pruning.asked(covered, fragments.depth, known.size or largest(known.proxy.vertices))
+            size = known.size or largest(known.proxy.vertices)
+            (kept, settled, _), scales = decided_in_views(hidden, picture, Question(covered, fragments.depth, size))
+            more: dict[str, np.ndarray] = {"scales": scales}
+            if settled is not None:
+                more["settled"] = settled
             if tells:
                 pieces = checked_pieces(surface, known.proxy) if kept[1:].any() else np.zeros(1, np.int16)
                 more["facing"] = facing_of_views(fragments, kept, known.proxy, pieces, own, picture.view)
-            over = 0 if self.capacity is None else _leave_out(kept, picture, self.capacity)
-            found = lift(fragments, known.proxy, capacity, kept, 0.0, views=(picture.down, picture.across))
+            over = 0
+            if settings.capacity is not None:
+                kept = kept.copy()
+                over = _leave_out(kept, picture, settings.capacity)
+            found = lift(fragments, known.proxy, capacity, kept, views=(picture.down, picture.across))
             counts = _counts(found.row, len(found.ids) if capacity is None else 0, picture)
             more["view"] = _numbers(counts, len(found.ids))
             return replace(found, overflow=np.asarray(over, np.int32)), more
 
         samples, more = HostCall(part, surface, cameras, shape, entry).samples(find, beside)
         view, scales = more.pop("view"), more.pop("scales")
-        return replace(samples, **more), view, scales
+        return samples.replace(**more), view, scales
 
 
 def sampled_as_one(given: Sampling) -> Views:
     """The views of a scene, sampled as one picture."""
-    needed, parts, picture = given.needed(), given.parts(), given.picture
-    pruning = _Pruning(needed, picture)
-    found = [given.of_part(*part, pruning if len(parts) == 1 else _Pruning(None, picture)) for part in parts]
-    sampled, scales = merge([samples for samples, _, _ in found], given.layers), found[0][2]
+    hidden, parts, picture = given.hidden(), given.parts(), given.picture
+    found = [given.of_part(*part, hidden if len(parts) == 1 else None) for part in parts]
+    sampled, scales = merge([samples for samples, _, _ in found], given.settings.most_layers), found[0][2]
     if len(parts) > 1:
         scales = _scales_of(sampled.depth, picture)
-        sampled = sampled if needed is None or is_traced(sampled.row) else prune(sampled, pruning)
-    sampled = replace(sampled, supersample=given.side, apron=apron_of(given.splatter))
+        if hidden is not None and not is_traced(sampled.row):
+            sampled = without_hidden(sampled, lambda question: decided_in_views(hidden, picture, question)[0])
+    sampled = replace(sampled, supersample=given.settings.side, apron=given.settings.apron)
     padded, view = engine_of(sampled.row).padded(sampled.row), tuple(own for _, own, _ in found)
     if is_traced(sampled.row) or (padded and len(parts) == 1):
         return Views(sampled, picture, view, None, scales)
@@ -234,16 +240,18 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
     for index in range(len(first.samples)):
         own = [view.samples[index] for view in views]
         row = laid_out([s.row for s in own], -1, starts[:, index, None])
-        samples.append(replace(in_one_table(own), row=row, depth=laid_out([s.depth for s in own], 0)))
+        samples.append(in_one_table(own).replace(row=row, depth=laid_out([s.depth for s in own], 0)))
     sampled = replace(
         first,
         samples=tuple(samples),
-        row=laid_out([view.row for view in views], -1, shifts),
-        depth=laid_out([view.depth for view in views], 0),
+        cells=Cells(
+            laid_out([view.row for view in views], -1, shifts),
+            laid_out([view.depth for view in views], 0),
+            facing=laid_out([view.facing for view in views], 0),
+            exit=laid_out([view.exit for view in views], -1, shifts),
+            settled=laid_out([view.settled for view in views], -1),
+        ),
         overflow=sum(view.overflow for view in views),
-        settled=laid_out([view.settled for view in views], -1),
-        facing=laid_out([view.facing for view in views], 0),
-        exit=laid_out([view.exit for view in views], -1, shifts),
     )
     return _with_counts(sampled, picture, _scales_of(sampled.depth, picture), tuple(counts.T))
 
@@ -268,7 +276,7 @@ def _is_plain(sampler: Any, part: CheckedPart, exits: bool) -> bool:
         return False
     if not isinstance(surface, TriangleSurface) or surface.refines or surface.depends_on_view or not surface.centered:
         return False
-    return not (exits and part.cull == "back" and sampler.tells_exits)
+    return not (exits and part.cull == "back")
 
 
 def _drawn(
@@ -303,62 +311,36 @@ def _drawn(
     return found, covered
 
 
-class _Pruning:
-    """Which samples of several views a splatter needs.
+def decided_in_views(
+    hidden: HiddenBySplatter | None, picture: Picture, question: Question
+) -> tuple[Decision, np.ndarray]:
+    """Which samples (K, height, width) of views are needed, and the scales (B,) by which their depths are compared.
 
     Args:
-        needed: says so of one view; None for all.
+        hidden: the rule for one view; None to keep all.
         picture: where the views are.
+        question: of the samples of the picture.
     """
+    covered, depth, size = question
+    far = _largest(depth, picture)
+    scales = depth_scales(far)
+    if hidden is None:
+        return Decision(covered, None, covered), scales
+    # Whether numbers are too large is decided here: depths are in other units below.
+    if max(size, hidden.size) > FAR * far[far > 0].min(initial=np.inf):
+        settled = np.full(covered.shape[1:], -1, np.int8) if hidden.settles else None
+        return Decision(covered, settled, covered), scales
+    if (scales != 1).any():
+        depth = depth * _factors(scales, picture, depth.dtype)
+    return replace(hidden, size=0.0).decide(Question(covered, depth)), scales
 
-    def __init__(self, needed: Needed | None, picture: Picture):
-        self.settles = needed is not None and needed.settles
-        # Where it is traced, that of the triangles is known on the host.
-        self._size, self._picture = 0.0 if needed is None else needed.size or 0.0, picture
-        self._near = copy.copy(needed)
-        if self._near is not None:
-            self._near.size = 0.0  # Whether numbers are too large is decided here: depths are in other units.
 
-    def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """See `Needed`."""
-        return self._asked(covered, depth, 0.0)[0]
-
-    def asked(self, covered: np.ndarray, depth: np.ndarray, size: float) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Which samples (K, height, width) are needed; and "scales" (B,) of depths, and "settled", if it `settles`.
-
-        Args:
-            covered: (K, height, width) bool, where the picture has samples.
-            depth: (K, height, width), their depths.
-            size: of the largest coordinate.
-        """
-        kept, scaled, scales = self._asked(covered, depth, size)
-        if not self.settles:
-            return kept, {"scales": scales}
-        settled = np.zeros(covered.shape[1:], bool)
-        if scaled is not None:
-            assert self._near is not None
-            settled = self._near.settled(covered, scaled, kept, 0.0)
-        return kept, {"scales": scales, "settled": of_first_row(settled)}
-
-    def _asked(
-        self, covered: np.ndarray, depth: np.ndarray, size: float
-    ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
-        """What is needed, depths of a like scale or None where numbers are too large to tell, and scales."""
-        far = _largest(depth, self._picture)
-        scales = depth_scales(far)
-        if self._near is None or max(size, self._size) > FAR * far[far > 0].min(initial=np.inf):
-            return covered.copy(), None, scales
-        if (scales != 1).any():
-            depth = depth * self._factors(scales, depth.dtype)
-        kept = self._near(covered, depth)
-        return kept.copy() if kept is covered else kept, depth, scales
-
-    def _factors(self, scales: np.ndarray, dtype: Any) -> np.ndarray:
-        """(height, width) the factor of each cell."""
-        found = np.ones(self._picture.size, dtype)
-        for (lines, columns), scale in zip(self._picture.places(), scales, strict=True):
-            found[lines, columns] = scale
-        return found
+def _factors(scales: np.ndarray, picture: Picture, dtype: Any) -> np.ndarray:
+    """(height, width) the factor of each cell."""
+    found = np.ones(picture.size, dtype)
+    for (lines, columns), scale in zip(picture.places(), scales, strict=True):
+        found[lines, columns] = scale
+    return found
 
 
 def _largest(depth: np.ndarray, picture: Picture) -> np.ndarray:

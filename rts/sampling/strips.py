@@ -11,15 +11,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from rts.adapting import adapted
 from rts.engines import Engine, constants, engine_of, namespace
-from rts.interfaces import Needed
-from rts.records import ArraySpec, Fine, Sampled, Samples
+from rts.records import ArraySpec, Cells, Decision, Fine, Question, Sampled, Samples
+from rts.sampling.hidden import HiddenBySplatter, numbers_of
 from rts.threads import parallel, read_only
 from rts.trees import Array
 
@@ -34,7 +33,7 @@ FILLED = 1 / 3
 """Share of a strip's cells that are needed, about, where shapes have to be known beforehand."""
 
 
-class Grid(NamedTuple):
+class FineGrid(NamedTuple):
     """The sizes of an adaptively sampled image.
 
     Attributes:
@@ -124,7 +123,7 @@ class Layout(NamedTuple):
     dropped: Array
 
     @staticmethod
-    def specs(grid: Grid, room: Room) -> tuple[ArraySpec, ...]:
+    def specs(grid: FineGrid, room: Room) -> tuple[ArraySpec, ...]:
         """Shapes and dtypes of the arrays."""
         place = _shape(grid, *_lines(grid, room.columns))
         lines = -(-room.cells // LINE), LINE
@@ -134,21 +133,21 @@ class Layout(NamedTuple):
         return tuple(itertools.starmap(ArraySpec, zip(shapes, kinds, strict=True)))
 
 
-def _lines(grid: Grid, columns: int) -> tuple[int, int]:
+def _lines(grid: FineGrid, columns: int) -> tuple[int, int]:
     """How many lines of a layout, and of how many columns, about square, have room for runs of so many in all."""
     # Where a line ends, up to `gap` columns stay empty, and a run that is cut has aprons once more.
     across = max(math.isqrt(columns * grid.pitch), 3 * grid.gap + 1)
     return -(-columns // (across - 2 * grid.gap)), across
 
 
-def _shape(grid: Grid, lines: int, across: int) -> tuple[int, int]:
+def _shape(grid: FineGrid, lines: int, across: int) -> tuple[int, int]:
     """Height and width of a layout."""
     pixels = (lines - 1) * grid.pitch + grid.high, across - grid.gap
     return pixels[0] * grid.side + 2 * grid.apron, pixels[1] * grid.side + 2 * grid.apron
 
 
 def lay_out(
-    active: np.ndarray, grid: Grid, room: Room | None = None, sizes_of: Callable[[int], int] | None = None
+    active: np.ndarray, grid: FineGrid, room: Room | None = None, sizes_of: Callable[[int], int] | None = None
 ) -> Layout:
     """The fine cells that active pixels (H, W) bool need, in strips, as far as there is room.
 
@@ -188,7 +187,7 @@ def lay_out(
     return Layout(cells.reshape(-1, LINE), place, kinds, wanted, pixel, coarse, np.asarray(left, np.int32))
 
 
-def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: Grid, most: int | None) -> tuple[np.ndarray, np.ndarray]:
+def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: FineGrid, most: int | None) -> tuple[np.ndarray, np.ndarray]:
     """The first pieces, as many as have no more cells than there is room for; and their cells in each line."""
     from rts.sampling import strips_kernels
 
@@ -208,51 +207,51 @@ def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: Grid, most: int | None
     return pieces[:low], counted(low)
 
 
-def _firsts(pieces: np.ndarray, grid: Grid) -> np.ndarray:
+def _firsts(pieces: np.ndarray, grid: FineGrid) -> np.ndarray:
     """Where the pieces of each strip begin, and where the last one's end."""
     return np.searchsorted(pieces[:, 0], np.arange(grid.strips + 1))
 
 
-class InStrips(Needed):
-    """Says which samples of listed cells can reach active pixels: asks what decides for images, of the layout."""
+@dataclass(frozen=True)
+class HiddenInStrips:
+    """What a splatter needs of listed cells: the rule for images, asked of their layout.
 
-    _shown: tuple[np.ndarray, np.ndarray, np.ndarray]
+    Attributes:
+        rule: for images.
+        layout: on the host.
+    """
 
-    def __init__(self, needed: Needed, layout: Layout):
-        """`layout` is on the host."""
-        self._needed, self._layout = needed, layout
-        self.settles, self.size = needed.settles, needed.size
+    rule: HiddenBySplatter
+    layout: Layout
 
-    def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-        """See `Needed`; (K, L, LINE)."""
+    @property
+    def settles(self) -> bool:
+        """See `Hidden`."""
+        return self.rule.settles
+
+    @property
+    def size(self) -> float:
+        """See `Hidden`."""
+        return self.rule.size
+
+    def decide(self, question: Question) -> Decision:
+        """See `Hidden`; cells are (K, L, LINE)."""
         from rts.sampling import strips_kernels
 
-        layers, place = len(covered), self._layout.place
+        covered, depth, size = question
+        layers, (place, wanted) = len(covered), (self.layout.place, self.layout.wanted)
         lists = [read_only(x).reshape(layers, -1) for x in (covered, depth)]
         laid, deep = np.empty((layers, *place.shape), bool), np.empty((layers, *place.shape), depth.dtype)
         parallel(strips_kernels.gather, layers * len(place), *lists, place, laid, deep, work=2 * laid.size)
-        kept = self._needed(laid, deep)
-        self._shown = laid, deep, kept
-        if kept is laid:
-            return covered
-        return np.concatenate([covered[:1], self._listed(kept[1:], covered[1:], self._layout.kinds)])
-
-    def settled(
-        self,
-        covered: np.ndarray,
-        depth: np.ndarray,
-        kept: np.ndarray,
-        size: float,
-        wanted: np.ndarray | None = None,
-    ) -> np.ndarray:
-        """See `Needed`; (L, LINE), of the samples that were asked about last. Active pixels alone are wanted."""
-        laid, deep, left = self._shown
-        left = left.copy() if left is laid else left
-        wanted = self._layout.wanted
-        found = self._needed.settled(laid, deep, left, size, wanted)
-        kept &= self._listed(left, kept)
+        kept, settled, asked = self.rule.decide(Question(laid, deep, size), wanted)
+        needed = covered
+        if asked is not laid:
+            needed = np.concatenate([covered[:1], self._listed(asked[1:], covered[1:], self.layout.kinds)])
+        if settled is None:
+            return Decision(needed, None, needed)
         # The places beside a wanted one are the cells that lie beside it, those beside others may not be.
-        return self._listed((found & wanted)[None], covered[:1])[0]
+        amid = self._listed(((settled >= 0) & wanted)[None], covered[:1])[0]
+        return Decision(self._listed(kept, needed), numbers_of(amid), needed)
 
     def _listed(self, marks: np.ndarray, among: np.ndarray, kinds: np.ndarray | None = None) -> np.ndarray:
         """Those of listed cells (K, L, LINE) that have marks (K, h, w) in the layout; with `kinds`, near wanted ones.
@@ -261,19 +260,15 @@ class InStrips(Needed):
         """
         from rts.sampling import strips_kernels
 
-        found, place = np.zeros((len(among), among[0].size), bool), self._layout.place
+        found, place = np.zeros((len(among), among[0].size), bool), self.layout.place
         given = marks, np.empty((0, 0), np.uint8) if kinds is None else kinds, place, found
         parallel(strips_kernels.scatter, len(marks) * len(place), *given, work=marks.size)
         found = found.reshape(among.shape)
         found &= among
         return found
 
-    def ran_out(self, cells: int) -> None:
-        """See `Needed`."""
-        adapted(self._needed, Needed).ran_out(cells)
 
-
-def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
+def arranged(sampled: Sampled, layout: Layout, grid: FineGrid) -> Fine:
     """Samples of listed cells, (K, L, LINE), put into the places that show these cells."""
     sizes = [s.ids.shape[-2] for s in sampled.samples]
     engine, layers = engine_of(sampled), sampled.row.shape[0]
@@ -301,7 +296,7 @@ def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
         sampled.samples,
         index,
         shift,
-        row,
+        Cells(row, facing=known[0] if told else None, settled=known[-1] if amid else None),
         part,
         layout.wanted,
         layout.pixel,
@@ -309,8 +304,6 @@ def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:
         sampled.overflow + layout.dropped,
         supersample=grid.side,
         apron=grid.apron,
-        facing=known[0] if told else None,
-        settled=known[-1] if amid else None,
     )
 
 
@@ -383,12 +376,10 @@ def at_cells(whole: Samples, cells: Array, capacity: int | None) -> Samples:
         whole,
         ids=xp.take(whole.ids, index, axis=0),
         params=xp.take(whole.params, index, axis=0),
-        row=row,
-        depth=depth,
+        cells=Cells(row, depth, facing[0] if facing else None),
         overflow=whole.overflow + overflow,
         tables={k: xp.take(v, index, axis=0) if k in whole.by_sample else v for k, v in tables},
         gbuffer=None if gbuffer is None else {k: xp.take(v, index, axis=0) for k, v in gbuffer.items()},
-        facing=facing[0] if facing else None,
     )
 
 

@@ -4,30 +4,33 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple, Self, TypeVar
+from dataclasses import dataclass
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from rts.adapting import adapted, unwrapped
+from rts.adapting import unwrapped
 from rts.arrays import shape_of
 from rts.camera import Camera
 from rts.engines import stopped, value_of
 from rts.errors import InputError, PluginError
-from rts.interfaces import AnyNeeded, Needed, Sampler, TriangleSurface, as_surface
+from rts.interfaces import Sampler, TriangleSurface, as_surface
 from rts.parts import Part
-from rts.records import ArraySpec, Fragments, Proxy, Samples
+from rts.records import ArraySpec, Decision, Fragments, Hidden, Proxy, Question, Request, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines
 from rts.sampling.extremes import largest
 from rts.sampling.facing import facing as facing_of
 from rts.sampling.host_call import HostCall, Shape
-from rts.sampling.packing import lift, of_first_row, repack
+from rts.sampling.packing import lift, repack
 from rts.sampling.settling import on_surface, refined
 from rts.sampling.validation import check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
 
 _T = TypeVar("_T")
+
+NOTHING_ELSE = Request()
+"""Asks for all samples, and nothing besides."""
 
 LEAST_LAYERS = 3
 """Where a surface refines its samples, so many layers of triangles are looked for, or one more than samples are asked
@@ -42,7 +45,6 @@ class TriangleSampler(Sampler):
     Attributes:
         builds: whether something is worth building once for a proxy; True in a class with its own `prepare`.
         follows: whether what was prepared can follow moved vertices; True in a class with its own `update`.
-        tells_exits: whether `rasterize` knows cull="front", too.
         concurrent: whether several threads may call `rasterize` at once; those of a sampler that `follows` wait for one
             another in any case.
     """
@@ -51,10 +53,6 @@ class TriangleSampler(Sampler):
     FLAGS = {"prepare": "builds", "update": "follows"}
     builds: bool = False
     follows: bool = False
-    culls = True
-    prunes = True
-    takes_cells = True
-    tells_facing = True
     _keeper: Keeper
 
     def __init_subclass__(cls, **options: Any) -> None:
@@ -104,8 +102,8 @@ class TriangleSampler(Sampler):
             camera: NumPy float64 matrices; world is the proxy's local space.
             size: (height, width).
             layers: K.
-            cull: "none", or "back": ignore triangles whose normal (counter-clockwise winding) faces away; and where a
-                class `tells_exits`, "front": ignore the others.
+            cull: "none"; "back": ignore triangles whose normal (counter-clockwise winding) faces away; or "front":
+                ignore the others.
 
         Returns:
             Fragments, front to back in each pixel; no layer follows an empty one.
@@ -141,7 +139,7 @@ class TriangleSampler(Sampler):
         layers: int,
         beside: Callable[[Fragments], np.ndarray],
     ) -> tuple[Fragments, np.ndarray, Fragments]:
-        """`rasterize` with cull="back", and what is seen from behind in some cells; where a class `tells_exits`.
+        """`rasterize` with cull="back", and the triangles seen from behind in some cells.
 
         The default calls `rasterize` and `rasterize_cells`, which look at all triangles anew.
 
@@ -174,9 +172,7 @@ class TriangleSampler(Sampler):
             camera = camera if size is None else camera.for_size(size)
             camera = camera.within(part.transform).map(_held)
         built = self.arranged(self._built(surface, inputs, camera, size))
-        arrays = leaves(stopped({name: part.theta[name] for name in surface.reads(part.theta)}))
-        read = [_held(x) for x in arrays]
-        built = built._replace(size=max([built.size or 0.0, *(largest(x) for x in read if x.dtype.kind == "f")]))
+        map_leaves(_held, stopped({name: part.theta[name] for name in surface.reads(part.theta)}))
         return built._replace(inputs=map_leaves(np.copy, inputs)) if surface.refines else built
 
     def arranged(self, entry: Entry) -> Entry:
@@ -211,173 +207,41 @@ class TriangleSampler(Sampler):
         return self._keeper.get(unwrapped(surface), key, lambda: self._built(surface, inputs, camera, size), follow)
 
     def sample(
-        self,
-        part: Part,
-        camera: Camera,
-        size: tuple[int, int],
-        layers: int,
-        *,
-        capacity: int | None = None,
-        needed: AnyNeeded | None = None,
-        entry: Entry | None = None,
-        cells: Array | None = None,
-        facing: bool = False,
-        exits: bool = False,
+        self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request = NOTHING_ELSE
     ) -> Samples:
         """The `layers` nearest samples of every pixel, by one call to the host; see `rts.Sampler`.
 
-        Args:
-            part: as in `rts.Sampler`.
-            camera: as in `rts.Sampler`.
-            size: as in `rts.Sampler`.
-            layers: as in `rts.Sampler`.
-            capacity: as in `rts.Sampler`.
-            needed: says which samples to keep; None for all.
-            entry: what `hold` gave, to be used without a look at the surface's inputs.
-            cells: as in `rts.Sampler`.
-            facing: as in `rts.Sampler`; surfaces that move samples off their triangles tell nothing.
-            exits: as in `rts.Sampler`; surfaces with a `refine` tell nothing, nor do those that are not `centered`, nor
-                lists of cells.
+        Surfaces that move samples off their triangles tell no sides. Those with a `refine` tell no exits, nor do those
+        that are not `centered`, nor lists of cells.
 
         Raises:
             InputError: the surface has no triangles, or a plugin broke its contract.
         """
         surface, camera = _of_triangles(part.surface), camera.for_size(size)
-        shape = Shape(layers, size if cells is None else tuple(cells.shape), capacity, size)
-        tells = facing and layers > 1 and part.cull == "none" and surface.tells_pieces
-        tells = tells and not (surface.refines and surface.refine_moves)
-        exits = exits and part.cull == "back" and cells is None and not surface.refines and surface.centered
-        tables = shape.tables(surface) if surface.refines else {}
-        wanted: Needed | None = None if needed is None else adapted(needed, Needed)
-        settles = wanted is not None and wanted.settles and not surface.refines
+        listed, hidden, entry = request.cells, request.hidden, request.entry
+        shape = Shape(layers, size if listed is None else tuple(listed.shape), request.capacity, size)
+        tables, moves = shape.tables(surface) if surface.refines else {}, surface.refines and surface.refine_moves
+        sides = request.facing and layers > 1 and part.cull == "none" and surface.tells_pieces and not moves
+        exits = request.exits and part.cull == "back" and listed is None and not surface.refines and surface.centered
         beside = {
-            **({"facing": ArraySpec((layers, *shape.size), np.int16)} if tells else {}),
-            **({"settled": ArraySpec(shape.size, np.int8)} if settles else {}),
+            **({"facing": ArraySpec((layers, *shape.size), np.int16)} if sides else {}),
+            **(
+                {"settled": ArraySpec(shape.size, np.int8)} if hidden and hidden.settles and not surface.refines else {}
+            ),
             **({"exit": ArraySpec(size, np.int32)} if exits else {}),
+            **({"ran_out": ArraySpec((), np.int32)} if moves else {}),
         }
 
         def find(cameras: Sequence[Camera], inputs: Tree, *cells: np.ndarray) -> tuple[Samples, dict[str, Any]]:
             own = np.asarray(cells[0], np.int32) if cells else None
-            given = shape, tables, wanted, entry, own, tells, exits
-            found = self._found(surface, part.cull, inputs, cameras[0], *given)
+            search = _Search(self, surface, part.cull, inputs, cameras[0], shape, tables, hidden, entry, own)
+            found = search.moved() if moves else search.in_place(sides, exits)
             return found, {name: getattr(found, name) for name in beside}
 
         call = HostCall(part, surface, [camera], shape, entry)
-        samples, more = call.samples(find, beside, tables, [] if cells is None else [cells])
-        return replace(samples, **more)
-
-    def _found(
-        self,
-        surface: TriangleSurface,
-        cull: str,
-        inputs: Tree,
-        camera: Camera,
-        shape: Shape,
-        tables: Mapping[str, ArraySpec],
-        needed: Needed | None,
-        entry: Entry | None,
-        cells: np.ndarray | None,
-        tells: bool,
-        exits: bool,
-    ) -> Samples:
-        """The samples that are to be kept, on the host.
-
-        With what faces the viewer, if it `tells`, and with `exits`.
-        """
-        # Of tables there is but one set, so that no samples can be added later.
-        more = surface.refines and surface.refine_moves and not tables
-        grid = max(shape.layers + 1, LEAST_LAYERS) if more else shape.layers, *shape.size
-        moves = surface.refines and surface.refine_moves
-
-        def keep(covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
-            """Which of the fragments, where nothing moves them any more, are samples."""
-            kept = covered if needed is None else needed(covered, depth)
-            return kept if kept is covered else kept & covered
-
-        asked = keep if exits else None
-        found, fragments, covered, kept, behind = self._fragments(
-            surface, cull, inputs, camera, shape.view, grid, entry, cells, asked
-        )
-        if not moves:
-            kept = keep(covered, fragments.depth) if kept is None else kept
-            settled, size = None, found.size
-            if needed is not None and not surface.refines:
-                if size is None:
-                    # Vertices that were looked at as a part of θ need not be looked at again.
-                    read = any(np.may_share_memory(x, found.proxy.vertices) for x in leaves(inputs))
-                    size = needed.size if read and needed.size is not None else largest(found.proxy.vertices)
-                if needed.settles:
-                    kept = kept.copy() if kept is covered else kept  # It is changed in place.
-                    settled = of_first_row(needed.settled(covered, fragments.depth, kept, size))
-            sides = None
-            if tells:
-                # Nobody looks at them where no sample is hidden, and to find them takes long.
-                pieces = checked_pieces(surface, found.proxy) if kept[1:].any() else np.zeros(1, np.int16)
-                sides = facing_of(fragments, kept, found.proxy, pieces, camera, listed=cells is not None)
-            if not surface.refines:
-                if size is not None and needed is not None and needed.size is not None and size <= needed.size:
-                    size = 0.0  # Where numbers of this size are too large all is kept already.
-                lifted = lift(fragments, found.proxy, shape.capacity, kept, size, behind)
-                return replace(lifted, facing=sides, settled=settled)
-            lifted = lift(fragments, found.proxy, None, kept)
-            samples, _ = refined(surface, inputs, lifted, camera, tables, shape.view, cells)
-            return replace(repack(samples, samples.row >= 0, shape.capacity), facing=sides)
-        given = surface, inputs, fragments, found.proxy, camera, shape.layers, tables, shape.view, cells
-        settled = on_surface(*given)
-        # `needed` is asked only now, since it goes by the final depths.
-        left = kept = settled.row >= 0
-        if needed is not None:
-            needed.ran_out(int((covered[-1] & ~left[-1]).sum()))
-            kept = needed(left, settled.depth)
-        return repack(settled, kept, shape.capacity)
-
-    def _fragments(
-        self,
-        surface: TriangleSurface,
-        cull: str,
-        inputs: Tree,
-        camera: Camera,
-        view: tuple[int, int],
-        grid: tuple[int, int, int],
-        entry: Entry | None,
-        cells: np.ndarray | None,
-        keep: Callable[[np.ndarray, np.ndarray], np.ndarray] | None,
-    ) -> _Found:
-        """What is prepared of a surface, and the fragments (K, ·, ·) of a grid of the size `view`, or of some cells.
-
-        With what says which of them to `keep` also that, and the exits beside outlines.
-        """
-
-        def drawn(found: Entry) -> tuple[Fragments, np.ndarray]:
-            if not len(found.proxy.faces):
-                return _no_fragments(grid), np.zeros(grid, np.bool_)
-            given = found.prepared, camera, view, grid[0], cull
-            fragments = self.rasterize(*given) if cells is None else self.rasterize_cells(*given, cells)
-            return fragments, check_fragments(fragments, grid, len(found.proxy.faces), self)
-
-        def all_of(found: Entry) -> _Found:
-            if keep is None:
-                return _Found(found, *drawn(found))
-            if not (count := len(found.proxy.faces)):
-                fragments, covered = drawn(found)
-                nowhere = np.empty((1, 0), np.int32)
-                return _Found(found, fragments, covered, None, Exits.of(fragments, nowhere, _no_fragments((1, 1, 0))))
-            wanted, looked_at, covered, kept = keep, None, None, None
-
-            def beside(fragments: Fragments) -> np.ndarray:
-                nonlocal looked_at, covered, kept
-                looked_at, covered = fragments, check_fragments(fragments, grid, count, self)
-                kept = wanted(covered, fragments.depth)
-                return beside_outlines(kept)
-
-            fragments, asked, backs = self.rasterize_exits(found.prepared, camera, view, grid[0], beside)
-            if covered is None or fragments is not looked_at:
-                covered, kept = check_fragments(fragments, grid, count, self), None
-            if asked.size:
-                check_fragments(backs, (1, *asked.shape), count, self)
-            return _Found(found, fragments, covered, kept, Exits.of(fragments, asked, backs))
-
-        return self.working_on(surface, inputs, camera, view, entry, all_of)
+        samples, more = call.samples(find, beside, tables, [] if listed is None else [listed])
+        followed = [name for name, asked in (("cells", listed), ("hidden", hidden)) if asked is not None]
+        return samples.replace(**more, followed=tuple(followed))
 
     def working_on(
         self,
@@ -410,22 +274,121 @@ class TriangleSampler(Sampler):
         return self.concurrent and not self.follows
 
 
-class _Found(NamedTuple):
-    """What a sampler has found of a surface.
+@dataclass(frozen=True)
+class _Search:
+    """How the samples of one view are found on the host.
 
     Attributes:
-        entry: what is prepared of it.
-        fragments: (K, ·, ·).
-        covered: (K, ·, ·) bool, which cells have one.
-        kept: (K, ·, ·) bool, which of them are to be samples, if that was asked.
-        exits: those beside outlines, if they were asked for.
+        sampler: draws the triangles.
+        surface: the surface.
+        cull: the part's.
+        inputs: of the surface's proxy.
+        camera: host matrices.
+        shape: how many samples there may be.
+        tables: what the surface's `table_specs` allots.
+        hidden: the rule for hidden samples; None to keep all.
+        entry: what is prepared of the surface, if it is known.
+        cells: (L, C), the cells to sample; None for all.
     """
 
-    entry: Entry
-    fragments: Fragments
-    covered: np.ndarray
-    kept: np.ndarray | None = None
-    exits: Exits | None = None
+    sampler: TriangleSampler
+    surface: TriangleSurface
+    cull: str
+    inputs: Tree
+    camera: Camera
+    shape: Shape
+    tables: Mapping[str, ArraySpec]
+    hidden: Hidden | None
+    entry: Entry | None
+    cells: np.ndarray | None
+
+    def in_place(self, sides: bool, exits: bool) -> Samples:
+        """The samples where the triangles are, or where a surface that moves none refines them."""
+        known, fragments, covered, decision, behind = self._drawn(self.shape.layers, exits)
+        decision = decision or self._decided(covered, fragments, known)
+        # What is refined is not settled.
+        kept, facing = decision.needed if self.surface.refines else decision.kept, None
+        if sides:
+            # Nobody looks at them where no sample is hidden, and to find them takes long.
+            pieces = checked_pieces(self.surface, known.proxy) if kept[1:].any() else np.zeros(1, np.int16)
+            facing = facing_of(fragments, kept, known.proxy, pieces, self.camera, listed=self.cells is not None)
+        if not self.surface.refines:
+            lifted = lift(fragments, known.proxy, self.shape.capacity, kept, behind)
+            return lifted.replace(facing=facing, settled=decision.settled)
+        lifted = lift(fragments, known.proxy, None, kept)
+        found, _ = refined(self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.cells)
+        return repack(found, found.row >= 0, self.shape.capacity).replace(facing=facing)
+
+    def moved(self) -> Samples:
+        """The samples where a surface moves them, off its triangles."""
+        layers = self.shape.layers
+        # Of tables there is but one set, so that no samples can be added later.
+        known, fragments, covered, *_ = self._drawn(layers if self.tables else max(layers + 1, LEAST_LAYERS), False)
+        found = on_surface(
+            self.surface,
+            self.inputs,
+            fragments,
+            known.proxy,
+            self.camera,
+            layers,
+            self.tables,
+            self.shape.view,
+            self.cells,
+        )
+        there = kept = found.row >= 0
+        if self.hidden is not None:  # It is asked only now, since it goes by the final depths.
+            kept = self.hidden.decide(Question(there, found.depth)).needed
+        ran_out = np.count_nonzero(covered[-1] & ~there[-1])
+        return repack(found, kept, self.shape.capacity).replace(ran_out=np.asarray(ran_out, np.int32))
+
+    def _drawn(self, layers: int, exits: bool) -> tuple[Entry, Fragments, np.ndarray, Decision | None, Exits | None]:
+        """What is prepared, the fragments (K, ·, ·), and where there are any; with `exits` what was decided for them.
+
+        The last is where rays leave the part.
+        """
+        sampler, (camera, view) = self.sampler, (self.camera, self.shape.view)
+        grid = layers, *self.shape.size
+
+        def draw(known: Entry) -> tuple[Entry, Fragments, np.ndarray, Decision | None, Exits | None]:
+            if not (count := len(known.proxy.faces)):
+                nowhere = Exits(np.empty((1, 0), np.int32), *_nothing((1, 1, 0))) if exits else None
+                return known, *_nothing(grid), None, nowhere
+            given = known.prepared, camera, view, layers
+            if not exits:
+                cells = self.cells
+                drawn = sampler.rasterize(*given, self.cull) if cells is None else None
+                fragments = drawn or sampler.rasterize_cells(*given, self.cull, cells)
+                return known, fragments, check_fragments(fragments, grid, count, sampler), None, None
+            seen: list[tuple[Fragments, np.ndarray, Decision]] = []
+
+            def beside(fragments: Fragments) -> np.ndarray:
+                covered = check_fragments(fragments, grid, count, sampler)
+                seen[:] = [(fragments, covered, self._decided(covered, fragments, known))]
+                return beside_outlines(seen[0][2].needed)
+
+            fragments, asked, backs = sampler.rasterize_exits(*given, beside)
+            if not seen or fragments is not seen[0][0]:
+                covered = check_fragments(fragments, grid, count, sampler)
+                seen[:] = [(fragments, covered, self._decided(covered, fragments, known))]
+            if asked.size:
+                check_fragments(backs, (1, *asked.shape), count, sampler)
+            return known, *seen[0], Exits.of(fragments, asked, backs)
+
+        return sampler.working_on(self.surface, self.inputs, camera, view, self.entry, draw)
+
+    def _decided(self, covered: np.ndarray, fragments: Fragments, known: Entry) -> Decision:
+        """Which fragments, where nothing moves them any more, are to be samples."""
+        if self.hidden is None:
+            return Decision(covered, None, covered)
+        return self.hidden.decide(Question(covered, fragments.depth, self._size(known)))
+
+    def _size(self, known: Entry) -> float:
+        """The size of the largest coordinate of the triangles; 0 where the rule knows it."""
+        if known.size is not None or self.hidden is None:
+            return known.size or 0.0
+        # Vertices that were looked at as a part of θ need not be looked at again.
+        read = self.hidden.size > 0 and any(np.may_share_memory(x, known.proxy.vertices) for x in leaves(self.inputs))
+        return 0.0 if read else largest(known.proxy.vertices)
 
 
 def _of_triangles(given: Any) -> TriangleSurface:
@@ -436,6 +399,11 @@ def _of_triangles(given: Any) -> TriangleSurface:
             f"{given!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
         )
     return surface
+
+
+def _nothing(shape: tuple[int, int, int]) -> tuple[Fragments, np.ndarray]:
+    """Fragments of a shape without any, and where they are: nowhere."""
+    return _no_fragments(shape), np.zeros(shape, np.bool_)
 
 
 def _no_fragments(shape: tuple[int, int, int]) -> Fragments:

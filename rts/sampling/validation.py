@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -257,7 +256,7 @@ def checked_refined(found: Any, given: Samples, surface: TriangleSurface) -> Sam
         count = (~np.isfinite(used).all(axis=1)).sum()
         raise InputError(f"{who} gave {count} samples whose params are not finite; set their rows to −1")
     tables = _checked_tables(found.tables, given, who)
-    return replace(given, ids=ids, params=params, row=row, depth=depth, overflow=overflow, tables=tables)
+    return given.replace(ids=ids, params=params, row=row, depth=depth, overflow=overflow, tables=tables)
 
 
 def _array(what: str, value: Any, shape: tuple[int, ...], kind: type, dtype: Any) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 from rts.engines import namespace, stopped
 from rts.errors import InputError
 from rts.operations.operation import known_value
-from rts.records import MORE, Splats
+from rts.records import Cells, Splats
 from rts.sampling.extremes import extent
 from rts.trees import Array
 
@@ -252,9 +252,9 @@ def fronts(covered: np.ndarray) -> np.ndarray:
 
 def _opposite(hidden: Array, front: Array, behind: Array) -> Array:
     """Whether a hidden layer shows the other side of a front's piece, and does not stand for what may be behind it."""
-    xp = namespace(front)
+    xp, bit = namespace(front), Cells.MORE_BEHIND
     other = (front != 0) & (hidden == -front)
-    return other | ((front != 0) & ~behind & (hidden == -front - xp.where(front > 0, MORE, -MORE)))
+    return other | ((front != 0) & ~behind & (hidden == -front - xp.where(front > 0, bit, -bit)))
 
 
 def _first_minimum(values: list[Array], xp: Any) -> tuple[Array, Array]:

@@ -15,8 +15,8 @@ from rts.engines import Engine, constants, engine_named, is_constant
 from rts.errors import EmptyImageWarning, RtsError
 from rts.interfaces import RaySurface, TriangleSurface
 from rts.parts import Part
-from rts.rendering import render
-from rts.sampling.scenes import apron_of
+from rts.rendering.image import render
+from rts.rendering.settings import RenderSettings
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.trees import leaves, map_leaves
 
@@ -25,7 +25,7 @@ CAMERA = Camera.look_at((0.9, 1.6, 3.2), (0, 0, 0), aspect=SIZE[1] / SIZE[0], pr
 """Sees an example, which lies about the origin and within two units of it; nothing is symmetric."""
 
 LAYERS = 2
-APRON = apron_of(None)
+APRON = RenderSettings(None, 1, 1, None).apron
 CAPACITY = LAYERS * (SIZE[0] + 2 * APRON) * (SIZE[1] + 2 * APRON)
 """A row for every cell, so that engines that compile meet the same shapes again."""
 

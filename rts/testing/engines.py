@@ -14,7 +14,7 @@ from rts.adapting import adapted
 from rts.engines import OWNERS, Engine, engine_named
 from rts.errors import EngineError
 from rts.operations.rigid import rigid
-from rts.records import ArraySpec, Samples
+from rts.records import ArraySpec, Cells, Samples
 from rts.testing import derivatives, scenes
 from rts.testing.claims import claim, claim_close, no_error
 from rts.testing.conformance import Conformance
@@ -196,7 +196,7 @@ class EngineConformance(Conformance):
         def f(samples: Samples) -> Any:
             return xp.sum(samples.params, axis=1) + xp.astype(samples.ids[:, 0], samples.params.dtype)
 
-        samples = Samples(IDS, numbers(N, 2), np.zeros((1, 1, 1), np.int32), numbers(1, 1, 1), np.int32(0))
+        samples = Samples(IDS, numbers(N, 2), Cells(np.zeros((1, 1, 1), np.int32), numbers(1, 1, 1)), np.int32(0))
         with owning(chosen), no_error("a compiled function of rts.Samples"):
             given = map_leaves(chosen.constant, samples)
             found = chosen.block(chosen.jit(f)(given))

@@ -11,8 +11,8 @@ from rts.camera import Camera
 from rts.checks import check_scene
 from rts.parts import Part
 from rts.records import Sampled
-from rts.rendering import render, render_samples
-from rts.sampling.scenes import sample
+from rts.rendering.image import render, render_samples
+from rts.rendering.samples import sample
 from rts.testing import compatibility
 from rts.testing.claims import claim
 from rts.testing.compatibility import APRON, CAPACITY, LAYERS, SIZE

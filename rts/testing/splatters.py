@@ -11,7 +11,7 @@ import pytest
 from rts.adapting import unwrapped
 from rts.checks import check_splatter
 from rts.interfaces import Splatter
-from rts.records import Splats
+from rts.records import Cells, Splats
 from rts.testing import derivatives
 from rts.testing.claims import claim, claim_close, no_error, refusal
 from rts.testing.conformance import Conformance
@@ -87,7 +87,7 @@ class SplatterConformance(Conformance):
         """The image stays the same if rows are permuted, and `row` with them."""
         splats, order = scattered(), np.random.default_rng(2).permutation(CELLS)
         row = np.where(splats.row >= 0, np.argsort(order)[splats.row], -1).astype(np.int32)
-        image = _splat(splatter, Splats(splats.positions[order], splats.rgba[order], row))
+        image = _splat(splatter, Splats(splats.positions[order], splats.rgba[order], Cells(row)))
         claim_close(image, _splat(splatter, splats), TOLERANCE, "the image of permuted rows")
 
     def test_rows_of_no_cell_have_no_effect(self, splatter: Any) -> None:
@@ -96,7 +96,7 @@ class SplatterConformance(Conformance):
         unused = np.setdiff1d(np.arange(CELLS), splats.row)
         positions, rgba = splats.positions.copy(), splats.rgba.copy()
         positions[unused], rgba[unused] = [3.5, 4.5, 1e4], 1.0
-        image = _splat(splatter, Splats(positions, rgba, splats.row))
+        image = _splat(splatter, Splats(positions, rgba, splats.cells))
         claim_close(image, _splat(splatter, splats), TOLERANCE, "the image with other values in padded rows")
 
     def test_what_it_does_not_need_has_no_effect(self, splatter: Any) -> None:
@@ -214,7 +214,7 @@ def everywhere(layers: int) -> Splats:
     """A white sample at the centre of every cell, layer k at depth 2 + k."""
     k, y, x = np.indices((layers, HEIGHT, WIDTH))
     positions = np.stack([x + 0.5, y + 0.5, 2.0 + k], -1).reshape(-1, 3).astype(np.float32)
-    return Splats(positions, np.ones((len(positions), 4), np.float32), _numbered(layers))
+    return Splats(positions, np.ones((len(positions), 4), np.float32), Cells(_numbered(layers)))
 
 
 def scattered() -> Splats:
@@ -227,7 +227,7 @@ def scattered() -> Splats:
     row = splats.row.copy()
     row[0][rng.random((HEIGHT, WIDTH)) < 0.3] = -1
     row[1][(rng.random((HEIGHT, WIDTH)) < 0.3) | (row[0] < 0)] = -1
-    return Splats((splats.positions + off).astype(np.float32), rgba, row)
+    return Splats((splats.positions + off).astype(np.float32), rgba, Cells(row))
 
 
 def steps() -> Splats:
@@ -243,7 +243,7 @@ def steps() -> Splats:
     row[:, 6:, :2] = -1
     rgba = np.random.default_rng(7).random((len(positions), 4)).astype(np.float32)
     rgba[:, 3] = 1
-    return Splats(positions, rgba, row)
+    return Splats(positions, rgba, Cells(row))
 
 
 def two_colors() -> tuple[Splats, np.ndarray]:
@@ -288,7 +288,7 @@ def _direct(splatter: Any, splats: Splats) -> Any:
 
 
 def _of_positions_and_colors(splatter: Any, row: np.ndarray) -> Callable[[list], Any]:
-    return lambda x: _direct(splatter, Splats(x[0], x[1], row))
+    return lambda x: _direct(splatter, Splats(x[0], x[1], Cells(row)))
 
 
 def _along(engine: Any, splatter: Any, splats: Splats, along: np.ndarray) -> np.ndarray:

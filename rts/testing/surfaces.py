@@ -12,7 +12,7 @@ from rts.engines import engine_of
 from rts.gbuffer import GBuffer
 from rts.interfaces import RaySurface, TriangleSurface
 from rts.parts import Part
-from rts.records import Proxy, Samples
+from rts.records import Cells, Proxy, Samples
 from rts.testing import derivatives, scenes
 from rts.testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing
 from rts.testing.claims import claim, claim_close, claim_finite, no_error, refusal
@@ -254,7 +254,6 @@ def _at_corner(proxy: Proxy, i: int) -> Samples:
     return Samples(
         proxy.faces if proxy.ids is None else proxy.ids,
         weights if proxy.corner_params is None else proxy.corner_params[:, i],
-        row,
-        np.ones_like(row, dtype=np.float32),
+        Cells(row, np.ones_like(row, dtype=np.float32)),
         np.int32(0),
     )

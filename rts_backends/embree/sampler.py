@@ -50,8 +50,6 @@ class Structure:
 class Embree(TriangleSampler):
     """K nearest hits a pixel by an intersection filter, decided in float64 as the rasterizer decides."""
 
-    tells_exits = True
-
     def prepare(self, proxy: Proxy) -> Structure:
         """Build the acceleration structure."""
         check_faces(proxy)

@@ -11,10 +11,12 @@ from __future__ import annotations
 import numpy as np
 
 from rts.compiling import compiled, kernel
-from rts.records import MORE
+from rts.records import Cells
 from rts_backends.fused.mixed import sums_of
 from rts_backends.fused.pairs import BLOCK, mark
 from rts_backends.fused.survey import BUSY, EMPTY
+
+MORE_BEHIND = Cells.MORE_BEHIND
 
 
 @compiled
@@ -189,7 +191,7 @@ def _opposite(hidden, front, behind):
     """Whether a hidden layer shows the other side of a front's piece, and does not stand for what may be behind it."""
     if front == 0 or (hidden > 0) == (front > 0):
         return False
-    return hidden == -front or (not behind and abs(hidden) == abs(front) + MORE)
+    return hidden == -front or (not behind and abs(hidden) == abs(front) + MORE_BEHIND)
 
 
 @compiled

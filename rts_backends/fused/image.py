@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from rts import splatting
+from rts import records, splatting
 from rts.arrays import without_border
 from rts.operations.operation import Arrays, Operation, Some
-from rts.records import Splats
 from rts.trees import Array
 from rts_backends.fused.cells import Cells, Choices, Settings
 
@@ -32,7 +31,8 @@ def specification(
     given = settings.sigma, settings.epsilon, settings.gamma
     options = {"rims": settings.rims, "crossings": settings.crossings} if settings.kind == "visible" else {}
     part, facing, settled, exits = (x if x.shape[0] else None for x in (part, facing, settled, exits))
-    splats = Splats(positions, rgba, row, part, facing, settled, exit=exits, one_part=settings.one_part)
+    cells = records.Cells(row, facing=facing, exit=exits, settled=settled)
+    splats = records.Splats(positions, rgba, cells, part, one_part=settings.one_part)
     return without_border(_SPECIFICATIONS[settings.kind](*given, **options).image(splats), settings.border)
 
 

@@ -15,7 +15,6 @@ from rts.engines import engine_of
 from rts.fitting.losses import SQUARE, Loss
 from rts.records import Splats
 from rts.trees import Array
-from rts_backends.fused import mean_loss
 from rts_backends.fused.cells import Settings
 from rts_backends.fused.image import IMAGE
 
@@ -98,20 +97,6 @@ class _Fused(splatting.Kernel):
         own += splats.wanted, splats.settled, self._exits(splats)
         given = *own, t_positions, t_rgba, target, weights, background
         return normal_equations.equations(self._settings_of(splats), engine_of(given), loss or SQUARE, *given)
-
-    def mean_loss(
-        self,
-        splats: Splats,
-        target: Array,
-        weights: Array | None = None,
-        background: Array | None = None,
-        loss: Loss | None = None,
-    ) -> Array | None:
-        """See `rts.Splatter`."""
-        if not self._sweeps or splats.rgba.shape[0] == 0:
-            return None
-        given = self._operands(splats), target, weights, background
-        return mean_loss.mean_loss(self._settings_of(splats), loss or SQUARE, *given)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`."""

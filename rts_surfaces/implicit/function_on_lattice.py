@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -156,7 +155,7 @@ class FunctionOnLattice(Field):
             gone = (row >= 0) & (ids.max(axis=1) >= room)[row]
             row, overflow = np.where(gone, -1, row), np.asarray(overflow + gone.sum(), np.int32)
             ids = np.minimum(ids, room - 1)
-        return replace(samples, ids=ids, row=row, overflow=overflow, tables={"points": points[:room].astype(np.int32)})
+        return samples.replace(ids=ids, row=row, overflow=overflow, tables={"points": points[:room].astype(np.int32)})
 
     def six(self, theta: Mapping[str, Tree], samples: Samples) -> tuple[Array, Array]:
         """Levels (M,), differentiable; and which rows of them (N, 6) int32 the six values of each sample are."""

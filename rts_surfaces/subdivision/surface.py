@@ -7,7 +7,6 @@ sample alone: linear in θ, and exactly differentiable.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -61,7 +60,7 @@ class LimitGeometry(Geometry):
         kept &= met[samples.row]
         faces[~met], params[~met] = 0, 0
         row = np.where(kept, samples.row, -1)
-        return replace(samples, ids=faces[:, None], params=params, row=row, depth=np.where(kept, depth[samples.row], 0))
+        return samples.replace(ids=faces[:, None], params=params, row=row, depth=np.where(kept, depth[samples.row], 0))
 
 
 class Subdivision(Parametric):

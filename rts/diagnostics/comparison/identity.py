@@ -15,10 +15,10 @@ from rts.camera import Camera
 from rts.checks import check_scene
 from rts.engines import engine_of
 from rts.parts import Part
-from rts.rendering import render
+from rts.rendering.image import render
+from rts.rendering.samples import sample
 from rts.sampling.cache import fingerprint
-from rts.sampling.pruning import LAYER_LIMIT
-from rts.sampling.scenes import sample
+from rts.sampling.hidden import LAYER_LIMIT
 from rts.trees import leaves
 
 PACKAGES = ("rts", "rts_backends", "rts_surfaces")

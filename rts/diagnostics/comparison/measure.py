@@ -27,8 +27,8 @@ from rts.fitting.names import one_line
 from rts.interfaces import as_surface
 from rts.parts import Part
 from rts.registry import instance
-from rts.rendering import render
-from rts.sampling.scenes import sample
+from rts.rendering.image import render
+from rts.rendering.samples import sample
 from rts.trees import Array, Tree, collected, leaves, map_leaves
 
 PATIENCE = 8.0

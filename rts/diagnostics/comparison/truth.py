@@ -24,7 +24,7 @@ from rts.engines import Engine, engine_of
 from rts.errors import InputError
 from rts.files.paths import cache_folder, output_folder, own_folder, writing
 from rts.parts import Part
-from rts.views import render_views
+from rts.rendering.batched import render_views
 
 SAMPLES = 16
 """Points a pixel, along x and along y."""

@@ -20,13 +20,13 @@ from rts.errors import InputError
 from rts.fitting.names import named_leaves
 from rts.parts import CheckedPart, Part
 from rts.records import Sampled
-from rts.rendering import render
+from rts.rendering.image import render
+from rts.rendering.samples import sample
 from rts.sampling.adaptive import finest
-from rts.sampling.prepared import PreparedParts
-from rts.sampling.scenes import sample
+from rts.sampling.prepared import Prepared
 from rts.trees import Array, Tree, leaves, map_leaves
 
-Scene = Callable[[Tree], tuple[Part | Sequence[Part] | PreparedParts, Camera]]
+Scene = Callable[[Tree], tuple[Part | Sequence[Part] | Prepared, Camera]]
 Change = Callable[[list[Part], Camera], tuple[list[Part], Camera]]
 """Another scene, made of one."""
 
@@ -336,7 +336,7 @@ class Subject:
 
 def listed_parts(parts: Any) -> list[Part]:
     """The parts in a list, without what was built for them."""
-    if isinstance(parts, PreparedParts):
+    if isinstance(parts, Prepared):
         parts = parts.parts
     return list(parts) if isinstance(parts, (list, tuple)) else [parts]
 

@@ -21,7 +21,7 @@ from rts.fitting.fit import fit
 from rts.operations.rigid import rigid
 from rts.parts import Part
 from rts.registry import plugin
-from rts.rendering import render
+from rts.rendering.image import render
 from rts.trees import Array
 
 COUNT, BOUNDS = 16, ((-1.0,) * 3, (1.0,) * 3)

@@ -20,7 +20,7 @@ from rts.diagnostics.failures.methods import Method
 from rts.engines import Engine, engine_named, engine_of
 from rts.errors import RtsWarning
 from rts.fitting.names import one_line
-from rts.rendering import render
+from rts.rendering.image import render
 from rts.trees import Array, Tree, leaves, map_leaves
 
 Weigh = Callable[[np.ndarray], np.ndarray]

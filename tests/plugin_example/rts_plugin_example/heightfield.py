@@ -33,7 +33,7 @@ class Heightfield(rts.TriangleSurface):
     def proxy(self, inputs, camera, size):
         counts = [self.squares * (n - 3) + 1 for n in inputs.shape]
         params = np.indices(counts, np.float32)[::-1].reshape(2, -1).T / self.squares
-        vertices = self.evaluate({"heights": inputs}, rts.Samples(None, params, None, None, None))["position"]
+        vertices = self.evaluate({"heights": inputs}, rts.Samples(None, params, None, None))["position"]
         index = np.arange(len(params), dtype=np.int32).reshape(counts)
         a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]  # From above, counter-clockwise.
         faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])

@@ -8,22 +8,23 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from rts.appearance import shaded_at_once
 from rts.arrays import described, shape_of
 from rts.camera import Camera
 from rts.channels import cropped_image
-from rts.checks import check_background, check_cameras, check_size, check_splatter, suited_sampler
-from rts.engines import Engine, is_constant, namespace, suiting_scene, uncompiled
+from rts.checks import check_background, check_cameras
+from rts.engines import Context, context_of_scene, is_constant, namespace, uncompiled
 from rts.errors import InputError
-from rts.evaluating import views_to_splats
-from rts.interfaces import Splatter
 from rts.operations.inset import averaged
 from rts.parts import Part
 from rts.records import Sampled
-from rts.rendering import bands_of, image_of, over_background, seen, splatted
-from rts.sampling.adaptive import Adaptive, finest
-from rts.sampling.prepared import PreparedParts
-from rts.sampling.scenes import Scene, apron_of, sampled_scene
+from rts.rendering.image import image_of, over_background, seen, splatted
+from rts.rendering.samples import sampled_scene
+from rts.rendering.scene import Scene
+from rts.rendering.settings import RenderSettings
+from rts.rendering.shade import shaded_at_once
+from rts.rendering.splats import views_to_splats
+from rts.sampling.adaptive import Adaptive
+from rts.sampling.prepared import Prepared
 from rts.sampling.several import Sampling, Views, laid_side_by_side, sampled_as_one
 from rts.splatting.side_by_side import Picture, at_once
 from rts.threads import each
@@ -34,7 +35,7 @@ _T = TypeVar("_T")
 
 @uncompiled
 def render_views(
-    parts: Part | Sequence[Part] | PreparedParts,
+    parts: Part | Sequence[Part] | Prepared,
     cameras: Sequence[Camera] | Camera,
     size: tuple[int, int],
     *,
@@ -82,16 +83,14 @@ def render_views(
         AspectWarning: a camera is for images of another ratio of width to height.
     """
     listed = check_cameras(cameras)
-    scene, size = Scene.of(parts, listed[0], sampler, engine), check_size(size, layers, capacity, finest(supersample))
-    suited = suiting_scene(scene.parts, listed, engine=engine)
-    scenes = [scene._replace(camera=camera, suited=suited).at(size) for camera in listed]
+    scene = Scene.of(parts, listed[0], sampler, engine)
+    size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
+    context = context_of_scene(scene.parts, listed, engine=engine)
+    scenes = [scene._replace(camera=camera, context=context).at(size) for camera in listed]
     background = _check_backgrounds(background, len(listed), size, scene.channels)
     if not is_constant(background):
-        suited = scene.suiting(listed, background)
-    options: dict[str, Any] = dict(
-        splatter=check_splatter(splatter), layers=layers, supersample=supersample, capacity=capacity
-    )
-    images = _images(scenes, size, suited, **options)
+        context = scene.context_with(listed, background)
+    images = _images(scenes, size, context, settings)
     for b, own in enumerate(scenes):
         seen(images[b], own, f"view {b}")
     return over_background(images, background)
@@ -106,51 +105,42 @@ def _check_backgrounds(background: Any, count: int, size: tuple[int, int], chann
     return namespace(background).stack([check_background(background[b, ...], size, channels) for b in range(count)])
 
 
-def _images(
-    scenes: Sequence[Scene],
-    size: tuple[int, int],
-    suited: tuple[Engine, Array | None],
-    *,
-    splatter: Splatter,
-    layers: int | Literal["auto"],
-    supersample: int | Adaptive,
-    capacity: int | None,
-) -> Array:
+def _images(scenes: Sequence[Scene], size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
     """The images (B, H, W, C + 1) of several views of one scene, over nothing."""
-    options: dict[str, Any] = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
-    draw, (engine, like) = partial(image_of, size=size, suited=suited, **options), scenes[0].suited
+    differentiates, (engine, like) = context.engine.differentiates, scenes[0].context
     # Where layers are "auto" it may warn, which is for this thread.
-    several = layers != "auto" and _concurrent(scenes[0])
-    whole = layers != "auto" and len(bands_of(*size, layers, supersample)) == 1
-    if whole and not isinstance(supersample, Adaptive):
-        view = supersample * size[0] + 2 * apron_of(splatter), supersample * size[1] + 2 * apron_of(splatter)
-        chunks = _chunks(scenes, at_once(view))
-        place = Picture.of(len(chunks[0]), view)
-        given = [
-            Sampling(own, place._replace(views=len(own)), size, supersample, int(layers), splatter, capacity)
-            for own in chunks
-        ]
+    several = settings.layers != "auto" and _concurrent(scenes[0])
+    if settings.layers != "auto" and settings.side is not None and len(settings.bands(size)) == 1:
+        height, width = (settings.side * n + 2 * settings.apron for n in size)
+        chunks = _chunks(scenes, at_once((height, width)))
+        place = Picture.of(len(chunks[0]), (height, width))
+        given = [Sampling(own, place._replace(views=len(own)), size, settings) for own in chunks]
         if place.views > 1 and all(own.possible for own in given):
             # Of padded rows it is not known which are those of a view, so that there must be one call for all.
             alike = len(given) == 1 and all(shaded_at_once(part) for part in scenes[0].parts)
-            known = capacity is None and engine.concurrent() and engine.on_host(like)
+            known = settings.capacity is None and engine.concurrent() and engine.on_host(like)
             if alike if engine.padded(like) else known:
-                return _as_pictures([sampled_as_one(own) for own in given], scenes, suited, splatter)
-        if several and suited[0].differentiates:
-            views = each(lambda own: sampled_scene(own, own.camera, size, settles=True, **options), scenes)
+                return _as_pictures([sampled_as_one(own) for own in given], scenes, context, settings)
+        if several and differentiates:
+            views = _sampled_at_once(scenes, size, settings)
             pictures = [laid_side_by_side(own, place._replace(views=len(own))) for own in _chunks(views, place.views)]
             found = [picture for picture in pictures if picture is not None]
             if len(found) == len(pictures):
-                return _as_pictures(found, scenes, suited, splatter)
-            return _one_by_one(scenes, views, suited, splatter)
-    elif isinstance(supersample, Adaptive) and several and suited[0].differentiates and supersample.contrast is None:
-        views = each(lambda own: sampled_scene(own, own.camera, size, settles=True, **options), scenes)
-        return _one_by_one(scenes, views, suited, splatter)
-    images = [draw(scene) for scene in (scenes[:1] if several and not suited[0].differentiates else scenes)]
+                return _as_pictures(found, scenes, context, settings)
+            return _one_by_one(scenes, views, context, settings)
+    elif settings.side is None and several and differentiates and settings.contrast is None:
+        return _one_by_one(scenes, _sampled_at_once(scenes, size, settings), context, settings)
+    draw = partial(image_of, size=size, context=context, settings=settings)
+    images = [draw(scene) for scene in (scenes[:1] if several and not differentiates else scenes)]
     if len(images) < len(scenes):
         # A shader may close over arrays of an engine whose transforms belong to this thread.
         images += each(draw, scenes[1:]) if type(images[0]) is np.ndarray else map(draw, scenes[1:])
     return namespace(*images).stack(images)
+
+
+def _sampled_at_once(scenes: Sequence[Scene], size: tuple[int, int], settings: RenderSettings) -> list[Sampled]:
+    """The samples of views, one on each core."""
+    return each(lambda own: sampled_scene(own, own.camera, size, settings, settles=True), scenes)
 
 
 def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:
@@ -160,21 +150,20 @@ def _chunks(views: Sequence[_T], most: int) -> list[Sequence[_T]]:
     return [views[first : first + size] for first in range(0, len(views), size)]
 
 
-def _one_by_one(
-    scenes: Sequence[Scene], views: Sequence[Sampled], suited: tuple[Engine, Array | None], splatter: Splatter
-) -> Array:
+def _one_by_one(scenes: Sequence[Scene], views: Sequence[Sampled], context: Context, settings: RenderSettings) -> Array:
     """The images (B, H, W, C + 1) of views that were sampled, each by a splat of its own."""
-    images = [splatted(own, scene, scene.camera, suited, splatter) for own, scene in zip(views, scenes, strict=True)]
+    pairs = zip(views, scenes, strict=True)
+    images = [splatted(own, scene, scene.camera, context, settings.reader) for own, scene in pairs]
     return namespace(*images).stack(images)
 
 
 def _as_pictures(
-    pictures: Sequence[Views], scenes: Sequence[Scene], suited: tuple[Engine, Array | None], splatter: Splatter
+    pictures: Sequence[Views], scenes: Sequence[Scene], context: Context, settings: RenderSettings
 ) -> Array:
     """The images (B, H, W, C + 1) of views that were sampled, by a splat of each picture."""
     images, cameras = [], [scene.camera for scene in scenes]
-    for views, splats in zip(pictures, views_to_splats(pictures, scenes[0].parts, cameras, *suited), strict=True):
-        cells = views.picture.apart(cropped_image(splatter, splats), views.sampled.apron)
+    for views, splats in zip(pictures, views_to_splats(pictures, scenes[0].parts, cameras, context), strict=True):
+        cells = views.picture.apart(cropped_image(settings.reader, splats), views.sampled.apron)
         xp, (count, height, width, channels), side = namespace(cells), cells.shape, views.sampled.supersample
         if side > 1:
             cells = averaged(xp.reshape(cells, (count * height, width, channels)), side)
@@ -184,8 +173,7 @@ def _as_pictures(
 
 def _concurrent(scene: Scene) -> bool:
     """Whether several threads may sample the scene at once."""
-    chosen = (suited_sampler(s, part, scene.camera) for s, part in zip(scene.samplers, scene.parts, strict=True))
-    engine, like = scene.suited
+    engine, like = scene.context
     # On devices work is queued by thread.
     on_host = like is None or engine.on_host(like)
-    return on_host and engine.concurrent() and all(sampler.concurrent for sampler in chosen)
+    return on_host and engine.concurrent() and all(sampler.concurrent for sampler in scene.chosen())

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from rts.appearance import add_footprint, apart, evaluate, shade, shaded_at_once, theta_of
 from rts.camera import Camera
 from rts.checks import check_splats
-from rts.engines import Engine, constants, engine_of, namespace, suiting
+from rts.engines import Context, context_of, engine_of, namespace
 from rts.errors import InputError
 from rts.operations.projection import projective_map_of_views
 from rts.operations.take import take, take_shifted
 from rts.parts import CheckedPart
 from rts.records import ON_RAYS, Fine, Sampled, Samples, Splats
+from rts.rendering.scene import Grid
+from rts.rendering.shade import add_footprint, apart, evaluate, shade, shaded_at_once, theta_of
 from rts.row_cameras import RowCameras
-from rts.sampling.scenes import Wide
 from rts.sampling.several import Views, in_one_table
 from rts.threads import each
-from rts.trees import Array
+from rts.trees import Array, Tree
 
 
 def to_splats(
@@ -28,8 +29,7 @@ def to_splats(
     parts: Sequence[CheckedPart],
     camera: Camera,
     window: Camera,
-    engine: Engine,
-    like: Array | None,
+    context: Context,
 ) -> Splats:
     """Evaluate, shade and project samples: what splatters take, with the apron as border. Fine ones are left out.
 
@@ -38,23 +38,30 @@ def to_splats(
         parts: checked parts.
         camera: the camera of the whole image, which shaders see.
         window: the camera of the samples.
-        engine: the engine to compute with.
-        like: an array that sets dtype and device of its constants and of the splats.
+        context: the engine to compute with, and what its constants and the splats are like.
     """
-    grid, apron = tuple(sampled.row.shape[1:]), sampled.apron
-    wide = Wide(window.with_apron((grid[0] - 2 * apron, grid[1] - 2 * apron), apron), grid)
-    if not engine.owns(sampled.row):
-        sampled = constants(sampled, engine, like if engine.differentiates else None)
-    positions, rgba = _together(*_shown(sampled.samples, sampled.row, parts, camera, wide, engine, like))
-    return _splats(sampled, positions, rgba, engine, border=apron)
+    height, width, apron = *sampled.row.shape[1:], sampled.apron
+    grid = Grid.around(window, (height - 2 * apron, width - 2 * apron), apron)
+    sampled = _owned(sampled, sampled.row, context)
+    positions, rgba = _together(*_shown(sampled.samples, sampled.row, parts, camera, grid, context))
+    return _splats(sampled, positions, rgba, context, border=apron)
+
+
+def _owned(tree: Tree, row: Array, context: Context) -> Tree:
+    """Samples in arrays of the engine, one of which is `row`."""
+    return tree if context.engine.owns(row) else _of_inputs(context).constants(tree)
+
+
+def _of_inputs(context: Context) -> Context:
+    """The context of what is computed from: without derivatives it keeps the dtypes that are given."""
+    return context if context.engine.differentiates else context._replace(like=None)
 
 
 def views_to_splats(
     pictures: Sequence[Views],
     parts: Sequence[CheckedPart],
     cameras: Sequence[Camera],
-    engine: Engine,
-    like: Array | None,
+    context: Context,
 ) -> list[Splats]:
     """The splats of pictures of several views: those of a picture have no border, but cells that are wanted.
 
@@ -65,17 +72,14 @@ def views_to_splats(
         pictures: the samples of the views; pictures are of one size.
         parts: checked parts.
         cameras: the camera of each view, in order, which shaders see.
-        engine: the engine to compute with.
-        like: an array that sets dtype and device of its constants and of the splats.
+        context: as in `to_splats`.
     """
     sampled = [picture.sampled for picture in pictures]
-    if not engine.owns(sampled[0].row):
-        sampled = constants(sampled, engine, like if engine.differentiates else None)
-    grid, border = pictures[0].picture.view, sampled[0].apron
-    wides = [Wide(c.with_apron((grid[0] - 2 * border, grid[1] - 2 * border), border), grid) for c in cameras]
+    sampled = _owned(sampled, sampled[0].row, context)
+    (height, width), border = pictures[0].picture.view, sampled[0].apron
+    grids = [Grid.around(camera, (height - 2 * border, width - 2 * border), border) for camera in cameras]
     shown = [
-        _shown_in_views(index, part, pictures, sampled, cameras, wides, engine, like)
-        for index, part in enumerate(parts)
+        _shown_in_views(index, part, pictures, sampled, cameras, grids, context) for index, part in enumerate(parts)
     ]
     made, start = [], 0
     for picture, whole in zip(pictures, sampled, strict=True):
@@ -83,7 +87,7 @@ def views_to_splats(
         of_parts = [_of_views(tables, pictures, index, here) for index, tables in enumerate(shown)]
         positions, rgba = _together(*zip(*of_parts, strict=True))
         wanted = engine_of(positions).constant(picture.picture.inside(border), positions)
-        made.append(_splats(whole, positions, rgba, engine, wanted=wanted))
+        made.append(_splats(whole, positions, rgba, context, wanted=wanted))
     return made
 
 
@@ -103,37 +107,31 @@ def _counts_of(pictures: Sequence[Views], part: int) -> np.ndarray | None:
     return np.concatenate(known) if len(known) == len(pictures) else None
 
 
-def _places_of(pictures: Sequence[Views], engine: Engine, like: Array) -> Array:
+def _places_of(pictures: Sequence[Views], context: Context) -> Array:
     """(B, 3) of each view what is added to columns and lines in its picture, and by what depth is multiplied."""
     corners = np.concatenate([picture.picture.corners() for picture in pictures]).astype(np.float32)
-    scales = [constants(picture.scales, engine, like) for picture in pictures]
+    scales = [context.constants(picture.scales) for picture in pictures]
     xp = namespace(*scales)
-    return xp.concat([constants(corners, engine, like), xp.concat(scales)[:, None]], axis=1)
+    return xp.concat([context.constants(corners), xp.concat(scales)[:, None]], axis=1)
 
 
-def _splats(sampled: Sampled, positions: Array, rgba: Array, engine: Engine, **more: Any) -> Splats:
+def _splats(sampled: Sampled, positions: Array, rgba: Array, context: Context, **more: Any) -> Splats:
     """The splats of samples whose positions and colours are known; `more` of their fields are given."""
-    part = None if sampled.one_part else sampled.part
-    cells = sampled.row, part, sampled.facing, sampled.settled, sampled.exit
-    if not engine.owns(rgba):
-        cells = constants(cells, *suiting(positions, rgba))
-    *cells, exits = cells
-    return Splats(positions, rgba, *cells, exit=exits, one_part=sampled.one_part, **more)
+    cells, part = replace(sampled.cells, depth=None), None if sampled.one_part else sampled.part
+    if not context.engine.owns(rgba):
+        cells, part = context_of(positions, rgba).constants((cells, part))
+    return Splats(positions, rgba, cells, part, one_part=sampled.one_part, **more)
 
 
-def to_fine_splats(
-    fine: Fine, parts: Sequence[CheckedPart], camera: Camera, engine: Engine, like: Array | None
-) -> Splats:
+def to_fine_splats(fine: Fine, parts: Sequence[CheckedPart], camera: Camera, context: Context) -> Splats:
     """Evaluate, shade and project fine samples: splats in the places of their layout. Arguments as in `to_splats`."""
-    size = tuple(n * fine.supersample for n in fine.pixel.shape)
-    wide = Wide(camera.with_apron(size, fine.apron), tuple(n + 2 * fine.apron for n in size))
-    if not engine.owns(fine.row):
-        fine = constants(fine, engine, like if engine.differentiates else None)
-    positions, rgba = _together(*_shown(fine.samples, fine.index, parts, camera, wide, engine, like))
-    arrays = fine.index, fine.shift, fine.row, fine.part, fine.facing, fine.settled, fine.wanted
-    index, shift, row, part, facing, settled, wanted = constants(arrays, *suiting(positions, rgba))
+    height, width = (n * fine.supersample for n in fine.pixel.shape)
+    fine, grid = _owned(fine, fine.row, context), Grid.around(camera, (height, width), fine.apron)
+    positions, rgba = _together(*_shown(fine.samples, fine.index, parts, camera, grid, context))
+    arrays = fine.index, fine.shift, fine.cells, fine.part, fine.wanted
+    index, shift, cells, part, wanted = context_of(positions, rgba).constants(arrays)
     moved = take_shifted(positions, index, namespace(positions).astype(shift, positions.dtype))
-    return Splats(moved, take(rgba, index), row, part, facing, settled, wanted=wanted, border=fine.apron)
+    return Splats(moved, take(rgba, index), cells, part, wanted=wanted, border=fine.apron)
 
 
 def _shown(
@@ -141,40 +139,36 @@ def _shown(
     row: Array,
     parts: Sequence[CheckedPart],
     camera: Camera,
-    wide: Wide,
-    engine: Engine,
-    like: Array | None,
+    grid: Grid,
+    context: Context,
 ) -> tuple[list[Array], list[Array]]:
-    """Positions (N, 3) in a grid and colours (N, C + 1) of the samples of each part.
+    """Positions (N, 3) and colours (N, C + 1) of the samples of each part, all of one engine.
 
     Args:
         sampled: the samples of each part.
         row: integers, those of them that are seen.
         parts: checked parts.
         camera: the camera of the whole image, which shaders see.
-        wide: the grid, and its camera.
-        engine: the engine to compute with.
-        like: an array that sets dtype and device of its constants and of what is returned.
+        grid: the cells of the samples, and their camera.
+        context: the engine to compute with, and what the results are like.
     """
-    dtype = like
-    if not engine.differentiates:
-        like = None  # All is constant, and computed in the dtypes that are given.
-    seen = wide.camera.replace(view=constants(wide.camera.view, engine, like))
-    camera = constants(camera, engine, dtype)
+    inputs, engine = _of_inputs(context), context.engine
+    seen = grid.camera.replace(view=inputs.constants(grid.camera.view))
+    camera = context.constants(camera)
     positions, colors, first = [], [], 0
     for index, (part, samples) in enumerate(zip(parts, sampled, strict=True)):
-        theta, transform = theta_of(part, engine, like), constants(part.transform, engine, like)
-        local = evaluate(part, samples, engine, like)
+        theta, transform = theta_of(part, inputs), inputs.constants(part.transform)
+        local = evaluate(part, samples, inputs)
         own = seen.within(transform)
-        add_footprint(part, samples, local, own, wide.grid, engine, like)
+        add_footprint(part, samples, local, own, grid.size, inputs)
         world, rgba = shade(part, theta, transform, samples, local, camera, engine)
-        positions.append(constants(own.project(_on_rays(samples, local["position"]), wide.grid), engine, dtype))
+        positions.append(context.constants(own.project(_on_rays(samples, local["position"]), grid.size)))
         check_splats(index, part, world, positions[-1], rgba, row, first)
-        colors.append(constants(rgba, engine, dtype))
+        colors.append(context.constants(rgba))
         first += samples.ids.shape[-2]
     if not engine.owns(colors[0]) or (len(parts) > 1 and engine_of(colors) is not engine):
         # A shader may close over arrays of an engine that the scene has none of.
-        positions, colors = constants((positions, colors), *suiting(positions, colors))
+        positions, colors = context_of(positions, colors).constants((positions, colors))
     return positions, colors
 
 
@@ -184,9 +178,8 @@ def _shown_in_views(
     pictures: Sequence[Views],
     sampled: Sequence[Sampled],
     cameras: Sequence[Camera],
-    wides: Sequence[Wide],
-    engine: Engine,
-    like: Array | None,
+    grids: Sequence[Grid],
+    context: Context,
 ) -> tuple[Array, Array]:
     """Positions (N, 3) in their pictures and colours (N, C + 1) of the samples of a part in several views.
 
@@ -196,29 +189,26 @@ def _shown_in_views(
         pictures: the views.
         sampled: their samples, in arrays of the engine.
         cameras: of the whole image of each view.
-        wides: the grid of each view, and its camera.
-        engine: the engine to compute with.
-        like: as in `_shown`.
+        grids: the cells of each view, and their camera.
+        context: as in `_shown`.
     """
-    dtype = like
-    if not engine.differentiates:
-        like = None
+    inputs, engine = _of_inputs(context), context.engine
     whole = in_one_table([own.samples[index] for own in sampled])
-    counts, grid = _counts_of(pictures, index), wides[0].grid
-    theta, transform = theta_of(part, engine, like), constants(part.transform, engine, like)
-    gbuffer = evaluate(part, whole, engine, like)
+    counts, size = _counts_of(pictures, index), grids[0].size
+    theta, transform = theta_of(part, inputs), inputs.constants(part.transform)
+    gbuffer = evaluate(part, whole, inputs)
     view, first = [], 0
     for picture in pictures:
         view.append(picture.view[index] + first if first else picture.view[index])
         first += picture.picture.views
-    (view,) = _together([constants(own, engine, like) for own in view])
-    seen = [w.camera.replace(view=constants(w.camera.view, engine, like)).within(transform) for w in wides]
-    rows = namespace(seen[0].view).stack([own.pixel_rows(grid) for own in seen])
+    (view,) = _together([inputs.constants(own) for own in view])
+    seen = [g.camera.replace(view=inputs.constants(g.camera.view)).within(transform) for g in grids]
+    rows = namespace(seen[0].view).stack([own.pixel_rows(size) for own in seen])
     points = _on_rays(whole, gbuffer["position"])
-    rows, points = constants((rows, points), *suiting(rows, points))
-    places = _places_of(pictures, engine_of(points), points)
-    positions = constants(projective_map_of_views(rows, points, view, places), engine, dtype)
-    cameras = constants(cameras, engine, dtype)
+    rows, points = context_of(rows, points).constants((rows, points))
+    places = _places_of(pictures, Context(engine_of(points), points))
+    positions = context.constants(projective_map_of_views(rows, points, view, places))
+    cameras = context.constants(cameras)
     if shaded_at_once(part):
         camera = cameras[0] if part.shader.uniform else RowCameras.of(cameras, view)
         rgba = shade(part, theta, transform, whole, gbuffer, camera, engine)[1]
@@ -226,7 +216,7 @@ def _shown_in_views(
         assert counts is not None
         shaded = []
         for own, (samples, local) in zip(seen, apart(whole, gbuffer, counts.tolist(), engine), strict=True):
-            add_footprint(part, samples, local, own, grid, engine, like)
+            add_footprint(part, samples, local, own, size, inputs)
             shaded.append((samples, local))
 
         def colored(given: tuple) -> Array:
@@ -236,16 +226,16 @@ def _shown_in_views(
                 none = namespace(local["position"]).broadcast_to(
                     local["position"][:, :1], (0, part.shader.channels + 1)
                 )
-                return constants(none, engine, dtype)
-            return constants(shade(part, theta, transform, samples, local, camera, engine)[1], engine, dtype)
+                return context.constants(none)
+            return context.constants(shade(part, theta, transform, samples, local, camera, engine)[1])
 
         views = list(zip(cameras, shaded, strict=True))
         colors = [colored(views[0])]
         colors += each(colored, views[1:]) if type(colors[0]) is np.ndarray else map(colored, views[1:])
         (rgba,) = _together(colors)
-    rgba = constants(rgba, engine, dtype)
+    rgba = context.constants(rgba)
     if engine_of(rgba) is not engine:
-        positions, rgba = constants((positions, rgba), *suiting(rgba))
+        positions, rgba = context_of(rgba).constants((positions, rgba))
     # Where rows are not used, values are not looked at.
     every = np.arange(gbuffer["position"].shape[0], dtype=np.int32)[None, None] if counts is not None else whole.row
     check_splats(index, part, gbuffer, positions, rgba, every, 0)
@@ -264,9 +254,9 @@ def _on_rays(samples: Samples, position: Array) -> Array:
             f"samples are not centered, and have no table {ON_RAYS!r}: expected (N, 3), where their cells' rays are at "
             f"their depth"
         )
-    engine, like = suiting(position)
-    place = namespace(position).astype(constants(samples.tables[ON_RAYS], engine, like), position.dtype, copy=False)
-    return place + (position - engine.stop_gradient(position))
+    own = context_of(position)
+    place = namespace(position).astype(own.constants(samples.tables[ON_RAYS]), position.dtype, copy=False)
+    return place + (position - own.engine.stop_gradient(position))
 
 
 def _together(*kinds: Sequence[Array]) -> list[Array]:

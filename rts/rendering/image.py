@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -12,38 +10,26 @@ from typing import Any, Literal
 from rts.arguments import quoted
 from rts.camera import Camera
 from rts.channels import cropped_image
-from rts.checks import changed_part, check_background, check_changes, check_channels, check_size, check_splatter
-from rts.engines import (
-    Engine,
-    constants,
-    engine_of,
-    is_constant,
-    namespace,
-    suiting,
-    suiting_scene,
-    uncompiled,
-    value_of,
-)
+from rts.checks import check_background, check_splatter
+from rts.engines import Context, constants, context_of, engine_of, is_constant, namespace, uncompiled, value_of
 from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
-from rts.evaluating import to_fine_splats, to_splats
 from rts.interfaces import Splatter
 from rts.operations.inset import averaged, painted_inset, with_inset
 from rts.parts import Part
 from rts.records import Sampled, Splats
-from rts.sampling.adaptive import Adaptive, finest
+from rts.rendering.samples import coarse_scene, sampled_scene, with_fine
+from rts.rendering.scene import Scene
+from rts.rendering.settings import RenderSettings
+from rts.rendering.splats import to_fine_splats, to_splats
+from rts.sampling.adaptive import Adaptive
 from rts.sampling.emptiness import why_empty
-from rts.sampling.prepared import PreparedParts
-from rts.sampling.pruning import planned
-from rts.sampling.scenes import Scene, apron_of, sampled_scene, with_fine
+from rts.sampling.prepared import Prepared
 from rts.trees import Array
-
-BAND = 2**20
-"""Cells, over all layers, that a supersampled image may have before it is rendered in bands of rows."""
 
 
 @uncompiled
 def render(
-    parts: Part | Sequence[Part] | PreparedParts,
+    parts: Part | Sequence[Part] | Prepared,
     camera: Camera,
     size: tuple[int, int],
     *,
@@ -95,138 +81,59 @@ def render(
         InputWarning: samples in front find no room in `capacity`, outside of `jax.jit`.
     """
     scene = Scene.of(parts, camera, sampler, engine)
-    size = check_size(size, layers, capacity, finest(supersample))
-    options: dict[str, Any] = dict(
-        splatter=check_splatter(splatter), layers=layers, supersample=supersample, capacity=capacity
-    )
-    return _image(scene.at(size), size, check_background(background, size, scene.channels), **options)
+    size, settings = RenderSettings.checked(size, splatter, layers, supersample, capacity)
+    return image_over(scene.at(size), size, check_background(background, size, scene.channels), settings)
 
 
-class Renderer:
-    """Renders prepared parts through one camera again and again; made by `PreparedParts.renderer`.
-
-    What stays is checked and looked up once, and what changes at each call.
-    """
-
-    def __init__(
-        self,
-        parts: PreparedParts,
-        camera: Camera,
-        size: tuple[int, int],
-        *,
-        splatter: Any = "auto",
-        layers: int | Literal["auto"] = 2,
-        supersample: int | Adaptive = 1,
-        background: Any = None,
-        capacity: int | None = None,
-        engine: str | None = None,
-    ):
-        scene, self._engine = Scene.of(parts, camera, "auto", engine), engine
-        self._size = check_size(size, layers, capacity, finest(supersample))
-        self._scene = scene.at(self._size)
-        self._background = check_background(background, self._size, scene.channels)
-        self._options: dict[str, Any] = dict(
-            splatter=check_splatter(splatter), layers=layers, supersample=supersample, capacity=capacity
-        )
-
-    @uncompiled
-    def __call__(self, index: int = 0, **changes: Any) -> Array:
-        """The image, as `render` gives it, with some fields of one part changed.
-
-        Args:
-            index: the part.
-            **changes: its `transform`, `theta`, `shader` or `cull`; they hold for this call alone.
-
-        Returns:
-            (H, W, 4) premultiplied linear RGBA.
-
-        Raises:
-            InputError: there is no such part or field, or what is given does not suit.
-        """
-        scene = self._scene
-        check_changes(index, changes, len(scene.parts))
-        if changes:
-            parts = list(scene.parts)
-            parts[index] = changed_part(index, parts[index], changes)
-            if "shader" in changes:
-                check_background(self._background, self._size, check_channels(parts))
-            suited = suiting_scene(parts, scene.camera, engine=self._engine)
-            scene = scene._replace(parts=parts, suited=suited)
-        return _image(scene, self._size, self._background, **self._options)
+def image_over(scene: Scene, size: tuple[int, int], background: Array | None, settings: RenderSettings) -> Array:
+    """The image of a scene for images of a size, over a checked background; see `render`."""
+    context = scene.context if is_constant(background) else scene.context_with(background)
+    return over_background(seen(image_of(scene, size, context, settings), scene), background)
 
 
-PreparedParts._made = Renderer
-
-
-def _image(scene: Scene, size: tuple[int, int], background: Array | None, **options: Any) -> Array:
-    """The image of a scene for images of a size; see `render`."""
-    suited = scene.suited if is_constant(background) else scene.suiting(background)
-    return over_background(seen(image_of(scene, size, suited, **options), scene), background)
-
-
-def image_of(
-    scene: Scene,
-    size: tuple[int, int],
-    suited: tuple[Engine, Array | None],
-    *,
-    splatter: Splatter,
-    layers: int | Literal["auto"],
-    supersample: int | Adaptive,
-    capacity: int | None,
-) -> Array:
-    """The image of a scene for images of a size, over nothing; `suited` is for the half with derivatives."""
-    options: dict[str, Any] = dict(splatter=splatter, layers=layers, supersample=supersample, capacity=capacity)
-    bands = bands_of(*size, layers, supersample)
-    if isinstance(supersample, Adaptive) and supersample.contrast is not None:
-        return _of_contrast(scene, size, suited, **options)
+def image_of(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
+    """The image of a scene for images of a size, over nothing; `context` is for the half with derivatives."""
+    if settings.contrast is not None:
+        return _of_contrast(scene, size, context, settings)
+    bands, reader = settings.bands(size), settings.reader
     if len(bands) == 1:
-        sampled = _sampled(scene, scene.camera, size, **options)
-        return splatted(sampled, scene, scene.camera, suited, splatter)
+        sampled = _sampled(scene, scene.camera, size, settings)
+        return splatted(sampled, scene, scene.camera, context, reader)
     images = []
     for top, rows in bands:
         window = scene.camera.window(size, (top, 0), (rows, size[1]))
-        take = partial(_sampled, scene, window, (rows, size[1]), **options)
-        images.append(suited[0].checkpoint(take, lambda s, w=window: splatted(s, scene, w, suited, splatter)))
+        take = partial(_sampled, scene, window, (rows, size[1]), settings)
+        images.append(context.engine.checkpoint(take, lambda s, w=window: splatted(s, scene, w, context, reader)))
     return namespace(*images).concat(images)
 
 
-def _sampled(scene: Scene, window: Camera, size: tuple[int, int], *, capacity: int | None, **options: Any) -> Sampled:
+def _sampled(scene: Scene, window: Camera, size: tuple[int, int], settings: RenderSettings) -> Sampled:
     """The samples of a window of the image, with a warning if some that are in front find no room."""
-    sampled = sampled_scene(scene, window, size, settles=True, capacity=capacity, **options)
-    if capacity is not None:
+    sampled = sampled_scene(scene, window, size, settings, settles=True)
+    if settings.capacity is not None:
         left_out, row = value_of(sampled.overflow), value_of(sampled.row)
         # Layers are left out from the deepest on.
         if left_out is not None and left_out.any() and row is not None and not (row[..., 1:, :, :] >= 0).any():
             warn(
-                f"capacity is {capacity}, and {int(left_out.max())} samples find no room, some of them in front: the "
-                f"image has holes; give a larger capacity, or None",
+                f"capacity is {settings.capacity}, and {int(left_out.max())} samples find no room, some of them in "
+                f"front: the image has holes; give a larger capacity, or None",
                 InputWarning,
             )
     return sampled
 
 
-def _of_contrast(
-    scene: Scene,
-    size: tuple[int, int],
-    suited: tuple,
-    *,
-    splatter: Splatter,
-    supersample: Adaptive,
-    **options: Any,
-) -> Array:
+def _of_contrast(scene: Scene, size: tuple[int, int], context: Context, settings: RenderSettings) -> Array:
     """The image with fine samples also where colours change, which are those of the coarse samples."""
-    options = dict(options, splatter=splatter)
-    coarse = sampled_scene(scene, scene.camera, size, supersample=1, **options)
-    splats = to_splats(coarse, scene.parts, scene.camera, scene.camera, *suited)
+    coarse = coarse_scene(scene, scene.camera, size, settings)
+    splats = to_splats(coarse, scene.parts, scene.camera, scene.camera, context)
     colors = value_of(splats.rgba)
     if colors is None or colors.ndim != 2 or value_of(coarse.row) is None:
         raise InputError(
-            f"contrast of Adaptive is {supersample.contrast}, and colours are traced; give None: what is sampled "
-            f"cannot depend on values that are not known yet"
+            f"contrast of Adaptive is {settings.contrast}, and colours are traced; give None: what is sampled cannot "
+            f"depend on values that are not known yet"
         )
-    options |= {"adaptive": supersample, "colors": colors, "needed": scene.needed_by(splatter)}
-    sampled = with_fine(scene, scene.camera, size, coarse, **options)
-    return splatted(sampled, scene, scene.camera, suited, splatter, splats)
+    sampled = with_fine(scene, scene.camera, size, coarse, settings, scene.hidden_by(settings.splatter), colors)
+    return splatted(sampled, scene, scene.camera, context, settings.reader, splats)
 
 
 @uncompiled
@@ -268,10 +175,10 @@ def render_samples(
             f"{len(scene.parts)} parts were given for the samples of {len(sampled.samples)}; pass the same parts"
         )
     splatter = check_splatter(splatter)
-    if apron < apron_of(splatter):
+    if apron < splatter.reach + 1:
         raise InputError(
             f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
-            f"{apron_of(splatter)}; give it to rts.sample, too"
+            f"{splatter.reach + 1}; give it to rts.sample, too"
         )
     if sampled.settled is not None and not (splatter.settles and scene.parts[0].shader.uniform):
         shaders = ", ".join(dict.fromkeys(repr(part.shader) for part in scene.parts))
@@ -279,32 +186,28 @@ def render_samples(
             f"samples of cells amid one colour were left out (settles=True), which {splatter!r} and "
             f"{shaders} need; give rts.sample this splatter and these parts, or leave it out"
         )
-    sampled = _narrowed(sampled, apron - apron_of(splatter))
+    sampled = _narrowed(sampled, apron - splatter.reach - 1)
     background = check_background(background, size, scene.channels)
-    suited = scene.suiting(sampled, background)
-    return over_background(splatted(sampled, scene, scene.camera, suited, splatter), background)
+    context = scene.context_with(sampled, background)
+    return over_background(splatted(sampled, scene, scene.camera, context, splatter), background)
 
 
-def _narrowed(sampled: Sampled, cells: int) -> Sampled:
-    """Samples with an apron that is narrower by some cells."""
-    if cells == 0:
+def _narrowed(sampled: Sampled, count: int) -> Sampled:
+    """Samples with an apron that is narrower by so many cells."""
+    if count == 0:
         return sampled
-    rows, columns = (slice(cells, n - cells) for n in sampled.row.shape[1:])
-    row, depth = (x[:, rows, columns] for x in (sampled.row, sampled.depth))
-    settled = None if sampled.settled is None else sampled.settled[rows, columns]
+    rows, columns = (slice(count, n - count) for n in sampled.row.shape[1:])
     fine = sampled.fine  # Its own apron may be wider than is needed.
     fine = None if fine is None else replace(fine, coarse=fine.coarse[rows, columns])
-    facing = None if sampled.facing is None else sampled.facing[:, rows, columns]
-    exits = None if sampled.exit is None else sampled.exit[rows, columns]
-    known = {"fine": fine, "facing": facing, "settled": settled, "exit": exits}
-    return replace(sampled, row=row, depth=depth, apron=sampled.apron - cells, **known)
+    cells = sampled.cells.map(lambda x: x[..., rows, columns])
+    return replace(sampled, cells=cells, apron=sampled.apron - count, fine=fine)
 
 
 def splatted(
     sampled: Sampled,
     scene: Scene,
     window: Camera,
-    suited: tuple,
+    context: Context,
     splatter: Splatter,
     splats: Splats | None = None,
 ) -> Array:
@@ -314,37 +217,25 @@ def splatted(
         sampled: the samples.
         scene: checked; shaders see the camera of the whole image.
         window: the camera of the samples.
-        suited: the engine to compute with, and an array that sets dtype and device of its constants, or None.
+        context: the engine to compute with, and what its constants are like.
         splatter: a splatter.
         splats: of the samples, but for the fine ones, if they are known.
     """
     fine = sampled.fine
     if fine is None or not fine.flat:
-        splats = splats or to_splats(sampled, scene.parts, scene.camera, window, *suited)
+        splats = splats or to_splats(sampled, scene.parts, scene.camera, window, context)
     if fine is None:
         assert splats is not None
         image = cropped_image(splatter, splats)
         return image if sampled.supersample == 1 else averaged(image, sampled.supersample)
-    finer = to_fine_splats(fine, scene.parts, scene.camera, *suited)
+    finer = to_fine_splats(fine, scene.parts, scene.camera, context)
     small = cropped_image(splatter, finer)
     if splats is None:
         told = fine.pixel, sampled.row[0], sampled.settled
         pixel, row, settled = constants(told, engine_of(small), small)
         return painted_inset(finer.rgba[0, ...], small, pixel, row, settled, fine.supersample)
-    image = cropped_image(splatter, splats.replace(wanted=constants(fine.coarse, *suiting(splats.rgba))))
+    image = cropped_image(splatter, splats.replace(wanted=context_of(splats.rgba).constants(fine.coarse)))
     return with_inset(image, small, constants(fine.pixel, engine_of(image), image), fine.supersample)
-
-
-def bands_of(
-    height: int, width: int, layers: int | Literal["auto"], supersample: int | Adaptive
-) -> list[tuple[int, int]]:
-    """(first row, number of rows) of the bands in which a supersampled image is rendered."""
-    if isinstance(supersample, Adaptive) or supersample == 1:
-        return [(0, height)]
-    rows = max(1, BAND // (planned(layers) * int(supersample) ** 2 * width))
-    count = math.ceil(height / rows)
-    edges = [height * i // count for i in range(count + 1)]
-    return [(top, end - top) for top, end in itertools.pairwise(edges)]
 
 
 def seen(image: Array, scene: Scene, name: str = "the image") -> Array:

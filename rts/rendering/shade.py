@@ -12,7 +12,7 @@ from typing import Any
 from rts.arrays import described, kind_of, shape_of
 from rts.camera import Camera
 from rts.checks import check_shaded
-from rts.engines import Engine, constants, is_constant, namespace
+from rts.engines import Context, Engine, is_constant, namespace
 from rts.errors import InputError
 from rts.footprints import FOOTPRINT, uv_footprint
 from rts.gbuffer import GBuffer
@@ -23,14 +23,14 @@ from rts.row_cameras import RowCameras
 from rts.trees import Array, Tree
 
 
-def evaluate(part: CheckedPart, samples: Samples, engine: Engine, like: Array | None) -> GBuffer:
+def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
     """The part's G-buffer in local space."""
     theta = _read(part)
     if samples.gbuffer is not None and is_constant(theta):
         wanted = part.shader.reads
         if samples.asked is None or (wanted is not None and set(wanted) <= set(samples.asked)):
             return GBuffer(samples.gbuffer)
-    gbuffer = part.surface.evaluate(constants(theta, engine, like), samples)
+    gbuffer = part.surface.evaluate(context.constants(theta), samples)
     if not isinstance(gbuffer, Mapping) or "position" not in gbuffer:
         what = f"one with {sorted(gbuffer)}" if isinstance(gbuffer, Mapping) else kind_of(gbuffer)
         raise InputError(f"evaluate of {part.surface!r} gave {what}; expected an rts.GBuffer with 'position'")
@@ -53,10 +53,10 @@ def shaded_at_once(part: CheckedPart) -> bool:
     return part.shader.uniform or (part.shader.takes_views and tells)
 
 
-def theta_of(part: CheckedPart, engine: Engine, like: Array | None) -> dict[str, Tree]:
+def theta_of(part: CheckedPart, context: Context) -> dict[str, Tree]:
     """The θ that a part's shader sees."""
     reads = part.surface.reads(part.theta)
-    return {k: v if k in reads else constants(v, engine, like) for k, v in part.theta.items()}
+    return {k: v if k in reads else context.constants(v) for k, v in part.theta.items()}
 
 
 def add_footprint(
@@ -65,14 +65,11 @@ def add_footprint(
     local: GBuffer,
     own: Camera,
     grid: tuple[int, int],
-    engine: Engine,
-    like: Array | None,
+    context: Context,
 ) -> None:
     """Add the footprint to the G-buffer of samples in one view, where there is uv; arguments as in `uv_footprint`."""
     if "uv" in local and FOOTPRINT not in local:
-        local.defer(
-            FOOTPRINT, partial(uv_footprint, part.surface, _read(part), samples, local, own, grid, engine, like)
-        )
+        local.defer(FOOTPRINT, partial(uv_footprint, part.surface, _read(part), samples, local, own, grid, *context))
 
 
 def shade(

@@ -1,0 +1,1 @@
+"""Rendering: settings → scene → samples → splats → shade → image, of one view or of several."""

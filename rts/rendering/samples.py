@@ -1,0 +1,163 @@
+"""Scenes sampled: all parts on one grid, without derivative, the half of `rts.render` that knows no colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+
+from rts.arguments import check_flag
+from rts.camera import Camera
+from rts.checks import check_memory
+from rts.engines import is_traced, uncompiled
+from rts.errors import InputError
+from rts.parts import Part
+from rts.records import Hidden, Request, Sampled
+from rts.rendering.scene import Grid, Scene
+from rts.rendering.settings import RenderSettings
+from rts.sampling.adaptive import Adaptive
+from rts.sampling.fine import Where, fine_samples
+from rts.sampling.hidden import HiddenBySplatter, with_layers_that_count, without_hidden
+from rts.sampling.merging import merge
+from rts.sampling.prepared import Prepared
+from rts.sampling.strips import FineGrid, at_cells
+from rts.sampling.validation import check_samples
+from rts.trees import Array
+
+
+@uncompiled
+def sample(
+    parts: Part | Sequence[Part] | Prepared,
+    camera: Camera,
+    size: tuple[int, int],
+    *,
+    sampler: Any = "auto",
+    splatter: Any = None,
+    layers: int | Literal["auto"] = 2,
+    supersample: int | Adaptive = 1,
+    capacity: int | None = None,
+    engine: str | None = None,
+    settles: bool = False,
+) -> Sampled:
+    """Find where the rays through cells' centres meet the surfaces: the half of `render` without derivative.
+
+    Args:
+        parts: as in `render`.
+        camera: as in `render`.
+        size: as in `render`.
+        sampler: as in `render`.
+        splatter: the splatter that the samples are for: the apron suits its reach, and hidden samples that it does not
+            need are dropped. None keeps all, with an apron that suits every built-in splatter.
+        layers: as in `render`.
+        supersample: as in `render`.
+        capacity: as in `render`.
+        engine: as in `render`.
+        settles: leave out samples of a single part of one colour that only cells amid it need, which show this colour
+            whatever moves. What renders them must be given the values of θ, transform and camera that are given here.
+            `render` does so.
+
+    Returns:
+        Samples for `render_samples`, which may be handed to a function under `jax.jit`.
+
+    Raises:
+        InputError: what was given cannot be sampled.
+        EngineError: torch and jax arrays in one scene.
+    """
+    scene = Scene.of(parts, camera, sampler, engine)
+    check_flag("settles", settles)
+    size, settings = RenderSettings.checked(
+        size, "auto" if splatter is None else splatter, layers, supersample, capacity
+    )
+    scene, settings = scene.at(size), replace(settings, splatter=None) if splatter is None else settings
+    if settings.contrast is not None:
+        raise InputError(
+            f"contrast of Adaptive is {settings.contrast}; expected None, since rts.sample knows no colours; render "
+            f"with it, or leave it out"
+        )
+    return sampled_scene(scene, scene.camera, size, settings, settles)
+
+
+def sampled_scene(
+    scene: Scene, camera: Camera, size: tuple[int, int], settings: RenderSettings, settles: bool = False
+) -> Sampled:
+    """The samples of a window of the image, through the camera of this window.
+
+    See `sample`; where `settles`, samples that only cells of one colour need may be left out.
+    """
+    hidden, side = scene.hidden_by(settings.splatter, settles), settings.side
+    if side is not None:
+        return _on_one_grid(scene, camera, size, settings, side, hidden)
+    # Outlines move on the fine grid alone, unless there is no room for some.
+    coarse = _on_one_grid(scene, camera, size, settings, 1, hidden, exits=settings.capacity is not None)
+    return with_fine(scene, camera, size, coarse, settings, hidden)
+
+
+def coarse_scene(scene: Scene, camera: Camera, size: tuple[int, int], settings: RenderSettings) -> Sampled:
+    """One sample a pixel of a window of the image, none of them left out for its colour."""
+    return _on_one_grid(scene, camera, size, settings, 1, scene.hidden_by(settings.splatter))
+
+
+def _on_one_grid(
+    scene: Scene,
+    camera: Camera,
+    size: tuple[int, int],
+    settings: RenderSettings,
+    side: int,
+    hidden: HiddenBySplatter | None,
+    exits: bool = True,
+) -> Sampled:
+    """The samples of side² cells a pixel; with exits where somebody reads them, if asked for."""
+    height, width = side * size[0], side * size[1]
+    gradient, capacity, reader = scene.context.engine.differentiates, settings.capacity, settings.reader
+    check_memory(height, width, settings.most_layers, capacity, gradient=gradient)
+    grid = Grid.sampled(scene, camera, (height, width), settings.apron)
+    request = Request(capacity, facing=reader.reads_facing, exits=exits and reader.reads_exits and gradient)
+    taken = partial(_taken, scene, grid, request)
+    sampled = taken(settings.layers, hidden) if settings.layers != "auto" else with_layers_that_count(taken, hidden)
+    return replace(sampled, supersample=side, apron=settings.apron)
+
+
+def _taken(scene: Scene, grid: Grid, request: Request, count: int, hidden: Hidden | None) -> Sampled:
+    """The samples of a grid of cells, or of those that are listed; less hidden ones that are not needed."""
+    samples, alone, listed = [], len(scene.parts) == 1, request.cells
+    for part, sampler, entry in zip(scene.parts, scene.chosen(), scene.entries, strict=True):
+        camera = grid.camera.within(part.transform)
+        asked = replace(request, entry=entry, hidden=hidden if alone else None)
+        found = sampler.sample(part, camera, grid.size, count, asked)
+        if listed is None or "cells" in found.followed:
+            check_samples(found, grid.size if listed is None else tuple(listed.shape), sampler)
+        else:
+            found = at_cells(check_samples(found, grid.size, sampler), listed, request.capacity)
+        samples.append(found)
+    sampled = merge(samples, count)
+    # Traced arrays have the shape of the worst case, with hidden samples or without.
+    if hidden is None or "hidden" in samples[0].followed or is_traced(sampled.row):
+        return sampled
+    return without_hidden(sampled, hidden.decide)
+
+
+def with_fine(
+    scene: Scene,
+    camera: Camera,
+    size: tuple[int, int],
+    coarse: Sampled,
+    settings: RenderSettings,
+    hidden: HiddenBySplatter | None,
+    colors: np.ndarray | None = None,
+) -> Sampled:
+    """Coarse samples, and fine ones where outlines are; `colors` (N, 4) of the coarse ones are to look for contrast."""
+    adaptive, splatter = settings.supersample, settings.splatter
+    assert isinstance(adaptive, Adaptive)
+    cells = FineGrid(size, adaptive.samples, settings.apron)
+    grid = Grid.sampled(scene, camera, (cells.side * size[0], cells.side * size[1]), cells.apron)
+    where = Where(adaptive, adaptive.dilates(scene.parts), colors)
+    flat = coarse.settled is not None and splatter is not None and splatter.follows_outlines
+
+    def taken(count: int, hidden: Hidden | None, listed: Array, capacity: int | None) -> Sampled:
+        return _taken(scene, grid, Request(capacity, listed, facing=settings.reader.reads_facing), count, hidden)
+
+    fine = fine_samples(coarse, cells, where, taken, hidden, settings.layers, settings.capacity, flat)
+    return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)

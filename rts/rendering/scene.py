@@ -1,0 +1,95 @@
+"""A scene that is checked, once for sampling and shading; and the grids of cells that it is sampled on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from rts.camera import Camera
+from rts.checks import check_ratio, check_sampler, check_scene, suited_sampler
+from rts.engines import Context, context_of_scene
+from rts.interfaces import Sampler, Splatter
+from rts.parts import CheckedPart, Part
+from rts.sampling.hidden import HiddenBySplatter, hidden_by
+from rts.sampling.prepared import Prepared
+from rts.sampling.winding import warn_of_winding
+from rts.trees import Tree
+from rts.unread import warn_of_unread
+
+
+class Scene(NamedTuple):
+    """A checked scene.
+
+    Attributes:
+        parts: checked parts.
+        camera: the camera of the whole image.
+        samplers: the sampler of each part, as the user chose it.
+        entries: what each sampler has built for its part, or None.
+        sizes: of each part the largest number that its surface reads, where that is known; else None.
+        context: the engine of parts and camera, and an array that sets dtype and device of its constants.
+    """
+
+    parts: list[CheckedPart]
+    camera: Camera
+    samplers: Sequence[Sampler]
+    entries: Sequence[Any]
+    sizes: Sequence[float | None]
+    context: Context
+
+    @property
+    def channels(self) -> int:
+        """The number of channels that its shaders give, besides alpha."""
+        return self.parts[0].shader.channels
+
+    @classmethod
+    def of(cls, parts: Part | Sequence[Part] | Prepared, camera: Camera, sampler: Any, engine: str | None) -> Scene:
+        """The scene of what the user gave."""
+        prepared = isinstance(parts, Prepared)
+        checked, camera = check_scene(parts.parts if prepared else parts, camera)
+        warn_of_unread(checked)
+        warn_of_winding(checked, camera)
+        if prepared:
+            known = parts.samplers, parts.entries, parts.sizes
+        else:
+            known = [check_sampler(sampler)] * len(checked), [None] * len(checked), [None] * len(checked)
+        return cls(checked, camera, *known, context_of_scene(checked, camera, engine=engine))
+
+    def at(self, size: tuple[int, int]) -> Scene:
+        """The scene for images of a size."""
+        check_ratio(self.camera, size)
+        return self._replace(camera=self.camera.for_size(size))
+
+    def hidden_by(self, splatter: Splatter | None, settles: bool = False) -> HiddenBySplatter | None:
+        """The rule by which hidden samples are decided; None to keep all. See `rts.sampling.hidden.hidden_by`."""
+        return None if splatter is None else hidden_by(splatter, self.parts, self.sizes, settles)
+
+    def chosen(self) -> list[Sampler]:
+        """The sampler that samples each part."""
+        pairs = zip(self.samplers, self.parts, strict=True)
+        return [suited_sampler(sampler, part, self.camera) for sampler, part in pairs]
+
+    def context_with(self, *others: Tree) -> Context:
+        """As `context`, with further arrays in the scene."""
+        found = context_of_scene(self.parts, self.camera, *others)
+        return found if found.engine.differentiates else self.context
+
+
+class Grid(NamedTuple):
+    """A grid of cells: its camera, constant, and its height and width."""
+
+    camera: Camera
+    size: tuple[int, int]
+
+    @classmethod
+    def around(cls, camera: Camera, size: tuple[int, int], apron: int) -> Grid:
+        """The grid of an image of cells (height, width) with an apron."""
+        return cls(camera.with_apron(size, apron), (size[0] + 2 * apron, size[1] + 2 * apron))
+
+    @classmethod
+    def sampled(cls, scene: Scene, camera: Camera, size: tuple[int, int], apron: int) -> Grid:
+        """As `around`, to sample a scene: its camera is a constant of the scene's engine."""
+        # Every part is sampled by the one engine, and by the very views that samples are projected with.
+        wide = cls.around(camera, size, apron)
+        if not scene.context.engine.differentiates:
+            return wide
+        return wide._replace(camera=scene.context.constants(wide.camera))

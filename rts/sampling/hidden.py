@@ -1,0 +1,217 @@
+"""Hidden samples: which of them can reach the image, and how many layers of them a scene needs.
+
+Others are dropped before they cost anything.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from rts.engines import engine_of, is_constant, namespace, value_of
+from rts.errors import InputError, LayersWarning, warn
+from rts.interfaces import Splatter, TriangleSurface
+from rts.operations.operation import known_value
+from rts.parts import CheckedPart
+from rts.records import ArraySpec, Decision, Hidden, Question, Sampled, Samples
+from rts.sampling.exits import beside_outlines
+from rts.sampling.extremes import largest
+from rts.sampling.packing import too_far
+from rts.trees import leaves
+
+LAYER_LIMIT = 8
+"""The largest number of layers that `layers="auto"` takes."""
+
+
+def planned(layers: int | Literal["auto"]) -> int:
+    """Layers to count with before they are known."""
+    return 4 if layers == "auto" else int(layers)
+
+
+def hidden_by(
+    splatter: Splatter, parts: Sequence[CheckedPart], sizes: Sequence[float | None], settles: bool
+) -> HiddenBySplatter | None:
+    """The rule by which hidden samples of a scene are decided; None to keep all.
+
+    Hidden samples are only without effect if all samples are opaque and lie on cells' centres; and only if numbers of
+    the scene are not so large that rounding reorders depths. Where these are not known, since they are traced, the
+    sampler looks at the triangles, unless samples are refined.
+
+    Args:
+        splatter: the splatter.
+        parts: checked parts.
+        sizes: of each part the largest number of those that its surface reads, or None where it is to be looked for.
+        settles: whether samples of a scene of one part may be left out that only cells amid its one colour need. Where
+            samples are to be evaluated at other values of θ than they were found for, they may not.
+    """
+    if not splatter.prunes or not all(p.shader.opaque for p in parts):
+        return None
+    size = _size(parts, sizes)
+    if size is None and not all(isinstance(p.surface, TriangleSurface) and not p.surface.refines for p in parts):
+        return None
+    # Where parts meet, rounding decides which of them a cell shows.
+    settles = settles and splatter.settles and len(parts) == 1 and parts[0].shader.uniform
+    return HiddenBySplatter(splatter, size or 0.0, settles)
+
+
+def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float | None:
+    """The largest number of those that surfaces read; None where one is traced."""
+    size = 0.0
+    for part, known in zip(parts, sizes, strict=True):
+        read = {name: part.theta[name] for name in part.surface.reads(part.theta)}
+        if known is not None and is_constant(read):
+            size = max(size, known)
+            continue
+        for x in leaves(read):
+            value = known_value(x)
+            if value is None:
+                return None
+            if value.dtype in (np.float32, np.float64):
+                size = max(size, largest(value))
+    return size
+
+
+@dataclass(frozen=True)
+class HiddenBySplatter:
+    """What a splatter needs of the samples of an image.
+
+    Attributes:
+        splatter: the splatter.
+        size: of the largest number that surfaces read; 0 where that is not known.
+        settles: whether all samples have one colour, and the splatter makes use of it.
+    """
+
+    splatter: Splatter
+    size: float
+    settles: bool
+
+    def decide(self, question: Question, wanted: np.ndarray | None = None) -> Decision:
+        """The samples that can reach the image, or those of its cells (H, W) that are `wanted`."""
+        covered, depth, size = question
+        too_rough = (self.settles or len(covered) > 1) and too_far(max(size, self.size), depth)
+        needed = covered if too_rough or len(covered) == 1 else self._needed(covered, depth)
+        if not self.settles:
+            return Decision(needed, None, needed)
+        if too_rough:
+            return Decision(needed, np.full(covered.shape[1:], -1, np.int8), needed)
+        from rts.sampling import interiors_kernels
+
+        kept = needed.copy()
+        # Beside cells that are not wanted, what decides for others is not settled, and may look at one cell more.
+        reach = self.splatter.reach + (wanted is not None)
+        amid = interiors_kernels.settle(covered, depth, kept, reach, wanted)
+        return Decision(kept, numbers_of(amid), needed)
+
+    def _needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        kept = self.splatter.needed(covered, depth)
+        if not (isinstance(kept, np.ndarray) and kept.shape == covered.shape and kept.dtype == bool):
+            given = f"{kept.dtype} of {kept.shape}" if isinstance(kept, np.ndarray) else type(kept).__name__
+            raise InputError(
+                f"needed of {self.splatter!r} gave {given}; expected a NumPy array, bool of {covered.shape}"
+            )
+        return kept & covered
+
+
+def numbers_of(settled: np.ndarray) -> np.ndarray:
+    """`Cells.settled` of a scene of one part, (H, W) int8: the first sample in cells that are settled (H, W) bool."""
+    return settled.view(np.int8) - np.int8(1)
+
+
+def with_layers_that_count(taken: Callable[[int, Hidden | None], Sampled], hidden: Hidden | None) -> Sampled:
+    """The scene with as many layers as its image needs.
+
+    Args:
+        taken: samples the scene with a number of layers, less what a rule drops.
+        hidden: the rule; None to keep all.
+    """
+    count = 3  # A closed surface before nothing needs two: the second at its outlines.
+    while True:
+        # At the limit one more is taken, to know what is missing there.
+        sampled = taken(min(count, LAYER_LIMIT + 1), hidden)
+        row = value_of(sampled.row)
+        if row is None:
+            raise InputError('layers is "auto", but the values that decide are traced; give a number of layers')
+        others = tuple(axis for axis in range(row.ndim) if axis != row.ndim - 3)
+        counts = (row[..., 1:, :, :] >= 0).sum(axis=others)
+        most = 1 + int(np.flatnonzero(np.append(1, counts)).max())
+        if (most < count and not _ran_out(sampled)) or count > LAYER_LIMIT:
+            break
+        count *= 2
+    missing = int(counts[LAYER_LIMIT - 1 :].sum())
+    if missing:
+        warn(
+            f"{missing} cells where surfaces hide one another have more than the {LAYER_LIMIT} layers of "
+            f'layers="auto"; give a larger number if their derivative matters',
+            LayersWarning,
+        )
+    cells = sampled.cells.first(min(most, LAYER_LIMIT))
+    return replace(sampled, cells=cells, overflow=sampled.overflow + missing)
+
+
+def _ran_out(sampled: Sampled) -> bool:
+    """Whether triangles ran out in some cells before all layers of a refined surface were found: there may be more."""
+    known = (None if s.ran_out is None else value_of(s.ran_out) for s in sampled.samples)
+    return any(bool(x) for x in known if x is not None)
+
+
+def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> Sampled:
+    """The scene without the samples that a decision does not keep; one host call."""
+    sizes = [s.ids.shape[0] for s in sampled.samples]
+    total, part = sum(sizes), sampled.part
+
+    def host(row: np.ndarray, depth: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
+        from rts.sampling.hidden_kernels import Numbering
+
+        if row.max(initial=-1) >= total:
+            raise InputError(f"row refers to sample {row.max()} of {total}; sample this scene anew")
+        numbering, covered = Numbering(sizes), row >= 0
+        kept = decide(Question(covered, depth)).needed
+        own_rows, exits = rest[: len(sizes)], rest[len(sizes) :]
+        if exits:
+            if (most := exits[0].max(initial=-1)) >= total:
+                raise InputError(f"exit refers to sample {most} of {total}; sample this scene anew")
+            near = np.full(exits[0].size, -1, np.int32)
+            cells = beside_outlines(kept)[0]
+            near[cells] = exits[0].reshape(-1)[cells]
+            exits = (near.reshape(exits[0].shape),)
+            numbering.use(exits[0], exits[0] >= 0)
+        numbering.use(row, kept)
+        indices = [index if len(index) else np.zeros(1, np.int32) for index in numbering.indices()]
+        own_rows = [numbering.renumbered(own, part=i) for i, own in enumerate(own_rows)]
+        return numbering.renumbered(row), *own_rows, *map(numbering.renumbered, exits), *indices
+
+    rows = sampled.row, *(s.row for s in sampled.samples), *([] if sampled.exit is None else [sampled.exit])
+    shapes = [ArraySpec(tuple(r.shape), np.int32) for r in rows]
+    packed = [ArraySpec((n,), np.int32, packed=True) for n in sizes]
+    found = engine_of(sampled).call_host(host, (*shapes, *packed), rows[0], sampled.depth, *rows[1:])
+    row, own_rows, indices = found[0], found[1 : 1 + len(sizes)], found[len(rows) :]
+    exits = None if sampled.exit is None else found[1 + len(sizes)]
+    samples = [_selected(*z) for z in zip(sampled.samples, own_rows, indices, strict=True)]
+    xp = namespace(row)
+    # Row numbers are within parts up to here, since an engine may have padded what comes before.
+    start = indices[0].shape[0]
+    for i, index in enumerate(indices[1:], start=1):
+        row = xp.where((row >= 0) & (part == i), row + start, row)
+        exits = None if exits is None else xp.where((exits >= 0) & (part[0] == i), exits + start, exits)
+        start += index.shape[0]
+    depth = xp.where(row >= 0, sampled.depth, 0.0)
+    cells = replace(sampled.cells, row=row, depth=depth, exit=exits)
+    return replace(sampled, samples=tuple(samples), cells=cells)
+
+
+def _selected(samples: Samples, row: Any, index: Any) -> Samples:
+    """Some of the rows of the samples of a part."""
+    xp = namespace(index)
+    gbuffer = samples.gbuffer
+    tables = samples.tables.items()
+    return replace(
+        samples,
+        tables={k: xp.take(v, index, axis=0) if k in samples.by_sample else v for k, v in tables},
+        ids=xp.take(samples.ids, index, axis=0),
+        params=xp.take(samples.params, index, axis=0),
+        gbuffer=None if gbuffer is None else {k: xp.take(v, index, axis=0) for k, v in gbuffer.items()},
+        cells=replace(samples.cells, row=row, depth=xp.where(row >= 0, samples.depth, 0.0), exit=None),
+    )
