@@ -1,44 +1,68 @@
-"""What plugins can do, read off their classes: what `rts.plugins(group, details=True)` says of each."""
+"""Capabilities of registered plugins: what `rts plugins` and `rts.plugins(…, details=True)` says of each."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-METHODS: Mapping[str, Mapping[str, str]] = {
-    "rts.surfaces": {"triangles": "proxy", "rays": "intersect"},
-}
-"""Group → capability → the method that a plugin with it has."""
+from rts.errors import PluginError
+from rts.plugin_base import PROMISES, overrides, promised
 
-VARIABLES: Mapping[str, Mapping[str, Any]] = {
-    "rts.engines": {"differentiates": True},
-    "rts.surfaces": {"refines": False, "depends_on_view": False},
-    "rts.samplers": dict.fromkeys(
-        ("culls", "prunes", "takes_cells", "tells_facing", "tells_exits", "concurrent"), False
-    ),
-    "rts.shaders": {"opaque": False, "uniform": False, "takes_views": False, "reads": None},
+BASES = {
+    "rts.surfaces": "Surface",
+    "rts.samplers": "Sampler",
+    "rts.shaders": "Shader",
+    "rts.splatters": "Splatter",
+    "rts.engines": "Engine",
+}
+"""Group → the name of the base in `rts`."""
+
+METHODS: Mapping[str, Mapping[str, tuple[str, str]]] = {
+    "rts.surfaces": {
+        "triangles": ("TriangleSurface", "proxy"),
+        "rays": ("RaySurface", "intersect"),
+        "refines": ("TriangleSurface", "refine"),
+        "depends_on_view": ("TriangleSurface", "proxy_key"),
+    },
     "rts.splatters": {
-        "layers": None,
-        "reach": 1,
-        "reads_facing": False,
-        "prunes": False,
-        "sums_products": False,
-        "sums_losses": False,
-        "takes_losses": False,
+        "prunes": ("Splatter", "needed"),
+        "sums_products": ("Splatter", "normal_equations"),
+        "sums_losses": ("Splatter", "mean_loss"),
     },
 }
-"""Group → class variable of its base → its default, for plugins of other classes."""
+"""Group → capability → the base and its method that a plugin with it overrides."""
+
+VARIABLES: Mapping[str, tuple[str, ...]] = {
+    "rts.engines": ("differentiates",),
+    "rts.samplers": ("culls", "prunes", "takes_cells", "tells_facing", "tells_exits", "concurrent"),
+    "rts.shaders": ("opaque", "uniform", "takes_views", "reads"),
+    "rts.splatters": ("layers", "reach", "reads_facing", "takes_losses"),
+}
+"""Group → class variables of its base that are told."""
 
 
 def capabilities(group: str, plugin: Any) -> dict[str, Any]:
-    """Name → value: of class variables of the group's base, and whether there are certain methods.
+    """Name → value: of class variables of the group's base, and whether certain methods are overridden.
 
     Args:
         group: such as "rts.samplers".
         plugin: what the entry point names.
+
+    Raises:
+        PluginError: it is not of the group's base.
     """
-    found: dict[str, Any] = {name: hasattr(plugin, method) for name, method in METHODS.get(group, {}).items()}
-    return found | {name: getattr(plugin, name, default) for name, default in VARIABLES[group].items()}
+    import rts  # It imports the registry, which imports this module.
+    from rts.interfaces import FunctionShader
+
+    base = getattr(rts, BASES[group])
+    if group == "rts.shaders" and callable(plugin) and not isinstance(plugin, (type, base)):
+        plugin = FunctionShader(plugin)
+    if not issubclass(plugin if isinstance(plugin, type) else type(plugin), base):
+        raise PluginError(f"{plugin!r}, which is registered in {group}, does not subclass rts.{base.__name__}")
+    methods = METHODS.get(group, {}).items()
+    found: dict[str, Any] = {name: overrides(plugin, method, getattr(rts, of)) for name, (of, method) in methods}
+    told = VARIABLES.get(group, ())
+    return found | {name: (promised if name in PROMISES else getattr)(plugin, name) for name in told}
 
 
 def in_words(capabilities: Mapping[str, Any]) -> str:

@@ -29,6 +29,7 @@ from rts.evaluating import to_fine_splats, to_splats
 from rts.interfaces import Splatter
 from rts.operations.inset import averaged, painted_inset, with_inset
 from rts.parts import Part
+from rts.plugin_base import promised
 from rts.records import Sampled, Splats
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.emptiness import why_empty
@@ -273,7 +274,7 @@ def render_samples(
             f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
             f"{apron_of(splatter)}; give it to rts.sample, too"
         )
-    if sampled.settled is not None and not (splatter.settles and scene.parts[0].shader.uniform):
+    if sampled.settled is not None and not (promised(splatter, "settles") and scene.parts[0].uniform):
         shaders = ", ".join(dict.fromkeys(repr(part.shader) for part in scene.parts))
         raise InputError(
             f"samples of cells amid one colour were left out (settles=True), which {splatter!r} and "

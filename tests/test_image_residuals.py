@@ -468,7 +468,7 @@ def test_what_goes_wrong_in_sampling_stops_the_fit_with_its_reason(target):
 # ------------------------------------------------------------------------------------------------ the protocol
 
 
-class Line:
+class Line(rts.Residuals):
     """Residuals A x − b that know AᵀA."""
 
     def __init__(self, target):

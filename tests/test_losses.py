@@ -17,6 +17,7 @@ from rts.capabilities import capabilities
 from rts.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
+from rts.plugin_base import promised
 from rts_backends.fused import normal_equations as fused_normal
 from rts_backends.fused import splatters as fused
 from rts_backends.fused.losses import cost_and_weight, in_numbers
@@ -405,7 +406,7 @@ def test_residuals_of_ones_own_may_say_their_loss():
         def __call__(self, p):
             return p - torch.tensor([0.0, 0.0, 9.0])
 
-    class Unrelated:
+    class Unrelated:  # No `rts.Residuals`: a function, of which nothing else is looked at.
         def loss(self):
             raise AssertionError
 
@@ -467,7 +468,8 @@ def test_a_splatter_that_is_mixed_with_another_is_asked_for_what_that_takes():
         takes_losses = True
 
     assert capabilities("rts.splatters", fused.Visible)["takes_losses"]
-    assert not Own.takes_losses and not Below.takes_losses and Knowing.takes_losses and fused.Visible.takes_losses
+    found = [promised(kind, "takes_losses") for kind in (Own, Below, Knowing, fused.Visible)]
+    assert found == [False, False, True, True]
 
 
 def test_images_have_a_scale_that_suits_them():

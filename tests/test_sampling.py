@@ -18,7 +18,7 @@ SIZE = (20, 24)
 TRIANGLE_SAMPLERS = [s for s in ("raster", "reference", "embree", "opengl") if s in rts.plugins("samplers")]
 
 
-class Ball:
+class Ball(rts.TriangleSurface):
     """A sphere of radius θ["radius"] (1,), tessellated coarsely and polished along the rays."""
 
     sample_widths = (1, 3)

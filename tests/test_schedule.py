@@ -238,7 +238,7 @@ def test_jax_goes_through_the_stages_that_torch_does():
     np.testing.assert_allclose(ours.history, theirs.history, rtol=1e-2)
 
 
-class Line:
+class Line(rts.Residuals):
     """Residuals of one's own: p − goal, where coarse stages are off, and see nothing but a wall beyond 5."""
 
     def __init__(self, off=0.0, wall=None):

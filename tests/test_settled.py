@@ -11,6 +11,7 @@ from helpers import DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere
 
 import rts
 from rts import splatting
+from rts.plugin_base import promised
 from rts.sampling.interiors_kernels import settle
 from rts.sampling.scenes import sample
 from rts.splatting.layers import dilated
@@ -62,7 +63,7 @@ class Painted(rts.Shader):
     """One colour, an entry of θ."""
 
     opaque = uniform = True
-    reads = ()
+    reads = ("color",)
 
     def __call__(self, theta, gbuffer, camera):
         xp, color = rts.namespace(theta["color"]), theta["color"]
@@ -237,7 +238,7 @@ def test_what_has_its_call_from_elsewhere_promises_no_colour(base):
     kind = rts.plugin("rts.shaders", base)
     body = vars(Stripes)["__call__"]
     for shader in (type("Mixed", (Stripes, kind), {})(), type("Own", (kind,), {"__call__": body})()):
-        assert not shader.uniform and not shader.takes_views
+        assert not promised(shader, "uniform") and not promised(shader, "takes_views")
         alone = mesh_part(SPHERE, shader=shader)
         sampled = sample(alone, CAMERA, SIZE, splatter="visible", settles=True)
         assert sampled.settled is None
@@ -439,8 +440,8 @@ def test_a_class_with_its_own_sums_says_anew_whether_it_follows_outlines():
             return super().accumulate(splats)
 
     kinds = splatting.Single, fused.Single, splatting.Visible, fused.Visible, Sharp
-    assert all(kind().follows_outlines for kind in kinds)
-    assert not any(kind().follows_outlines for kind in (Wide, splatting.Multi, fused.Multi))
+    assert all(promised(kind, "follows_outlines") for kind in kinds)
+    assert not any(promised(kind, "follows_outlines") for kind in (Wide, splatting.Multi, fused.Multi))
 
 
 @pytest.mark.filterwarnings("ignore:capacity is:rts.InputWarning")

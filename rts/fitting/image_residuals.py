@@ -34,6 +34,7 @@ from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
 from rts.interfaces import Residuals, Splatter
 from rts.parts import CheckedPart, Part
+from rts.plugin_base import overrides, promised
 from rts.records import ArraySpec, Fine, Splats
 from rts.rendering import bands_of, render
 from rts.sampling.adaptive import Adaptive, finest
@@ -257,7 +258,7 @@ class ImageResiduals(Residuals):
     @property
     def _ordinary(self) -> bool:
         """Whether residuals are those of this class: a subclass may make others of them."""
-        return type(self).__call__ is ImageResiduals.__call__
+        return not overrides(self, "__call__", ImageResiduals)
 
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
         """Mean loss () of the n residuals, JᵀSJ / n (U, U) and JᵀWr / n (U,) for the U numbers in the parameters.
@@ -274,10 +275,10 @@ class ImageResiduals(Residuals):
         if (
             self._ordinary
             and not self._sigma
-            and splatter.sums_products
+            and overrides(splatter, "normal_equations", Splatter)
             and engine.differentiates
             and self._image_channels == 3
-            and (splatter.takes_losses or not self.loss.robust)
+            and (promised(splatter, "takes_losses") or not self.loss.robust)
             and (self.supersample == 1 or splatter.averages)
             and not (isinstance(self.supersample, Adaptive) and self.supersample.contrast is not None)
         ):
@@ -298,8 +299,9 @@ class ImageResiduals(Residuals):
         """
         splatter = self._splatter
         ordinary = self._ordinary and not self._views and not self._sigma and self._image_channels == 3
-        ordinary = ordinary and self.supersample == 1 and (splatter.takes_losses or not self.loss.robust)
-        found = self._compared(splatter, parameters) if ordinary and splatter.sums_losses else None
+        ordinary = ordinary and self.supersample == 1 and (promised(splatter, "takes_losses") or not self.loss.robust)
+        ordinary = ordinary and overrides(splatter, "mean_loss", Splatter)
+        found = self._compared(splatter, parameters) if ordinary else None
         return self.loss(self(parameters)) if found is None else found
 
     def _compared(self, splatter: Splatter, parameters: Tree) -> Array | None:

@@ -9,12 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rts.adapting import adapted
 from rts.engines import engine_of, is_constant, is_traced, namespace
 from rts.errors import InputError, LayersWarning, warn
 from rts.interfaces import AnyNeeded, Needed, Splatter, TriangleSurface
 from rts.operations.operation import known_value
 from rts.parts import CheckedPart
+from rts.plugin_base import overrides, promised
 from rts.records import ArraySpec, Sampled, Samples
 from rts.sampling.exits import beside_outlines
 from rts.sampling.extremes import largest
@@ -49,13 +49,14 @@ def needed_by(
         settles: whether samples of a scene of one part may be left out that only cells amid its one colour need. Where
             samples are to be evaluated at other values of θ than they were found for, they may not.
     """
-    if not splatter.prunes or not all(p.shader.opaque for p in parts):
+    if not overrides(splatter, "needed", Splatter) or not all(p.shader.opaque for p in parts):
         return None
     size = _size(parts, sizes or [None] * len(parts))
     if size is None and not all(isinstance(p.surface, TriangleSurface) and not p.surface.refines for p in parts):
         return None
     # Where parts meet, rounding decides which of them a cell shows.
-    return _BySplatter(splatter, size, settles and splatter.settles and len(parts) == 1 and parts[0].shader.uniform)
+    settles = settles and promised(splatter, "settles") and len(parts) == 1 and parts[0].uniform
+    return _BySplatter(splatter, size, settles)
 
 
 def _size(parts: Sequence[CheckedPart], sizes: Sequence[float | None]) -> float | None:
@@ -126,8 +127,8 @@ class Inspection(Needed):
         short: number of cells whose layers ran out as they were refined: there may be more behind.
     """
 
-    def __init__(self, needed: AnyNeeded | None):
-        self._needed, self._lock = None if needed is None else adapted(needed, Needed), threading.Lock()
+    def __init__(self, needed: Needed | None):
+        self._needed, self._lock = needed, threading.Lock()
         self.settles = self._needed is not None and self._needed.settles
         self.size = None if self._needed is None else self._needed.size
         self.short = 0
@@ -164,12 +165,22 @@ class Inspection(Needed):
             self.short += cells
 
 
+class ByFunction(Needed):
+    """What a function says."""
+
+    def __init__(self, function: AnyNeeded):
+        self._function = function
+
+    def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """See `Needed`."""
+        return self._function(covered, depth)
+
+
 class Everything(Needed):
     """Keeps all samples of one part of several, which are pruned once they are merged; hands on what ran out."""
 
-    def __init__(self, needed: AnyNeeded):
-        self._needed: Needed = adapted(needed, Needed)
-        self.size = self._needed.size
+    def __init__(self, needed: Needed):
+        self._needed, self.size = needed, needed.size
 
     def __call__(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `Needed`."""
@@ -180,7 +191,7 @@ class Everything(Needed):
         self._needed.ran_out(cells)
 
 
-def as_needed(taken: Callable[[int, Needed], Sampled], needed: AnyNeeded | None) -> Sampled:
+def as_needed(taken: Callable[[int, Needed], Sampled], needed: Needed | None) -> Sampled:
     """The scene with as many layers as count.
 
     Args:
@@ -211,9 +222,8 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: AnyNeeded | None)
     return replace(sampled, row=row, depth=depth, facing=facing, overflow=sampled.overflow + missing)
 
 
-def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
+def prune(sampled: Sampled, needed: Needed) -> Sampled:
     """The scene without the samples that are not needed; one host call."""
-    asked: Needed = adapted(needed, Needed)
     sizes = [s.ids.shape[0] for s in sampled.samples]
     total, part = sum(sizes), sampled.part
 
@@ -223,7 +233,7 @@ def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
         if row.max(initial=-1) >= total:
             raise InputError(f"row refers to sample {row.max()} of {total}; sample this scene anew")
         numbering, covered = Numbering(sizes), row >= 0
-        kept = asked(covered, depth)
+        kept = needed(covered, depth)
         own_rows, exits = rest[: len(sizes)], rest[len(sizes) :]
         if exits:
             if (most := exits[0].max(initial=-1)) >= total:

@@ -14,8 +14,9 @@ from rts.camera import Camera
 from rts.checks import check_memory, check_ratio, check_sampler, check_scene, check_size, check_splatter, suited_sampler
 from rts.engines import Engine, constants, is_traced, suiting_scene, uncompiled
 from rts.errors import InputError
-from rts.interfaces import AnyNeeded, Needed, Sampler, Splatter
+from rts.interfaces import Needed, Sampler, Splatter
 from rts.parts import CheckedPart, Part
+from rts.plugin_base import overrides, promised
 from rts.records import Sampled, Samples
 from rts.sampling.adaptive import Adaptive, finest
 from rts.sampling.cache import Entry
@@ -207,7 +208,7 @@ def _taken(
     scene: Scene,
     wide: Wide,
     count: int,
-    needed: AnyNeeded | None,
+    needed: Needed | None,
     *,
     capacity: int | None,
     cells: Array | None = None,
@@ -239,8 +240,8 @@ def _taken(
 def _found(sampler: Sampler, part: Part, camera: Camera, grid: tuple[int, int], count: int, **options: Any) -> Samples:
     """What `sample` of a sampler gives, refused where it does not fit; arguments as there."""
     found = sampler.sample(part, camera, grid, count, **options)
-    if type(sampler).sample is TriangleSampler.sample:  # It has made them of fragments that are checked.
-        return found
+    if isinstance(sampler, TriangleSampler) and not overrides(sampler, "sample", TriangleSampler):
+        return found  # It has made them of fragments that are checked.
     cells = options.get("cells")
     return check_samples(found, grid if cells is None else tuple(cells.shape), sampler)
 
@@ -263,7 +264,7 @@ def with_fine(
     wide = widened(scene, camera, (grid.side * size[0], grid.side * size[1]), grid.apron)
     where = Where(adaptive, adaptive.dilates(scene.parts), colors)
     take = partial(_taken, scene, wide, facing=(splatter or Visible()).reads_facing)
-    flat = coarse.settled is not None and splatter is not None and splatter.follows_outlines
+    flat = coarse.settled is not None and splatter is not None and promised(splatter, "follows_outlines")
     fine = fine_samples(coarse, grid, where, take, needed, layers, capacity, flat)
     return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)
 

@@ -19,6 +19,7 @@ from rts.checks import check_memory, suited_sampler
 from rts.engines import engine_of, is_traced, namespace, stopped, value_of
 from rts.interfaces import Needed, Splatter, TriangleSurface
 from rts.parts import CheckedPart
+from rts.plugin_base import overrides
 from rts.records import ArraySpec, Fragments, Sampled, Samples
 from rts.sampling.cache import Entry
 from rts.sampling.extremes import largest
@@ -111,7 +112,8 @@ class Sampling(NamedTuple):
         cameras = [stopped(wide.camera.within(part.transform)) for wide in wides]
         surface, picture, layers = part.surface, self.picture, self.layers
         assert isinstance(surface, TriangleSurface)
-        tells = self.splatter.reads_facing and layers > 1 and part.cull == "none" and surface.tells_pieces
+        tells = self.splatter.reads_facing and layers > 1 and part.cull == "none"
+        tells = tells and overrides(surface, "pieces", TriangleSurface)
         capacity = None if self.capacity is None else picture.views * self.capacity
         shape = Shape(layers, picture.size, capacity, picture.size)
         beside = {
@@ -264,7 +266,7 @@ def in_one_table(samples: Sequence[Samples]) -> Samples:
 def _is_plain(sampler: Any, part: CheckedPart, exits: bool) -> bool:
     """Whether views of a part can be sampled as one; with `exits` where somebody reads them."""
     surface = part.surface
-    if not isinstance(sampler, TriangleSampler) or type(sampler).sample is not TriangleSampler.sample:
+    if not isinstance(sampler, TriangleSampler) or overrides(sampler, "sample", TriangleSampler):
         return False
     if not isinstance(surface, TriangleSurface) or surface.refines or surface.depends_on_view or not surface.centered:
         return False

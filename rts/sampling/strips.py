@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.adapting import adapted
 from rts.engines import Engine, constants, engine_of, namespace
 from rts.interfaces import Needed
 from rts.records import ArraySpec, Fine, Sampled, Samples
@@ -270,7 +269,7 @@ class InStrips(Needed):
 
     def ran_out(self, cells: int) -> None:
         """See `Needed`."""
-        adapted(self._needed, Needed).ran_out(cells)
+        self._needed.ran_out(cells)
 
 
 def arranged(sampled: Sampled, layout: Layout, grid: Grid) -> Fine:

@@ -9,13 +9,13 @@ from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from rts.adapting import adapted, unwrapped
 from rts.arrays import shape_of
 from rts.camera import Camera
 from rts.engines import stopped, value_of
 from rts.errors import InputError, PluginError
-from rts.interfaces import AnyNeeded, Needed, Sampler, TriangleSurface, as_surface
+from rts.interfaces import AnyNeeded, Needed, Sampler, TriangleSurface
 from rts.parts import Part
+from rts.plugin_base import overrides
 from rts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines
@@ -23,6 +23,7 @@ from rts.sampling.extremes import largest
 from rts.sampling.facing import facing as facing_of
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.packing import lift, of_first_row, repack
+from rts.sampling.pruning import ByFunction
 from rts.sampling.settling import on_surface, refined
 from rts.sampling.validation import check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.trees import Array, Tree, leaves, map_leaves
@@ -40,34 +41,24 @@ class TriangleSampler(Sampler):
     What was prepared is kept (`rts.sampling.cache`) until the proxy's inputs change.
 
     Attributes:
-        builds: whether something is worth building once for a proxy; True in a class with its own `prepare`.
-        follows: whether what was prepared can follow moved vertices; True in a class with its own `update`.
         tells_exits: whether `rasterize` knows cull="front", too.
-        concurrent: whether several threads may call `rasterize` at once; those of a sampler that `follows` wait for one
-            another in any case.
+        concurrent: whether several threads may call `rasterize` at once; those of a sampler with an `update` wait
+            for one another in any case.
     """
 
-    DECLARES = True
-    FLAGS = {"prepare": "builds", "update": "follows"}
-    builds: bool = False
-    follows: bool = False
     culls = True
     prunes = True
     takes_cells = True
     tells_facing = True
     _keeper: Keeper
 
-    def __init_subclass__(cls, **options: Any) -> None:
-        """Refuse what would never be called."""
-        super().__init_subclass__(**options)
-        if cls.follows and not cls.builds:
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Give every instance a keeper, whatever `__init__` a subclass has; refuse what would never be called."""
+        if overrides(cls, "update", TriangleSampler) and not overrides(cls, "prepare", TriangleSampler):
             raise PluginError(
                 f"{cls.__qualname__} has an update, which adapts what prepare built, and no prepare; write prepare, or "
                 f"leave update out"
             )
-
-    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Give every instance a keeper, whatever `__init__` a subclass has."""
         self = super().__new__(cls)
         self._keeper = Keeper()
         return self
@@ -192,13 +183,13 @@ class TriangleSampler(Sampler):
 
     def _entry(self, surface: TriangleSurface, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
         """What `_built` gives, kept from call to call where that pays."""
-        if surface.proxy_is_cheap and not self.builds:
+        if surface.proxy_is_cheap and not overrides(self, "prepare", TriangleSampler):
             proxy = checked_proxy(surface, inputs, camera, size)
             return Entry(proxy, self.prepare(proxy))
         beside = surface.proxy_key(inputs, camera, size) if surface.depends_on_view else None
 
         def follow(old: Entry) -> Entry | None:
-            if not self.follows or old.prepared is None:
+            if not self._follows or old.prepared is None:
                 return None
             proxy = checked_proxy(surface, inputs, camera, size)
             if not same_faces(old.proxy, proxy):
@@ -208,7 +199,7 @@ class TriangleSampler(Sampler):
             return None if updated is None else Entry(proxy, updated, largest(proxy.vertices))
 
         key = (fingerprint(inputs), beside)
-        return self._keeper.get(unwrapped(surface), key, lambda: self._built(surface, inputs, camera, size), follow)
+        return self._keeper.get(surface, key, lambda: self._built(surface, inputs, camera, size), follow)
 
     def sample(
         self,
@@ -244,11 +235,11 @@ class TriangleSampler(Sampler):
         """
         surface, camera = _of_triangles(part.surface), camera.for_size(size)
         shape = Shape(layers, size if cells is None else tuple(cells.shape), capacity, size)
-        tells = facing and layers > 1 and part.cull == "none" and surface.tells_pieces
+        tells = facing and layers > 1 and part.cull == "none" and overrides(surface, "pieces", TriangleSurface)
         tells = tells and not (surface.refines and surface.refine_moves)
         exits = exits and part.cull == "back" and cells is None and not surface.refines and surface.centered
         tables = shape.tables(surface) if surface.refines else {}
-        wanted: Needed | None = None if needed is None else adapted(needed, Needed)
+        wanted = needed if needed is None or isinstance(needed, Needed) else ByFunction(needed)
         settles = wanted is not None and wanted.settles and not surface.refines
         beside = {
             **({"facing": ArraySpec((layers, *shape.size), np.int16)} if tells else {}),
@@ -407,7 +398,12 @@ class TriangleSampler(Sampler):
     @property
     def draws_at_once(self) -> bool:
         """Whether several threads may draw what is prepared of one surface at once."""
-        return self.concurrent and not self.follows
+        return self.concurrent and not self._follows
+
+    @property
+    def _follows(self) -> bool:
+        """Whether what was prepared can follow moved vertices."""
+        return overrides(self, "update", TriangleSampler)
 
 
 class _Found(NamedTuple):
@@ -428,12 +424,11 @@ class _Found(NamedTuple):
     exits: Exits | None = None
 
 
-def _of_triangles(given: Any) -> TriangleSurface:
+def _of_triangles(surface: Any) -> TriangleSurface:
     """The surface, which must be one of triangles."""
-    surface = as_surface(given)
     if not isinstance(surface, TriangleSurface):
         raise InputError(
-            f"{given!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
+            f"{surface!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
         )
     return surface
 

@@ -13,6 +13,7 @@ from rts import splatting
 from rts.arrays import without_border
 from rts.engines import engine_of
 from rts.fitting.losses import SQUARE, Loss
+from rts.plugin_base import overrides
 from rts.records import Splats
 from rts.trees import Array
 from rts_backends.fused import mean_loss
@@ -26,7 +27,7 @@ class _Fused(splatting.Kernel):
     kind: ClassVar[str]
     averages = True
     takes_losses = True
-    _knows_settled = True
+    settles = splatting.Kernel.settles
 
     def image(self, splats: Splats) -> Array:
         """See `rts.splatting.Kernel`."""
@@ -36,7 +37,7 @@ class _Fused(splatting.Kernel):
 
     def cropped(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
-        if type(self).image is not _Fused.image:  # A subclass has an `image` of its own.
+        if overrides(self, "image", _Fused):  # A subclass has an `image` of its own.
             return super().cropped(splats)
         if splats.rgba.shape[0] == 0:
             return without_border(super().image(splats), splats.border)
@@ -64,8 +65,7 @@ class _Fused(splatting.Kernel):
     @property
     def _sweeps(self) -> bool:
         """Whether the image is that of compiled kernels: a subclass may have one of its own."""
-        kind = type(self)
-        return kind.image is _Fused.image and kind.cropped is _Fused.cropped
+        return not (overrides(self, "image", _Fused) or overrides(self, "cropped", _Fused))
 
     def _settings(self, border: int, one_part: bool = False) -> Settings:
         return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border, one_part, *self._motions)
