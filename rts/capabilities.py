@@ -51,18 +51,19 @@ def capabilities(group: str, plugin: Any) -> dict[str, Any]:
     Raises:
         PluginError: it is not of the group's base.
     """
-    import rts  # It imports the registry, which imports this module.
-    from rts.interfaces import FunctionShader
-
-    base = getattr(rts, BASES[group])
-    if group == "rts.shaders" and callable(plugin) and not isinstance(plugin, (type, base)):
-        plugin = FunctionShader(plugin)
-    if not issubclass(plugin if isinstance(plugin, type) else type(plugin), base):
-        raise PluginError(f"{plugin!r}, which is registered in {group}, does not subclass rts.{base.__name__}")
-    methods = METHODS.get(group, {}).items()
-    found: dict[str, Any] = {name: overrides(plugin, method, getattr(rts, of)) for name, (of, method) in methods}
-    told = VARIABLES.get(group, ())
-    return found | {name: (promised if name in PROMISES else getattr)(plugin, name) for name in told}
+    kind = plugin if isinstance(plugin, type) else type(plugin)
+    bases = {c.__name__: c for c in kind.__mro__ if c.__module__.partition(".")[0] == "rts"}
+    if BASES[group] not in bases:
+        if group == "rts.shaders" and callable(plugin) and plugin is not kind:  # A function.
+            return {name: getattr(plugin, name, None if name == "reads" else False) for name in VARIABLES[group]}
+        raise PluginError(f"{plugin!r}, which is registered in {group}, does not subclass rts.{BASES[group]}")
+    found: dict[str, Any] = {
+        name: base in bases and overrides(plugin, method, bases[base])
+        for name, (base, method) in METHODS.get(group, {}).items()
+    }
+    return found | {
+        name: (promised if name in PROMISES else getattr)(plugin, name) for name in VARIABLES.get(group, ())
+    }
 
 
 def in_words(capabilities: Mapping[str, Any]) -> str:

@@ -155,13 +155,9 @@ def test_what_does_not_subclass_its_base_is_refused_by_its_name():
         show(part.replace(surface=duck))
     with pytest.raises(rts.InputError, match="the shader of part 0 is .*, or an object whose class subclasses rts.Sha"):
         show(part.replace(shader=duck))
-    with pytest.raises(
-        rts.InputError, match="the splatter is .*a name, or an object whose class subclasses rts.Sp"
-    ):
+    with pytest.raises(rts.InputError, match="the splatter is .*a name, or an object whose class subclasses rts.Sp"):
         show(part, splatter=duck)
-    with pytest.raises(
-        rts.InputError, match="the sampler is .*a name, or an object whose class subclasses rts.Sa"
-    ):
+    with pytest.raises(rts.InputError, match="the sampler is .*a name, or an object whose class subclasses rts.Sa"):
         show(part, sampler=duck)
 
 

@@ -108,7 +108,7 @@ def fit(
         tolerance: stop when the loss has not fallen by this fraction in `patience` steps ("lm": in an accepted step).
         patience: the number of steps that `tolerance` speaks of; not for "lm".
         schedule: stages, one after the other, each from where the one before ended: the resolutions at which images are
-            compared, such as `rts.pyramid(size)`. For `ImageResiduals`, or residuals with a method `at_stage`.
+            compared, such as `rts.pyramid(size)`. For `ImageResiduals`, or other `rts.Residuals` with `at_stage`.
         callback: called as `callback(step, parameters, loss)`; a true result stops the fit, later stages included.
         progress: show a progress bar with loss and ms/iteration; default only on a terminal.
         jit: compile with jax (no effect on torch). Turn off if `residuals` cannot be traced.
