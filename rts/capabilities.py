@@ -61,9 +61,9 @@ def capabilities(group: str, plugin: Any) -> dict[str, Any]:
         name: base in bases and overrides(plugin, method, bases[base])
         for name, (base, method) in METHODS.get(group, {}).items()
     }
-    return found | {
-        name: (promised if name in PROMISES else getattr)(plugin, name) for name in VARIABLES.get(group, ())
-    }
+    for name in VARIABLES.get(group, ()):
+        found[name] = promised(plugin, name) if name in PROMISES else getattr(plugin, name)
+    return found
 
 
 def in_words(capabilities: Mapping[str, Any]) -> str:

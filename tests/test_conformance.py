@@ -778,7 +778,7 @@ SHADERS = {
     "it_reads_what_it_says": {
         "color unsaid": shading(reads=("uv",)),
         "normal unsaid": shading(by_length, reads=("color",)),
-        "θ unsaid": shading(lambda c, t, g: c * (1 if "light" in t else 0.5), reads=("color", "uv")),
+        "θ unsaid": shading(lambda c, t, g: 0 * c + (1 if "color" in t else 0.5), reads=("uv", "normal")),
     },
     "samples_of_several_views_are_shaded_as_by_each": {
         "one view": one_view,

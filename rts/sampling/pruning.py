@@ -222,7 +222,7 @@ def as_needed(taken: Callable[[int, Needed], Sampled], needed: Needed | None) ->
     return replace(sampled, row=row, depth=depth, facing=facing, overflow=sampled.overflow + missing)
 
 
-def prune(sampled: Sampled, needed: Needed) -> Sampled:
+def prune(sampled: Sampled, needed: AnyNeeded) -> Sampled:
     """The scene without the samples that are not needed; one host call."""
     sizes = [s.ids.shape[0] for s in sampled.samples]
     total, part = sum(sizes), sampled.part

@@ -12,7 +12,7 @@ from rts import registry
 from rts.camera import Camera
 from rts.checks import check_sampler
 from rts.gbuffer import GBuffer
-from rts.interfaces import TriangleSurface
+from rts.interfaces import Surface, TriangleSurface
 from rts.parts import Part
 from rts.records import Sampled
 from rts.sampling.prepared import prepare
@@ -33,7 +33,7 @@ SCALES = 1, 0.9, 0.8, 0.7, 0.8
 """Factors of θ, call after call: more than are kept (`rts.sampling.cache.KEPT`), and one that is."""
 
 
-class Elsewhere:
+class Elsewhere(Surface):
     """A surface that no sampler can sample: it has neither triangles nor an intersection."""
 
     sample_widths = (0, 2)

@@ -27,13 +27,17 @@ class _Fused(splatting.Kernel):
     kind: ClassVar[str]
     averages = True
     takes_losses = True
-    settles = splatting.Kernel.settles
 
     def image(self, splats: Splats) -> Array:
         """See `rts.splatting.Kernel`."""
         if splats.rgba.shape[0] == 0:
             return super().image(splats)
         return self._of(splats.replace(border=0))
+
+    @property
+    def settles(self) -> bool:
+        """See `rts.splatting.Kernel`, of this image, too."""
+        return super().settles
 
     def cropped(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
