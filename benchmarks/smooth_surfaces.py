@@ -154,7 +154,7 @@ def patches(kind: str, scene: Scene, tolerance: float) -> Contender:
     surface = scene.surface(tolerance)
     if kind == AS_FOUND:
         # Samples stay where rays meet the triangles, so that they are not at the centres of pixels.
-        marks = {"refines": False, "centered": False, "coarse": 1.0}
+        marks = {"refine": rts.TriangleSurface.refine, "centered": False, "coarse": 1.0}
         surface = changed(surface, type("AsFound", (type(surface),), marks))
 
     def count(size: tuple[int, int]) -> int:

@@ -10,7 +10,6 @@ The surfaces that come with it are attributes, too, loaded when they are first u
 from typing import TYPE_CHECKING, Any
 
 from rts import registry, regularizers
-from rts.adapting import unwrapped
 from rts.camera import Camera
 from rts.diagnostics.gradients import check_gradient, gradient_image
 from rts.diagnostics.tune import Tuned, tune
@@ -163,7 +162,6 @@ __all__ = [
     "save_animation",
     "save_image",
     "tune",
-    "unwrapped",
     "volume_render",
     "warmup",
 ]

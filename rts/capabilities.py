@@ -1,41 +1,70 @@
-"""What plugins can do, read off their classes: what `rts.plugins(group, details=True)` says of each."""
+"""Capabilities of registered plugins: what `rts plugins` and `rts.plugins(…, details=True)` says of each."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-METHODS: Mapping[str, Mapping[str, str]] = {
-    "rts.surfaces": {"triangles": "proxy", "rays": "intersect"},
-}
-"""Group → capability → the method that a plugin with it has."""
+from rts.errors import PluginError
+from rts.plugin_base import PROMISES, overrides, promised
 
-VARIABLES: Mapping[str, Mapping[str, Any]] = {
-    "rts.engines": {"differentiates": True},
-    "rts.surfaces": {"refines": False, "depends_on_view": False},
-    "rts.samplers": {"concurrent": False},
-    "rts.shaders": {"opaque": False, "uniform": False, "takes_views": False, "reads": None},
+BASES = {
+    "rts.surfaces": "Surface",
+    "rts.samplers": "Sampler",
+    "rts.shaders": "Shader",
+    "rts.splatters": "Splatter",
+    "rts.engines": "Engine",
+}
+"""Group → the name of the base in `rts`."""
+
+METHODS: Mapping[str, Mapping[str, tuple[str, str]]] = {
+    "rts.surfaces": {
+        "triangles": ("TriangleSurface", "proxy"),
+        "rays": ("RaySurface", "intersect"),
+        "refines": ("TriangleSurface", "refine"),
+        "depends_on_view": ("TriangleSurface", "proxy_key"),
+    },
     "rts.splatters": {
-        "layers": None,
-        "reach": 1,
-        "reads_facing": False,
-        "prunes": False,
-        "sums_products": False,
-        "takes_losses": False,
+        "prunes": ("Splatter", "needed"),
+        "sums": ("SummingSplatter", "normal_equations"),
     },
 }
-"""Group → class variable of its base → its default, for plugins of other classes."""
+"""Group → capability → the base and its method that a plugin with it overrides."""
+
+VARIABLES: Mapping[str, tuple[str, ...]] = {
+    "rts.engines": ("differentiates",),
+    "rts.samplers": ("concurrent",),
+    "rts.shaders": ("opaque", "uniform", "takes_views", "reads"),
+    "rts.splatters": ("layers", "reach", "reads", "fills_interiors"),
+}
+"""Group → class variables of its base that are told."""
 
 
 def capabilities(group: str, plugin: Any) -> dict[str, Any]:
-    """Name → value: of class variables of the group's base, and whether there are certain methods.
+    """Name → value: of class variables of the group's base, and whether certain methods are overridden.
 
     Args:
         group: such as "rts.samplers".
         plugin: what the entry point names.
+
+    Raises:
+        PluginError: it is not of the group's base.
     """
-    found: dict[str, Any] = {name: hasattr(plugin, method) for name, method in METHODS.get(group, {}).items()}
-    return found | {name: getattr(plugin, name, default) for name, default in VARIABLES[group].items()}
+    kind = plugin if isinstance(plugin, type) else type(plugin)
+    bases = {c.__name__: c for c in kind.__mro__ if c.__module__.partition(".")[0] == "rts"}
+    if BASES[group] not in bases:
+        if group == "rts.shaders" and callable(plugin) and plugin is not kind:  # A function.
+            return {name: getattr(plugin, name, None if name == "reads" else False) for name in VARIABLES[group]}
+        raise PluginError(f"{plugin!r}, which is registered in {group}, does not subclass rts.{BASES[group]}")
+    found: dict[str, Any] = {
+        name: base in bases and overrides(plugin, method, bases[base])
+        for name, (base, method) in METHODS.get(group, {}).items()
+    }
+    # What depends on settings is that of the default ones.
+    told = kind() if group == "rts.splatters" and plugin is kind else plugin
+    for name in VARIABLES.get(group, ()):
+        found[name] = promised(told, name) if name in PROMISES else getattr(told, name)
+    return found
 
 
 def in_words(capabilities: Mapping[str, Any]) -> str:
@@ -45,8 +74,8 @@ def in_words(capabilities: Mapping[str, Any]) -> str:
         shown = name.replace("_", " ")
         if value is True:
             words.append(shown)
-        elif isinstance(value, (tuple, list)):
-            words.append(f"{shown} {' '.join(map(str, value)) or 'nothing'}")
+        elif isinstance(value, (tuple, list, frozenset)):
+            words.append(f"{shown} {' '.join(sorted(map(str, value))) or 'nothing'}")
         elif value is not False and value is not None:
             words.append(f"{shown} {value}")
     return ", ".join(words)

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 from rts import registry
-from rts.adapting import adapted
 from rts.arguments import check_pixels, quoted
 from rts.arrays import described, from_numbers, is_finite, shape_of
 from rts.camera import Camera
 from rts.engines import floating_bits, value_of
-from rts.errors import AspectWarning, InputError, warn
+from rts.errors import AspectWarning, InputError, PluginError, warn
 from rts.gbuffer import GBuffer
-from rts.interfaces import Sampler, Shader, Splatter, as_surface
+from rts.interfaces import FunctionShader, RaySurface, Sampler, Shader, Splatter, Surface, TriangleSurface
 from rts.parts import CheckedPart, Part
+from rts.plugin_base import check_members
 from rts.trees import Array, placed_leaves
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}
@@ -83,15 +83,10 @@ def _check_camera(camera: Camera) -> Camera:
 
 
 def _check_part(index: int, part: Part) -> CheckedPart:
-    surface = as_surface(part.surface)
-    if surface is None:
-        raise InputError(f"the surface of part {index} is {quoted(part.surface)}; expected an object such as a mesh")
+    surface = _check_surface(part.surface, f"the surface of part {index}")
     if min(surface.sample_widths) < 0:
         raise InputError(f"{surface!r} has no sample_widths; expected (I, P), the integers and reals of a sample")
-    chosen = registry.instance("rts.shaders", part.shader)
-    shader = adapted(chosen, Shader)
-    if shader is None:
-        raise InputError(f"the shader of part {index} is {quoted(chosen)}; expected a name or a function")
+    shader = check_shader(part.shader, f"the shader of part {index}")
     theta, transform = from_numbers(part.theta, f"part {index}'s theta"), part.transform
     if transform is not None:
         transform = check_matrix(f"the transform of part {index}", transform)
@@ -152,7 +147,7 @@ def changed_part(index: int, part: CheckedPart, changes: Mapping[str, Any]) -> C
 
 def check_sampler(chosen: Any) -> Sampler:
     """A usable sampler from a name, a class or an object."""
-    return _checked_plugin("rts.samplers", chosen, Sampler, "sample")
+    return checked_plugin(registry.instance("rts.samplers", chosen), "the sampler", Sampler)
 
 
 def suited_sampler(chosen: Sampler, part: Part, camera: Camera | None) -> Sampler:
@@ -163,19 +158,45 @@ def suited_sampler(chosen: Sampler, part: Part, camera: Camera | None) -> Sample
 
 def check_splatter(chosen: Any) -> Splatter:
     """A usable splatter from a name, a class or an object."""
-    found = _checked_plugin("rts.splatters", chosen, Splatter, "image")
+    found = checked_plugin(registry.instance("rts.splatters", chosen), "the splatter", Splatter)
     if not (is_count(found.reach)):
         raise InputError(f"reach of {found!r} is {found.reach!r}; expected cells, an integer of at least 1")
     return found
 
 
-def _checked_plugin(group: str, chosen: Any, base: type, method: str) -> Any:
-    instance = registry.instance(group, chosen)
-    found = adapted(instance, base)
-    if found is None:
-        kind = group.removeprefix("rts.").removesuffix("s")
-        raise InputError(f"the {kind} is {quoted(instance)}; expected a name or an object with a method {method!r}")
-    return found
+def check_shader(chosen: Any, what: str) -> Shader:
+    """A usable shader from a name, a class, an object or a function; `what` names it."""
+    found = registry.instance("rts.shaders", chosen)
+    found = FunctionShader(found) if callable(found) and not isinstance(found, Shader) else found
+    return checked_plugin(found, what, Shader, "a function, ")
+
+
+def _check_surface(surface: Any, what: str) -> Surface:
+    checked_plugin(surface, what, Surface, "such as a mesh, ")
+    for base, method in ((TriangleSurface, "proxy"), (RaySurface, "intersect")):
+        if hasattr(surface, method) and not isinstance(surface, base):
+            raise PluginError(f"{type(surface).__qualname__} has the methods of rts.{base.__name__}; subclass that")
+    return surface
+
+
+def checked_plugin(given: Any, what: str, base: type, others: str = "a name, ") -> Any:
+    """An object of a subclass of the base of its kind, whose members are not misspelt.
+
+    Args:
+        given: the object.
+        what: names it, such as "the sampler".
+        base: the base.
+        others: what else may be given.
+
+    Raises:
+        InputError: it is of no such class.
+        PluginError: a function of its class is named almost like an optional member.
+    """
+    if not isinstance(given, base):
+        bases = "rts.TriangleSurface or rts.RaySurface" if base is Surface else f"rts.{base.__name__}"
+        raise InputError(f"{what} is {quoted(given)}; expected {others}or an object whose class subclasses {bases}")
+    check_members(type(given))
+    return given
 
 
 def check_matrix(name: str, matrix: Any) -> Array:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 import numpy as np
 
 from rts import registry
-from rts.adapting import Plugin, adapted
 from rts.errors import EngineError, InputError, PluginError, RtsError
+from rts.plugin_base import Plugin, check_members
 from rts.trees import Array, Tree, collected, map_leaves
 
 if TYPE_CHECKING:
@@ -282,9 +282,10 @@ def engine_named(name: str) -> Engine:
         PluginError: it cannot be loaded.
     """
     if name not in _ENGINES:
-        engine = adapted(registry.plugin("rts.engines", name)(), Engine)
-        if engine is None:
-            raise PluginError(f"the engine {name!r} is not an rts.Engine, nor has its methods; subclass it")
+        engine = registry.plugin("rts.engines", name)()
+        if not isinstance(engine, Engine):
+            raise PluginError(f"the engine {name!r} is {engine!r}; expected a class that subclasses rts.Engine")
+        check_members(type(engine))
         _ENGINES[name] = engine
     return _ENGINES[name]
 

@@ -18,7 +18,7 @@ from rts.sampling.adaptive import Adaptive
 from rts.sampling.auto import Choice, choose, is_static
 from rts.sampling.prepared import Prepared
 from rts.sampling.winding import INSIDE_OUT, is_inside_out
-from rts.unread import Observed, likely_name, unread
+from rts.unread import Observed, likely_name, shaded_by, unread
 
 FEW = 32
 """Pixels along each side of the image that shows what shaders read."""
@@ -53,7 +53,7 @@ def explain(
     """
     checked, seen = check_scene(parts.parts if isinstance(parts, Prepared) else parts, camera)
     found = None
-    shaded: list[Any] = [part.shader.reads_theta for part in checked]
+    shaded: list[Any] = [shaded_by(part) for part in checked]
     if size is not None:
         found = sample(parts, camera, size, splatter=splatter, layers=layers, supersample=supersample)
         if None in shaded:

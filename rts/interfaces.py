@@ -1,7 +1,7 @@
 """What plugins implement: a base class for each kind, with every optional member, its default and its contract.
 
-A plugin subclasses its base. An object of another class will do if it has the required members: it is wrapped
-(`rts.adapting`).
+A plugin subclasses its base; a plain function is a shader, too. What a class overrides, and which of its promises
+hold, is found out by `rts.plugin_base`.
 Shapes use the letters of `rts.records`; conventions of space are in `rts.camera`.
 """
 
@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple, final
 
 import numpy as np
 
-from rts.adapting import Plugin, adapted
+from rts.arguments import quoted
 from rts.arrays import from_numbers, shape_of, without_border
 from rts.engines import constants, engine_of, exemplar, namespace, stopped
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
+from rts.plugin_base import Plugin, overrides
 from rts.records import ArraySpec, Cells, Proxy, RayHits, Rays, Request, Samples, Splats
 from rts.trees import Array, Tree, map_leaves
 
@@ -65,26 +66,6 @@ class Evaluator(Plugin):
         Returns:
             "position" (N, 3) and further attributes, each (N, C), in θ's dtype.
         """
-
-
-def _promise_anew(cls: type, method: str, promises: Sequence[str], base: type) -> None:
-    """Have a class with a method of its own, or of another base, not inherit what was promised of the one it replaces.
-
-    Args:
-        cls: the class, as it is made.
-        method: the name of the method.
-        promises: names of members that promise something of it. They become those of `base`, unless they come from the
-            class that the method comes from, or from one that has no such method yet.
-        base: declares the method and these members.
-    """
-
-    def place(name: str) -> int:
-        return next(i for i, c in enumerate(cls.__mro__) if name in vars(c))
-
-    for name in promises:
-        promised = getattr(cls.__mro__[place(name)], method)
-        if place(method) < place(name) and promised is not getattr(base, method):
-            setattr(cls, name, getattr(base, name))
 
 
 class Surface(Evaluator):
@@ -154,23 +135,27 @@ class TriangleSurface(Surface):
 
     Attributes:
         proxy_is_cheap: whether making the triangles costs no more than looking whether their inputs have changed.
-        depends_on_view: whether the triangles depend on camera and size; True in a class with its own `proxy_key`.
-        refines: whether samples on the triangles go through `refine`; True in a class with its own `refine`.
         refine_moves: whether `refine` moves samples or drops them. Where it only adds to what they carry, hidden ones
             are left out before.
-        tells_pieces: whether its triangles are known to be oriented alike; True in a class with its own `pieces`.
         face_count: how many triangles there are, or None if that is not known beforehand; the sampler "auto" goes by
             it.
     """
 
-    FLAGS = {"refine": "refines", "proxy_key": "depends_on_view", "pieces": "tells_pieces"}
-
     proxy_is_cheap: bool = False
-    depends_on_view: bool = False
-    refines: bool = False
     refine_moves: bool = True
-    tells_pieces: bool = False
     face_count: int | None = None
+
+    @property
+    @final
+    def refines(self) -> bool:
+        """Whether samples on the triangles go through `refine`: it is overridden."""
+        return overrides(self, "refine", TriangleSurface)
+
+    @property
+    @final
+    def depends_on_view(self) -> bool:
+        """Whether the triangles depend on camera and size: `proxy_key` is overridden."""
+        return overrides(self, "proxy_key", TriangleSurface)
 
     @abc.abstractmethod
     def proxy_inputs(self, theta: Mapping[str, Tree]) -> Tree:
@@ -196,7 +181,7 @@ class TriangleSurface(Surface):
     def proxy_key(self, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Hashable:
         """A value that changes when triangles must be rebuilt for another reason than their inputs, e.g. the camera.
 
-        Only called if `depends_on_view` is True. The default is the view itself: triangles are rebuilt for each.
+        Override it only where triangles depend on the view. This one gives the view itself: they are rebuilt for each.
         """
         return size, *(m.tobytes() for m in camera)
 
@@ -301,11 +286,6 @@ class RaySurface(Surface):
         """
 
 
-def as_surface(given: Any) -> Any:
-    """A surface with all members of its bases, or None where it is none; see `rts.adapting.adapted`."""
-    return adapted(given, Surface, TriangleSurface, RaySurface)
-
-
 # ------------------------------------------------------------------------------------------------------------ samplers
 
 
@@ -356,18 +336,20 @@ class Sampler(Plugin):
 
 
 class Shader(Plugin):
-    """Colours samples. Any function with the signature of `__call__` will do.
+    """Colours samples. Any function with the signature of `__call__` will do; its attributes are those of a shader.
+
+    Promises but for `opaque` are of a class and its `__call__`: a subclass with its own has to say so itself.
 
     Attributes:
+        channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
         opaque: a promise that alpha is 1.
         uniform: a promise that all samples of a part have one colour, through whatever camera. It may depend on θ.
-        reads: the entries of the G-buffer that it needs besides position; None for all.
-        reads_theta: the entries of θ that it reads where they are there; None if it does not say. `rts.explain` lists
-            entries that nobody reads, and what is almost one of these is warned of.
-        takes_views: whether a call may be of samples of several views, as `rts.render_views` then makes it: `camera` is
-            an `rts.RowCameras`, whose methods give a row for each sample. A shader that says so also says what it
-            `reads`, without "uv_footprint". A subclass with its own `__call__` has to say so itself.
-        channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
+        takes_views: a promise that a call may be of samples of several views, as `rts.render_views` then makes it:
+            `camera` is an `rts.RowCameras`, whose methods give a row for each sample. A shader that says so also says
+            what it `reads`, without "uv_footprint".
+        reads: a promise that it needs no entries but these, of the G-buffer besides position and of θ; None for all.
+            Samples then carry no others. `rts.explain` lists entries of θ that nobody reads, and what is almost one of
+            these is warned of.
     """
 
     channels: int = 3
@@ -375,12 +357,6 @@ class Shader(Plugin):
     uniform: bool = False
     takes_views: bool = False
     reads: tuple[str, ...] | None = None
-    reads_theta: tuple[str, ...] | None = None
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        """What another `__call__` does is promised anew."""
-        super().__init_subclass__(**options)
-        _promise_anew(cls, "__call__", ["takes_views", "uniform", "reads_theta"], Shader)
 
     @abc.abstractmethod
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
@@ -400,9 +376,26 @@ class Shader(Plugin):
         """
 
 
-def _image_of_arrays(given: Any, splats: Splats) -> Array:
-    """What `Splatter.image` does for an object that only has `splat(positions, rgba, row)`."""
-    return given.splat(splats.positions, splats.rgba, splats.row)
+class FunctionShader(Shader):
+    """A function as a shader, with the attributes of a shader that it has."""
+
+    def __init__(self, function: Callable[..., Array]):
+        self.function = function
+        for name in ("channels", "opaque", "uniform", "takes_views", "reads"):
+            setattr(self, name, getattr(function, name, getattr(Shader, name)))
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+        """See `Shader`."""
+        return self.function(theta, gbuffer, camera)
+
+    def __repr__(self) -> str:
+        return quoted(self.function)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FunctionShader) and self.function == other.function
+
+    def __hash__(self) -> int:
+        return hash(self.function)
 
 
 class Splatter(Plugin):
@@ -411,39 +404,18 @@ class Splatter(Plugin):
     Attributes:
         layers: how many layers it looks at, from the front; None for all that there are.
         reach: how many cells away from its own, along either axis, a sample may have an effect.
-        reads_facing: whether it reads `Splats.facing`, which is found only then.
-        reads_exits: whether it reads `Splats.exit`, which is found only then.
-        prunes: whether it says which samples it needs; True in a class with its own `needed`.
-        sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
-        takes_losses: whether normal equations may be asked for with another `loss` than the square. A subclass with its
-            own `normal_equations` has to say so itself.
-        averages: whether its normal equations may be asked for with a target of fewer pixels than there are cells.
-        settles: whether it reads `Splats.settled`: where all nine samples around a cell are fronts of one opaque
-            colour, on cells' centres, and no hidden one beside them is `needed`, the cell has that colour, whatever
-            moves by little and whatever colours others have; and samples farther than `reach` from all other cells
-            need not be there: where `Splats.wanted` is told, those farther than one cell more from the others of them.
-        follows_outlines: whether, of samples of one colour, cells whose nine neighbours are fronts show this colour and
-            those that have none show nothing, where `rts.Adaptive` sees no outline: hidden samples have no effect.
+        reads: which of "facing" and "exit" of `Cells` it reads; these are found only then.
+        fills_interiors: a promise on samples of one opaque colour, on cells' centres. A cell shows this colour where
+            all nine samples around it are fronts and no hidden one beside them is `needed`, and nothing where none of
+            the nine is there, whatever moves by little. A cell that is `settled` shows the colour of that sample,
+            whatever samples there are; so those farther than `reach` from all other cells need not be there, or where
+            `Splats.wanted` is told, those farther than one cell more from the others of them.
     """
-
-    FLAGS = {"needed": "prunes", "normal_equations": "sums_products"}
-    STAND_INS = {"image": ("splat", _image_of_arrays)}
 
     layers: int | None = None
     reach: int = 1
-    reads_facing: bool = False
-    reads_exits: bool = False
-    prunes: bool = False
-    sums_products: bool = False
-    takes_losses: bool = False
-    averages: bool = False
-    settles: bool = False
-    follows_outlines: bool = False
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        """What other sums take is said anew."""
-        super().__init_subclass__(**options)
-        _promise_anew(cls, "normal_equations", ["takes_losses"], Splatter)
+    reads: frozenset[str] = frozenset()
+    fills_interiors: bool = False
 
     @abc.abstractmethod
     def image(self, splats: Splats) -> Array:
@@ -475,7 +447,7 @@ class Splatter(Plugin):
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """The samples that can reach the image, in value or derivative, where all are opaque and on pixel centres.
 
-        Others are dropped before they are evaluated. Host arrays.
+        Others are dropped before they are evaluated, in a class that overrides it. Host arrays.
 
         Args:
             covered: (K, H, W) bool.
@@ -486,6 +458,11 @@ class Splatter(Plugin):
         """
         return covered
 
+
+class SummingSplatter(Splatter):
+    """A splatter that can sum up the normal equations of an image without the Jacobian of it."""
+
+    @abc.abstractmethod
     def normal_equations(
         self,
         splats: Splats,
@@ -499,20 +476,18 @@ class Splatter(Plugin):
         """Normal equations of the n residuals weight · (image − target), without their Jacobian.
 
         Args:
-            splats: the samples; without their border there are h × w cells, each a pixel. Where the class says
-                `averages` there may be s h × s w, and a pixel is the mean of s × s cells.
+            splats: the samples; without their border there are s h × s w cells, and a pixel is the mean of s × s.
             t_positions: (T, N, 3), tangents of positions along T directions.
             t_rgba: (T, N, 4), tangents of colours; None for zeros.
             target: (h, w, C): alpha (C = 1), colours (3) or both (4).
             weights: (h, w, 1) or (h, w, C); None for ones.
             background: (h, w, 4), what the image is composited onto, or None.
-            loss: of the residuals; None for the square. Given only where the class says `takes_losses`.
+            loss: of the residuals; None for the square.
 
         Returns:
             Mean loss (), JᵀSJ / n (T, T) and JᵀWr / n (T,), where W and S are diagonals of `loss.weights(r)`, ones for
             the square; None where it cannot work on these arrays.
         """
-        return None
 
 
 def _checked_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Splats:
@@ -536,18 +511,13 @@ def _checked_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Spl
 
 
 class Residuals(Plugin):
-    """What `rts.fit` makes small: any function of parameters will do.
+    """Function of parameters that `rts.fit` makes small. A plain function will do, which has none of the other methods.
 
     Attributes:
-        sums_products: whether it gives normal equations; True in a class with its own `normal_equations`.
-        has_stages: whether it can be had at other resolutions; True in a class with its own `at_stage`.
         loss: what their mean is taken of, an `rts.Loss`; None for the square. What `at_stage` gives has its own, or
             where that is None this one.
     """
 
-    FLAGS = {"normal_equations": "sums_products", "at_stage": "has_stages"}
-    sums_products: bool = False
-    has_stages: bool = False
     loss: Loss | None = None
 
     @abc.abstractmethod

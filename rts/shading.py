@@ -29,6 +29,7 @@ from rts.errors import InputError
 from rts.footprints import FOOTPRINT
 from rts.gbuffer import GBuffer
 from rts.interfaces import Shader
+from rts.plugin_base import promised
 from rts.row_cameras import RowCameras
 from rts.textures import WRAPS, sample_texture
 from rts.trees import Array, Tree, map_leaves
@@ -46,7 +47,6 @@ class Silhouette(Shader):
     opaque = True
     uniform = True
     reads = ()
-    reads_theta = ()
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -62,7 +62,6 @@ class Normals(Shader):
     opaque = True
     takes_views = True
     reads = ("normal",)
-    reads_theta = ()
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -75,8 +74,7 @@ class Depth(Shader):
 
     opaque = True
     takes_views = True
-    reads = ()
-    reads_theta = ("depth_range",)
+    reads = ("depth_range",)
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -105,20 +103,14 @@ class Unlit(Shader):
     opaque: bool = True
     mip: bool = False
     takes_views = True
-    reads = ("color", "uv")
-    reads_theta = ("texture", "color")
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        """Another base colour may read other entries."""
-        super().__init_subclass__(**options)
-        if "base_color" in vars(cls) and "reads_theta" not in vars(cls):
-            cls.reads_theta = None
+    reads = ("color", "uv", "texture")
 
     def __post_init__(self):
         if not isinstance(self.wrap, str) or self.wrap not in WRAPS:
             raise InputError(f"wrap is {quoted(self.wrap)}; expected one of {', '.join(WRAPS)}")
-        if self.mip and self.reads is not None:
-            object.__setattr__(self, "reads", (*self.reads, FOOTPRINT))
+        reads = promised(self, "reads")
+        if self.mip and reads is not None:
+            object.__setattr__(self, "reads", (*reads, FOOTPRINT))
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -163,8 +155,7 @@ class Textured(Unlit):
     """The base colour, which must come from a texture."""
 
     takes_views = True
-    reads = ("uv",)
-    reads_theta = ("texture", "color")
+    reads = ("uv", "texture", "color")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -179,8 +170,7 @@ class Lambert(Unlit):
     """Diffuse shading, two-sided: normals are turned towards the viewer."""
 
     takes_views = True
-    reads = ("normal", "color", "uv")
-    reads_theta = ("texture", "color", "light")
+    reads = ("normal", "color", "uv", "texture", "light")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""
@@ -199,8 +189,7 @@ class BlinnPhong(Unlit):
     """Diffuse shading with highlights (Blinn 1977), two-sided."""
 
     takes_views = True
-    reads = ("normal", "color", "uv")
-    reads_theta = ("texture", "color", "light", "specular", "shininess")
+    reads = ("normal", "color", "uv", "texture", "light", "specular", "shininess")
 
     def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
         """See `rts.Shader`."""

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from rts.errors import InputWarning, warn
+from rts.footprints import FOOTPRINT
 from rts.gbuffer import GBuffer
 from rts.interfaces import Shader
 from rts.parts import CheckedPart
@@ -16,8 +17,16 @@ SURFACE_ENTRIES = ("vertices", "points", "normals", "colors", "uv")
 SHADER_ENTRIES = ("color", "texture", "light", "specular", "shininess", "depth_range", "weights")
 """Names that built-in surfaces and shaders give a meaning: files bring them, and not every shader reads them."""
 
+ATTRIBUTES = ("position", "normal", "uv", FOOTPRINT)
+"""What shaders read of the G-buffer alone, unlike "color"."""
+
 ALIKE = 0.8
 """The least ratio of `difflib` of two names that one may be meant by the other: "lights" and "light" have 0.9."""
+
+
+def shaded_by(part: CheckedPart) -> set[str] | None:
+    """The entries of θ that a part's shader says it reads; None if it does not say."""
+    return None if part.reads is None else set(part.reads).difference(ATTRIBUTES)
 
 
 def unread(part: CheckedPart, shaded: Collection[str] | None) -> tuple[str, ...]:
@@ -46,7 +55,7 @@ def likely_name(part: CheckedPart, name: str, shaded: Collection[str]) -> str | 
 def warn_of_unread(parts: Sequence[CheckedPart]) -> None:
     """Warn of entries of θ that are not read, and whose names are almost those of others that would be."""
     for index, part in enumerate(parts):
-        shaded = part.shader.reads_theta
+        shaded = shaded_by(part)
         for name in unread(part, shaded):
             if name in SURFACE_ENTRIES or name in SHADER_ENTRIES:
                 continue
@@ -59,11 +68,10 @@ def warn_of_unread(parts: Sequence[CheckedPart]) -> None:
                 )
 
 
-class Observed:
+class Observed(Shader):
     """A shader that notes which entries of θ another one reads.
 
     Attributes:
-        channels: those of the other.
         read: the names so far.
     """
 

@@ -10,7 +10,7 @@ from rts.arrays import shape_of
 from rts.camera import Camera
 from rts.engines import constants, engine_of, exemplar, namespace
 from rts.errors import InputError
-from rts.interfaces import RaySurface, Sampler, as_surface
+from rts.interfaces import RaySurface, Sampler
 from rts.parts import Part
 from rts.records import ArraySpec, Cells, RayHits, Request, Samples
 from rts.sampling.validation import check_camera
@@ -22,10 +22,10 @@ class Rays(Sampler):
 
     def sample(self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request) -> Samples:
         """See `rts.Sampler`."""
-        surface = as_surface(part.surface)
+        surface = part.surface
         if not isinstance(surface, RaySurface):
             raise InputError(
-                f"{part.surface!r} does not intersect rays itself; use a sampler of triangles, such as 'raster'"
+                f"{surface!r} does not intersect rays itself; use a sampler of triangles, such as 'raster'"
             )
         if part.cull != "none":
             raise InputError(f"cull is {part.cull!r}, but the sampler 'rays' has no triangles to cull; expected 'none'")

@@ -1,11 +1,11 @@
 """A surface that intersects rays itself: an axis-aligned ellipsoid."""
 
-from rts import GBuffer, RayHits
+from rts import GBuffer, RayHits, RaySurface
 from rts.arrays import unit
 from rts.engines import namespace
 
 
-class Ellipsoid:
+class Ellipsoid(RaySurface):
     """θ["center"] (3,) and θ["radii"] (3,); the parameters of a sample are its point on the unit sphere."""
 
     sample_widths = (0, 3)

@@ -232,7 +232,6 @@ GROUPS = {
         *("scene", "parameters", "tolerance", "budget_s", "directions", "size", "modes", "engine", "samplers"),
         *("splatters", "truths", "truth_samples"),
     ),
-    "unwrapped": {"plugin": rts.unwrapped},
     "volume_render": open_in(volume, "field", "camera", "size", "near", "far", "samples", "background", "ndc"),
     "warmup": {"processes": rts.warmup},
     "ARAP": open_in(lambda **o: energy(regularizers.ARAP, **o), "vertices", "faces", "weights"),

@@ -79,7 +79,7 @@ def test_coarse_and_fine_triangles_lead_to_the_same_roots():
 
 
 def unpruned(splatter):
-    return type("Whole", (type(splatter),), {"prunes": False})()
+    return type("Whole", (type(splatter),), {"needed": rts.Splatter.needed})()
 
 
 @pytest.mark.parametrize("layers", [2, 3, 4])

@@ -11,6 +11,7 @@ from helpers import arrays, icosphere, soup, to_numpy
 
 import rts
 from rts import Camera, GBuffer, InputError, Part, PluginError, Proxy, TriangleSampler, registry
+from rts.plugin_base import overrides
 from rts.sampling import cache
 from rts.sampling.cache import KEPT, fingerprint
 
@@ -41,7 +42,7 @@ def counting(name):
             self.prepared.append((lambda: built) if isinstance(built, tuple) else weakref.ref(built))
             return built
 
-    if Counting.follows:
+    if overrides(Counting, "update", rts.TriangleSampler):
 
         def update(self, prepared, proxy):
             self.updated += 1
@@ -408,7 +409,7 @@ def test_a_handle_serves_in_torch_and_in_a_traced_function_of_jax():
 # --------------------------------------------------------------------- triangles that depend on the view
 
 
-class Ball:
+class Ball(rts.TriangleSurface):
     """A sphere cut into more triangles the nearer it is; the parameters of a sample are a point near the sphere."""
 
     sample_widths = (3, 3)

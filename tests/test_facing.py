@@ -19,7 +19,7 @@ pytestmark = pytest.mark.splatting
 MESH = rts.plugin("rts.surfaces", "mesh")
 CAMERA = rts.Camera.look_at((0.3, 0.4, 4.0), (0, 0, 0), fov_y=50)
 SIZE = (24, 28)
-BY_DEPTH = Visible(reads_facing=False)
+BY_DEPTH = Visible(facing=False)
 
 
 def part_of(mesh, **options):
@@ -190,7 +190,7 @@ def test_the_compiled_splatter_is_the_specification(layers):
     facing = np.where(covered, rng.integers(-2, 3, covered.shape), 0).astype(np.int16)
     facing[-1] += (np.sign(facing[-1]) * Cells.MORE_BEHIND).astype(np.int16)
     splats = splats_of(positions, rgba, row, facing=facing)
-    images = [s.image(splats) for s in (Visible(), splatting.Visible(), Visible(reads_facing=False))]
+    images = [s.image(splats) for s in (Visible(), splatting.Visible(), Visible(facing=False))]
     np.testing.assert_allclose(images[0], images[1], rtol=0, atol=1e-12)
     assert np.abs(images[0] - images[2]).max() > 0.05
     target, tangents = rng.random(images[0].shape), rng.normal(size=(1, *positions.shape))

@@ -213,22 +213,6 @@ def test_supersampled_images_of_any_size(side):
         check(rts.ImageResiduals(scene, camera, size, goal, supersample=fine), start("torch-cpu", np.float64), 1e-10)
 
 
-def test_splatters_that_know_no_means_are_never_asked_for_them():
-    class Own(fused.Visible):
-        averages = False
-        asked = 0
-
-        def normal_equations(self, splats, t_positions, t_rgba, target, weights=None, background=None):
-            Own.asked += 1
-            return super().normal_equations(splats, t_positions, t_rgba, target, weights, background)
-
-    goal, _ = fields(3)
-    check(rts.ImageResiduals(scene, CAMERA, SIZE, goal, splatter=Own(), supersample=2), start("torch-cpu"), 1e-5)
-    assert Own.asked == 0
-    check(rts.ImageResiduals(scene, CAMERA, SIZE, goal, splatter=Own()), start("torch-cpu"), 1e-5)
-    assert Own.asked == 1 and not rts.Splatter.averages
-
-
 @torch_targets
 def test_shapes_of_target_and_weights(target):
     alpha, weights = fields(1)
@@ -470,7 +454,7 @@ def test_what_goes_wrong_in_sampling_stops_the_fit_with_its_reason(target):
 # ------------------------------------------------------------------------------------------------ the protocol
 
 
-class Line:
+class Line(rts.Residuals):
     """Residuals A x − b that know AᵀA."""
 
     def __init__(self, target):

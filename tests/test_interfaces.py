@@ -1,4 +1,4 @@
-"""The bases of plugins: defaults, flags that follow from methods, objects of other classes, misspelt members."""
+"""The bases of plugins: what a class overrides and promises, objects of other classes, misspelt members."""
 
 import gc
 import weakref
@@ -11,8 +11,8 @@ from helpers import CAMERA, DIFFERENTIABLE, FRONT, SIZE, arrays, gradient, icosp
 
 import rts
 from rts import splatting
-from rts.adapting import adapted, unwrapped
-from rts.interfaces import Shader, as_surface
+from rts.checks import check_shader
+from rts.plugin_base import overrides, promised
 from rts.records import Cells
 from rts.testing import SplatterConformance
 
@@ -23,16 +23,16 @@ RASTER = rts.plugin("samplers", "raster")
 BALL = {"center": np.zeros(3, np.float32), "radii": np.full(3, 0.8, np.float32)}
 
 
-# -------------------------------------------------------------------------------------------- flags and defaults
+# ------------------------------------------------------------------------------------- what a class overrides
 
 
-def test_class_variables_follow_from_the_methods_of_a_class():
+def test_what_a_class_overrides_is_read_off_it():
     class Refining(MESH):
         def refine(self, inputs, samples, rays):
             return samples
 
-    class Silent(Refining):
-        refines = False
+    class Still(Refining):
+        refine = rts.TriangleSurface.refine
 
     class Mixin:
         def needed(self, covered, depth):
@@ -41,10 +41,38 @@ def test_class_variables_follow_from_the_methods_of_a_class():
     class Mixed(Mixin, splatting.Plain):
         pass
 
-    assert not MESH.refines and Refining.refines and not Silent.refines
-    assert type("Below", (Refining,), {}).refines and not type("BelowSilent", (Silent,), {}).refines
-    assert splatting.Multi.prunes and Mixed.prunes and not rts.Splatter.prunes
-    assert not RASTER.builds and rts.plugin("samplers", "embree").builds and not RASTER.follows
+    faces = icosphere(0)[1]
+    assert not MESH(faces).refines and Refining(faces).refines and not Still(faces).refines
+    assert type("Below", (Refining,), {})(faces).refines and not type("BelowStill", (Still,), {})(faces).refines
+    assert all(overrides(kind, "needed", rts.Splatter) for kind in (splatting.Multi, Mixed, splatting.Plain()))
+    assert not overrides(Far, "needed", rts.Splatter) and not overrides(RASTER, "needed", rts.Splatter)
+    assert overrides(rts.plugin("samplers", "embree"), "prepare", rts.TriangleSampler)
+    assert not overrides(RASTER, "prepare", rts.TriangleSampler)
+
+
+def calling(self, theta, gbuffer, camera):
+    return gbuffer["position"]
+
+
+def test_a_promise_holds_for_the_class_that_states_it_and_for_its_call():
+    one = type("One", (rts.Shader,), {"uniform": True, "reads": ("color",), "__call__": calling})
+    kinds = {
+        "as it is": (one, True),
+        "inherited": (type("Below", (one,), {}), True),
+        "another call": (other := type("Other", (one,), {"__call__": lambda *_: None}), False),
+        "below it": (type("BelowOther", (other,), {}), False),
+        "stated anew": (type("Anew", (other,), {"uniform": True, "reads": ("color",)}), True),
+        "a call from elsewhere": (type("Mixed", (type("Mixin", (), {"__call__": lambda *_: None}), one), {}), False),
+    }
+    abstract = type("Abstract", (rts.Shader,), {"uniform": True, "reads": ("color",)})
+    kinds["stated where there is no call yet"] = type("Full", (abstract,), {"__call__": calling}), True
+    for name, (kind, holds) in kinds.items():
+        for given in (kind, kind()):
+            assert promised(given, "uniform") is holds, name
+            assert promised(given, "reads") == (("color",) if holds else None), name
+    stating = other()
+    stating.uniform = True
+    assert promised(stating, "uniform") and not promised(other(), "uniform")
 
 
 def test_a_class_may_be_both_of_triangles_and_of_rays():
@@ -80,7 +108,11 @@ def test_a_class_may_be_both_of_triangles_and_of_rays():
 # ---------------------------------------------------------------------------------------- objects of any class
 
 
-def test_a_duck_typed_surface_is_drawn_and_its_structures_are_kept():
+def method(*_):
+    return None
+
+
+def test_a_surface_is_not_kept_alive_by_what_is_built_of_it():
     built = []
 
     class Counting(rts.plugin("samplers", "embree")):
@@ -88,47 +120,16 @@ def test_a_duck_typed_surface_is_drawn_and_its_structures_are_kept():
             built.append(len(proxy.faces))
             return super().prepare(proxy)
 
-    class Duck:
-        """A mesh that inherits from nothing."""
-
-        sample_widths = (3, 2)
-
-        def __init__(self, faces):
-            self.mesh = MESH(faces)
-
-        def evaluate(self, theta, samples):
-            return self.mesh.evaluate(theta, samples)
-
-        def proxy_inputs(self, theta):
-            return theta["vertices"]
-
-        def proxy(self, inputs, camera, size):
-            return self.mesh.proxy(inputs, camera, size)
-
     vertices, faces = icosphere(1)
-    surface, sampler = Duck(faces), Counting()
+    surface, sampler = MESH(faces), Counting()
     part = rts.Part(surface, {"vertices": vertices}, "silhouette")
-    found = [show(part, sampler=sampler) for _ in range(3)]
-    np.testing.assert_array_equal(found[0], found[2])
-    np.testing.assert_array_equal(found[0], show(mesh_part((vertices, faces)), sampler="embree"))
-    assert built == [len(faces)], "what was built is not kept by the object that the user holds"
+    for _ in range(3):
+        show(part, sampler=sampler)
+    assert built == [len(faces)]
     kept = weakref.ref(surface)
     del surface, part
     gc.collect()
-    assert kept() is None, "a wrapper keeps a surface alive"
-
-
-def test_a_wrapper_passes_for_the_object_in_it():
-    duck = Ellipsoid()
-    duck.note = 3
-    wrapped = as_surface(duck)
-    assert isinstance(wrapped, Ellipsoid) and isinstance(wrapped, rts.RaySurface)
-    assert not isinstance(wrapped, rts.TriangleSurface)
-    assert wrapped.note == 3 and repr(wrapped) == repr(duck) and hash(wrapped) == hash(duck) and wrapped == duck
-    assert unwrapped(wrapped) is duck and unwrapped(duck) is duck
-    assert wrapped.centered and wrapped.reads(BALL) == ("center", "radii") and wrapped.sample_widths == (0, 3)
-    wrapped.note = 4
-    assert duck.note == 4
+    assert kept() is None
 
 
 def test_functions_are_shaders_with_the_promises_that_they_make():
@@ -139,37 +140,29 @@ def test_functions_are_shaders_with_the_promises_that_they_make():
         return plain(theta, gbuffer, camera)
 
     promising.opaque, promising.reads = True, ("normal",)
-    one, other = adapted(plain, Shader), adapted(promising, Shader)
+    one, other = check_shader(plain, "the shader"), check_shader(promising, "the shader")
     assert (one.opaque, one.reads) == (False, None) and (other.opaque, other.reads) == (True, ("normal",))
+    assert one == check_shader(plain, "the shader") != other and repr(one) == "<function plain>"
     part = mesh_part(icosphere(1))
     expected = show(part.replace(shader="normals"))
     for shader in (plain, promising):
         np.testing.assert_array_equal(show(part.replace(shader=shader)), expected)
 
 
-def test_a_splatter_may_be_an_object_with_an_image_or_a_splat():
-    known, part = splatting.Visible(), mesh_part(icosphere(1))
-    expected = show(part, splatter=known)
-    for duck in (SimpleNamespace(image=known.image), SimpleNamespace(splat=known.splat)):
-        # They do not say how far they reach, so that the apron is another, and so is how positions are rounded.
-        np.testing.assert_allclose(show(part, splatter=duck), expected, rtol=0, atol=1e-6)
-
-
-def test_what_lacks_a_required_member_is_refused():
+def test_what_does_not_subclass_its_base_is_refused_by_its_name():
     part = mesh_part(icosphere(0))
-    with pytest.raises(rts.InputError, match="the surface of part 0 is .*; expected an object such as a mesh"):
-        show(part.replace(surface=SimpleNamespace(proxy=None)))
-    with pytest.raises(rts.InputError, match="the splatter is .*method 'image'"):
-        show(part, splatter=SimpleNamespace(needed=None))
-    with pytest.raises(rts.InputError, match="the sampler is .*method 'sample'"):
-        show(part, sampler=SimpleNamespace(rasterize=None))
+    duck = SimpleNamespace(proxy=method, evaluate=method, image=method, sample=method)
+    with pytest.raises(rts.InputError, match="part 0 is .*class subclasses rts.TriangleSurface or rts.RaySurface$"):
+        show(part.replace(surface=duck))
+    with pytest.raises(rts.InputError, match="the shader of part 0 is .*, or an object whose class subclasses rts.Sha"):
+        show(part.replace(shader=duck))
+    with pytest.raises(rts.InputError, match="the splatter is .*a name, or an object whose class subclasses rts.Sp"):
+        show(part, splatter=duck)
+    with pytest.raises(rts.InputError, match="the sampler is .*a name, or an object whose class subclasses rts.Sa"):
+        show(part, sampler=duck)
 
 
 # ------------------------------------------------------------------------------------------- misspelt members
-
-
-def method(*_):
-    return None
 
 
 MISSPELT = [
@@ -179,6 +172,7 @@ MISSPELT = [
     (RASTER, "prepares", "prepare"),
     (RASTER, "updates", "update"),
     (splatting.Plain, "normal_equation", "normal_equations"),
+    (Ellipsoid, "read", "reads"),
 ]
 
 
@@ -187,7 +181,9 @@ def test_a_method_that_is_one_letter_off_is_refused_when_first_used(base, name, 
     own = {name: lambda self, *args: None, "__init__": base.__init__}
     kind = type("Misspelt", (base,), own)
     part, options = mesh_part(icosphere(0)), {}
-    if base is MESH:
+    if base is Ellipsoid:
+        part, options = rts.Part(kind(), BALL), {"sampler": "rays"}
+    elif base is MESH:
         part = part.replace(surface=kind(icosphere(0)[1]))
     else:
         options["sampler" if base is RASTER else "splatter"] = kind()
@@ -195,21 +191,12 @@ def test_a_method_that_is_one_letter_off_is_refused_when_first_used(base, name, 
         show(part, **options)
 
 
-def test_an_update_without_a_prepare_is_refused_where_the_class_is_made():
+def test_an_update_without_a_prepare_is_refused_where_a_sampler_is_made():
     own = {"update": method, "rasterize": method}
     with pytest.raises(rts.PluginError, match="^Lone has an update, .* and no prepare; write prepare, or leave update"):
-        type("Lone", (rts.TriangleSampler,), own)
+        type("Lone", (rts.TriangleSampler,), own)()
     complete = type("Complete", (rts.TriangleSampler,), {**own, "prepare": method})
-    assert type("Derived", (complete,), {"update": method}).follows
-
-
-def test_a_duck_typed_class_is_read_as_closely():
-    class Duck(Ellipsoid):
-        def read(self, theta):
-            return ("center",)
-
-    with pytest.raises(rts.PluginError, match="Duck has a function 'read'.*did you mean 'reads' of RaySurface"):
-        show(rts.Part(Duck(), BALL), sampler="rays")
+    type("Derived", (complete,), {"update": method})()
 
 
 @pytest.mark.parametrize("name", ["center", "examples", "tessellate", "refined_by_hand", "keys"])
@@ -231,12 +218,12 @@ def test_a_name_like_that_of_a_member_that_is_there_is_the_plugin_s_own():
     assert show(rts.Part(Own(faces), {"vertices": vertices}))[..., 3].any()
 
 
-def test_a_splatter_that_overrides_the_direct_call_is_told_what_to_write():
+def test_a_splatter_that_overrides_the_direct_call_is_told_what_that_is_for():
     class Old(splatting.Multi):
         def splat(self, positions, rgba, row):
             return super().splat(positions, rgba, row)
 
-    with pytest.raises(rts.PluginError, match=r"Old overrides 'splat', which is for direct calls; write 'image'"):
+    with pytest.raises(rts.PluginError, match=r"Old overrides 'splat', which is final: Splat packed .* direct calls"):
         show(mesh_part(icosphere(0)), splatter=Old())
 
 
@@ -442,9 +429,9 @@ def test_the_spread_of_rays_is_the_width_of_a_pixel(camera):
 def test_a_plugin_of_another_kind_is_refused():
     part = mesh_part(icosphere(0))
     show(part, sampler=RASTER(), splatter=splatting.Plain())  # Known by now, each as what it is.
-    with pytest.raises(rts.InputError, match="the splatter is .*method 'image'"):
+    with pytest.raises(rts.InputError, match="the splatter is .*rts.Splatter"):
         show(part, splatter=RASTER())
-    with pytest.raises(rts.InputError, match="the sampler is .*method 'sample'"):
+    with pytest.raises(rts.InputError, match="the sampler is .*rts.Sampler"):
         show(part, sampler=splatting.Plain())
 
 
@@ -472,15 +459,6 @@ def test_a_shader_may_close_over_arrays_that_the_scene_has_none_of(splatter):
         image = rts.render(parts, CAMERA, SIZE, splatter=splatter)
         image.sum().backward()
         assert color.grad.abs().sum() > 0
-
-
-def test_wrappers_can_be_copied_and_hand_over_what_is_in_them():
-    import copy
-    import pickle
-
-    wrapped = as_surface(Ellipsoid())
-    for other in (copy.copy(wrapped), copy.deepcopy(wrapped), pickle.loads(pickle.dumps(wrapped))):
-        assert isinstance(other, rts.RaySurface) and type(unwrapped(other)) is Ellipsoid
 
 
 def test_a_surface_that_has_the_methods_of_another_base_is_told_to_subclass_that():

@@ -12,12 +12,10 @@ from scipy.optimize import least_squares
 
 import rts
 from rts import splatting
-from rts.capabilities import capabilities
 from rts.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
 from rts_backends.fused import normal_equations as fused_normal
-from rts_backends.fused import splatters as fused
 from rts_backends.fused.losses import cost_and_weight, in_numbers
 
 pytestmark = pytest.mark.fitting
@@ -265,26 +263,6 @@ def test_normal_equations_are_bitwise_the_same_on_any_number_of_threads(monkeypa
     assert torch.equal(found[0], found[1]) and torch.equal(found[0], found[2])
 
 
-def test_splatters_that_know_no_losses_are_never_asked_for_them(monkeypatch):
-    torch = pytest.importorskip("torch")
-    asked = []
-
-    class Own(fused.Visible):
-        def normal_equations(self, splats, t_positions, t_rgba, target, weights=None, background=None):
-            asked.append("equations")
-            return super().normal_equations(splats, t_positions, t_rgba, target, weights, background)
-
-    pose, given = torch.tensor(POSE), {"loss": "huber", "f_scale": 0.1}
-
-    swept, own = residuals("lambert", 4, **given), residuals("lambert", 4, splatter=Own(), **given)
-    for a, b in zip(own.normal_equations(pose), swept.normal_equations(pose), strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-7)
-    assert not asked and fused.Visible.takes_losses and not rts.Splatter.takes_losses
-    square = residuals("lambert", 4, splatter=Own())
-    square.normal_equations(pose)
-    assert asked == ["equations"]
-
-
 # --------------------------------------------------------------------------------------------------------- fits
 
 
@@ -426,7 +404,7 @@ def test_residuals_of_ones_own_may_say_their_loss():
         def __call__(self, p):
             return p - torch.tensor([0.0, 0.0, 9.0])
 
-    class Unrelated:
+    class Unrelated:  # No `rts.Residuals`: a function, of which nothing else is looked at.
         def loss(self):
             raise AssertionError
 
@@ -471,24 +449,6 @@ def test_a_subclass_with_more_residuals_has_the_normal_equations_of_all_of_them(
     equations = swept.normal_equations(pose)
     torch.testing.assert_close(equations[0], value)
     torch.testing.assert_close(2 * equations[2], found, rtol=1e-4, atol=1e-7)
-
-
-def test_a_splatter_that_is_mixed_with_another_is_asked_for_what_that_takes():
-    class Mixed:
-        def normal_equations(self, splats, t_positions, t_rgba, target, weights=None, background=None):
-            raise AssertionError
-
-    class Own(Mixed, fused.Visible):
-        pass
-
-    class Below(Own):
-        pass
-
-    class Knowing(Own):
-        takes_losses = True
-
-    assert capabilities("rts.splatters", fused.Visible)["takes_losses"]
-    assert not Own.takes_losses and not Below.takes_losses and Knowing.takes_losses and fused.Visible.takes_losses
 
 
 def test_images_have_a_scale_that_suits_them():

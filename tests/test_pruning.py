@@ -156,11 +156,11 @@ def test_constant_surfaces_are_evaluated_only_where_needed():
 
 
 def test_a_splatter_that_does_not_say_what_it_needs_gets_everything():
-    class Own:
+    class Own(rts.Splatter):
         reach = splatting.Visible.reach
 
-        def splat(self, positions, rgba, row):
-            return rts.plugin("splatters", "visible")().splat(positions, rgba, row)
+        def image(self, splats):
+            return rts.plugin("splatters", "visible")().image(splats)
 
     (whole, count), (same, same_count) = images(SCENES["closed box"], Own(), 3)
     assert count == same_count

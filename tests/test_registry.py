@@ -105,9 +105,10 @@ def test_a_name_or_a_class_gives_one_shared_instance_an_object_itself():
 
 def test_a_plugin_of_another_distribution_is_used_by_its_name(install):
     source = (
-        "class White:\n"
-        "    def splat(self, positions, rgba, row):\n"
-        "        return 0 * row[0][..., None] + rgba[:1] * 0 + 0.25\n"
+        "import rts\n"
+        "class White(rts.Splatter):\n"
+        "    def image(self, splats):\n"
+        "        return 0 * splats.row[0][..., None] + splats.rgba[:1] * 0 + 0.25\n"
     )
     install("flat", {"rts.splatters": {"flat": "flat_plugin:White"}}, {"flat_plugin": source})
     vertices = np.array([(-1, -1, 0), (1, -1, 0), (0, 1, 0)], np.float32)
@@ -128,7 +129,7 @@ def test_a_survey_names_the_distribution_and_why_a_plugin_does_not_load(install)
     install(
         "mixed",
         {"rts.splatters": {"good": "mixed_good:Good", "bad": "mixed_bad:Bad"}},
-        {"mixed_good": "class Good: pass", "mixed_bad": "raise RuntimeError('no display')"},
+        {"mixed_good": "import rts\nclass Good(rts.Splatter): pass", "mixed_bad": "raise RuntimeError('no display')"},
         version="3.4",
     )
     lines = {info.name: info for info in registry.survey() if info.group == "rts.splatters"}
@@ -146,10 +147,10 @@ def test_details_say_what_each_plugin_can_do():
 
     assert able("surfaces", "mesh")["triangles"] and not able("surfaces", "mesh")["rays"]
     assert able("surfaces", "sdf")["rays"] and not able("surfaces", "sdf")["triangles"]
-    assert able("samplers", "raster")["culls"] and not able("samplers", "rays")["culls"]
     assert able("splatters", "single")["layers"] == 1 and able("splatters", "visible")["layers"] is None
-    assert able("samplers", "raster")["tells_facing"] and not able("samplers", "rays")["tells_facing"]
-    assert able("splatters", "visible")["reads_facing"] and not able("splatters", "multi")["reads_facing"]
+    assert able("samplers", "raster")["concurrent"] and not able("samplers", "rays")["concurrent"]
+    assert able("splatters", "visible")["reads"] == {"facing", "exit"} and not able("splatters", "multi")["reads"]
+    assert able("splatters", "visible")["sums"] and not able("splatters", "none")["sums"]
     assert able("engines", "numpy") == {"differentiates": False}
     assert able("shaders", "silhouette")["uniform"] and able("shaders", "textured")["reads"] is not None
     assert found["rts.surfaces", "mesh"].ready and found["rts.surfaces", "mesh"].missing == ()
@@ -169,8 +170,11 @@ def test_a_splatter_looks_at_no_more_layers_than_it_says():
 
 
 def test_details_say_which_extra_is_missing(install, tmp_path):
-    source = "class Odd:\n    def splat(self, positions, rgba, row): ...\n"
-    install("mine", {"rts.splatters": {"odd": "mine_odd:Odd", "even": "mine_gone:Even"}}, {"mine_odd": source}, ["odd"])
+    source = (
+        "import rts\nclass Odd(rts.Splatter):\n    def image(self, splats): ...\nclass Other:\n    image = Odd.image\n"
+    )
+    entries = {"odd": "mine_odd:Odd", "even": "mine_gone:Even", "other": "mine_odd:Other"}
+    install("mine", {"rts.splatters": entries}, {"mine_odd": source}, ["odd"])
     metadata = next((tmp_path / "mine").glob("*.dist-info")) / "METADATA"
     needs = "Requires-Dist: numpy; extra == 'odd'\nRequires-Dist: qqq-there.is-none>=3; extra == \"odd\"\n"
     metadata.write_text(metadata.read_text() + needs)
@@ -178,6 +182,9 @@ def test_details_say_which_extra_is_missing(install, tmp_path):
     assert found["odd"].ready and found["odd"].missing == ("qqq-there.is-none",) and found["odd"].install == "mine[odd]"
     assert found["odd"].capabilities["reach"] == 1 and not found["odd"].capabilities["prunes"]
     assert not found["even"].ready and found["even"].install is None and found["even"].capabilities == {}
+    assert found["other"].error.endswith("which is registered in rts.splatters, does not subclass rts.Splatter")
+    with pytest.raises(rts.InputError, match="the splatter is .*Other.*whose class subclasses rts.Splatter"):
+        rts.render(rts.Mesh.example(), rts.Camera.look_at((0, 0, 3), (0, 0, 0)), (4, 4), splatter="other")
 
 
 # ---------------------------------------------------------------------------------- surfaces as attributes

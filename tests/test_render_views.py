@@ -324,7 +324,7 @@ def test_compiled_views_are_shaded_together_in_pieces_of_rows_in_use(capacity, m
     calls, part = [], mesh_part(icosphere(1))
 
     class Counted(Lambert):
-        takes_views = True
+        takes_views, reads = True, Lambert.reads
 
         def __call__(self, theta, gbuffer, camera):
             calls.append(type(camera))
@@ -409,7 +409,7 @@ class Dimmed(rts.plugin("rts.shaders", "lambert")):
 def test_promises_of_a_call_that_is_overridden_hold_no_more():
     part = mesh_part(icosphere(1), shader=Dimmed())
     np.testing.assert_allclose(rts.render_views(part, CAMERAS, SIZE), looped(part), rtol=0, atol=1e-5)
-    again = type("Again", (Dimmed,), {"takes_views": True})
+    again = type("Again", (Dimmed,), {"takes_views": True, "reads": Dimmed.reads})
     with pytest.raises(AttributeError, match="view of a camera was asked for by a shader that takes_views"):
         rts.render_views(part.replace(shader=again()), CAMERAS, SIZE)
 

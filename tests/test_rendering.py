@@ -1,7 +1,6 @@
 """Rendering from end to end, degenerate views, backgrounds, and what bad input is told."""
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -56,13 +55,6 @@ def test_a_part_at_plus_x_plus_y_appears_upper_right(splatter):
     rows, columns = np.nonzero(alpha > 0.5)
     # 5 pixels a unit: x from 12 + 2 to 12 + 8, y from 10 − 8 to 10 − 2.
     assert (rows.min(), rows.max(), columns.min(), columns.max()) == (2, 7, 14, 19)
-
-
-def test_a_splatter_may_have_its_method_by_itself_alone():
-    part, known = mesh_part(icosphere(1)), rts.plugin("splatters", "visible")()
-    expected = show(part)
-    for splat in (known.splat, lambda positions, rgba, row: known.splat(positions, rgba, row)):
-        np.testing.assert_allclose(show(part, splatter=SimpleNamespace(splat=splat)), expected, atol=1e-6)
 
 
 def test_a_surface_beyond_the_image_keeps_the_rim_bright():

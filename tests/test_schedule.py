@@ -238,7 +238,7 @@ def test_jax_goes_through_the_stages_that_torch_does():
     np.testing.assert_allclose(ours.history, theirs.history, rtol=1e-2)
 
 
-class Line:
+class Line(rts.Residuals):
     """Residuals of one's own: p − goal, where coarse stages are off, and see nothing but a wall beyond 5."""
 
     def __init__(self, off=0.0, wall=None):
@@ -301,7 +301,7 @@ def test_schedules_that_cannot_be_followed_are_refused_before_work_starts():
         def at_stage(self, stage):
             return None
 
-    with pytest.raises(InputError, match="at_stage gave no function"):
+    with pytest.raises(InputError, match="what at_stage gave is None; expected a function of the parameters, or "):
         rts.fit(Nothing(), start, schedule=[rts.Stage()])
     for size, options in (((0, 4), {}), ((64, 64), {"coarsest": 0}), ((64, 64), {"largest": 2.5})):
         with pytest.raises(InputError, match=r"expected .*pixels|coarsest|largest|size"):

@@ -10,6 +10,7 @@ from helpers import DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere
 
 import rts
 from rts import splatting
+from rts.plugin_base import promised
 from rts.records import Cells
 from rts.rendering.samples import sample
 from rts.sampling.interiors_kernels import settle
@@ -55,14 +56,14 @@ class Twice(splatting.Visible):
 class Whole(fused.Visible):
     """A splatter that does not read which cells are settled."""
 
-    settles = False
+    fills_interiors = False
 
 
 class Painted(rts.Shader):
     """One colour, an entry of θ."""
 
     opaque = uniform = True
-    reads = ()
+    reads = ("color",)
 
     def __call__(self, theta, gbuffer, camera):
         xp, color = rts.namespace(theta["color"]), theta["color"]
@@ -119,7 +120,7 @@ def test_only_cells_that_are_wanted_need_samples(reach):
 @pytest.mark.parametrize("name", ["box before a card", "spheres that cross"])
 @pytest.mark.parametrize(
     ("splatter", "layers"),
-    [("single", 2), ("multi", 2), ("visible", 2), (splatting.Visible(), 2), ("single", 1), ("visible", 1)],
+    [("single", 2), ("visible", 2), (splatting.Visible(), 2), ("single", 1), ("visible", 1)],
 )
 def test_so_are_those_of_active_pixels(name, splatter, layers):
     import torch
@@ -135,7 +136,7 @@ def test_so_are_those_of_active_pixels(name, splatter, layers):
         results.append((image.detach().numpy(), vertices.grad.numpy(), color.grad.numpy()))
         counts.append(len(sampled.fine.samples[0].ids))
     assert (sampled.fine.settled >= 0).any()
-    assert counts[1] < counts[0] or splatter == "multi"  # Hidden samples that count are everywhere, then.
+    assert counts[1] < counts[0]
     for whole, settled in zip(*results, strict=True):
         np.testing.assert_allclose(settled, whole, rtol=0, atol=1e-10 * max(1, np.abs(whole).max()))
 
@@ -145,7 +146,6 @@ def test_pixels_that_are_not_active_are_flat_where_hidden_samples_have_no_effect
     cases = {
         "visible": {},
         "single": {},
-        "multi": {"splatter": "multi"},
         "no room": {"capacity": 1500},
         "two": {"parts": [part, behind]},
         "shaded": {"parts": part.replace(shader="normals")},
@@ -170,7 +170,7 @@ def test_the_farthest_front_stays_amid_one_colour(layers):
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
-@pytest.mark.parametrize("splatter", ["single", "multi", "visible"])
+@pytest.mark.parametrize("splatter", ["single", "visible"])
 @pytest.mark.parametrize("name", ["sphere", "box before a card"])
 def test_the_image_and_its_derivatives_are_those_of_all_samples(name, splatter, target):
     vertices = SCENES[name][0].astype(np.float32)
@@ -199,7 +199,7 @@ def test_the_image_and_its_derivatives_are_those_of_all_samples(name, splatter, 
 
 
 @pytest.mark.parametrize("name", SCENES)
-@pytest.mark.parametrize("make", [splatting.Visible, splatting.Multi, partial(splatting.Visible, rims=False)])
+@pytest.mark.parametrize("make", [splatting.Visible, partial(splatting.Visible, rims=False)])
 def test_the_specification_agrees(name, make):
     import torch
 
@@ -237,7 +237,7 @@ def test_what_has_its_call_from_elsewhere_promises_no_colour(base):
     kind = rts.plugin("rts.shaders", base)
     body = vars(Stripes)["__call__"]
     for shader in (type("Mixed", (Stripes, kind), {})(), type("Own", (kind,), {"__call__": body})()):
-        assert not shader.uniform and not shader.takes_views
+        assert not promised(shader, "uniform") and not promised(shader, "takes_views")
         alone = mesh_part(SPHERE, shader=shader)
         sampled = sample(alone, CAMERA, SIZE, splatter="visible", settles=True)
         assert sampled.settled is None
@@ -427,20 +427,20 @@ def test_what_has_no_cotangent_is_not_pulled_and_what_has_no_weight_not_swept(ki
         np.testing.assert_allclose(masked, every, rtol=1e-9, atol=1e-15)
 
 
-def test_a_class_with_its_own_sums_says_anew_whether_it_follows_outlines():
+def test_a_class_with_its_own_sums_says_anew_whether_it_fills_interiors():
     class Wide(splatting.Single):
         def accumulate(self, splats):
             return super().accumulate(splats)
 
     class Sharp(Wide):
-        follows_outlines = True
+        fills_interiors = True
 
         def accumulate(self, splats):
             return super().accumulate(splats)
 
     kinds = splatting.Single, fused.Single, splatting.Visible, fused.Visible, Sharp
-    assert all(kind().follows_outlines for kind in kinds)
-    assert not any(kind().follows_outlines for kind in (Wide, splatting.Multi, fused.Multi))
+    assert all(promised(kind(), "fills_interiors") for kind in kinds)
+    assert not any(promised(kind(), "fills_interiors") for kind in (Wide, splatting.Multi, fused.Multi))
 
 
 @pytest.mark.filterwarnings("ignore:capacity is:rts.InputWarning")

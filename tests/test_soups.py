@@ -112,7 +112,7 @@ def test_images_are_finite_and_those_of_the_specification_pruned_or_not(name, fi
     wrong, seen = {}, 0
     specification = {"multi": splatting.Multi, "visible": splatting.Visible}[name]()
     # On the same cells: with a wider apron, rays through edges are rounded to either side.
-    every = type("Every", (rts.plugin("splatters", name),), {"prunes": False})()
+    every = type("Every", (rts.plugin("splatters", name),), {"needed": rts.Splatter.needed})()
     for number in numbers(first):
         soup, said = soup_of(number), []
         specified, image, pruned = (

@@ -23,7 +23,9 @@ FIRST, LAST = map(int, ("0:" + os.environ.get("RTS_TIES", "150")).split(":")[-2:
 MESH = rts.plugin("rts.surfaces", "mesh")
 SPECIFICATIONS = {"multi": splatting.Multi(), "visible": splatting.Visible()}
 # On the same cells: with a wider apron, rays through edges are rounded to either side.
-EVERY = {name: type("Every", (rts.plugin("splatters", name),), {"prunes": False})() for name in SPECIFICATIONS}
+EVERY = {
+    name: type("Every", (rts.plugin("splatters", name),), {"needed": rts.Splatter.needed})() for name in SPECIFICATIONS
+}
 LIMIT = 1e-6
 """Share of the largest gradient, in float64, that rounding may change: zeros are added in another order."""
 

@@ -91,13 +91,14 @@ def scenes() -> dict[str, list[Any]]:
     moved[:3, :3] *= 0.7
     ellipsoid = {"center": [0.1, -0.1, 0.05], "radii": [0.9, 0.6, 0.75], "color": [0.8, 0.5, 0.3]}
     ellipsoid = {name: np.array(value, np.float32) for name, value in ellipsoid.items()}
+    own = type("Ellipsoid", (Ellipsoid, getattr(rts, "RaySurface", object)), {})  # Old commits know no such base.
     found = {
         "mesh": [example],
         "split uv": [split],
         "silhouette": [outline],
         "scene": [split, example.replace(transform=moved)],
         "glass": [split, glass.replace(transform=moved)],
-        "ellipsoid": [rts.Part(Ellipsoid(), ellipsoid, "lambert")],
+        "ellipsoid": [rts.Part(own(), ellipsoid, "lambert")],
     }
     if "heightfield" in rts.plugins("surfaces"):
         found["heightfield"] = [rts.plugin("surfaces", "heightfield").example()]

@@ -62,12 +62,14 @@ class Clock:
 class TimedSplatter(rts.Splatter):
     """A splatter that is timed, forwards and backwards."""
 
-    prunes = True
-
     def __init__(self, splatter: Any, clock: Clock):
         self._splatter, self._clock = splatter, clock
-        self.reach, self.settles = splatter.reach, splatter.settles
-        self.needed = clock.timed("choose hidden layers", splatter.needed)
+        self.reach, self.reads, self.fills_interiors = splatter.reach, splatter.reads, splatter.fills_interiors
+
+    def needed(self, covered: Any, depth: Any) -> Any:
+        """See `rts.Splatter`."""
+        with self._clock.stage("choose hidden layers"):
+            return self._splatter.needed(covered, depth)
 
     def image(self, splats: rts.Splats) -> Any:
         """See `rts.Splatter`."""

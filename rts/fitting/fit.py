@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.adapting import adapted, unwrapped
 from rts.arguments import check_flag, quoted
 from rts.arrays import kind_of
-from rts.checks import is_count, is_real
+from rts.checks import checked_plugin, is_count, is_real
 from rts.engines import Engine
 from rts.errors import InputError
 from rts.fitting.dependence import differentiable, refuse_independent
@@ -23,6 +22,7 @@ from rts.fitting.names import listed, named_leaves, one_line
 from rts.fitting.run import LONGEST_REASON, NO_GRADIENT, Astray, Report, Run, progress_bar, require
 from rts.fitting.schedule import Stage, checked_schedule
 from rts.interfaces import Residuals
+from rts.plugin_base import overrides
 from rts.sampling.adaptive import finest
 from rts.trees import Array, Tree, leaves, map_leaves
 
@@ -108,7 +108,7 @@ def fit(
         tolerance: stop when the loss has not fallen by this fraction in `patience` steps ("lm": in an accepted step).
         patience: the number of steps that `tolerance` speaks of; not for "lm".
         schedule: stages, one after the other, each from where the one before ended: the resolutions at which images are
-            compared, such as `rts.pyramid(size)`. For `ImageResiduals`, or residuals with a method `at_stage`.
+            compared, such as `rts.pyramid(size)`. For `ImageResiduals`, or other `rts.Residuals` with `at_stage`.
         callback: called as `callback(step, parameters, loss)`; a true result stops the fit, later stages included.
         progress: show a progress bar with loss and ms/iteration; default only on a terminal.
         jit: compile with jax (no effect on torch). Turn off if `residuals` cannot be traced.
@@ -138,7 +138,7 @@ def fit(
             try:
                 checked = _checked(stage, engine, run)
                 if isinstance(reduced, Loss) and method == "lm":
-                    own = stage.normal_equations if fits and stage.sums_products else None
+                    own = stage.normal_equations if fits and overrides(stage, "normal_equations", Residuals) else None
                     supersample = finest(getattr(stage, "supersample", None))
                     levenberg_marquardt(checked, parameters, engine, run, jit, reduced, own, supersample)
                 else:
@@ -211,10 +211,8 @@ def _flat(loss: float) -> str:
 
 
 def _check_functions(residuals: Any, loss: Any, callback: Any) -> Residuals:
-    """The residuals with all members of their base."""
-    known = adapted(residuals, Residuals)
-    if known is None:
-        raise InputError(f"residuals is {quoted(residuals)}; expected a function of the parameters")
+    """The residuals as those of their base."""
+    known = _residuals(residuals, "residuals")
     if loss is not None and not callable(loss):
         raise InputError(
             f"loss is {quoted(loss)}; expected a function of the residuals, such as rts.Loss('huber', f_scale=0.1), or "
@@ -230,20 +228,37 @@ def _stages(residuals: Residuals, schedule: Any) -> list[Residuals]:
     if schedule is None:
         return [residuals]
     schedule = checked_schedule(schedule)
-    if not residuals.has_stages:
+    if not overrides(residuals, "at_stage", Residuals):
         raise InputError(
-            f"residuals is {quoted(unwrapped(residuals))}, whose resolution nobody knows; with a schedule pass "
-            f"rts.ImageResiduals, or an object with a method at_stage(stage); see rts.Residuals"
+            f"residuals is {quoted(residuals)}, whose resolution nobody knows; with a schedule pass "
+            f"rts.ImageResiduals, or subclass rts.Residuals and give it a method at_stage(stage)"
         )
-    found = [adapted(residuals.at_stage(stage), Residuals) for stage in schedule]
-    if None in found:
-        raise InputError("at_stage gave no function of the parameters; expected residuals")
-    return found
+    return [_residuals(residuals.at_stage(stage), "what at_stage gave") for stage in schedule]
+
+
+class _Function(Residuals):
+    """A function of parameters as residuals, of which nothing else is known."""
+
+    def __init__(self, function: Callable[[Tree], Array]):
+        self._function = function
+
+    def __call__(self, parameters: Tree) -> Array:
+        """See `rts.Residuals`."""
+        return self._function(parameters)
+
+    def __repr__(self) -> str:
+        return quoted(self._function)
+
+
+def _residuals(given: Any, what: str) -> Residuals:
+    """Residuals, of a function if they are one; `what` names them."""
+    found = _Function(given) if callable(given) and not isinstance(given, Residuals) else given
+    return checked_plugin(found, what, Residuals, "a function of the parameters, ")
 
 
 def _taken(stage: Residuals, whole: Residuals, given: Callable | None) -> tuple[Callable[[Array], Array], bool]:
     """The loss at a stage of the residuals `whole`, and whether the stage's own sums are for it."""
-    if given is not None and not stage.sums_products:
+    if given is not None and not overrides(stage, "normal_equations", Residuals):
         return given, False
     own = _own_loss(stage)
     taken = (own or _own_loss(whole) or SQUARE) if given is None else given
@@ -255,9 +270,7 @@ def _own_loss(residuals: Residuals) -> Loss | None:
     loss = residuals.loss
     if loss is None or isinstance(loss, Loss):
         return loss
-    if unwrapped(residuals) is residuals:
-        raise InputError(f"the residuals' loss is {quoted(loss)}; expected an rts.Loss, or None")
-    return None  # Objects of other classes may mean anything by the name.
+    raise InputError(f"the residuals' loss is {quoted(loss)}; expected an rts.Loss, or None")
 
 
 def _check_method(method: str, loss: Callable | None, steps: int | None, learning_rate: float | None) -> None:

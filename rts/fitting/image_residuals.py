@@ -30,8 +30,9 @@ from rts.fitting.losses import Loss
 from rts.fitting.names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
-from rts.interfaces import Residuals, Splatter
+from rts.interfaces import Residuals, Splatter, SummingSplatter
 from rts.parts import CheckedPart, Part
+from rts.plugin_base import overrides
 from rts.records import ArraySpec, Fine, Splats
 from rts.rendering.batched import render_views
 from rts.rendering.image import render
@@ -257,7 +258,7 @@ class ImageResiduals(Residuals):
     @property
     def _ordinary(self) -> bool:
         """Whether residuals are those of this class: a subclass may make others of them."""
-        return type(self).__call__ is ImageResiduals.__call__
+        return not overrides(self, "__call__", ImageResiduals)
 
     def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
         """Mean loss () of the n residuals, JᵀSJ / n (U, U) and JᵀWr / n (U,) for the U numbers in the parameters.
@@ -274,21 +275,15 @@ class ImageResiduals(Residuals):
         if (
             self._ordinary
             and not self._sigma
-            and splatter.sums_products
+            and isinstance(splatter, SummingSplatter)
             and engine.differentiates
             and self._image_channels == 3
-            and (splatter.takes_losses or not self.loss.robust)
-            and (self.supersample == 1 or splatter.averages)
             and self._settings.contrast is None
         ):
             mask = self._channels == 1
             companion.expect(companion.LEAST_SQUARES_OF_MASKS if mask else companion.LEAST_SQUARES)
             found = self._swept(splatter, parameters, engine)
         return normal_equations(self, parameters, engine, self.loss) if found is None else found
-
-    def _loss_beside(self) -> dict[str, Loss]:
-        """The argument of a splatter's sums beside those that all take."""
-        return {"loss": self.loss} if self.loss.robust else {}
 
     def _swept(self, splatter: Splatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
         """`normal_equations` by those of the splatter, in the bands that `render` takes; None where it gives none."""
@@ -340,7 +335,7 @@ class ImageResiduals(Residuals):
                 t_positions,
                 t_rgba if colored else None,
                 **fields._asdict(),
-                **self._loss_beside(),
+                loss=self.loss if self.loss.robust else None,
             )
 
         part = None if sampled.one_part else sampled.part

@@ -16,6 +16,7 @@ from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
 from rts.interfaces import Splatter
 from rts.operations.inset import averaged, painted_inset, with_inset
 from rts.parts import Part
+from rts.plugin_base import promised
 from rts.records import Sampled, Splats
 from rts.rendering.samples import coarse_scene, sampled_scene, with_fine
 from rts.rendering.scene import Scene
@@ -180,7 +181,7 @@ def render_samples(
             f"the samples have an apron of {apron} cells, and {splatter!r}, which reaches {splatter.reach}, needs "
             f"{splatter.reach + 1}; give it to rts.sample, too"
         )
-    if sampled.settled is not None and not (splatter.settles and scene.parts[0].shader.uniform):
+    if sampled.settled is not None and not (promised(splatter, "fills_interiors") and scene.parts[0].uniform):
         shaders = ", ".join(dict.fromkeys(repr(part.shader) for part in scene.parts))
         raise InputError(
             f"samples of cells amid one colour were left out (settles=True), which {splatter!r} and "

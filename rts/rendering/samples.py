@@ -15,6 +15,7 @@ from rts.checks import check_memory
 from rts.engines import is_traced, uncompiled
 from rts.errors import InputError
 from rts.parts import Part
+from rts.plugin_base import promised
 from rts.records import Hidden, Request, Sampled
 from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
@@ -114,7 +115,7 @@ def _on_one_grid(
     gradient, capacity, reader = scene.context.engine.differentiates, settings.capacity, settings.reader
     check_memory(height, width, settings.most_layers, capacity, gradient=gradient)
     grid = Grid.sampled(scene, camera, (height, width), settings.apron)
-    request = Request(capacity, facing=reader.reads_facing, exits=exits and reader.reads_exits and gradient)
+    request = Request(capacity, facing="facing" in reader.reads, exits=exits and "exit" in reader.reads and gradient)
     taken = partial(_taken, scene, grid, request)
     sampled = taken(settings.layers, hidden) if settings.layers != "auto" else with_layers_that_count(taken, hidden)
     return replace(sampled, supersample=side, apron=settings.apron)
@@ -154,10 +155,10 @@ def with_fine(
     cells = FineGrid(size, adaptive.samples, settings.apron)
     grid = Grid.sampled(scene, camera, (cells.side * size[0], cells.side * size[1]), cells.apron)
     where = Where(adaptive, adaptive.dilates(scene.parts), colors)
-    flat = coarse.settled is not None and splatter is not None and splatter.follows_outlines
+    flat = coarse.settled is not None and splatter is not None and promised(splatter, "fills_interiors")
 
     def taken(count: int, hidden: Hidden | None, listed: Array, capacity: int | None) -> Sampled:
-        return _taken(scene, grid, Request(capacity, listed, facing=settings.reader.reads_facing), count, hidden)
+        return _taken(scene, grid, Request(capacity, listed, facing="facing" in settings.reader.reads), count, hidden)
 
     fine = fine_samples(coarse, cells, where, taken, hidden, settings.layers, settings.capacity, flat)
     return replace(coarse, fine=fine, overflow=coarse.overflow + fine.overflow)

@@ -27,7 +27,7 @@ def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:
     """The part's G-buffer in local space."""
     theta = _read(part)
     if samples.gbuffer is not None and is_constant(theta):
-        wanted = part.shader.reads
+        wanted = part.reads
         if samples.asked is None or (wanted is not None and set(wanted) <= set(samples.asked)):
             return GBuffer(samples.gbuffer)
     gbuffer = part.surface.evaluate(context.constants(theta), samples)
@@ -49,8 +49,8 @@ def _read(part: CheckedPart) -> dict[str, Tree]:
 def shaded_at_once(part: CheckedPart) -> bool:
     """Whether a part's shader takes the samples of several views in one call."""
     # The footprint of a sample is found by the camera of its view.
-    tells = part.shader.reads is not None and FOOTPRINT not in part.shader.reads
-    return part.shader.uniform or (part.shader.takes_views and tells)
+    tells = part.reads is not None and FOOTPRINT not in part.reads
+    return part.uniform or (part.takes_views and tells)
 
 
 def theta_of(part: CheckedPart, context: Context) -> dict[str, Tree]:
@@ -95,7 +95,7 @@ def shade(
     world = _to_world(_readable(local, samples, engine), transform)
     rgba = _shaded(part, theta, world, camera)
     check_shaded(rgba, samples.ids.shape[-2], part.shader)
-    if part.shader.uniform:  # One colour, of however many rows.
+    if part.uniform:  # One colour, of however many rows.
         return world, rgba
     rows, names = local.computed, [*local]
     if isinstance(camera, RowCameras):

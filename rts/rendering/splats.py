@@ -210,7 +210,7 @@ def _shown_in_views(
     positions = context.constants(projective_map_of_views(rows, points, view, places))
     cameras = context.constants(cameras)
     if shaded_at_once(part):
-        camera = cameras[0] if part.shader.uniform else RowCameras.of(cameras, view)
+        camera = cameras[0] if part.uniform else RowCameras.of(cameras, view)
         rgba = shade(part, theta, transform, whole, gbuffer, camera, engine)[1]
     else:
         assert counts is not None

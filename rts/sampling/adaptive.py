@@ -61,7 +61,7 @@ class Adaptive:
     def dilates(self, parts: Sequence[CheckedPart]) -> bool:
         """Whether active pixels of a scene are dilated."""
         if self.dilated is None:
-            return self.contrast is not None or not all(part.shader.uniform for part in parts)
+            return self.contrast is not None or not all(part.uniform for part in parts)
         return self.dilated
 
 

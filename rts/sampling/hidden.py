@@ -16,6 +16,7 @@ from rts.errors import InputError, LayersWarning, warn
 from rts.interfaces import Splatter, TriangleSurface
 from rts.operations.operation import known_value
 from rts.parts import CheckedPart
+from rts.plugin_base import overrides, promised
 from rts.records import ArraySpec, Decision, Hidden, Question, Sampled, Samples
 from rts.sampling.exits import beside_outlines
 from rts.sampling.extremes import largest
@@ -47,13 +48,13 @@ def hidden_by(
         settles: whether samples of a scene of one part may be left out that only cells amid its one colour need. Where
             samples are to be evaluated at other values of θ than they were found for, they may not.
     """
-    if not splatter.prunes or not all(p.shader.opaque for p in parts):
+    if not overrides(splatter, "needed", Splatter) or not all(p.shader.opaque for p in parts):
         return None
     size = _size(parts, sizes)
     if size is None and not all(isinstance(p.surface, TriangleSurface) and not p.surface.refines for p in parts):
         return None
     # Where parts meet, rounding decides which of them a cell shows.
-    settles = settles and splatter.settles and len(parts) == 1 and parts[0].shader.uniform
+    settles = settles and promised(splatter, "fills_interiors") and len(parts) == 1 and parts[0].uniform
     return HiddenBySplatter(splatter, size or 0.0, settles)
 
 

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.adapting import adapted
 from rts.camera import Camera
 from rts.engines import context_of, floating_bits, is_constant, stopped
-from rts.interfaces import Shader, TriangleSurface
+from rts.interfaces import TriangleSurface
 from rts.parts import CheckedPart, Part
 from rts.records import ON_RAYS, ArraySpec, Cells, Samples
 from rts.sampling.cache import Entry
@@ -93,8 +92,7 @@ class HostCall:
         reads = {name: part.theta[name] for name in surface.reads(part.theta)}
         # What has no derivative is evaluated where it is sampled.
         self._theta = reads if self._engine.differentiates and is_constant(reads) else None
-        shader = adapted(part.shader, Shader)
-        self._asked = None if shader is None else shader.reads
+        self._asked = part.reads if isinstance(part, CheckedPart) else None
         self._attributes = _attribute_specs(surface, self._asked, self._theta, shape, like)
 
     def samples(

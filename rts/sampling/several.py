@@ -18,6 +18,7 @@ from rts.checks import check_memory
 from rts.engines import engine_of, is_traced, namespace, stopped, value_of
 from rts.interfaces import TriangleSurface
 from rts.parts import CheckedPart
+from rts.plugin_base import overrides
 from rts.records import ArraySpec, Cells, Decision, Fragments, Question, Sampled, Samples
 from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
@@ -82,7 +83,7 @@ class Sampling(NamedTuple):
         One by one are sampled surfaces that refine their samples or leave them off their rays, that intersect rays or
         have other triangles for each view, parts with exits, and what a sampler with a `sample` of its own samples.
         """
-        exits = self.scenes[0].context.engine.differentiates and self.settings.reader.reads_exits
+        exits = self.scenes[0].context.engine.differentiates and "exit" in self.settings.reader.reads
         return all(_is_plain(sampler, part, exits) for part, sampler, _ in self.parts())
 
     def parts(self) -> list[tuple[Any, Any, Any]]:
@@ -110,7 +111,8 @@ class Sampling(NamedTuple):
         cameras = [stopped(grid.camera.within(part.transform)) for grid in grids]
         surface, picture, layers = part.surface, self.picture, settings.most_layers
         assert isinstance(surface, TriangleSurface)
-        tells = settings.reader.reads_facing and layers > 1 and part.cull == "none" and surface.tells_pieces
+        tells = "facing" in settings.reader.reads and layers > 1 and part.cull == "none"
+        tells = tells and overrides(surface, "pieces", TriangleSurface)
         capacity = None if settings.capacity is None else picture.views * settings.capacity
         shape = Shape(layers, picture.size, capacity, picture.size)
         beside = {
@@ -272,7 +274,7 @@ def in_one_table(samples: Sequence[Samples]) -> Samples:
 def _is_plain(sampler: Any, part: CheckedPart, exits: bool) -> bool:
     """Whether views of a part can be sampled as one; with `exits` where somebody reads them."""
     surface = part.surface
-    if not isinstance(sampler, TriangleSampler) or type(sampler).sample is not TriangleSampler.sample:
+    if not isinstance(sampler, TriangleSampler) or overrides(sampler, "sample", TriangleSampler):
         return False
     if not isinstance(surface, TriangleSurface) or surface.refines or surface.depends_on_view or not surface.centered:
         return False

@@ -9,13 +9,13 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from rts.adapting import unwrapped
 from rts.arrays import shape_of
 from rts.camera import Camera
 from rts.engines import stopped, value_of
 from rts.errors import InputError, PluginError
-from rts.interfaces import Sampler, TriangleSurface, as_surface
+from rts.interfaces import Sampler, TriangleSurface
 from rts.parts import Part
+from rts.plugin_base import overrides
 from rts.records import ArraySpec, Decision, Fragments, Hidden, Proxy, Question, Request, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines
@@ -43,29 +43,19 @@ class TriangleSampler(Sampler):
     What was prepared is kept (`rts.sampling.cache`) until the proxy's inputs change.
 
     Attributes:
-        builds: whether something is worth building once for a proxy; True in a class with its own `prepare`.
-        follows: whether what was prepared can follow moved vertices; True in a class with its own `update`.
-        concurrent: whether several threads may call `rasterize` at once; those of a sampler that `follows` wait for one
-            another in any case.
+        concurrent: whether several threads may call `rasterize` at once; those of a sampler with an `update` wait
+            for one another in any case.
     """
 
-    DECLARES = True
-    FLAGS = {"prepare": "builds", "update": "follows"}
-    builds: bool = False
-    follows: bool = False
     _keeper: Keeper
 
-    def __init_subclass__(cls, **options: Any) -> None:
-        """Refuse what would never be called."""
-        super().__init_subclass__(**options)
-        if cls.follows and not cls.builds:
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Give every instance a keeper, whatever `__init__` a subclass has; refuse what would never be called."""
+        if overrides(cls, "update", TriangleSampler) and not overrides(cls, "prepare", TriangleSampler):
             raise PluginError(
                 f"{cls.__qualname__} has an update, which adapts what prepare built, and no prepare; write prepare, or "
                 f"leave update out"
             )
-
-    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Give every instance a keeper, whatever `__init__` a subclass has."""
         self = super().__new__(cls)
         self._keeper = Keeper()
         return self
@@ -188,13 +178,13 @@ class TriangleSampler(Sampler):
 
     def _entry(self, surface: TriangleSurface, inputs: Tree, camera: Camera, size: tuple[int, int]) -> Entry:
         """What `_built` gives, kept from call to call where that pays."""
-        if surface.proxy_is_cheap and not self.builds:
+        if surface.proxy_is_cheap and not overrides(self, "prepare", TriangleSampler):
             proxy = checked_proxy(surface, inputs, camera, size)
             return Entry(proxy, self.prepare(proxy))
         beside = surface.proxy_key(inputs, camera, size) if surface.depends_on_view else None
 
         def follow(old: Entry) -> Entry | None:
-            if not self.follows or old.prepared is None:
+            if not self._follows or old.prepared is None:
                 return None
             proxy = checked_proxy(surface, inputs, camera, size)
             if not same_faces(old.proxy, proxy):
@@ -204,7 +194,7 @@ class TriangleSampler(Sampler):
             return None if updated is None else Entry(proxy, updated, largest(proxy.vertices))
 
         key = (fingerprint(inputs), beside)
-        return self._keeper.get(unwrapped(surface), key, lambda: self._built(surface, inputs, camera, size), follow)
+        return self._keeper.get(surface, key, lambda: self._built(surface, inputs, camera, size), follow)
 
     def sample(
         self, part: Part, camera: Camera, size: tuple[int, int], layers: int, request: Request = NOTHING_ELSE
@@ -221,7 +211,8 @@ class TriangleSampler(Sampler):
         listed, hidden, entry = request.cells, request.hidden, request.entry
         shape = Shape(layers, size if listed is None else tuple(listed.shape), request.capacity, size)
         tables, moves = shape.tables(surface) if surface.refines else {}, surface.refines and surface.refine_moves
-        sides = request.facing and layers > 1 and part.cull == "none" and surface.tells_pieces and not moves
+        sides = request.facing and layers > 1 and part.cull == "none" and not moves
+        sides = sides and overrides(surface, "pieces", TriangleSurface)
         exits = request.exits and part.cull == "back" and listed is None and not surface.refines and surface.centered
         beside = {
             **({"facing": ArraySpec((layers, *shape.size), np.int16)} if sides else {}),
@@ -271,7 +262,12 @@ class TriangleSampler(Sampler):
     @property
     def draws_at_once(self) -> bool:
         """Whether several threads may draw what is prepared of one surface at once."""
-        return self.concurrent and not self.follows
+        return self.concurrent and not self._follows
+
+    @property
+    def _follows(self) -> bool:
+        """Whether what was prepared can follow moved vertices."""
+        return overrides(self, "update", TriangleSampler)
 
 
 @dataclass(frozen=True)
@@ -391,12 +387,11 @@ class _Search:
         return 0.0 if read else largest(known.proxy.vertices)
 
 
-def _of_triangles(given: Any) -> TriangleSurface:
+def _of_triangles(surface: Any) -> TriangleSurface:
     """The surface, which must be one of triangles."""
-    surface = as_surface(given)
     if not isinstance(surface, TriangleSurface):
         raise InputError(
-            f"{given!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
+            f"{surface!r} has no triangles, which this sampler needs; use a sampler of its kind, such as 'rays'"
         )
     return surface
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from rts.adapting import unwrapped
 from rts.camera import Camera
 from rts.engines import stopped
 from rts.errors import InputWarning, warn
@@ -25,11 +24,11 @@ _looked_at: weakref.WeakSet[Any] = weakref.WeakSet()
 def warn_of_winding(parts: Sequence[CheckedPart], camera: Camera) -> None:
     """Warn of culled parts that are wound inside out; each surface is looked at but once."""
     for index, part in enumerate(parts):
-        if part.cull != "back" or _triangles_of(part) is None or not _is_new(surface := unwrapped(part.surface)):
+        if part.cull != "back" or _triangles_of(part) is None or not _is_new(part.surface):
             continue
         found = is_inside_out(part, camera)
         if found is None:
-            _looked_at.discard(surface)
+            _looked_at.discard(part.surface)
         if found:
             warn(f"part {index} {INSIDE_OUT}; give it faces[:, ::-1]", InputWarning)
 

@@ -16,7 +16,6 @@ import abc
 import functools
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
 
 import numpy as np
 
@@ -51,14 +50,6 @@ class Kernel(Splatter):
     sigma: float = SIGMA
     epsilon: float = EPSILON
     calibration: float | None = 1.0
-    _knows_settled: ClassVar[bool] = True
-
-    def __init_subclass__(cls, **options: Any) -> None:
-        super().__init_subclass__(**options)
-        if "image" in vars(cls):
-            cls._knows_settled = "_knows_settled" in vars(cls)
-        if vars(cls).keys() & {"image", "accumulate"} and "follows_outlines" not in vars(cls):
-            cls.follows_outlines = False  # What a class inherits it may not do.
 
     def __post_init__(self):
         if not (is_real(self.sigma) and LEAST_SIGMA <= self.sigma <= LARGEST_SIGMA):
@@ -73,11 +64,6 @@ class Kernel(Splatter):
         if splats.rgba.shape[0] == 0:
             return nothing(splats.rgba, splats.row)
         return settled(self.accumulate(splats), splats)
-
-    @property
-    def settles(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
-        """See `rts.Splatter`: True where weights fill a cell, and not in a class with an `image` of its own."""
-        return self._knows_settled and self.epsilon >= LEAST_EPSILON
 
     @abc.abstractmethod
     def accumulate(self, splats: Splats) -> Array:

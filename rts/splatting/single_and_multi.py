@@ -51,8 +51,12 @@ class Plain(Splatter):
 class Single(Kernel):
     """One layer, occlusion ignored (paper eq. 1–3): only the front layer of `row` is splatted."""
 
-    follows_outlines = True
     layers = 1
+
+    @property
+    def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
+        """See `rts.Splatter`: True where weights fill a cell."""
+        return self.epsilon >= LEAST_EPSILON
 
     def accumulate(self, splats: Splats) -> Array:
         """See `Kernel`."""

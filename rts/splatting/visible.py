@@ -11,12 +11,20 @@ import numpy as np
 from rts.engines import engine_of
 from rts.records import Splats
 from rts.splatting import crossings, rims
-from rts.splatting.kernel import Kernel
+from rts.splatting.kernel import LEAST_EPSILON, Kernel
 from rts.splatting.layers import NEIGHBOURS, Depths, Layers, all_of, nearest, normalised, over
 from rts.trees import Array
 
 CONTINUED = 0.8
 """Share of the error of plain pairing below which `Visible` takes the line of a front layer for its continuation."""
+
+
+_READS = {
+    (facing, exits): frozenset(name for name, read in (("facing", facing), ("exit", exits)) if read)
+    for facing in (False, True)
+    for exits in (False, True)
+}
+"""What is read of cells, by whether sides and exits are."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +48,7 @@ class Visible(Kernel):
             it moves as the samples, which on a smooth rim that turns move faster. The image is the same.
         crossings: whether lines where two surfaces pass through one another move as their depths say (`crossings.py`);
             otherwise as the samples beside them, which hardly do. The image is the same.
-        reads_facing: whether layers that show opposite sides of one sheet are kept from pairing, where samplers tell
+        facing: whether layers that show opposite sides of one sheet are kept from pairing, where samplers tell
             sides (`Splats.facing`); otherwise depths alone decide.
         exits: whether outlines of culled parts move as the middles of their chords, where samplers tell where these end
             (`Splats.exit`); otherwise fronts alone decide. The image is the same.
@@ -50,21 +58,25 @@ class Visible(Kernel):
     calibration: float | None = None
     rims: bool = True
     crossings: bool = True
-    reads_facing: bool = True
+    facing: bool = True
     exits: bool = True
-    follows_outlines = True
     reach = 3  # Depths three cells away may decide how an outline or a line of crossing moves.
 
     @property
-    def reads_exits(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
+    def reads(self) -> frozenset[str]:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
         """See `rts.Splatter`."""
-        return self.rims and self.exits
+        return _READS[self.facing, self.rims and self.exits]
+
+    @property
+    def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
+        """See `rts.Splatter`: True where weights fill a cell."""
+        return self.epsilon >= LEAST_EPSILON
 
     def accumulate(self, splats: Splats) -> Array:
         """See `Kernel`."""
         row = splats.row
-        splats = splats if self.reads_exits else splats.replace(exit=None)
-        layers = Layers(self.weights, splats, splats.facing if self.reads_facing else None)
+        splats = splats if "exit" in self.reads else splats.replace(exit=None)
+        layers = Layers(self.weights, splats, splats.facing if self.facing else None)
         xp, shift = layers.xp, {}
         for n in NEIGHBOURS:
             s, off = layers.pairing(*n)

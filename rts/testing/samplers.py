@@ -13,7 +13,7 @@ from rts.camera import Camera
 from rts.checks import check_sampler
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.interfaces import TriangleSurface
+from rts.interfaces import Surface, TriangleSurface
 from rts.parts import Part
 from rts.records import Decision, Question, Request, Sampled
 from rts.rendering.renderer import prepare
@@ -34,7 +34,7 @@ SCALES = 1, 0.9, 0.8, 0.7, 0.8
 """Factors of θ, call after call: more than are kept (`rts.sampling.cache.KEPT`), and one that is."""
 
 
-class Elsewhere:
+class Elsewhere(Surface):
     """A surface that no sampler can sample: it has neither triangles nor an intersection."""
 
     sample_widths = (0, 2)

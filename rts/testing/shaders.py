@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rts import registry
-from rts.adapting import adapted
+from rts.checks import check_shader
 from rts.engines import Engine, constants, engine_of
 from rts.gbuffer import GBuffer
 from rts.interfaces import Shader
+from rts.plugin_base import promised
 from rts.row_cameras import RowCameras
 from rts.testing import derivatives, scenes
 from rts.testing.claims import claim, claim_close, claim_finite, no_error, refusal
@@ -82,7 +82,7 @@ class ShaderConformance(Conformance):
     def test_uniform_is_one_color(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
         """A shader that promises one colour gives it to all samples, through any camera."""
         instance, theta = _instance(shader), map_leaves(derivatives.single, theta)
-        if not instance.uniform:
+        if not promised(instance, "uniform"):
             pytest.skip("the shader does not promise one colour")
         first = np.asarray(instance(theta, GBuffer(gbuffer), scenes.CAMERA))[:1]
         for view, camera in scenes.VIEWS.items():
@@ -91,29 +91,24 @@ class ShaderConformance(Conformance):
             claim((rgba == first).all(), f"the shader promises one colour; from {view} there are others")
 
     def test_it_reads_what_it_says(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
-        """Given only position and the entries that `reads` names, a shader gives the same colours.
-
-        So it does given only the entries of θ that `reads_theta` names.
-        """
-        reads, of_theta = _instance(shader).reads, _instance(shader).reads_theta
-        if of_theta is not None:
-            with no_error(f"shading with no θ but {', '.join(of_theta)}, as `reads_theta` says"):
-                found = _shaded(shader, {name: x for name, x in theta.items() if name in of_theta}, gbuffer)
-            claim_close(found, _shaded(shader, theta, gbuffer), 0, "the colour without what is not in `reads_theta`")
+        """Given only position and the entries that `reads` names, of the G-buffer and of θ, colours are the same."""
+        reads = promised(_instance(shader), "reads")
         if reads is None:
             pytest.skip("the shader does not say what it reads")
         fewer = {name: value for name, value in gbuffer.items() if name in ("position", *reads)}
+        few = {name: value for name, value in theta.items() if name in reads}
         with no_error(f"shading with position, {', '.join(reads)} only, as `reads` says"):
-            found = _shaded(shader, theta, fewer)
+            found = _shaded(shader, few, fewer)
         claim_close(found, _shaded(shader, theta, gbuffer), 0, "the colour without what is not in `reads`")
 
     def test_samples_of_several_views_are_shaded_as_by_each(self, shader: Any, theta: Tree, gbuffer: dict) -> None:
         """A shader that takes samples of several views gives each the colour that it has through its own camera."""
         own: Any = _instance(shader)
-        if not own.takes_views:
+        if not promised(own, "takes_views"):
             pytest.skip("the shader does not take samples of several views")
         claim(
-            own.reads is not None, "the shader takes samples of several views; expected it to say what it `reads`, too"
+            promised(own, "reads") is not None,
+            "the shader takes samples of several views; expected it to say what it `reads`, too",
         )
         cameras, single = [scenes.CAMERA, scenes.NEAR], map_leaves(derivatives.single, theta)
         number = np.repeat(np.array([1, 2], np.int32), [ROWS // 4, ROWS - ROWS // 4])
@@ -219,9 +214,7 @@ def awkward(gbuffer: dict) -> dict:
 
 
 def _instance(shader: Any) -> Shader:
-    found = adapted(registry.instance("rts.shaders", shader), Shader)
-    claim(found is not None, f"the shader is {shader!r}; expected a name, an object or a function")
-    return found
+    return check_shader(shader, "the shader")
 
 
 def _call(shader: Any, inputs: dict, engine: Engine | None) -> Any:

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rts.adapting import unwrapped
 from rts.checks import check_splatter
 from rts.interfaces import Splatter
+from rts.plugin_base import overrides, promised
 from rts.records import Cells, Splats
 from rts.testing import derivatives
-from rts.testing.claims import claim, claim_close, no_error, refusal
+from rts.testing.claims import claim, claim_close, no_error
 from rts.testing.conformance import Conformance
 from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating
 
@@ -102,7 +102,7 @@ class SplatterConformance(Conformance):
     def test_what_it_does_not_need_has_no_effect(self, splatter: Any) -> None:
         """Without the samples that `needed` leaves out, image and derivative are the same."""
         chosen = _instance(splatter)
-        if not chosen.prunes:
+        if not overrides(chosen, "needed", Splatter):
             pytest.skip("the splatter does not say which samples it needs")
         splats = steps()
         covered = splats.row >= 0
@@ -120,7 +120,7 @@ class SplatterConformance(Conformance):
     def test_settled_cells_show_the_colors_that_they_name(self, splatter: Any) -> None:
         """Settled cells show the colour of the sample that they name; what only they need may be missing."""
         chosen = _instance(splatter)
-        if not chosen.settles:
+        if not promised(chosen, "fills_interiors"):
             pytest.skip("the splatter does not read which cells are settled")
         splats, settled = two_colors()
         loose = settled < 0
@@ -191,20 +191,6 @@ class SplatterConformance(Conformance):
             unused = np.setdiff1d(np.arange(CELLS), row)
             for what, g in zip(("positions", "colours"), derivatives.host(chosen, gradient), strict=True):
                 claim((g[unused] == 0).all(), f"in {engine}, the gradient of the {what} of padded rows is not zero")
-
-    # ------------------------------------------------------------------------------------------- errors
-
-    def test_wrong_shapes_are_refused_in_one_line(self, splatter: Any) -> None:
-        """Wrong shapes are an `rts.InputError` that says what was expected."""
-        splats = scattered()
-        wrong = {
-            "positions of two coordinates": splats.replace(positions=splats.positions[:, :2]),
-            "colours without alpha": splats.replace(rgba=splats.rgba[:, :3]),
-            "fewer colours than positions": splats.replace(rgba=splats.rgba[:-1]),
-            "row without layers": splats.replace(row=splats.row[0]),
-        }
-        for what, given in wrong.items():
-            claim(refusal(lambda given=given: _direct(splatter, given), what), f"{what} is accepted")
 
 
 # ------------------------------------------------------------------------------------------------ samples
@@ -281,10 +267,8 @@ def _splat(splatter: Any, splats: Splats) -> np.ndarray:
 
 
 def _direct(splatter: Any, splats: Splats) -> Any:
-    """The image by a direct call with arrays; the plugin's own `splat`, if it has one."""
-    found = _instance(splatter)
-    own = unwrapped(found)
-    return (own if hasattr(own, "splat") else found).splat(splats.positions, splats.rgba, splats.row)
+    """The image by a direct call with arrays."""
+    return _instance(splatter).splat(splats.positions, splats.rgba, splats.row)
 
 
 def _of_positions_and_colors(splatter: Any, row: np.ndarray) -> Callable[[list], Any]:

@@ -13,19 +13,18 @@ from rts import splatting
 from rts.arrays import without_border
 from rts.engines import engine_of
 from rts.fitting.losses import SQUARE, Loss
+from rts.interfaces import SummingSplatter
+from rts.plugin_base import overrides
 from rts.records import Splats
 from rts.trees import Array
 from rts_backends.fused.cells import Settings
 from rts_backends.fused.image import IMAGE
 
 
-class _Fused(splatting.Kernel):
+class _Fused(splatting.Kernel, SummingSplatter):
     """Base that makes `image` by compiled kernels; it stands before a class of `rts.splatting`, which it extends."""
 
     kind: ClassVar[str]
-    averages = True
-    takes_losses = True
-    _knows_settled = True
 
     def image(self, splats: Splats) -> Array:
         """See `rts.splatting.Kernel`."""
@@ -35,7 +34,7 @@ class _Fused(splatting.Kernel):
 
     def cropped(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
-        if type(self).image is not _Fused.image:  # A subclass has an `image` of its own.
+        if overrides(self, "image", _Fused):  # A subclass has an `image` of its own.
             return super().cropped(splats)
         if splats.rgba.shape[0] == 0:
             return without_border(super().image(splats), splats.border)
@@ -55,16 +54,15 @@ class _Fused(splatting.Kernel):
         return splats.positions, splats.rgba, splats.row, part, facing, *(none if x is None else x for x in known)
 
     def _facing(self, splats: Splats) -> Array | None:
-        return splats.facing if self.reads_facing else None
+        return splats.facing if "facing" in self.reads else None
 
     def _exits(self, splats: Splats) -> Array | None:
-        return splats.exit if self.reads_exits else None
+        return splats.exit if "exit" in self.reads else None
 
     @property
     def _sweeps(self) -> bool:
         """Whether the image is that of compiled kernels: a subclass may have one of its own."""
-        kind = type(self)
-        return kind.image is _Fused.image and kind.cropped is _Fused.cropped
+        return not (overrides(self, "image", _Fused) or overrides(self, "cropped", _Fused))
 
     def _settings(self, border: int, one_part: bool = False) -> Settings:
         return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border, one_part, *self._motions)
@@ -111,7 +109,7 @@ class Single(_Fused, splatting.Single):
     """`rts.splatting.Single`, compiled."""
 
     kind = "single"
-    follows_outlines = True
+    fills_interiors = splatting.Single.fills_interiors
 
 
 class Multi(_Fused, splatting.Multi):
@@ -124,7 +122,7 @@ class Visible(_Fused, splatting.Visible):
     """`rts.splatting.Visible`, compiled."""
 
     kind = "visible"
-    follows_outlines = True
+    fills_interiors = splatting.Visible.fills_interiors
 
     @property
     def _motions(self) -> tuple[bool, ...]:

@@ -40,8 +40,7 @@ class RadianceShader(Shader):
     chunk: int = CHUNK
     opaque = True
     takes_views = True
-    reads = ()
-    reads_theta = ("weights",)
+    reads = ("weights",)
 
     def __post_init__(self):
         if self.ndc is not None and not isinstance(self.ndc, Ndc):

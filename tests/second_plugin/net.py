@@ -8,7 +8,7 @@ from .softplus import SOFTPLUS
 
 
 class Net(rts.Shader):
-    opaque, reads = True, ()
+    opaque, reads = True, ("net",)
 
     def __call__(self, theta, gbuffer, camera):
         net, position = theta.get("net", {}), gbuffer["position"]

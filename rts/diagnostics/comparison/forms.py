@@ -9,7 +9,7 @@ import numpy as np
 
 from rts.camera import Camera
 from rts.diagnostics.comparison.scene import SceneFunction, parts_of
-from rts.interfaces import Rate, as_surface
+from rts.interfaces import Rate
 from rts.parts import Part
 from rts.trees import Tree
 
@@ -37,7 +37,7 @@ def forms_of(at: SceneFunction, parts: Sequence[Part]) -> dict[str, Form]:
     """
     offered: dict[tuple[type, int], dict[int, Rate]] = {}
     for index, part in enumerate(parts):
-        surface = as_surface(part.surface)
+        surface = part.surface
         for number, rate in enumerate(surface.rates(part.theta)):
             offered.setdefault((type(surface), number), {})[index] = rate
     found = {"": Form(at, 1.0)}

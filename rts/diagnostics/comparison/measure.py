@@ -24,7 +24,6 @@ from rts.engines import Engine, is_constant, namespace
 from rts.errors import InputError, RtsWarning
 from rts.explaining import explain
 from rts.fitting.names import one_line
-from rts.interfaces import as_surface
 from rts.parts import Part
 from rts.registry import instance
 from rts.rendering.image import render
@@ -89,7 +88,7 @@ class Measurements:
 
     def _group(self, mode: str) -> str:
         parts = parts_of(self.scene.at(self.scene.moved(mode, 0.0, self.engine)))
-        read = [part.theta[name] for part in parts for name in as_surface(part.surface).reads(part.theta)]
+        read = [part.theta[name] for part in parts for name in part.surface.reads(part.theta)]
         return "surfaces rest" if is_constant(read) else "surfaces change"
 
     def group(self, mode: str) -> str:

@@ -12,11 +12,12 @@ import numpy as np
 
 from rts.arguments import quoted
 from rts.camera import Camera
+from rts.checks import check_shader
 from rts.engines import Engine, constants, engine_of, exemplar, is_constant
 from rts.errors import InputError
-from rts.interfaces import TriangleSurface, as_surface
+from rts.interfaces import TriangleSurface
 from rts.parts import Part
-from rts.registry import instance
+from rts.plugin_base import promised
 from rts.shading import Unlit
 from rts.trees import Array, Tree, collected, leaves, map_leaves
 
@@ -242,7 +243,7 @@ def _middle(parts: Sequence[Part]) -> np.ndarray:
 
 def _points(part: Part) -> np.ndarray:
     """Points (M, 3) of a surface, local space; where it has no triangles, the middle that it says it has, or 0."""
-    surface = as_surface(part.surface)
+    surface = part.surface
     if isinstance(surface, TriangleSurface):
         with contextlib.suppress(InputError):  # Of a surface whose triangles depend on the view.
             vertices, faces = surface.tessellate(part.theta, CUTS)
@@ -265,7 +266,7 @@ TINT = np.array([1.0, -0.5, 0.25, 0.0])
 
 def _swelling(part: Part) -> dict[str, np.ndarray]:
     """The directions in which what the surface is made of changes, by entry."""
-    reads = as_surface(part.surface).reads(part.theta)
+    reads = part.surface.reads(part.theta)
     # Beside its vertices a mesh may have attributes of any name.
     names = ("vertices",) if "vertices" in reads else [name for name in reads if name not in NO_SHAPE]
     found = {}
@@ -292,9 +293,9 @@ def _away(points: np.ndarray) -> np.ndarray:
 
 def _coloring(part: Part) -> dict[str, np.ndarray]:
     """The direction in which the base colour of a part changes, by the entry that it comes from."""
-    theta, reads = part.theta, as_surface(part.surface).reads(part.theta)
-    shader = instance("rts.shaders", part.shader)
-    wanted = getattr(shader, "reads", None)
+    theta, reads = part.theta, part.surface.reads(part.theta)
+    shader = check_shader(part.shader, "the shader")
+    wanted = promised(shader, "reads")
     if wanted is not None and not {"color", "uv"} & set(wanted):
         return {}
     sources = {"texture": "uv" in theta, "colors": "colors" in reads, "color": True}

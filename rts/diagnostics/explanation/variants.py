@@ -11,7 +11,6 @@ from rts.camera import Camera
 from rts.diagnostics.explanation.subject import Change
 from rts.engines import engine_of, namespace
 from rts.gbuffer import GBuffer
-from rts.interfaces import as_surface
 from rts.parts import Part
 from rts.registry import instance
 from rts.trees import Array, Tree
@@ -42,7 +41,7 @@ def transparent(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
 
 def unbounded(parts: list[Part], camera: Camera) -> tuple[list[Part], Camera]:
     """The scene of surfaces whose derivatives are as large as they come."""
-    surfaces = [as_surface(p.surface).unbounded() for p in parts]
+    surfaces = [p.surface.unbounded() for p in parts]
     return [p if s is None else p.replace(surface=s) for p, s in zip(parts, surfaces, strict=True)], camera
 
 

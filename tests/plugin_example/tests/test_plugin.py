@@ -16,21 +16,6 @@ class TestHeightfield(SurfaceConformance):
         return Heightfield.example()
 
 
-class Duck:
-    """A heightfield that inherits from nothing."""
-
-    sample_widths, squares, newton_steps = Heightfield.sample_widths, Heightfield.squares, Heightfield.newton_steps
-    check, evaluate, proxy_inputs = Heightfield.check, Heightfield.evaluate, Heightfield.proxy_inputs
-    proxy, refine = Heightfield.proxy, Heightfield.refine
-
-
-class TestDuck(SurfaceConformance):
-    @pytest.fixture
-    def part(self):
-        assert not isinstance(Duck(), rts.Surface)
-        return Heightfield.example().replace(surface=Duck())
-
-
 class TestToy(SamplerConformance):
     @pytest.fixture
     def sampler(self):

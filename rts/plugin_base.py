@@ -1,0 +1,93 @@
+"""The base of all bases of plugins: what a class overrides, which promises hold for it, and misspelt members."""
+
+from __future__ import annotations
+
+import abc
+import inspect
+import weakref
+from collections.abc import Mapping
+from types import FunctionType
+from typing import Any
+
+from rts.errors import PluginError
+
+
+class Plugin(abc.ABC):  # noqa: B024
+    """The base of all bases. A plugin subclasses the base of its kind."""
+
+
+PROMISES: Mapping[str, tuple[str, ...]] = {
+    "uniform": ("__call__",),
+    "takes_views": ("__call__",),
+    "reads": ("__call__", "base_color"),
+    "fills_interiors": ("image", "accumulate"),
+}
+"""Promise → the methods that it speaks of, in classes that have them."""
+
+
+def overrides(plugin: Any, method: str, base: type) -> bool:
+    """Whether a plugin, or a class of plugins, has another method of this name than `base`, of which it is."""
+    kind = plugin if isinstance(plugin, type) else type(plugin)
+    return issubclass(kind, base) and getattr(kind, method, None) is not getattr(base, method, None)
+
+
+def promised(plugin: Any, name: str) -> Any:
+    """A promise of a plugin, or of a class of plugins, as far as it holds.
+
+    It holds for the class that states it. Where a class below overrides a method that it speaks of, it is as the base
+    has it; a promise of a class that has no such method yet is for those that will.
+    """
+    kind = plugin if isinstance(plugin, type) else type(plugin)
+    stated = [c for c in kind.__mro__ if name in vars(c)]
+    own, base = stated[0], stated[-1]
+    there = {m for c in own.__mro__ if not issubclass(base, c) for m in PROMISES[name] if m in vars(c)}
+    if name in getattr(plugin, "__dict__", ()) or not any(overrides(kind, m, own) for m in there):
+        return getattr(plugin, name)
+    return vars(base)[name]
+
+
+_checked: weakref.WeakSet[type] = weakref.WeakSet()
+
+
+def check_members(kind: type[Plugin]) -> None:
+    """Refuse a class with a function whose name is one letter from an optional method that it lacks, or that is final.
+
+    Optional methods are those of the bases of the library, which are its abstract classes.
+
+    Raises:
+        PluginError: there is one; it is looked for once.
+    """
+    if kind in _checked:
+        return
+    bases = [c for c in kind.__mro__ if inspect.isabstract(c) and c.__module__.partition(".")[0] == "rts"]
+    members = {n: f for c in reversed(bases) for n, f in vars(c).items() if isinstance(f, FunctionType) and n[0] != "_"}
+    functions = [(c, n) for c in kind.__mro__ if c not in bases for n, f in vars(c).items() if type(f) is FunctionType]
+    there = {name for _, name in functions}
+    lacked = [n for n, f in members.items() if n not in there and not getattr(f, "__isabstractmethod__", False)]
+    package = kind.__module__.partition(".")[0]
+    for where, name in functions:
+        if getattr(members.get(name), "__final__", False):
+            raise PluginError(f"{where.__qualname__} overrides {name!r}, which is final: {_line(members[name])}")
+        if name in members or where.__module__.partition(".")[0] != package:
+            continue
+        meant = next((n for n in sorted(lacked) if _one_edit(name, n)), None)
+        if meant is not None:
+            raise PluginError(
+                f"{where.__qualname__} has a function {name!r}, which rts never calls; did you mean {meant!r} of "
+                f"{bases[0].__name__}? Rename it to that, or to something less alike"
+            )
+    _checked.add(kind)
+
+
+def _line(function: Any) -> str:
+    """The first line of a function's docstring."""
+    return inspect.getdoc(function).partition("\n")[0]  # pyright: ignore[reportOptionalMemberAccess]  # It has one.
+
+
+def _one_edit(a: str, b: str) -> bool:
+    """Whether one character added, left out or exchanged makes one name of the other."""
+    if abs(len(a) - len(b)) > 1 or a == b:
+        return False
+    short, long = sorted((a, b), key=len)
+    start = next((i for i, c in enumerate(short) if c != long[i]), len(short))
+    return short[start + (len(short) == len(long)) :] == long[start + 1 :]
