@@ -252,7 +252,8 @@ class _Function(Residuals):
 
 def _residuals(given: Any, what: str) -> Residuals:
     """Residuals, of a function if they are one; `what` names them."""
-    found = _Function(given) if callable(given) and not isinstance(given, Residuals) else given
+    function = callable(given) and not isinstance(given, (Residuals, type))
+    found = _Function(given) if function else given
     return checked_plugin(found, what, Residuals, "a function of the parameters, ")
 
 
