@@ -61,7 +61,8 @@ def capabilities(group: str, plugin: Any) -> dict[str, Any]:
         for name, (base, method) in METHODS.get(group, {}).items()
     }
     # What depends on settings is that of the default ones.
-    told = kind() if group == "rts.splatters" and plugin is kind else plugin
+    by_settings = any(isinstance(getattr(kind, name), property) for name in VARIABLES.get(group, ()))
+    told = kind() if by_settings and plugin is kind else plugin
     for name in VARIABLES.get(group, ()):
         found[name] = promised(told, name) if name in PROMISES else getattr(told, name)
     return found

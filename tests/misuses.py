@@ -188,7 +188,7 @@ GROUPS = {
     "RayHits": open_in(lambda **o: drawn(Ball(**o), {}), "hit", "distance", "params", "ids"),
     "Revolution": open_in(rts.Revolution, "ends", "tolerance", heights=np.arange(5.0)),
     "Samples": open_in(
-        lambda **o: rts.render_samples(replace(SAMPLED, samples=[replace(SAMPLES, **o)]), PART, CAMERA),
+        lambda **o: rts.render_samples(replace(SAMPLED, samples=[SAMPLES.replace(**o)]), PART, CAMERA),
         *("ids", "params", "row", "depth"),
     ),
     "Sdf": open_in(lambda **o: rts.Sdf(lambda t, p: p[:, 0], **o), "isovalue", "inside", "reads", "attributes"),

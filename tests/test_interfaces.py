@@ -171,7 +171,7 @@ MISSPELT = [
     (MESH, "refime", "refine"),
     (RASTER, "prepares", "prepare"),
     (RASTER, "updates", "update"),
-    (splatting.Plain, "normal_equation", "normal_equations"),
+    (splatting.Plain, "croped", "cropped"),
     (Ellipsoid, "read", "reads"),
 ]
 

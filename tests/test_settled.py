@@ -327,7 +327,7 @@ def test_samples_are_left_out_only_where_nothing_can_depend_on_them():
             (part, splatting.Visible(epsilon=0.0)),
         )
     ]
-    assert settled == [True, True, False, False, False, False, False, False]
+    assert settled == [True, False, False, False, False, False, False, False]
 
 
 def test_what_needs_the_samples_that_were_left_out_is_refused():
