@@ -9,38 +9,28 @@ The surfaces that come with it are attributes, too, loaded when they are first u
 
 from typing import TYPE_CHECKING, Any
 
-from rts import registry, regularizers
-from rts.adapting import unwrapped
+from rts import errors, registry, regularizers
 from rts.camera import Camera
 from rts.diagnostics.gradients import check_gradient, gradient_image
-from rts.diagnostics.tune import Tuned, tune
+from rts.diagnostics.tune import tune
 from rts.engines import Engine, engine_of, namespace
 from rts.errors import (
-    AspectWarning,
-    EmptyImageWarning,
     EngineError,
-    FileWarning,
     InputError,
-    InputWarning,
-    LayersWarning,
     PluginError,
     RtsError,
     RtsWarning,
-    SamplerWarning,
-    ToleranceWarning,
 )
 from rts.explaining import explain
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
-from rts.files.views import View, load_views
-from rts.fitting.fit import Fit, fit
+from rts.files.views import load_views
+from rts.fitting.fit import fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
 from rts.gbuffer import GBuffer
 from rts.interfaces import (
-    Evaluator,
-    Rate,
     RaySurface,
     Residuals,
     Sampler,
@@ -50,21 +40,15 @@ from rts.interfaces import (
     TriangleSurface,
 )
 from rts.ndc import Ndc
-from rts.operations.combine import combine
-from rts.operations.gradient import gradient
-from rts.operations.operation import Operation
 from rts.operations.rigid import rigid
 from rts.parts import Part
-from rts.radiance_fields import load_radiance_field, volume_render
-from rts.records import ArraySpec, Fine, Fragments, Proxy, RayHits, Rays, Sampled, Samples, Splats
+from rts.radiance_fields import load_radiance_field
 from rts.registry import plugin, plugins
 from rts.rendering import render, render_samples
-from rts.row_cameras import RowCameras
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.prepared import prepare
 from rts.sampling.scenes import sample
 from rts.sampling.triangle_sampler import TriangleSampler
-from rts.splatting import exact_calibration
 from rts.views import render_views
 from rts.warming import warmup
 
@@ -93,57 +77,32 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Adaptive",
-    "ArraySpec",
-    "AspectWarning",
     "Camera",
-    "EmptyImageWarning",
     "Engine",
     "EngineError",
-    "Evaluator",
-    "FileWarning",
-    "Fine",
-    "Fit",
-    "Fragments",
     "GBuffer",
     "ImageResiduals",
     "InputError",
-    "InputWarning",
-    "LayersWarning",
     "Loss",
     "Ndc",
-    "Operation",
     "Part",
     "PluginError",
-    "Proxy",
-    "RayHits",
     "RaySurface",
-    "Rate",
-    "Rays",
     "Residuals",
-    "RowCameras",
     "RtsError",
     "RtsWarning",
-    "Sampled",
     "Sampler",
-    "SamplerWarning",
-    "Samples",
     "Shader",
-    "Splats",
     "Splatter",
     "Stage",
     "Surface",
-    "ToleranceWarning",
     "TriangleSampler",
     "TriangleSurface",
-    "Tuned",
-    "View",
     "check_gradient",
-    "combine",
     "engine_of",
-    "exact_calibration",
+    "errors",
     "explain",
     "fit",
-    "gradient",
     "gradient_image",
     "load",
     "load_image",
@@ -163,7 +122,5 @@ __all__ = [
     "save_animation",
     "save_image",
     "tune",
-    "unwrapped",
-    "volume_render",
     "warmup",
 ]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import field, replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -124,6 +124,8 @@ class Samples:
         exit: (H, W) int32, the sample where the ray leaves the closed part behind its front, or −1: a row of its own,
             which `row` does not name, in cells at outlines and beside them. None where nothing is told.
     """
+
+    MORE: ClassVar[int] = MORE
 
     ids: Array
     params: Array

@@ -6,15 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import shape_of
-from rts.camera import Camera
-from rts.engines import constants, engine_of, exemplar, namespace
-from rts.errors import InputError
-from rts.interfaces import RaySurface, Sampler, as_surface
-from rts.parts import Part
-from rts.records import ArraySpec, RayHits, Samples
-from rts.sampling.validation import check_camera
-from rts.trees import Array, map_leaves
+from rts import Camera, InputError, Part, RaySurface, Sampler, engine_of, namespace
+from rts.plugin_api.arrays import Array, constants, exemplar, map_leaves, shape_of
+from rts.plugin_api.checks import check_camera
+from rts.plugin_api.records import ArraySpec, RayHits, Samples
 
 
 class Rays(Sampler):
@@ -33,7 +28,7 @@ class Rays(Sampler):
         cells: Array | None = None,
     ) -> Samples:
         """See `rts.Sampler`."""
-        surface = as_surface(part.surface)
+        surface = part.surface
         if not isinstance(surface, RaySurface):
             raise InputError(
                 f"{part.surface!r} does not intersect rays itself; use a sampler of triangles, such as 'raster'"

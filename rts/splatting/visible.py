@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import operator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -17,6 +18,10 @@ from rts.trees import Array
 
 CONTINUED = 0.8
 """Share of the error of plain pairing below which `Visible` takes the line of a front layer for its continuation."""
+
+RIMS = rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF
+CROSSINGS = crossings.LARGEST, crossings.DIRECT, crossings.FIT, crossings.SLACK, crossings.KEPT
+"""Numbers of those modules, for compiled code."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,9 @@ class Visible(Kernel):
     crossings: bool = True
     reads_facing: bool = True
     exits: bool = True
+    CONTINUED: ClassVar[float] = CONTINUED
+    RIMS: ClassVar[tuple[float, ...]] = RIMS
+    CROSSINGS: ClassVar[tuple[float, ...]] = CROSSINGS
     follows_outlines = True
     reach = 3  # Depths three cells away may decide how an outline or a line of crossing moves.
 

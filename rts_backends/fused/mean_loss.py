@@ -6,15 +6,16 @@ is no other array of the image's size, and the way back starts at what is left i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
-from rts.fitting.losses import Loss
-from rts.operations.operation import Arrays, Operation, Some
-from rts.threads import parallel, read_only
-from rts.trees import Array
+from rts import Loss
+from rts.plugin_api.arrays import Array
+from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.operations import Operation
+from rts.plugin_api.threads import parallel, read_only
 from rts_backends.fused.cells import Cells, Choices, Settings
 from rts_backends.fused.image import specification, used
 from rts_backends.fused.losses import LINEAR, cost_and_weight, in_numbers
@@ -52,12 +53,12 @@ def _shape(*shapes: tuple[int, ...], settings: Settings, loss: Loss) -> tuple[in
     return ()
 
 
-def _cells(operands: Arrays, settings: Settings, choices: Choices | None) -> Cells:
+def _cells(operands: Sequence[np.ndarray], settings: Settings, choices: Choices | None) -> Cells:
     positions, rgba, row, *known = operands[:8]
     return Cells(settings, positions, rgba, row, choices, *known)
 
 
-def _swept(operands: Arrays, settings: Settings, loss: Loss) -> tuple[Swept, float]:
+def _swept(operands: Sequence[np.ndarray], settings: Settings, loss: Loss) -> tuple[Swept, float]:
     """What is left to the derivatives, and the value."""
     target, weights, background = map(read_only, operands[8:])
     cells, image = _cells(operands, settings, None), np.empty((*target.shape[:2], 4), target.dtype)
@@ -68,13 +69,19 @@ def _swept(operands: Arrays, settings: Settings, loss: Loss) -> tuple[Swept, flo
     return Swept(read_only(image), cells.choices), float(sums.sum() / max(target.size, 1))
 
 
-def _forward(operands: Arrays, out: np.ndarray, *, settings: Settings, loss: Loss) -> Swept:
+def _forward(operands: Sequence[np.ndarray], out: np.ndarray, *, settings: Settings, loss: Loss) -> Swept:
     swept, out[...] = _swept(operands, settings, loss)
     return swept
 
 
 def _push(
-    operands: Arrays, tangents: Some, out: np.ndarray, *, settings: Settings, loss: Loss, kept: Swept | None
+    operands: Sequence[np.ndarray],
+    tangents: Sequence[np.ndarray | None],
+    out: np.ndarray,
+    *,
+    settings: Settings,
+    loss: Loss,
+    kept: Swept | None,
 ) -> None:
     swept = kept or _swept(operands, settings, loss)[0]
     images = np.empty((len(out), *swept.cotangents.shape), swept.cotangents.dtype)
@@ -85,7 +92,13 @@ def _push(
 
 
 def _pull(
-    operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings, loss: Loss, kept: Swept | None
+    operands: Sequence[np.ndarray],
+    g: np.ndarray,
+    results: Sequence[np.ndarray | None],
+    *,
+    settings: Settings,
+    loss: Loss,
+    kept: Swept | None,
 ) -> None:
     swept = kept or _swept(operands, settings, loss)[0]
     g_positions, g_rgba = results

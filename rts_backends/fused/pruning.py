@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-from rts.compiling import compiled, kernel
-from rts.sampling.extremes import bounds
-from rts.splatting.kernel import LEAST_EPSILON, TIE
-from rts.splatting.visible import CONTINUED
-from rts.threads import parallel
+from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.splats import Visible
+from rts.plugin_api.threads import parallel
 from rts_backends.fused import crossing_pairs
 from rts_backends.fused.cells import Settings
 
@@ -23,17 +23,38 @@ def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.nda
     """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W); for `Visible` or `Multi`."""
     layers, height, _ = covered.shape
     visible, rims = settings.kind == "visible", settings.rims
-    if layers == 1 or not (visible or settings.epsilon >= LEAST_EPSILON):
+    if layers == 1 or not (visible or settings.epsilon >= Visible.LEAST_EPSILON):
         return covered
     covered, depth = np.ascontiguousarray(covered), np.ascontiguousarray(depth)
     kept, kind = np.empty_like(covered), depth.dtype.type
-    least, largest = map(kind, bounds(depth, covered))
-    numbers = kind(2 * (largest - least)), kind(TIE * max(largest, -least)), kind(CONTINUED)
+    least, largest = _extremes(covered, depth)
+    numbers = kind(2 * (largest - least)), kind(Visible.TIE * max(largest, -least)), kind(Visible.CONTINUED)
     parallel(_keep, height, covered, depth, visible, rims, *numbers, kept, work=2 * covered.size)
     if settings.crossings:
-        least, largest = map(kind, bounds(depth[0], covered[0]))
+        least, largest = _extremes(covered[:1], depth[:1])
         crossing_pairs.sheets(covered, depth, largest - least, kept)
     return kept
+
+
+def _extremes(covered: np.ndarray, depth: np.ndarray) -> tuple[np.floating, np.floating]:
+    """The least and the largest covered depth, and zero; none is NaN."""
+    lines = math.prod(depth.shape[:2])
+    found = np.empty((lines, 2), depth.dtype)
+    flat = covered.reshape(lines, -1), depth.reshape(lines, -1)
+    parallel(_find_extremes, lines, *flat, found, work=depth.size // 4)
+    return found[:, 0].min(initial=0), found[:, 1].max(initial=0)
+
+
+@kernel(fastmath={"nnan", "nsz"})
+def _find_extremes(start, stop, covered, depth, found):
+    """Fill `found` (lines, 2) for lines [start, stop). Numbers that are never NaN let it become vector code."""
+    zero = depth.dtype.type(0)
+    for i in range(start, stop):
+        low, high = zero, zero
+        for x in range(depth.shape[1]):
+            z = depth[i, x] if covered[i, x] else zero
+            low, high = min(low, z), max(high, z)
+        found[i, 0], found[i, 1] = low, high
 
 
 @kernel

@@ -9,21 +9,22 @@ from typing import ClassVar
 
 import numpy as np
 
-from rts import splatting
-from rts.arrays import without_border
-from rts.engines import engine_of
-from rts.fitting.losses import SQUARE, Loss
-from rts.records import Splats
-from rts.trees import Array
+from rts import Loss, Splatter, engine_of
+from rts.plugin_api import splats as specification
+from rts.plugin_api.arrays import Array
+from rts.plugin_api.records import Splats
 from rts_backends.fused import mean_loss
 from rts_backends.fused.cells import Settings
 from rts_backends.fused.image import IMAGE
 
 
-class _Fused(splatting.Kernel):
+class _Fused(Splatter):
     """Base that makes `image` by compiled kernels; it stands before a class of `rts.splatting`, which it extends."""
 
     kind: ClassVar[str]
+    sigma: float
+    epsilon: float
+    gamma: float
     averages = True
     takes_losses = True
     _knows_settled = True
@@ -36,10 +37,8 @@ class _Fused(splatting.Kernel):
 
     def cropped(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
-        if type(self).image is not _Fused.image:  # A subclass has an `image` of its own.
+        if type(self).image is not _Fused.image or splats.rgba.shape[0] == 0:  # A subclass has an `image` of its own.
             return super().cropped(splats)
-        if splats.rgba.shape[0] == 0:
-            return without_border(super().image(splats), splats.border)
         return self._of(splats)
 
     def _of(self, splats: Splats) -> Array:
@@ -97,7 +96,7 @@ class _Fused(splatting.Kernel):
         own = splats.positions, splats.rgba, splats.row, splats.part, self._facing(splats)
         own += splats.wanted, splats.settled, self._exits(splats)
         given = *own, t_positions, t_rgba, target, weights, background
-        return normal_equations.equations(self._settings_of(splats), engine_of(given), loss or SQUARE, *given)
+        return normal_equations.equations(self._settings_of(splats), engine_of(given), loss or Loss(), *given)
 
     def mean_loss(
         self,
@@ -111,7 +110,7 @@ class _Fused(splatting.Kernel):
         if not self._sweeps or splats.rgba.shape[0] == 0:
             return None
         given = self._operands(splats), target, weights, background
-        return mean_loss.mean_loss(self._settings_of(splats), loss or SQUARE, *given)
+        return mean_loss.mean_loss(self._settings_of(splats), loss or Loss(), *given)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`."""
@@ -122,20 +121,20 @@ class _Fused(splatting.Kernel):
         return pruning.needed(covered, depth, self._settings(0))
 
 
-class Single(_Fused, splatting.Single):
+class Single(_Fused, specification.Single):
     """`rts.splatting.Single`, compiled."""
 
     kind = "single"
     follows_outlines = True
 
 
-class Multi(_Fused, splatting.Multi):
+class Multi(_Fused, specification.Multi):
     """`rts.splatting.Multi`, compiled."""
 
     kind = "multi"
 
 
-class Visible(_Fused, splatting.Visible):
+class Visible(_Fused, specification.Visible):
     """`rts.splatting.Visible`, compiled."""
 
     kind = "visible"

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from rts.arguments import quoted
-from rts.arrays import unit
-from rts.camera import Camera
-from rts.checks import is_count
-from rts.engines import constants, engine_of, exemplar, namespace
-from rts.errors import InputError
-from rts.gbuffer import GBuffer
-from rts.interfaces import Shader
-from rts.ndc import Ndc
-from rts.row_cameras import RowCameras
-from rts.trees import Array, Tree
+from rts import Camera, GBuffer, InputError, Ndc, Shader, engine_of, namespace
+from rts.plugin_api.arrays import Array, Tree, constants, exemplar, unit
+from rts.plugin_api.checks import is_count, quoted
+from rts.plugin_api.records import RowCameras
 from rts_surfaces.radiance_field.chunks import CHUNK, in_chunks
 from rts_surfaces.radiance_field.field import RadianceField, load_radiance_field
 from rts_surfaces.radiance_field.network import check_network, radiance
@@ -67,7 +61,7 @@ class RadianceShader(Shader):
         return xp.concat([color, xp.ones_like(color[:, :1])], axis=1)
 
     @staticmethod
-    def load(path: Any) -> RadianceField:
+    def load(path: Path) -> RadianceField:
         """See `rts.load_radiance_field`."""
         return load_radiance_field(path)
 
