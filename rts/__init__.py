@@ -3,6 +3,8 @@
 Find where camera rays meet a surface with any ordinary renderer; evaluate the surface there, shade it and splat it;
 differentiate only that.
 
+Plugins import from `rts.plugin_api` what is not here. The kinds of warnings are in `rts.errors`.
+
 The surfaces that come with it are attributes, too, loaded when they are first used: `rts.Mesh`, `rts.Bezier`,
 `rts.BSpline`, `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`.
 """
@@ -52,6 +54,15 @@ from rts.sampling.triangle_sampler import TriangleSampler
 from rts.views import render_views
 from rts.warming import warmup
 
+_MOVED = {
+    "rts.errors": "AspectWarning EmptyImageWarning FileWarning InputWarning LayersWarning SamplerWarning ToleranceWarning",
+    "rts.plugin_api.operations": "Operation combine gradient",
+    "rts.plugin_api.records": "ArraySpec Fragments Proxy Rate RayHits Rays RowCameras Samples Splats",
+    "rts.radiance_fields": "volume_render",
+    "rts.splatting": "exact_calibration",
+}
+"""Module → names that were here."""
+
 if TYPE_CHECKING:
     # Names alone, so that misspelt ones are found: entry points say what they stand for, as of everybody's plugins.
     Bezier: Any
@@ -64,7 +75,10 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str):
-        """The built-in surfaces, found through entry points when they are first asked for."""
+        """A built-in surface, found through entry points when it is first asked for."""
+        for place, names in _MOVED.items():
+            if name in names.split():
+                raise AttributeError(f"rts.{name} is {place}.{name} now")
         found = globals()[name] = registry.attribute(name, __all__)
         return found
 

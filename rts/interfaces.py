@@ -425,7 +425,7 @@ class Shader(Plugin):
         reads_theta: the entries of θ that it reads where they are there; None if it does not say. `rts.explain` lists
             entries that nobody reads, and what is almost one of these is warned of.
         takes_views: whether a call may be of samples of several views, as `rts.render_views` then makes it: `camera` is
-            an `rts.RowCameras`, whose methods give a row for each sample. A shader that says so also says what it
+            a `RowCameras`, whose methods give a row for each sample. A shader that says so also says what it
             `reads`, without "uv_footprint". A subclass with its own `__call__` has to say so itself.
         channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
     """
@@ -449,7 +449,7 @@ class Shader(Plugin):
         Args:
             theta: θ of the part.
             gbuffer: its G-buffer, in world space.
-            camera: the camera of the whole image; for a shader that `takes_views` it may be an `rts.RowCameras`.
+            camera: the camera of the whole image; for a shader that `takes_views` it may be a `RowCameras`.
 
         Returns:
             (N, 4) premultiplied linear RGBA, in [0, 1]; (N, C + 1), alpha last, of a shader with other `channels`, all

@@ -84,7 +84,7 @@ class Rays(Sampler):
 def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, int]) -> RayHits:
     """What `intersect` of a surface gave, which must have the right shapes."""
     if not isinstance(hits, RayHits):
-        raise InputError(f"intersect of {surface!r} gave a {type(hits).__name__}; expected rts.RayHits")
+        raise InputError(f"intersect of {surface!r} gave a {type(hits).__name__}; expected RayHits")
     grid, (i, p) = (layers, size[0] * size[1]), surface.hit_widths or surface.sample_widths
     given = tuple(map(shape_of, (hits.hit, hits.distance, hits.params, *([] if hits.ids is None else [hits.ids]))))
     expected = grid, grid, (*grid, p), *([] if hits.ids is None and i == 0 else [(*grid, i)])

@@ -8,7 +8,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from rts import Camera, Samples
+from rts import Camera
+from rts.plugin_api.records import Samples
 
 PROPERTIES = settings(deadline=None, derandomize=True, max_examples=60)
 """What all properties are tried with: the same examples every time, however busy the machine is."""

@@ -9,7 +9,8 @@ from soups import soup_of
 from test_raster import CAMERAS, SIZE, triangles
 
 import rts
-from rts import Camera, Part, Proxy
+from rts import Camera, Part
+from rts.plugin_api.records import Proxy
 
 pytestmark = pytest.mark.sampling
 

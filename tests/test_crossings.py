@@ -10,6 +10,7 @@ import rts
 from rts import rendering
 from rts.diagnostics.comparison import shapes
 from rts.engines import constants, engine_of
+from rts.plugin_api.records import Splats
 from rts.splatting import Visible, crossings
 from rts_backends.fused import splatters as fused
 from rts_surfaces.implicit import fields
@@ -40,7 +41,7 @@ class Sheets:
         positions = np.concatenate([place, depth[..., None]], axis=-1)[covered].astype(dtype)
         rgba = np.concatenate([colors[sheet], np.ones((*depth.shape, 1))], axis=-1)[covered].astype(dtype)
         part = np.where(covered, sheet, -1).astype(np.int32)
-        self.splats, self.sheet = rts.Splats(positions, rgba, row, part), sheet[covered]
+        self.splats, self.sheet = Splats(positions, rgba, row, part), sheet[covered]
         self.depth, self.covered = np.where(covered, depth, 0).astype(dtype), covered
 
     def pairs(self):
@@ -66,7 +67,7 @@ def pulled(splatter, splats, along, target="torch-cpu"):
     """The gradients of positions and colours from that of the image, in float64."""
     own, tables = (splats.positions, splats.rgba), (splats.row, splats.part)
     given, tables, along = arrays(target, (own, tables, along), np.float64)
-    return gradient(target, lambda x: (splatter.image(rts.Splats(*x, *tables)) * along).sum(), given)
+    return gradient(target, lambda x: (splatter.image(Splats(*x, *tables)) * along).sum(), given)
 
 
 def rough(seed, size=(20, 23), layers=2):
@@ -277,7 +278,7 @@ def test_the_image_is_the_same_bit_for_bit():
         for layers in (2, 3):
             splats = rough(layers, layers=layers)
             given = arrays("torch-cpu", (splats.positions, splats.rgba, splats.row))
-            images = [splatter(crossings=on).image(rts.Splats(*given)).numpy() for on in (True, False)]
+            images = [splatter(crossings=on).image(Splats(*given)).numpy() for on in (True, False)]
             np.testing.assert_array_equal(*images)
 
 
@@ -384,7 +385,7 @@ def test_normal_equations_are_products_of_tangents(fine):
     given = arrays(
         "torch-cpu", (splats.positions, splats.rgba, splats.row, tangents, tints, np.zeros(shape)), np.float64
     )
-    whole = rts.Splats(*given[:3], arrays("torch-cpu", splats.part), border=border)
+    whole = Splats(*given[:3], arrays("torch-cpu", splats.part), border=border)
     found = fused.Visible().normal_equations(whole, *given[3:])
     np.testing.assert_allclose(found[1], columns @ columns.T / image.size, rtol=1e-10)
     np.testing.assert_allclose(found[2], columns @ image / image.size, rtol=1e-10)

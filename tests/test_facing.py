@@ -8,6 +8,7 @@ from helpers import DIFFERENTIABLE, arrays, box, icosphere, rotation, soup, to_n
 
 import rts
 from rts import splatting
+from rts.plugin_api.records import Splats
 from rts.records import MORE
 from rts.sampling.facing import eye
 from rts.topology import pieces
@@ -187,7 +188,7 @@ def test_the_compiled_splatter_is_the_specification(layers):
     rgba = rng.random((len(positions), 4))
     facing = np.where(covered, rng.integers(-2, 3, covered.shape), 0).astype(np.int16)
     facing[-1] += (np.sign(facing[-1]) * MORE).astype(np.int16)
-    splats = rts.Splats(positions, rgba, row, facing=facing)
+    splats = Splats(positions, rgba, row, facing=facing)
     images = [s.image(splats) for s in (Visible(), splatting.Visible(), Visible(reads_facing=False))]
     np.testing.assert_allclose(images[0], images[1], rtol=0, atol=1e-12)
     assert np.abs(images[0] - images[2]).max() > 0.05
@@ -200,6 +201,6 @@ def test_the_compiled_splatter_is_the_specification(layers):
     found = []
     for splatter in (Visible(), splatting.Visible()):
         moved = torch.tensor(positions, requires_grad=True)
-        image = splatter.image(rts.Splats(moved, *constant[:2], facing=constant[2]))
+        image = splatter.image(Splats(moved, *constant[:2], facing=constant[2]))
         found.append(torch.autograd.grad((image * along).sum(), moved)[0].numpy())
     np.testing.assert_allclose(*found, rtol=0, atol=1e-10)

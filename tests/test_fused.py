@@ -13,6 +13,7 @@ from helpers import DIFFERENTIABLE, arrays, gradient, to_numpy
 import rts
 from rts import splatting
 from rts.arrays import without_border
+from rts.plugin_api.records import Splats
 from rts_backends.fused import splatters as fused
 from rts_backends.fused.cells import Cells, Settings, _reach
 from rts_backends.fused.survey import BUSY, EMPTY, FLAT
@@ -270,7 +271,7 @@ def test_what_is_told_of_other_cells_is_refused(name):
     positions, rgba, row = cells(2)
     other = np.zeros(row.shape if name in ("part", "facing") else row.shape[1:], np.int32)[..., :-1]
     with pytest.raises(rts.InputError, match=rf"{name} has shape .*; expected .*, as row says"):
-        KINDS["visible"]().image(rts.Splats(positions, rgba, row, **{name: other}))
+        KINDS["visible"]().image(Splats(positions, rgba, row, **{name: other}))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -517,7 +518,7 @@ def test_other_dtypes_are_left_to_the_specification(dtypes):
 def test_other_devices_are_left_to_the_specification():
     # Tensors without values stand for those of a device that is not at hand.
     scene = (torch.tensor(x).to("meta") for x in cells(2))
-    image = fused.Visible().image(rts.Splats(*scene))
+    image = fused.Visible().image(Splats(*scene))
     assert image.device.type == "meta" and image.shape == (9, 11, 4)
 
 

@@ -14,6 +14,7 @@ from rts import splatting
 from rts.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
+from rts.plugin_api.records import Splats
 from rts_backends.fused import normal_equations as fused_normal
 from rts_backends.fused import splatters as fused
 from rts_backends.fused.cells import Cells
@@ -173,7 +174,7 @@ FINE_CASES = [
 """Splatter, channels, layers, samples a pixel along each axis, engine and dtype."""
 
 
-@pytest.mark.filterwarnings("ignore::rts.LayersWarning")
+@pytest.mark.filterwarnings("ignore::rts.errors.LayersWarning")
 @pytest.mark.parametrize(("kind", "channels", "layers", "fine", "target", "dtype"), FINE_CASES)
 def test_supersampled_images_are_swept_to_the_normal_equations_of_their_jacobian(
     kind, channels, layers, fine, target, dtype, monkeypatch
@@ -321,9 +322,9 @@ def test_half_precision_is_done_by_the_jacobian(monkeypatch):
     row = torch.zeros((1, 3, 3), dtype=torch.int32)
     tangents = torch.zeros((2, 5, 3), dtype=torch.bfloat16)
     goal = torch.zeros((3, 3, 1))
-    assert fused.Visible().normal_equations(rts.Splats(*splats, row), tangents, None, goal) is None
+    assert fused.Visible().normal_equations(Splats(*splats, row), tangents, None, goal) is None
     elsewhere = [x.float().to("meta") for x in (*splats, row, tangents)]
-    assert fused.Visible().normal_equations(rts.Splats(*elsewhere[:3]), elsewhere[3], None, goal) is None
+    assert fused.Visible().normal_equations(Splats(*elsewhere[:3]), elsewhere[3], None, goal) is None
     assert not sweeps
 
 
@@ -576,7 +577,7 @@ def test_wrong_arguments_say_what_was_expected(target, options, expected):
 def test_colours_far_beyond_one_are_warned_of_and_features_are_not(target):
     picture = arrays(target, np.full((*SIZE, 3), 254.0))
     with pytest.warns(
-        rts.InputWarning, match="target's colours go up to 254, .* divide a picture from 0 to 255 by 255"
+        rts.errors.InputWarning, match="target's colours go up to 254, .* divide a picture from 0 to 255 by 255"
     ):
         rts.ImageResiduals(scene, CAMERA, SIZE, picture)
     rts.ImageResiduals(scene, CAMERA, SIZE, picture / 200)  # A filter may overshoot.
@@ -593,7 +594,9 @@ def test_what_requires_a_gradient_is_warned_of(name):
     torch = pytest.importorskip("torch")
     given = {"target": torch.zeros(SIZE), "weights": torch.ones(SIZE), "background": torch.ones(3)}
     given[name].requires_grad_(True)
-    with pytest.warns(rts.InputWarning, match=f"^{name} requires a gradient, .* as a constant; give {name}.detach"):
+    with pytest.warns(
+        rts.errors.InputWarning, match=f"^{name} requires a gradient, .* as a constant; give {name}.detach"
+    ):
         rts.ImageResiduals(scene, CAMERA, SIZE, **given)
 
 

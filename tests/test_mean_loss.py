@@ -165,7 +165,7 @@ def test_it_warns_where_nothing_is_seen():
     swept = residuals()
     away = rts.Camera.look_at((0, 0, 3), (0, 0, 6), fov_y=40, aspect=23 / 18)
     swept._camera = away
-    with pytest.warns(rts.EmptyImageWarning, match="nothing is seen"):
+    with pytest.warns(rts.errors.EmptyImageWarning, match="nothing is seen"):
         value = swept.mean_loss(POSE)
     image, weights = goal(1)
     np.testing.assert_allclose(value, np.mean((image * weights) ** 2), 1e-5)

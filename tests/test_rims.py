@@ -9,6 +9,7 @@ from loops import STEPS, Pairing
 
 import rts
 from rts import rendering
+from rts.plugin_api.records import Splats
 from rts.splatting import Visible, rims
 from rts.splatting.layers import NEIGHBOURS, Layers
 from rts_backends.fused import splatters as fused
@@ -23,7 +24,7 @@ def pushed(splatter, splats, tangent, target="torch-cpu"):
     """The image and its derivative along a tangent of the positions, in float64."""
     positions, rgba, tangent = arrays(target, (splats.positions, splats.rgba, tangent), np.float64)
     known = cells(splats, target)
-    return derivative(target, lambda p: splatter.image(rts.Splats(p, rgba, **known)), positions, tangent)
+    return derivative(target, lambda p: splatter.image(Splats(p, rgba, **known)), positions, tangent)
 
 
 def cells(splats, target):
@@ -37,7 +38,7 @@ def packed(covered, place, depth, rgba, part=None):
     row = np.where(covered, np.cumsum(covered).reshape(covered.shape) - 1, -1).astype(np.int32)
     positions = np.concatenate([place, depth[..., None]], axis=-1)[covered]
     part = None if part is None else np.where(covered, part, -1).astype(np.int32)
-    return rts.Splats(positions, np.broadcast_to(rgba, (*covered.shape, 4))[covered], row, part)
+    return Splats(positions, np.broadcast_to(rgba, (*covered.shape, 4))[covered], row, part)
 
 
 def centres(layers, height, width):
@@ -197,7 +198,7 @@ def test_the_image_is_the_same_bit_for_bit(splatter, target):
     splats = rough(2, 7, exits=True)
     given, known = arrays(target, (splats.positions, splats.rgba)), cells(splats, target)
     splatters = splatter(), splatter(exits=False), splatter(rims=False)
-    images = [to_numpy(s.image(rts.Splats(*given, **known))) for s in splatters]
+    images = [to_numpy(s.image(Splats(*given, **known))) for s in splatters]
     np.testing.assert_array_equal(images[1:], images[:1] * 2)
 
 
@@ -220,7 +221,7 @@ def test_splats_of_one_part_need_no_array_of_parts(splatter, layers, exits, targ
 
     def slope(**told):
         own = cells(splats.replace(part=told.pop("part", None)), target)
-        return gradient(target, lambda x: (splatter().image(rts.Splats(*x, **own, **told)) * along).sum(), given)
+        return gradient(target, lambda x: (splatter().image(Splats(*x, **own, **told)) * along).sum(), given)
 
     expected, found, unknown = slope(part=np.minimum(splats.row, 0)), slope(one_part=True), slope()
     for x, y in zip(found, expected, strict=True):
@@ -240,7 +241,7 @@ def pulled(splatter, splats, along, target="torch-cpu"):
     along, known = arrays(target, along, np.float64), cells(splats, target)
 
     def loss(x):
-        image = splatter.image(rts.Splats(x["positions"], x["rgba"], **known))
+        image = splatter.image(Splats(x["positions"], x["rgba"], **known))
         return (image * along).sum()
 
     return gradient(target, loss, given)
@@ -286,12 +287,12 @@ def test_normal_equations_are_products_of_tangents(border, exits):
     splats, rng = rough(2, 5, 40, 50, exits).replace(border=border), np.random.default_rng(5)
     tangents = rng.normal(size=(3, *splats.positions.shape))
     given, known = arrays("torch-cpu", (splats.positions, splats.rgba), np.float64), cells(splats, "torch-cpu")
-    image = to_numpy(fused.Visible().cropped(rts.Splats(*given, **known, border=border)))
+    image = to_numpy(fused.Visible().cropped(Splats(*given, **known, border=border)))
     jacobian = [pushed(fused.Visible(), splats, t)[1] for t in tangents]
     inside = slice(border, 40 - border), slice(border, 50 - border)
     columns = np.stack([change[inside].ravel() for change in jacobian])
     target, t_positions = arrays("torch-cpu", (np.zeros_like(image), tangents), np.float64)
-    found = fused.Visible().normal_equations(rts.Splats(*given, **known, border=border), t_positions, None, target)
+    found = fused.Visible().normal_equations(Splats(*given, **known, border=border), t_positions, None, target)
     np.testing.assert_allclose(found[1], columns @ columns.T / image.size, rtol=1e-10)
     np.testing.assert_allclose(found[2], columns @ image.ravel() / image.size, rtol=1e-10)
 

@@ -113,4 +113,4 @@ IMAGE = Operation(
 """The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled and exit, without
 a border.
 
-The last five are those of `rts.Splats`; (0, H, W) and (0, W) where they are not known."""
+The last five are those of `Splats`; (0, H, W) and (0, W) where they are not known."""

@@ -67,5 +67,5 @@ class RadianceShader(Shader):
 
     @staticmethod
     def volume_render(field: RadianceField, camera: Camera, size: tuple[int, int], **options: Any) -> VolumeImage:
-        """See `rts.volume_render`."""
+        """See `rts.radiance_fields.volume_render`."""
         return volume_render(field, camera, size, **options)

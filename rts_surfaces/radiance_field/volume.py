@@ -45,7 +45,7 @@ def volume_render(
     ndc: Ndc | None,
     progress: bool | None,
 ) -> VolumeImage:
-    """The image, and the evaluations of both networks; see `rts.volume_render`, which checks the rest.
+    """The image, and the evaluations of both networks; see `rts.radiance_fields.volume_render`, which checks the rest.
 
     Args:
         field: the field.
