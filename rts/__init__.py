@@ -55,7 +55,8 @@ from rts.views import render_views
 from rts.warming import warmup
 
 _MOVED = {
-    "rts.errors": "AspectWarning EmptyImageWarning FileWarning InputWarning LayersWarning SamplerWarning ToleranceWarning",
+    "rts.errors": "AspectWarning EmptyImageWarning FileWarning InputWarning "
+    "LayersWarning SamplerWarning ToleranceWarning",
     "rts.plugin_api.operations": "Operation combine gradient",
     "rts.plugin_api.records": "ArraySpec Fragments Proxy Rate RayHits Rays RowCameras Samples Splats",
     "rts.radiance_fields": "volume_render",

@@ -136,7 +136,7 @@ class Field(ScalarField):
         )
 
     def slope(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """The gradient (M, 3) of `level` at points (M, 3), towards the outside; see `rts.plugin_api.operations.gradient`."""
+        """The gradient (M, 3) of `level` at points (M, 3), towards the outside; see `gradient`."""
         return gradient(partial(self.level, theta), points)
 
     def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
