@@ -6,7 +6,7 @@ import abc
 import functools
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -68,7 +68,7 @@ class Engine(Plugin):
         """The value of an array as NumPy, on the host; not for traced arrays."""
 
     @staticmethod
-    def records() -> Iterator[tuple[type, Callable[[Any], tuple], Callable[[Sequence[Any], tuple], Any]]]:
+    def records() -> Iterator[tuple[type, Callable[[Any], tuple], Callable[[Iterable[Any], tuple], Any]]]:
         """Records to register as pytrees: the class, a function to (arrays, other fields), and its inverse."""
         for cls in STATIC_FIELDS:
             yield cls, split_record, functools.partial(join_record, cls)

@@ -5,7 +5,7 @@ What fits is float32 or float64 in the memory of the host. Second derivatives ar
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -24,7 +24,7 @@ class _Fused(Splatter):
     kind: ClassVar[str]
     sigma: float
     epsilon: float
-    gamma: float
+    gamma: Any
     averages = True
     takes_losses = True
     _knows_settled = True
