@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from rts.plugin_api.loops import compiled, kernel
@@ -14,6 +12,9 @@ from rts_backends.fused.cells import Settings
 
 HALO = 3
 """Rows that the decision for a row looks at on either side: its marks, their neighbours, and those one farther on."""
+
+UNSIGNED = np.int32(0x7FFFFFFF)
+"""All bits of a float32 but the sign's."""
 
 MIXED, RING = 1, 2
 """Marks of targets at which more than fronts may count, and of cells beside empty ones."""
@@ -38,22 +39,29 @@ def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.nda
 
 def _extremes(covered: np.ndarray, depth: np.ndarray) -> tuple[np.floating, np.floating]:
     """The least and the largest covered depth, and zero; none is NaN."""
-    lines = math.prod(depth.shape[:2])
-    found = np.empty((lines, 2), depth.dtype)
-    flat = covered.reshape(lines, -1), depth.reshape(lines, -1)
-    parallel(_find_extremes, lines, *flat, found, work=depth.size // 4)
-    return found[:, 0].min(initial=0), found[:, 1].max(initial=0)
+    if depth.dtype != np.float32:
+        return depth.min(initial=0, where=covered), depth.max(initial=0, where=covered)
+    lines = depth.shape[0] * depth.shape[1]
+    bits, found = depth.reshape(lines, -1).view(np.int32), np.zeros((lines, 2), np.int32)
+    parallel(_find_extremes, lines, bits, covered.reshape(lines, -1), found, work=depth.size // 12)
+    low, high = found.max(axis=0, initial=0).view(np.float32)
+    return -low, high
 
 
-@kernel(fastmath={"nnan", "nsz"})
-def _find_extremes(start, stop, covered, depth, found):
-    """Fill `found` (lines, 2) for lines [start, stop). Numbers that are never NaN let it become vector code."""
-    zero = depth.dtype.type(0)
+@kernel
+def _find_extremes(start, stop, bits, covered, found):
+    """Fill `found` (lines, 2) with how far floats of each line are below and above zero at most, as bits.
+
+    Bits are below zero where the float has a sign. Integers' maxima become vector code, floats' do not.
+    """
+    zero = np.int32(0)
     for i in range(start, stop):
         low, high = zero, zero
-        for x in range(depth.shape[1]):
-            z = depth[i, x] if covered[i, x] else zero
-            low, high = min(low, z), max(high, z)
+        line, taken = bits[i], covered[i]
+        for x in range(len(line)):
+            number = line[x] if taken[x] else zero
+            high = np.int32(max(high, number))
+            low = np.int32(max(low, np.int32(number & UNSIGNED) if number < zero else zero))
         found[i, 0], found[i, 1] = low, high
 
 
