@@ -114,7 +114,7 @@ class FunctionOnLattice(Field):
             if few_shapes:  # Lest each be compiled.
                 places = np.resize(places, (1 << max(0, count - 1).bit_length(), 3))
             points = self.suited(theta, engine.constant(places.astype(np.float32), like))
-            return engine.to_numpy(engine.stop_gradient(self.level(theta, points)))[:count]
+            return np.asarray(engine.known(engine.stop_gradient(self.level(theta, points))))[:count]
 
         found = self.band.find(level, self._lattice, closed)
         return Looked({k: v for k, v in found._asdict().items() if k != "evaluations"}, found.evaluations)
