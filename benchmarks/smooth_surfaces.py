@@ -31,6 +31,7 @@ from benchmarks.report import table
 from benchmarks.speed.memory import growth
 from benchmarks.timing import in_turn
 from rts.diagnostics.comparison.environment import environment
+from rts.plugin_api.records import Proxy
 
 SHADERS = ("silhouette", "lambert")
 TOLERANCES = (0.8, 0.4, 0.2, 0.1, 0.05)
@@ -204,7 +205,7 @@ def mesh(kind: str, scene: Scene, rate: int) -> Contender:
     return Contender(kind, rate, part, lambda size: len(proxy.faces), lambda size: fixed)
 
 
-def meshed(scene: Scene, rate: int) -> rts.Proxy:
+def meshed(scene: Scene, rate: int) -> Proxy:
     """All patches cut alike."""
     from rts_surfaces.tiles import triangles
 

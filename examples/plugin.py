@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 import rts
+from rts.plugin_api.records import RayHits
 
 SIZE = (32, 32) if "--quick" in sys.argv else (160, 160)
 
@@ -34,7 +35,7 @@ class Ellipsoid(rts.RaySurface):
         # The camera is outside: the first hit enters, the second leaves, and there are no more.
         distance = xp.stack([middle - half, middle + half, *[middle] * (layers - 2)][:layers])
         hit = xp.stack([inside > 0, inside > 0, *[inside > 2] * (layers - 2)][:layers])
-        return rts.RayHits(hit=hit, distance=distance, params=start + distance[..., None] * along)
+        return RayHits(hit=hit, distance=distance, params=start + distance[..., None] * along)
 
 
 camera = rts.Camera.look_at((1.5, 1, 3), (0, 0, 0))

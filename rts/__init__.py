@@ -3,69 +3,68 @@
 Find where camera rays meet a surface with any ordinary renderer; evaluate the surface there, shade it and splat it;
 differentiate only that.
 
+Plugins import from `rts.plugin_api` what is not here. The kinds of warnings are in `rts.errors`.
+
 The surfaces that come with it are attributes, too, loaded when they are first used: `rts.Mesh`, `rts.Bezier`,
 `rts.BSpline`, `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`.
 """
 
 from typing import TYPE_CHECKING, Any
 
-from rts import registry, regularizers
+from rts import errors, registry, regularizers  # noqa: F401
 from rts.camera import Camera
 from rts.diagnostics.gradients import check_gradient, gradient_image
-from rts.diagnostics.tune import Tuned, tune
+from rts.diagnostics.tune import tune
 from rts.engines import Engine, engine_of, namespace
 from rts.errors import (
-    AspectWarning,
-    EmptyImageWarning,
     EngineError,
-    FileWarning,
     InputError,
-    InputWarning,
-    LayersWarning,
     PluginError,
     RtsError,
     RtsWarning,
-    SamplerWarning,
-    ToleranceWarning,
 )
 from rts.explaining import explain
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
-from rts.files.views import View, load_views
-from rts.fitting.fit import Fit, fit
+from rts.files.views import load_views
+from rts.fitting.fit import fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
 from rts.gbuffer import GBuffer
 from rts.interfaces import (
-    Evaluator,
     Rate,
     RaySurface,
     Residuals,
     Sampler,
     Shader,
     Splatter,
+    SummingSplatter,
     Surface,
     TriangleSurface,
 )
-from rts.ndc import Ndc
-from rts.operations.combine import combine
-from rts.operations.gradient import gradient
-from rts.operations.operation import Operation
 from rts.operations.rigid import rigid
 from rts.parts import Part
-from rts.radiance_fields import load_radiance_field, volume_render
-from rts.records import ArraySpec, Fine, Fragments, Proxy, RayHits, Rays, Sampled, Samples, Splats
+from rts.radiance_fields import load_radiance_field
 from rts.registry import plugin, plugins
 from rts.rendering.batched import render_views
 from rts.rendering.image import render, render_samples
 from rts.rendering.renderer import prepare
 from rts.rendering.samples import sample
-from rts.row_cameras import RowCameras
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.triangle_sampler import TriangleSampler
-from rts.splatting import exact_calibration
 from rts.warming import warmup
+
+_MOVED = {
+    "rts.errors": "AspectWarning EmptyImageWarning FileWarning InputWarning "
+    "LayersWarning SamplerWarning ToleranceWarning",
+    "rts.ndc": "Ndc",
+    "rts.plugin_api.operations": "Operation combine gradient",
+    "rts.plugin_api.records": "ArraySpec Fragments Proxy RayHits Rays Samples Splats",
+    "rts.radiance_fields": "volume_render",
+    "rts.splatting": "exact_calibration",
+}
+"""Module → names that were here."""
 
 if TYPE_CHECKING:
     # Names alone, so that misspelt ones are found: entry points say what they stand for, as of everybody's plugins.
@@ -79,7 +78,10 @@ if TYPE_CHECKING:
 else:
 
     def __getattr__(name: str):
-        """The built-in surfaces, found through entry points when they are first asked for."""
+        """A built-in surface, found through entry points when it is first asked for."""
+        for place, names in _MOVED.items():
+            if name in names.split():
+                raise AttributeError(f"rts.{name} is {place}.{name} now")
         found = globals()[name] = registry.attribute(name, __all__)
         return found
 
@@ -92,57 +94,32 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Adaptive",
-    "ArraySpec",
-    "AspectWarning",
     "Camera",
-    "EmptyImageWarning",
     "Engine",
     "EngineError",
-    "Evaluator",
-    "FileWarning",
-    "Fine",
-    "Fit",
-    "Fragments",
     "GBuffer",
     "ImageResiduals",
     "InputError",
-    "InputWarning",
-    "LayersWarning",
     "Loss",
-    "Ndc",
-    "Operation",
     "Part",
     "PluginError",
-    "Proxy",
-    "RayHits",
-    "RaySurface",
     "Rate",
-    "Rays",
+    "RaySurface",
     "Residuals",
-    "RowCameras",
     "RtsError",
     "RtsWarning",
-    "Sampled",
     "Sampler",
-    "SamplerWarning",
-    "Samples",
     "Shader",
-    "Splats",
     "Splatter",
     "Stage",
+    "SummingSplatter",
     "Surface",
-    "ToleranceWarning",
     "TriangleSampler",
     "TriangleSurface",
-    "Tuned",
-    "View",
     "check_gradient",
-    "combine",
     "engine_of",
-    "exact_calibration",
     "explain",
     "fit",
-    "gradient",
     "gradient_image",
     "load",
     "load_image",

@@ -6,7 +6,7 @@ import abc
 import functools
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy as np
 from rts import registry
 from rts.errors import EngineError, InputError, PluginError, RtsError
 from rts.plugin_base import Plugin, check_members
-from rts.trees import Array, Tree, collected, map_leaves
+from rts.trees import STATIC_FIELDS, Array, Tree, collected, join_record, map_leaves, split_record
 
 if TYPE_CHECKING:
     from rts.operations.operation import Operation
@@ -66,6 +66,12 @@ class Engine(Plugin):
     @abc.abstractmethod
     def to_numpy(self, x: Array) -> np.ndarray:
         """The value of an array as NumPy, on the host; not for traced arrays."""
+
+    @staticmethod
+    def records() -> Iterator[tuple[type, Callable[[Any], tuple], Callable[[Iterable[Any], tuple], Any]]]:
+        """Records to register as pytrees: the class, a function to (arrays, other fields), and its inverse."""
+        for cls in STATIC_FIELDS:
+            yield cls, split_record, functools.partial(join_record, cls)
 
     # ----------------------------------------------------------------------------- how arrays are computed with
 

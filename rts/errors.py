@@ -1,4 +1,4 @@
-"""Every error that the library raises on purpose.
+"""Errors that the library raises on purpose, and its kinds of warnings; a public module, as `rts.errors`.
 
 Each message says what was given, what was expected, and what to do next. Warnings say what an image lacks that was
 rendered nevertheless, or what in the input looks like a mistake.

@@ -345,7 +345,7 @@ class Shader(Plugin):
         opaque: a promise that alpha is 1.
         uniform: a promise that all samples of a part have one colour, through whatever camera. It may depend on θ.
         takes_views: a promise that a call may be of samples of several views, as `rts.render_views` then makes it:
-            `camera` is an `rts.RowCameras`, whose methods give a row for each sample. A shader that says so also says
+            `camera` is a `RowCameras`, whose methods give a row for each sample. A shader that says so also says
             what it `reads`, without "uv_footprint".
         reads: a promise that it needs no entries but these, of the G-buffer besides position and of θ; None for all.
             Samples then carry no others. `rts.explain` lists entries of θ that nobody reads, and what is almost one of
@@ -365,7 +365,7 @@ class Shader(Plugin):
         Args:
             theta: θ of the part.
             gbuffer: its G-buffer, in world space.
-            camera: the camera of the whole image; for a shader that `takes_views` it may be an `rts.RowCameras`.
+            camera: the camera of the whole image; for a shader that `takes_views` it may be a `RowCameras`.
 
         Returns:
             (N, 4) premultiplied linear RGBA, in [0, 1]; (N, C + 1), alpha last, of a shader with other `channels`, all

@@ -5,7 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from rts import registry
+from rts.arguments import check_pixels, check_planes, quoted
 from rts.camera import Camera
+from rts.errors import InputError
+from rts.files.paths import as_path
+from rts.files.views import colour_named
 from rts.ndc import Ndc
 
 
@@ -27,7 +31,7 @@ def load_radiance_field(path: Any) -> Any:
         InputError: there is no such file, it is no .npz, holds pickles, or something other than real finite numbers; a
             layer is missing, unknown, or its shape does not fit.
     """
-    return registry.plugin("rts.shaders", "radiance").load(path)
+    return registry.plugin("rts.shaders", "radiance").load(as_path(path))
 
 
 def volume_render(
@@ -67,14 +71,15 @@ def volume_render(
     Raises:
         InputError: an argument is none of these, or the camera is orthographic.
     """
-    return registry.plugin("rts.shaders", "radiance").volume_render(
-        field,
-        camera,
-        size,
-        near=near,
-        far=far,
-        samples=samples,
-        background=background,
-        ndc=ndc,
-        progress=progress,
-    )
+    size = check_pixels(size)
+    if ndc is None:
+        near, far = 2.0 if near is None else near, 6.0 if far is None else far
+        check_planes(near, far, positive=True)
+    elif not isinstance(ndc, Ndc):
+        raise InputError(f"ndc is {quoted(ndc)}; expected an Ndc, or None")
+    elif near is not None or far is not None:
+        raise InputError("near and far are given with ndc, whose rays run from its near plane to infinity; leave them")
+    background = None if background is None else colour_named(background)
+    planes = (0.0, 1.0) if ndc is not None else (near, far)
+    options = {"planes": planes, "samples": samples, "background": background, "ndc": ndc, "progress": progress}
+    return registry.plugin("rts.shaders", "radiance").volume_render(field, camera, size, **options)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar, dataclass_transform
 
@@ -50,7 +50,7 @@ def split_record(value: Any) -> tuple[list[Any], tuple[Any, ...]]:
     return record_arrays(value), tuple([found[name] for name in STATIC_FIELDS[type(value)]])
 
 
-def join_record(cls: type, arrays: Sequence[Any], static: tuple[Any, ...]) -> Any:
+def join_record(cls: type, arrays: Iterable[Any], static: tuple[Any, ...]) -> Any:
     """The inverse of `split_record`; runs no check, since frameworks put placeholders into the fields."""
     value = object.__new__(cls)
     value.__dict__.update(

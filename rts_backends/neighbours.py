@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.plugin_api.loops import compiled, kernel
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
 
 WALK = 16

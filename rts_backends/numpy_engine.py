@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from array_api_compat import numpy as array_api
 
-from rts.engines import Engine
-from rts.operations.operation import Operation, specifying
-from rts.records import ArraySpec
-from rts.threads import read_only
-from rts.trees import Array
+from rts import Engine
+from rts.plugin_api.arrays import Array
+from rts.plugin_api.operations import Operation
+from rts.plugin_api.records import ArraySpec
+from rts.plugin_api.threads import read_only
 
 _DTYPE = attrgetter("dtype")
 
@@ -40,7 +40,7 @@ class NumpyEngine(Engine):
 
     def apply(self, operation: Operation, operands: Sequence[np.ndarray], params: Mapping[str, Any]) -> np.ndarray:
         """The result by compiled code if all floats are float32 or all float64, else by specification."""
-        if specifying.on or not operation.fits(list(map(_DTYPE, operands))):
+        if not operation.fits(list(map(_DTYPE, operands))):
             return operation.specification(*operands, **params)
         return operation.value_on_host(list(map(read_only, operands)), dict(params))[0]
 

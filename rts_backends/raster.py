@@ -19,11 +19,10 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.compiling import compiled, kernel
-from rts.records import Fragments, Proxy
-from rts.sampling.triangle_sampler import TriangleSampler
-from rts.threads import parallel, read_only
+from rts import Camera, TriangleSampler
+from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.records import Fragments, Proxy
+from rts.plugin_api.threads import parallel, read_only
 from rts_backends.raster_cells import EVERYTHING, Blocks, touching
 from rts_backends.raster_clusters import BACKS, FRONTS, SIZE, Clusters
 from rts_backends.raster_drawing import BAND_ROWS, LISTED, clear, draw, draw_cells

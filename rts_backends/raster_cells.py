@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
-from rts.errors import InputError
+from rts import InputError
+from rts.plugin_api.loops import compiled, kernel
 
 SIDE = 16
 """Cells along each side of a block, which are as many as rows of a band of the rasterizer."""

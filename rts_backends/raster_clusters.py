@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
-from rts.records import Proxy
-from rts.threads import parallel, read_only
+from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.records import Proxy
+from rts.plugin_api.threads import parallel, read_only
 from rts_backends.raster_cells import EVERYTHING, SIDE, Blocks
 
 SIZE = 256

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.plugin_api.loops import compiled, kernel
 from rts_backends import raster_cells
 from rts_backends.raster_cells import touching
 from rts_backends.triangles import owns

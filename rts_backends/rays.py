@@ -6,15 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import shape_of
-from rts.camera import Camera
-from rts.engines import constants, engine_of, exemplar, namespace
-from rts.errors import InputError
-from rts.interfaces import RaySurface, Sampler
-from rts.parts import Part
-from rts.records import ArraySpec, Cells, RayHits, Request, Samples
-from rts.sampling.validation import check_camera
-from rts.trees import Array, map_leaves
+from rts import Camera, InputError, Part, RaySurface, Sampler, engine_of, namespace
+from rts.plugin_api.arrays import Array, constants, exemplar, map_leaves, shape_of
+from rts.plugin_api.checks import check_camera
+from rts.plugin_api.records import ArraySpec, Cells, RayHits, Request, Samples
 
 
 class Rays(Sampler):
@@ -79,7 +74,7 @@ class Rays(Sampler):
 def _checked_hits(hits: Any, surface: RaySurface, layers: int, size: tuple[int, int]) -> RayHits:
     """What `intersect` of a surface gave, which must have the right shapes."""
     if not isinstance(hits, RayHits):
-        raise InputError(f"intersect of {surface!r} gave a {type(hits).__name__}; expected rts.RayHits")
+        raise InputError(f"intersect of {surface!r} gave a {type(hits).__name__}; expected RayHits")
     grid, (i, p) = (layers, size[0] * size[1]), surface.hit_widths or surface.sample_widths
     given = tuple(map(shape_of, (hits.hit, hits.distance, hits.params, *([] if hits.ids is None else [hits.ids]))))
     expected = grid, grid, (*grid, p), *([] if hits.ids is None and i == 0 else [(*grid, i)])

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.records import Fragments, Proxy
-from rts.sampling.triangle_sampler import TriangleSampler
+from rts import Camera, TriangleSampler
+from rts.plugin_api.records import Fragments, Proxy
 
 CANDIDATES_AT_ONCE = 1 << 20
 

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.compiling import compiled, kernel
+from rts import Camera
+from rts.plugin_api.loops import compiled, kernel
 
 
 def pixel_matrix(camera: Camera, size: tuple[int, int]) -> np.ndarray:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.errors import InputError
-from rts.parts import Part
-from rts.topology import fixed, index_table
-from rts.trees import Array
+from rts import InputError, Part
+from rts.plugin_api.arrays import Array
+from rts.plugin_api.checks import index_table
+from rts.plugin_api.threads import read_only
 from rts_surfaces.parametric import TOLERANCE
 from rts_surfaces.patches import Patches
 
@@ -33,7 +33,7 @@ class Bezier(Patches):
 
     def __init__(self, indices: Any, tolerance: float = TOLERANCE):
         table = index_table("indices", indices, 16)
-        super().__init__(table, tolerance, fixed(np.unique(table)))
+        super().__init__(table, tolerance, read_only(np.unique(table)))
         self._least = int(self.table.max()) + 1
 
     def __repr__(self) -> str:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from rts.arrays import unit
-from rts.engines import namespace
-from rts.errors import InputError
-from rts.operations.combine import combine
-from rts.operations.operation import Arrays, Operation, Some
-from rts.threads import parallel, read_only
-from rts.trees import Array
+from rts import InputError, namespace
+from rts.plugin_api.arrays import Array, unit
+from rts.plugin_api.operations import Operation, combine
+from rts.plugin_api.threads import parallel, read_only
 
 COLLAPSED = 1e-4
 """A tangent is taken for zero, and the normal from the mixed derivative, where it is less than this share of the
@@ -72,7 +71,7 @@ def _specified_normals(rows: Array, params: Array, patch: Array, table: Array) -
     return unit(xp.linalg.cross(first, second))
 
 
-def _nets(rows: np.ndarray, operands: Arrays) -> np.ndarray:
+def _nets(rows: np.ndarray, operands: Sequence[np.ndarray]) -> np.ndarray:
     """The control points (n, 16, C) of all patches; operands that do not fit one another are refused."""
     from rts_surfaces import bicubic_kernels
 
@@ -101,22 +100,22 @@ def _value_shape(rows: tuple[int, ...], params: tuple[int, ...], *_: tuple[int, 
     return params[0], rows[1]
 
 
-def _sums(rows: np.ndarray, operands: Arrays, out: np.ndarray) -> None:
+def _sums(rows: np.ndarray, operands: Sequence[np.ndarray], out: np.ndarray) -> None:
     from rts_surfaces import bicubic_kernels
 
     _, params, patch, _ = operands
     parallel(bicubic_kernels.values, len(out), _nets(rows, operands), patch, params, out, work=30 * len(out))
 
 
-def _values(operands: Arrays, out: np.ndarray) -> None:
+def _values(operands: Sequence[np.ndarray], out: np.ndarray) -> None:
     _sums(operands[0], operands, out)
 
 
-def _push_values(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
+def _push_values(operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray | None], out: np.ndarray) -> None:
     _sums(read_only(tangents[0]), operands, out)  # pyright: ignore[reportArgumentType]  # Only rows have tangents.
 
 
-def _pull_values(operands: Arrays, g: np.ndarray, results: Some) -> None:
+def _pull_values(operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None]) -> None:
     from rts_surfaces import bicubic_kernels
 
     if results[0] is not None:
@@ -130,7 +129,7 @@ def _normal_shape(rows: tuple[int, ...], params: tuple[int, ...], *_: tuple[int,
     return params[0], 3
 
 
-def _normals(operands: Arrays, out: np.ndarray) -> None:
+def _normals(operands: Sequence[np.ndarray], out: np.ndarray) -> None:
     from rts_surfaces import bicubic_kernels
 
     rows, params, patch, _ = operands
@@ -138,7 +137,7 @@ def _normals(operands: Arrays, out: np.ndarray) -> None:
     parallel(bicubic_kernels.normals, len(out), *given, out, work=60 * len(out))
 
 
-def _push_normals(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
+def _push_normals(operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray | None], out: np.ndarray) -> None:
     from rts_surfaces import bicubic_kernels
 
     rows, params, patch, _ = operands
@@ -147,7 +146,7 @@ def _push_normals(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
     parallel(bicubic_kernels.push_normals, len(out), *given, out, work=120 * len(out))
 
 
-def _pull_normals(operands: Arrays, g: np.ndarray, results: Some) -> None:
+def _pull_normals(operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None]) -> None:
     from rts_surfaces import bicubic_kernels
 
     if results[0] is not None:

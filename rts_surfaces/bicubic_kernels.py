@@ -11,10 +11,10 @@ from functools import partial
 
 import numpy as np
 
-from rts import compiling
+from rts.plugin_api import loops
 
-compiled = partial(compiling.compiled, fastmath={"contract"})
-kernel = partial(compiling.kernel, fastmath={"contract"})
+compiled = partial(loops.compiled, fastmath={"contract"})
+kernel = partial(loops.kernel, fastmath={"contract"})
 
 BEZIER = np.array([[1.0, 0, 0, 0], [-3, 3, 0, 0], [3, -6, 3, 0], [-1, 3, -3, 1]])
 """Coefficients of 1, t, t², t³ (rows) from Bézier control points (columns)."""

@@ -7,15 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import check_numbers, quoted
-from rts.arrays import from_numbers, shape_of
-from rts.checks import is_count
-from rts.engines import engine_of, namespace
-from rts.errors import InputError
-from rts.operations.linear import matmul
-from rts.parts import Part
-from rts.topology import fixed
-from rts.trees import Array, Tree
+from rts import InputError, Part, engine_of, namespace
+from rts.plugin_api.arrays import Array, Tree, from_numbers, shape_of
+from rts.plugin_api.checks import check_numbers, is_count, quoted
+from rts.plugin_api.threads import read_only
 from rts_surfaces.parametric import TOLERANCE
 from rts_surfaces.patches import Patches
 
@@ -45,7 +40,7 @@ class BSpline(Patches):
         if not (isinstance(both, (tuple, list)) and len(both) == 2 and all(map(_is_end, both))):
             raise InputError(f"ends is {quoted(ends)}; expected one of {', '.join(ENDS)}, or two of them")
         self.shape, self.ends = (int(shape[0]), int(shape[1])), (both[0], both[1])
-        self._along = [fixed(extraction(n, end)) for n, end in zip(self.shape, self.ends, strict=True)]
+        self._along = [read_only(extraction(n, end)) for n, end in zip(self.shape, self.ends, strict=True)]
         (mu, mv), steps = (len(m) for m in self._along), np.arange(4)
         spans = [n if end == "periodic" else n - 3 for n, end in zip(self.shape, self.ends, strict=True)]
         rows, columns = (3 * np.arange(s)[:, None] + steps for s in spans)
@@ -73,14 +68,20 @@ class BSpline(Patches):
         xp, engine = namespace(values), engine_of(values)
         a, b = (engine.constant(m, values) for m in self._along)
         (nu, nv, width), (mu, mv) = values.shape, (len(m) for m in self._along)
-        rows = xp.reshape(matmul(a, xp.reshape(values, (nu, nv * width))), (mu, nv, width))
+        rows = xp.reshape(_product(a, xp.reshape(values, (nu, nv * width))), (mu, nv, width))
         rows = xp.reshape(xp.permute_dims(rows, (1, 0, 2)), (nv, mu * width))
-        rows = xp.reshape(matmul(b, rows), (mv, mu, width))
+        rows = xp.reshape(_product(b, rows), (mv, mu, width))
         return xp.reshape(xp.permute_dims(rows, (1, 0, 2)), (mu * mv, width))
 
     def control_shape(self, shape: tuple[int, ...]) -> str | None:
         """One row for each control point of the grid."""
         return None if shape == self.shape else f"({self.shape[0]}, {self.shape[1]}, C)"
+
+
+def _product(a: Array, b: Array) -> Array:
+    """The product of matrices (n, m) and (m, k) in full precision, of which matrix units of some devices have less."""
+    engine = engine_of(b)
+    return a @ b if engine.exact_products(a, b) else engine.namespace.sum(a[:, :, None] * b[None, :, :], axis=1)
 
 
 class Revolution(BSpline):
@@ -115,7 +116,10 @@ class Revolution(BSpline):
         # A closed spline runs inside its control points; a control point's own radius is met at its angle.
         reach = 3 / (2 + np.cos(2 * np.pi / count))
         around = np.stack([np.cos(angle), np.zeros(count), np.sin(angle)], axis=-1) * reach
-        self._around, self._up = fixed(around[None]), fixed(heights[:, None, None] * np.array([[[0.0, 1.0, 0.0]]]))
+        self._around, self._up = (
+            read_only(around[None]),
+            read_only(heights[:, None, None] * np.array([[[0.0, 1.0, 0.0]]])),
+        )
 
     def __repr__(self) -> str:
         return f"Revolution({self.shape[0]} radii)"

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
-from rts.arrays import described, shape_of
-from rts.engines import namespace
-from rts.errors import InputError
-from rts.trees import Tree
+from rts import InputError, namespace
+from rts.plugin_api.arrays import Tree, shape_of
 
 G_BUFFER_NAMES = {"normals": "normal", "colors": "color"}
 """What the G-buffer calls an entry, if not by its own name."""
@@ -40,7 +38,8 @@ def check_entry(
         raise InputError(f"theta of {who} has no {name!r}; it has {sorted(theta)}")
     value, wrong = theta[name], expected(shape_of(theta[name]))
     if wrong is not None:
-        raise InputError(f"theta[{name!r}] of {who} {described(value)}; expected {wrong}")
+        what = f"has shape {tuple(value.shape)}" if hasattr(value, "shape") else f"is a {type(value).__name__}"
+        raise InputError(f"theta[{name!r}] of {who} {what}; expected {wrong}")
     if not namespace(value).isdtype(value.dtype, "real floating"):
         raise InputError(f"theta[{name!r}] of {who} has dtype {value.dtype}; expected a floating one")
 

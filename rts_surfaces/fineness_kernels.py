@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.plugin_api.loops import compiled, kernel
 
 COLLAPSED = 1e-6
 """Derivatives that are parallel but for this share have no normal."""

@@ -9,19 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.arrays import unit
-from rts.engines import engine_of, is_constant, namespace
-from rts.errors import InputError
-from rts.gbuffer import GBuffer
-from rts.interfaces import Rate, TriangleSurface
-from rts.operations.combine import interpolate
-from rts.operations.take import take
-from rts.parts import Part
-from rts.records import Proxy, Samples
-from rts.sampling.cache import fingerprint
-from rts.topology import fixed, index_table, pieces
-from rts.trees import Array, Tree
+from rts import GBuffer, InputError, Part, TriangleSurface, engine_of, namespace
+from rts.plugin_api.arrays import Array, Tree, exemplar, unit
+from rts.plugin_api.checks import fingerprint, index_table, pieces, quoted
+from rts.plugin_api.operations import interpolate, take
+from rts.plugin_api.records import Proxy, Rate, Samples
+from rts.plugin_api.threads import read_only
 from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows
 
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv")
@@ -63,7 +56,7 @@ class Mesh(TriangleSurface):
                 if not np.array_equal(table, self.faces):
                     self._columns[name] = 3 * len(self._tables)
                     self._tables.append(table)
-        self._ids = self.faces if len(self._tables) == 1 else fixed(np.concatenate(self._tables, axis=1))
+        self._ids = self.faces if len(self._tables) == 1 else read_only(np.concatenate(self._tables, axis=1))
         self._extents = [int(t.max()) + 1 for t in self._tables]
         self.sample_widths = (self._ids.shape[1], 2)
         self._normals: tuple[tuple, np.ndarray] | None = None
@@ -71,10 +64,10 @@ class Mesh(TriangleSurface):
         self._reads: dict[tuple, tuple[str, ...]] = {}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """A copy's tables are fixed, too."""
+        """Make a copy's tables read-only, too."""
         vars(self).update(state)
         for table in (*self._tables, self._ids):
-            fixed(table)
+            table.flags.writeable = False
 
     def __repr__(self) -> str:
         return f"Mesh({len(self.faces)} faces)"
@@ -115,7 +108,7 @@ class Mesh(TriangleSurface):
         from rts_surfaces.decimation import fewer_faces
 
         plain = len(self._tables) == 1 and "normals" not in theta and "uv" not in theta
-        if not plain or not is_constant(theta["vertices"]):
+        if not plain or exemplar(theta["vertices"]) is not None:
             return ()
         found = []
         for faces, vertices, nearest in fewer_faces(np.asarray(theta["vertices"]), self.faces):
@@ -158,7 +151,7 @@ class Mesh(TriangleSurface):
 
     def vertex_normals(self, vertices: Array) -> Array:
         """(V, 3) unit normals, the area-weighted mean of the faces around each vertex; zero where there is none."""
-        if not is_constant(vertices):
+        if exemplar(vertices) is not None:
             return self._vertex_normals(vertices)
         key, kept = fingerprint(vertices), self._normals
         if kept is None or kept[0] != key:

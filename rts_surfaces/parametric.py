@@ -12,15 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import check_positive
-from rts.camera import Camera
-from rts.checks import is_count
-from rts.engines import engine_of
-from rts.errors import InputError
-from rts.interfaces import Rate, TriangleSurface
-from rts.records import Proxy, Rays, Samples
-from rts.topology import fixed
-from rts.trees import Array, Tree
+from rts import Camera, InputError, TriangleSurface, engine_of
+from rts.plugin_api.arrays import Array, Tree
+from rts.plugin_api.checks import check_positive, is_count
+from rts.plugin_api.records import Proxy, Rate, Rays, Samples
 from rts_surfaces.tiles import MOST, Allowed, Shapes, Tiles, allowed_in, by_error, shapes, split, triangles, uniform
 from rts_surfaces.views import view_key, view_of
 
@@ -82,12 +77,12 @@ class Parametric(TriangleSurface):
         self.whole, self.tiles, self.tolerance, self.used = tiles, split(tiles), float(tolerance), used
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """A copy's tables are fixed, too."""
+        """Make a copy's tables read-only, too."""
         vars(self).update(state)
         for value in state.values():
             for array in value if isinstance(value, tuple) else (value,):
                 if isinstance(array, np.ndarray):
-                    fixed(array)
+                    array.flags.writeable = False
 
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
         """Other tolerances."""

@@ -8,12 +8,10 @@ from functools import partial
 
 import numpy as np
 
-from rts.engines import constants, engine_of
-from rts.gbuffer import GBuffer
-from rts.records import Rays, Samples
-from rts.threads import parallel
-from rts.topology import fixed
-from rts.trees import Array, Tree
+from rts import GBuffer, engine_of
+from rts.plugin_api.arrays import Array, Tree, constants
+from rts.plugin_api.records import Rays, Samples
+from rts.plugin_api.threads import parallel, read_only
 from rts_surfaces.bicubic import normals, values
 from rts_surfaces.entries import G_BUFFER_NAMES, WIDTHS, check_entry
 from rts_surfaces.parametric import LIMITS, Geometry, Parametric
@@ -77,9 +75,9 @@ class Patches(Parametric):
     shaped_by: tuple[str, ...] = ("points",)
 
     def __init__(self, table: np.ndarray, tolerance: float, used: np.ndarray | None = None):
-        self.table = fixed(np.array(table, np.int32))
+        self.table = read_only(np.array(table, np.int32))
         super().__init__(_tiles(self.table), tolerance, used)
-        self.across = fixed(across(self.whole.sides))
+        self.across = read_only(across(self.whole.sides))
 
     @abc.abstractmethod
     def bezier_rows(self, values: Array) -> Array:

@@ -12,10 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.errors import InputError
-from rts.records import Proxy
-from rts.threads import parallel
-from rts.topology import fixed
+from rts import InputError
+from rts.plugin_api.records import Proxy
+from rts.plugin_api.threads import parallel, read_only
 from rts_surfaces.views import View
 
 MOST = 256
@@ -68,7 +67,7 @@ class Tiles(NamedTuple):
         corners, corner_tiles = _numbered(corners)
         sides, edge_tiles = _numbered(sides)
         patch, frames, flips = patch.astype(np.int32), frames.astype(np.float64), np.array(flips, bool)
-        return cls(*(fixed(x) for x in (patch, frames, corners, sides, flips, corner_tiles, edge_tiles)))
+        return cls(*(read_only(x) for x in (patch, frames, corners, sides, flips, corner_tiles, edge_tiles)))
 
     def params(self, tiles: np.ndarray, local: np.ndarray) -> np.ndarray:
         """Parameters (N, 2) at local coordinates (N, 2) of tiles (N,)."""

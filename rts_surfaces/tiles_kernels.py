@@ -5,7 +5,7 @@ Tiles, their tables and their local coordinates are those of `rts_surfaces.tiles
 
 from __future__ import annotations
 
-from rts.compiling import compiled, kernel
+from rts.plugin_api.loops import compiled, kernel
 
 # ------------------------------------------------------------------------------------------ points and counts
 

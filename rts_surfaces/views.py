@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.camera import Camera
+from rts import Camera
 
 STEP, CELLS = 1.1, 16
 """Views whose distances and widths of pixels differ by less than this factor, and whose directions are in one cell of a

@@ -1,8 +1,9 @@
 """A surface that intersects rays itself: an axis-aligned ellipsoid."""
 
-from rts import GBuffer, RayHits, RaySurface
+from rts import GBuffer, RaySurface
 from rts.arrays import unit
 from rts.engines import namespace
+from rts.plugin_api.records import RayHits
 
 
 class Ellipsoid(RaySurface):

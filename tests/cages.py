@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import rts
-from rts import Samples
+from rts.plugin_api.records import Samples
 from rts.records import Cells
 from rts_surfaces.subdivision.binding import Limit, Rules
 from rts_surfaces.subdivision.cage import checked_cage

@@ -6,6 +6,8 @@ import numpy as np
 
 import rts
 from rts.arrays import described, unit
+from rts.plugin_api.operations import combine
+from rts.plugin_api.records import ArraySpec, Proxy, RayHits
 
 
 class Bezier(rts.TriangleSurface):
@@ -35,10 +37,10 @@ class Bezier(rts.TriangleSurface):
     def evaluate(self, theta, samples):
         (a, da), (b, db) = (bernstein(samples.params[:, i]) for i in range(2))
         points, ids = theta["points"], samples.ids
-        gbuffer = rts.GBuffer(position=rts.combine(points, ids, products(a, b)))
+        gbuffer = rts.GBuffer(position=combine(points, ids, products(a, b)))
 
         def normal():
-            along_u, along_v = (rts.combine(points, ids, products(*w)) for w in ((da, b), (a, db)))
+            along_u, along_v = (combine(points, ids, products(*w)) for w in ((da, b), (a, db)))
             return unit(rts.namespace(along_u).linalg.cross(along_u, along_v))
 
         gbuffer.defer("normal", normal)
@@ -56,7 +58,7 @@ class Bezier(rts.TriangleSurface):
         a, b, c, d = (x.reshape(-1) for x in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
         faces = np.stack([np.stack(t, axis=-1) for t in ((a, b, c), (a, c, d))], axis=1).reshape(-1, 3)
         every = (faces + (len(params) * np.arange(patches, dtype=np.int32))[:, None, None]).reshape(-1, 3)
-        return rts.Proxy(
+        return Proxy(
             points_at(inputs, ids, np.tile(params, (patches, 1)))[0].astype(np.float32),
             every,
             np.repeat(self.indices, len(faces), axis=0),
@@ -129,7 +131,7 @@ class Sheets(rts.TriangleSurface):
         vertices = np.concatenate([np.insert(corners, 2, z, axis=1) for z in inputs])
         faces = np.array([(0, 1, 2), (0, 2, 3)], np.int32)
         sheet = np.repeat(np.arange(len(inputs), dtype=np.int32), 2)[:, None]
-        return rts.Proxy(
+        return Proxy(
             vertices, np.tile(faces, (len(inputs), 1)) + 4 * sheet, sheet, np.tile(corners[faces], (len(inputs), 1, 1))
         )
 
@@ -155,7 +157,7 @@ class Crowded(Sheets):
         self.room = room
 
     def table_specs(self, rows, capacity):
-        return {"places": rts.ArraySpec((self.room, 2), np.float32, packed=capacity is None)}
+        return {"places": ArraySpec((self.room, 2), np.float32, packed=capacity is None)}
 
     def refine(self, inputs, samples, rays):
         entry = np.arange(len(samples.ids), dtype=np.int32)[:, None]
@@ -250,7 +252,7 @@ class Torus(rts.RaySurface):
         about_axis = unit(xp.stack([point[..., 0], point[..., 2]], axis=-1))
         out = point[..., 0] * about_axis[..., 0] + point[..., 2] * about_axis[..., 1] - radii[0]
         about_circle = unit(xp.stack([out, point[..., 1]], axis=-1))
-        return rts.RayHits(hits, t, xp.concat([about_axis, about_circle], axis=-1))
+        return RayHits(hits, t, xp.concat([about_axis, about_circle], axis=-1))
 
     @classmethod
     def example(cls):

@@ -10,6 +10,8 @@ from test_radiance_field import FIELD
 import rts
 from rts import Camera, regularizers
 from rts.diagnostics import compare, stability
+from rts.plugin_api.operations import Operation, gradient
+from rts.plugin_api.records import Fragments, Proxy, RayHits
 
 SIZE = (12, 16)
 CAMERA = Camera.look_at((0.4, 0.5, 4), (0, 0, 0))
@@ -19,7 +21,7 @@ POINTS = np.array([[0.1, 0.2, -2.0], [0.3, 0.1, -3.0]], np.float32)
 SAMPLED = rts.sample(PART, CAMERA, SIZE)
 SAMPLES = SAMPLED.samples[0]
 NDC = rts.Ndc((1.0, 1.0))
-DOUBLE = rts.Operation(
+DOUBLE = Operation(
     "misuses.double",
     lambda x: 2 * x,
     ranks=(2,),
@@ -47,7 +49,7 @@ class Card(rts.TriangleSurface):
         return theta["vertices"]
 
     def proxy(self, inputs, camera, size):
-        return rts.Proxy(VERTICES, FACES)._replace(**self.changes)
+        return Proxy(VERTICES, FACES)._replace(**self.changes)
 
 
 class Ball(rts.RaySurface):
@@ -63,7 +65,7 @@ class Ball(rts.RaySurface):
 
     def intersect(self, theta, origins, directions, layers):
         shape = (layers, len(origins))
-        hits = rts.RayHits(np.zeros(shape, bool), np.ones(shape, np.float32), np.zeros((*shape, 1), np.float32))
+        hits = RayHits(np.zeros(shape, bool), np.ones(shape, np.float32), np.zeros((*shape, 1), np.float32))
         return hits._replace(**self.changes)
 
 
@@ -74,7 +76,7 @@ class Traced(Card):
         return self.changes["made"](super().evaluate(theta, samples))
 
     def proxy(self, inputs, camera, size):
-        return rts.Proxy(VERTICES, FACES)
+        return Proxy(VERTICES, FACES)
 
 
 class Raster(rts.TriangleSampler):
@@ -86,7 +88,7 @@ class Raster(rts.TriangleSampler):
     def rasterize(self, prepared, camera, size, layers, cull):
         shape = (layers, *size)
         ids, depth = np.full(shape, -1, np.int32), np.zeros(shape, np.float32)
-        return rts.Fragments(ids, np.zeros((*shape, 2), np.float32), depth)._replace(**self.changes)
+        return Fragments(ids, np.zeros((*shape, 2), np.float32), depth)._replace(**self.changes)
 
 
 def drawn(surface, theta=None, **options):
@@ -123,7 +125,9 @@ def broken(**options):
 
 
 def volume(**options):
-    return rts.volume_render(**{"field": FIELD, "camera": CAMERA, "size": SIZE, "samples": (3, 1), **options})
+    return rts.radiance_fields.volume_render(
+        **{"field": FIELD, "camera": CAMERA, "size": SIZE, "samples": (3, 1), **options}
+    )
 
 
 def energy(kind, **options):
@@ -197,12 +201,12 @@ GROUPS = {
     ),
     "check_gradient": open_in(checked, "loss", "samples", "tolerance", "budget_s"),
     "engine_of": {"trees": rts.engine_of},
-    "exact_calibration": {"reach": lambda v: rts.exact_calibration(0.5, v)},
+    "exact_calibration": {"reach": lambda v: rts.splatting.exact_calibration(0.5, v)},
     "explain": open_in(
         lambda **o: rts.explain(PART, CAMERA, **o), "size", "splatter", "layers", "supersample", size=SIZE
     ),
     "fit": open_in(lambda **o: rts.fit(lambda p: p, pose(), steps=1, **o), "progress", "jit"),
-    "gradient": {"points": lambda v: rts.gradient(lambda p: p[:, 0], v)},
+    "gradient": {"points": lambda v: gradient(lambda p: p[:, 0], v)},
     "gradient_image": {
         "parameters": lambda v: rts.gradient_image(lambda p: p, v),
         "direction": lambda v: rts.gradient_image(lambda p: p.reshape(1, 1, 1), pose()[:1], v),
@@ -251,5 +255,5 @@ CALLS = {f"{group}.{name}": call for group, calls in GROUPS.items() for name, ca
 ALL = "stability.rows warmup.processes compare.samplers tune.samplers tune.splatters check_gradient.loss".split()
 """Where None is right, and takes long."""
 
-RECORDS = "ArraySpec Fine Fit Rate Rays RowCameras Sampled Splats Tuned View Comparison Stability".split()
+RECORDS = "ArraySpec Rate Rays RowCameras Splats Comparison Stability".split()
 """What the library gives, and users read; functions that take one are in the tables."""

@@ -8,7 +8,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from rts import Camera, Samples
+from rts import Camera
+from rts.plugin_api.records import Samples
 from rts.records import Cells
 
 PROPERTIES = settings(deadline=None, derandomize=True, max_examples=60)

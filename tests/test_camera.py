@@ -153,7 +153,9 @@ def test_views_near_up_are_continuous():
 def test_a_field_of_view_in_radians_is_warned_of(make):
     places = ((0, 0, 5), (0, 0, 0)) if make == Camera.look_at else ()
     for radians in 0.1, np.float32(math.pi / 4), math.pi / 2:
-        with pytest.warns(rts.InputWarning, match=r"fov_y is .*, and is in degrees: of radians give math.degrees"):
+        with pytest.warns(
+            rts.errors.InputWarning, match=r"fov_y is .*, and is in degrees: of radians give math.degrees"
+        ):
             make(*places, fov_y=radians)
     make(*places, fov_y=2.0)
     Camera.from_blender(np.eye(4), SIZE, focal=5000.0)  # Of half a degree, which nobody gave as an angle.
@@ -724,7 +726,7 @@ def test_a_camera_without_a_ratio_takes_it_from_the_size_and_a_square_stays_squa
 )
 def test_an_image_of_another_ratio_than_its_cameras_is_warned_of_with_both(make):
     camera = make()
-    with pytest.warns(rts.AspectWarning, match=r"width / height = 1\.5, and size is \(40, 40\), of 1") as caught:
+    with pytest.warns(rts.errors.AspectWarning, match=r"width / height = 1\.5, and size is \(40, 40\), of 1") as caught:
         rts.render(square(), camera, (40, 40))
     assert caught[0].filename == __file__
     for size in (SIZE, (80, 120), (27, 40)):  # The last is the ratio up to a pixel.

@@ -10,7 +10,8 @@ from soups import soup_of
 from test_raster import CAMERAS, SIZE, triangles
 
 import rts
-from rts import Camera, Part, Proxy
+from rts import Camera, Part
+from rts.plugin_api.records import Proxy
 from rts.records import Request
 
 pytestmark = pytest.mark.sampling

@@ -105,7 +105,7 @@ def test_the_matrix_names_each_pair_and_why_one_does_not_work(monkeypatch):
     assert "has no triangles" in cells["broken", "raster"][1]
 
 
-@pytest.mark.filterwarnings("ignore::rts.EmptyImageWarning")
+@pytest.mark.filterwarnings("ignore::rts.errors.EmptyImageWarning")
 @pytest.mark.parametrize(
     "change, expected",
     [

@@ -11,9 +11,11 @@ import pytest
 from analytic import Ellipsoid
 
 import rts
-from rts import Fragments, GBuffer, InputError, Part, PluginError, RayHits, Splats
+from rts import GBuffer, InputError, Part, PluginError
 from rts.arrays import without_border
 from rts.engines import engine_of, namespace
+from rts.plugin_api.operations import Operation
+from rts.plugin_api.records import Fragments, RayHits, RowCameras, Splats
 from rts.records import Request
 from rts.registry import instance
 from rts.shading import Depth, Normals, Unlit
@@ -751,7 +753,7 @@ def by_length(rgba, theta, gbuffer):
 
 def one_view(theta, gbuffer, camera):
     """Shades all samples as those of the first."""
-    first = camera.of_rows(1 + 0 * camera.number) if isinstance(camera, rts.RowCameras) else camera
+    first = camera.of_rows(1 + 0 * camera.number) if isinstance(camera, RowCameras) else camera
     return Depth()(theta, gbuffer, first)
 
 
@@ -1010,7 +1012,7 @@ def scaled(**members):
         "pull": pull,
     }
     options = {"differentiable": 2, "packed": (0,), "packed_result": True}
-    return rts.Operation("tests.odd", ranks=(2, 1), **{**given, **options, **members})
+    return Operation("tests.odd", ranks=(2, 1), **{**given, **options, **members})
 
 
 def forward_of_all(operands, out):

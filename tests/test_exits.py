@@ -6,6 +6,7 @@ from helpers import arrays, derivative, gradient, icosphere, mesh_part, to_numpy
 
 import rts
 from rts import splatting
+from rts.plugin_api.records import Proxy
 from rts.sampling.exits import beside_outlines
 from rts.splatting.layers import dilated
 from rts_backends.fused import splatters as fused
@@ -64,7 +65,7 @@ def test_one_look_at_all_triangles_finds_what_two_find(eye):
     raster = rts.plugin("rts.samplers", "raster")()
     heap = np.concatenate([0.3 * vertices + shift for shift in ((0, 0, 0), (0.4, 0.3, 0.1), (-0.3, 0.1, 0.5))])
     all_faces = np.concatenate([faces + k * len(vertices) for k in range(3)])
-    mesh = rts.Proxy(heap.astype(np.float32), all_faces.astype(np.int32))
+    mesh = Proxy(heap.astype(np.float32), all_faces.astype(np.int32))
     camera = rts.Camera.look_at(eye, (0, 0, 0), fov_y=40, near=0.3).for_size((SIZE, SIZE))
     camera = camera.map(lambda m: np.asarray(m, np.float64))
     given = mesh, camera, (SIZE, SIZE), 2, lambda fragments: beside_outlines(fragments.triangle_ids >= 0)

@@ -16,6 +16,7 @@ from strategies import PROPERTIES, reals, sizes, steps, table
 
 import rts
 from rts.files.srgb import decode_srgb, encode_srgb
+from rts.plugin_api.records import Samples
 from rts.records import Cells
 
 pytestmark = pytest.mark.files
@@ -37,7 +38,7 @@ def at_corners(part):
     # Barycentrics of zero give the last corner exactly.
     ids = np.stack([np.roll(tables, 2 - i, axis=2) for i in range(3)], axis=1).reshape(3 * len(tables), -1)
     none = np.full((1, 1, 1), -1, np.int32)
-    samples = rts.Samples(ids, np.zeros((len(ids), 2), np.float32), Cells(none, none), np.int32(0))
+    samples = Samples(ids, np.zeros((len(ids), 2), np.float32), Cells(none, none), np.int32(0))
     gbuffer = part.surface.evaluate(part.theta, samples)
     return {name: gbuffer[name].reshape(len(tables), 3, -1) for name in gbuffer}
 

@@ -480,9 +480,9 @@ def test_how_opaque_a_material_is(tmp_path, text, alpha):
 def test_materials_that_no_library_has_are_warned_of(tmp_path):
     write(tmp_path / "m.mtl", "newmtl m\nKd 1 0 0\n")
     path = write(tmp_path / "m.obj", "mtllib m.mtl\n" + QUAD + "usemtl m\nf 1 2 3\nusemtl n\nf 1 3 4\n")
-    with pytest.warns(rts.FileWarning, match="m.obj uses materials that its libraries lack: 'n'") as caught:
+    with pytest.warns(rts.errors.FileWarning, match="m.obj uses materials that its libraries lack: 'n'") as caught:
         rts.load(path)
-    assert issubclass(rts.FileWarning, rts.RtsWarning) and caught[0].filename == __file__
+    assert issubclass(rts.errors.FileWarning, rts.RtsWarning) and caught[0].filename == __file__
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def test_what_is_sampled_is_rendered():
 
 def test_an_empty_view_has_a_gradient_of_zero():
     part = rts.Part(MESH(FACES), {"vertices": arrays(TORCH[0], BALL + [0, 0, 90])})
-    with pytest.warns(rts.EmptyImageWarning):
+    with pytest.warns(rts.errors.EmptyImageWarning):
         found = gradient(
             TORCH[0],
             lambda v: render(rts.Part(MESH(FACES), {"vertices": v}), Adaptive(3)).sum(),

@@ -175,7 +175,7 @@ FINE_CASES = [
 """Splatter, channels, layers, samples a pixel along each axis, engine and dtype."""
 
 
-@pytest.mark.filterwarnings("ignore::rts.LayersWarning")
+@pytest.mark.filterwarnings("ignore::rts.errors.LayersWarning")
 @pytest.mark.parametrize(("kind", "channels", "layers", "fine", "target", "dtype"), FINE_CASES)
 def test_supersampled_images_are_swept_to_the_normal_equations_of_their_jacobian(
     kind, channels, layers, fine, target, dtype, monkeypatch
@@ -562,7 +562,7 @@ def test_wrong_arguments_say_what_was_expected(target, options, expected):
 def test_colours_far_beyond_one_are_warned_of_and_features_are_not(target):
     picture = arrays(target, np.full((*SIZE, 3), 254.0))
     with pytest.warns(
-        rts.InputWarning, match="target's colours go up to 254, .* divide a picture from 0 to 255 by 255"
+        rts.errors.InputWarning, match="target's colours go up to 254, .* divide a picture from 0 to 255 by 255"
     ):
         rts.ImageResiduals(scene, CAMERA, SIZE, picture)
     rts.ImageResiduals(scene, CAMERA, SIZE, picture / 200)  # A filter may overshoot.
@@ -579,7 +579,9 @@ def test_what_requires_a_gradient_is_warned_of(name):
     torch = pytest.importorskip("torch")
     given = {"target": torch.zeros(SIZE), "weights": torch.ones(SIZE), "background": torch.ones(3)}
     given[name].requires_grad_(True)
-    with pytest.warns(rts.InputWarning, match=f"^{name} requires a gradient, .* as a constant; give {name}.detach"):
+    with pytest.warns(
+        rts.errors.InputWarning, match=f"^{name} requires a gradient, .* as a constant; give {name}.detach"
+    ):
         rts.ImageResiduals(scene, CAMERA, SIZE, **given)
 
 

@@ -14,6 +14,7 @@ from rts.operations.linear import AFFINE
 from rts.operations.projection import PROJECTION
 from rts.operations.rigid import RIGID
 from rts.operations.take import take
+from rts.plugin_api.records import Fragments, Proxy
 from rts.rendering.samples import sample
 from rts.sampling.merging import merge
 from rts.sampling.packing import lift
@@ -222,7 +223,7 @@ def test_triangles_that_are_not_there_are_refused_beside_exits(wrong, target):
 def test_triangles_that_are_not_there_are_refused_when_they_are_packed():
     ids = np.full((1, 1, 2), -7, np.int32)
     with refused("triangle -7 to a cell"):
-        lift(rts.Fragments(ids, np.zeros((*ids.shape, 2)), np.zeros(ids.shape)), rts.Proxy(*quad()))
+        lift(Fragments(ids, np.zeros((*ids.shape, 2)), np.zeros(ids.shape)), Proxy(*quad()))
 
 
 def shifted(samples, by):

@@ -12,6 +12,7 @@ from helpers import CAMERA, DIFFERENTIABLE, FRONT, SIZE, arrays, gradient, icosp
 import rts
 from rts import splatting
 from rts.checks import check_shader
+from rts.plugin_api.records import Proxy, Samples
 from rts.plugin_base import overrides, promised
 from rts.records import Cells
 from rts.testing import SplatterConformance
@@ -87,7 +88,7 @@ def test_a_class_may_be_both_of_triangles_and_of_rays():
 
         def proxy(self, inputs, camera, size):
             vertices = (inputs["center"] + 1.1 * inputs["radii"] * self.vertices).astype(np.float32)
-            return rts.Proxy(vertices, self.faces, np.zeros((len(self.faces), 0), np.int32), vertices[self.faces])
+            return Proxy(vertices, self.faces, np.zeros((len(self.faces), 0), np.int32), vertices[self.faces])
 
         def refine(self, inputs, samples, rays):
             hits = self.intersect(inputs, rays.origins, rays.directions, 2)
@@ -97,7 +98,7 @@ def test_a_class_may_be_both_of_triangles_and_of_rays():
                 row[k][cells >= 0] = np.where(hits.hit[k, index], index, -1)
                 depth[k][cells >= 0] = hits.distance[k, index]
                 params[index] = hits.params[k, index]
-            return rts.Samples(samples.ids, params, Cells(row, depth), samples.overflow)
+            return Samples(samples.ids, params, Cells(row, depth), samples.overflow)
 
     part = rts.Part(Both(), BALL, "normals")
     by_rays, by_triangles = (show(part, sampler=sampler, splatter="single") for sampler in ("rays", "raster"))
@@ -298,7 +299,7 @@ class Gaussian5(rts.Splatter):
     reach, sigma = 2, 0.8
 
     def __init__(self, calibrated=True):
-        self.gamma = rts.exact_calibration(self.sigma, self.reach) if calibrated else 1.0
+        self.gamma = rts.splatting.exact_calibration(self.sigma, self.reach) if calibrated else 1.0
 
     def image(self, splats):
         xp, engine = rts.namespace(splats.positions), rts.engine_of(splats.positions)
@@ -338,7 +339,7 @@ def test_the_calibration_of_any_gaussian_is_that_of_its_first_moment(sigma, reac
     weights = np.exp(-(u**2) / (2 * sigma**2))
     # The derivative of the weights when the splat moves has the first moment Σ u² w / σ², of weights that sum to one.
     moment = (u**2 * weights).sum() / weights.sum() / sigma**2
-    assert rts.exact_calibration(sigma, reach) == pytest.approx(1 / moment, rel=1e-12)
+    assert rts.splatting.exact_calibration(sigma, reach) == pytest.approx(1 / moment, rel=1e-12)
 
 
 @pytest.mark.parametrize("calibrated", [True, False])
@@ -356,7 +357,7 @@ def test_a_ramp_that_moves_under_a_stranger_s_gaussian_has_its_true_derivative(c
     splatter = Gaussian5(calibrated)
     value = lambda p: (splatter.splat(p, arrays(target, rgba), cells)[..., 0] * weights).sum()  # noqa: E731
     slope = gradient(target, value, given)[:, 0].sum()
-    expected = -0.04 * (1.0 if calibrated else 1 / rts.exact_calibration(0.8, 2))
+    expected = -0.04 * (1.0 if calibrated else 1 / rts.splatting.exact_calibration(0.8, 2))
     assert slope == pytest.approx(expected, rel=2e-3)
 
 

@@ -312,7 +312,7 @@ def scaled_gradients(field_values, near_singular, motion):
     bounds = ((-1, -1, -1), (1, 1, 1))
     part = Part(Isosurface(bounds, motion=motion, near_singular=near_singular), {"values": values}, "normals")
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rts.EmptyImageWarning)
+        warnings.simplefilter("ignore", rts.errors.EmptyImageWarning)
         image = rts.render(part, CAMERA, (24, 24))
     weights = torch.from_numpy(np.random.default_rng(0).standard_normal((24, 24, 4)).astype(np.float32))
     (image * weights).sum().backward()
@@ -370,7 +370,7 @@ def test_samples_of_prepared_parts_are_those_of_what_was_prepared():
 
 def test_a_band_that_finds_nothing_carries_nothing():
     surface = Isosurface(BOUNDS, f=lambda theta, p: torus(RADII, p) + 5, shape=(40,) * 3, band=NarrowBand(1.0))
-    with pytest.warns(rts.EmptyImageWarning, match="its band found no place"):
+    with pytest.warns(rts.errors.EmptyImageWarning, match="its band found no place"):
         assert not rts.render(Part(surface, {}), CAMERA, SIZE).any()
 
 
@@ -562,6 +562,8 @@ def test_without_a_change_of_sign_there_is_an_empty_image_and_a_warning(target, 
     def area(values):
         return rts.render(Part(surface, {"values": values}), CAMERA, (8, 8))[..., 3].sum()
 
-    with pytest.warns(rts.EmptyImageWarning, match="the field is outside of the isovalue [09] all over its bounds"):
+    with pytest.warns(
+        rts.errors.EmptyImageWarning, match="the field is outside of the isovalue [09] all over its bounds"
+    ):
         slope = gradient(target, area, values)
     assert not slope.any()

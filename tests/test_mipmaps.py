@@ -21,6 +21,7 @@ import rts
 from rts import Camera, GBuffer
 from rts.errors import InputError
 from rts.footprints import uv_footprint
+from rts.plugin_api.records import Samples
 from rts.records import Cells
 from rts.shading import Textured
 from rts.textures import level_of, mip_levels, sample_texture
@@ -296,7 +297,7 @@ def test_a_shader_called_without_footprints_says_so():
 def test_surfaces_of_other_parameters_are_refused():
     vertices, faces = quad()
     one, three = np.zeros((1, 3), np.int32), np.zeros((1, 3), np.float32)
-    samples = rts.Samples(one, three, Cells(np.zeros((1, 1, 1), np.int32), np.ones((1, 1, 1))), np.int32(0))
+    samples = Samples(one, three, Cells(np.zeros((1, 1, 1), np.int32), np.ones((1, 1, 1))), np.int32(0))
     surface = mesh_part((vertices, faces)).surface
     with pytest.raises(InputError, match="3 parameters a sample"):
         uv_footprint(surface, {}, samples, {}, FRONT, SIZE, rts.engine_of(three), None)

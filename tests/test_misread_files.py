@@ -64,7 +64,9 @@ def outcome(folder, files, **options):
             assert str(path) in said and "\n" not in said and "Traceback" not in said and len(said) < 600
             assert PLACE.search(said.replace(str(path), "")), said
     for warning in caught:
-        assert issubclass(warning.category, rts.FileWarning) and str(path) in str(warning.message), warning.message
+        assert issubclass(warning.category, rts.errors.FileWarning) and str(path) in str(warning.message), (
+            warning.message
+        )
     return found, bool(caught)
 
 
@@ -170,6 +172,6 @@ def test_errors_name_the_line_or_the_accessor(tmp_path, named, name):
 @pytest.mark.parametrize("name", WARNED)
 def test_warnings_name_what_is_left_out_once(tmp_path, named, name):
     assert outcome(tmp_path, named[name])[1]
-    with pytest.warns(rts.FileWarning) as caught:
+    with pytest.warns(rts.errors.FileWarning) as caught:
         rts.load(tmp_path / next(iter(named[name])))
     assert len(caught) == 1 and re.search(WARNED[name], str(caught[0].message))

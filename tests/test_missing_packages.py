@@ -12,7 +12,8 @@ from test_raster import CAMERAS, KINDS, PIXELS, grid, triangles
 from test_samplers import interior
 
 import rts
-from rts import Camera, InputError, Part, PluginError, Proxy
+from rts import Camera, InputError, Part, PluginError
+from rts.plugin_api.records import Proxy
 from rts.testing.compatibility import APRON
 
 pytestmark = pytest.mark.core

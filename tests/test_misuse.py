@@ -1,6 +1,7 @@
 """Wrong values for every argument: one line that names the argument, or an acceptance that is documented."""
 
 import math
+from importlib import import_module
 from inspect import isabstract
 
 import misuses
@@ -10,6 +11,7 @@ import pytest
 import rts
 import rts.diagnostics
 from rts import Camera
+from rts.plugin_api.operations import combine, gradient
 from rts_surfaces.implicit.narrow_band import NarrowBand
 
 pytestmark = pytest.mark.rendering
@@ -175,11 +177,11 @@ CALLS = {
     "splat.row": lambda v: splatter().splat(np.ones((1, 3), np.float32), np.ones((1, 4), np.float32), v),
     "splatter.sigma": lambda v: rts.plugin("splatters", "visible")(sigma=v),
     "splatter.calibration": lambda v: rts.plugin("splatters", "visible")(calibration=v),
-    "exact_calibration.sigma": rts.exact_calibration,
-    "gradient.f": lambda v: rts.gradient(v, np.zeros((1, 3))),
-    "combine.rows": lambda v: rts.combine(v, np.zeros((1, 1), np.int32), np.ones((1, 1), np.float32)),
-    "combine.ids": lambda v: rts.combine(np.ones((2, 3), np.float32), v, np.ones((1, 1), np.float32)),
-    "combine.weights": lambda v: rts.combine(np.ones((2, 3), np.float32), np.zeros((1, 1), np.int32), v),
+    "exact_calibration.sigma": rts.splatting.exact_calibration,
+    "gradient.f": lambda v: gradient(v, np.zeros((1, 3))),
+    "combine.rows": lambda v: combine(v, np.zeros((1, 1), np.int32), np.ones((1, 1), np.float32)),
+    "combine.ids": lambda v: combine(np.ones((2, 3), np.float32), v, np.ones((1, 1), np.float32)),
+    "combine.weights": lambda v: combine(np.ones((2, 3), np.float32), np.zeros((1, 1), np.int32), v),
     "rigid.pose": rts.rigid,
     "rigid.center": lambda v: rts.rigid(np.zeros(6), v),
     "Isosurface.bounds": lambda v: isosurface(bounds=v),
@@ -326,7 +328,7 @@ FUNCTIONS = "ImageResiduals.scene fit.loss fit.callback check_gradient.scene gra
 TRIED = [(call, value) for call in CALLS for value in WRONG if value != "a class" or call not in FUNCTIONS]
 
 
-@pytest.mark.filterwarnings("ignore::rts.EmptyImageWarning")
+@pytest.mark.filterwarnings("ignore::rts.errors.EmptyImageWarning")
 @pytest.mark.parametrize("call, value", TRIED)
 def test_a_wrong_value_is_one_line_that_names_the_argument_or_accepted(call, value, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -365,6 +367,9 @@ def public():
     modules = (rts, rts.regularizers, rts.diagnostics)
     names = {name: getattr(module, name) for module in modules for name in module.__all__}
     names |= {name: getattr(rts, name) for name in rts.registry.built_in_surfaces()}
+    names |= {
+        name: getattr(import_module(place), name) for place, moved in rts._MOVED.items() for name in moved.split()
+    }
     return {name for name, value in names.items() if callable(value) and not is_base(value)}
 
 
@@ -390,7 +395,7 @@ def test_arrays_of_two_engines_are_refused():
         lambda: rts.render_samples(SAMPLED, part.replace(transform=eye), CAMERA),
         lambda: rts.render_views(part.replace(transform=eye), [CAMERA] * 2, SIZE),
         lambda: rts.sample(part.replace(transform=eye), CAMERA, SIZE),
-        lambda: rts.combine(points, np.zeros((1, 1), np.int32), eye[:1, :1]),
+        lambda: combine(points, np.zeros((1, 1), np.int32), eye[:1, :1]),
         lambda: rts.rigid(torch.zeros(6), eye[0, :3]),
         lambda: CAMERA.replace(view=eye).project(points, SIZE),
         lambda: ndc.rays(points, jnp.ones((4, 3))),

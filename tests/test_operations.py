@@ -14,6 +14,7 @@ from rts.operations.linear import affine_map, affine_map_of_views, matmul
 from rts.operations.projection import projective_map, projective_map_of_views
 from rts.operations.rigid import RIGID
 from rts.operations.take import SHIFTED, TAKE, take
+from rts.plugin_api.operations import Operation
 from rts.testing import OperationConformance
 from rts.testing.splatters import scattered
 from rts_backends.fused.image import IMAGE
@@ -204,7 +205,7 @@ def pull(operands, g, results, *, power, kept):
         results[1][...] = (by_scale * g).sum(axis=0)
 
 
-CLAMP = rts.Operation(
+CLAMP = Operation(
     "tests.clamp",
     specification,
     ranks=(2, 1),
@@ -383,7 +384,7 @@ def test_the_gradient_of_a_function_of_points_is_that_of_its_closed_form(target)
     xp_points = arrays(target, points)
     f = lambda p: p[:, 0] ** 2 * p[:, 1] + 3 * p[:, 2]  # noqa: E731
     expected = np.stack([2 * points[:, 0] * points[:, 1], points[:, 0] ** 2, np.full(9, 3.0)], -1)
-    np.testing.assert_allclose(to_numpy(rts.gradient(f, xp_points)), expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(to_numpy(rts.plugin_api.operations.gradient(f, xp_points)), expected, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
@@ -392,7 +393,7 @@ def test_it_is_differentiable_in_what_the_function_closes_over_and_in_the_points
     given = {"k": np.array(2.0, np.float32), "p": points}
 
     def total(t):
-        return (rts.gradient(lambda p: t["k"] * (p**3).sum(-1), t["p"]) ** 2).sum()
+        return (rts.plugin_api.operations.gradient(lambda p: t["k"] * (p**3).sum(-1), t["p"]) ** 2).sum()
 
     found = gradient(target, total, arrays(target, given))
     # The gradient is 3 k p², its square 9 k² p⁴.
@@ -402,7 +403,7 @@ def test_it_is_differentiable_in_what_the_function_closes_over_and_in_the_points
 
 def test_a_function_that_gives_another_shape_is_refused():
     with pytest.raises(rts.InputError, match=r"f gave shape \(4, 3\) for 4 points; expected \(4,\)"):
-        rts.gradient(lambda p: p, np.ones((4, 3)))
+        rts.plugin_api.operations.gradient(lambda p: p, np.ones((4, 3)))
 
 
 # ------------------------------------------------------------------------------------------------- operands of any kind
@@ -410,7 +411,7 @@ def test_a_function_that_gives_another_shape_is_refused():
 
 @pytest.mark.parametrize("target", ALL)
 def test_an_operand_may_be_a_number(target):
-    scaled = rts.Operation(
+    scaled = Operation(
         "tests.scaled",
         lambda x, k: x * k,
         ranks=[2, 0],
@@ -459,7 +460,7 @@ def test_what_is_no_operation_is_refused_when_it_is_made():
 
 
 @pytest.mark.parametrize("value", [None, 7, "abc", [None], np.ones(2), {1}, 0.5], ids=str)
-@pytest.mark.parametrize("name", [field.name for field in fields(rts.Operation) if field.init])
+@pytest.mark.parametrize("name", [field.name for field in fields(Operation) if field.init])
 def test_a_wrong_field_is_one_line_that_names_it(name, value):
     if (name, repr(value)) in (("used", "None"), ("name", "'abc'")):
         pytest.skip("it is a right one")
@@ -532,7 +533,7 @@ def test_a_camera_of_numpy_and_of_another_engine_projects():
 def test_the_gradient_of_numpy_suits_scenes_of_any_size():
     for size in (1e-5, 1.0, 1e5):
         points = size * np.array([[0.6, 0.8, 0.0]])
-        found = rts.gradient(lambda p: np.sqrt((p * p).sum(-1)), points)
+        found = rts.plugin_api.operations.gradient(lambda p: np.sqrt((p * p).sum(-1)), points)
         np.testing.assert_allclose(found, [[0.6, 0.8, 0.0]], atol=1e-6)
 
 

@@ -10,7 +10,8 @@ from helpers import ALL, arrays, to_numpy
 from thin_patches import lacking, thin_patches
 
 import rts
-from rts import Camera, InputError, Part, Samples
+from rts import Camera, InputError, Part
+from rts.plugin_api.records import Samples
 from rts.records import Cells
 from rts.sampling import settling
 from rts.testing import OperationConformance

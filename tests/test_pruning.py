@@ -247,7 +247,7 @@ def test_auto_without_a_splatter_takes_every_layer():
     assert rts.sample(SCENES["closed box"], CAMERA, SIZE, layers="auto").row.shape[0] == 2
 
 
-@pytest.mark.filterwarnings("ignore::rts.EmptyImageWarning")
+@pytest.mark.filterwarnings("ignore::rts.errors.EmptyImageWarning")
 def test_auto_of_an_empty_view_takes_one_layer():
     image = rts.render(card(50.0), CAMERA, SIZE, layers="auto")
     np.testing.assert_array_equal(image, 0)
@@ -255,7 +255,7 @@ def test_auto_of_an_empty_view_takes_one_layer():
 
 def test_auto_says_what_is_beyond_its_limit(monkeypatch):
     parts = [card(-0.1 * i, 0.5 + 0.02 * i, 0.02 * i) for i in range(12)]
-    with pytest.warns(rts.LayersWarning, match="more than the 8 layers") as warned:
+    with pytest.warns(rts.errors.LayersWarning, match="more than the 8 layers") as warned:
         sampled = rts.sample(parts, CAMERA, SIZE, splatter="visible", layers="auto")
     assert warned[0].filename == __file__
     assert sampled.row.shape[0] == 8 and int(sampled.overflow) > 0

@@ -5,8 +5,9 @@ import pytest
 from helpers import box, icosphere, quad, rotation, soup
 
 import rts
-from rts import Camera, Proxy
+from rts import Camera
 from rts.camera import orthographic, perspective
+from rts.plugin_api.records import Proxy
 
 pytestmark = pytest.mark.sampling
 

@@ -9,6 +9,7 @@ from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, box, gradient, icosphere
 import rts
 from rts import Camera
 from rts.errors import EmptyImageWarning, InputError
+from rts.plugin_api.records import RowCameras
 from rts.shading import Lambert
 from rts.splatting import side_by_side
 from rts.splatting.side_by_side import Picture
@@ -105,7 +106,7 @@ def test_derivatives_along_cameras_and_poses_are_those_of_a_loop_but_for_roundin
         torch.testing.assert_close(a, b, rtol=0, atol=1e-6 * float(b.abs().max()))
 
 
-@pytest.mark.filterwarnings("ignore::rts.InputWarning")  # A telephoto lens.
+@pytest.mark.filterwarnings("ignore::rts.errors.InputWarning")  # A telephoto lens.
 def test_near_views_move_outlines_as_alone_beside_far_ones():
     torch = pytest.importorskip("torch")
     cameras = [Camera.look_at(np.array(EYES[0]) * k, (0, 0, 0), fov_y=45 / k, far=5000) for k in (1, 300)]
@@ -208,7 +209,7 @@ def test_silhouettes_through_poses_cameras_and_batches_are_those_of_a_loop(targe
     np.testing.assert_allclose(to_numpy(together)[0], expected, atol=2e-5)
 
 
-@pytest.mark.filterwarnings("ignore::rts.InputWarning")  # A telephoto lens.
+@pytest.mark.filterwarnings("ignore::rts.errors.InputWarning")  # A telephoto lens.
 def test_views_are_the_same_on_any_number_of_threads_and_in_any_company(monkeypatch):
     found = []
     for threads in ("1", "2", "2"):
@@ -278,7 +279,7 @@ def test_cameras_of_rows_are_those_of_their_views(target):
     cameras = [camera.for_size(SIZE) for camera in (CAMERAS[0], flat, CAMERAS[1])]
     number = np.array([1, 1, 3, 3, 3, 0], np.int32)  # Nothing is seen in the second, and one row is not used.
     points, direction = np.random.default_rng(1).normal(size=(6, 3)).astype(np.float32), (0.3, -0.2, 0.9)
-    rows = rts.RowCameras.of(arrays(target, cameras), arrays(target, number))
+    rows = RowCameras.of(arrays(target, cameras), arrays(target, number))
     found = [rows.toward(arrays(target, points)), rows.to_world(direction), rows.depth(arrays(target, points))]
     found = [to_numpy(x) for x in (*found, *rows.depth_range())]
     for n in range(5):
@@ -291,7 +292,7 @@ def test_cameras_of_rows_are_those_of_their_views(target):
         np.testing.assert_allclose(camera.depth(point)[0], expected[2])
         for i in (0, 2, 3, 4):
             np.testing.assert_allclose(found[i][n], expected[i], rtol=1e-4, atol=1e-5)
-    rows = rts.RowCameras.of(arrays(target, cameras), arrays(target, np.full(6, 2, np.int32)))
+    rows = RowCameras.of(arrays(target, cameras), arrays(target, np.full(6, 2, np.int32)))
     np.testing.assert_allclose(to_numpy(rows.toward(arrays(target, points))), flat.toward(points), atol=1e-5)
 
 
@@ -340,7 +341,7 @@ def test_compiled_views_are_shaded_together_in_pieces_of_rows_in_use(capacity, m
     expected = torch.autograd.grad(loss(*given, torch.tensor(WEIGHTS)), given)
     gradient_of = jax.jit(jax.grad(lambda v, p: loss(v, p, WEIGHTS, capacity=capacity), (0, 1)))
     found = gradient_of(*arrays("jax", [part.theta["vertices"], pose]))
-    assert set(calls) == {rts.RowCameras}
+    assert set(calls) == {RowCameras}
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1e-4 * float(b.abs().max()))
 
@@ -391,7 +392,7 @@ def test_shaders_are_given_one_camera_unless_they_take_views_and_say_what_they_r
         ({}, [Camera] * 3),
         ({"takes_views": True}, [Camera] * 3),
         ({"takes_views": True, "reads": ("uv_footprint",)}, [Camera] * 3),
-        ({"takes_views": True, "reads": ()}, [rts.RowCameras]),
+        ({"takes_views": True, "reads": ()}, [RowCameras]),
     ):
         vars(shader).update(promises)
         calls.clear()

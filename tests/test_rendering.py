@@ -140,7 +140,7 @@ def test_a_mirroring_transform_keeps_the_outside_outside(target):
     assert image[..., 3].sum() > 50
 
 
-@pytest.mark.filterwarnings("ignore:part 0 is closed and wound inside out:rts.InputWarning")
+@pytest.mark.filterwarnings("ignore:part 0 is closed and wound inside out:rts.errors.InputWarning")
 def test_culling_hides_the_inside_and_nothing_else():
     vertices, faces = icosphere(2)
     outside = mesh_part((vertices, faces), cull="back")
@@ -174,7 +174,7 @@ VIEWS = {
 }
 
 
-@pytest.mark.filterwarnings("ignore::rts.EmptyImageWarning")
+@pytest.mark.filterwarnings("ignore::rts.errors.EmptyImageWarning")
 @pytest.mark.parametrize("name", VIEWS)
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_degenerate_views_give_finite_images_and_gradients(name, target):
@@ -456,7 +456,9 @@ def test_plain_lists_of_numbers_are_arrays():
 def test_samples_in_front_that_find_no_room_are_warned_of(target):
     part = PART.replace(theta=arrays(target, dict(PART.theta)))
     for options in {}, {"supersample": 2}:
-        with pytest.warns(rts.InputWarning, match="capacity is 1, and [0-9]+ samples find no room, .* image has holes"):
+        with pytest.warns(
+            rts.errors.InputWarning, match="capacity is 1, and [0-9]+ samples find no room, .* image has holes"
+        ):
             rts.render(part, CAMERA, SIZE, capacity=1, **options)
     # Hidden ones are left out first, as it is documented.
     row = rts.sample(part, CAMERA, SIZE).row
@@ -550,7 +552,7 @@ MISSPELT = [
 def test_entries_that_nobody_reads_are_warned_of_with_the_nearest_name(shader, name, meant):
     theta = {"vertices": BOX[0], name: np.ones(3, np.float32)}
     part = Part(Mesh(BOX[1]), theta, shader)
-    with pytest.warns(rts.InputWarning) as found:
+    with pytest.warns(rts.errors.InputWarning) as found:
         rts.render([PART, part], CAMERA, SIZE)
     assert [str(w.message) for w in found] == [
         f"theta[{name!r}] of part 1 is not read; did you mean {meant!r}? rts.explain lists all such entries"
@@ -624,7 +626,7 @@ def test_closed_meshes_that_are_wound_inside_out_are_warned_of_once(name, target
         rts.render(right, CAMERA, SIZE)
         assert rts.explain(right, CAMERA)[0].remarks == ()
     wrong = mesh_part((given, inward), cull="back")
-    with pytest.warns(rts.InputWarning, match="part 0 is closed and wound inside out: .*; give it faces"):
+    with pytest.warns(rts.errors.InputWarning, match="part 0 is closed and wound inside out: .*; give it faces"):
         rts.render(wrong, CAMERA, SIZE)
     rts.render(wrong, CAMERA, SIZE)
     assert "is closed and wound inside out" in rts.explain(wrong, CAMERA)[0].remarks[0]

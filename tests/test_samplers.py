@@ -9,8 +9,9 @@ from helpers import box, icosphere, quad, rotation, soup
 from test_raster import CAMERAS, KINDS, PIXELS, cast, grid, triangles
 
 import rts
-from rts import Camera, Proxy
+from rts import Camera
 from rts.camera import perspective
+from rts.plugin_api.records import Proxy
 
 pytestmark = pytest.mark.sampling
 
@@ -353,7 +354,7 @@ def test_a_mesh_far_from_the_origin_has_no_holes(sampler, offset, lens):
     np.testing.assert_allclose(found.depth[inside], expected.depth[inside], rtol=1e-4)
 
 
-@pytest.mark.filterwarnings("ignore::rts.InputWarning")  # A telephoto lens.
+@pytest.mark.filterwarnings("ignore::rts.errors.InputWarning")  # A telephoto lens.
 def test_a_camera_far_from_the_mesh_sees_it_as_the_reference_does(sampler):
     vertices, faces = icosphere(3)
     camera = Camera.look_at((1e4, 2e4, 3e4), (0, 0, 0), fov_y=0.004, aspect=1.25, near=1e3, far=1e5)
@@ -555,7 +556,7 @@ def test_a_ground_to_the_horizon_is_seen_and_opengl_says_once_that_it_does_not_d
         found = [chosen.rasterize(prepared, host(camera).for_size(size), size, 1, "none") for _ in range(2)]
     for each in found:
         assert ((each.triangle_ids >= 0) != (expected.triangle_ids >= 0)).sum() <= (sampler == "embree")
-    assert [w.category for w in caught] == [rts.SamplerWarning] * (sampler == "opengl")
+    assert [w.category for w in caught] == [rts.errors.SamplerWarning] * (sampler == "opengl")
 
 
 def test_opengl_draws_itself_what_is_no_larger_than_a_room():

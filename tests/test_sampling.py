@@ -5,8 +5,9 @@ import pytest
 from helpers import DIFFERENTIABLE, arrays, icosphere, to_numpy
 
 import rts
-from rts import Camera, Fragments, GBuffer, Part, Proxy, Samples
+from rts import Camera, GBuffer, Part
 from rts.engines import engine_of, namespace
+from rts.plugin_api.records import Fragments, Proxy, Samples
 from rts.records import ArraySpec, Cells
 from rts.sampling.merging import merge
 from rts.sampling.packing import lift
@@ -161,7 +162,7 @@ def test_a_surface_that_cannot_be_hashed_is_sampled_all_the_same():
     np.testing.assert_array_equal(rts.render(part, CAMERA, SIZE, sampler="raster"), expected)
 
 
-@pytest.mark.filterwarnings("ignore::rts.EmptyImageWarning")
+@pytest.mark.filterwarnings("ignore::rts.errors.EmptyImageWarning")
 @pytest.mark.parametrize("sampler", TRIANGLE_SAMPLERS)
 def test_a_surface_without_a_triangle_is_an_empty_picture(sampler):
     if sampler == "opengl":

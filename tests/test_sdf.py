@@ -6,6 +6,7 @@ from helpers import ALL, DIFFERENTIABLE, arrays, finite_difference, gradient, to
 from test_torus import RADII, closed_form, some_rays
 
 import rts
+from rts.plugin_api.records import Samples
 from rts.testing import SurfaceConformance
 from rts_surfaces.implicit.casting import ball, box, cast, moving
 from rts_surfaces.implicit.fields import sphere, swept_sphere, union
@@ -216,7 +217,7 @@ def at_some_samples(target, dtype=np.float32):
     origins, directions, _ = some_rays(60)
     hits = TORUS.intersect({"radii": RADII}, origins, directions, 2)
     params = hits.params[hits.hit].astype(np.float32)
-    return rts.Samples(np.zeros((len(params), 0), np.int32), arrays(target, params, dtype), None, None)
+    return Samples(np.zeros((len(params), 0), np.int32), arrays(target, params, dtype), None, None)
 
 
 @pytest.mark.parametrize("target", DIFFERENTIABLE)

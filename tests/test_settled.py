@@ -10,6 +10,7 @@ from helpers import DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere
 
 import rts
 from rts import splatting
+from rts.plugin_api.records import Splats
 from rts.plugin_base import promised
 from rts.records import Cells
 from rts.rendering.samples import sample
@@ -342,7 +343,7 @@ def test_what_needs_the_samples_that_were_left_out_is_refused():
 def test_settled_of_the_wrong_kind_is_refused(make):
     y, x = np.indices((6, 7))
     positions = np.stack([x + 0.5, y + 0.5, np.full(x.shape, 2.0)], -1).reshape(-1, 3)
-    splats = rts.Splats(positions, np.ones((42, 4)), Cells(np.arange(42, dtype=np.int32).reshape(1, 6, 7)))
+    splats = Splats(positions, np.ones((42, 4)), Cells(np.arange(42, dtype=np.int32).reshape(1, 6, 7)))
     none = np.full((6, 7), -1, np.int32)
     wrong = {
         "settled has shape (6, 6); expected (6, 7)": none[:, :-1],
@@ -367,7 +368,7 @@ def test_the_gradient_of_many_colors_is_that_of_the_specification():
     found = []
     for make in (splatting.Visible, fused.Visible):
         rgba = torch.ones((360, 4), dtype=torch.float64, requires_grad=True)
-        splats = rts.Splats(positions, rgba, Cells(torch.from_numpy(row), settled=torch.from_numpy(row[0])), border=2)
+        splats = Splats(positions, rgba, Cells(torch.from_numpy(row), settled=torch.from_numpy(row[0])), border=2)
         found.append(torch.autograd.grad((make().cropped(splats) * weights).sum(), rgba)[0])
     expected = torch.zeros((18, 20, 4), dtype=torch.float64)
     expected[2:-2, 2:-2] = weights
@@ -443,7 +444,7 @@ def test_a_class_with_its_own_sums_says_anew_whether_it_fills_interiors():
     assert not any(promised(kind(), "fills_interiors") for kind in (Wide, splatting.Multi, fused.Multi))
 
 
-@pytest.mark.filterwarnings("ignore:capacity is:rts.InputWarning")
+@pytest.mark.filterwarnings("ignore:capacity is:rts.errors.InputWarning")
 @pytest.mark.parametrize("capacity", [60, 100])
 def test_where_samples_were_dropped_only_outlines_that_are_known_are_read(capacity, monkeypatch):
     """A settled cell without a sample beside a cell whose sample was dropped has no outline of its own."""

@@ -9,7 +9,7 @@ from helpers import ALL, FRONT, arrays, rigid, to_numpy
 from seen import CAMERA, SIZE, VIEWS, rays_spread
 
 import rts
-from rts import Samples
+from rts.plugin_api.records import ArraySpec, Samples
 from rts.records import Cells
 from rts.sampling import packing, settling
 
@@ -234,8 +234,8 @@ def spoiled(array, at):
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda s: None, "gave a NoneType; expected rts.Samples"),
-        (lambda s: (s.ids, s.params), "gave a tuple; expected rts.Samples"),
+        (lambda s: None, "gave a NoneType; expected Samples"),
+        (lambda s: (s.ids, s.params), "gave a tuple; expected Samples"),
         (lambda s: s.replace(row=np.where(s.row >= 0, s.row.max() - s.row, -1)), "another number to a row"),
         (lambda s: s.replace(row=np.where(s.row < 0, 0, s.row)), "another number to a row"),
         (
@@ -269,8 +269,8 @@ def spoiled(array, at):
 def test_what_refine_may_not_give_is_refused_in_its_name(change, words):
     class Tabled(Sheets):
         def table_specs(self, rows, capacity):
-            spec = rts.ArraySpec((rows, 1), np.float32, packed=True, by_sample=True)
-            return {"places": rts.ArraySpec((10, 2), np.float32, packed=True), "own": spec}
+            spec = ArraySpec((rows, 1), np.float32, packed=True, by_sample=True)
+            return {"places": ArraySpec((10, 2), np.float32, packed=True), "own": spec}
 
     part = rts.Part(Tabled(lambda samples, rays: change(samples)), {"heights": HEIGHTS})
     with pytest.raises(rts.InputError, match=f"refine of .*Tabled.*{words}") as caught:

@@ -13,6 +13,7 @@ from soups import deepened, differences, hits_of, soup_of
 
 import rts
 from rts import splatting
+from rts.plugin_api.records import Proxy
 from rts.rendering.samples import sample
 
 pytestmark = pytest.mark.sampling
@@ -35,7 +36,7 @@ def rasterize(name, soup, layers):
             _samplers[name] = str(error)
     if isinstance(_samplers[name], str):
         pytest.skip(_samplers[name])
-    sampler, proxy = _samplers[name], rts.Proxy(soup.vertices, soup.faces)
+    sampler, proxy = _samplers[name], Proxy(soup.vertices, soup.faces)
     return sampler.rasterize(sampler.prepare(proxy), soup.camera, soup.size, layers, soup.cull)
 
 
@@ -70,7 +71,7 @@ def test_hardware_finds_what_the_reference_finds_but_for_outlines(first):
             soup = deepened(soup, number)
         known, count = hits_of(soup), len(soup.faces)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rts.SamplerWarning)
+            warnings.simplefilter("ignore", rts.errors.SamplerWarning)
             found, every = rasterize("opengl", soup, count), rasterize("reference", soup, count)
         # Corners are snapped to fractions of a pixel, and planes cut in float32.
         planes = [np.abs(known.depth - z) <= 1e-4 * abs(z) for z in soup.camera.depth_range()]
@@ -96,8 +97,8 @@ def rendered(soup, number, needed, splatter, dtype):
     along = torch.tensor(np.random.default_rng(number).normal(size=(*soup.size, 4)), dtype=vertices.dtype)
     part = colored(soup, number, vertices)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rts.EmptyImageWarning)
-        warnings.simplefilter("ignore", rts.InputWarning)  # Some soups are closed, and wound inside out.
+        warnings.simplefilter("ignore", rts.errors.EmptyImageWarning)
+        warnings.simplefilter("ignore", rts.errors.InputWarning)  # Some soups are closed, and wound inside out.
         # Exits take what room samples leave: all samples leave none.
         cells = np.prod([n + 2 * (splatting.Visible.reach + 1) for n in soup.size])
         options = {"layers": soup.layers, "capacity": int(cells) * (soup.layers + 1)}

@@ -5,7 +5,8 @@ import pytest
 from helpers import DIFFERENTIABLE, arrays, to_numpy
 
 import rts
-from rts import Camera, InputError, Part, Samples
+from rts import Camera, InputError, Part
+from rts.plugin_api.records import Samples
 from rts.records import Cells
 from rts.testing.compatibility import APRON
 from rts_surfaces import tiles
@@ -451,7 +452,7 @@ def test_bad_input_is_one_line_that_says_what_was_given(name):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.filterwarnings("ignore::rts.EmptyImageWarning")
+@pytest.mark.filterwarnings("ignore::rts.errors.EmptyImageWarning")
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 @pytest.mark.parametrize("name", ["a point", "a line", "a fold"])
 def test_collapsed_patches_give_finite_images_and_gradients(name, target):

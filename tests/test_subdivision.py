@@ -275,7 +275,7 @@ def test_a_cage_from_a_file_has_its_tags_polygons_and_map(tmp_path):
     lines += ["t interpolateboundary 1/0/0 2", "t creasemethod 0/0/1 chaikin", "t hole 1/0/0 3"]
     lines += ["t smoothtriangles 0/0/0"]
     path.write_text("\n".join(lines))
-    with pytest.warns(rts.FileWarning, match="line 34: the tag 'smoothtriangles' is not followed"):
+    with pytest.warns(rts.errors.FileWarning, match="line 34: the tag 'smoothtriangles' is not followed"):
         (part,) = rts.load(path, surface="subdivision")
     cage = part.surface.cage
     assert cage.sizes.tolist() == [5, 5, 4, 4, 4, 4, 4]

@@ -375,5 +375,5 @@ def test_a_cage_with_several_materials_is_warned_of(tmp_path):
     lines.insert(9, "usemtl one")
     lines.insert(11, "usemtl two")
     (tmp_path / "cage.obj").write_text("\n".join(lines) + "\n")
-    with pytest.warns(rts.FileWarning, match="materials, of which a cage can have but one"):
+    with pytest.warns(rts.errors.FileWarning, match="materials, of which a cage can have but one"):
         rts.load(tmp_path / "cage.obj", surface="subdivision")

@@ -46,7 +46,7 @@ def rendered(number, needed, splatter, shader="unlit", **options):
         return rts.render_samples(sampled, parts(vertices), scene.camera, splatter=splatter)
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", rts.EmptyImageWarning)
+        warnings.simplefilter("ignore", rts.errors.EmptyImageWarning)
         options |= {"sampler": "raster", "splatter": needed, "layers": scene.layers}
         sampled = sample(parts(vertices), scene.camera, scene.size, **options)
         slopes = gradient("torch", lambda v: (image(v) * weights).sum(), vertices)

@@ -9,7 +9,8 @@ from helpers import ALL, DIFFERENTIABLE, arrays, finite_difference, gradient, to
 from seen import CAMERA, SIZE, VIEWS, loss_of
 
 import rts
-from rts import Samples
+import rts.plugin_api.operations
+from rts.plugin_api.records import Samples
 from rts.testing import SurfaceConformance
 from rts.testing.compatibility import APRON
 
@@ -148,7 +149,7 @@ def test_the_gradient_of_its_distance_is_the_normal_of_the_torus(target):
     samples = rts.sample(TORUS, CAMERA, SIZE).samples[0]
     gbuffer = TORUS.surface.evaluate(TORUS.theta, samples)
     points, radii = arrays(target, (gbuffer["position"], RADII))
-    found = rts.gradient(lambda p: distance(radii, p), points)
+    found = rts.plugin_api.operations.gradient(lambda p: distance(radii, p), points)
     np.testing.assert_allclose(to_numpy(found), gbuffer["normal"], atol=1e-5)
 
 

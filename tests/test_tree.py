@@ -5,12 +5,14 @@ import re
 import sys
 import tomllib
 from graphlib import CycleError, TopologicalSorter
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 import rts
+import rts.testing
 
 pytestmark = pytest.mark.core
 
@@ -22,7 +24,7 @@ FILES = {
     for path in sorted((ROOT / package).rglob("*.py"))
 }
 
-COMPILING = ("rts.compiling", "rts.pipeline")
+COMPILING = ("rts.compiling", "rts.pipeline", "rts.plugin_api.loops")
 
 
 def imports(path, types=False):
@@ -54,6 +56,67 @@ def test_the_core_never_imports_a_plugin_package():
     for name, path in FILES.items():
         if name.partition(".")[0] == "rts":
             assert not {n for n in imports(path, types=True) if n.partition(".")[0] != "rts"}, name
+
+
+def toolkit():
+    """The names of each submodule of `rts.plugin_api`."""
+    return {name: import_module(name).__all__ for name in FILES if name.startswith("rts.plugin_api.")}
+
+
+def private(path, public):
+    """Imports of a file from inside `rts` that are not among the public names of its modules, and such attributes."""
+    tree = ast.parse(path.read_text())
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {a.name for a in node.names if a.name.startswith("rts.") and a.name not in public}
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "rts":
+            found |= {f"{node.module}.{a.name}" for a in node.names if a.name not in public.get(node.module, ())}
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "rts":
+            found |= {f"rts.{node.attr}"} - {f"rts.{name}" for name in public["rts"]}
+    return found
+
+
+def test_plugins_import_public_names_alone():
+    api = toolkit()
+    public = {"rts": rts.__all__, "rts.plugin_api": [name.rpartition(".")[2] for name in api], **api}
+    own = [path for name, path in FILES.items() if name.partition(".")[0] != "rts"]
+    assert len(own) > 80
+    for path in own:
+        assert not private(path, public), path
+    public["rts"] = [*rts.__all__, "splatting", *rts.registry.built_in_surfaces()]
+    public["rts.testing"] = rts.testing.__all__
+    others = [p for folder in ("plugin_example", "second_plugin") for p in (ROOT / "tests" / folder).rglob("*.py")]
+    assert len(others) > 5
+    for path in others:
+        assert not private(path, public), path
+
+
+def test_a_private_import_is_found(tmp_path):
+    path = tmp_path / "plugin.py"
+    path.write_text("import rts\nimport rts.compiling\nfrom rts import Part, compiling\nfrom rts.trees import Array\n")
+    expected = {"rts.compiling", "rts.trees.Array"}
+    assert private(path, {"rts": rts.__all__}) == expected
+    path.write_text("import rts\nrts.render(rts.threads)\n")
+    assert private(path, {"rts": rts.__all__}) == {"rts.threads"}
+
+
+def test_the_toolkit_is_small_and_documented():
+    names = [name for listed in toolkit().values() for name in listed]
+    assert len(names) == len(set(names)) <= 40
+    assert not set(names) & set(rts.__all__)
+    text = (ROOT / "docs/plugins.md").read_text()
+    for place, listed in toolkit().items():
+        for name in listed:
+            assert re.search(rf"^\| `{place.rpartition('.')[2]}` \| `{name}[`(]", text, re.MULTILINE), f"{place}.{name}"
+
+
+def test_old_names_tell_where_they_are():
+    for place, names in rts._MOVED.items():
+        for name in names.split():
+            assert hasattr(import_module(place), name)
+            with pytest.raises(AttributeError, match=f"rts.{name} is {place}.{name} now"):
+                getattr(rts, name)
 
 
 def test_compiled_code_is_imported_when_it_is_needed():

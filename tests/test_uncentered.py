@@ -8,6 +8,8 @@ from helpers import icosphere
 
 import rts
 from rts import Camera, Part
+from rts.plugin_api.operations import combine
+from rts.plugin_api.records import Proxy
 
 pytestmark = pytest.mark.rendering
 
@@ -29,7 +31,7 @@ class Ball(rts.TriangleSurface):
         directions = engine.constant(self.directions, theta["radius"])
         b = xp.astype(samples.params, directions.dtype)
         weights = xp.concat([b, 1 - xp.sum(b, axis=1, keepdims=True)], axis=1)
-        normal = rts.combine(directions, samples.ids, weights)
+        normal = combine(directions, samples.ids, weights)
         some = xp.sum(normal * normal, axis=1, keepdims=True)
         normal = normal / xp.sqrt(xp.where(some > 0, some, xp.ones_like(some)))
         return rts.GBuffer(position=theta["radius"] * normal, normal=normal)
@@ -38,7 +40,7 @@ class Ball(rts.TriangleSurface):
         return theta["radius"]
 
     def proxy(self, inputs, camera, size):
-        return rts.Proxy((inputs * self.directions).astype(np.float32), self.faces)
+        return Proxy((inputs * self.directions).astype(np.float32), self.faces)
 
 
 class Refined(Ball):

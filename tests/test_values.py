@@ -10,6 +10,7 @@ from helpers import ALL, DIFFERENTIABLE, arrays, to_numpy
 import rts
 from rts import Camera, InputError, Part
 from rts.arrays import is_finite
+from rts.plugin_api.records import Proxy
 
 pytestmark = pytest.mark.rendering
 
@@ -295,7 +296,7 @@ def test_a_proxy_that_is_prepared_by_hand_is_checked_too(sampler, by):
     chosen = rts.plugin("samplers", sampler)()
     camera = CAMERA.for_size(SIZE)
     with pytest.raises(InputError, match="the proxy has faces from"):
-        chosen.rasterize(chosen.prepare(rts.Proxy(VERTICES, FACES + np.int32(by))), camera, SIZE, 1, "none")
+        chosen.rasterize(chosen.prepare(Proxy(VERTICES, FACES + np.int32(by))), camera, SIZE, 1, "none")
 
 
 @pytest.mark.parametrize("engine", ["jax", "torch"])
@@ -352,14 +353,14 @@ EMPTY = {
 @pytest.mark.parametrize("name", EMPTY)
 def test_an_empty_image_is_warned_of_with_its_cause(name, target, options):
     part, camera, cause = EMPTY[name]
-    with pytest.warns(rts.EmptyImageWarning, match=cause) as caught:
+    with pytest.warns(rts.errors.EmptyImageWarning, match=cause) as caught:
         show(part.replace(theta=arrays(target, part.theta)), camera, **options)
     assert len(caught) == 1 and caught[0].filename == __file__
 
 
 def test_an_empty_image_of_several_parts_names_each():
     part, camera, _ = EMPTY["left"]
-    with pytest.warns(rts.EmptyImageWarning, match="part 0 lies outside .* left edge; part 1 lies outside"):
+    with pytest.warns(rts.errors.EmptyImageWarning, match="part 0 lies outside .* left edge; part 1 lies outside"):
         show([part, part], camera)
 
 

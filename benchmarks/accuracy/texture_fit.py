@@ -17,6 +17,7 @@ from rich.progress import track
 import rts
 from benchmarks.accuracy import scenes
 from benchmarks.camera import camera, supersampled
+from rts.plugin_api.records import Splats
 from rts.splatting import Plain, Visible
 
 SIZE, TEXELS, TRAINING, HELD_OUT, STEPS, BATCHES, RATE = (128, 128), 256, 16, 6, 120, 4, 0.03
@@ -25,7 +26,7 @@ SIZE, TEXELS, TRAINING, HELD_OUT, STEPS, BATCHES, RATE = (128, 128), 256, 16, 6,
 class Sharp(rts.Splatter):
     """The image of `none` with the derivative of `visible`."""
 
-    def image(self, splats: rts.Splats) -> torch.Tensor:
+    def image(self, splats: Splats) -> torch.Tensor:
         """See `rts.Splatter`."""
         soft = Visible().image(splats)
         return soft + (Plain().image(splats) - soft).detach()

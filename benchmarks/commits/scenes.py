@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from rts.plugin_api.records import RayHits
+
 SIZE = (28, 36)
 POSE = (0.11, -0.07, 0.05, 0.02, -0.03, 0.04)
 """At which all is rendered: radians and units."""
@@ -44,7 +46,7 @@ class Ellipsoid:
         seen, outside = square > 0, near >= 0
         distance = xp.stack([xp.where(outside, near, far), far, *[far] * (layers - 2)][:layers])
         hit = xp.stack([seen & (far >= 0), seen & outside, *[seen & ~seen] * (layers - 2)][:layers])
-        return rts.RayHits(hit, distance, _unit(xp, o[None] + distance[..., None] * d[None]))
+        return RayHits(hit, distance, _unit(xp, o[None] + distance[..., None] * d[None]))
 
 
 def _unit(xp: Any, vectors: Any) -> Any:

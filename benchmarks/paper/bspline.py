@@ -20,6 +20,7 @@ import numpy as np
 
 import rts
 from rts.engines import engine_named
+from rts.fitting.fit import Fit
 
 PIECE = np.array([0.80, 0.85, 0.30, 0.26, 0.22, 0.62, 0.55, 0.02])
 CYLINDER = 0.45
@@ -44,7 +45,7 @@ def overlap(mask: np.ndarray, target: np.ndarray) -> float:
     return float(np.minimum(mask, target).sum() / np.maximum(mask, target).sum())
 
 
-def fitted(engine: str, method: str, side: int, target: np.ndarray) -> tuple[rts.Fit, list[np.ndarray]]:
+def fitted(engine: str, method: str, side: int, target: np.ndarray) -> tuple[Fit, list[np.ndarray]]:
     """The fit, and the radii at each step."""
     shape, trail = surface(), []
     residuals = rts.ImageResiduals(

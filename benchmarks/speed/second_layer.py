@@ -8,6 +8,7 @@ from typing import Any
 import rts
 from benchmarks.speed.pose_iteration import ENGINES, Task
 from benchmarks.timing import in_turn
+from rts.plugin_api.records import Splats
 
 SHADERS = ("silhouette", "lambert")
 
@@ -18,11 +19,11 @@ class Unpruned(rts.Splatter):
     def __init__(self) -> None:
         self._splatter = rts.plugin("rts.splatters", "auto")()
 
-    def image(self, splats: rts.Splats) -> Any:
+    def image(self, splats: Splats) -> Any:
         """See `rts.Splatter`."""
         return self._splatter.image(splats)
 
-    def cropped(self, splats: rts.Splats) -> Any:
+    def cropped(self, splats: Splats) -> Any:
         """See `rts.Splatter`."""
         return self._splatter.cropped(splats)
 

@@ -12,6 +12,7 @@ from benchmarks.speed.pose_iteration import Task
 from benchmarks.timing import START, in_turn
 from rts import splatting
 from rts.engines import namespace
+from rts.plugin_api.records import Splats
 
 SPLATTERS = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}
 """The specification of each registered name."""
@@ -22,7 +23,7 @@ BUDGET = 2.0
 class Capture(rts.Splatter):
     """A splatter that keeps what it is given, of all layers."""
 
-    def image(self, splats: rts.Splats) -> Any:
+    def image(self, splats: Splats) -> Any:
         """See `rts.Splatter`."""
         self.given = splats.positions, splats.rgba, splats.row
         return namespace(splats.positions).zeros((*splats.row.shape[1:], 4), dtype=splats.positions.dtype)

@@ -13,6 +13,7 @@ import numpy as np
 import rts
 from benchmarks.speed.pose_iteration import Task
 from benchmarks.timing import CONSECUTIVE, RATE, START, WARM_UP
+from rts.plugin_api.records import Splats
 from rts.sampling import packing, triangle_sampler
 
 STAGES = (
@@ -71,11 +72,11 @@ class TimedSplatter(rts.Splatter):
         with self._clock.stage("choose hidden layers"):
             return self._splatter.needed(covered, depth)
 
-    def image(self, splats: rts.Splats) -> Any:
+    def image(self, splats: Splats) -> Any:
         """See `rts.Splatter`."""
         return self._splatter.image(splats)
 
-    def cropped(self, splats: rts.Splats) -> Any:
+    def cropped(self, splats: Splats) -> Any:
         """See `rts.Splatter`."""
         positions = splats.positions + 0  # Whose gradient arrives when the splatter's is done.
         positions.register_hook(self._leave)

@@ -16,6 +16,7 @@ from rts.files.images import read_texture
 from rts.files.mtl_reader import Material, read_mtl
 from rts.files.paths import inside
 from rts.files.pieces import Piece
+from rts.files.srgb import decode_srgb
 
 LENGTHS = {"v": {3, 4, 6, 7}, "vt": {1, 2, 3}, "vn": {3}}
 """How many numbers rows may have: a position may have a weight, or a colour, and that an alpha."""
@@ -192,14 +193,14 @@ class Polygons(NamedTuple):
 
     Attributes:
         vertices: (V, 3) float64.
-        colors: (V, 3) float64 in [0, 1], sRGB, or None.
+        colors: (V, 3) float64 in [0, 1], linear, or None.
         uv: (A, 2) float64.
         sizes: (F,) int64, how many corners each face has.
         corners: (H, 3) int64, position, uv and normal of the corners of all faces; −1 where one is not given.
         tags: the statements "t", as OpenSubdiv's files have them, each with the number of its line.
         materials: how many materials faces have.
-        material: the only material, or a plain one where there are several.
-        texture: (h, w, 3 or 4) float32 in [0, 1], sRGB, of that material; or None.
+        color: (3,) or (4,) in [0, 1], linear, of the only material; None of none, or of several.
+        texture: (h, w, 3 or 4) float32 in [0, 1], linear, of that material; or None.
     """
 
     vertices: np.ndarray
@@ -209,7 +210,7 @@ class Polygons(NamedTuple):
     corners: np.ndarray
     tags: list[tuple[int, str]]
     materials: int
-    material: Material
+    color: np.ndarray | None
     texture: np.ndarray | None
 
 
@@ -226,7 +227,9 @@ def read_polygons(path: Path) -> Polygons:
     material = found[0] if len(used) == len(found) == 1 else Material()
     corners, sizes = lines.polygons((len(v), len(vt), len(vn)))
     texture = None if material.texture is None else read_texture(material.texture, path)
-    return Polygons(v[:, :3], _colors(v), vt, sizes, corners, lines.tags, len(used), material, texture)
+    linear = (None if x is None else decode_srgb(x) for x in (_colors(v), material.color, texture))
+    colors, color, texture = linear
+    return Polygons(v[:, :3], colors, vt, sizes, corners, lines.tags, len(used), color, texture)
 
 
 def _rows(lines: _Lines) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -29,7 +29,7 @@ class _Specifying(threading.local):
     on = False
 
 
-specifying = _Specifying()
+_specifying = _Specifying()
 
 
 def _listed(shapes: Iterable[tuple[int, ...]]) -> str:
@@ -183,9 +183,9 @@ class Operation:
                 raise InputError(f"the operation {self.name} was given shapes {shapes}; expected ranks {self.ranks}")
 
     def fits(self, dtypes: Sequence[np.dtype]) -> bool:
-        """Whether operands of these NumPy dtypes are of the kind that the functions on the host know."""
+        """Whether operands of these NumPy dtypes are for the functions on the host; none are within a specification."""
         first = dtypes[0]
-        if first != np.float32 and first != np.float64:
+        if _specifying.on or (first != np.float32 and first != np.float64):
             return False
         for dtype in dtypes:
             if dtype != first and dtype.kind not in "iub":
@@ -244,14 +244,14 @@ class Operation:
                 return
         elif out.size + sum(x.size for x in operands) > SMALL:
             return
-        specifying.on = True
+        _specifying.on = True
         try:
             with np.errstate(all="ignore"):
                 expected = np.asarray(self.specification(*operands, **params))
         except Exception:  # It may be for other engines' arrays alone, and is refused where it is asked for.
             return
         finally:
-            specifying.on = False
+            _specifying.on = False
         if expected.shape != out.shape:
             raise InputError(
                 f"the operation {self.name} has a result of shape {out.shape}, by its `shape`, but its specification "

@@ -48,14 +48,6 @@ def _ends(x: np.ndarray, there: np.ndarray) -> tuple[int, int]:
     return int(found[:, 0].min()), int(found[:, 1].max())
 
 
-def bounds(x: np.ndarray, covered: np.ndarray) -> tuple[float, float]:
-    """The least and the largest of those numbers of an array of floats that are covered, and zero; none is NaN."""
-    if x.dtype != np.float32:
-        return float(x.min(initial=0, where=covered)), float(x.max(initial=0, where=covered))
-    low, high = _sizes(x, covered).max(axis=0).view(np.float32)
-    return -float(low), float(high)
-
-
 def places(x: np.ndarray, covered: np.ndarray) -> list[tuple[int, ...]]:
     """Where the least and the largest covered number first stand: of those that are below, and above, zero."""
     if x.dtype != np.float32:

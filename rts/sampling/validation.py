@@ -31,7 +31,7 @@ def checked_proxy(surface: TriangleSurface, inputs: Tree, camera: Any, size: Any
 def _packed_proxy(proxy: Any, surface: TriangleSurface) -> Proxy:
     """The proxy with contiguous arrays of the right dtypes; triangles that would be read out of bounds are refused."""
     if not isinstance(proxy, Proxy):
-        raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected an rts.Proxy")
+        raise InputError(f"the proxy of {surface!r} is a {type(proxy).__name__}; expected a Proxy")
     vertices = _table(surface, "vertices", proxy.vertices, (3,), np.float32)
     faces = _table(surface, "faces", proxy.faces, (3,), np.int32)
     check_faces(Proxy(vertices, faces), surface)
@@ -138,7 +138,7 @@ def check_fragments(fragments: Any, shape: tuple[int, int, int], faces: int, sam
     if not fits:
         given = tuple(shape_of(x) for x in fragments) if isinstance(fragments, Fragments) else type(fragments).__name__
         raise InputError(
-            f"rasterize of {type(sampler).__name__} returned {given}; expected rts.Fragments of "
+            f"rasterize of {type(sampler).__name__} returned {given}; expected Fragments of "
             f"{(shape, (*shape, 2), shape)}"
         )
     covered, last = covered_cells(fragments.triangle_ids)
@@ -237,7 +237,7 @@ def checked_refined(found: Any, given: Samples, surface: TriangleSurface) -> Sam
     """What `refine` of a surface gave, with arrays of the right dtypes; refused where it breaks its contract."""
     who = f"refine of {surface!r}"
     if not isinstance(found, Samples):
-        raise InputError(f"{who} gave a {type(found).__name__}; expected rts.Samples")
+        raise InputError(f"{who} gave a {type(found).__name__}; expected Samples")
     rows, grid, (i, p) = len(given.ids), given.row.shape, surface.sample_widths
     ids = _array(f"{who} gave ids", found.ids, (rows, i), np.integer, np.int32)
     params = _array(f"{who} gave params", found.params, (rows, p), np.floating, np.float32)

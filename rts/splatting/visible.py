@@ -18,6 +18,10 @@ from rts.trees import Array
 CONTINUED = 0.8
 """Share of the error of plain pairing below which `Visible` takes the line of a front layer for its continuation."""
 
+RIMS = rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF
+CROSSINGS = crossings.LARGEST, crossings.DIRECT, crossings.FIT, crossings.SLACK, crossings.KEPT
+"""Numbers of those modules, for compiled code."""
+
 
 _READS = {
     (facing, exits): frozenset(name for name, read in (("facing", facing), ("exit", exits)) if read)

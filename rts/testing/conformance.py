@@ -11,7 +11,9 @@ class Conformance:
     """Base of the kit's classes: only subclasses made outside the kit are collected by pytest."""
 
     __test__ = False
-    pytestmark = pytest.mark.filterwarnings("ignore::rts.EmptyImageWarning")  # The kit shows plugins nothing, too.
+    pytestmark = pytest.mark.filterwarnings(
+        "ignore::rts.errors.EmptyImageWarning"
+    )  # The kit shows plugins nothing, too.
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)

@@ -196,7 +196,7 @@ class EngineConformance(Conformance):
             return xp.sum(samples.params, axis=1) + xp.astype(samples.ids[:, 0], samples.params.dtype)
 
         samples = Samples(IDS, numbers(N, 2), Cells(np.zeros((1, 1, 1), np.int32), numbers(1, 1, 1)), np.int32(0))
-        with owning(chosen), no_error("a compiled function of rts.Samples"):
+        with owning(chosen), no_error("a compiled function of Samples"):
             given = map_leaves(chosen.constant, samples)
             found = chosen.block(chosen.jit(f)(given))
         claim_close(chosen.to_numpy(found), samples.params.sum(1) + IDS[:, 0], TOLERANCE, "a compiled function")

@@ -23,14 +23,14 @@ TOLERANCES = {np.dtype(np.float32): 1e-4, np.dtype(np.float64): 1e-9}
 class OperationConformance(Conformance):
     """Checks of an operation: its functions on NumPy arrays, and the operation in every engine, by its specification.
 
-    Override the fixtures `operation`: an `rts.Operation`; `operands`: NumPy arrays, floats of any dtype, at which the
+    Override the fixtures `operation`: an `Operation`; `operands`: NumPy arrays, floats of any dtype, at which the
     specification has derivatives; and, where it takes parameters, `params`: a dict.
     """
 
     @pytest.fixture
     def operation(self) -> Operation:
         """The operation."""
-        raise NotImplementedError("override the fixture 'operation' with an rts.Operation")
+        raise NotImplementedError("override the fixture 'operation' with an Operation")
 
     @pytest.fixture
     def operands(self) -> Sequence[np.ndarray]:

@@ -112,7 +112,7 @@ class ShaderConformance(Conformance):
         )
         cameras, single = [scenes.CAMERA, scenes.NEAR], map_leaves(derivatives.single, theta)
         number = np.repeat(np.array([1, 2], np.int32), [ROWS // 4, ROWS - ROWS // 4])
-        with no_error("shading samples of two views with rts.RowCameras"):
+        with no_error("shading samples of two views with RowCameras"):
             found = own(single, GBuffer(gbuffer), RowCameras.of(cameras, number))
         first, second = (np.asarray(own(single, GBuffer(gbuffer), camera)) for camera in cameras)
         expected = np.where(number[:, None] == 1, first, second)

@@ -14,8 +14,8 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
-from rts.threads import parallel
+from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.threads import parallel
 
 LEAST, MOST = 2e-6, 2e-5
 """How far out edges are moved: a two-hundredth of the inscribed circle's radius, within these limits."""

@@ -12,10 +12,10 @@ import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from rts.camera import Camera
-from rts.compiling import kernel
-from rts.records import Fragments, Proxy
-from rts.threads import parallel
+from rts import Camera
+from rts.plugin_api.loops import kernel
+from rts.plugin_api.records import Fragments, Proxy
+from rts.plugin_api.threads import parallel
 from rts_backends.neighbours import corner_lists, look, places
 from rts_backends.triangles import facing, pixel_matrix
 

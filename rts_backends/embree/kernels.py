@@ -17,7 +17,7 @@ from llvmlite import ir
 from numba import carray, types  # pyright: ignore[reportPrivateImportUsage]  # Documented, but not in __all__.
 from numba.extending import intrinsic
 
-from rts.compiling import compiled, kernel
+from rts.plugin_api.loops import compiled, kernel
 from rts_backends.embree.covers import NEVER
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
 

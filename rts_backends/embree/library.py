@@ -17,7 +17,7 @@ from pathlib import Path
 import embreex
 import numpy as np
 
-from rts.errors import PluginError
+from rts import PluginError
 
 GEOMETRY_TRIANGLES = 0
 BUFFER_INDEX, BUFFER_VERTEX = 0, 1

@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.records import Fragments, Proxy
-from rts.sampling.triangle_sampler import TriangleSampler
-from rts.sampling.validation import check_faces
-from rts.threads import parallel
+from rts import Camera, TriangleSampler
+from rts.plugin_api.records import Fragments, Proxy
+from rts.plugin_api.threads import parallel
 from rts_backends.embree import embreex_fallback, library
 from rts_backends.embree.covers import Covers
 from rts_backends.embree.kernels import TILE, cast, keep_nearest_address
@@ -52,8 +50,7 @@ class Embree(TriangleSampler):
 
     def prepare(self, proxy: Proxy) -> Structure:
         """Build the acceleration structure."""
-        check_faces(proxy)
-        return Structure(proxy)
+        return Structure(super().prepare(proxy))
 
     def update(self, prepared: Structure, proxy: Proxy) -> Structure | None:
         """Refit the structure to moved vertices."""

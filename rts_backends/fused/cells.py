@@ -13,13 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.arrays import without_border
-from rts.errors import InputError
-from rts.splatting import rims
-from rts.splatting.kernel import LEAST_EPSILON
-from rts.splatting.layers import OFFSETS, check_rows, check_settled
-from rts.splatting.visible import CONTINUED
-from rts.threads import parallel, read_only
+from rts import InputError
+from rts.plugin_api.splats import Visible
+from rts.plugin_api.threads import parallel, read_only
 from rts_backends.fused import choices as listing
 from rts_backends.fused import crossing_pairs, crossings, mixed, outlines, stencil
 from rts_backends.fused.crossings import Crossings
@@ -124,13 +120,9 @@ class Cells:
             raise InputError(f"positions and rgba have shapes {given}; expected (N, 3) and (N, 4)")
         shape, row = row.shape, row[:1] if settings.kind == "single" else row
         if choices is None:
-            check_rows(row, len(positions))
-            if exits is not None:
-                check_rows(exits, len(positions))
             _check_grids(shape, part=part, facing=facing)
             _check_grids(shape[1:], exit=exits, wanted=wanted)
-            if settled is not None and len(settled):
-                check_settled(settled, shape[1:], len(positions))
+            Visible.check(row, len(positions), settled if settled is not None and len(settled) else None, exits)
         self.positions, self.rgba, self.row = read_only(positions), read_only(rgba), read_only(row, np.int32)
         self.part = read_only(self.row[:0] if part is None else part, np.int32)
         self.exits = read_only(np.empty((0, row.shape[2])) if exits is None else exits, np.int32)
@@ -226,7 +218,8 @@ class Cells:
         ranges = np.empty((offsets[-1], 9, 3, 2), np.uint8 if layers < 256 else np.int32)
         sums = np.empty((offsets[-1], 3, 5), kind)
         if len(columns):
-            continued = kind.type(CONTINUED)  # An argument, since compiled code that is cached would keep its value.
+            # An argument, since compiled code that is cached would keep its value.
+            continued = kind.type(Visible.CONTINUED)
             given = self.facing, self.visible, continued, beyond, marks, offsets, columns, ranges, sums, states, ends
             arrays = self.positions, self.rgba, self.row, *self._numbers
             parallel(listing.choose, height, *arrays, *given, work=500 * len(columns))
@@ -253,7 +246,7 @@ class Cells:
             np.empty((offsets[-1], 2, 4), kind),
         )
         if len(found.columns):
-            rules = outlines.Rules(*map(kind.type, (rims.LEAST, rims.LARGEST, rims.FLAT, rims.CONVERGING, rims.HALF)))
+            rules = outlines.Rules(*map(kind.type, Visible.RIMS))
             arrays = self.positions, self.rgba, self.row, *self._numbers
             decide = self.part, self.one_part, self.exits, kind.type(choices.extent), rules, self._pairs[0]
             listed = choices.columns, choices.offsets, choices.ranges, choices.sums
@@ -309,7 +302,7 @@ class Cells:
                 parallel(note, len(settled), settled, noted, work=settled.size // 8)
             shown = np.flatnonzero(noted)
             if len(shown) > MANY:  # Sums of each line take their memory. Those of parts are few.
-                inner = without_border(settled, self.border)
+                inner = settled[self.border : self.border + len(g), self.border : self.border + g.shape[1]]
                 there = inner >= 0
                 np.add.at(g_rgba, inner[there], g[there])
                 return
@@ -410,13 +403,13 @@ def _check_grids(shape: tuple[int, ...], **given: np.ndarray | None) -> None:
 def _scale_and_peak(settings: Settings) -> tuple[float, float]:
     """The exponent's factor, and the weight of a splat on its cell's centre along one axis."""
     scale = 1 / (2 * settings.sigma**2)
-    return scale, math.sqrt(1 + settings.epsilon) / sum(math.exp(-(u**2) * scale) for u in OFFSETS)
+    return scale, math.sqrt(1 + settings.epsilon) / sum(math.exp(-(u**2) * scale) for u in (-1, 0, 1))
 
 
 @lru_cache
 def _reach(settings: Settings) -> float:
     """How far, in pixels along x and y, samples may lie off their cells' centres while weights surely sum up to one."""
-    if settings.epsilon < LEAST_EPSILON:
+    if settings.epsilon < Visible.LEAST_EPSILON:
         return -1.0
     scale, low, high = 1 / (2 * settings.sigma**2), 0.0, 1.0
     full = 1 + 2 * math.exp(-scale)

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
-from rts.records import Cells
+from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.records import Cells
 from rts_backends.fused.mixed import sums_of
 from rts_backends.fused.pairs import BLOCK, mark
 from rts_backends.fused.survey import BUSY, EMPTY

@@ -10,15 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
-from rts.splatting import crossings as specification
-from rts.splatting.kernel import TIE
-from rts.threads import parallel, read_only
+from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.splats import Visible
+from rts.plugin_api.threads import parallel, read_only
 
 BORDER = 3
 """Rows around those of arrays of depths (2, ·, W), and rows and columns around those of their gaps (·, ·): so far from
 a cell are those that decide whether it is in a pair with a neighbour. Rows y below count from the first of all."""
-STEPS = np.array(specification.HALF)
+STEPS = np.array([(1, 0), (0, 1), (1, 1), (1, -1)])
 """Steps (x, y) from one cell of each pair to the other, which bits 0 to 3 stand for."""
 CHUNK = 32
 """Cells that are passed over at once."""
@@ -39,8 +38,8 @@ class Rules(NamedTuple):
     def of(cls, extent: Any) -> Rules:
         """For fronts whose depths have an extent, the camera's included, in their dtype."""
         kind = type(extent)
-        least, numbers = kind(TIE) * extent, (specification.LARGEST, specification.DIRECT, specification.FIT)
-        return cls(least, *map(kind, numbers), slack=kind(specification.SLACK) * least)
+        least, (*numbers, slack, _) = kind(Visible.TIE) * extent, Visible.CROSSINGS
+        return cls(least, *map(kind, numbers), slack=kind(slack) * least)
 
 
 def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np.ndarray) -> None:
@@ -49,7 +48,7 @@ def sheets(covered: np.ndarray, depth: np.ndarray, extent: np.floating, kept: np
     bits, some = _no_pairs(height, width)
     parallel(_find_candidates, height, covered, depth, Rules.of(extent), bits, some, work=3 * covered[0].size)
     if some.any():
-        _keep(covered, bits, some, specification.KEPT, kept)
+        _keep(covered, bits, some, Visible.CROSSINGS[-1], kept)
 
 
 def _no_pairs(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:

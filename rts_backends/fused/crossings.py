@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
-from rts.threads import parallel
+from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.threads import parallel
 from rts_backends.fused.crossing_pairs import BORDER, Rules, gather, has_two, steps
 from rts_backends.fused.mixed import splat, tint_of
 from rts_backends.fused.survey import BUSY, SETTLED

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from rts import records, splatting
-from rts.arrays import without_border
-from rts.operations.operation import Arrays, Operation, Some
-from rts.trees import Array
+from rts.plugin_api import records
+from rts.plugin_api.arrays import Array
+from rts.plugin_api.operations import Operation
+from rts.plugin_api.splats import Multi, Single, Visible
 from rts_backends.fused.cells import Cells, Choices, Settings
 
-_SPECIFICATIONS = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}
+_SPECIFICATIONS = {"single": Single, "multi": Multi, "visible": Visible}
 
 
 def specification(
@@ -32,8 +33,8 @@ def specification(
     options = {"rims": settings.rims, "crossings": settings.crossings} if settings.kind == "visible" else {}
     part, facing, settled, exits = (x if x.shape[0] else None for x in (part, facing, settled, exits))
     cells = records.Cells(row, facing=facing, exit=exits, settled=settled)
-    splats = records.Splats(positions, rgba, cells, part, one_part=settings.one_part)
-    return without_border(_SPECIFICATIONS[settings.kind](*given, **options).image(splats), settings.border)
+    splats = records.Splats(positions, rgba, cells, part, border=settings.border, one_part=settings.one_part)
+    return _SPECIFICATIONS[settings.kind](*given, **options).cropped(splats)
 
 
 def _shape(
@@ -51,28 +52,42 @@ def _shape(
     return *(max(0, n - 2 * settings.border) for n in row[1:]), 4
 
 
-def _cells(settings: Settings, operands: Arrays, kept: Choices | None) -> Cells:
+def _cells(settings: Settings, operands: Sequence[np.ndarray], kept: Choices | None) -> Cells:
     positions, rgba, row, *known = operands
     return Cells(settings, positions, rgba, row, kept, *known)
 
 
-def _forward(operands: Arrays, out: np.ndarray, *, settings: Settings) -> Choices | None:
+def _forward(operands: Sequence[np.ndarray], out: np.ndarray, *, settings: Settings) -> Choices | None:
     cells = _cells(settings, operands, None)
     cells.image(out)
     return cells.choices if out.size else None
 
 
-def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, settings: Settings, kept: Choices | None) -> None:
+def _push(
+    operands: Sequence[np.ndarray],
+    tangents: Sequence[np.ndarray | None],
+    out: np.ndarray,
+    *,
+    settings: Settings,
+    kept: Choices | None,
+) -> None:
     t_positions, t_rgba = tangents
     _cells(settings, operands, kept).jvp(t_positions, t_rgba, out)
 
 
-def _pull(operands: Arrays, g: np.ndarray, results: Some, *, settings: Settings, kept: Choices | None) -> None:
+def _pull(
+    operands: Sequence[np.ndarray],
+    g: np.ndarray,
+    results: Sequence[np.ndarray | None],
+    *,
+    settings: Settings,
+    kept: Choices | None,
+) -> None:
     g_positions, g_rgba = results
     _cells(settings, operands, kept).vjp(g, g_positions, g_rgba)
 
 
-def used(operands: Arrays) -> int:
+def used(operands: Sequence[np.ndarray]) -> int:
     """How many rows cells refer to."""
     return rows_of(operands[2], *operands[6:8])
 
@@ -98,4 +113,4 @@ IMAGE = Operation(
 """The image (H, W, 4) of positions (N, 3), rgba (N, 4), row (K, H, W), part, facing, wanted, settled and exit, without
 a border.
 
-The last five are those of `rts.Splats`; (0, H, W) and (0, W) where they are not known."""
+The last five are those of `Splats`; (0, H, W) and (0, W) where they are not known."""

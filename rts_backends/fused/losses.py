@@ -6,10 +6,11 @@ import math
 
 import numpy as np
 
-from rts.compiling import compiled
-from rts.fitting.losses import FAR, FORMS, LEAST_SHARE, Loss
+from rts import Loss
+from rts.plugin_api.loops import compiled
 
-LINEAR, SOFT_L1, HUBER, CAUCHY = range(len(FORMS))
+LINEAR, SOFT_L1, HUBER, CAUCHY = range(4)
+FAR, LEAST_SHARE = Loss.FAR, Loss.LEAST_SHARE
 
 
 def in_numbers(loss: Loss, dtype: np.dtype) -> tuple[int, np.floating]:

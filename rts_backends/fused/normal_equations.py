@@ -15,11 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.engines import Engine
-from rts.fitting.losses import SQUARE, Loss
-from rts.records import ArraySpec
-from rts.threads import parallel, read_only
-from rts.trees import Array
+from rts import Engine, Loss
+from rts.plugin_api.arrays import Array
+from rts.plugin_api.records import ArraySpec
+from rts.plugin_api.threads import parallel, read_only
 from rts_backends.fused.cells import Cells, Settings
 from rts_backends.fused.crossings import change_of
 from rts_backends.fused.image import rows_of
@@ -94,7 +93,7 @@ def normal_equations(
     target: np.ndarray,
     weights: np.ndarray | None,
     background: np.ndarray | None,
-    loss: Loss = SQUARE,
+    loss: Loss,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean loss of the n residuals weight · (image − target), JᵀSJ / n and JᵀWr / n, float64.
 

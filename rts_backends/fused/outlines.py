@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
-from rts.threads import parallel
+from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.threads import parallel
 from rts_backends.fused.crossing_pairs import steps
 from rts_backends.fused.pairs import BLOCK
 from rts_backends.fused.rows import exp

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled
+from rts.plugin_api.loops import compiled
 
 BLOCK = 16
 """Columns that share a note of whether hidden layers are near."""

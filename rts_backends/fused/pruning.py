@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
-from rts.sampling.extremes import bounds
-from rts.splatting.kernel import LEAST_EPSILON, TIE
-from rts.splatting.visible import CONTINUED
-from rts.threads import parallel
+from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.splats import Visible
+from rts.plugin_api.threads import parallel
 from rts_backends.fused import crossing_pairs
 from rts_backends.fused.cells import Settings
 
 HALO = 3
 """Rows that the decision for a row looks at on either side: its marks, their neighbours, and those one farther on."""
+
+UNSIGNED = np.int32(0x7FFFFFFF)
+"""All bits of a float32 but the sign's."""
 
 MIXED, RING = 1, 2
 """Marks of targets at which more than fronts may count, and of cells beside empty ones."""
@@ -23,17 +24,45 @@ def needed(covered: np.ndarray, depth: np.ndarray, settings: Settings) -> np.nda
     """(K, H, W) bool of covered (K, H, W) bool and depth (K, H, W); for `Visible` or `Multi`."""
     layers, height, _ = covered.shape
     visible, rims = settings.kind == "visible", settings.rims
-    if layers == 1 or not (visible or settings.epsilon >= LEAST_EPSILON):
+    if layers == 1 or not (visible or settings.epsilon >= Visible.LEAST_EPSILON):
         return covered
     covered, depth = np.ascontiguousarray(covered), np.ascontiguousarray(depth)
     kept, kind = np.empty_like(covered), depth.dtype.type
-    least, largest = map(kind, bounds(depth, covered))
-    numbers = kind(2 * (largest - least)), kind(TIE * max(largest, -least)), kind(CONTINUED)
+    least, largest = _extremes(covered, depth)
+    numbers = kind(2 * (largest - least)), kind(Visible.TIE * max(largest, -least)), kind(Visible.CONTINUED)
     parallel(_keep, height, covered, depth, visible, rims, *numbers, kept, work=2 * covered.size)
     if settings.crossings:
-        least, largest = map(kind, bounds(depth[0], covered[0]))
+        least, largest = _extremes(covered[:1], depth[:1])
         crossing_pairs.sheets(covered, depth, largest - least, kept)
     return kept
+
+
+def _extremes(covered: np.ndarray, depth: np.ndarray) -> tuple[np.floating, np.floating]:
+    """The least and the largest covered depth, and zero; none is NaN."""
+    if depth.dtype != np.float32:
+        return depth.min(initial=0, where=covered), depth.max(initial=0, where=covered)
+    lines = depth.shape[0] * depth.shape[1]
+    bits, found = depth.reshape(lines, -1).view(np.int32), np.zeros((lines, 2), np.int32)
+    parallel(_find_extremes, lines, bits, covered.reshape(lines, -1), found, work=depth.size // 12)
+    low, high = found.max(axis=0, initial=0).view(np.float32)
+    return -low, high
+
+
+@kernel
+def _find_extremes(start, stop, bits, covered, found):
+    """Fill `found` (lines, 2) with how far floats of each line are below and above zero at most, as bits.
+
+    Bits are below zero where the float has a sign. Integers' maxima become vector code, floats' do not.
+    """
+    zero = np.int32(0)
+    for i in range(start, stop):
+        low, high = zero, zero
+        line, taken = bits[i], covered[i]
+        for x in range(len(line)):
+            number = line[x] if taken[x] else zero
+            high = np.int32(max(high, number))
+            low = np.int32(max(low, np.int32(number & UNSIGNED) if number < zero else zero))
+        found[i, 0], found[i, 1] = low, high
 
 
 @kernel

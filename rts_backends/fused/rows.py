@@ -21,7 +21,7 @@ import numpy as np
 from numba import types
 from numba.extending import overload
 
-from rts import compiling
+from rts.plugin_api import loops
 from rts_backends.fused.survey import FLAT
 
 TILE = 32
@@ -34,8 +34,8 @@ COLOR, ONE, WX, WY, RX, RY, SOURCE = (PITCH * p for p in (0, 4, 5, 8, 11, 12, 13
 SUM, SUMS = 5 * PITCH, 10 * PITCH
 """How many numbers a buffer's sums take, and those of two buffers: colours and the weight."""
 
-compiled = partial(compiling.compiled, fastmath={"contract"})
-kernel = partial(compiling.kernel, fastmath={"contract"})
+compiled = partial(loops.compiled, fastmath={"contract"})
+kernel = partial(loops.kernel, fastmath={"contract"})
 
 _F = [np.float32(1 / math.factorial(i)) for i in range(8)]
 _ONE, _F2, _F3, _F4, _F5, _F6, _F7 = _F[1:]

@@ -5,26 +5,25 @@ What fits is float32 or float64 in the memory of the host. Second derivatives ar
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from rts import splatting
-from rts.arrays import without_border
-from rts.engines import engine_of
-from rts.fitting.losses import SQUARE, Loss
-from rts.interfaces import SummingSplatter
-from rts.plugin_base import overrides
-from rts.records import Splats
-from rts.trees import Array
+from rts import Loss, SummingSplatter, engine_of
+from rts.plugin_api import splats as specification
+from rts.plugin_api.arrays import Array
+from rts.plugin_api.records import Splats
 from rts_backends.fused.cells import Settings
 from rts_backends.fused.image import IMAGE
 
 
-class _Fused(splatting.Kernel, SummingSplatter):
+class _Fused(SummingSplatter):
     """Base that makes `image` by compiled kernels; it stands before a class of `rts.splatting`, which it extends."""
 
     kind: ClassVar[str]
+    sigma: float
+    epsilon: float
+    gamma: Any
 
     def image(self, splats: Splats) -> Array:
         """See `rts.splatting.Kernel`."""
@@ -34,10 +33,8 @@ class _Fused(splatting.Kernel, SummingSplatter):
 
     def cropped(self, splats: Splats) -> Array:
         """See `rts.Splatter`."""
-        if overrides(self, "image", _Fused):  # A subclass has an `image` of its own.
+        if not self._own_image or splats.rgba.shape[0] == 0:
             return super().cropped(splats)
-        if splats.rgba.shape[0] == 0:
-            return without_border(super().image(splats), splats.border)
         return self._of(splats)
 
     def _of(self, splats: Splats) -> Array:
@@ -60,9 +57,14 @@ class _Fused(splatting.Kernel, SummingSplatter):
         return splats.exit if "exit" in self.reads else None
 
     @property
+    def _own_image(self) -> bool:
+        """Whether the image is that of the compiled loops: a subclass may have one of its own."""
+        return type(self).image is _Fused.image
+
+    @property
     def _sweeps(self) -> bool:
-        """Whether the image is that of compiled kernels: a subclass may have one of its own."""
-        return not (overrides(self, "image", _Fused) or overrides(self, "cropped", _Fused))
+        """Whether sums may be taken by the compiled loops."""
+        return self._own_image and type(self).cropped is _Fused.cropped
 
     def _settings(self, border: int, one_part: bool = False) -> Settings:
         return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border, one_part, *self._motions)
@@ -94,7 +96,7 @@ class _Fused(splatting.Kernel, SummingSplatter):
         own = splats.positions, splats.rgba, splats.row, splats.part, self._facing(splats)
         own += splats.wanted, splats.settled, self._exits(splats)
         given = *own, t_positions, t_rgba, target, weights, background
-        return normal_equations.equations(self._settings_of(splats), engine_of(given), loss or SQUARE, *given)
+        return normal_equations.equations(self._settings_of(splats), engine_of(given), loss or Loss(), *given)
 
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`."""
@@ -105,24 +107,24 @@ class _Fused(splatting.Kernel, SummingSplatter):
         return pruning.needed(covered, depth, self._settings(0))
 
 
-class Single(_Fused, splatting.Single):
+class Single(_Fused, specification.Single):
     """`rts.splatting.Single`, compiled."""
 
     kind = "single"
-    fills_interiors = splatting.Single.fills_interiors
+    fills_interiors = specification.Single.fills_interiors
 
 
-class Multi(_Fused, splatting.Multi):
+class Multi(_Fused, specification.Multi):
     """`rts.splatting.Multi`, compiled."""
 
     kind = "multi"
 
 
-class Visible(_Fused, splatting.Visible):
+class Visible(_Fused, specification.Visible):
     """`rts.splatting.Visible`, compiled."""
 
     kind = "visible"
-    fills_interiors = splatting.Visible.fills_interiors
+    fills_interiors = specification.Visible.fills_interiors
 
     @property
     def _motions(self) -> tuple[bool, ...]:

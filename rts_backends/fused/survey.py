@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.plugin_api.loops import compiled, kernel
 from rts_backends.fused.pairs import BLOCK, mark
 
 EMPTY, SETTLED, FLAT, BUSY = 0, 1, 2, 3

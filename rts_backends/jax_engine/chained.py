@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.operations.operation import Arrays, Operation, Some
-from rts.threads import read_only
-from rts.trees import Array
+from rts.plugin_api.arrays import Array
+from rts.plugin_api.operations import Operation
+from rts.plugin_api.threads import read_only
 
 
 class _Kept(NamedTuple):
@@ -38,14 +39,21 @@ def chained(first: Operation, second: Operation) -> Operation:
     def shape(*shapes: tuple[int, ...], **params: Any) -> tuple[int, ...]:
         return second.shape(first.shape(*shapes[:count]), *shapes[count:], **params)
 
-    def between(operands: Arrays) -> np.ndarray:
+    def between(operands: Sequence[np.ndarray]) -> np.ndarray:
         return read_only(first.value_on_host(operands[:count], {})[0])
 
-    def forward(operands: Arrays, out: np.ndarray, **params: Any) -> _Kept:
+    def forward(operands: Sequence[np.ndarray], out: np.ndarray, **params: Any) -> _Kept:
         made = between(operands)
         return _Kept(made, second.forward((made, *operands[count:]), out, **params))
 
-    def push(operands: Arrays, tangents: Some, out: np.ndarray, *, kept: _Kept | None, **params: Any) -> None:
+    def push(
+        operands: Sequence[np.ndarray],
+        tangents: Sequence[np.ndarray | None],
+        out: np.ndarray,
+        *,
+        kept: _Kept | None,
+        **params: Any,
+    ) -> None:
         made, own = kept or (between(operands), None)
         moved = None
         if any(t is not None for t in tangents[:count]):
@@ -53,7 +61,14 @@ def chained(first: Operation, second: Operation) -> Operation:
             first.push_on_host(operands[:count], tangents[:count], moved, None, {})
         second.push_on_host((made, *operands[count:]), [moved, *tangents[count:]], out, own, params)
 
-    def pull(operands: Arrays, g: np.ndarray, results: Some, *, kept: _Kept | None, **params: Any) -> None:
+    def pull(
+        operands: Sequence[np.ndarray],
+        g: np.ndarray,
+        results: Sequence[np.ndarray | None],
+        *,
+        kept: _Kept | None,
+        **params: Any,
+    ) -> None:
         made, own = kept or (between(operands), None)
         wanted = any(x is not None for x in results[:count])
         g_made = np.zeros_like(made) if wanted else None

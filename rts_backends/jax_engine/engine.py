@@ -11,18 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from rts.engines import Engine
-from rts.errors import InputError, RtsError
-from rts.operations.operation import Operation
-from rts.records import ArraySpec
-from rts.trees import STATIC_FIELDS, Tree, join_record, split_record
+from rts import Engine, InputError, RtsError
+from rts.plugin_api.arrays import Tree
+from rts.plugin_api.operations import Operation
+from rts.plugin_api.records import ArraySpec
 from rts_backends.jax_engine import host, operations, rows_in_use
 from rts_backends.jax_engine.chained import chained, may_chain
 
-for _cls in STATIC_FIELDS:
-    jax.tree_util.register_pytree_node(
-        _cls, split_record, lambda static, arrays, cls=_cls: join_record(cls, tuple(arrays), static)
-    )
+for _cls, _split, _join in Engine.records():
+    jax.tree_util.register_pytree_node(_cls, _split, lambda static, arrays, join=_join: join(arrays, static))
 
 
 _REAL_KINDS = ("f", "i", "u", "b", "V")

@@ -27,8 +27,8 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.interpreters import ad
 
-from rts.operations.operation import Arrays, Operation
-from rts.threads import read_only
+from rts.plugin_api.operations import Operation
+from rts.plugin_api.threads import read_only
 from rts_backends.jax_engine.host import PIECE, clear
 from rts_backends.jax_engine.primitives import HostPrimitive
 
@@ -160,7 +160,7 @@ class _Differentiable:
 
     # ------------------------------------------------------------------------------------------ by compiled kernels
 
-    def _in_use(self, given: Arrays) -> tuple[list[np.ndarray], int, Any]:
+    def _in_use(self, given: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int, Any]:
         """The operands, of packed ones the rows in use; their number; and what the value has kept."""
         operands = [read_only(x) for x in given[: self._inputs]]
         operation, used = self.operation, 0
@@ -174,7 +174,7 @@ class _Differentiable:
         kept = _kept.get(int(given[self.count - 1])) if operation.keeps and len(given) >= self.count else None
         return operands, used, kept
 
-    def _host_value(self, given: Arrays, results: Arrays, **params: Any) -> None:
+    def _host_value(self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], **params: Any) -> None:
         operands, used, _ = self._in_use(given)
         out = results[0]
         if self.operation.packed_result:
@@ -184,7 +184,9 @@ class _Differentiable:
         if self.operation.keeps:
             results[1][...] = -1 if kept is None else _kept.add(kept)
 
-    def _host_push(self, given: Arrays, results: Arrays, wanted: Wanted, **params: Any) -> None:
+    def _host_push(
+        self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, **params: Any
+    ) -> None:
         operands, used, kept = self._in_use(given)
         tangents: list[Any] = _spread(given[self.count :], wanted)
         for i in self.operation.packed:
@@ -197,7 +199,9 @@ class _Differentiable:
                 clear(result[used:], PIECE)
         self.operation.push_on_host(operands, tangents, out, kept, params)
 
-    def _host_pull(self, given: Arrays, results: Arrays, wanted: Wanted, **params: Any) -> None:
+    def _host_pull(
+        self, given: Sequence[np.ndarray], results: Sequence[np.ndarray], wanted: Wanted, **params: Any
+    ) -> None:
         operands, used, kept = self._in_use(given)
         places = _spread(results, wanted)
         for t, g in enumerate(given[-1]):

@@ -15,7 +15,6 @@ from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
 from jaxlib.mlir.dialects import stablehlo as hlo
 
-from rts.operations.operation import Arrays
 from rts_backends.jax_engine import host
 
 # jax reuses what a cacheable rule gave for an equation alike; such a rule does not see where operands come from.
@@ -96,7 +95,7 @@ class HostPrimitive:
         dtypes = [operands[0].dtype] * (len(shapes) - self._noted) + [np.int32] * self._noted
         return list(map(jax.ShapeDtypeStruct, shapes, dtypes))
 
-    def _on_host(self, operands: Arrays, results: Arrays, params: dict) -> None:
+    def _on_host(self, operands: Sequence[np.ndarray], results: Sequence[np.ndarray], params: dict) -> None:
         """Fill the results."""
         by_item = self._by_item(operands, params)
         if not any(by_item):
@@ -128,7 +127,7 @@ class HostPrimitive:
             found = host.call_named(name, filler, tuple(own), *given, in_place=places)
             return [x[None] if i in alike else x for i, x in enumerate(found)]
 
-        def filler(operands: Arrays, results: Arrays) -> None:
+        def filler(operands: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:
             self._on_host(operands, [x[None] if i in alike else x for i, x in enumerate(results)], params)
 
         return mlir.lower_fun(call, multiple_results=True)(ctx.replace(avals_in=avals), *values)

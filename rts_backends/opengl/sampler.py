@@ -18,12 +18,9 @@ from typing import Any
 import moderngl
 import numpy as np
 
-from rts.camera import Camera
-from rts.errors import InputError, SamplerWarning, warn
-from rts.records import Fragments, Proxy
-from rts.sampling.triangle_sampler import TriangleSampler
-from rts.sampling.validation import check_faces
-from rts.threads import parallel
+from rts import Camera, InputError, TriangleSampler, errors
+from rts.plugin_api.records import Fragments, Proxy
+from rts.plugin_api.threads import parallel
 from rts_backends.neighbours import corner_lists, places, settle
 from rts_backends.opengl.worker import LESS, Worker
 from rts_backends.raster import Raster
@@ -102,8 +99,7 @@ class OpenGL(TriangleSampler):
 
     def prepare(self, proxy: Proxy) -> Buffers:
         """Move the triangles to the device."""
-        check_faces(proxy)
-        return Buffers(self._worker, proxy)
+        return Buffers(self._worker, super().prepare(proxy))
 
     def rasterize(self, prepared: Buffers, camera: Camera, size: tuple[int, int], layers: int, cull: str) -> Fragments:
         """See `TriangleSampler.rasterize`."""
@@ -132,11 +128,11 @@ class OpenGL(TriangleSampler):
         """Say once that another sampler draws."""
         if not self._warned:
             self._warned = True
-            warn(
+            errors.warn(
                 f"triangles reach from the camera to more than {MOST_RATIO:g} times as far, or are too large beside a "
                 "pixel, for OpenGL's float32: the sampler 'raster' draws such views instead of 'opengl'; move the near "
                 "plane away from the camera, or choose 'raster'",
-                SamplerWarning,
+                errors.SamplerWarning,
             )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import moderngl
 
-from rts.errors import PluginError
+from rts import PluginError
 
 VERSION = 330
 HINT = (

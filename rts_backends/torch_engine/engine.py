@@ -13,21 +13,15 @@ from torch._C._functorch import get_unwrapped, is_functorch_wrapped_tensor, mayb
 from torch.autograd import forward_ad
 from torch.utils import _pytree
 
-from rts.engines import Engine
-from rts.errors import InputError
-from rts.operations.operation import Operation
-from rts.records import ArraySpec
-from rts.trees import STATIC_FIELDS, Tree, join_record, leaves, map_leaves, split_record
+from rts import Engine, InputError
+from rts.plugin_api.arrays import Tree, leaves, map_leaves
+from rts.plugin_api.operations import Operation
+from rts.plugin_api.records import ArraySpec
 from rts_backends.torch_engine import operations
 from rts_backends.torch_engine.functions import applied, foreign, quiet_forward_mode, tangent_alike, transformed
 
-for _cls in STATIC_FIELDS:
-    _pytree.register_pytree_node(
-        _cls,
-        split_record,
-        lambda arrays, static, cls=_cls: join_record(cls, tuple(arrays), static),
-        serialized_type_name=f"rts.{_cls.__name__}",
-    )
+for _cls, _split, _join in Engine.records():
+    _pytree.register_pytree_node(_cls, _split, _join, serialized_type_name=f"rts.{_cls.__name__}")
 
 
 _REAL = {torch.float32, torch.float64, torch.int32, torch.int64, torch.bool, torch.uint8, torch.float16, torch.bfloat16}

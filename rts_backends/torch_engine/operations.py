@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rts.operations.operation import Operation
-from rts.threads import read_only
+from rts.plugin_api.operations import Operation
+from rts.plugin_api.threads import read_only
 from rts_backends.torch_engine.functions import along, applied, foreign, on_host
 
 _DTYPES = {torch.float32: np.dtype(np.float32), torch.float64: np.dtype(np.float64)}

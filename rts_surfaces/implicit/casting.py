@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.engines import engine_of, namespace
-from rts.operations.gradient import gradient
-from rts.records import RayHits
-from rts.trees import Array, map_leaves
+from rts import engine_of, namespace
+from rts.plugin_api.arrays import Array, map_leaves
+from rts.plugin_api.operations import gradient
+from rts.plugin_api.records import RayHits
 
 STEPS, WITH_BOUND = 256, 512
 """How many of the shortest steps there are across the region, without and with a Lipschitz constant."""

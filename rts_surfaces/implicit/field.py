@@ -10,15 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import check_numbers, one_line, quoted
-from rts.arrays import kind_of, shape_of, unit
-from rts.engines import Engine, engine_of, is_constant, namespace
-from rts.errors import EngineError, InputError, RtsError
-from rts.gbuffer import GBuffer
-from rts.interfaces import Surface
-from rts.operations.gradient import gradient
-from rts.records import Samples
-from rts.trees import Array, Tree, leaves
+from rts import Engine, EngineError, GBuffer, InputError, RtsError, Surface, engine_of, namespace
+from rts.plugin_api.arrays import Array, Tree, exemplar, leaves, shape_of, unit
+from rts.plugin_api.checks import check_numbers, quoted
+from rts.plugin_api.operations import gradient
+from rts.plugin_api.records import Samples
 from rts_surfaces.entries import RESERVED
 
 LARGEST = 1e38
@@ -128,7 +124,7 @@ class Field(ScalarField):
 
     def _why(self, error: Exception, engine: Engine) -> str:
         """The message for an error of `f`."""
-        told = one_line(error)
+        told = " ".join(str(error).split())[:120] or type(error).__name__
         if isinstance(error, (AttributeError, TypeError)) and not engine.differentiates:
             return (
                 f"{self.name} cannot work with arrays of NumPy ({told}); it gets these where theta has no others: put "
@@ -140,7 +136,7 @@ class Field(ScalarField):
         )
 
     def slope(self, theta: Mapping[str, Tree], points: Array) -> Array:
-        """The gradient (M, 3) of `level` at points (M, 3), towards the outside; see `rts.gradient`."""
+        """The gradient (M, 3) of `level` at points (M, 3), towards the outside; see `gradient`."""
         return gradient(partial(self.level, theta), points)
 
     def suited(self, theta: Mapping[str, Tree], points: Array) -> Array:
@@ -218,7 +214,7 @@ class Implicit(Surface):
 def check_isovalue(isovalue: Any) -> float:
     """The isovalue; refused where it is no number of single precision, or an array whose derivative would be lost."""
     value = known_number("isovalue", check_numbers("isovalue", isovalue, ()))
-    if not is_constant(isovalue):
+    if exemplar(isovalue) is not None:
         raise InputError(
             f"isovalue is an array of {engine_of(isovalue).name}; expected a number, which has no derivative. Where it "
             f"is to have one, put it into theta, and subtract it from the values, or in f; else take float(isovalue)"
@@ -261,7 +257,8 @@ def check_result(name: str, value: Any, points: Array, columns: bool = False) ->
     except EngineError:
         own = False
     if not own:
-        raise InputError(f"{name} gave {kind_of(value)} for points of {engine.name}; expected its array {expected}")
+        what = "None" if value is None else f"a {type(value).__name__}"
+        raise InputError(f"{name} gave {what} for points of {engine.name}; expected its array {expected}")
     shape = shape_of(value)
     if len(shape) != 1 + columns or shape[0] != count:
         raise InputError(f"{name} gave shape {shape} for {count} points; expected {expected}")

@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import reduce
 
-from rts.arguments import check_positive
-from rts.engines import engine_of, namespace
-from rts.errors import InputError
-from rts.operations.take import take
-from rts.trees import Array, Tree
+from rts import InputError, engine_of, namespace
+from rts.plugin_api.arrays import Array, Tree
+from rts.plugin_api.checks import check_positive
+from rts.plugin_api.operations import take
 from rts_surfaces.entries import check_entry
 from rts_surfaces.implicit.field import Function, check_function
 

@@ -9,13 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.arrays import shape_of
-from rts.checks import is_count
-from rts.engines import engine_of, exemplar, namespace, value_of
-from rts.errors import InputError
-from rts.records import ArraySpec, Samples
-from rts.trees import Array, Tree, collected
+from rts import InputError, engine_of, namespace
+from rts.plugin_api.arrays import Array, Tree, exemplar, leaves, shape_of
+from rts.plugin_api.checks import is_count, quoted
+from rts.plugin_api.records import ArraySpec, Samples
 from rts_surfaces.implicit.field import Field, Function
 from rts_surfaces.implicit.lattice import Lattice
 from rts_surfaces.implicit.narrow_band import NarrowBand
@@ -103,7 +100,7 @@ class FunctionOnLattice(Field):
             planes = engine.constant(np.arange(across, dtype=np.int32), like)
             levels = engine.map_rows(partial(self._in_planes, theta), planes, max(1, CHUNK // (rest[0] * rest[1])))
             return Looked({"values": levels}, count)
-        known = [(value_of(x), shape_of(x)) for x in collected(read)]
+        known = [(engine_of(x).known(x), shape_of(x)) for x in leaves(read)]
         if any(value is None or value.shape != shape for value, shape in known):
             raise InputError(
                 "a narrow band decides on values of f, and theta is traced; sample outside of jit and vmap (by "
@@ -116,7 +113,7 @@ class FunctionOnLattice(Field):
             if few_shapes:  # Lest each be compiled.
                 places = np.resize(places, (1 << max(0, count - 1).bit_length(), 3))
             points = self.suited(theta, engine.constant(places.astype(np.float32), like))
-            return np.asarray(value_of(engine.stop_gradient(self.level(theta, points))))[:count]
+            return np.asarray(engine.known(engine.stop_gradient(self.level(theta, points))))[:count]
 
         found = self.band.find(level, self._lattice, closed)
         return Looked({k: v for k, v in found._asdict().items() if k != "evaluations"}, found.evaluations)

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.engines import engine_of, namespace
-from rts.operations.combine import combine
-from rts.operations.operation import Arrays, Operation, Some
-from rts.threads import parallel, read_only
-from rts.trees import Array
+from rts import engine_of, namespace
+from rts.plugin_api.arrays import Array
+from rts.plugin_api.operations import Operation, combine
+from rts.plugin_api.threads import parallel, read_only
 from rts_surfaces.implicit.lattice import Lattice
 
 Numbers = tuple[float, ...]
@@ -85,14 +84,21 @@ def _shape(values: tuple[int, ...], points: tuple[int, ...], **_: object) -> tup
     return points[0], 3
 
 
-def _forward(operands: Arrays, out: np.ndarray, *, low: Numbers, step: Numbers) -> None:
+def _forward(operands: Sequence[np.ndarray], out: np.ndarray, *, low: Numbers, step: Numbers) -> None:
     from rts_surfaces.implicit import interpolation_kernels
 
     values, points = operands
     parallel(interpolation_kernels.value, len(points), values, points, low, step, out, work=150 * len(points))
 
 
-def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, low: Numbers, step: Numbers) -> None:
+def _push(
+    operands: Sequence[np.ndarray],
+    tangents: Sequence[np.ndarray | None],
+    out: np.ndarray,
+    *,
+    low: Numbers,
+    step: Numbers,
+) -> None:
     from rts_surfaces.implicit import interpolation_kernels
 
     (values, points), (t_values, t_points) = operands, tangents
@@ -104,7 +110,9 @@ def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, low: Numbers, st
         parallel(interpolation_kernels.push_points, len(points), *given, work=300 * len(points))
 
 
-def _pull(operands: Arrays, g: np.ndarray, results: Some, *, low: Numbers, step: Numbers) -> None:
+def _pull(
+    operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None], *, low: Numbers, step: Numbers
+) -> None:
     from rts_surfaces.implicit import interpolation_kernels
 
     (values, points), (g_values, g_points), g = operands, results, read_only(g)

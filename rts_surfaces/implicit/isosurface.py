@@ -14,18 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arguments import check_positive, quoted
-from rts.arrays import from_numbers, is_finite, unit
-from rts.engines import engine_of, namespace, stopped, value_of
-from rts.errors import InputError
-from rts.gbuffer import GBuffer
-from rts.interfaces import Rate, RaySurface, TriangleSurface
-from rts.operations.gradient import gradient
-from rts.parts import Part
-from rts.records import ArraySpec, Proxy, RayHits, Rays, Samples
-from rts.sampling.cache import fingerprint
-from rts.threads import parallel
-from rts.trees import Array, Tree, map_leaves
+from rts import GBuffer, InputError, Part, RaySurface, TriangleSurface, engine_of, namespace
+from rts.plugin_api.arrays import Array, Tree, from_numbers, map_leaves, unit
+from rts.plugin_api.checks import check_positive, fingerprint, quoted
+from rts.plugin_api.operations import gradient
+from rts.plugin_api.records import ArraySpec, Proxy, Rate, RayHits, Rays, Samples
+from rts.plugin_api.threads import parallel
 from rts_surfaces.implicit import marching_cubes
 from rts_surfaces.implicit.casting import box, cast, per_level
 from rts_surfaces.implicit.field import SIDES, Implicit, check_isovalue, known_number
@@ -188,7 +182,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         Raises:
             InputError: the field is NaN or infinite somewhere.
         """
-        theta = stopped(from_numbers(theta, "theta"))
+        theta = map_leaves(lambda x: engine_of(x).stop_gradient(x), from_numbers(theta, "theta"))
         self.check(theta)
         looked = self.field.look(theta, self.closed)
         found = self._triangles(map_leaves(lambda x: engine_of(x).to_numpy(x), looked.inputs))
@@ -203,7 +197,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     def _check_finite(self, inputs: Mapping[str, np.ndarray], lattice: Lattice) -> None:
         values = inputs["values"]
-        if is_finite(values):
+        if np.isfinite([values.min(initial=0), values.max(initial=0)]).all():  # Faster than to look at each.
             return
         flat = int(np.flatnonzero(~np.isfinite(values.reshape(-1)))[0])
         number = int(inputs["numbers"][flat]) if "numbers" in inputs else flat
@@ -273,8 +267,8 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
     def intersect(self, theta: Mapping[str, Tree], origins: Array, directions: Array, layers: int) -> RayHits:
         """Where rays meet the field itself within the bounds, and the caps; see `rts.RaySurface`."""
         lattice, (low, high) = self.field.lattice(theta), self.bounds
-        margin = BESIDE * (high - low) if self.closed else 0.0
-        known = value_of(theta["values"]) if isinstance(self.field, LatticeField) else None
+        values, margin = theta.get("values"), BESIDE * (high - low) if self.closed else 0.0
+        known = engine_of(values).known(values) if isinstance(self.field, LatticeField) else None
         if known is not None and known.shape == lattice.shape:
             self._check_finite({"values": known}, lattice)
         steps = np.linalg.norm(high - low) * STEPS_PER_CELL / lattice.step.min()

@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import check_numbers, quoted
-from rts.checks import is_count
-from rts.engines import namespace
-from rts.errors import InputError
-from rts.trees import Array
+from rts import InputError, namespace
+from rts.plugin_api.arrays import Array
+from rts.plugin_api.checks import check_numbers, is_count, quoted
 
 MOST_POINTS = 2**31 - 1
 """Points are numbered by int32."""

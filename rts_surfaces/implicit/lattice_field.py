@@ -6,10 +6,9 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Any
 
-from rts.arrays import shape_of
-from rts.engines import namespace
-from rts.records import ArraySpec, Samples
-from rts.trees import Array, Tree
+from rts import namespace
+from rts.plugin_api.arrays import Array, Tree, shape_of
+from rts.plugin_api.records import ArraySpec, Samples
 from rts_surfaces.entries import check_entry
 from rts_surfaces.implicit.field import ScalarField
 from rts_surfaces.implicit.function_on_lattice import Looked, Resampled

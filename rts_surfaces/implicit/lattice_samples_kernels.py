@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.plugin_api.loops import compiled, kernel
 
 LARGEST = 1e38
 """What is larger is no number of single precision: fields that are flat to the last digit move nothing."""

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.errors import PluginError
-from rts.threads import parallel
+from rts import PluginError
+from rts.plugin_api.threads import parallel
 from rts_surfaces.implicit.lattice import Lattice
 from rts_surfaces.implicit.narrow_band import Band
 

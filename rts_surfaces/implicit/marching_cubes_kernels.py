@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.plugin_api.loops import compiled, kernel
 
 
 @compiled(inline="always")

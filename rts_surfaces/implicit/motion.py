@@ -9,13 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rts.engines import engine_of, namespace
-from rts.errors import InputError
-from rts.operations.combine import combine
-from rts.operations.operation import Arrays, Operation, Some
-from rts.operations.take import take
-from rts.threads import parallel, read_only
-from rts.trees import Array
+from rts import InputError, engine_of, namespace
+from rts.plugin_api.arrays import Array
+from rts.plugin_api.operations import Operation, combine, take
+from rts.plugin_api.threads import parallel, read_only
 from rts_surfaces.implicit.lattice import Lattice
 
 Edges = tuple[tuple[int, ...], tuple[float, ...], tuple[float, ...]]
@@ -35,7 +32,7 @@ def _shape(values: tuple[int, ...], params: tuple[int, ...], *_: object, **__: o
     return params[0], 3
 
 
-def _checked(operands: Arrays, width: int) -> Arrays:
+def _checked(operands: Sequence[np.ndarray], width: int) -> Sequence[np.ndarray]:
     values, params, *numbers = operands
     for rows in numbers:
         if rows.shape != (len(params), 6) or params.shape[1] != width:
@@ -51,7 +48,7 @@ def _checked(operands: Arrays, width: int) -> Arrays:
     return operands
 
 
-def _forward(operands: Arrays, out: np.ndarray, *, isovalue: float, sign: float) -> None:
+def _forward(operands: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, sign: float) -> None:
     from rts_surfaces.implicit import motion_kernels
 
     values, params, rows = _checked(operands, 16)
@@ -59,7 +56,9 @@ def _forward(operands: Arrays, out: np.ndarray, *, isovalue: float, sign: float)
     parallel(motion_kernels.move, len(rows), values, params, rows, real(isovalue), real(sign), out, work=30 * len(rows))
 
 
-def _push(operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, sign: float) -> None:
+def _push(
+    operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, sign: float
+) -> None:
     from rts_surfaces.implicit import motion_kernels
 
     values, params, rows = _checked(operands, 16)
@@ -67,7 +66,9 @@ def _push(operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray, *, 
     parallel(motion_kernels.push, len(rows), *given, work=30 * len(rows))
 
 
-def _pull(operands: Arrays, g: np.ndarray, results: Some, *, isovalue: float, sign: float) -> None:
+def _pull(
+    operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None], *, isovalue: float, sign: float
+) -> None:
     from rts_surfaces.implicit import motion_kernels
 
     values, params, rows = _checked(operands, 16)
@@ -122,7 +123,7 @@ def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
     return xp.where(singular, along - change / xp.where(singular, bounded, xp.ones_like(bounded)), exact)
 
 
-def _forward_edges(operands: Arrays, out: np.ndarray, *, isovalue: float, lattice: Edges) -> None:
+def _forward_edges(operands: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, lattice: Edges) -> None:
     from rts_surfaces.implicit import motion_kernels
 
     values, params, rows, numbers = _checked(operands, 4)
@@ -131,7 +132,7 @@ def _forward_edges(operands: Arrays, out: np.ndarray, *, isovalue: float, lattic
 
 
 def _push_edges(
-    operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, lattice: Edges
+    operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, lattice: Edges
 ) -> None:
     from rts_surfaces.implicit import motion_kernels
 
@@ -140,7 +141,14 @@ def _push_edges(
     parallel(motion_kernels.push_crossings, len(rows), *given, work=60 * len(rows))
 
 
-def _pull_edges(operands: Arrays, g: np.ndarray, results: Some, *, isovalue: float, lattice: Edges) -> None:
+def _pull_edges(
+    operands: Sequence[np.ndarray],
+    g: np.ndarray,
+    results: Sequence[np.ndarray | None],
+    *,
+    isovalue: float,
+    lattice: Edges,
+) -> None:
     from rts_surfaces.implicit import motion_kernels
 
     values, params, rows, numbers = _checked(operands, 4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.plugin_api.loops import compiled, kernel
 
 
 @kernel

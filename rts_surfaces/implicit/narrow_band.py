@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arguments import check_positive, quoted
-from rts.checks import is_count
-from rts.errors import InputError
-from rts.threads import parallel
+from rts import InputError
+from rts.plugin_api.checks import check_positive, is_count, quoted
+from rts.plugin_api.threads import parallel
 from rts_surfaces.implicit import narrow_band_kernels as kernels
 from rts_surfaces.implicit.lattice import Lattice
 

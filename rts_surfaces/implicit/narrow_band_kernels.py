@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.plugin_api.loops import compiled, kernel
 
 SHIFT = 2
 MASK = (1 << SHIFT) - 1

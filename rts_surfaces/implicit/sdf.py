@@ -8,14 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import check_numbers, check_positive, quoted
-from rts.checks import is_count
-from rts.errors import InputError
-from rts.gbuffer import GBuffer
-from rts.interfaces import RaySurface
-from rts.parts import Part
-from rts.records import RayHits, Samples
-from rts.trees import Array, Tree
+from rts import GBuffer, InputError, Part, RaySurface
+from rts.plugin_api.arrays import Array, Tree
+from rts.plugin_api.checks import check_numbers, check_positive, is_count, quoted
+from rts.plugin_api.records import RayHits, Samples
 from rts_surfaces.implicit.casting import ball, cast, moving
 from rts_surfaces.implicit.field import Field, Function, Implicit, known_number
 from rts_surfaces.implicit.fields import swept_sphere

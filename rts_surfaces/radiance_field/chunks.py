@@ -6,9 +6,8 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator
 
-from rts.engines import Engine, engine_named, engine_of
-from rts.errors import InputError, PluginError
-from rts.trees import Array
+from rts import Engine, engine_of
+from rts.plugin_api.arrays import Array
 
 CHUNK = 8192
 """Rows at a time: activations of a network of 128 units are then some 20 MB."""
@@ -38,9 +37,10 @@ def in_chunks(f: Callable[..., Array], rows: int, *arrays: Array) -> Array:
 def fast_engine() -> Engine:
     """The engine for networks whose arrays are NumPy's: torch, which uses all cores, where it is installed."""
     try:
-        return engine_named("torch")
-    except (PluginError, InputError):  # Missing, or not registered.
-        return engine_named("numpy")
+        import torch
+    except ImportError:
+        return engine_of()
+    return engine_of(torch.empty(0))
 
 
 @contextlib.contextmanager

@@ -8,14 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.arrays import from_numbers
-from rts.engines import engine_of
-from rts.errors import InputError
-from rts.files.paths import as_path, output_file, writing
-from rts.trees import Tree, map_leaves, placed_leaves
+from rts import InputError, engine_of
+from rts.plugin_api.arrays import Tree, map_leaves
+from rts.plugin_api.checks import quoted
 from rts_surfaces.radiance_field.lattice import lattice
-from rts_surfaces.radiance_field.network import REPEATED, Architecture, check_network
+from rts_surfaces.radiance_field.network import REPEATED, Architecture, check_network, placed
 
 NETWORKS = ("coarse", "fine")
 LARGEST = 2**30
@@ -55,11 +52,15 @@ class RadianceField:
         Raises:
             InputError: another extension, or a path that cannot be or may not be written to.
         """
-        path = output_file(path, "radiance field", (".npz",))
-        named = {".".join(map(str, place)): x for place, x in placed_leaves(self.on_host())}
-        with writing(path):
+        path = Path(path)
+        if path.suffix.lower() != ".npz":
+            raise InputError(f"the radiance field is to be called {path.name!r}; expected a name ending in .npz")
+        named = {".".join(map(str, place)): x for place, x in placed(self.on_host())}
+        try:
             path.parent.mkdir(parents=True, exist_ok=True)
             np.savez(path, allow_pickle=False, **named)
+        except OSError as error:
+            raise InputError(f"{path} cannot be written ({error.strerror}); choose another name or folder") from error
 
     def lattice(
         self,
@@ -89,9 +90,8 @@ class RadianceField:
         return map_leaves(engine_of(self.weights).to_numpy, self.weights)
 
 
-def load_radiance_field(path: Any) -> RadianceField:
+def load_radiance_field(path: Path) -> RadianceField:
     """The field whose weights an .npz holds, as float32; see `rts.load_radiance_field`."""
-    path = as_path(path)
     if not path.is_file():
         raise InputError(f"there is no file {path} of weights; check the path (relative paths start at {Path.cwd()})")
     found: dict[str, Any] = {}
@@ -141,7 +141,7 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
         if array.dtype.kind != "f":
             raise InputError(f"{path} has {key[:60]!r} of dtype {array.dtype}; expected floating numbers")
         with np.errstate(over="ignore"):
-            found[key] = from_numbers(array, key).astype(np.float32)
+            found[key] = array.astype(np.float32)
         if not np.isfinite(found[key]).all():
             raise InputError(f"{path} has NaN, infinity or too large numbers in {key[:60]!r}; repair the file")
     return found

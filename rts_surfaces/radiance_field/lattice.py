@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.engines import constants
-from rts.errors import InputError
-from rts.files.paths import as_path, cache_folder
-from rts.trees import placed_leaves
+from rts import InputError
+from rts.plugin_api.arrays import constants
+from rts.plugin_api.checks import quoted
+from rts.plugin_api.files import cache_folder
 from rts_surfaces.implicit.lattice import Lattice
 from rts_surfaces.radiance_field.chunks import CHUNK, fast_engine, progress_bar
-from rts_surfaces.radiance_field.network import density
+from rts_surfaces.radiance_field.network import density, placed
 
 if TYPE_CHECKING:
     from rts_surfaces.radiance_field.field import RadianceField
@@ -58,7 +57,7 @@ def lattice(
         raise InputError(f"network is {quoted(network)}; expected 'fine' or 'coarse'")
     points = Lattice(bounds, shape)
     weights = field.on_host()[network]
-    folder = None if keep is False else cache_folder() if keep is True else as_path(keep)
+    folder = None if keep is False else cache_folder() if keep is True else Path(keep)
     path = folder / f"density-{_key(weights, points)}.npz" if folder is not None else None
     kept = _kept(path, points.shape) if path is not None else None
     if kept is not None:
@@ -85,7 +84,7 @@ def _computed(weights: Any, points: Lattice, progress: bool | None) -> np.ndarra
 def _key(weights: Any, points: Lattice) -> str:
     """A name that changes with weights and points."""
     found = hashlib.sha256(VERSION + repr(points.shape).encode() + points.low.tobytes() + points.step.tobytes())
-    for place, array in placed_leaves(weights):
+    for place, array in placed(weights):
         found.update(repr((place, array.shape, str(array.dtype))).encode() + np.ascontiguousarray(array).tobytes())
     return found.hexdigest()[:32]
 

@@ -15,13 +15,12 @@ Weights that are NumPy arrays are constants beside points of any engine. Results
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from rts.arrays import described, shape_of
-from rts.engines import constants, engine_of, exemplar, namespace
-from rts.errors import InputError
-from rts.trees import Array, Tree
+from rts import InputError, engine_of, namespace
+from rts.plugin_api.arrays import Array, Tree, constants, exemplar, shape_of
+from rts.plugin_api.checks import quoted
 
 SINGLE = ("layer1", "fc_alpha", "fc_feat", "fc_rgb")
 REPEATED = ("layers_xyz", "layers_dir")
@@ -57,7 +56,7 @@ def check_network(weights: Any, name: str = "the network") -> Architecture:
         InputError: it is none; the message names the layer.
     """
     if not isinstance(weights, Mapping):
-        raise InputError(f"{name} {described(weights)}; expected a dict of layers {', '.join(SINGLE + REPEATED)}")
+        raise InputError(f"{name} is {quoted(weights)}; expected a dict of layers {', '.join(SINGLE + REPEATED)}")
     missing = [n for n in SINGLE + REPEATED if n not in weights]
     if missing:
         raise InputError(f"{name} lacks the layer {missing[0]!r}; expected {', '.join(SINGLE + REPEATED)}")
@@ -194,3 +193,12 @@ def _layer(layer: Mapping[str, Array], x: Array) -> Array:
 def _relu(x: Array) -> Array:
     xp = namespace(x)
     return xp.maximum(x, xp.zeros_like(x[:1, :1]))  # NaN stays NaN.
+
+
+def placed(weights: Tree, place: tuple = ()) -> Iterator[tuple[tuple, Array]]:
+    """The arrays of nested dicts and lists, sorted, each with the keys and indices that lead to it."""
+    if not isinstance(weights, (Mapping, list, tuple)):
+        yield place, weights
+        return
+    for key in sorted(weights) if isinstance(weights, Mapping) else range(len(weights)):
+        yield from placed(weights[key], (*place, key))

@@ -12,16 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.arrays import unit
-from rts.engines import namespace
-from rts.errors import InputError
-from rts.gbuffer import GBuffer
-from rts.interfaces import TriangleSurface
-from rts.ndc import Ndc
-from rts.parts import Part
-from rts.records import ArraySpec, Proxy, Rays, Samples
-from rts.trees import Array, Tree
+from rts import GBuffer, InputError, Ndc, Part, TriangleSurface, namespace
+from rts.plugin_api.arrays import Array, Tree, unit
+from rts.plugin_api.checks import quoted
+from rts.plugin_api.records import ArraySpec, Proxy, Rays, Samples
 
 DEEPEST = 1e4
 """Depth, over that of the near plane, beyond which triangles are left out: rounding moves them too far in the world."""

@@ -4,19 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from rts.arguments import quoted
-from rts.arrays import unit
-from rts.camera import Camera
-from rts.checks import is_count
-from rts.engines import constants, engine_of, exemplar, namespace
-from rts.errors import InputError
-from rts.gbuffer import GBuffer
-from rts.interfaces import Shader
-from rts.ndc import Ndc
-from rts.row_cameras import RowCameras
-from rts.trees import Array, Tree
+from rts import Camera, GBuffer, InputError, Ndc, Shader, engine_of, namespace
+from rts.plugin_api.arrays import Array, Tree, constants, exemplar, unit
+from rts.plugin_api.checks import is_count, quoted
 from rts_surfaces.radiance_field.chunks import CHUNK, in_chunks
 from rts_surfaces.radiance_field.field import RadianceField, load_radiance_field
 from rts_surfaces.radiance_field.network import check_network, radiance
@@ -48,7 +41,7 @@ class RadianceShader(Shader):
         if not is_count(self.chunk):
             raise InputError(f"chunk is {quoted(self.chunk)}; expected an integer of at least 1")
 
-    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera | RowCameras) -> Array:
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Any) -> Array:
         """See `rts.Shader`."""
         if "weights" not in theta:
             raise InputError(
@@ -66,11 +59,11 @@ class RadianceShader(Shader):
         return xp.concat([color, xp.ones_like(color[:, :1])], axis=1)
 
     @staticmethod
-    def load(path: Any) -> RadianceField:
+    def load(path: Path) -> RadianceField:
         """See `rts.load_radiance_field`."""
         return load_radiance_field(path)
 
     @staticmethod
     def volume_render(field: RadianceField, camera: Camera, size: tuple[int, int], **options: Any) -> VolumeImage:
-        """See `rts.volume_render`."""
+        """See `rts.radiance_fields.volume_render`."""
         return volume_render(field, camera, size, **options)

@@ -7,14 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arguments import check_pixels, check_planes, quoted
-from rts.camera import Camera
-from rts.checks import is_count
-from rts.engines import constants, engine_of
-from rts.errors import InputError
-from rts.files.views import colour_named
-from rts.ndc import Ndc
-from rts.trees import map_leaves
+from rts import Camera, InputError, Ndc, engine_of
+from rts.plugin_api.arrays import constants, map_leaves
+from rts.plugin_api.checks import is_count, quoted
 from rts_surfaces.radiance_field.chunks import CHUNK, fast_engine, in_chunks, progress_bar
 from rts_surfaces.radiance_field.field import RadianceField
 from rts_surfaces.radiance_field.network import density_and_radiance
@@ -44,15 +39,24 @@ def volume_render(
     camera: Camera,
     size: tuple[int, int],
     *,
-    near: float | None,
-    far: float | None,
+    planes: tuple[float, float],
     samples: tuple[int, int],
-    background: Any,
+    background: np.ndarray | None,
     ndc: Ndc | None,
     progress: bool | None,
 ) -> VolumeImage:
-    """The image, and the evaluations of both networks; see `rts.volume_render`."""
-    height, width = check_pixels(size)
+    """The image, and the evaluations of both networks; see `rts.radiance_fields.volume_render`, which checks the rest.
+
+    Args:
+        field: the field.
+        camera: a perspective camera.
+        size: (height, width).
+        planes: the parameters of rays at which they begin and end.
+        samples: of the coarse and the fine network, along each ray.
+        background: a colour (3,), or None for transparency.
+        ndc: the map to the field's space, or None.
+        progress: whether to show a progress bar.
+    """
     if not isinstance(field, RadianceField):
         raise InputError(f"field is {quoted(field)}; expected what rts.load_radiance_field gives")
     if not isinstance(camera, Camera):
@@ -62,13 +66,7 @@ def volume_render(
     counts = tuple(samples) if isinstance(samples, (tuple, list)) else ()
     if len(counts) != 2 or not all(map(is_count, counts)) or counts[0] < 3:
         raise InputError(f"samples is {quoted(samples)}; expected (coarse, fine), at least 3 and 1")
-    if ndc is not None and not isinstance(ndc, Ndc):
-        raise InputError(f"ndc is {quoted(ndc)}; expected an rts.Ndc, or None")
-    if ndc is not None and not (near is None and far is None):
-        raise InputError("near and far are given with ndc, whose rays run from its near plane to infinity; leave them")
-    near, far = (0.0, 1.0) if ndc is not None else (2.0 if near is None else near, 6.0 if far is None else far)
-    check_planes(near, far, positive=ndc is None)
-    behind = None if background is None else colour_named(background)
+    (height, width), (near, far) = size, planes
     camera = map_leaves(engine_of(camera).to_numpy, camera)
     if camera.for_size((height, width)).projection[3, 2] == 0:
         raise InputError("the camera is orthographic; volumes are drawn by perspective ones")
@@ -94,8 +92,8 @@ def volume_render(
             done["fine"] += t.size
             advance(len(o))
     image = image.reshape(height, width, 4)
-    if behind is not None:
-        image = image[..., :3] + (1 - image[..., 3:]) * behind
+    if background is not None:
+        image = image[..., :3] + (1 - image[..., 3:]) * background
     return VolumeImage(image, done["coarse"], done["fine"])
 
 

@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.errors import InputError
-from rts.threads import parallel
-from rts.topology import fixed
+from rts import InputError
+from rts.plugin_api.threads import parallel, read_only
 from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.cage import Cage
 
@@ -131,7 +130,7 @@ class Limit:
         # What a `Points` leaves behind: the next one's memory need not be asked of the system, page by page.
         self._left: list[int] = []
         weakref.finalize(self, _free, self._library, self.handle, self._left)
-        self.used = fixed(used.astype(np.int32))
+        self.used = read_only(used.astype(np.int32))
         self._tables(widths[0], uv_used, widths[1])
 
     def _tables(self, width: int, uv_used: np.ndarray | None, uv_width: int) -> None:
@@ -148,8 +147,8 @@ class Limit:
         self._call(
             "rts_tables", self.handle, table.ctypes.data, uv_data, self.kinds.ctypes.data, self.corners.ctypes.data
         )
-        self.table = fixed(self.used[table])
-        self.uv_table = None if uv_table is None or uv_used is None else fixed(uv_used.astype(np.int32)[uv_table])
+        self.table = read_only(self.used[table])
+        self.uv_table = None if uv_table is None or uv_used is None else read_only(uv_used.astype(np.int32)[uv_table])
 
     def _call(self, name: str, *args: Any) -> None:
         if getattr(self._library, name)(*args):

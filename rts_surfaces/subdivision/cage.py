@@ -12,11 +12,9 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from rts.arguments import check_numbers, quoted
-from rts.arrays import shape_of
-from rts.engines import value_of
-from rts.errors import EngineError, InputError
-from rts.topology import fixed
+from rts import EngineError, InputError, engine_of
+from rts.plugin_api.arrays import shape_of
+from rts.plugin_api.checks import check_numbers, quoted
 
 REPAIR = "repair the cage"
 INFINITE = 10
@@ -101,7 +99,7 @@ def checked_cage(faces: Any, scheme: str, creases: Any = (), corners: Any = (), 
         corner_sharpness=corner_sharpness,
     )
     for table in cage[1:]:
-        fixed(table)
+        table.flags.writeable = False
     return cage
 
 
@@ -137,7 +135,7 @@ def checked_lists(name: str, lists: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def _known(name: str, table: Any, wrong: InputError) -> np.ndarray:
     try:
-        known = np.asarray(table) if isinstance(table, np.ndarray) else value_of(table)
+        known = np.asarray(table) if isinstance(table, np.ndarray) else engine_of(table).known(table)
     except EngineError:
         raise wrong from None
     if known is None or known.shape != shape_of(table):

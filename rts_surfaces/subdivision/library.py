@@ -18,8 +18,8 @@ import threading
 from pathlib import Path
 from typing import NamedTuple
 
-from rts.errors import PluginError
-from rts.files.paths import cache_folder, own_folder
+from rts import PluginError
+from rts.plugin_api.files import cache_folder
 
 SOURCES = ("opensubdiv.cpp", "cage.h", "newton.h")
 PREFIXES = ("/usr", "/usr/local", "/opt/homebrew", "/usr/local/opt/opensubdiv")
@@ -114,7 +114,7 @@ def _opened(tools: Tools) -> ctypes.CDLL:
             path.unlink(missing_ok=True)
             path = _compiled(tools, cache_folder())
         except OSError:  # It cannot be removed.
-            path = _compiled(tools, Path(own_folder().name))
+            path = _compiled(tools, Path(_own_folder().name))
         try:
             library = ctypes.CDLL(str(path))
         except OSError as error:
@@ -138,7 +138,7 @@ def _compiled(tools: Tools, folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         handle, draft = tempfile.mkstemp(suffix=".so", dir=folder)
     except OSError:  # A cache that cannot be written to: made anew in each process.
-        folder = Path(own_folder().name)
+        folder = Path(_own_folder().name)
         handle, draft = tempfile.mkstemp(suffix=".so", dir=folder)
     os.close(handle)
     try:
@@ -149,6 +149,12 @@ def _compiled(tools: Tools, folder: Path) -> Path:
         Path(draft).unlink(missing_ok=True)
         raise
     return folder / name
+
+
+@functools.cache
+def _own_folder() -> tempfile.TemporaryDirectory:
+    """A folder of this process alone, which is removed at its end."""
+    return tempfile.TemporaryDirectory(prefix="rts-")
 
 
 def _key(tools: Tools) -> str:

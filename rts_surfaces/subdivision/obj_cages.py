@@ -11,12 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.errors import FileWarning, InputError, warn
-from rts.files.obj_reader import Polygons, read_polygons
-from rts.files.srgb import decode_srgb
-from rts.interfaces import Shader
-from rts.shading import Lambert, Textured
-from rts.trees import Tree
+from rts import InputError, Shader, errors, plugin
+from rts.plugin_api.arrays import Tree
+from rts.plugin_api.files import read_polygons
 from rts_surfaces.subdivision.binding import UV_RULES
 
 _BOUNDARIES = ("none", "edge_and_corner", "edge_only")
@@ -53,7 +50,10 @@ def read_cage(path: Path) -> CageFile:
         raise InputError(f"{path} is no OBJ file; cages of subdivision surfaces are read from .obj")
     found = read_polygons(path)
     if found.materials > 1:
-        warn(f"{path} has {found.materials} materials, of which a cage can have but one; none is taken", FileWarning)
+        errors.warn(
+            f"{path} has {found.materials} materials, of which a cage can have but one; none is taken",
+            errors.FileWarning,
+        )
     with np.errstate(over="ignore"):  # What overflows is refused.
         theta: dict[str, Any] = {"vertices": found.vertices.astype(np.float32)}
         options = _tagged(path, found.tags)
@@ -61,7 +61,7 @@ def read_cage(path: Path) -> CageFile:
             theta["uv"] = found.uv.astype(np.float32)
             options["indices"] = {"uv": _lists(found.corners[:, 1], found.sizes)}
         if found.colors is not None:
-            theta["colors"] = decode_srgb(found.colors).astype(np.float32)
+            theta["colors"] = found.colors.astype(np.float32)
     opaque = _material(found, theta)
     for name, values in theta.items():
         bad = np.argwhere(~np.isfinite(values))
@@ -69,7 +69,7 @@ def read_cage(path: Path) -> CageFile:
             raise InputError(
                 f"{path}: row {bad[0][0]} of {name} is NaN, infinite or too large for float32; repair the file"
             )
-    shader = (Textured if "texture" in theta else Lambert)(opaque=opaque)
+    shader = plugin("shaders", "textured" if "texture" in theta else "lambert")(opaque=opaque)
     return CageFile(_lists(found.corners[:, 0], found.sizes), options, theta, shader)
 
 
@@ -77,15 +77,15 @@ def _lists(indices: np.ndarray, sizes: np.ndarray) -> list[list[int]]:
     return [part.tolist() for part in np.split(indices, np.cumsum(sizes)[:-1])]
 
 
-def _material(found: Polygons, theta: dict[str, Any]) -> bool:
-    """Add colour and texture of the material to θ; whether all is opaque."""
-    color = found.material.color
+def _material(found: Any, theta: dict[str, Any]) -> bool:
+    """Add colour and texture of the material to θ; True if all is opaque."""
+    color = found.color
     opaque = color is None or len(color) < 4 or color[3] >= 1
     if found.texture is not None and "uv" in theta:
-        theta["texture"] = decode_srgb(found.texture).astype(np.float32)
+        theta["texture"] = found.texture.astype(np.float32)
         opaque = opaque and found.texture.shape[-1] < 4
     if color is not None and (color < 1).any():
-        theta["color"] = decode_srgb(color)[: 3 if (color[3:] >= 1).all() else 4].astype(np.float32)
+        theta["color"] = color[: 3 if (color[3:] >= 1).all() else 4].astype(np.float32)
     return bool(opaque)
 
 
@@ -112,7 +112,7 @@ def _tagged(path: Path, tags: list[tuple[int, str]]) -> dict[str, Any]:
         elif name in _TAGS:
             raise _damaged(path, number, text)
         else:
-            warn(f"{path}, line {number}: the tag {name[:40]!r} is not followed", FileWarning)
+            errors.warn(f"{path}, line {number}: the tag {name[:40]!r} is not followed", errors.FileWarning)
     return options
 
 

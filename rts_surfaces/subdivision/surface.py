@@ -13,18 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.arrays import shape_of, unit
-from rts.engines import constants, engine_of
-from rts.errors import InputError
-from rts.gbuffer import GBuffer
-from rts.operations.combine import combine
-from rts.operations.take import take
-from rts.parts import Part
-from rts.records import ArraySpec, Rays, Samples
-from rts.sampling.cache import fingerprint
-from rts.topology import fixed
-from rts.trees import Array, Tree
+from rts import GBuffer, InputError, Part, engine_of
+from rts.plugin_api.arrays import Array, Tree, constants, shape_of, unit
+from rts.plugin_api.checks import fingerprint, quoted
+from rts.plugin_api.operations import combine, take
+from rts.plugin_api.records import ArraySpec, Rays, Samples
+from rts.plugin_api.threads import read_only
 from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows
 from rts_surfaces.parametric import BEYOND, CROSSINGS, LARGEST_STEP, RESIDUAL, STEPS, TOLERANCE, Geometry, Parametric
 from rts_surfaces.subdivision import library
@@ -137,7 +131,7 @@ class Subdivision(Parametric):
             sizes, uv = checked_lists("indices['uv']", lists)
             if not np.array_equal(sizes, self.cage.sizes):
                 raise InputError("indices['uv'] has faces of other sizes than the cage; expected a row for each corner")
-            uv = fixed(uv)
+            uv = read_only(uv)
         return tuple(dict.fromkeys((*VERTEX_ATTRIBUTES, *(indices or {})))), uv
 
     def _prepare(self) -> None:

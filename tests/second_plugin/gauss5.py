@@ -25,7 +25,7 @@ class Gauss5(rts.Splatter):
         rgba = xp.reshape(xp.take(splats.rgba, index, axis=0), (*row.shape, 4))
         rgba = xp.where(covered[..., None], xp.concat([rgba, xp.ones_like(rgba[..., :1])], axis=-1), 0.0)
         grid = np.stack(np.meshgrid(np.arange(row.shape[1]), np.arange(row.shape[0])), -1) + (0.5 - reach)
-        off = rts.exact_calibration(self.sigma, reach) * (xy - engine.constant(grid, splats.positions))
+        off = rts.splatting.exact_calibration(self.sigma, reach) * (xy - engine.constant(grid, splats.positions))
         off = xp.where(covered[..., None], off, 0.0)
         scale, steps = 1 / (2 * self.sigma**2), range(-reach, reach + 1)
         peak = 1.001 / sum(math.exp(-(u * u) * scale) for u in steps) ** 2

@@ -3,6 +3,7 @@
 import numpy as np
 
 import rts
+from rts.plugin_api.operations import Operation
 
 
 def specification(x, sharpness):
@@ -37,7 +38,7 @@ def pull(operands, gradient, results):
         results[1][...] = (by_s * gradient).sum(axis=0)
 
 
-SOFTPLUS = rts.Operation(
+SOFTPLUS = Operation(
     "second_plugin.softplus",
     specification,
     ranks=(2, 1),

@@ -3,6 +3,8 @@
 import numpy as np
 
 import rts
+from rts.plugin_api.operations import gradient
+from rts.plugin_api.records import RayHits
 
 from .net import Net, random_net
 
@@ -39,7 +41,7 @@ class Torus(rts.RaySurface):
         out = radii[0] + radii[1] * xp.cos(v)
         position = xp.stack([out * xp.cos(u), radii[1] * xp.sin(v), out * xp.sin(u)], axis=-1)
         gbuffer = rts.GBuffer(position=position)
-        gbuffer.defer("normal", lambda: rts.gradient(lambda p: distance(radii, p), position))
+        gbuffer.defer("normal", lambda: gradient(lambda p: distance(radii, p), position))
         return gbuffer
 
     def intersect(self, theta, origins, directions, layers):
@@ -75,7 +77,7 @@ class Torus(rts.RaySurface):
         points = origins + found[..., None] * unit
         x, y, z = points[..., 0], points[..., 1], points[..., 2]
         angles = xp.stack([xp.atan2(z, x), xp.atan2(y, norm(xp, x, z) - radii[0])], axis=-1)
-        return rts.RayHits(hit=hit, distance=found / length, params=angles)
+        return RayHits(hit=hit, distance=found / length, params=angles)
 
     @staticmethod
     def example():

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 
 import rts
+from rts.plugin_api.records import Proxy, Samples
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,11 +34,11 @@ class Heightfield(rts.TriangleSurface):
     def proxy(self, inputs, camera, size):
         counts = [self.squares * (n - 3) + 1 for n in inputs.shape]
         params = np.indices(counts, np.float32)[::-1].reshape(2, -1).T / self.squares
-        vertices = self.evaluate({"heights": inputs}, rts.Samples(None, params, None, None))["position"]
+        vertices = self.evaluate({"heights": inputs}, Samples(None, params, None, None))["position"]
         index = np.arange(len(params), dtype=np.int32).reshape(counts)
         a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]  # From above, counter-clockwise.
         faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
-        return rts.Proxy(vertices.astype(np.float32), faces, np.zeros((len(faces), 0), np.int32), params[faces])
+        return Proxy(vertices.astype(np.float32), faces, np.zeros((len(faces), 0), np.int32), params[faces])
 
     def refine(self, inputs, samples, rays):
         """Move the samples from the triangles to the surface, along their rays, by Newton's method."""

@@ -3,6 +3,7 @@
 import numpy as np
 
 import rts
+from rts.plugin_api.records import Fragments
 
 
 class Toy(rts.TriangleSampler):
@@ -27,7 +28,7 @@ class Toy(rts.TriangleSampler):
             ids = np.take_along_axis(np.concatenate([ids, np.full((1, *size), index, np.int32)]), order, axis=0)
             weights = np.take_along_axis(np.concatenate([weights, found[None]]), order[..., None], axis=0)
         covered = depths < np.inf
-        return rts.Fragments(
+        return Fragments(
             np.where(covered, ids, -1),
             np.where(covered[..., None], weights, 0).astype(np.float32),
             np.where(covered, depths, 0).astype(np.float32),

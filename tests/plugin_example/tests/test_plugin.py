@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import rts
+from rts.plugin_api.records import Samples
 from rts.testing import SamplerConformance, SurfaceConformance
 
 pytest.importorskip("rts_plugin_example", reason="not installed: pip install -e ./tests/plugin_example")
@@ -36,7 +37,7 @@ def test_a_control_height_moves_only_its_own_four_by_four_patches():
     heights = np.zeros((9, 9), np.float32)
     heights[4, 4] = 1
     at = np.array([(3.0, 3.0), (1.0, 3.0), (5.01, 3.0), (2.0, 3.0)], np.float32)
-    samples = rts.Samples(None, at, None, None)
+    samples = Samples(None, at, None, None)
     y = Heightfield().evaluate({"heights": heights}, samples)["position"][:, 1]
     np.testing.assert_allclose(y, [4 / 9, 0, 0, 1 / 9], atol=1e-6)
 

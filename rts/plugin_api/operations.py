@@ -1,0 +1,8 @@
+"""Functions of arrays with compiled values and derivatives, and the record that makes more of them."""
+
+from rts.operations.combine import combine, interpolate
+from rts.operations.gradient import gradient
+from rts.operations.operation import Operation
+from rts.operations.take import take
+
+__all__ = ["Operation", "combine", "gradient", "interpolate", "take"]

@@ -1,0 +1,6 @@
+"""The splatters in array code, which compiled ones extend, with the numbers of their Gaussian."""
+
+from rts.splatting.single_and_multi import Multi, Single
+from rts.splatting.visible import Visible
+
+__all__ = ["Multi", "Single", "Visible"]
