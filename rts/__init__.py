@@ -13,6 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 from rts import errors, registry, regularizers  # noqa: F401
 from rts.camera import Camera
+from rts.contracts.residuals import Residuals
+from rts.contracts.sampler import Sampler
+from rts.contracts.shader import Shader
+from rts.contracts.splatter import Splatter, SummingSplatter
+from rts.contracts.surface import Rate, RaySurface, Surface, TriangleSurface
 from rts.diagnostics.gradients import check_gradient, gradient_image
 from rts.diagnostics.tune import tune
 from rts.engines import Engine, engine_of, namespace
@@ -32,17 +37,6 @@ from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
 from rts.gbuffer import GBuffer
-from rts.interfaces import (
-    Rate,
-    RaySurface,
-    Residuals,
-    Sampler,
-    Shader,
-    Splatter,
-    SummingSplatter,
-    Surface,
-    TriangleSurface,
-)
 from rts.operations.rigid import rigid
 from rts.parts import Part
 from rts.radiance_fields import load_radiance_field

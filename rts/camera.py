@@ -28,11 +28,11 @@ from rts.arguments import (
     quoted,
 )
 from rts.arrays import described, from_numbers, promote, shape_of, unit
+from rts.contracts.records import Rays
 from rts.engines import constants, engine_of, is_constant, load_engines, namespace, value_of
 from rts.errors import InputError
 from rts.operations.linear import affine, matmul, specified_affine_map
 from rts.operations.projection import projective_map
-from rts.records import Rays
 from rts.transforms import (
     ROUNDING,
     affine_matrix,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from rts.arrays import described, shape_of
+from rts.contracts.records import Splats
+from rts.contracts.splatter import Splatter
 from rts.engines import namespace
 from rts.errors import InputError
-from rts.interfaces import Splatter
-from rts.records import Splats
 from rts.trees import Array
 
 GROUP = 3

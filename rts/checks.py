@@ -14,13 +14,43 @@ from rts import registry
 from rts.arguments import check_pixels, quoted
 from rts.arrays import described, from_numbers, is_finite, shape_of
 from rts.camera import Camera
+from rts.contracts.plugin import check_members, promised
+from rts.contracts.sampler import Sampler
+from rts.contracts.shader import FunctionShader, Shader
+from rts.contracts.splatter import Splatter
+from rts.contracts.surface import RaySurface, Surface, TriangleSurface
 from rts.engines import floating_bits, value_of
 from rts.errors import AspectWarning, InputError, PluginError, warn
 from rts.gbuffer import GBuffer
-from rts.interfaces import FunctionShader, RaySurface, Sampler, Shader, Splatter, Surface, TriangleSurface
-from rts.parts import CheckedPart, Part
-from rts.plugin_base import check_members
-from rts.trees import Array, placed_leaves
+from rts.parts import Part
+from rts.trees import Array, Tree, placed_leaves, record
+
+
+@record(static=("surface", "shader", "cull"))
+class CheckedPart(Part):
+    """A part whose surface and shader are of their bases, as `rts.checks` makes it."""
+
+    surface: Surface
+    theta: Mapping[str, Tree]
+    shader: Shader  # pyright: ignore[reportGeneralTypeIssues]  # It is always given.
+    transform: Array | None = None
+    cull: str = "none"
+
+    @property
+    def uniform(self) -> bool:
+        """Whether its shader promises one colour."""
+        return promised(self.shader, "uniform")
+
+    @property
+    def takes_views(self) -> bool:
+        """Whether its shader promises to take samples of several views."""
+        return promised(self.shader, "takes_views")
+
+    @property
+    def reads(self) -> tuple[str, ...] | None:
+        """The entries that its shader promises to do with, of the G-buffer and of θ; None for all."""
+        return promised(self.shader, "reads")
+
 
 BYTES_PER_CELL = {"forward": 200, "gradient": 700}
 """Rough memory of a cell of a layer through sampling, shading and splatting in array code; compiled, it is less."""

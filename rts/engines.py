@@ -7,18 +7,14 @@ import functools
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
 from rts import registry
+from rts.contracts.plugin import Plugin, check_members
 from rts.errors import EngineError, InputError, PluginError, RtsError
-from rts.plugin_base import Plugin, check_members
 from rts.trees import STATIC_FIELDS, Array, Tree, collected, join_record, map_leaves, split_record
-
-if TYPE_CHECKING:
-    from rts.operations.operation import Operation
-    from rts.records import ArraySpec
 
 
 class Engine(Plugin):
@@ -46,12 +42,12 @@ class Engine(Plugin):
         """An array with no derivative on the device of `like`; floats take the dtype of `like`, or are float32."""
 
     @abc.abstractmethod
-    def call_host(self, fn: Callable, specs: Sequence[ArraySpec], *args: Array) -> tuple[Array, ...]:
+    def call_host(self, fn: Callable, specs: Sequence[Any], *args: Array) -> tuple[Array, ...]:
         """Call `fn` on NumPy copies of `args`; the results carry no derivative and live where `args` do.
 
         Args:
             fn: host arrays → as many host arrays as there are specs.
-            specs: shape and dtype of each result.
+            specs: an `ArraySpec` for each result.
             *args: arrays.
         """
 
@@ -75,7 +71,7 @@ class Engine(Plugin):
 
     # ----------------------------------------------------------------------------- how arrays are computed with
 
-    def apply(self, operation: Operation, operands: Sequence[Array], params: Mapping[str, Any]) -> Array:
+    def apply(self, operation: Any, operands: Sequence[Array], params: Mapping[str, Any]) -> Array:
         """The result of an operation. The default runs its specification; override it to run compiled code."""
         return operation.specification(*operands, **params)
 

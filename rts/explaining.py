@@ -8,10 +8,10 @@ from typing import Any, Literal
 import numpy as np
 
 from rts.camera import Camera
-from rts.checks import check_scene
+from rts.checks import CheckedPart, check_scene
+from rts.contracts.records import Samples
 from rts.engines import engine_of
-from rts.parts import CheckedPart, Part
-from rts.records import Samples
+from rts.parts import Part
 from rts.rendering.image import render_samples
 from rts.rendering.samples import sample
 from rts.sampling.adaptive import Adaptive

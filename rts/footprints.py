@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from rts.camera import Camera
+from rts.contracts.records import Samples
+from rts.contracts.surface import Surface
 from rts.engines import Engine, constants, namespace, stopped
 from rts.errors import InputError
-from rts.interfaces import Surface
 from rts.operations.linear import affine_map
-from rts.records import Samples
 from rts.trees import Array, Tree
 
 FOOTPRINT = "uv_footprint"

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 from rts import registry
 from rts.arguments import quoted
 from rts.errors import InputError
-from rts.interfaces import Shader, Surface
-from rts.plugin_base import promised
 from rts.trees import Array, Tree, record
 
 
@@ -28,7 +26,7 @@ class Part:
 
     surface: Any
     theta: Mapping[str, Tree]
-    shader: Shader | Callable[..., Array] | str = "silhouette"
+    shader: Any = "silhouette"
     transform: Array | None = None
     cull: str = "none"
 
@@ -43,29 +41,3 @@ class Part:
     def replace(self, **changes: Any) -> Part:
         """A copy with some fields changed."""
         return replace(self, **changes)
-
-
-@record(static=("surface", "shader", "cull"))
-class CheckedPart(Part):
-    """A part whose surface and shader are of their bases, as `rts.checks` makes it."""
-
-    surface: Surface
-    theta: Mapping[str, Tree]
-    shader: Shader  # pyright: ignore[reportGeneralTypeIssues]  # It is always given.
-    transform: Array | None = None
-    cull: str = "none"
-
-    @property
-    def uniform(self) -> bool:
-        """Whether its shader promises one colour."""
-        return promised(self.shader, "uniform")
-
-    @property
-    def takes_views(self) -> bool:
-        """Whether its shader promises to take samples of several views."""
-        return promised(self.shader, "takes_views")
-
-    @property
-    def reads(self) -> tuple[str, ...] | None:
-        """The entries that its shader promises to do with, of the G-buffer and of θ; None for all."""
-        return promised(self.shader, "reads")

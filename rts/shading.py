@@ -24,12 +24,12 @@ from typing import Any
 from rts.arguments import quoted
 from rts.arrays import described, dot, is_finite, shape_of, unit
 from rts.camera import Camera
+from rts.contracts.plugin import promised
+from rts.contracts.shader import Shader
 from rts.engines import engine_of, is_constant, namespace, value_of
 from rts.errors import InputError
 from rts.footprints import FOOTPRINT
 from rts.gbuffer import GBuffer
-from rts.interfaces import Shader
-from rts.plugin_base import promised
 from rts.row_cameras import RowCameras
 from rts.textures import WRAPS, sample_texture
 from rts.trees import Array, Tree, map_leaves

@@ -9,9 +9,9 @@ import numpy as np
 
 from rts.arguments import quoted
 from rts.arrays import shape_of
+from rts.contracts.records import Cells
 from rts.engines import value_of
 from rts.errors import EngineError, InputError
-from rts.records import Cells
 from rts.sampling.extremes import extent
 from rts.trees import leaves
 

@@ -6,11 +6,11 @@ import difflib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
+from rts.checks import CheckedPart
+from rts.contracts.shader import Shader
 from rts.errors import InputWarning, warn
 from rts.footprints import FOOTPRINT
 from rts.gbuffer import GBuffer
-from rts.interfaces import Shader
-from rts.parts import CheckedPart
 from rts.trees import Array, Tree
 
 SURFACE_ENTRIES = ("vertices", "points", "normals", "colors", "uv")

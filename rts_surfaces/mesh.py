@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from rts import GBuffer, InputError, Part, TriangleSurface, engine_of, namespace
+from rts import GBuffer, InputError, Part, Rate, TriangleSurface, engine_of, namespace
 from rts.plugin_api.arrays import Array, Tree, exemplar, unit
 from rts.plugin_api.checks import fingerprint, index_table, pieces, quoted
 from rts.plugin_api.operations import interpolate, take
-from rts.plugin_api.records import Proxy, Rate, Samples
+from rts.plugin_api.records import Proxy, Samples
 from rts.plugin_api.threads import read_only
 from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows
 

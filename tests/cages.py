@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 import rts
+from rts.contracts.records import Cells
 from rts.plugin_api.records import Samples
-from rts.records import Cells
 from rts_surfaces.subdivision.binding import Limit, Rules
 from rts_surfaces.subdivision.cage import checked_cage
 from rts_surfaces.subdivision.face_tiles import tiles_of

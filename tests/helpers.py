@@ -7,8 +7,8 @@ import pytest
 
 import rts
 from rts import Camera, Part
+from rts.contracts.records import Cells, Splats
 from rts.engines import is_constant
-from rts.records import Cells, Splats
 from rts.trees import map_leaves
 
 

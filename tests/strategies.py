@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from rts import Camera
+from rts.contracts.records import Cells
 from rts.plugin_api.records import Samples
-from rts.records import Cells
 
 PROPERTIES = settings(deadline=None, derandomize=True, max_examples=60)
 """What all properties are tried with: the same examples every time, however busy the machine is."""

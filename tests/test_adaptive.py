@@ -22,9 +22,9 @@ from helpers import TORCH, arrays, derivative, gradient, icosphere, quad, to_num
 
 import rts
 from rts import Adaptive
+from rts.contracts.records import Request
+from rts.contracts.sampler import Sampler
 from rts.fitting.least_squares import normal_equations
-from rts.interfaces import Sampler
-from rts.records import Request
 from rts.splatting import Multi
 
 pytestmark = pytest.mark.splatting

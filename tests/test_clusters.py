@@ -11,8 +11,8 @@ from test_raster import CAMERAS, SIZE, triangles
 
 import rts
 from rts import Camera, Part
+from rts.contracts.records import Request
 from rts.plugin_api.records import Proxy
-from rts.records import Request
 
 pytestmark = pytest.mark.sampling
 

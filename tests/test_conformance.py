@@ -13,11 +13,12 @@ from analytic import Ellipsoid
 import rts
 from rts import GBuffer, InputError, Part, PluginError
 from rts.arrays import without_border
+from rts.contracts.records import Request
 from rts.engines import engine_of, namespace
 from rts.plugin_api.operations import Operation
-from rts.plugin_api.records import Fragments, RayHits, RowCameras, Splats
-from rts.records import Request
+from rts.plugin_api.records import Fragments, RayHits, Splats
 from rts.registry import instance
+from rts.row_cameras import RowCameras
 from rts.shading import Depth, Normals, Unlit
 from rts.splatting import Multi, Plain
 from rts.testing import (

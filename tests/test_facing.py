@@ -9,7 +9,7 @@ from helpers import DIFFERENTIABLE, arrays, box, icosphere, rotation, soup, spla
 
 import rts
 from rts import splatting
-from rts.records import Cells
+from rts.contracts.records import Cells
 from rts.sampling.facing import eye
 from rts.topology import pieces
 from rts_backends.fused.splatters import Visible

@@ -15,9 +15,9 @@ from PIL import Image
 from strategies import PROPERTIES, reals, sizes, steps, table
 
 import rts
+from rts.contracts.records import Cells
 from rts.files.srgb import decode_srgb, encode_srgb
 from rts.plugin_api.records import Samples
-from rts.records import Cells
 
 pytestmark = pytest.mark.files
 

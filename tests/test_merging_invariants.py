@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from strategies import PROPERTIES, masks, rows_of, steps, told_apart
 
 from rts import threads
-from rts.records import Cells
+from rts.contracts.records import Cells
 from rts.sampling import merging
 from rts.sampling.merging import merge
 

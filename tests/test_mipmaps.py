@@ -19,10 +19,10 @@ from helpers import (
 
 import rts
 from rts import Camera, GBuffer
+from rts.contracts.records import Cells
 from rts.errors import InputError
 from rts.footprints import uv_footprint
 from rts.plugin_api.records import Samples
-from rts.records import Cells
 from rts.shading import Textured
 from rts.textures import level_of, mip_levels, sample_texture
 

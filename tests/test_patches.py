@@ -11,8 +11,8 @@ from thin_patches import lacking, thin_patches
 
 import rts
 from rts import Camera, InputError, Part
+from rts.contracts.records import Cells
 from rts.plugin_api.records import Samples
-from rts.records import Cells
 from rts.sampling import settling
 from rts.testing import OperationConformance
 from rts.testing.compatibility import APRON

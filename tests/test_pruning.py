@@ -9,7 +9,7 @@ from helpers import ALL, DIFFERENTIABLE, arrays, box, derivative, gradient, icos
 
 import rts
 from rts import splatting
-from rts.records import ArraySpec
+from rts.contracts.records import ArraySpec
 from rts.rendering.samples import sample
 from rts.sampling import pruning
 from rts.sampling.extremes import extent, largest, named

@@ -9,7 +9,7 @@ from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, box, gradient, icosphere
 import rts
 from rts import Camera
 from rts.errors import EmptyImageWarning, InputError
-from rts.plugin_api.records import RowCameras
+from rts.row_cameras import RowCameras
 from rts.shading import Lambert
 from rts.splatting import side_by_side
 from rts.splatting.side_by_side import Picture

@@ -9,8 +9,8 @@ from helpers import ALL, FRONT, arrays, rigid, to_numpy
 from seen import CAMERA, SIZE, VIEWS, rays_spread
 
 import rts
+from rts.contracts.records import Cells
 from rts.plugin_api.records import ArraySpec, Samples
-from rts.records import Cells
 from rts.sampling import packing, settling
 
 pytestmark = pytest.mark.sampling

@@ -6,8 +6,8 @@ from helpers import DIFFERENTIABLE, arrays, to_numpy
 
 import rts
 from rts import Camera, InputError, Part
+from rts.contracts.records import Cells
 from rts.plugin_api.records import Samples
-from rts.records import Cells
 from rts.testing.compatibility import APRON
 from rts_surfaces import tiles
 from rts_surfaces.bspline import extraction

@@ -23,7 +23,7 @@ import numpy as np
 import rts
 from benchmarks.camera import camera
 from benchmarks.meshes import MESHES, mesh, subdivided
-from rts.records import Proxy
+from rts.contracts.records import Proxy
 from rts.threads import thread_count
 from rts_backends.triangles import pixel_matrix
 

@@ -7,9 +7,9 @@ from functools import partial
 
 import numpy as np
 
+from rts.contracts.records import Splats
+from rts.contracts.splatter import Splatter
 from rts.engines import Engine, constants, namespace
-from rts.interfaces import Splatter
-from rts.records import Splats
 from rts.trees import Array, Tree
 
 STEP_PIXELS = 1.0

@@ -13,6 +13,8 @@ import numpy as np
 from rts.arguments import check_flag, quoted
 from rts.arrays import kind_of
 from rts.checks import checked_plugin, is_count, is_real
+from rts.contracts.plugin import overrides
+from rts.contracts.residuals import Residuals
 from rts.engines import Engine
 from rts.errors import InputError
 from rts.fitting.dependence import differentiable, refuse_independent
@@ -21,8 +23,6 @@ from rts.fitting.losses import SQUARE, Loss
 from rts.fitting.names import listed, named_leaves, one_line
 from rts.fitting.run import LONGEST_REASON, NO_GRADIENT, Astray, Report, Run, progress_bar, require
 from rts.fitting.schedule import Stage, checked_schedule
-from rts.interfaces import Residuals
-from rts.plugin_base import overrides
 from rts.sampling.adaptive import finest
 from rts.trees import Array, Tree, leaves, map_leaves
 

@@ -15,6 +15,7 @@ from rts.arguments import quoted
 from rts.arrays import described, from_numbers, is_finite, kind_of, shape_of
 from rts.camera import Camera
 from rts.checks import (
+    CheckedPart,
     check_background,
     check_cameras,
     check_floating,
@@ -23,6 +24,10 @@ from rts.checks import (
     check_scene,
     is_count,
 )
+from rts.contracts.plugin import overrides
+from rts.contracts.records import ArraySpec, Fine, Splats
+from rts.contracts.residuals import Residuals
+from rts.contracts.splatter import Splatter, SummingSplatter
 from rts.engines import Engine, constants, context_of, engine_of, exemplar, namespace
 from rts.errors import InputError
 from rts.fitting.least_squares import flatten, normal_equations
@@ -30,10 +35,7 @@ from rts.fitting.losses import Loss
 from rts.fitting.names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
-from rts.interfaces import Residuals, Splatter, SummingSplatter
-from rts.parts import CheckedPart, Part
-from rts.plugin_base import overrides
-from rts.records import ArraySpec, Fine, Splats
+from rts.parts import Part
 from rts.rendering.batched import render_views
 from rts.rendering.image import render
 from rts.rendering.samples import sample

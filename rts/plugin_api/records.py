@@ -1,5 +1,5 @@
 """Records that pass between the library and plugins."""
 
-from rts.records import ArraySpec, Cells, Fragments, Proxy, RayHits, Rays, Request, Samples, Splats
+from rts.contracts.records import ArraySpec, Cells, Fragments, Proxy, RayHits, Rays, Request, Samples, Splats
 
 __all__ = ["ArraySpec", "Cells", "Fragments", "Proxy", "RayHits", "Rays", "Request", "Samples", "Splats"]

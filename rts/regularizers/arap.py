@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from rts.contracts.records import ArraySpec
 from rts.engines import engine_of
-from rts.records import ArraySpec
 from rts.regularizers.connectivity import both_ways, edge_weights
 from rts.regularizers.regularizer import OfRestShape, combined
 from rts.trees import Array

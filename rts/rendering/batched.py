@@ -12,11 +12,11 @@ from rts.arrays import described, shape_of
 from rts.camera import Camera
 from rts.channels import cropped_image
 from rts.checks import check_background, check_cameras
+from rts.contracts.records import Sampled
 from rts.engines import Context, context_of_scene, is_constant, namespace, uncompiled
 from rts.errors import InputError
 from rts.operations.inset import averaged
 from rts.parts import Part
-from rts.records import Sampled
 from rts.rendering.image import image_of, over_background, seen, splatted
 from rts.rendering.samples import sampled_scene
 from rts.rendering.scene import Scene

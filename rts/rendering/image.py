@@ -11,13 +11,13 @@ from rts.arguments import quoted
 from rts.camera import Camera
 from rts.channels import cropped_image
 from rts.checks import check_background, check_splatter
+from rts.contracts.plugin import promised
+from rts.contracts.records import Sampled, Splats
+from rts.contracts.splatter import Splatter
 from rts.engines import Context, constants, context_of, engine_of, is_constant, namespace, uncompiled, value_of
 from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
-from rts.interfaces import Splatter
 from rts.operations.inset import averaged, painted_inset, with_inset
 from rts.parts import Part
-from rts.plugin_base import promised
-from rts.records import Sampled, Splats
 from rts.rendering.samples import coarse_scene, sampled_scene, with_fine
 from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings

@@ -12,11 +12,11 @@ import numpy as np
 from rts.arguments import check_flag
 from rts.camera import Camera
 from rts.checks import check_memory
+from rts.contracts.plugin import promised
+from rts.contracts.records import Hidden, Request, Sampled
 from rts.engines import is_traced, uncompiled
 from rts.errors import InputError
 from rts.parts import Part
-from rts.plugin_base import promised
-from rts.records import Hidden, Request, Sampled
 from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.adaptive import Adaptive

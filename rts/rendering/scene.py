@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from rts.camera import Camera
-from rts.checks import check_ratio, check_sampler, check_scene, suited_sampler
+from rts.checks import CheckedPart, check_ratio, check_sampler, check_scene, suited_sampler
+from rts.contracts.sampler import Sampler
+from rts.contracts.splatter import Splatter
 from rts.engines import Context, context_of_scene
-from rts.interfaces import Sampler, Splatter
-from rts.parts import CheckedPart, Part
+from rts.parts import Part
 from rts.sampling.hidden import HiddenBySplatter, hidden_by
 from rts.sampling.prepared import Prepared
 from rts.sampling.winding import warn_of_winding

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from rts.checks import check_size, check_splatter
-from rts.interfaces import Splatter
+from rts.contracts.splatter import Splatter
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.hidden import planned
 

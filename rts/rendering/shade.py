@@ -11,14 +11,13 @@ from typing import Any
 
 from rts.arrays import described, kind_of, shape_of
 from rts.camera import Camera
-from rts.checks import check_shaded
+from rts.checks import CheckedPart, check_shaded
+from rts.contracts.records import Samples
 from rts.engines import Context, Engine, is_constant, namespace
 from rts.errors import InputError
 from rts.footprints import FOOTPRINT, uv_footprint
 from rts.gbuffer import GBuffer
 from rts.operations.linear import affine_map
-from rts.parts import CheckedPart
-from rts.records import Samples
 from rts.row_cameras import RowCameras
 from rts.trees import Array, Tree
 

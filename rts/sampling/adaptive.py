@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from rts.arguments import quoted
-from rts.checks import is_count, is_real
+from rts.checks import CheckedPart, is_count, is_real
 from rts.errors import InputError
-from rts.parts import CheckedPart
 from rts.threads import parallel, read_only
 
 MOST = 64

@@ -8,11 +8,12 @@ from typing import NamedTuple
 from rts import registry
 from rts.camera import Camera
 from rts.checks import check_sampler
+from rts.contracts.records import Request, Samples
+from rts.contracts.sampler import Sampler
+from rts.contracts.surface import TriangleSurface
 from rts.engines import engine_of, is_constant
 from rts.errors import PluginError
-from rts.interfaces import Sampler, TriangleSurface
 from rts.parts import Part
-from rts.records import Request, Samples
 
 STATIC_FACES = 4_000_000
 """From so many triangles on, rays at a kept structure are faster than drawing all (benchmarks/speed/samplers.py)."""

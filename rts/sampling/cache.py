@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xxhash
 
-from rts.records import Proxy
+from rts.contracts.records import Proxy
 from rts.trees import Tree, leaves
 
 KEPT = 2

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.camera import Camera
+from rts.checks import CheckedPart
+from rts.contracts.records import Proxy
+from rts.contracts.surface import TriangleSurface
 from rts.engines import stopped, value_of
-from rts.interfaces import TriangleSurface
-from rts.parts import CheckedPart
-from rts.records import Proxy
 from rts.trees import Tree, map_leaves
 
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.records import Fragments
+from rts.contracts.records import Fragments
 from rts.threads import read_only
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from rts.camera import Camera
-from rts.records import Cells, Fragments, Proxy
+from rts.contracts.records import Cells, Fragments, Proxy
 from rts.threads import parallel, read_only
 
 OTHER_COLUMNS = np.array([[j for j in range(4) if j != i] for i in range(4)])
@@ -17,7 +17,7 @@ ALTERNATING = np.array([1, -1, 1, -1])
 def facing(
     fragments: Fragments, kept: np.ndarray, proxy: Proxy, pieces: np.ndarray, camera: Camera, listed: bool
 ) -> np.ndarray:
-    """Which piece is seen, and from which side: (K, H, W) int16, see `rts.records.Samples`.
+    """Which piece is seen, and from which side: (K, H, W) int16, see `rts.contracts.records.Samples`.
 
     It is found where splatters may compare it: in cells that have hidden layers, and beside them. It is 0 elsewhere.
     The last layer of fragments is marked by `MORE_BEHIND`.

@@ -11,13 +11,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from rts.checks import CheckedPart
+from rts.contracts.plugin import overrides, promised
+from rts.contracts.records import ArraySpec, Decision, Hidden, Question, Sampled, Samples
+from rts.contracts.splatter import Splatter
+from rts.contracts.surface import TriangleSurface
 from rts.engines import engine_of, is_constant, namespace, value_of
 from rts.errors import InputError, LayersWarning, warn
-from rts.interfaces import Splatter, TriangleSurface
 from rts.operations.operation import known_value
-from rts.parts import CheckedPart
-from rts.plugin_base import overrides, promised
-from rts.records import ArraySpec, Decision, Hidden, Question, Sampled, Samples
 from rts.sampling.exits import beside_outlines
 from rts.sampling.extremes import largest
 from rts.sampling.packing import too_far

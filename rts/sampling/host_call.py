@@ -9,10 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.camera import Camera
+from rts.checks import CheckedPart
+from rts.contracts.records import ON_RAYS, ArraySpec, Cells, Samples
+from rts.contracts.surface import TriangleSurface
 from rts.engines import context_of, floating_bits, is_constant, stopped
-from rts.interfaces import TriangleSurface
-from rts.parts import CheckedPart, Part
-from rts.records import ON_RAYS, ArraySpec, Cells, Samples
+from rts.parts import Part
 from rts.sampling.cache import Entry
 from rts.sampling.settling import rays_of
 from rts.sampling.validation import check_camera

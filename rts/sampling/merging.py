@@ -7,9 +7,9 @@ from functools import partial
 
 import numpy as np
 
+from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
 from rts.engines import engine_of, namespace
 from rts.errors import InputError
-from rts.records import ArraySpec, Cells, Sampled, Samples
 from rts.trees import Array
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from rts.contracts.records import Cells, Fragments, Proxy, Samples
 from rts.errors import InputError
-from rts.records import Cells, Fragments, Proxy, Samples
 from rts.sampling.exits import Exits
 from rts.sampling.extremes import largest, named
 

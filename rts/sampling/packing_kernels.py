@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.compiling import kernel
-from rts.records import Fragments
+from rts.contracts.records import Fragments
 from rts.threads import parallel
 
 

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from rts.camera import Camera
-from rts.interfaces import TriangleSurface
-from rts.records import ArraySpec, Fragments, Proxy, Rays, Samples
+from rts.contracts.records import ArraySpec, Fragments, Proxy, Rays, Samples
+from rts.contracts.surface import TriangleSurface
 from rts.sampling.packing import lift
 from rts.sampling.validation import checked_refined
 from rts.threads import parallel, read_only

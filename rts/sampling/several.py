@@ -14,12 +14,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.camera import Camera
-from rts.checks import check_memory
+from rts.checks import CheckedPart, check_memory
+from rts.contracts.plugin import overrides
+from rts.contracts.records import ArraySpec, Cells, Decision, Fragments, Question, Sampled, Samples
+from rts.contracts.surface import TriangleSurface
 from rts.engines import engine_of, is_traced, namespace, stopped, value_of
-from rts.interfaces import TriangleSurface
-from rts.parts import CheckedPart
-from rts.plugin_base import overrides
-from rts.records import ArraySpec, Cells, Decision, Fragments, Question, Sampled, Samples
 from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.cache import Entry

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rts.contracts.records import ArraySpec, Cells, Decision, Fine, Question, Sampled, Samples
 from rts.engines import Engine, constants, engine_of, namespace
-from rts.records import ArraySpec, Cells, Decision, Fine, Question, Sampled, Samples
 from rts.sampling.hidden import HiddenBySplatter, numbers_of
 from rts.threads import parallel, read_only
 from rts.trees import Array

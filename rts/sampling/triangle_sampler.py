@@ -11,12 +11,13 @@ import numpy as np
 
 from rts.arrays import shape_of
 from rts.camera import Camera
+from rts.contracts.plugin import overrides
+from rts.contracts.records import ArraySpec, Decision, Fragments, Hidden, Proxy, Question, Request, Samples
+from rts.contracts.sampler import Sampler
+from rts.contracts.surface import TriangleSurface
 from rts.engines import stopped, value_of
 from rts.errors import InputError, PluginError
-from rts.interfaces import Sampler, TriangleSurface
 from rts.parts import Part
-from rts.plugin_base import overrides
-from rts.records import ArraySpec, Decision, Fragments, Hidden, Proxy, Question, Request, Samples
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines
 from rts.sampling.extremes import largest

@@ -10,10 +10,10 @@ import numpy as np
 from rts.arguments import is_invertible, one_line
 from rts.arrays import shape_of
 from rts.camera import Camera
+from rts.contracts.records import Fragments, Proxy, Samples
+from rts.contracts.surface import TriangleSurface
 from rts.engines import namespace
 from rts.errors import InputError
-from rts.interfaces import TriangleSurface
-from rts.records import Fragments, Proxy, Samples
 from rts.sampling.extremes import largest
 from rts.sampling.packing import covered_cells
 from rts.splatting.layers import check_rows

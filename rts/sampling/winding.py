@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from rts.camera import Camera
+from rts.checks import CheckedPart
+from rts.contracts.surface import TriangleSurface
 from rts.engines import stopped
 from rts.errors import InputWarning, warn
-from rts.interfaces import TriangleSurface
-from rts.parts import CheckedPart
 from rts.sampling.emptiness import known_tree
 
 FLAT = 1e-6

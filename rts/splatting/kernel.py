@@ -16,16 +16,17 @@ import abc
 import functools
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from rts.arguments import quoted
 from rts.checks import is_count, is_real
+from rts.contracts.records import Splats
+from rts.contracts.splatter import Splatter
 from rts.engines import engine_of, namespace
 from rts.errors import InputError
-from rts.interfaces import Splatter
-from rts.records import Splats
-from rts.splatting.layers import NEIGHBOURS, OFFSETS, Depths, bordered, check_settled, nothing, unpack
+from rts.splatting.layers import NEIGHBOURS, OFFSETS, Depths, bordered, check_rows, check_settled, nothing, unpack
 from rts.trees import Array
 
 SIGMA, EPSILON = 0.5, 0.05
@@ -50,6 +51,8 @@ class Kernel(Splatter):
     sigma: float = SIGMA
     epsilon: float = EPSILON
     calibration: float | None = 1.0
+    TIE: ClassVar[float] = TIE
+    LEAST_EPSILON: ClassVar[float] = LEAST_EPSILON
 
     def __post_init__(self):
         if not (is_real(self.sigma) and LEAST_SIGMA <= self.sigma <= LARGEST_SIGMA):
@@ -64,6 +67,15 @@ class Kernel(Splatter):
         if splats.rgba.shape[0] == 0:
             return nothing(splats.rgba, splats.row)
         return settled(self.accumulate(splats), splats)
+
+    @staticmethod
+    def check(row: Array, count: int, settled: Array | None = None, exits: Array | None = None) -> None:
+        """Refuse fields of `Splats` that name none of so many samples, before compiled code reads there."""
+        check_rows(row, count)
+        if exits is not None:
+            check_rows(exits, count)
+        if settled is not None:
+            check_settled(settled, row.shape[1:], count)
 
     @abc.abstractmethod
     def accumulate(self, splats: Splats) -> Array:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from rts.contracts.records import Cells, Splats
 from rts.engines import namespace, stopped
 from rts.errors import InputError
 from rts.operations.operation import known_value
-from rts.records import Cells, Splats
 from rts.sampling.extremes import extent
 from rts.trees import Array
 

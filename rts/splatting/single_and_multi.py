@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rts.contracts.records import Splats
+from rts.contracts.splatter import Splatter
 from rts.engines import namespace
-from rts.interfaces import Splatter
-from rts.records import Splats
 from rts.splatting.kernel import LEAST_EPSILON, Kernel
 from rts.splatting.layers import (
     NEIGHBOURS,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import functools
 import operator
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
+from rts.contracts.records import Splats
 from rts.engines import engine_of
-from rts.records import Splats
 from rts.splatting import crossings, rims
 from rts.splatting.kernel import LEAST_EPSILON, Kernel
 from rts.splatting.layers import NEIGHBOURS, Depths, Layers, all_of, nearest, normalised, over
@@ -64,6 +65,9 @@ class Visible(Kernel):
     crossings: bool = True
     facing: bool = True
     exits: bool = True
+    CONTINUED: ClassVar[float] = CONTINUED
+    RIMS: ClassVar[tuple[float, ...]] = RIMS
+    CROSSINGS: ClassVar[tuple[float, ...]] = CROSSINGS
     reach = 3  # Depths three cells away may decide how an outline or a line of crossing moves.
 
     @property

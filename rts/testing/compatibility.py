@@ -11,9 +11,9 @@ import numpy as np
 from rts import registry
 from rts.camera import Camera
 from rts.checks import check_sampler, check_scene
+from rts.contracts.surface import RaySurface, TriangleSurface
 from rts.engines import Engine, constants, engine_named, is_constant
 from rts.errors import EmptyImageWarning, RtsError
-from rts.interfaces import RaySurface, TriangleSurface
 from rts.parts import Part
 from rts.rendering.image import render
 from rts.rendering.settings import RenderSettings

@@ -10,10 +10,10 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from rts.contracts.records import ArraySpec, Cells, Samples
 from rts.engines import OWNERS, Engine, engine_named
 from rts.errors import EngineError
 from rts.operations.rigid import rigid
-from rts.records import ArraySpec, Cells, Samples
 from rts.testing import derivatives, scenes
 from rts.testing.claims import claim, claim_close, no_error
 from rts.testing.conformance import Conformance

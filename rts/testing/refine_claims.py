@@ -6,8 +6,8 @@ import numpy as np
 
 from rts import registry
 from rts.camera import Camera
+from rts.contracts.surface import RaySurface, TriangleSurface
 from rts.errors import InputError
-from rts.interfaces import RaySurface, TriangleSurface
 from rts.parts import Part
 from rts.sampling.packing import lift
 from rts.sampling.settling import refined

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rts.camera import Camera
+from rts.contracts.records import Sampled
 from rts.parts import Part
-from rts.records import Sampled
 from rts.testing.claims import claim
 from rts.testing.compatibility import APRON
 from rts.testing.scenes import GRID, SIZE

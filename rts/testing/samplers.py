@@ -11,11 +11,11 @@ import pytest
 from rts import registry
 from rts.camera import Camera
 from rts.checks import check_sampler
+from rts.contracts.records import Decision, Question, Request, Sampled
+from rts.contracts.surface import Surface, TriangleSurface
 from rts.errors import InputError
 from rts.gbuffer import GBuffer
-from rts.interfaces import Surface, TriangleSurface
 from rts.parts import Part
-from rts.records import Decision, Question, Request, Sampled
 from rts.rendering.renderer import prepare
 from rts.rendering.samples import sample
 from rts.testing import derivatives, scenes
@@ -53,7 +53,7 @@ class Fronts:
     settles, size = False, 0.0
 
     def decide(self, question: Question) -> Decision:
-        """See `rts.records.Hidden`."""
+        """See `rts.contracts.records.Hidden`."""
         covered, depth, _ = question
         claim(covered.dtype == bool and covered.shape == depth.shape, "decide is not asked with (K, H, W) arrays")
         kept = covered & (np.arange(len(covered)) == 0)[:, None, None]

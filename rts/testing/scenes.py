@@ -9,8 +9,8 @@ import numpy as np
 from rts import registry
 from rts.camera import Camera
 from rts.checks import check_scene
+from rts.contracts.records import Sampled
 from rts.parts import Part
-from rts.records import Sampled
 from rts.rendering.image import render, render_samples
 from rts.rendering.samples import sample
 from rts.testing import compatibility

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from rts.checks import check_shader
+from rts.contracts.plugin import promised
+from rts.contracts.shader import Shader
 from rts.engines import Engine, constants, engine_of
 from rts.gbuffer import GBuffer
-from rts.interfaces import Shader
-from rts.plugin_base import promised
 from rts.row_cameras import RowCameras
 from rts.testing import derivatives, scenes
 from rts.testing.claims import claim, claim_close, claim_finite, no_error, refusal

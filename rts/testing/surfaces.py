@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from rts.camera import Camera
+from rts.contracts.records import Cells, Proxy, Samples
+from rts.contracts.surface import RaySurface, TriangleSurface
 from rts.engines import engine_of
 from rts.gbuffer import GBuffer
-from rts.interfaces import RaySurface, TriangleSurface
 from rts.parts import Part
-from rts.records import Cells, Proxy, Samples
 from rts.testing import derivatives, scenes
 from rts.testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing
 from rts.testing.claims import claim, claim_close, claim_finite, no_error, refusal

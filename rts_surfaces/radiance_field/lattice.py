@@ -7,7 +7,7 @@ import hashlib
 import os
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -19,15 +19,12 @@ from rts_surfaces.implicit.lattice import Lattice
 from rts_surfaces.radiance_field.chunks import CHUNK, fast_engine, progress_bar
 from rts_surfaces.radiance_field.network import density, placed
 
-if TYPE_CHECKING:
-    from rts_surfaces.radiance_field.field import RadianceField
-
 VERSION = b"rts density lattice 1"
 """Changes when lattices that are kept no longer hold."""
 
 
 def lattice(
-    field: RadianceField,
+    field: Any,
     bounds: Any,
     shape: tuple[int, int, int],
     *,

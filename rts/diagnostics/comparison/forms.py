@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.camera import Camera
+from rts.contracts.surface import Rate
 from rts.diagnostics.comparison.scene import SceneFunction, parts_of
-from rts.interfaces import Rate
 from rts.parts import Part
 from rts.trees import Tree
 

@@ -13,11 +13,11 @@ import numpy as np
 from rts.arguments import quoted
 from rts.camera import Camera
 from rts.checks import check_shader
+from rts.contracts.plugin import promised
+from rts.contracts.surface import TriangleSurface
 from rts.engines import Engine, constants, engine_of, exemplar, is_constant
 from rts.errors import InputError
-from rts.interfaces import TriangleSurface
 from rts.parts import Part
-from rts.plugin_base import promised
 from rts.shading import Unlit
 from rts.trees import Array, Tree, collected, leaves, map_leaves
 

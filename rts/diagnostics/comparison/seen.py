@@ -16,11 +16,11 @@ import numpy as np
 
 from rts import registry
 from rts.camera import Camera
-from rts.checks import check_scene
+from rts.checks import CheckedPart, check_scene
 from rts.diagnostics.comparison.scene import Scene
 from rts.engines import Engine, engine_of
 from rts.errors import InputError
-from rts.parts import CheckedPart, Part
+from rts.parts import Part
 from rts.shading import Silhouette, Unlit
 from rts.trees import map_leaves
 

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.contracts.records import Sampled
 from rts.engines import engine_of
-from rts.records import Sampled
 
 FINE, CELLS = 8, 2**22
 """Cells along each side of a sample, to see what is thinner; fewer where there would be more than so many in all."""

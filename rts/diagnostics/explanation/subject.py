@@ -12,14 +12,14 @@ import numpy as np
 
 from rts.arrays import kind_of
 from rts.camera import Camera
-from rts.checks import check_colors, check_scene, check_splatter
+from rts.checks import CheckedPart, check_colors, check_scene, check_splatter
+from rts.contracts.records import Sampled
 from rts.diagnostics.explanation.fineness import Fineness, fineness
 from rts.diagnostics.steps import pixel_step
 from rts.engines import Engine, is_constant, namespace
 from rts.errors import InputError
 from rts.fitting.names import named_leaves
-from rts.parts import CheckedPart, Part
-from rts.records import Sampled
+from rts.parts import Part
 from rts.rendering.image import render
 from rts.rendering.samples import sample
 from rts.sampling.adaptive import finest

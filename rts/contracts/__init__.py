@@ -1,0 +1,1 @@
+"""What plugins implement: a base class for each kind, and the records that pass between them."""

@@ -1,0 +1,38 @@
+"""The base of residuals, which `rts.fit` makes small."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable
+from typing import Any
+
+from rts.contracts.plugin import Plugin
+from rts.trees import Array, Tree
+
+
+class Residuals(Plugin):
+    """Function of parameters that `rts.fit` makes small. A plain function will do, which has none of the other methods.
+
+    Attributes:
+        loss: what their mean is taken of, an `rts.Loss`; None for the square. What `at_stage` gives has its own, or
+            where that is None this one.
+    """
+
+    loss: Any = None
+
+    @abc.abstractmethod
+    def __call__(self, parameters: Tree) -> Array:
+        """Residuals, of any shape."""
+
+    def at_stage(self, stage: Any) -> Callable[[Tree], Array]:
+        """The residuals at another resolution, for `rts.fit` with a schedule."""
+        raise NotImplementedError
+
+    def normal_equations(self, parameters: Tree) -> tuple[Array, Array, Array]:
+        """Mean loss () of the n residuals r, JᵀSJ / n (U, U) and JᵀWr / n (U,) for their Jacobian J.
+
+        W and S are diagonals of `self.loss.weights(r)`, ones for the mean square.
+        U counts the numbers in the parameters, in the order of `rts.trees.leaves`. All are arrays of the parameters'
+        engine, which may be traced. With it, Levenberg–Marquardt makes no Jacobian of its own.
+        """
+        raise NotImplementedError

@@ -1,0 +1,75 @@
+"""The base of shaders, and plain functions as shaders."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Callable, Mapping
+
+from rts.arguments import quoted
+from rts.camera import Camera
+from rts.contracts.plugin import Plugin
+from rts.gbuffer import GBuffer
+from rts.trees import Array, Tree
+
+
+class Shader(Plugin):
+    """Colours samples. Any function with the signature of `__call__` will do; its attributes are those of a shader.
+
+    Promises but for `opaque` are of a class and its `__call__`: a subclass with its own has to say so itself.
+
+    Attributes:
+        channels: C, how many numbers it gives besides alpha: 3 for colours, any other number for features.
+        opaque: a promise that alpha is 1.
+        uniform: a promise that all samples of a part have one colour, through whatever camera. It may depend on θ.
+        takes_views: a promise that a call may be of samples of several views, as `rts.render_views` then makes it:
+            `camera` is a `RowCameras`, whose methods give a row for each sample. A shader that says so also says
+            what it `reads`, without "uv_footprint".
+        reads: a promise that it needs no entries but these, of the G-buffer besides position and of θ; None for all.
+            Samples then carry no others. `rts.explain` lists entries of θ that nobody reads, and what is almost one of
+            these is warned of.
+    """
+
+    channels: int = 3
+    opaque: bool = False
+    uniform: bool = False
+    takes_views: bool = False
+    reads: tuple[str, ...] | None = None
+
+    @abc.abstractmethod
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+        """The colours of N samples, each from its own sample alone: N may be all, or some thousands at a time.
+
+        Args:
+            theta: θ of the part.
+            gbuffer: its G-buffer, in world space.
+            camera: the camera of the whole image; for a shader that `takes_views` it may be a `RowCameras`.
+
+        Returns:
+            (N, 4) premultiplied linear RGBA, in [0, 1]; (N, C + 1), alpha last, of a shader with other `channels`, all
+            of them multiplied by alpha and otherwise of any value.
+
+        Raises:
+            InputError: an entry that the shader needs is missing.
+        """
+
+
+class FunctionShader(Shader):
+    """A function as a shader, with the attributes of a shader that it has."""
+
+    def __init__(self, function: Callable[..., Array]):
+        self.function = function
+        for name in ("channels", "opaque", "uniform", "takes_views", "reads"):
+            setattr(self, name, getattr(function, name, getattr(Shader, name)))
+
+    def __call__(self, theta: Mapping[str, Tree], gbuffer: GBuffer, camera: Camera) -> Array:
+        """See `Shader`."""
+        return self.function(theta, gbuffer, camera)
+
+    def __repr__(self) -> str:
+        return quoted(self.function)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, FunctionShader) and self.function == other.function
+
+    def __hash__(self) -> int:
+        return hash(self.function)

@@ -1,0 +1,124 @@
+"""The bases of splatters."""
+
+from __future__ import annotations
+
+import abc
+from typing import Any, final
+
+import numpy as np
+
+from rts.arrays import from_numbers, shape_of, without_border
+from rts.contracts.plugin import Plugin
+from rts.contracts.records import Cells, Splats
+from rts.engines import constants, engine_of, exemplar, namespace
+from rts.errors import InputError
+from rts.trees import Array
+
+
+class Splatter(Plugin):
+    """Turns shaded samples into an image that has derivatives at occlusion boundaries.
+
+    Attributes:
+        layers: how many layers it looks at, from the front; None for all that there are.
+        reach: how many cells away from its own, along either axis, a sample may have an effect.
+        reads: which of "facing" and "exit" of `Cells` it reads; these are found only then.
+        fills_interiors: a promise on samples of one opaque colour, on cells' centres. A cell shows this colour where
+            all nine samples around it are fronts and no hidden one beside them is `needed`, and nothing where none of
+            the nine is there, whatever moves by little. A cell that is `settled` shows the colour of that sample,
+            whatever samples there are; so those farther than `reach` from all other cells need not be there, or where
+            `Splats.wanted` is told, those farther than one cell more from the others of them.
+    """
+
+    layers: int | None = None
+    reach: int = 1
+    reads: frozenset[str] = frozenset()
+    fills_interiors: bool = False
+
+    @abc.abstractmethod
+    def image(self, splats: Splats) -> Array:
+        """The image of all cells, those of the border included: (H, W, 4) premultiplied RGBA."""
+
+    def cropped(self, splats: Splats) -> Array:
+        """The image without the border: (H − 2 border, W − 2 border, 4). Override it only to save a copy."""
+        return without_border(self.image(splats), splats.border)
+
+    @final
+    def splat(self, positions: Array, rgba: Array, row: Array, border: int = 0) -> Array:
+        """Splat packed samples; for direct calls, with arrays of any engine, lists and numbers.
+
+        Args:
+            positions: (N, 3) pixel x, pixel y, linear depth.
+            rgba: (N, 4) premultiplied.
+            row: (K, H, W) int32, the sample of each cell front to back, or −1.
+            border: cells at each side that splat into the image but are no part of it.
+
+        Returns:
+            (H − 2 border, W − 2 border, 4) premultiplied RGBA.
+
+        Raises:
+            InputError: wrong shapes, or `row` holds no integers.
+            EngineError: arrays of two engines.
+        """
+        return self.cropped(_checked_splats(positions, rgba, row, border))
+
+    def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """The samples that can reach the image, in value or derivative, where all are opaque and on pixel centres.
+
+        Others are dropped before they are evaluated, in a class that overrides it. Host arrays.
+
+        Args:
+            covered: (K, H, W) bool.
+            depth: (K, H, W) float.
+
+        Returns:
+            (K, H, W) bool; by default all that are covered.
+        """
+        return covered
+
+
+class SummingSplatter(Splatter):
+    """A splatter that can sum up the normal equations of an image without the Jacobian of it."""
+
+    @abc.abstractmethod
+    def normal_equations(
+        self,
+        splats: Splats,
+        t_positions: Array,
+        t_rgba: Array | None,
+        target: Array,
+        weights: Array | None = None,
+        background: Array | None = None,
+        loss: Any = None,
+    ) -> tuple[Array, Array, Array] | None:
+        """Normal equations of the n residuals weight · (image − target), without their Jacobian.
+
+        Args:
+            splats: the samples; without their border there are s h × s w cells, and a pixel is the mean of s × s.
+            t_positions: (T, N, 3), tangents of positions along T directions.
+            t_rgba: (T, N, 4), tangents of colours; None for zeros.
+            target: (h, w, C): alpha (C = 1), colours (3) or both (4).
+            weights: (h, w, 1) or (h, w, C); None for ones.
+            background: (h, w, 4), what the image is composited onto, or None.
+            loss: of the residuals, an `rts.Loss`; None for the square.
+
+        Returns:
+            Mean loss (), JᵀSJ / n (T, T) and JᵀWr / n (T,), where W and S are diagonals of `loss.weights(r)`, ones for
+            the square; None where it cannot work on these arrays.
+        """
+
+
+def _checked_splats(positions: Any, rgba: Any, row: Any, border: int = 0) -> Splats:
+    """Splats of arrays, or of lists, all of one engine; wrong shapes and dtypes are refused."""
+    given = from_numbers(positions, "positions"), from_numbers(rgba, "rgba")
+    row = np.asarray(from_numbers(row, "row"), np.int32) if isinstance(row, (list, tuple)) else from_numbers(row, "row")
+    shapes = [shape_of(x) for x in (*given, row)]
+    ok = len(shapes[0]) == 2 and shapes[0][1] == 3 and shapes[1] == (shapes[0][0], 4) and len(shapes[2]) == 3
+    if not ok or shapes[2][0] < 1:
+        raise InputError(
+            f"positions, rgba and row have shapes {shapes[0]}, {shapes[1]}, {shapes[2]}; "
+            f"expected (N, 3), (N, 4), (K, H, W)"
+        )
+    if not namespace(row).isdtype(row.dtype, "signed integer"):
+        raise InputError(f"row has dtype {row.dtype}; expected signed integers, -1 where a cell is empty")
+    positions, rgba, row = constants((*given, row), engine_of(given, row), exemplar(given))
+    return Splats(positions, rgba, Cells(row), border=border)
