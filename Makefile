@@ -23,7 +23,7 @@ check: lint types test wheel oldest
 demo: $(VENV)/.demo
 	$(BIN)/rts demo -o out
 
-# Kernels that both workers need are compiled once, ahead; where that fails, the tests say more.
+# Loops that both workers need are compiled once, ahead; where that fails, the tests say more.
 test: system $(VENV)/.test
 	-$(BIN)/rts warmup
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile

@@ -1,6 +1,6 @@
 """How long a newcomer waits: the first call of each kind where nothing has been compiled, the next, and the next day.
 
-Each is a process of its own with an empty folder for compiled kernels, and then another that finds them there:
+Each is a process of its own with an empty folder for compiled loops, and then another that finds them there:
 
     python -m benchmarks.cold_start
     python -m benchmarks.cold_start --tree ../other_checkout
@@ -103,9 +103,9 @@ def seconds(task: str) -> list[float]:
     return [b - a for a, b in zip(times[:-1], times[1:], strict=True)]
 
 
-def measured(task: str, kernels: str, tree: Path) -> list[float]:
-    """`seconds` of a process that keeps compiled kernels in a folder, by the packages of a tree."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": kernels}
+def measured(task: str, loops: str, tree: Path) -> list[float]:
+    """`seconds` of a process that keeps compiled loops in a folder, by the packages of a tree."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": loops}
     command = f"import runpy; print(__import__('json').dumps(runpy.run_path({str(SELF)!r})['seconds']({task!r})))"
     done = subprocess.run(
         [sys.executable, "-c", command], cwd=tree, env=environment, check=True, stdout=subprocess.PIPE
@@ -119,8 +119,8 @@ def main() -> None:
     args = parser.parse_args()
     lines = []
     for task in TASKS:
-        with tempfile.TemporaryDirectory() as kernels:
-            first, later = (measured(task, kernels, args.tree.resolve()) for _ in range(2))
+        with tempfile.TemporaryDirectory() as loops:
+            first, later = (measured(task, loops, args.tree.resolve()) for _ in range(2))
         lines.append([task, *(f"{x:.2f}" for x in (first[1], first[2], later[0], later[1]))])
     print(table(["call", "first, s", "second, s", "imports, s", "first of the next process, s"], lines))
 

@@ -11,7 +11,7 @@ The surfaces that come with it are attributes, too, loaded when they are first u
 
 from typing import TYPE_CHECKING, Any
 
-from rts import errors, registry, regularizers  # noqa: F401
+from rts import errors, registry, regularizers
 from rts.camera import Camera
 from rts.contracts.residuals import Residuals
 from rts.contracts.sampler import Sampler
@@ -112,6 +112,7 @@ __all__ = [
     "TriangleSurface",
     "check_gradient",
     "engine_of",
+    "errors",
     "explain",
     "fit",
     "gradient_image",

@@ -1,4 +1,4 @@
-"""What a companion does: it compiles kernels in an order that leaves others to the process that it helps."""
+"""What a companion does: it compiles loops in an order that leaves others to the process that it helps."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ PATIENCE = 30.0
 
 
 def serve(descriptor: int, everything: bool) -> None:
-    """Compile, one kernel after another, until there is nothing more to do or the standard input ends.
+    """Compile, one loop after another, until there is nothing more to do or the standard input ends.
 
     Args:
         descriptor: of the file of the claims; −1 if there is none.
-        everything: whether to compile all that is known, and let errors through; else what goes with the kernels
+        everything: whether to compile all that is known, and let errors through; else what goes with the loops
             whose numbers come in.
     """
     missed: SimpleQueue[int] = SimpleQueue()
@@ -35,7 +35,7 @@ def serve(descriptor: int, everything: bool) -> None:
     for key, need in _all() if everything else _asked(missed):
         if claims is None or claims.take(key):
             with contextlib.nullcontext() if everything else contextlib.suppress(Exception):
-                need.kernel.compile(need.types)
+                need.loop.compile(need.types)
             if claims is not None:
                 claims.drop(key)
 

@@ -1,9 +1,9 @@
-"""A companion: a process that compiles kernels beside this one, from the last that this one will need on.
+"""A companion: a process that compiles loops beside this one, from the last that this one will need on.
 
-numba's compiler has one lock a process. So the first kernel that is missing on disk, or that comes to where none is
+numba's compiler has one lock a process. So the first loop that is missing on disk, or that comes to where none is
 kept, starts another process (`rts.accompanying`), which finds out what such a call needs, begins in the last half of
-it, and goes on until the two meet. This process tells which kernels it misses; who compiles which is settled by locks
-on single bytes of a nameless file. Nothing waits for the companion but a kernel that it has begun, and it ends with
+it, and goes on until the two meet. This process tells which loops it misses; who compiles which is settled by locks
+on single bytes of a nameless file. Nothing waits for the companion but a loop that it has begun, and it ends with
 this process.
 """
 
@@ -58,7 +58,7 @@ def number(name: str) -> int:
 
 
 def expect(kind: str) -> None:
-    """Say what kind of call is going on, where its first kernels do not tell."""
+    """Say what kind of call is going on, where its first loops do not tell."""
     if kind not in _expected:
         _expected.append(kind)
         if isinstance(_state, _Companion):
@@ -66,7 +66,7 @@ def expect(kind: str) -> None:
 
 
 def prepare() -> None:
-    """Start the companion of this process, if it may have one, since a kernel will be missing."""
+    """Start the companion of this process, if it may have one, since a loop will be missing."""
     global _state
     with _starting:
         if _state is None:
@@ -74,7 +74,7 @@ def prepare() -> None:
 
 
 def begin(key: int) -> bool:
-    """Say that a kernel is missing on disk; whether another process has compiled it meanwhile, perhaps."""
+    """Say that a loop is missing on disk; whether another process has compiled it meanwhile, perhaps."""
     global _state
     prepare()
     if isinstance(_state, _Companion) and not _state.goes_on():
@@ -83,7 +83,7 @@ def begin(key: int) -> bool:
 
 
 def end(key: int) -> None:
-    """Say that a kernel is on disk now."""
+    """Say that a loop is on disk now."""
     if isinstance(_state, _Companion):
         _state.claims.drop(key)
 
@@ -116,13 +116,13 @@ def _started() -> _Companion | bool:
 
 
 class Claims:
-    """Which kernel each of several processes compiles: locks on bytes of a file, which end with their process."""
+    """Which loop each of several processes compiles: locks on bytes of a file, which end with their process."""
 
     def __init__(self, file: IO[bytes]):
         self.file = file
 
     def take(self, key: int) -> bool:
-        """Claim a kernel, unless another process has it."""
+        """Claim a loop, unless another process has it."""
         try:
             fcntl.lockf(self.file, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, key)
         except (BlockingIOError, PermissionError):
@@ -132,7 +132,7 @@ class Claims:
         return True
 
     def wait(self, key: int) -> None:
-        """Claim a kernel, once nobody else has it."""
+        """Claim a loop, once nobody else has it."""
         with contextlib.suppress(OSError):
             fcntl.lockf(self.file, fcntl.LOCK_EX, 1, key)
 
@@ -228,7 +228,7 @@ class _Companion:
             self.tell(number(kind))
 
     def _end(self) -> None:
-        """At the end of this process, after which some thread or handler may miss a kernel yet."""
+        """At the end of this process, after which some thread or handler may miss a loop yet."""
         global _state
         _state = False
         self.stop()

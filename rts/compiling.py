@@ -1,6 +1,6 @@
-"""How loops are compiled: kernels, which Python calls, and helpers, which only other compiled loops call.
+"""How loops are compiled: those that Python calls, and helpers, which only other loops call.
 
-Kernels are kept on disk; helpers are not, since a helper that is loaded is not inlined. numba makes of every function
+The former are on disk; helpers are not, since a helper that is loaded is not inlined. numba makes of every function
 two wrappers beside its code, one for Python and one for C. Here each has the wrappers that something calls, which
 shortens compilation by a fifth. What is not on disk is compiled here and, meanwhile, in another process
 (`rts.companion`). Where much has to be compiled, a terminal is told.
@@ -33,9 +33,9 @@ except ImportError:  # Windows.
     fcntl = None
 
 try:
-    from rts.pipeline import KERNEL, PART
+    from rts.pipeline import LOOP, PART
 except (ImportError, AttributeError):  # A numba that is built in another way compiles as it does.
-    KERNEL = {"no_cfunc_wrapper": True}
+    LOOP = {"no_cfunc_wrapper": True}
     PART = {"no_cfunc_wrapper": True, "no_cpython_wrapper": True}
 
 TOLD_AFTER = 1.0
@@ -44,12 +44,12 @@ TOLD_AFTER = 1.0
 PACKAGES = ("rts", "rts_backends", "rts_surfaces")
 
 saving = threading.RLock()
-"""Held while a kernel is written to disk."""
+"""Held while a loop is written to disk."""
 
 
-def kernel(function: Callable | None = None, **options: Any) -> Any:
+def loop(function: Callable | None = None, **options: Any) -> Any:
     """Compile a loop that Python calls, without the interpreter lock, and keep it on disk; `options` are numba's."""
-    options |= {"nogil": True} | KERNEL
+    options |= {"nogil": True} | LOOP
 
     def decorate(function: Callable) -> Any:
         made = cast(Any, numba.njit(**options)(function))
@@ -74,7 +74,7 @@ def compiled(function: Callable | None = None, **options: Any) -> Any:
 
 @functools.cache
 def _foresee(folder: str) -> None:
-    """Where a folder has no kernels yet, the companion can begin before one is missed."""
+    """Where a folder has no loops yet, the companion can begin before one is missed."""
     try:
         begun = any(name.endswith(".nbi") for name in os.listdir(folder))
     except OSError:
@@ -85,13 +85,13 @@ def _foresee(folder: str) -> None:
 
 @contextmanager
 def alone(folder: str, writes: bool = True) -> Iterator[None]:
-    """Hold a folder of kernels as the only process that writes, where the system and the file system know such locks.
+    """Hold a folder of loops as the only process that writes, where the system and the file system know such locks.
 
     numba reads a function's index, chooses a name for the code, and writes both, one after the other. Two processes
     that do so at once, for different types, may choose the same name: one type's calls would then run the other's code.
 
     Args:
-        folder: where the kernels are.
+        folder: where the loops are.
         writes: False to hold it together with others that read.
     """
     file = _lock_file(folder)
@@ -116,7 +116,7 @@ def _lock_file(folder: str) -> IO[bytes] | None:
 
 
 class _Cache(FunctionCache):
-    """A kernel's compiled code on disk, which another process may be about to write."""
+    """A loop's compiled code on disk, which another process may be about to write."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """What is on disk; None if it is to be compiled here."""
@@ -147,15 +147,15 @@ def _key(function: Callable, types: Any) -> int:
 
 
 class Need(NamedTuple):
-    """A kernel, and the types of arguments that it is called with.
+    """A loop, and the types of arguments that it is called with.
 
     Attributes:
-        kernel: what compiles it.
+        loop: what compiles it.
         types: numba's.
         effort: how long it takes to compile, compared to others.
     """
 
-    kernel: Any
+    loop: Any
     types: tuple
     effort: float = 1
 
@@ -166,7 +166,7 @@ _stand_ins: dict[Any, Any] = {}
 
 @contextmanager
 def interpreting() -> Iterator[dict[int, Need]]:
-    """Have Python interpret all kernels and helpers, which takes long but for the smallest pictures.
+    """Have Python interpret all loops and helpers, which takes long but for the smallest pictures.
 
     Yields:
         What calls would have had compiled, in the order of the first calls; filled as they come, and with what effort
@@ -182,7 +182,7 @@ def interpreting() -> Iterator[dict[int, Need]]:
         _exchange(_stand_ins)
         _stand_ins.clear()
     for key, need in needs.items():
-        needs[key] = need._replace(effort=_effort(need.kernel))
+        needs[key] = need._replace(effort=_effort(need.loop))
 
 
 def _interpreted(made: Any) -> Any:
@@ -262,9 +262,9 @@ class _Outermost(event.Listener):
 
 
 class _Progress(_Outermost):
-    """Lines on a terminal while kernels are compiled: how many, in which time; nothing where they are on disk.
+    """Lines on a terminal while loops are compiled: how many, in which time; nothing where they are on disk.
 
-    Each comes after twice the time of the one before, and is whole, since nobody knows which kernel is the last.
+    Each comes after twice the time of the one before, and is whole, since nobody knows which loop is the last.
     """
 
     def __init__(self) -> None:
@@ -277,18 +277,18 @@ class _Progress(_Outermost):
         self._since = time.perf_counter()
 
     def ended(self, ours: bool) -> None:
-        """Count a kernel that is done, and tell of it."""
+        """Count a loop that is done, and tell of it."""
         if ours:
             self.count, self.seconds = self.count + 1, self.seconds + time.perf_counter() - self._since
             stream = sys.stderr
             if self.seconds > self._next and stream is not None and stream.isatty():
                 self._next = 2 * self.seconds
-                stream.write(f"rts: compiling kernels (once): {self.count} in {self.seconds:.0f} s\n")
+                stream.write(f"rts: compiling loops (once): {self.count} in {self.seconds:.0f} s\n")
                 stream.flush()
 
 
 class _NoCollection(_Outermost):
-    """No garbage is collected while a kernel is compiled, which makes many objects: it takes a tenth of the time."""
+    """No garbage is collected while a loop is compiled, which makes many objects: it takes a tenth of the time."""
 
     def __init__(self) -> None:
         super().__init__()

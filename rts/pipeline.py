@@ -1,8 +1,8 @@
-"""numba's compiler without what kernels do not need: functions that only they call have no machine code of their own.
+"""numba's compiler without what loops do not need: functions that only they call have no machine code of their own.
 
-A kernel has what it calls linked into it, ours (`rts.compiling.compiled`) and numba's own (`min`, `np.empty`). numba
+A loop has what it calls linked into it, ours (`rts.compiling.compiled`) and numba's own (`min`, `np.empty`). numba
 makes machine code of each of these all the same, with two wrappers where it is numba's. Here they stay intermediate
-code, which is optimised in the kernels. It saves a quarter of the time.
+code, which is optimised in the loops. It saves a quarter of the time.
 
 numba also counts references to every array that a function is handed, by calls that stay in code with branches. Where
 a function of ours is certain to make no array and to return none, whoever calls it holds them all, and nothing is
@@ -121,7 +121,7 @@ class _Flags(Flags):
         return self._copies.setdefault(flags, flags)
 
 
-class _Kernels(Compiler):
+class _Loops(Compiler):
     """Compiles functions that Python calls."""
 
     def __init__(
@@ -131,7 +131,7 @@ class _Kernels(Compiler):
         super().__init__(typingctx, targetctx, library, args, return_type, _Flags(flags), locals)
 
 
-class _Parts(_Kernels):
+class _Parts(_Loops):
     """Compiles functions that only compiled functions call."""
 
     def define_pipelines(self) -> list[Any]:
@@ -219,18 +219,18 @@ class _Uncounted(AnalysisPass):
         return False
 
 
-KERNEL = {"no_cfunc_wrapper": True, "pipeline_class": _Kernels}
+LOOP = {"no_cfunc_wrapper": True, "pipeline_class": _Loops}
 PART = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "pipeline_class": _OwnParts}
 
 
 class _Target(CPU):
-    """The processor, as kernels have it."""
+    """The processor, as loops have it."""
 
 
-def _for_kernels(*args: Any, **options: Any) -> Any:
-    """Numba's decorator, as it is used for its own functions where kernels call them."""
+def _for_loops(*args: Any, **options: Any) -> Any:
+    """Numba's decorator, as it is used for its own functions where loops call them."""
     return numba.jit(*args, **(options | PART | {"pipeline_class": _Parts}))
 
 
 dispatcher_registry[_Target] = dispatcher_registry[CPU]
-jit_registry[_Target] = _for_kernels
+jit_registry[_Target] = _for_loops

@@ -1,4 +1,4 @@
-"""Which kernels ordinary calls need, found by such calls on small pictures, which Python interprets."""
+"""Which loops ordinary calls need, found by such calls on small pictures, which Python interprets."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SIZES = {1: (8, 10), 2: (24, 32)}
 def routes() -> Iterator[list[dict[int, Need | None]]]:
     """What kinds of calls need, by number, in the order in which they need it; ordinary kinds first, a few at a time.
 
-    Those that `companion.expect` knows have the number of their name, too, of no kernel.
+    Those that `companion.expect` knows have the number of their name, too, of no loop.
     """
     yield [_route(_render, 1)]
     yield [_route(kind, 1) for kind in KINDS[1:]]

@@ -1,6 +1,6 @@
 """Compiled loops on all cores.
 
-A pool of plain Python threads runs kernels that release the interpreter lock. numba's own parallel loops are not used:
+A pool of plain Python threads runs loops that release the interpreter lock. numba's own parallel loops are not used:
 their OpenMP threads spin against torch's for milliseconds after every loop, and its other layers must not be entered
 by two threads at once.
 """
@@ -195,17 +195,17 @@ def thread_count() -> int:
 
 
 def read_only(x: np.ndarray, dtype: Any = None) -> np.ndarray:
-    """A contiguous view, copied only if it has to be; always read-only, so that kernels are compiled but once."""
+    """A contiguous view, copied only if it has to be; always read-only, so that loops are compiled but once."""
     view = np.asarray(x, dtype, order="C").view()
     view.flags.writeable = False
     return view
 
 
-def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK, apart: bool = True) -> None:
-    """Call `kernel(start, stop, *args)` so that the ranges cover [0, count); the kernel must release the lock.
+def parallel(loop: Callable, count: int, *args: Any, work: int = LITTLE_WORK, apart: bool = True) -> None:
+    """Call `loop(start, stop, *args)` so that the ranges cover [0, count); it must release the lock.
 
     Args:
-        kernel: the loop.
+        loop: a function of (start, stop, *args).
         count: the end of the range.
         *args: handed on.
         work: nanoseconds that it takes on one thread, roughly.
@@ -214,7 +214,7 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK, 
     """
     # In a task of another loop there may be no helper left, and to ask takes time.
     if work < LITTLE_WORK or count <= 1 or (threads := thread_count()) == 1 or not (free := _helpers.free(threads - 1)):
-        kernel(0, count, *args)
+        loop(0, count, *args)
         return
     tasks = min(count, threads * TASKS_PER_THREAD)
     bounds = [count * i // tasks for i in range(tasks + 1)]
@@ -224,7 +224,7 @@ def parallel(kernel: Callable, count: int, *args: Any, work: int = LITTLE_WORK, 
         nonlocal failed
         try:
             while not failed and (task := next(numbers)) < tasks:
-                kernel(bounds[task], bounds[task + 1], *args)
+                loop(bounds[task], bounds[task + 1], *args)
         except BaseException:
             failed = True  # What has not begun is left, by all.
             raise

@@ -19,14 +19,14 @@ from rts.errors import InputError, RtsError
 from rts.threads import thread_count
 
 MOST = 8
-"""Processes that are used unless more are asked for: there are some sixty kernels."""
+"""Processes that are used unless more are asked for: there are some sixty loops."""
 
 
 def warmup(processes: int | None = None) -> float:
     """Compile ahead what ordinary renders and fits of meshes use, and keep it on disk.
 
-    Kernels are otherwise compiled when they are first called, once for each installation: the first render takes long.
-    Where all is compiled it takes seconds. Kernels are for float32, and for derivatives as well.
+    Loops are otherwise compiled when they are first called, once for each installation: the first render takes long.
+    Where all is compiled it takes seconds. Loops are for float32, and for derivatives as well.
 
     Args:
         processes: how many to use at once; None for as many as there are cores for this process, 8 at most. One where
@@ -55,5 +55,5 @@ def warmup(processes: int | None = None) -> float:
             said = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
             if process.wait():
                 said = said or f"exit code {process.returncode}"
-                raise RtsError(f"could not compile kernels: {said.splitlines()[-1]}")
+                raise RtsError(f"could not compile loops: {said.splitlines()[-1]}")
     return time.perf_counter() - start

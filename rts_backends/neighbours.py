@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
 
 WALK = 16
 """Steps from triangle to triangle at most."""
 
 
-@kernel
+@loop
 def corner_lists(faces, count):
     """For each of `count` vertices the triangles around it: offsets (V + 1,) into members (3 T,)."""
     offsets = np.zeros(count + 1, np.int32)
@@ -29,7 +29,7 @@ def corner_lists(faces, count):
     return offsets, members
 
 
-@kernel
+@loop
 def places(vertices, faces):
     """(T, 3) faces in which corners at one place have one number, though they may be different vertices."""
     size = 4
@@ -77,7 +77,7 @@ def look(t, x, y, matrix, row, keep, vertices, faces, corners):
     return inside, min(ea, eb, ec) / total, z, ea / total, eb / total
 
 
-@kernel
+@loop
 def settle(
     first, last, matrix, row, keep, vertices, faces, around, offsets, members, triangle_ids, barycentrics, depths
 ):  # fmt: skip

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from rts import Camera, TriangleSampler
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel, read_only
 from rts_backends.raster_cells import EVERYTHING, Blocks, touching
@@ -253,7 +253,7 @@ def _sorted(keep: float, order: np.ndarray, rows: np.ndarray, spans: np.ndarray,
     return _List(keep, np.argsort(-sums), offsets, items, rows)
 
 
-@kernel(error_model="numpy")
+@loop(error_model="numpy")
 def _project(first, last, used, vertices, m, screen):
     """Positions (V,) on screen, in steps from the image's middle: columns in the lower 16 bits, rows in the others.
 
@@ -280,7 +280,7 @@ def _project(first, last, used, vertices, m, screen):
             written[v] = (pixels[1, v] << SIXTEEN) | (pixels[0, v] & LOWER)
 
 
-@kernel(error_model="numpy")
+@loop(error_model="numpy")
 def _select(
     first,
     last,
@@ -417,7 +417,7 @@ def _clipped_box(corners, width, height):
     return np.float32(x0), np.float32(x1), np.float32(y0), np.float32(y1)
 
 
-@kernel
+@loop
 def _sort(first, last, order, listed, spans, places, items):
     """Sort the list by bands: write where each band's triangles are, in order, from `places` (chunks, bands) on.
 

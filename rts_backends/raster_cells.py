@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rts import InputError
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 
 SIDE = 16
 """Cells along each side of a block, which are as many as rows of a band of the rasterizer."""
@@ -51,7 +51,7 @@ EVERYTHING = Blocks(np.empty((0, 0), np.int32), np.empty((0, SIDE, SIDE), np.int
 """What stands for all cells: no blocks, and no bits."""
 
 
-@kernel
+@loop
 def _fill(cells, width, table, numbers, bits):
     """Number the blocks that hold any cells, and fill in what these are; how many there are.
 

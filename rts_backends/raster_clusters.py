@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.records import Proxy
 from rts.plugin_api.threads import parallel, read_only
 from rts_backends.raster_cells import EVERYTHING, SIDE, Blocks
@@ -109,7 +109,7 @@ class Clusters(NamedTuple):
         return kept, sides, used[: _use(kept, self.offsets, self.blocks, used)]
 
 
-@kernel
+@loop
 def _extent(vertices):
     """The least x, y and z (3,) of vertices, and how far these reach at most; without what is not finite."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -121,7 +121,7 @@ def _extent(vertices):
     return low, max((high - low).max(), 1e-30)
 
 
-@kernel
+@loop
 def _keys(start, stop, vertices, faces, low, scale, keys):
     """Fill in 33 bits of where triangles are to be, and below the indices: what sorts alike on every machine."""
     for t in range(start, stop):
@@ -142,7 +142,7 @@ def _keys(start, stop, vertices, faces, low, scale, keys):
         keys[t] = key << np.uint64(31) | np.uint64(t)
 
 
-@kernel
+@loop
 def _renumber(vertices, faces, order, new_vertices, new_faces):
     """Fill in the triangles in this order, and the vertices in the order of their use; how many there are."""
     numbers, count = np.full(len(vertices), -1, np.int32), 0
@@ -158,7 +158,7 @@ def _renumber(vertices, faces, order, new_vertices, new_faces):
     return count
 
 
-@kernel
+@loop
 def _find_blocks(faces, last, offsets, blocks):
     """Fill in which blocks of vertices each cluster uses, and where these begin; how many there are."""
     count = 0
@@ -174,7 +174,7 @@ def _find_blocks(faces, last, offsets, blocks):
     return count
 
 
-@kernel(error_model="numpy")
+@loop(error_model="numpy")
 def _bound(start, stop, vertices, faces, boxes, cones):
     """Fill in boxes and cones of clusters."""
     normals = np.empty((SIZE, 3))
@@ -227,7 +227,7 @@ def _same(vertices, i, j):
     return vertices[i, 0] == vertices[j, 0] and vertices[i, 1] == vertices[j, 1] and vertices[i, 2] == vertices[j, 2]
 
 
-@kernel(error_model="numpy")
+@loop(error_model="numpy")
 def _find(boxes, cones, planes, rows, keep, wanted, kept, sides):
     """Fill in which clusters may hold what is wanted, and what these may hold; how many there are.
 
@@ -286,7 +286,7 @@ def _test(boxes, cones, planes, towards, rows, sides):
         sides[cluster] = 0 if out else FRONTS | BACKS if not sure else FRONTS if along > 0 else BACKS
 
 
-@kernel(error_model="numpy")
+@loop(error_model="numpy")
 def _touch(start, stop, kept, boxes, rows, height, width, there, near):
     """Fill in for some clusters whether they may touch blocks that are asked for; `there` counts these from the first.
 
@@ -319,7 +319,7 @@ def _touch(start, stop, kept, boxes, rows, height, width, there, near):
                 near[n] = there[bottom, right] - there[top, right] - there[bottom, left] + there[top, left] > 0
 
 
-@kernel
+@loop
 def _use(kept, offsets, blocks, used):
     """Fill in which blocks of vertices some clusters use; how many there are."""
     every = len(kept) == len(offsets) - 1

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 from rts_backends import raster_cells
 from rts_backends.raster_cells import touching
 from rts_backends.triangles import owns
@@ -23,7 +23,7 @@ NUMBERS = 18
 """Three edge functions (x, y, 1) turned inward; of the corners the depths, and w + z and w − z of clip space."""
 
 
-@kernel(error_model="numpy")
+@loop(error_model="numpy")
 def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragments):
     """Fill the three fragment arrays (K, H · W), band by band.
 
@@ -45,7 +45,7 @@ def draw(first, last, listed, vertices, matrix, view_depth, asked, size, fragmen
             _depths(depths[k, start:stop], nearest[k])
 
 
-@kernel(error_model="numpy")
+@loop(error_model="numpy")
 def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows, nearest, fragments):
     """As `draw`, of some cells: arrays (K, M), which `clear` has emptied, are of their list; depths are left to it.
 
@@ -64,7 +64,7 @@ def draw_cells(first, last, listed, vertices, matrix, view_depth, asked, narrows
         _draw(here, given, top, end, width, (table[band : band + 1], numbers, bits), layered)
 
 
-@kernel
+@loop
 def clear(start, stop, nearest, fragments, drawn):
     """Empty the layers of cells [start, stop) of arrays (K, M), or, once they are drawn, fill in the depths."""
     triangle_ids, barycentrics, depths = fragments

@@ -4,8 +4,8 @@ A corner is (X, Y, clip z, w), at the pixel (X / w, Y / w). The edge function of
 (X, Y, w) (Olano and Greer, *Triangle scan conversion using 2D homogeneous coordinates*, 1997): no triangle needs
 clipping, and two triangles that share an edge evaluate exactly opposite numbers on it. All of it is float64.
 
-These helpers are not cached on disk, only the kernels that call them are: a helper loaded from the cache is not
-inlined, which costs a factor of three. After a change here, touch the files of the kernels, whose caches go by their
+These helpers are not cached on disk, only the loops that call them are: a helper loaded from the cache is not
+inlined, which costs a factor of three. After a change here, touch the files of the loops, whose caches go by their
 own dates.
 """
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from rts import Camera
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 
 
 def pixel_matrix(camera: Camera, size: tuple[int, int]) -> np.ndarray:
@@ -34,7 +34,7 @@ def facing(camera: Camera, cull: str) -> float:
     return float(winding) * {"back": -1.0, "front": 1.0, "none": 0.0}[cull]
 
 
-@kernel
+@loop
 def bounding_sphere(vertices, faces):
     """(4,) centre and radius of a sphere around the vertices that triangles refer to, by their bounding box."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)

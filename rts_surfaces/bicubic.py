@@ -73,7 +73,7 @@ def _specified_normals(rows: Array, params: Array, patch: Array, table: Array) -
 
 def _nets(rows: np.ndarray, operands: Sequence[np.ndarray]) -> np.ndarray:
     """The control points (n, 16, C) of all patches; operands that do not fit one another are refused."""
-    from rts_surfaces import bicubic_kernels
+    from rts_surfaces import bicubic_loops
 
     _, params, patch, table = operands
     if params.shape != (len(patch), 2) or table.shape[1] != 16:
@@ -87,7 +87,7 @@ def _nets(rows: np.ndarray, operands: Sequence[np.ndarray]) -> np.ndarray:
                 f"samples refer to {what} {named.min()} to {named.max()} of {count}; sample this surface anew"
             )
     nets = np.empty((len(table), 16, rows.shape[1]), rows.dtype)
-    parallel(bicubic_kernels.gather, len(table), rows, table, nets, work=50 * len(table))
+    parallel(bicubic_loops.gather, len(table), rows, table, nets, work=50 * len(table))
     return nets
 
 
@@ -101,10 +101,10 @@ def _value_shape(rows: tuple[int, ...], params: tuple[int, ...], *_: tuple[int, 
 
 
 def _sums(rows: np.ndarray, operands: Sequence[np.ndarray], out: np.ndarray) -> None:
-    from rts_surfaces import bicubic_kernels
+    from rts_surfaces import bicubic_loops
 
     _, params, patch, _ = operands
-    parallel(bicubic_kernels.values, len(out), _nets(rows, operands), patch, params, out, work=30 * len(out))
+    parallel(bicubic_loops.values, len(out), _nets(rows, operands), patch, params, out, work=30 * len(out))
 
 
 def _values(operands: Sequence[np.ndarray], out: np.ndarray) -> None:
@@ -116,13 +116,13 @@ def _push_values(operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray |
 
 
 def _pull_values(operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None]) -> None:
-    from rts_surfaces import bicubic_kernels
+    from rts_surfaces import bicubic_loops
 
     if results[0] is not None:
         _, params, patch, table = operands
         found = _shares(_nets(results[0], operands))
-        parallel(bicubic_kernels.pull_values, len(found), patch, params, read_only(g), found, work=30 * len(g))
-        bicubic_kernels.scatter(table, found, results[0])
+        parallel(bicubic_loops.pull_values, len(found), patch, params, read_only(g), found, work=30 * len(g))
+        bicubic_loops.scatter(table, found, results[0])
 
 
 def _normal_shape(rows: tuple[int, ...], params: tuple[int, ...], *_: tuple[int, ...]) -> tuple[int, ...]:
@@ -130,32 +130,32 @@ def _normal_shape(rows: tuple[int, ...], params: tuple[int, ...], *_: tuple[int,
 
 
 def _normals(operands: Sequence[np.ndarray], out: np.ndarray) -> None:
-    from rts_surfaces import bicubic_kernels
+    from rts_surfaces import bicubic_loops
 
     rows, params, patch, _ = operands
     given = _nets(rows, operands), patch, params, rows.dtype.type(COLLAPSED)
-    parallel(bicubic_kernels.normals, len(out), *given, out, work=60 * len(out))
+    parallel(bicubic_loops.normals, len(out), *given, out, work=60 * len(out))
 
 
 def _push_normals(operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray | None], out: np.ndarray) -> None:
-    from rts_surfaces import bicubic_kernels
+    from rts_surfaces import bicubic_loops
 
     rows, params, patch, _ = operands
     moved = _nets(read_only(tangents[0]), operands)  # pyright: ignore[reportArgumentType]  # Only rows have tangents.
     given = _nets(rows, operands), moved, patch, params, rows.dtype.type(COLLAPSED)
-    parallel(bicubic_kernels.push_normals, len(out), *given, out, work=120 * len(out))
+    parallel(bicubic_loops.push_normals, len(out), *given, out, work=120 * len(out))
 
 
 def _pull_normals(operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None]) -> None:
-    from rts_surfaces import bicubic_kernels
+    from rts_surfaces import bicubic_loops
 
     if results[0] is not None:
         rows, params, patch, table = operands
         nets = _nets(rows, operands)
         found = _shares(nets)
         given = nets, patch, params, rows.dtype.type(COLLAPSED), read_only(g), found
-        parallel(bicubic_kernels.pull_normals, len(found), *given, work=80 * len(g))
-        bicubic_kernels.scatter(table, found, results[0])
+        parallel(bicubic_loops.pull_normals, len(found), *given, work=80 * len(g))
+        bicubic_loops.scatter(table, found, results[0])
 
 
 VALUES = Operation(

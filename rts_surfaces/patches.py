@@ -31,31 +31,31 @@ class Bicubic(Geometry):
     """
 
     def __init__(self, nets: np.ndarray, across: np.ndarray, flips: np.ndarray):
-        from rts_surfaces import bicubic_kernels
+        from rts_surfaces import bicubic_loops
 
-        self.nets, self.powers = nets, bicubic_kernels.powers(nets)
+        self.nets, self.powers = nets, bicubic_loops.powers(nets)
         self.across, self.flips = across, flips
 
     def points(self, patch: np.ndarray, params: np.ndarray, order: int) -> np.ndarray:
         """See `Geometry`."""
-        from rts_surfaces import bicubic_kernels
+        from rts_surfaces import bicubic_loops
 
-        kernel, width = (bicubic_kernels.expansions, 6) if order else (bicubic_kernels.points, 1)
+        loop, width = (bicubic_loops.expansions, 6) if order else (bicubic_loops.points, 1)
         out = np.empty((len(patch), width, 3))
-        parallel(kernel, len(patch), self.powers, patch, params, out, work=40 * width * len(patch))
+        parallel(loop, len(patch), self.powers, patch, params, out, work=40 * width * len(patch))
         return out
 
     def meet(self, samples: Samples, rays: Rays) -> Samples:
         """See `Geometry`."""
-        from rts_surfaces import meeting_kernels
+        from rts_surfaces import meeting_loops
 
         bounds = np.empty((len(self.nets), 3))
-        meeting_kernels.bounds(self.nets, bounds)
+        meeting_loops.bounds(self.nets, bounds)
         ids, params, row, depth = (np.array(x) for x in (samples.ids, samples.params, samples.row, samples.depth))
         lines = row.reshape(-1, row.shape[2]), depth.reshape(-1, row.shape[2])
         ends = (np.ascontiguousarray(x, np.float64) for x in (rays.origins, rays.directions, rays.spread))
         given = self.powers, bounds, self.across, self.flips, ids, params, *lines, *ends, LIMITS
-        parallel(meeting_kernels.meet, len(lines[0]), *given, work=200 * len(samples.ids))
+        parallel(meeting_loops.meet, len(lines[0]), *given, work=200 * len(samples.ids))
         return samples.replace(ids=ids, params=params, row=row, depth=depth)
 
 

@@ -152,7 +152,7 @@ def shapes(tiles: Tiles, points: Points, beside: float = 0.0) -> Shapes:
         points: the surface.
         beside: how far from the border of a tile, and from the ends of an edge, its grid begins, a share of its size.
     """
-    from rts_surfaces import fineness_kernels
+    from rts_surfaces import fineness_loops
 
     (count, width), edges = tiles.corners.shape, len(tiles.edge_tiles)
     grid = GRID[width]
@@ -165,14 +165,14 @@ def shapes(tiles: Tiles, points: Points, beside: float = 0.0) -> Shapes:
         found = _expanded(tiles, points, np.arange(count)[some], local[None])
         part = out.normals[some], out.places[some], out.bends[some]
         work = 100 * len(local) * len(found)
-        parallel(fineness_kernels.shapes, len(found), found, tiles.frames[some], *part, work=work)
+        parallel(fineness_loops.shapes, len(found), found, tiles.frames[some], *part, work=work)
     corners = _CORNERS[width]
     along = np.roll(corners, -1, axis=0) - corners
     for some in _slices(edges):
         tile, side = tiles.edge_tiles[some].T
         found = _expanded(tiles, points, tile, corners[side][:, None] + steps[:, None] * along[side][:, None])
         given = found, tiles.frames[tile], along[side], out.curves[some]
-        parallel(fineness_kernels.curves, len(found), *given, work=100 * grid * len(found))
+        parallel(fineness_loops.curves, len(found), *given, work=100 * grid * len(found))
     return out
 
 
@@ -216,23 +216,23 @@ def allowed_in(view: View, found: Shapes, fine: float, coarse: float) -> Allowed
         fine: pixels, where a tile or an edge may have an outline.
         coarse: pixels elsewhere.
     """
-    from rts_surfaces import fineness_kernels
+    from rts_surfaces import fineness_loops
 
     count, angle = len(found.bends), min(view.angle, math.pi / 2)
     allowed = Allowed(np.empty(count), np.empty(count), np.empty(count, np.int8))
     cone = np.array([*view.axis, math.sin(angle), math.cos(angle)])
     seen = view.eye, view.toward, view.parallel, view.aside, view.along, view.spread, cone, np.array([fine, coarse])
     given = found.places, found.normals, found.bends, *seen
-    parallel(fineness_kernels.outlines, count, *given, *allowed, work=500 * count)
+    parallel(fineness_loops.outlines, count, *given, *allowed, work=500 * count)
     return allowed
 
 
 def by_error(tiles: Tiles, found: Shapes, allowed: Allowed) -> tuple[np.ndarray, np.ndarray]:
     """Rates of edges (E,) and of tiles (n, 2), int32, so that triangles are off by no more than is allowed."""
-    from rts_surfaces import fineness_kernels
+    from rts_surfaces import fineness_loops
 
     inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
-    fineness_kernels.rates(
+    fineness_loops.rates(
         found.bends, found.curves, *allowed, tiles.sides, LEAST[tiles.sides.shape[1]], MOST, inner, edges
     )
     return edges, inner
@@ -264,10 +264,10 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
     Raises:
         InputError: so many triangles that memory would not do.
     """
-    from rts_surfaces import tiles_kernels
+    from rts_surfaces import tiles_loops
 
     count, width = tiles.corners.shape
-    total = int(tiles_kernels.counted(inner, tiles.sides, edges))
+    total = int(tiles_loops.counted(inner, tiles.sides, edges))
     if total > MOST_TRIANGLES:
         raise InputError(f"{count} patches make {total} triangles; expected fewer, so cut them less finely")
     within = (inner[:, 0] - 1) * (inner[:, 1] - 1) if width == 4 else (inner[:, 0] - 1) * (inner[:, 0] - 2) // 2
@@ -275,11 +275,11 @@ def triangles(tiles: Tiles, points: Points, edges: np.ndarray, inner: np.ndarray
     inner_first = edge_first[-1] + np.concatenate([[0], np.cumsum(within)]).astype(np.int32)
     vertices = points(*_places(tiles, edges, edge_first, inner, inner_first), 0)[:, 0].astype(np.float32)
     first = np.zeros(count + 1, np.int32)
-    tiles_kernels.counts(inner, tiles.sides, edges, first)
+    tiles_loops.counts(inner, tiles.sides, edges, first)
     out = np.empty((total, 3), np.int32), np.empty((total, 1), np.int32), np.empty((total, 3, 2), np.float32)
-    kernel = tiles_kernels.quadrilaterals if width == 4 else tiles_kernels.triangles
+    loop = tiles_loops.quadrilaterals if width == 4 else tiles_loops.triangles
     given = *tiles[:5], edges, edge_first, inner, inner_first, first
-    parallel(kernel, count, *given, out, work=30 * total)
+    parallel(loop, count, *given, out, work=30 * total)
     return Proxy(vertices, *out)
 
 
@@ -287,7 +287,7 @@ def _places(
     tiles: Tiles, edges: np.ndarray, edge_first: np.ndarray, inner: np.ndarray, inner_first: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Patches (V,) and parameters (V, 2) of vertices: of corners, within edges, within tiles."""
-    from rts_surfaces import tiles_kernels
+    from rts_surfaces import tiles_loops
 
     shape = _CORNERS[tiles.corners.shape[1]]
     total = int(inner_first[-1])
@@ -299,7 +299,7 @@ def _places(
     back = tiles.flips[tile, side][:, None]
     ends = tiles.params(tile, shape[side]), tiles.params(tile, np.roll(shape, -1, axis=0)[side])
     ends = np.where(back, ends[1], ends[0]), np.where(back, ends[0], ends[1])
-    tiles_kernels.within_edges(tiles.patch[tile], *ends, edges, edge_first, patch, params)
-    kernel = tiles_kernels.within_quadrilaterals if len(shape) == 4 else tiles_kernels.within_triangles
-    kernel(tiles.patch, tiles.frames, inner, inner_first, patch, params)
+    tiles_loops.within_edges(tiles.patch[tile], *ends, edges, edge_first, patch, params)
+    loop = tiles_loops.within_quadrilaterals if len(shape) == 4 else tiles_loops.within_triangles
+    loop(tiles.patch, tiles.frames, inner, inner_first, patch, params)
     return patch, params

@@ -29,7 +29,7 @@ def compiled():
     kept = [x for x in found.values() if isinstance(x._cache, compiling._Cache)]
     return {compiling._key(x.py_func, sig): f"{x.__name__} {sig}" for x in kept for sig in x.overloads}
 
-# A ball, coarsely, since outlines and hidden layers are what most kernels are for.
+# A ball, coarsely, since outlines and hidden layers are what most loops are for.
 y, x = np.mgrid[:7, :12]
 up, round = np.pi * y.ravel() / 6, np.pi * x.ravel() / 6
 vertices = np.stack([np.sin(up) * np.cos(round), np.cos(up), np.sin(up) * np.sin(round)], 1).astype(np.float32)
@@ -119,7 +119,7 @@ PICTURE, GRADIENT, POSE, FIT = map(route, ("abcd", "abcdef", "rabcdgh", "rabcij"
 )
 def test_what_will_be_needed_last_is_compiled_first(seen, done, expected):
     key, need = accompanying.following([PICTURE, GRADIENT, POSE, FIT], [*map(ord, seen)], {*map(ord, done)})
-    assert (need.kernel if need else None) == expected
+    assert (need.loop if need else None) == expected
     assert key == (ord(expected) if expected else 0)
 
 
@@ -137,14 +137,14 @@ def test_of_the_last_half_of_what_is_left_the_largest_is_compiled_first(efforts,
     done, found = set(), ""
     while (key := accompanying.following([left | {ord("s"): Need("s", ())}], [ord("s")], done))[1]:
         done.add(key[0])
-        found += key[1].kernel
+        found += key[1].loop
     assert found == order
 
 
-def test_an_expected_kind_of_call_counts_as_a_kernel_but_is_none():
+def test_an_expected_kind_of_call_counts_as_a_loop_but_is_none():
     name = companion.number(companion.LEAST_SQUARES)
     fit = {name: None, **FIT}
-    assert accompanying.following([PICTURE, POSE, fit], [name], set())[1].kernel == "j"
+    assert accompanying.following([PICTURE, POSE, fit], [name], set())[1].loop == "j"
     assert accompanying.following([PICTURE, POSE, fit], [ord("r")], {*FIT, *POSE}) == (0, None)
 
 
@@ -199,7 +199,7 @@ def test_no_child_of_multiprocessing_and_no_program_but_python_starts_it(monkeyp
         assert not companion._may_start()
 
 
-FIRST_KERNEL = """
+FIRST_LOOP = """
 import os, sys
 import numpy as np
 from rts import accompanying, companion
@@ -223,9 +223,9 @@ if sys.argv[1] == "killed":
 
 @pytest.mark.skipif(not companion.SHARED, reason="there is no companion")
 @pytest.mark.parametrize("how", ["ends", "killed"])
-def test_it_starts_with_the_first_kernel_that_is_missing_and_ends_with_its_process(how, tmp_path, willing):
+def test_it_starts_with_the_first_loop_that_is_missing_and_ends_with_its_process(how, tmp_path, willing):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-W", "error::ResourceWarning", "-c", FIRST_KERNEL, how]
+    command = [sys.executable, "-W", "error::ResourceWarning", "-c", FIRST_LOOP, how]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert done.returncode == (-signal.SIGKILL if how == "killed" else 0) and not done.stderr, done.stderr
     end = time.monotonic() + 20
@@ -271,10 +271,10 @@ def test_it_compiles_what_nobody_has_asked_for_yet(tmp_path, willing):
 
 
 @pytest.mark.parametrize(("kept", "begun"), [(None, 1), ("__init__.pyc", 1), ("several.double-7.py311.nbi", 0)])
-def test_it_starts_before_a_kernel_is_missed_where_none_is_kept(kept, begun, tmp_path, monkeypatch):
+def test_it_starts_before_a_loop_is_missed_where_none_is_kept(kept, begun, tmp_path, monkeypatch):
     started = []
     monkeypatch.setattr(companion, "prepare", lambda: started.append(1))
-    folder = tmp_path / "kernels"
+    folder = tmp_path / "loops"
     if kept:
         folder.mkdir()
         (folder / kept).touch()

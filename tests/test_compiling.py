@@ -1,4 +1,4 @@
-"""What is compiled, and when: few kernels, each once; a line on terminals alone."""
+"""What is compiled, and when: few loops, each once; a line on terminals alone."""
 
 import gc
 import io
@@ -48,7 +48,7 @@ print(len(first), max(first.values()), *sorted(first))
 """
 
 
-def test_the_first_render_compiles_few_kernels_each_once():
+def test_the_first_render_compiles_few_loops_each_once():
     done = subprocess.run([sys.executable, "-c", FIRST_RENDER], capture_output=True, text=True, check=True)
     count, most, *_ = done.stdout.split()
     assert 8 <= int(count) <= 20, done.stdout
@@ -81,11 +81,11 @@ def test_a_terminal_is_told_of_what_takes_long(stream, told, monkeypatch):
     assert not stream.getvalue()
     for seconds in (2.5, 1.0, 4.0):
         compile_(ours, seconds)
-    lines = ["rts: compiling kernels (once): 2 in 3 s", "rts: compiling kernels (once): 4 in 8 s"]
+    lines = ["rts: compiling loops (once): 2 in 3 s", "rts: compiling loops (once): 4 in 8 s"]
     assert stream.getvalue().splitlines() == (lines if told else [])
 
 
-def test_no_garbage_is_collected_while_our_kernels_are_compiled():
+def test_no_garbage_is_collected_while_our_loops_are_compiled():
     ours, theirs = (type("", (), {"data": {"dispatcher": type("", (), {"py_func": f})}}) for f in (rts.render, np.dot))
     listener = compiling._NoCollection()
     for event, paused in ((ours, True), (theirs, False)):
@@ -109,9 +109,9 @@ def _total(values):
     return kept[1:].sum()
 
 
-def compiled_total(kernel, helper):
+def compiled_total(loop, helper):
     names = {"np": np, "_doubled": numba.njit(_doubled, nogil=True, **helper), "__name__": __name__}
-    made = numba.njit(FunctionType(_total.__code__, names), nogil=True, **kernel)
+    made = numba.njit(FunctionType(_total.__code__, names), nogil=True, **loop)
     assert made(np.array([9, -2, 3, 8])) == 2 + 6 + 7
     return made, names["_doubled"]
 
@@ -125,9 +125,9 @@ def instructions(made):
     return [line.split(maxsplit=1)[0] for line in lines if line.strip()]  # Which registers it takes may differ.
 
 
-def test_what_only_kernels_call_has_no_machine_code_and_kernels_are_those_that_numba_makes():
+def test_what_only_loops_call_has_no_machine_code_and_loops_are_those_that_numba_makes():
     plain, helper = compiled_total({"no_cfunc_wrapper": True}, {"no_cfunc_wrapper": True})
-    ours, part = compiled_total(compiling.KERNEL, compiling.PART)
+    ours, part = compiled_total(compiling.LOOP, compiling.PART)
     assert instructions(ours) == instructions(plain)
     for each, running in ((plain, True), (helper, True), (ours, True), (part, False)):
         ((types, compiled),) = each.overloads.items()
@@ -153,8 +153,8 @@ numba.version_info = numba.version_info._replace(short=(9, 0))
 DOUBLED = """
 from rts import compiling
 helper = compiling.compiled(lambda x: x + x)
-made = compiling.numba.njit(lambda x: helper(x), **compiling.KERNEL)
-print(made(3.0), "pipeline_class" in compiling.KERNEL | compiling.PART)
+made = compiling.numba.njit(lambda x: helper(x), **compiling.LOOP)
+print(made(3.0), "pipeline_class" in compiling.LOOP | compiling.PART)
 """
 
 
@@ -177,7 +177,7 @@ print(needy.checked(3.0))
 """
 
 NEEDY = """
-from rts.compiling import compiled, kernel
+from rts.compiling import compiled, loop
 
 @compiled
 def check(x):
@@ -185,7 +185,7 @@ def check(x):
         raise ValueError("below zero", x)
     print("checked", x)
 
-@kernel
+@loop
 def checked(x):
     check(x)
     return 2 * x
@@ -211,7 +211,7 @@ def test_warmup_has_as_many_processes_share_the_work_and_says_what_failed(monkey
     monkeypatch.setattr(companion, "process", process)
     assert rts.warmup(2) < 60
     assert given[0] == given[1] and given[0][1]
-    with pytest.raises(rts.RtsError, match="could not compile kernels: MemoryError: no more"):
+    with pytest.raises(rts.RtsError, match="could not compile loops: MemoryError: no more"):
         rts.warmup(1)
 
 
@@ -232,8 +232,8 @@ double(np.zeros(3, np.{kind}))
 
 
 @pytest.mark.skipif(compiling.fcntl is None, reason="the system has no such locks")
-def test_kernels_are_written_by_one_process_at_a_time(tmp_path):
-    (tmp_path / "several.py").write_text("from rts.compiling import kernel\n\n\n@kernel\ndef double(x):\n    x *= 2\n")
+def test_loops_are_written_by_one_process_at_a_time(tmp_path):
+    (tmp_path / "several.py").write_text("from rts.compiling import loop\n\n\n@loop\ndef double(x):\n    x *= 2\n")
     kept = tmp_path / "__pycache__"
     kept.mkdir()
 
@@ -309,7 +309,7 @@ IDS = np.array([2, 0, 1])
 
 
 def part_with(f):
-    """A function that hands its argument to a part of a kernel."""
+    """A function that hands its argument to a part of a loop."""
     part = compiling.compiled(f)
     return lambda v: part(v)
 
@@ -332,7 +332,7 @@ def part_with(f):
 )
 def test_parts_that_may_make_something_count_references(function):
     v = np.arange(6.0)
-    assert numba.njit(part_with(function), **compiling.KERNEL)(v) == pytest.approx(function(v))
+    assert numba.njit(part_with(function), **compiling.LOOP)(v) == pytest.approx(function(v))
 
 
 def test_what_generators_read_lives_as_long_as_they_do():
@@ -347,10 +347,10 @@ def test_what_generators_read_lives_as_long_as_they_do():
             found += x + 0 * np.full(64, -1.0)[0]
         return found
 
-    assert numba.njit(total, **compiling.KERNEL)(np.arange(64.0)) == 4032
+    assert numba.njit(total, **compiling.LOOP)(np.arange(64.0)) == 4032
 
 
-def test_kernels_call_what_numba_has():
+def test_loops_call_what_numba_has():
     """Its own functions count references, and may make arrays."""
     a = np.eye(3)
     for f in (
@@ -359,4 +359,4 @@ def test_kernels_call_what_numba_has():
         lambda a: np.allclose(a, a),
         lambda a: hash((a[0, 0], 1)) * 0 + 1,
     ):
-        numba.njit(f, **compiling.KERNEL)(a)
+        numba.njit(f, **compiling.LOOP)(a)

@@ -48,7 +48,7 @@ def cells(layers, size=(9, 11), seed=0, dtype=np.float64, holes=0.2, middle_hole
 
 
 class Compiled(Cells):
-    """The kernels, with results of their own."""
+    """The loops, with results of their own."""
 
     def size(self):
         return tuple(max(0, n - 2 * self.border) for n in self.row.shape[1:])

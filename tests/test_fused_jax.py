@@ -42,7 +42,7 @@ def scene32(*args, **options):
 
 @pytest.fixture
 def calls(monkeypatch):
-    """Names of the kernels that run, with what their pullbacks want."""
+    """Names of the loops that run, with what their pullbacks want."""
     found = []
 
     def listen(name, method):
@@ -174,7 +174,7 @@ def test_hessians_are_those_of_the_specification(kind, mode):
     check_transform(SECOND["hessian"], kind, mode, layers=1, tolerance=1e-3)
 
 
-def test_gauss_newton_products_take_kernels_alone(calls):
+def test_gauss_newton_products_take_loops_alone(calls):
     ours = Smooth(KINDS["visible"](), jnp.asarray, 2)
     jacobian = jax.jacfwd(ours.image)(ours.x).reshape(-1, 6)
     calls.clear()
@@ -320,7 +320,7 @@ def test_rows_beyond_the_samples_are_refused(kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_results_are_bitwise_those_of_the_kernels(kind, monkeypatch):
+def test_results_are_bitwise_those_of_the_loops(kind, monkeypatch):
     scene = cells(3, (70, 150), dtype=np.float32)
     g, tangents = noise(70, 150, 4, dtype=np.float32), noise(*scene[0].shape, dtype=np.float32)
     splatter = KINDS[kind]()
@@ -396,10 +396,10 @@ def test_other_dtypes_are_left_to_the_specification(dtype, calls):
 def test_other_devices_are_left_to_the_specification():
     positions, rgba, row = scene32(2)
     f = jax.jit(jax.grad(lambda p: KINDS["single"]().splat(p, rgba, row).sum()))
-    for platform, by_kernels in (("cuda", False), ("cpu", True)):
+    for platform, by_loops in (("cuda", False), ("cpu", True)):
         allowed = [jax.export.DisabledSafetyCheck.custom_call(jax_host.TARGET)]
         exported = jax.export.export(f, platforms=[platform], disabled_checks=allowed)(positions)
-        assert (jax_host.TARGET in exported.mlir_module()) == by_kernels
+        assert (jax_host.TARGET in exported.mlir_module()) == by_loops
 
 
 def test_many_calls_at_once():

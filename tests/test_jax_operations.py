@@ -150,10 +150,10 @@ def test_other_dtypes_are_left_to_array_code():
 def test_other_devices_are_left_to_array_code():
     ours, _, given = FUNCTIONS["projection"]
     f = jax.jit(jax.grad(lambda a, b: ours(a, b).sum(), (0, 1)))
-    for platform, by_kernels in (("cuda", False), ("cpu", True)):
+    for platform, by_loops in (("cuda", False), ("cpu", True)):
         allowed = [jax.export.DisabledSafetyCheck.custom_call(jax_host.TARGET)]
         exported = jax.export.export(f, platforms=[platform], disabled_checks=allowed)(*given)
-        assert (jax_host.TARGET in exported.mlir_module()) == by_kernels
+        assert (jax_host.TARGET in exported.mlir_module()) == by_loops
 
 
 # ---------------------------------------------------------------------------------------------- rows that are not used

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rts import InputError
-from rts_surfaces.implicit.distinct_kernels import distinct
+from rts_surfaces.implicit.distinct_loops import distinct
 from rts_surfaces.implicit.lattice import Lattice
 from rts_surfaces.implicit.narrow_band import NarrowBand
 

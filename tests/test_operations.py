@@ -60,17 +60,17 @@ def test_interpolation_is_combine_with_the_weight_that_the_others_lack_of_one():
     found = interpolate(rows, ids, 3, weights)
     np.testing.assert_allclose(found, combine(rows, ids[:, 3:], whole), rtol=1e-12, atol=1e-12)
     # The loops for any number of rows agree with those for triangles.
-    from rts.operations import combine_kernels
+    from rts.operations import combine_loops
 
     general, special = np.empty_like(found), np.empty_like(found)
-    combine_kernels.parallel(
-        combine_kernels._sum, 40, *combine_kernels_read(rows, ids), 3, 3, True, *combine_kernels_read(weights), general
+    combine_loops.parallel(
+        combine_loops._sum, 40, *combine_loops_read(rows, ids), 3, 3, True, *combine_loops_read(weights), general
     )
-    combine_kernels.forward(*combine_kernels_read(rows, weights, ids), special, 3, 3, True)
+    combine_loops.forward(*combine_loops_read(rows, weights, ids), special, 3, 3, True)
     np.testing.assert_allclose(general, special, rtol=1e-12)
 
 
-def combine_kernels_read(*given):
+def combine_loops_read(*given):
     from rts.threads import read_only
 
     return [read_only(x) for x in given]

@@ -136,14 +136,14 @@ def test_rotations_are_those_by_singular_values(target):
 
 def test_the_rotation_of_any_matrix_is_one_and_the_best():
     pytest.importorskip("numba")
-    from rts.regularizers import arap_kernels
+    from rts.regularizers import arap_loops
 
     rng = np.random.default_rng(6)
     values = [(1, 0.6, 0.2), (1, 1, 1), (1, 1e-9, 1e-12), (1, 1e-5, 0), (1, 0, 0), (0, 0, 0), (1e-90, 3e-91, 0)]
     for singular in values * 20:
         left, right = (np.linalg.qr(rng.normal(size=(3, 3)))[0] for _ in range(2))  # Reflections among them.
         matrix, found = (left * singular) @ right, np.empty((3, 3))
-        arap_kernels._nearest_rotation(matrix.T.copy(), np.empty((3, 3)), found)
+        arap_loops._nearest_rotation(matrix.T.copy(), np.empty((3, 3)), found)
         np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-14)
         assert np.linalg.det(found) > 0
         best = singular[0] + singular[1] + singular[2] * np.sign(np.linalg.det(left) * np.linalg.det(right))

@@ -14,7 +14,7 @@ from rts.contracts.plugin import promised
 from rts.contracts.records import Cells
 from rts.plugin_api.records import Splats
 from rts.rendering.samples import sample
-from rts.sampling.interiors_kernels import settle
+from rts.sampling.interiors_loops import settle
 from rts.splatting.layers import dilated
 from rts_backends.fused import splatters as fused
 

@@ -130,14 +130,14 @@ def test_threads_that_start_together_share_few_helpers(monkeypatch, helpers):
 
     start, done = threading.Barrier(8), []
 
-    def kernel(start, stop):
+    def loop(start, stop):
         time.sleep(0.001)
         done.append(stop - start)
 
     def work():
         start.wait(30)
         for _ in range(20):
-            threads.parallel(kernel, 9)
+            threads.parallel(loop, 9)
 
     monkeypatch.setenv("RTS_NUM_THREADS", "3")
     together = [threading.Thread(target=work) for _ in range(8)]
@@ -156,7 +156,7 @@ def cores_of_helper(monkeypatch, run):
     monkeypatch.setenv("RTS_NUM_THREADS", "2")
     caller, both, seen = threading.get_ident(), threading.Barrier(2), {}
 
-    def kernel(start, stop):
+    def loop(start, stop):
         if start in (0, 1):  # Each of the two threads has one of these.
             both.wait(30)
             seen[threading.get_ident() == caller] = os.sched_getaffinity(0)
@@ -164,7 +164,7 @@ def cores_of_helper(monkeypatch, run):
     core = threads._core
     assert core is not None
     asked = core()
-    run(kernel)
+    run(loop)
     assert len(seen) == 2 and seen[True] == os.sched_getaffinity(0)
     return asked, core(), seen[False]
 
@@ -178,7 +178,7 @@ needs_cores = pytest.mark.skipif(
 def test_helpers_keep_off_the_core_of_the_thread_that_asks(monkeypatch, helpers):
     from rts import threads
 
-    found = [cores_of_helper(monkeypatch, lambda kernel: threads.parallel(kernel, 9)) for _ in range(20)]
+    found = [cores_of_helper(monkeypatch, lambda loop: threads.parallel(loop, 9)) for _ in range(20)]
     cores = os.sched_getaffinity(0)
     assert all(len(allowed) == len(cores) - 1 for _, _, allowed in found)
     # The system may move this thread between any two of its steps.
@@ -213,7 +213,7 @@ def test_an_error_in_a_helper_reaches_the_caller_and_the_helper_lives_on(monkeyp
     monkeypatch.setenv("RTS_NUM_THREADS", "2")
     caller, both, seen = threading.get_ident(), threading.Barrier(2), []
 
-    def kernel(start, stop):
+    def loop(start, stop):
         if start == 0 or stop == 9:
             return
         both.wait(30)  # So that either has one of the two tasks in between.
@@ -222,7 +222,7 @@ def test_an_error_in_a_helper_reaches_the_caller_and_the_helper_lives_on(monkeyp
 
     monkeypatch.setattr(threads, "TASKS_PER_THREAD", 2)
     with pytest.raises(ValueError, match="in a helper"):
-        threads.parallel(kernel, 9)
+        threads.parallel(loop, 9)
     threads.parallel(lambda start, stop: seen.append((start, stop)), 9)
     assert sorted(seen) == [(0, 2), (2, 4), (4, 6), (6, 9)] and helpers.count == 1
 
@@ -235,7 +235,7 @@ def test_after_an_error_what_has_not_begun_is_left(monkeypatch, helpers, error):
     monkeypatch.setattr(threads, "TASKS_PER_THREAD", 20)
     caller, both, seen = threading.get_ident(), threading.Barrier(2), []
 
-    def kernel(start, stop):
+    def loop(start, stop):
         seen.append(start)
         if len(seen) <= 2:
             both.wait(30)  # Both have begun.
@@ -244,7 +244,7 @@ def test_after_an_error_what_has_not_begun_is_left(monkeypatch, helpers, error):
         time.sleep(0.01)
 
     with pytest.raises(error):
-        threads.parallel(kernel, 40)
+        threads.parallel(loop, 40)
     assert len(seen) < 10
 
 

@@ -121,11 +121,11 @@ def test_old_names_tell_where_they_are():
 
 def test_compiled_code_is_imported_when_it_is_needed():
     for name, path in FILES.items():
-        if name.partition(".")[0] == "rts" and not name.endswith("_kernels") and name not in COMPILING:
+        if name.partition(".")[0] == "rts" and not name.endswith("_loops") and name not in COMPILING:
             top = ast.parse(path.read_text()).body
             named = {ast.unparse(n) for n in top if isinstance(n, (ast.Import, ast.ImportFrom))}
-            compiled = ("numba", "_kernels import", *COMPILING)
-            assert not [n for n in named if any(x in n for x in compiled) or n.endswith("_kernels")], name
+            compiled = ("numba", "_loops import", *COMPILING)
+            assert not [n for n in named if any(x in n for x in compiled) or n.endswith("_loops")], name
 
 
 def test_a_docstring_says_by_itself_what_it_speaks_of():
@@ -140,7 +140,7 @@ def test_the_architecture_has_a_line_for_every_file():
     for name, path in FILES.items():
         if path.name != "__init__.py" or name == "rts":
             assert re.search(rf"\b{path.name}\b", tree), f"{name} is not in docs/architecture.md"
-    for named in re.findall(r"\b(\w+)\.py\b", tree.replace("*_kernels.py", "").replace("test_<what>.py", "")):
+    for named in re.findall(r"\b(\w+)\.py\b", tree.replace("*_loops.py", "").replace("test_<what>.py", "")):
         assert any(path.stem == named for path in FILES.values()), f"docs/architecture.md names {named}.py"
 
 

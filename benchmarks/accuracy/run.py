@@ -77,7 +77,7 @@ def timed(scene: scenes.Scene, others: list[Method], done: Callable[[], None]) -
     """Render and gradient of a loss in the scalar motion, by each method."""
     weights = np.array(loss_weights(*scene.size)[0])
     chosen = [*(methods.ours(scene, "visible", 2, s) for s in (1, 2, 4, *methods.ADAPTIVE)), *others]
-    # The fewest samples compile the same kernels as many.
+    # The fewest samples compile the same loops as many.
     fewest = next((m for m in chosen if m.name.startswith("Mitsuba")), None)
     for method in chosen:
         if method is fewest or not method.name.startswith("Mitsuba"):

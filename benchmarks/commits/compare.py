@@ -13,7 +13,7 @@ largest value, 1e-5 of a gradient's norm. All is posed by one matrix, pinned to 
 `rts.rigid`; what each side's own matrices give stands in lines of its own, "not pinned", with wider limits. `speed`
 times the iterations of a pose fit, both sides in turn.
 
-With --folder what is installed stays, its compiled kernels too, and is used again as long as its sources are the same.
+With --folder what is installed stays, its compiled loops too, and is used again as long as its sources are the same.
 The arrays of the last `results` stay too, in results/before and results/after.
 """
 
@@ -143,7 +143,7 @@ def main() -> None:
     for command in (results, speed):
         command.add_argument("before", nargs="?", default="HEAD~1")
         command.add_argument("after", nargs="?", default=WORKING_TREE)
-        command.add_argument("--folder", type=Path, help="keeps installs, with compiled kernels, arrays and meshes")
+        command.add_argument("--folder", type=Path, help="keeps installs, with compiled loops, arrays and meshes")
     keys = [engine.key for engine in ENGINES]
     results.add_argument("--engines", nargs="+", choices=keys, default=[], help="instead of all")
     results.add_argument("--scenes", nargs="+", default=[], help="names in commits/scenes.py, instead of all")

@@ -219,7 +219,7 @@ class Mitsuba(_Fit):
         matrix, slopes = rotation(pose[:3])
         turn, move = mi.Matrix3f(matrix.tolist()), mi.Point3f(pose[3:].tolist())
         vertices = mi.Point3f(self.vertices)
-        dr.make_opaque(turn, move)  # Numbers that differ would be compiled into the kernels each time.
+        dr.make_opaque(turn, move)  # Numbers that differ would be compiled into the loops each time.
         dr.enable_grad(turn, move)
         if self.full:
             dr.enable_grad(vertices)

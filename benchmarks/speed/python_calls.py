@@ -6,7 +6,7 @@ those of its backward pass; C functions do not count. Prints totals and the func
     python -m benchmarks.speed.python_calls
     python -m benchmarks.speed.python_calls --against HEAD~1     # the same of another commit
 
-Kernels run on one thread, since it is chance which others join in.
+Loops run on one thread, since it is chance which others join in.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def main() -> None:
         return check_origin(site)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--against", metavar="REVISION", help="also of another commit, installed into a folder")
-    parser.add_argument("--folder", type=Path, help="keeps that install, with compiled kernels")
+    parser.add_argument("--folder", type=Path, help="keeps that install, with compiled loops")
     args = parser.parse_args()
     console = Console(width=None if sys.stdout.isatty() else 120)
     show(measure(), "installed", console)

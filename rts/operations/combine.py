@@ -104,26 +104,26 @@ def _columns(operands: Arrays, column: int, count: int, affine: bool) -> Arrays:
 
 
 def _forward(operands: Arrays, out: np.ndarray, *, column: int, count: int, affine: bool) -> None:
-    from rts.operations import combine_kernels
+    from rts.operations import combine_loops
 
     rows, weights, ids = _columns(operands, column, count, affine)
-    combine_kernels.forward(rows, weights, ids, out, column, count, affine)
+    combine_loops.forward(rows, weights, ids, out, column, count, affine)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, column: int, count: int, affine: bool) -> None:
-    from rts.operations import combine_kernels
+    from rts.operations import combine_loops
 
     rows, weights, ids = _columns(operands, column, count, affine)
     t_rows, t_weights = tangents
-    combine_kernels.push(rows, weights, ids, t_rows, t_weights, out, column, count, affine)
+    combine_loops.push(rows, weights, ids, t_rows, t_weights, out, column, count, affine)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some, *, column: int, count: int, affine: bool) -> None:
-    from rts.operations import combine_kernels
+    from rts.operations import combine_loops
 
     rows, weights, ids = _columns(operands, column, count, affine)
     g_rows, g_weights = results
-    combine_kernels.pull(rows, weights, ids, g, g_rows, g_weights, column, count, affine)
+    combine_loops.pull(rows, weights, ids, g, g_rows, g_weights, column, count, affine)
 
 
 COMBINE = Operation(

@@ -103,9 +103,9 @@ def _put(
     side: int,
     out: np.ndarray,
 ) -> None:
-    from rts.operations import inset_kernels
+    from rts.operations import inset_loops
 
-    parallel(inset_kernels.put, len(out), image, color, row, settled, fine, pixel, side, out, work=out.size)
+    parallel(inset_loops.put, len(out), image, color, row, settled, fine, pixel, side, out, work=out.size)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray, *, side: int) -> None:
@@ -143,10 +143,10 @@ def _pulled(
     sums: np.ndarray,
     fine: np.ndarray,
 ) -> None:
-    from rts.operations import inset_kernels
+    from rts.operations import inset_loops
 
     given = read_only(g), read_only(pixel), row, settled, side
-    parallel(inset_kernels.pull, len(g), *given, image, sums, fine, work=g.size)
+    parallel(inset_loops.pull, len(g), *given, image, sums, fine, work=g.size)
 
 
 INSET = Operation("rts.inset", _specification, (3, 3, 2), _shape, _forward, _push, _pull, differentiable=2)

@@ -66,26 +66,26 @@ def _fitting(operands: Arrays) -> Arrays:
 
 
 def _forward(operands: Arrays, out: np.ndarray) -> None:
-    from rts.operations import linear_kernels
+    from rts.operations import linear_loops
 
     rows, points = _fitting(operands)
-    linear_kernels.affine(rows, points, out)
+    linear_loops.affine(rows, points, out)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
-    from rts.operations import linear_kernels
+    from rts.operations import linear_loops
 
     rows, points = _fitting(operands)
     t_rows, t_points = tangents
-    linear_kernels.affine_push(rows, points, t_rows, t_points, out)
+    linear_loops.affine_push(rows, points, t_rows, t_points, out)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
-    from rts.operations import linear_kernels
+    from rts.operations import linear_loops
 
     rows, points = _fitting(operands)
     g_rows, g_points = results
-    linear_kernels.affine_pull(rows, points, g, g_rows, g_points)
+    linear_loops.affine_pull(rows, points, g, g_rows, g_points)
 
 
 _PACKED: dict[str, Any] = {"differentiable": 2, "packed": (1,), "packed_result": True}

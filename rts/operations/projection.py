@@ -62,26 +62,26 @@ def _fitting(operands: Arrays) -> Arrays:
 
 
 def _forward(operands: Arrays, out: np.ndarray) -> None:
-    from rts.operations import projection_kernels
+    from rts.operations import projection_loops
 
     rows, points = _fitting(operands)
-    projection_kernels.project(rows, points, out)
+    projection_loops.project(rows, points, out)
 
 
 def _push(operands: Arrays, tangents: Some, out: np.ndarray) -> None:
-    from rts.operations import projection_kernels
+    from rts.operations import projection_loops
 
     rows, points = _fitting(operands)
     t_rows, t_points = tangents
-    projection_kernels.push(rows, points, t_rows, t_points, out)
+    projection_loops.push(rows, points, t_rows, t_points, out)
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
-    from rts.operations import projection_kernels
+    from rts.operations import projection_loops
 
     rows, points = _fitting(operands)
     g_rows, g_points = results
-    projection_kernels.pull(rows, points, g, g_rows, g_points)
+    projection_loops.pull(rows, points, g, g_rows, g_points)
 
 
 PROJECTION = Operation(

@@ -73,12 +73,12 @@ def _shape(pose: tuple[int, ...], center: tuple[int, ...]) -> tuple[int, ...]:
 
 def _computed(operands: Arrays) -> tuple[np.ndarray, np.ndarray]:
     """The matrix, and its Jacobian (16, 9), float64."""
-    from rts.operations import rigid_kernels
+    from rts.operations import rigid_loops
 
     pose, center = operands
     if pose.shape != (6,) or center.shape != (3,):
         raise InputError(f"pose and center have shapes {pose.shape} and {center.shape}; expected (6,) and (3,)")
-    return rigid_kernels.rigid(*operands)
+    return rigid_loops.rigid(*operands)
 
 
 def _forward(operands: Arrays, out: np.ndarray) -> None:

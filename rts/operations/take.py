@@ -51,10 +51,10 @@ def _put(rows: np.ndarray, index: np.ndarray, shift: np.ndarray, out: np.ndarray
     Raises:
         InputError: there is no such row.
     """
-    from rts.operations import take_kernels
+    from rts.operations import take_loops
 
     index, bad = read_only(index, np.int32 if index.dtype.itemsize < 8 else np.int64), np.zeros(1, np.bool_)
-    parallel(take_kernels.put, len(index), read_only(rows), index, read_only(shift), out, bad, work=2 * out.size)
+    parallel(take_loops.put, len(index), read_only(rows), index, read_only(shift), out, bad, work=2 * out.size)
     if bad[0]:
         _check(index, len(rows))
 
@@ -65,10 +65,10 @@ def _push(operands: Arrays, tangents: Sequence[np.ndarray], out: np.ndarray) -> 
 
 
 def _pull(operands: Arrays, g: np.ndarray, results: Some) -> None:
-    from rts.operations import take_kernels
+    from rts.operations import take_loops
 
     if results[0] is not None:
-        take_kernels.add(np.ascontiguousarray(g), operands[1], results[0])
+        take_loops.add(np.ascontiguousarray(g), operands[1], results[0])
 
 
 _PACKED: dict[str, Any] = {"packed": (1,), "packed_result": True}

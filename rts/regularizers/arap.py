@@ -72,9 +72,9 @@ class ARAP(OfRestShape):
         dtype = np.float64 if engine.namespace.finfo(spokes.dtype).bits == 64 else np.float32
 
         def host(found: np.ndarray) -> tuple[np.ndarray]:
-            from rts.regularizers import arap_kernels
+            from rts.regularizers import arap_loops
 
-            return (arap_kernels.turned(found, self._at_rest, self._starts),)
+            return (arap_loops.turned(found, self._at_rest, self._starts),)
 
         return engine.call_host(host, [ArraySpec((self.terms, 3), dtype)], spokes)
 

@@ -117,7 +117,7 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
         settled: (H, W) int8, 0 at cells that are covered by the only part, with a sample or without, −1 at others;
             None for none.
     """
-    from rts.sampling import adaptive_kernels
+    from rts.sampling import adaptive_loops
     from rts.splatting.kernel import TIE
     from rts.splatting.visible import CONTINUED
 
@@ -133,7 +133,7 @@ def outlines(row: np.ndarray, depth: np.ndarray, sizes: Sequence[int], settled: 
         np.cumsum(sizes)[:-1],
         *map(kind, (beyond, TIE * max(largest, -least), CONTINUED)),
     )
-    parallel(adaptive_kernels.mark, len(marks), *given, marks, work=4 * row.size)
+    parallel(adaptive_loops.mark, len(marks), *given, marks, work=4 * row.size)
     return marks.view(bool)
 
 

@@ -38,8 +38,8 @@ def beside_outlines(kept: np.ndarray) -> np.ndarray:
     Args:
         kept: (K, H, W) bool, the samples that splatters need.
     """
-    from rts.sampling import exits_kernels
+    from rts.sampling import exits_loops
 
     cells = np.empty(kept[0].size, np.int32)
-    count = exits_kernels.find(read_only(kept), cells)
+    count = exits_loops.find(read_only(kept), cells)
     return cells[None, :count]

@@ -43,7 +43,7 @@ def facing_of_views(
     listed: bool = False,
 ) -> np.ndarray:
     """As `facing`, of views (height, width) that lie side by side, line after line; each has a camera."""
-    from rts.sampling import facing_kernels
+    from rts.sampling import facing_loops
 
     behind = np.count_nonzero(kept[1:])
     if not behind:
@@ -53,7 +53,7 @@ def facing_of_views(
     triangles = read_only(proxy.vertices), read_only(proxy.faces, np.int32), read_only(pieces, np.int16)
     eyes = np.stack([eye(camera) for camera in cameras])
     arrays = *given, *triangles, eyes, *view, listed, Cells.MORE_BEHIND
-    parallel(facing_kernels.fill, kept.shape[1], *arrays, found, work=kept[0].size + 100 * behind)
+    parallel(facing_loops.fill, kept.shape[1], *arrays, found, work=kept[0].size + 100 * behind)
     return found
 
 

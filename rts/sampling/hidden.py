@@ -99,12 +99,12 @@ class HiddenBySplatter:
             return Decision(needed, None, needed)
         if too_rough:
             return Decision(needed, np.full(covered.shape[1:], -1, np.int8), needed)
-        from rts.sampling import interiors_kernels
+        from rts.sampling import interiors_loops
 
         kept = needed.copy()
         # Beside cells that are not wanted, what decides for others is not settled, and may look at one cell more.
         reach = self.splatter.reach + (wanted is not None)
-        amid = interiors_kernels.settle(covered, depth, kept, reach, wanted)
+        amid = interiors_loops.settle(covered, depth, kept, reach, wanted)
         return Decision(kept, numbers_of(amid), needed)
 
     def _needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -165,7 +165,7 @@ def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> 
     total, part = sum(sizes), sampled.part
 
     def host(row: np.ndarray, depth: np.ndarray, *rest: np.ndarray) -> tuple[np.ndarray, ...]:
-        from rts.sampling.hidden_kernels import Numbering
+        from rts.sampling.hidden_loops import Numbering
 
         if row.max(initial=-1) >= total:
             raise InputError(f"row refers to sample {row.max()} of {total}; sample this scene anew")

@@ -79,13 +79,13 @@ def _interleaved_on_the_host(layers: int, sizes: Sequence[int], *given: Array) -
     dtype = np.float64 if any(namespace(d).finfo(d.dtype).bits == 64 for d in depths) else np.float32
 
     def host(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
-        from rts.sampling import merging_kernels
+        from rts.sampling import merging_loops
 
         for i, (row, size) in enumerate(zip(arrays, sizes, strict=False)):
             if row.max(initial=-1) >= size:
                 raise InputError(f"row of part {i} refers to sample {row.max()} of {size}; sample this scene anew")
         given = arrays[:count], arrays[count : 2 * count], arrays[2 * count :]
-        return merging_kernels.interleave(*given, layers, Cells.MORE_BEHIND)
+        return merging_loops.interleave(*given, layers, Cells.MORE_BEHIND)
 
     specs = ArraySpec(shape, np.int32), ArraySpec(shape, np.int32), ArraySpec(shape, dtype)
     specs = specs if len(given) == 2 * count else (*specs, ArraySpec(shape, np.int16))

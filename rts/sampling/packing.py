@@ -52,14 +52,14 @@ def lift(
     of the `covered_cells` to take, None for all. `exits` come last, as many as there is room for, in as
     many rows as there are cells and layers at most.
     """
-    from rts.sampling import packing_kernels
+    from rts.sampling import packing_loops
 
     if kept is None:
         kept, _ = covered_cells(fragments.triangle_ids)
     table = np.ascontiguousarray(proxy.faces if proxy.ids is None else proxy.ids, np.int32)
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
     beside = () if exits is None else ((exits.fragments, exits.there),)
-    packed = packing_kernels.pack(fragments, kept, table, corner_params, capacity or 0, *beside, views=views)
+    packed = packing_loops.pack(fragments, kept, table, corner_params, capacity or 0, *beside, views=views)
     found = None
     if exits is not None:
         found = np.full(kept[0].shape, -1, np.int32)

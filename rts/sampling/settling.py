@@ -104,7 +104,7 @@ def refined(
 
 def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.ndarray | None = None) -> Rays:
     """The ray of each packed sample (N, 3); where no cell has any, the first row gets the first pixel's."""
-    from rts.sampling import settling_kernels
+    from rts.sampling import settling_loops
 
     matrices = np.ascontiguousarray(camera.projection, np.float64), np.linalg.inv(np.asarray(camera.view, np.float64))
     ends = np.empty((len(samples.ids), 3)), np.empty((len(samples.ids), 3))
@@ -112,13 +112,13 @@ def rays_of(samples: Samples, camera: Camera, size: tuple[int, ...], cells: np.n
     given = (height, width), *matrices, *ends
     if len(samples.ids) == 1:
         none = np.zeros(1, np.int64)
-        settling_kernels.rays_of_cells(np.zeros((1, 1), np.int32), none, none, *given)
+        settling_loops.rays_of_cells(np.zeros((1, 1), np.int32), none, none, *given)
     if cells is not None:
         lines, columns = np.divmod(cells.reshape(-1), width)
-        settling_kernels.rays_of_cells(samples.row.reshape(len(samples.row), -1), lines, columns, *given)
+        settling_loops.rays_of_cells(samples.row.reshape(len(samples.row), -1), lines, columns, *given)
     else:
         lines = read_only(samples.row, np.int32).reshape(-1, width)
-        parallel(settling_kernels.rays_of, len(lines), lines, *given, work=20 * len(samples.ids))
+        parallel(settling_loops.rays_of, len(lines), lines, *given, work=20 * len(samples.ids))
     return Rays(*ends, camera.spread((height, width)))
 
 
@@ -133,14 +133,14 @@ def settle(samples: Samples, camera: Camera, spread: np.ndarray) -> Samples:
     Returns:
         Samples with another `row` and `depth`. What lies before the near or beyond the far plane is gone.
     """
-    from rts.sampling import settling_kernels
+    from rts.sampling import settling_loops
 
     row, depth = np.empty_like(samples.row), np.empty_like(samples.depth)
     # Depths are in the camera's units, the spread in the surface's: the view scales by this cube root.
     near, slope = SAME_ROOT_PIXELS * np.abs(np.linalg.det(camera.view[:3, :3])) ** (1 / 3) * spread
     limits = np.array([*_planes(camera), near, slope + SAME_ROOT])
     given = read_only(samples.row, np.int32), read_only(samples.depth, np.float32)
-    parallel(settling_kernels.settle_lines, row.shape[1], *given, limits, row, depth, work=10 * row.size)
+    parallel(settling_loops.settle_lines, row.shape[1], *given, limits, row, depth, work=10 * row.size)
     return samples.replace(row=row, depth=depth)
 
 

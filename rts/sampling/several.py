@@ -363,9 +363,9 @@ def _scales_of(depth: Array, picture: Picture) -> Array:
 
 def _counts(row: np.ndarray | None, rows: int, picture: Picture) -> np.ndarray:
     """(B,) how many rows of a table of at least so many are those of a view, of which each stands in one cell."""
-    from rts.sampling import packing_kernels
+    from rts.sampling import packing_loops
 
     assert row is not None
-    counts = packing_kernels.count_in_views(row >= 0, (picture.down, picture.across))[: picture.views]
+    counts = packing_loops.count_in_views(row >= 0, (picture.down, picture.across))[: picture.views]
     counts[0] += max(0, rows - counts.sum())  # Where nothing is seen there is a row nevertheless.
     return counts

@@ -107,7 +107,7 @@ class Layout(NamedTuple):
     Attributes:
         cells: (L, LINE) int32, the cells to sample, as flat indices in the grid with its apron; −1 for none.
         place: (h, w) int32, which of these each place of the layout shows, or −1.
-        kinds: (h, w) uint8, bits of `strips_kernels`.
+        kinds: (h, w) uint8, bits of `strips_loops`.
         wanted: (h, w) bool, the cells of active pixels.
         pixel: (H, W) int32, where in the layout, in pixels, an active pixel is; −1 for pixels that are not active.
         coarse: (H', W') bool, with the apron, the pixels of the image that are not active.
@@ -158,13 +158,13 @@ def lay_out(
         sizes_of: where shapes follow from what is needed, how many columns, and lines of cells, to allot for a number
             that is needed. None where they follow from `room`.
     """
-    from rts.sampling import strips_kernels
+    from rts.sampling import strips_loops
 
     marks = read_only(active).view(np.uint8)
-    runs = strips_kernels.find(marks, grid.high, grid.gap)
+    runs = strips_loops.find(marks, grid.high, grid.gap)
     columns = max(1, int(runs[:, 2].sum()) + grid.gap * len(runs))
     lines, across = _lines(grid, (sizes_of or int)(columns) if room is None else room.columns)
-    pieces = strips_kernels.split(runs, grid.gap, lines, across)
+    pieces = strips_loops.split(runs, grid.gap, lines, across)
     if room is None and sizes_of is int:
         lines = int(pieces[:, 3].max(initial=0)) + 1
     sizes = grid.side, grid.apron, grid.high, grid.gap
@@ -177,24 +177,24 @@ def lay_out(
     cells[total:] = -1
     place, kinds = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8)
     given = marks, pieces, _firsts(pieces, grid), *sizes, np.cumsum(counts) - counts, cells, place, kinds
-    parallel(strips_kernels.fill, len(counts), *given, work=4 * place.size)
-    strips_kernels.number(marks, pieces, grid.high, grid.pitch, across - grid.gap, pixel)
+    parallel(strips_loops.fill, len(counts), *given, work=4 * place.size)
+    strips_loops.number(marks, pieces, grid.high, grid.pitch, across - grid.gap, pixel)
     left = np.count_nonzero(active) - np.count_nonzero(pixel >= 0)
     coarse = np.ones([n + 2 * grid.apron for n in grid.size], bool)
     inner = tuple(slice(grid.apron, grid.apron + n) for n in grid.size)
     np.less(pixel, 0, out=coarse[inner])
-    wanted = (kinds & strips_kernels.WANTED).view(np.bool_)
+    wanted = (kinds & strips_loops.WANTED).view(np.bool_)
     return Layout(cells.reshape(-1, LINE), place, kinds, wanted, pixel, coarse, np.asarray(left, np.int32))
 
 
 def _fitting(marks: np.ndarray, pieces: np.ndarray, grid: FineGrid, most: int | None) -> tuple[np.ndarray, np.ndarray]:
     """The first pieces, as many as have no more cells than there is room for; and their cells in each line."""
-    from rts.sampling import strips_kernels
+    from rts.sampling import strips_loops
 
     def counted(n: int) -> np.ndarray:
         counts = np.zeros(grid.fine[0], np.int64)
         given = marks, pieces[:n], _firsts(pieces[:n], grid), grid.side, grid.apron, grid.high
-        parallel(strips_kernels.count, len(counts), *given, grid.fine[1], counts, work=500 * len(counts))
+        parallel(strips_loops.count, len(counts), *given, grid.fine[1], counts, work=500 * len(counts))
         return counts
 
     counts = counted(len(pieces))
@@ -236,13 +236,13 @@ class HiddenInStrips:
 
     def decide(self, question: Question) -> Decision:
         """See `Hidden`; cells are (K, L, LINE)."""
-        from rts.sampling import strips_kernels
+        from rts.sampling import strips_loops
 
         covered, depth, size = question
         layers, (place, wanted) = len(covered), (self.layout.place, self.layout.wanted)
         lists = [read_only(x).reshape(layers, -1) for x in (covered, depth)]
         laid, deep = np.empty((layers, *place.shape), bool), np.empty((layers, *place.shape), depth.dtype)
-        parallel(strips_kernels.gather, layers * len(place), *lists, place, laid, deep, work=2 * laid.size)
+        parallel(strips_loops.gather, layers * len(place), *lists, place, laid, deep, work=2 * laid.size)
         kept, settled, asked = self.rule.decide(Question(laid, deep, size), wanted)
         needed = covered
         if asked is not laid:
@@ -258,11 +258,11 @@ class HiddenInStrips:
 
         Other marks are then taken away.
         """
-        from rts.sampling import strips_kernels
+        from rts.sampling import strips_loops
 
         found, place = np.zeros((len(among), among[0].size), bool), self.layout.place
         given = marks, np.empty((0, 0), np.uint8) if kinds is None else kinds, place, found
-        parallel(strips_kernels.scatter, len(marks) * len(place), *given, work=marks.size)
+        parallel(strips_loops.scatter, len(marks) * len(place), *given, work=marks.size)
         found = found.reshape(among.shape)
         found &= among
         return found
@@ -315,21 +315,21 @@ def _arranged(
     width: int,
     settled: np.ndarray | None = None,
 ) -> tuple[np.ndarray, ...]:
-    """What `strips_kernels.arrange` fills; there is always at least one splat."""
-    from rts.sampling import strips_kernels
+    """What `strips_loops.arrange` fills; there is always at least one splat."""
+    from rts.sampling import strips_loops
 
     row, place, cells = (read_only(x, np.int32) for x in (row, place, cells))
     amid = read_only(np.empty(0, np.int8) if settled is None else settled.reshape(-1))
     row, cells, lines = row.reshape(len(row), -1), cells.reshape(-1), len(row) * len(place)
     counts = np.empty(lines, np.int64)
-    parallel(strips_kernels.count_samples, lines, row, place, counts, work=len(row) * place.size)
+    parallel(strips_loops.count_samples, lines, row, place, counts, work=len(row) * place.size)
     offsets, total = np.cumsum(counts) - counts, int(counts.sum())
     make = np.empty if total else np.zeros
     index, shift = make(max(1, total), np.int32), make((max(1, total), 3), np.float32)
     laid, part = (np.empty((len(row), *place.shape), np.int32) for _ in range(2))
     shown = np.empty(place.shape if len(amid) else (0, 0), np.int8)
     given = row, place, cells, amid, np.cumsum(sizes)[:-1], width, offsets, index, shift, laid, part, shown
-    parallel(strips_kernels.arrange, lines, *given, work=2 * laid.size)
+    parallel(strips_loops.arrange, lines, *given, work=2 * laid.size)
     return index, shift, laid, part, shown
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.threads import parallel
 
 LEAST, MOST = 2e-6, 2e-5
@@ -92,7 +92,7 @@ def _shape(vertices, faces, t, sphere, points):
     return a, b, np.sqrt(ux * ux + uy * uy + uz * uz), np.sqrt(nx * nx + ny * ny + nz * nz)
 
 
-@kernel(error_model="numpy")
+@loop(error_model="numpy")
 def _count(start, stop, vertices, faces, sphere, wanted):
     """How many further covers triangles need."""
     points = np.empty((3, 3))
@@ -103,7 +103,7 @@ def _count(start, stop, vertices, faces, sphere, wanted):
             wanted[t] = 2 if max(a, b, c) < SMALL else 1
 
 
-@kernel(error_model="numpy")
+@loop(error_model="numpy")
 def _cover(start, stop, vertices, faces, sphere, wanted, places, corners, owners, margins):
     points, along, side, across = np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(3)
     for t in range(start, stop):

@@ -13,7 +13,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from rts import Camera
-from rts.plugin_api.loops import kernel
+from rts.plugin_api.loops import loop
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel
 from rts_backends.neighbours import corner_lists, look, places
@@ -108,7 +108,7 @@ class Scene:
         )
 
 
-@kernel
+@loop
 def _take(
     first, last, pixels, triangles, width, matrix, row, keep, vertices, faces, around, offsets, members, ids, found
 ):  # fmt: skip

@@ -156,7 +156,7 @@ class Cells:
 
     @property
     def plain_arguments(self) -> tuple:
-        """Arguments of the stencil's kernels. In `visible` no plain target takes a hidden layer."""
+        """Arguments of the stencil's loops. In `visible` no plain target takes a hidden layer."""
         return self.positions, self.rgba, self.row[:1] if self.visible else self.row, *self._numbers
 
     @property
@@ -171,7 +171,7 @@ class Cells:
 
     @property
     def mixed_arguments(self) -> tuple:
-        """Arguments of the kernels of mixed targets."""
+        """Arguments of the loops of mixed targets."""
         choices = self.choices
         return self.positions, self.rgba, self.row, *self._numbers, choices.offsets, choices.columns, choices.ranges
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.records import Cells
 from rts_backends.fused.mixed import sums_of
 from rts_backends.fused.pairs import BLOCK, mark
@@ -34,7 +34,7 @@ def _depths(z, at, positions, row, y, x, beyond):
             z[k, at] = z.dtype.type(np.nan)
 
 
-@kernel
+@loop
 def find(start, stop, positions, row, beyond, hidden, states, mixed, counts):
     """Mark mixed targets (H, W) of `Multi`, and count those of each row. `survey` finds those of `Visible`.
 
@@ -68,7 +68,7 @@ def _any(states):
     return most == BUSY
 
 
-@kernel
+@loop
 def narrow(start, stop, mixed, wanted, kept, counts):
     """Leave out mixed targets of rows [start, stop) that decide nothing for wanted ones.
 
@@ -94,7 +94,7 @@ def narrow(start, stop, mixed, wanted, kept, counts):
                 counts[y] += kept[y, x]
 
 
-@kernel
+@loop
 def choose(
     start,
     stop,

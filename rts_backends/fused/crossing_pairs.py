@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.splats import Visible
 from rts.plugin_api.threads import parallel, read_only
 
@@ -80,7 +80,7 @@ def nothing(width: int) -> tuple[np.ndarray, np.ndarray]:
     return read_only(np.empty((0, width), np.uint8)), np.empty(0, np.bool_)
 
 
-@kernel
+@loop
 def gather(start, stop, positions, row, some, z, gap):
     """Fill those rows of depths and gaps, in [start, stop) of all that there are, that decide about pairs in others.
 
@@ -102,7 +102,7 @@ def gather(start, stop, positions, row, some, z, gap):
                 _load_cells(z[:, at], gap[at], positions, row, y)
 
 
-@kernel
+@loop
 def find_in_cells(start, stop, positions, row, rules, bits, some):
     """Find pairs whose first cell lies in rows [start, stop)."""
     _, height, width = row.shape
@@ -119,7 +119,7 @@ def find_in_cells(start, stop, positions, row, rules, bits, some):
             _find(top, bottom, z, gap, most, rules, False, bits, some)
 
 
-@kernel
+@loop
 def _find_candidates(start, stop, covered, depth, rules, bits, some):
     """Find what may be pairs, whatever hidden layers are left out, whose first cell lies in rows [start, stop)."""
     _, height, width = covered.shape
@@ -349,7 +349,7 @@ def steps(bits, y, x):
     return found
 
 
-@kernel
+@loop
 def _keep(covered, bits, some, reach, kept):
     """Keep the first two layers near pairs."""
     _, height, width = covered.shape

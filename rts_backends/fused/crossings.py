@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.threads import parallel
 from rts_backends.fused.crossing_pairs import BORDER, Rules, gather, has_two, steps
 from rts_backends.fused.mixed import splat, tint_of
@@ -99,7 +99,7 @@ def listed(arrays: tuple, choices: Any, extent: np.floating, bits: np.ndarray, s
     return found
 
 
-@kernel
+@loop
 def _still(start, stop, firsts, crossed, offsets, columns, changes):
     """`Crossings.still` of rows [start, stop)."""
     for y in range(start, stop):
@@ -111,7 +111,7 @@ def _still(start, stop, firsts, crossed, offsets, columns, changes):
                 changes[d, :, :] = 0
 
 
-@kernel
+@loop
 def _list(start, stop, bits, some, states, row, mixed, firsts, columns, ranges, z, gap, rules, around, counts):
     """Find targets of rows [start, stop): their pairs, as bits 3 (v + 1) + (u + 1) of steps; and how many there are.
 
@@ -141,7 +141,7 @@ def _place(columns, m, mixed, y, x):
     return m
 
 
-@kernel
+@loop
 def _fill(
     start,
     stop,
@@ -308,7 +308,7 @@ def change_of(pixel, d, found, positions, rgba, row, scale, peak, gamma, ranges,
             pixel[c] += found.weights[d, n, 0] * t_rgba[row[0, y + 1 - n // 3, x + 1 - n % 3], c]
 
 
-@kernel
+@loop
 def push(
     start,
     stop,
@@ -336,7 +336,7 @@ def push(
                     change_of(out[t, y - border, x], d, found, *given, y, t_positions[t], t_rgba[t])
 
 
-@kernel
+@loop
 def pull(rgba, row, found, border, g, g_positions, g_rgba):
     """Add to the gradients of positions (N, 3) and rgba (N, 4), or of no rows, what listed targets give.
 

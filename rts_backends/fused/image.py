@@ -1,4 +1,4 @@
-"""A splatted image as an operation: compiled kernels, and the specification that they equal."""
+"""A splatted image as an operation: compiled loops, and the specification that they equal."""
 
 from __future__ import annotations
 

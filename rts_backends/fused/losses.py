@@ -14,7 +14,7 @@ FAR, LEAST_SHARE = Loss.FAR, Loss.LEAST_SHARE
 
 
 def in_numbers(loss: Loss, dtype: np.dtype) -> tuple[int, np.floating]:
-    """A loss as kernels take it: its place, and the scale as a number of the residuals' dtype."""
+    """A loss as loops take it: its place, and the scale as a number of the residuals' dtype."""
     return loss.place, np.dtype(dtype).type(loss.f_scale)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts_backends.fused.rows import compiled, exp, kernel
+from rts_backends.fused.rows import compiled, exp, loop
 
 
 @compiled
@@ -41,7 +41,7 @@ def sums_of(total, positions, rgba, row, y, x, choice, scale, peak, gamma):
             total[b, c] *= over
 
 
-@kernel
+@loop
 def forward(start, stop, offsets, columns, sums, border, image):
     """Fill mixed targets of rows [start, stop) of the image (H, W, 4), which is the cells without `border`."""
     one = image.dtype.type(1)
@@ -55,7 +55,7 @@ def forward(start, stop, offsets, columns, sums, border, image):
                 image[y - border, x - border, c] = total[0, c] + (one - total[0, 3]) * back
 
 
-@kernel
+@loop
 def adjoint(start, stop, offsets, columns, sums, border, g, adjoints):
     """Adjoints (M, 3, 5) of the sums of mixed targets from that of the image, zero beyond it."""
     zero, one = g.dtype.type(0), g.dtype.type(1)
@@ -92,7 +92,7 @@ def _any(adjoints, d):
     return some
 
 
-@kernel
+@loop
 def pull(
     start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, adjoints, g_positions, g_rgba
 ):
@@ -122,7 +122,7 @@ def pull(
                                 g_positions[i, 1] += slope * w * h * dy
 
 
-@kernel
+@loop
 def push(start, stop, positions, rgba, row, scale, peak, gamma, offsets, columns, choices, sums, tangents, border, out):
     """Fill mixed targets of rows [start, stop) of `out` (T, H, W, 4); `tangents` are those of positions and rgba."""
     changes = np.empty((len(out), 3, 5), out.dtype)

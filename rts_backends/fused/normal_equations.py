@@ -35,7 +35,7 @@ from rts_backends.fused.rows import (
     compiled,
     composite,
     fill,
-    kernel,
+    loop,
     normalised_sums,
     slot,
 )
@@ -131,7 +131,7 @@ def _any(tangents: np.ndarray) -> bool:
     return bool((tangents[:1] if tangents.strides[0] == 0 else tangents).any())
 
 
-@kernel
+@loop
 def _accumulate(
     start, stop, planes, plain, row, choices, outlines, crossings, settled, tangents, fields, loss, border, fine, sums
 ):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.threads import parallel
 from rts_backends.fused.crossing_pairs import steps
 from rts_backends.fused.pairs import BLOCK
@@ -87,7 +87,7 @@ OUTWARD = np.array([_ordered(bits) for bits in range(LISTED)], np.int8)
 """The order (512, 9) in which directions are looked at, by the bits of those in which a front ends."""
 
 
-@kernel
+@loop
 def narrow(start, stop, ends, wanted, kept, counts):
     """Take marks of rows [start, stop) off targets that are neither wanted nor beside wanted ones.
 
@@ -186,7 +186,7 @@ def _ratio(positions, row, ends, y, x, v, u, flat):
     return (positions[row[0, y, x], 2] - middle) / slope if slope > flat else zero
 
 
-@kernel
+@loop
 def fill(
     start,
     stop,
@@ -397,7 +397,7 @@ def gain(d, t_positions, row, outlines, y):
     return front, surface
 
 
-@kernel
+@loop
 def push(start, stop, row, outlines, t_positions, border, out):
     """Add to rows [start, stop) of the tangents (T, H, W, 4)."""
     for y in range(start + border, stop + border):
@@ -420,7 +420,7 @@ def pull(row: np.ndarray, outlines: Outlines, border: int, g: np.ndarray, g_posi
         parallel(_pull, (bands + 1 - first) // 2, *given, work=20 * len(outlines.columns))
 
 
-@kernel
+@loop
 def _pull(start, stop, row, outlines, border, g, first, g_positions):
     """`pull` of every other band of rows, from band `first` on: these have no sample in common."""
     width, zero = g.shape[1], g_positions.dtype.type(0)

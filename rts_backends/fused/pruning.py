@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.splats import Visible
 from rts.plugin_api.threads import parallel
 from rts_backends.fused import crossing_pairs
@@ -48,7 +48,7 @@ def _extremes(covered: np.ndarray, depth: np.ndarray) -> tuple[np.floating, np.f
     return -low, high
 
 
-@kernel
+@loop
 def _find_extremes(start, stop, bits, covered, found):
     """Fill `found` (lines, 2) with how far floats of each line are below and above zero at most, as bits.
 
@@ -65,7 +65,7 @@ def _find_extremes(start, stop, bits, covered, found):
         found[i, 0], found[i, 1] = low, high
 
 
-@kernel
+@loop
 def _keep(start, stop, covered, depth, visible, rims, beyond, margin, continued, kept):
     """Keep the fronts of rows [start, stop), and hidden layers around marks: of RING alone, the second."""
     layers, height, width = covered.shape

@@ -8,8 +8,8 @@ it has been read.
 Buffers here are one or two: the surface, which takes the front layers, and, where `row` has more layers, what is behind
 it, which takes all the others.
 
-Helpers are not cached on disk, only the kernels that call them (see `rts_backends.triangles`): after a change here,
-touch the files of the kernels.
+Helpers are not cached on disk, only the loops that call them (see `rts_backends.triangles`): after a change here,
+touch the files of the loops.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SUM, SUMS = 5 * PITCH, 10 * PITCH
 """How many numbers a buffer's sums take, and those of two buffers: colours and the weight."""
 
 compiled = partial(loops.compiled, fastmath={"contract"})
-kernel = partial(loops.kernel, fastmath={"contract"})
+loop = partial(loops.loop, fastmath={"contract"})
 
 _F = [np.float32(1 / math.factorial(i)) for i in range(8)]
 _ONE, _F2, _F3, _F4, _F5, _F6, _F7 = _F[1:]

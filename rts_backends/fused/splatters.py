@@ -18,7 +18,7 @@ from rts_backends.fused.image import IMAGE
 
 
 class _Fused(SummingSplatter):
-    """Base that makes `image` by compiled kernels; it stands before a class of `rts.splatting`, which it extends."""
+    """Base that makes `image` by compiled loops; it stands before a class of `rts.splatting`, which it extends."""
 
     kind: ClassVar[str]
     sigma: float

@@ -18,8 +18,8 @@ from rts_backends.fused.rows import (
     busy,
     compiled,
     composite,
-    kernel,
     load,
+    loop,
     normalised_sums,
     slot,
     store,
@@ -46,7 +46,7 @@ def load_around(sources, loaded, positions, rgba, row, y, first, count, scale, p
     return start
 
 
-@kernel
+@loop
 def forward(start, stop, positions, rgba, row, scale, peak, gamma, states, border, image):
     """Fill rows [start, stop) of the image (H, W, 4), which is the cells without `border`."""
     layers, (_, width, _) = len(row), image.shape
@@ -161,7 +161,7 @@ def gather(to, s, above, level, below, count):
         to[5 * PITCH + j], to[6 * PITCH + j], to[7 * PITCH + j] = h, hx, hy
 
 
-@kernel
+@loop
 def pull(start, stop, positions, rgba, row, scale, peak, gamma, states, border, g, g_positions, g_rgba):
     """Gradients of what source rows [start, stop) give to targets that are not mixed; each cell collects its own."""
     layers, _, width = row.shape
@@ -266,7 +266,7 @@ def tangent_row(to, total, layers, count, planes=COLORS):
                 to[p] += through * to[SUM + p] - change * total[SUM + p]
 
 
-@kernel
+@loop
 def push(start, stop, positions, rgba, row, scale, peak, gamma, t_positions, t_rgba, states, border, out):
     """Fill rows [start, stop) of the tangents (T, H, W, 4). Tangents that are zeros may be absent: (T, 0, ·)."""
     layers, (many, _, width, _) = len(row), out.shape

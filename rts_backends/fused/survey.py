@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 from rts_backends.fused.pairs import BLOCK, mark
 
 EMPTY, SETTLED, FLAT, BUSY = 0, 1, 2, 3
@@ -23,7 +23,7 @@ NOTHING, COVERED, LOOSE = np.uint8(1), np.uint8(2), np.uint8(4)
 """Bits of a cell: in the array without a sample, with one, and not sure to fill its share of what is around it."""
 
 
-@kernel
+@loop
 def survey(
     start,
     stop,
@@ -255,7 +255,7 @@ def _empty(kinds, x, n):
     return np.uint16(kinds[x] & NOTHING) << n
 
 
-@kernel
+@loop
 def paint(start, stop, settled, border, colors, images):
     """Give settled targets of rows [start, stop) of images (T, H, W, 4), which have no border, colours (T, N, 4).
 
@@ -273,7 +273,7 @@ def paint(start, stop, settled, border, colors, images):
                         image[x, c] = colors[n, i, c] if some else zero
 
 
-@kernel
+@loop
 def note(start, stop, settled, shown):
     """Mark the samples (N,) bool whose colours settled targets of rows [start, stop) show."""
     last = -1
@@ -285,7 +285,7 @@ def note(start, stop, settled, shown):
                     shown[last] = True
 
 
-@kernel
+@loop
 def collect(start, stop, settled, number, border, g, sums):
     """Sums (H, S, 4) of the gradient (H, W, 4) of an image without a border at settled targets of rows [start, stop).
 

@@ -55,7 +55,7 @@ def apply(operation: Operation, operands: Sequence[jax.Array], params: Mapping[s
 
 
 def fits(operation: Operation, operands: Sequence[jax.Array]) -> bool:
-    """Whether kernels may compute it: dtypes are theirs; on what device arrays are, a traced function cannot know."""
+    """Whether loops may compute it: dtypes are theirs; on what device arrays are, a traced function cannot know."""
     return not _specifying.get() and operation.fits([x.dtype for x in operands])
 
 
@@ -158,7 +158,7 @@ class _Differentiable:
         """The result."""
         return self._value(*operands, **params)[0]
 
-    # ------------------------------------------------------------------------------------------ by compiled kernels
+    # ------------------------------------------------------------------------------------------ by compiled loops
 
     def _in_use(self, given: Sequence[np.ndarray]) -> tuple[list[np.ndarray], int, Any]:
         """The operands, of packed ones the rows in use; their number; and what the value has kept."""

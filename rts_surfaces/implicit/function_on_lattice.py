@@ -141,7 +141,7 @@ class FunctionOnLattice(Field):
         """Samples whose ids are rows of a table of lattice points, if there is to be one."""
         if not self.table:
             return samples
-        from rts_surfaces.implicit.distinct_kernels import distinct
+        from rts_surfaces.implicit.distinct_loops import distinct
 
         points, rows = distinct(samples.ids.reshape(-1).astype(np.int64))
         room = len(samples.tables["points"])

@@ -85,10 +85,10 @@ def _shape(values: tuple[int, ...], points: tuple[int, ...], **_: object) -> tup
 
 
 def _forward(operands: Sequence[np.ndarray], out: np.ndarray, *, low: Numbers, step: Numbers) -> None:
-    from rts_surfaces.implicit import interpolation_kernels
+    from rts_surfaces.implicit import interpolation_loops
 
     values, points = operands
-    parallel(interpolation_kernels.value, len(points), values, points, low, step, out, work=150 * len(points))
+    parallel(interpolation_loops.value, len(points), values, points, low, step, out, work=150 * len(points))
 
 
 def _push(
@@ -99,7 +99,7 @@ def _push(
     low: Numbers,
     step: Numbers,
 ) -> None:
-    from rts_surfaces.implicit import interpolation_kernels
+    from rts_surfaces.implicit import interpolation_loops
 
     (values, points), (t_values, t_points) = operands, tangents
     out[...] = 0
@@ -107,20 +107,20 @@ def _push(
         _forward((read_only(t_values), points), out, low=low, step=step)
     if t_points is not None:
         given = values, points, read_only(t_points), low, step, out
-        parallel(interpolation_kernels.push_points, len(points), *given, work=300 * len(points))
+        parallel(interpolation_loops.push_points, len(points), *given, work=300 * len(points))
 
 
 def _pull(
     operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None], *, low: Numbers, step: Numbers
 ) -> None:
-    from rts_surfaces.implicit import interpolation_kernels
+    from rts_surfaces.implicit import interpolation_loops
 
     (values, points), (g_values, g_points), g = operands, results, read_only(g)
     if g_values is not None:
-        interpolation_kernels.pull_values(points, g, low, step, g_values)
+        interpolation_loops.pull_values(points, g, low, step, g_values)
     if g_points is not None:
         given = values, points, g, low, step, g_points
-        parallel(interpolation_kernels.pull_points, len(points), *given, work=300 * len(points))
+        parallel(interpolation_loops.pull_points, len(points), *given, work=300 * len(points))
 
 
 _PACKED: dict[str, Any] = {"packed": (1,), "packed_result": True}

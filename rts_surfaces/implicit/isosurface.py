@@ -215,7 +215,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     def proxy(self, inputs: Mapping[str, np.ndarray], camera: Any, size: tuple[int, int]) -> Proxy:
         """The triangles of marching cubes, each with the ends of its edges, its cell, and where it is capped."""
-        from rts_surfaces.implicit import lattice_samples_kernels
+        from rts_surfaces.implicit import lattice_samples_loops
 
         found = self._triangles(inputs)
         if len(self._usual) >= KEPT:
@@ -226,7 +226,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
             kept = ~_singular(found)[faces].any(axis=1)
             faces, cells, caps = faces[kept], cells[kept], caps[kept]
         ids = np.empty((len(faces), 8), np.int32)
-        parallel(lattice_samples_kernels.hand_on, len(ids), faces, found.ends, cells, caps, ids, work=10 * len(ids))
+        parallel(lattice_samples_loops.hand_on, len(ids), faces, found.ends, cells, caps, ids, work=10 * len(ids))
         return Proxy(found.vertices, faces, ids)
 
     def pieces(self, proxy: Proxy) -> np.ndarray:
@@ -235,7 +235,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
 
     def refine(self, inputs: Mapping[str, np.ndarray], samples: Samples, rays: Rays) -> Samples:
         """What samples carry: weights of the six values, their place, and how they move; and lattice points merged."""
-        from rts_surfaces.implicit import lattice_samples_kernels
+        from rts_surfaces.implicit import lattice_samples_loops
 
         lattice = self.field.lattice(inputs)
         values = np.ascontiguousarray(inputs["values"]).reshape(-1)
@@ -250,7 +250,7 @@ class Isosurface(Implicit, TriangleSurface, RaySurface):
         # Where no cell is covered there is a row nevertheless, of nothing.
         count = int(samples.row.max()) + 1
         made = points, params, least / lattice.step.max()
-        parallel(lattice_samples_kernels.fill, count, *given, samples.ids, samples.params, *made, work=300 * count)
+        parallel(lattice_samples_loops.fill, count, *given, samples.ids, samples.params, *made, work=300 * count)
         return self.field.tabled(replace(samples, ids=points, params=params))
 
     def _usual_difference(self, inputs: Mapping[str, np.ndarray]) -> float:

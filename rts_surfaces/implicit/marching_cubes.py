@@ -82,7 +82,7 @@ def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: floa
         sign: 1 or −1.
         closed: whether to cap what is inside at the bounds.
     """
-    from rts_surfaces.implicit import marching_cubes_kernels as kernels
+    from rts_surfaces.implicit import marching_cubes_loops as loops
 
     counts, edges = cases()
     values = np.ascontiguousarray(values)
@@ -90,7 +90,7 @@ def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: floa
     tally = np.zeros((layers, 3), np.int64)
     level = values.dtype.type(isovalue), values.dtype.type(sign)
     given = values, *level, closed
-    parallel(kernels.count, layers, *given, counts, tally, work=layers * values[0].size)
+    parallel(loops.count, layers, *given, counts, tally, work=layers * values[0].size)
     offsets = np.cumsum(tally, axis=0) - tally
     mixed, vertices, triangles = (int(n) for n in tally.sum(axis=0))
     cells, codes = np.empty(mixed, np.int64), np.empty(mixed, np.uint8)
@@ -99,19 +99,19 @@ def of_lattice(values: np.ndarray, lattice: Lattice, isovalue: float, sign: floa
     ends, places = np.empty((vertices, 2), np.int32), np.empty((vertices, 3), np.float32)
     differences = np.empty(vertices, np.float32)
     found = cells, codes, first, ends, places, differences
-    parallel(kernels.vertices, layers, *given, lattice.low, lattice.step, offsets, *found, work=layers * values[0].size)
+    parallel(loops.vertices, layers, *given, lattice.low, lattice.step, offsets, *found, work=layers * values[0].size)
     faces = np.empty((triangles, 3), np.int32)
     owners, caps = np.empty(triangles, np.int32), np.empty(triangles, np.int8)
     made = faces, owners, caps
     table = counts, edges, EDGES
-    parallel(kernels.faces, layers, values.shape, closed, offsets, cells, codes, first, *table, *made, work=50 * mixed)
+    parallel(loops.faces, layers, values.shape, closed, offsets, cells, codes, first, *table, *made, work=50 * mixed)
     return Triangles(places, faces, ends, owners, caps, differences)
 
 
 def of_band(band: Band, lattice: Lattice, closed: bool) -> Triangles:
     """The isosurface in the cells of a band, of a level that is negative inside; see `of_lattice`."""
-    from rts_surfaces.implicit import marching_cubes_kernels as kernels
-    from rts_surfaces.implicit.distinct_kernels import distinct
+    from rts_surfaces.implicit import marching_cubes_loops as loops
+    from rts_surfaces.implicit.distinct_loops import distinct
 
     counts, edges = cases()
     owners, corners, virtual, caps = _with_border(band, lattice, closed)
@@ -122,7 +122,7 @@ def of_band(band: Band, lattice: Lattice, closed: bool) -> Triangles:
     per_cell = counts[codes].astype(np.int64)
     total = int(per_cell.sum())
     keys, pairs = np.empty(3 * total, np.int64), np.empty((3 * total, 2), np.int32)
-    kernels.edges_of_cells(corners, virtual, codes, counts, edges, EDGES, keys, pairs)
+    loops.edges_of_cells(corners, virtual, codes, counts, edges, EDGES, keys, pairs)
     kept, faces = distinct(keys)
     ends = np.empty((len(kept), 2), np.int32)
     ends[faces] = pairs

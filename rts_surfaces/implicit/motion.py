@@ -49,31 +49,31 @@ def _checked(operands: Sequence[np.ndarray], width: int) -> Sequence[np.ndarray]
 
 
 def _forward(operands: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, sign: float) -> None:
-    from rts_surfaces.implicit import motion_kernels
+    from rts_surfaces.implicit import motion_loops
 
     values, params, rows = _checked(operands, 16)
     real = values.dtype.type
-    parallel(motion_kernels.move, len(rows), values, params, rows, real(isovalue), real(sign), out, work=30 * len(rows))
+    parallel(motion_loops.move, len(rows), values, params, rows, real(isovalue), real(sign), out, work=30 * len(rows))
 
 
 def _push(
     operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, sign: float
 ) -> None:
-    from rts_surfaces.implicit import motion_kernels
+    from rts_surfaces.implicit import motion_loops
 
     values, params, rows = _checked(operands, 16)
     given = read_only(tangents[0]), params, rows, values.dtype.type(sign), out
-    parallel(motion_kernels.push, len(rows), *given, work=30 * len(rows))
+    parallel(motion_loops.push, len(rows), *given, work=30 * len(rows))
 
 
 def _pull(
     operands: Sequence[np.ndarray], g: np.ndarray, results: Sequence[np.ndarray | None], *, isovalue: float, sign: float
 ) -> None:
-    from rts_surfaces.implicit import motion_kernels
+    from rts_surfaces.implicit import motion_loops
 
     values, params, rows = _checked(operands, 16)
     if results[0] is not None:
-        motion_kernels.pull(read_only(g), params, rows, values.dtype.type(sign), results[0])
+        motion_loops.pull(read_only(g), params, rows, values.dtype.type(sign), results[0])
 
 
 ALONG_NORMAL = Operation(
@@ -124,21 +124,21 @@ def _crossing(f_a: Array, f_b: Array, least: Array) -> Array:
 
 
 def _forward_edges(operands: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, lattice: Edges) -> None:
-    from rts_surfaces.implicit import motion_kernels
+    from rts_surfaces.implicit import motion_loops
 
     values, params, rows, numbers = _checked(operands, 4)
     given = values, params, rows, numbers, values.dtype.type(isovalue), *lattice, out
-    parallel(motion_kernels.cross, len(rows), *given, work=60 * len(rows))
+    parallel(motion_loops.cross, len(rows), *given, work=60 * len(rows))
 
 
 def _push_edges(
     operands: Sequence[np.ndarray], tangents: Sequence[np.ndarray], out: np.ndarray, *, isovalue: float, lattice: Edges
 ) -> None:
-    from rts_surfaces.implicit import motion_kernels
+    from rts_surfaces.implicit import motion_loops
 
     values, params, rows, numbers = _checked(operands, 4)
     given = values, read_only(tangents[0]), params, rows, numbers, values.dtype.type(isovalue), *lattice, out
-    parallel(motion_kernels.push_crossings, len(rows), *given, work=60 * len(rows))
+    parallel(motion_loops.push_crossings, len(rows), *given, work=60 * len(rows))
 
 
 def _pull_edges(
@@ -149,12 +149,12 @@ def _pull_edges(
     isovalue: float,
     lattice: Edges,
 ) -> None:
-    from rts_surfaces.implicit import motion_kernels
+    from rts_surfaces.implicit import motion_loops
 
     values, params, rows, numbers = _checked(operands, 4)
     if results[0] is not None:
         given = values, read_only(g), params, rows, numbers, values.dtype.type(isovalue), *lattice, results[0]
-        motion_kernels.pull_crossings(*given)
+        motion_loops.pull_crossings(*given)
 
 
 ALONG_EDGES = Operation(

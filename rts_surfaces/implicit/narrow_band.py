@@ -12,7 +12,7 @@ import numpy as np
 from rts import InputError
 from rts.plugin_api.checks import check_positive, is_count, quoted
 from rts.plugin_api.threads import parallel
-from rts_surfaces.implicit import narrow_band_kernels as kernels
+from rts_surfaces.implicit import narrow_band_loops as loops
 from rts_surfaces.implicit.lattice import Lattice
 
 Level = Callable[[np.ndarray], np.ndarray]
@@ -111,7 +111,7 @@ class NarrowBand:
             point = np.array(np.unravel_index(unknown.number, lattice.shape))
             grid, cells = _Grid(evaluate, 1), np.minimum(point, np.array(lattice.shape) - 2)[None].astype(np.int32)
             rows = grid.corners(cells)
-        numbers, values = kernels.compact(rows, grid.numbers, grid.values)
+        numbers, values = loops.compact(rows, grid.numbers, grid.values)
         return Band(numbers, values, rows, cells, evaluate.count)
 
 
@@ -142,24 +142,24 @@ class _Evaluate:
 
     def at_points(self, numbers: np.ndarray) -> np.ndarray:
         """The levels (M,) at points by number (M,)."""
-        return self._levels(kernels.places_of, numbers, numbers, self.shape, self.low, self.step)
+        return self._levels(loops.places_of, numbers, numbers, self.shape, self.low, self.step)
 
     def at_centres(self, blocks: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
         """The numbers (B,) of the centres of blocks (B, 3), −1 where a block is cropped, and the levels there (B,)."""
-        numbers = kernels.centre_numbers(blocks, side, self.shape)
-        return numbers, self._levels(kernels.centres, numbers, blocks, side, self.shape, self.low, self.step)
+        numbers = loops.centre_numbers(blocks, side, self.shape)
+        return numbers, self._levels(loops.centres, numbers, blocks, side, self.shape, self.low, self.step)
 
     def slack(self, values: np.ndarray, lipschitz: float) -> float:
         """How far levels may be off by rounding."""
         far = max(max(abs(x), abs(x + s * (n - 1))) for x, s, n in zip(self.low, self.step, self.shape, strict=True))
         return ROUNDING * float(np.finfo(values.dtype).eps) * lipschitz * far
 
-    def _levels(self, kernel: Callable, numbers: np.ndarray, items: np.ndarray, *args: Any) -> np.ndarray:
+    def _levels(self, loop: Callable, numbers: np.ndarray, items: np.ndarray, *args: Any) -> np.ndarray:
         found = np.empty(0, self.dtype)
         for first in range(0, len(items), self.chunk):
             some = items[first : first + self.chunk]
             places = np.empty((len(some), 3))
-            parallel(kernel, len(some), some, *args, places, work=len(some) * WORK)
+            parallel(loop, len(some), some, *args, places, work=len(some) * WORK)
             levels = np.asarray(self.level(places))
             self.count += len(some)
             if first == 0:
@@ -197,7 +197,7 @@ class _Grid:
         """Tell the levels at corners by their numbers in the lattice, all of them new; negative numbers are none."""
         numbers, values = numbers[numbers >= 0], values[numbers >= 0]
         first, state = self._count, (self.directory, self.bricks, self._used, self._numbers, self._count)
-        self.bricks, self._used, self._numbers, self._count = kernels.given_rows(
+        self.bricks, self._used, self._numbers, self._count = loops.given_rows(
             numbers, self.side, self._evaluate.shape, self.counts, *state
         )
         self._keep(first, values)
@@ -205,7 +205,7 @@ class _Grid:
     def corners(self, blocks: np.ndarray) -> np.ndarray:
         """The rows (B, 8) of the corners of blocks; where the level is not known there, it is evaluated."""
         first, state = self._count, (self.directory, self.bricks, self._used, self._numbers, self._count)
-        rows, self.bricks, self._used, self._numbers, self._count = kernels.numbered(
+        rows, self.bricks, self._used, self._numbers, self._count = loops.numbered(
             blocks, self.side, self._evaluate.shape, self.counts, *state
         )
         if self._count > first:
@@ -221,9 +221,9 @@ class _Grid:
 
 
 def _bricks(counts: tuple[int, ...], dtype: Any) -> tuple[np.ndarray, np.ndarray]:
-    """A directory without bricks, and room for some; see `rts_surfaces.implicit.narrow_band_kernels`."""
-    places = int(np.prod([n // kernels.BRICK + 1 for n in counts]))
-    return np.full(places, -1, np.int32), np.empty((64, kernels.BRICK**3), dtype)
+    """A directory without bricks, and room for some; see `rts_surfaces.implicit.narrow_band_loops`."""
+    places = int(np.prod([n // loops.BRICK + 1 for n in counts]))
+    return np.full(places, -1, np.int32), np.empty((64, loops.BRICK**3), dtype)
 
 
 def _bounded(evaluate: _Evaluate, side: int, lipschitz: float, closed: bool) -> tuple[_Grid, np.ndarray, np.ndarray]:
@@ -232,11 +232,11 @@ def _bounded(evaluate: _Evaluate, side: int, lipschitz: float, closed: bool) -> 
     while side > 1:
         numbers, levels = evaluate.at_centres(blocks, side)
         slack = evaluate.slack(levels, lipschitz)
-        near = kernels.near(blocks, levels, side, evaluate.shape, evaluate.step, lipschitz, slack, closed)
+        near = loops.near(blocks, levels, side, evaluate.shape, evaluate.step, lipschitz, slack, closed)
         blocks = blocks[near]
         centres.append((numbers[near], levels[near]))
         if side > 2:
-            blocks = kernels.halved(blocks, evaluate.counts(side // 2))
+            blocks = loops.halved(blocks, evaluate.counts(side // 2))
         side //= 2
     grid = _Grid(evaluate, 1)
     if centres:
@@ -245,11 +245,11 @@ def _bounded(evaluate: _Evaluate, side: int, lipschitz: float, closed: bool) -> 
         for known in centres:
             pairs.give(*known)
         rows, bounds = pairs.corners(blocks), (grid.counts, evaluate.step, lipschitz, slack, closed)
-        blocks = kernels.uncertain(blocks, numbers, levels, rows, pairs.values, *bounds)
+        blocks = loops.uncertain(blocks, numbers, levels, rows, pairs.values, *bounds)
         grid.give(pairs.numbers, pairs.values)
         grid.give(numbers, levels)
     rows = grid.corners(blocks)
-    return grid, *kernels.crossed(blocks, rows, grid.values, grid.counts, closed)
+    return grid, *loops.crossed(blocks, rows, grid.values, grid.counts, closed)
 
 
 def _followed(evaluate: _Evaluate, side: int, margin: int, closed: bool) -> tuple[_Grid, np.ndarray, np.ndarray]:
@@ -257,16 +257,16 @@ def _followed(evaluate: _Evaluate, side: int, margin: int, closed: bool) -> tupl
     grid = _Grid(evaluate, side)
     blocks = evaluate.all_blocks(side)
     rows = grid.corners(blocks)
-    blocks, rows = kernels.crossed(blocks, rows, grid.values, grid.counts, closed)
+    blocks, rows = loops.crossed(blocks, rows, grid.values, grid.counts, closed)
     if side > 1 and margin > 0:
-        blocks = kernels.widened(blocks, margin, grid.counts)
+        blocks = loops.widened(blocks, margin, grid.counts)
         rows = grid.corners(blocks)
     while side > 1:
         side //= 2
-        known = kernels.compact(rows, grid.numbers, grid.values)
+        known = loops.compact(rows, grid.numbers, grid.values)
         grid = _Grid(evaluate, side)
         grid.give(*known)
-        blocks = kernels.halved(blocks, grid.counts)
+        blocks = loops.halved(blocks, grid.counts)
         blocks, rows = _complete(grid, blocks, closed)
     return grid, blocks, rows
 
@@ -274,11 +274,11 @@ def _followed(evaluate: _Evaluate, side: int, margin: int, closed: bool) -> tupl
 def _complete(grid: _Grid, blocks: np.ndarray, closed: bool) -> tuple[np.ndarray, np.ndarray]:
     """Choose the blocks whose corners differ in sign, and add those that the surface goes on in."""
     directory, bricks = _bricks(grid.counts, np.uint8)
-    bricks, used = kernels.marked(blocks, grid.counts, directory, bricks, 0)
+    bricks, used = loops.marked(blocks, grid.counts, directory, bricks, 0)
     rows = grid.corners(blocks)
-    found = [kernels.crossed(blocks, rows, grid.values, grid.counts, closed)]
+    found = [loops.crossed(blocks, rows, grid.values, grid.counts, closed)]
     while len(found[-1][0]):
-        blocks, bricks, used = kernels.beyond(*found[-1], grid.values, grid.counts, closed, directory, bricks, used)
+        blocks, bricks, used = loops.beyond(*found[-1], grid.values, grid.counts, closed, directory, bricks, used)
         rows = grid.corners(blocks)
         found.append((blocks, rows))
     return np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])

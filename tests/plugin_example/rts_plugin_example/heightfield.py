@@ -55,7 +55,7 @@ class Heightfield(rts.TriangleSurface):
         met = (np.abs(step) < 1e-6) & (np.abs(depth - start) < 0.1)  # Past an outline, rays meet triangles only.
         params = np.where(met[:, None], np.stack([u, v], axis=-1), samples.params).astype(np.float32)
         refined = np.where(cells, np.where(met, depth, start)[samples.row], 0).astype(np.float32)
-        return dataclasses.replace(samples, params=params, depth=refined)
+        return samples.replace(params=params, depth=refined)
 
     @classmethod
     def example(cls):

@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from rts.compiling import kernel
+from rts.compiling import loop
 from rts.threads import parallel, read_only
 
 SWEEPS = 12
@@ -30,7 +30,7 @@ def turned(spokes: np.ndarray, rest: np.ndarray, starts: np.ndarray) -> np.ndarr
     return out
 
 
-@kernel(error_model="numpy")
+@loop(error_model="numpy")
 def _turn(start, stop, spokes, rest, starts, out):
     columns, axes, rotation = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(start, stop):

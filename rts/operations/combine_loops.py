@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.compiling import compiled, loop
 from rts.errors import InputError
 from rts.threads import parallel, read_only
 
@@ -100,7 +100,7 @@ def _all_known(ids, n, column, count, rows):
     return known
 
 
-@kernel
+@loop
 def _sum(start, stop, rows, ids, column, count, affine, weights, out):
     for n in range(start, stop):
         if not _all_known(ids, n, column, count, len(rows)):
@@ -115,7 +115,7 @@ def _sum(start, stop, rows, ids, column, count, affine, weights, out):
                 out[n, c] += w * (rows[r, c] - rows[last, c] if affine else rows[r, c])
 
 
-@kernel
+@loop
 def _add_sum(start, stop, rows, ids, column, count, affine, weights, out):
     for n in range(start, stop):
         if not _all_known(ids, n, column, count, len(rows)):
@@ -128,7 +128,7 @@ def _add_sum(start, stop, rows, ids, column, count, affine, weights, out):
                 out[n, c] += w * (rows[r, c] - rows[last, c] if affine else rows[r, c])
 
 
-@kernel
+@loop
 def _scatter_sum(ids, column, count, affine, weights, g, g_rows):
     one = g.dtype.type(1)
     for n in range(len(ids)):
@@ -142,7 +142,7 @@ def _scatter_sum(ids, column, count, affine, weights, g, g_rows):
                 g_rows[ids[n, column + i], c] += w * g[n, c]
 
 
-@kernel
+@loop
 def _weigh_sum(start, stop, rows, ids, column, count, affine, g, g_weights):
     for n in range(start, stop):
         g_weights[n] = 0
@@ -165,7 +165,7 @@ def _known(a, b, c, count):
     return 0 <= a < count and 0 <= b < count and 0 <= c < count
 
 
-@kernel
+@loop
 def _interpolate(start, stop, rows, ids, column, weights, out):
     for n in range(start, stop):
         a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
@@ -177,7 +177,7 @@ def _interpolate(start, stop, rows, ids, column, weights, out):
             out[n, i] = last + weights[n, 0] * (rows[a, i] - last) + weights[n, 1] * (rows[b, i] - last)
 
 
-@kernel
+@loop
 def _add_weighted(start, stop, rows, ids, column, weights, out):
     for n in range(start, stop):
         a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]
@@ -189,7 +189,7 @@ def _add_weighted(start, stop, rows, ids, column, weights, out):
             out[n, i] += weights[n, 0] * (rows[a, i] - last) + weights[n, 1] * (rows[b, i] - last)
 
 
-@kernel
+@loop
 def _scatter(ids, column, weights, g, g_rows):
     one = g.dtype.type(1)
     for n in range(len(ids)):
@@ -206,7 +206,7 @@ def _scatter(ids, column, weights, g, g_rows):
                 g_rows[c, i] += w * x
 
 
-@kernel
+@loop
 def _weigh(start, stop, rows, ids, column, g, g_weights):
     for n in range(start, stop):
         a, b, c = ids[n, column], ids[n, column + 1], ids[n, column + 2]

@@ -5,12 +5,12 @@ Tiles, their tables and their local coordinates are those of `rts_surfaces.tiles
 
 from __future__ import annotations
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 
 # ------------------------------------------------------------------------------------------ points and counts
 
 
-@kernel
+@loop
 def within_edges(owner, starts, ends, edges, edge_first, patch, params):
     """Fill patch (V,) and params (V, 2) of the points within edges.
 
@@ -37,7 +37,7 @@ def _put(frame, s, t, out):
         out[c] = frame[0, c] + s * frame[1, c] + t * frame[2, c]
 
 
-@kernel
+@loop
 def within_quadrilaterals(owner, frames, inner, inner_first, patch, params):
     """Fill patch (V,) and params (V, 2) of the points within tiles: first along t, then along s."""
     for n in range(len(inner)):
@@ -49,7 +49,7 @@ def within_quadrilaterals(owner, frames, inner, inner_first, patch, params):
                 v += 1
 
 
-@kernel
+@loop
 def within_triangles(owner, frames, inner, inner_first, patch, params):
     """Fill patch (V,) and params (V, 2) of the points within triangular tiles: first along s, then along t."""
     for n in range(len(inner)):
@@ -73,7 +73,7 @@ def _count(rates, sides, edges):
     return total
 
 
-@kernel
+@loop
 def counted(inner, sides, edges):
     """How many triangles there are."""
     total = 0
@@ -82,7 +82,7 @@ def counted(inner, sides, edges):
     return total
 
 
-@kernel
+@loop
 def counts(inner, sides, edges, first):
     """Fill first (n + 1,): the number of the first triangle of each tile."""
     first[0] = 0
@@ -129,7 +129,7 @@ def _square_ring(faces, params, t, place, side, m, rs, rt, frame, base):
     _square_point(faces, params, t, place, i, j, rs, rt, frame, base)
 
 
-@kernel
+@loop
 def quadrilaterals(
     start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out
 ):
@@ -201,7 +201,7 @@ def _triangle_ring(faces, params, t, place, side, m, r, frame, base):
     _triangle_point(faces, params, t, place, i, j, r, frame, base)
 
 
-@kernel
+@loop
 def triangles(start, stop, owner, frames, corners, sides, flips, edges, edge_first, inner, inner_first, first, out):
     """Fill the triangles of triangular tiles; the arguments are as those of `quadrilaterals`, of three sides."""
     faces, ids, params = out

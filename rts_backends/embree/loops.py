@@ -17,7 +17,7 @@ from llvmlite import ir
 from numba import carray, types  # pyright: ignore[reportPrivateImportUsage]  # Documented, but not in __all__.
 from numba.extending import intrinsic
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 from rts_backends.embree.covers import NEVER
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
 
@@ -175,7 +175,7 @@ def keep_nearest_address() -> int:
     return _keep_nearest.address  # pyright: ignore[reportReturnType]  # None before it is compiled, which it is.
 
 
-@kernel(error_model="numpy")
+@loop(error_model="numpy")
 def cast(
     first, last, intersect, filter_address, scene, matrix, row, ray_space, object_sphere, planes, keep, left_out,
     vertices, faces, owners, margins, width, height, cells, triangle_ids, barycentrics, depths_out,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import kernel
+from rts.compiling import loop
 from rts.threads import parallel, read_only
 
 
@@ -46,7 +46,7 @@ class Numbering:
         return found.reshape(row.shape)
 
 
-@kernel
+@loop
 def _mark(start, stop, row, kept, used):
     for y in range(start, stop):
         for x in range(row.shape[1]):
@@ -54,7 +54,7 @@ def _mark(start, stop, row, kept, used):
                 used[row[y, x]] = True
 
 
-@kernel
+@loop
 def _number(start, stop, used, firsts, numbers, index, counts):
     """Number the rows of parts [start, stop)."""
     for part in range(start, stop):
@@ -67,7 +67,7 @@ def _number(start, stop, used, firsts, numbers, index, counts):
         counts[part] = count
 
 
-@kernel
+@loop
 def _renumber(start, stop, row, numbers, found):
     for y in range(start, stop):
         for x in range(row.shape[1]):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import kernel
+from rts.compiling import loop
 from rts.threads import parallel, read_only
 
 CHUNK = 4096
@@ -40,7 +40,7 @@ def pull(
         g_rows[...] = sums.sum(axis=0)
 
 
-@kernel
+@loop
 def _project(start, stop, m, points, out):
     one = out.dtype.type(1)
     for n in range(start, stop):
@@ -52,7 +52,7 @@ def _project(start, stop, m, points, out):
         out[n, 2] = m[3, 0] * x + m[3, 1] * y + m[3, 2] * z + m[3, 3]
 
 
-@kernel
+@loop
 def _push(start, stop, m, points, turn, move, out):
     zero, one = out.dtype.type(0), out.dtype.type(1)
     value, change = np.empty(4, out.dtype), np.empty(4, out.dtype)
@@ -70,7 +70,7 @@ def _push(start, stop, m, points, turn, move, out):
         out[n, 2] = change[3]
 
 
-@kernel
+@loop
 def _pull(start, stop, m, points, g, sums, g_points):
     zero, one = points.dtype.type(0), points.dtype.type(1)
     for chunk in range(start, stop):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import kernel
+from rts.compiling import loop
 
 CHUNK = 1 << 14
 
 UNSIGNED = np.int32(2**31 - 1)
 
 
-@kernel
+@loop
 def find(first, last, bits, found):
     """Fill `found` with the largest of each chunk of floats without their signs; all are given as `bits`, int32.
 
@@ -24,7 +24,7 @@ def find(first, last, bits, found):
         found[chunk] = most
 
 
-@kernel
+@loop
 def ends(first, last, numbers, found, named):
     """Fill `found` (·, 2) with the least and the largest of each chunk of int32, and `named`, if any, with which name.
 
@@ -41,7 +41,7 @@ def ends(first, last, numbers, found, named):
             there[i] = block[i] >= 0
 
 
-@kernel
+@loop
 def bounds(first, last, bits, covered, found):
     """Fill `found` (·, 2) with how far floats of each chunk are below and above zero at most, as bits.
 

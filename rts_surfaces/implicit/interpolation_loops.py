@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 
 
 @compiled(inline="always")
@@ -38,7 +38,7 @@ def _difference(values, at, axis, step):
     return (above - below) / ((up + down) * step[axis])
 
 
-@kernel
+@loop
 def value(start, stop, values, points, low, step, out):
     """Fill the differences (N, 3) at points `start` to `stop`."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
@@ -68,7 +68,7 @@ def _share_slopes(i, near, slopes, out):
         out[along] = slope
 
 
-@kernel
+@loop
 def push_points(start, stop, values, points, tangents, low, step, out):
     """Add the derivatives along tangents (N, 3) of the points."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
@@ -86,7 +86,7 @@ def push_points(start, stop, values, points, tangents, low, step, out):
                 out[n, axis] += change * _difference(values, at, axis, step)
 
 
-@kernel
+@loop
 def pull_points(start, stop, values, points, g, low, step, results):
     """Fill the gradients (N, 3) of the points, of those of the differences."""
     lowest, near, slopes, at = np.empty(3, np.int64), np.empty((3, 2)), np.empty(3), np.empty(3, np.int64)
@@ -106,7 +106,7 @@ def pull_points(start, stop, values, points, g, low, step, results):
                 results[n, axis] += along * own[axis]
 
 
-@kernel
+@loop
 def pull_values(points, g, low, step, results):
     """Add the gradients (X, Y, Z) of the values, of those of the differences."""
     shape = results.shape

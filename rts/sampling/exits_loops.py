@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
-from rts.sampling.windows_kernels import add, unite
+from rts.compiling import compiled, loop
+from rts.sampling.windows_loops import add, unite
 
 BLOCK = 32
 """Cells that are passed over at once if none is marked."""
 
 
-@kernel
+@loop
 def find(kept, cells):
     """Fill `cells` (H · W,) with the places that `exits.beside_outlines` returns; how many there are."""
     layers, height, width = kept.shape

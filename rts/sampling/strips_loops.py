@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.compiling import compiled, loop
 
 WANTED, NEAR = 1, 2
 """Bits of cells: inside of an active pixel, and within two cells of one."""
 
 
-@kernel
+@loop
 def find(active, high, gap):
     """Runs (R, 3) int32 of columns of strips: strip, first column, number; those that aprons would join are one.
 
@@ -48,7 +48,7 @@ def _unite(some, active):
         some[x] |= active[x]
 
 
-@kernel
+@loop
 def split(runs, gap, lines, across):
     """Pieces (P, 5) int32 of runs that fit into so many lines of so many columns; what finds no room is left out."""
     pieces = np.empty((len(runs) + lines, 5), np.int32)
@@ -68,7 +68,7 @@ def split(runs, gap, lines, across):
     return pieces[:found]
 
 
-@kernel
+@loop
 def number(active, pieces, high, pitch, across, pixel):
     """Fill in where in the layout (in pixels, `across` in a line, lines of pieces `pitch` apart) active pixels are."""
     height, _ = active.shape
@@ -109,7 +109,7 @@ def _end(marks, first):
     return end
 
 
-@kernel
+@loop
 def count(start, stop, active, pieces, firsts, side, apron, high, width, counts):
     """Count the cells of lines [start, stop) of the grid that active pixels need: counts (H',).
 
@@ -149,7 +149,7 @@ def _strips(line, side, apron, high, strips):
     return max(0, (line - 2 * apron) // (high * side)), min(strips, line // (high * side) + 1)
 
 
-@kernel
+@loop
 def fill(start, stop, active, pieces, firsts, side, apron, high, gap, offsets, cells, place, kinds):
     """Lay out the cells of lines [start, stop) of the grid that active pixels need.
 
@@ -262,7 +262,7 @@ def _tell(kinds, active, near, strip, first, columns, side, apron, high):
                 kinds[u] |= np.uint8(WANTED)
 
 
-@kernel
+@loop
 def count_samples(start, stop, row, place, counts):
     """Count the samples of lines [start, stop) of a layout, counted over layers: counts (K · h,)."""
     height = len(place)
@@ -273,7 +273,7 @@ def count_samples(start, stop, row, place, counts):
         counts[line] = found
 
 
-@kernel
+@loop
 def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, index, shift, laid, part, shown):
     """Put samples into lines [start, stop) of a layout, counted over layers.
 
@@ -314,7 +314,7 @@ def arrange(start, stop, row, place, cells, settled, firsts, width, offsets, ind
             n += 1
 
 
-@kernel
+@loop
 def gather(start, stop, covered, depth, place, laid, deep):
     """What of (K, M) cells is covered, and how deep, in lines [start, stop) of a layout, counted over layers."""
     height = len(place)
@@ -326,7 +326,7 @@ def gather(start, stop, covered, depth, place, laid, deep):
             deep[k, y, x] = depth[k, m] if m >= 0 else 0
 
 
-@kernel
+@loop
 def scatter(start, stop, kept, kinds, place, found):
     """Mark the (K, M) cells that are kept (K, h, w), in lines [start, stop) of a layout, counted over layers.
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.compiling import compiled, loop
 from rts.sampling.extremes import places
-from rts.sampling.windows_kernels import add, unite
+from rts.sampling.windows_loops import add, unite
 from rts.threads import parallel
 
 LONG = 2
@@ -45,7 +45,7 @@ def settle(
     return found
 
 
-@kernel
+@loop
 def _settle(start, stop, covered, kept, wanted, reach, found, near):
     """Fill rows [start, stop) of what is found, and of cells near any that are not."""
     layers, height, width = covered.shape
@@ -85,7 +85,7 @@ def _settle(start, stop, covered, kept, wanted, reach, found, near):
             _join(near[y], wide[r + v])
 
 
-@kernel
+@loop
 def _drop(start, stop, near, kept):
     """Leave out what is not near."""
     for k in range(len(kept)):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
-from rts.sampling.windows_kernels import add, spread
+from rts.compiling import compiled, loop
+from rts.sampling.windows_loops import add, spread
 
 
-@kernel
+@loop
 def fill(start, stop, kept, triangle_ids, vertices, faces, pieces, eyes, rows, columns, listed, more, found):
     """Fill lines [start, stop) of `found` (K, H, W) int16; see `rts.sampling.facing`.
 

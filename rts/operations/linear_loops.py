@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import kernel
-from rts.operations.projection_kernels import CHUNK
+from rts.compiling import loop
+from rts.operations.projection_loops import CHUNK
 from rts.threads import parallel, read_only
 
 
@@ -39,7 +39,7 @@ def affine_pull(
         parallel(_pull_points, len(points), rows, g, g_points, work=g.size)
 
 
-@kernel
+@loop
 def _affine(start, stop, rows, points, out):
     for n in range(start, stop):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
@@ -47,7 +47,7 @@ def _affine(start, stop, rows, points, out):
             out[n, r] = x * rows[r, 0] + y * rows[r, 1] + z * rows[r, 2] + rows[r, 3]
 
 
-@kernel
+@loop
 def _add_moved(start, stop, rows, move, out):
     for n in range(start, stop):
         x, y, z = move[n, 0], move[n, 1], move[n, 2]
@@ -55,7 +55,7 @@ def _add_moved(start, stop, rows, move, out):
             out[n, r] += x * rows[r, 0] + y * rows[r, 1] + z * rows[r, 2]
 
 
-@kernel
+@loop
 def _pull_rows(start, stop, points, g, sums):
     for chunk in range(start, stop):
         total = sums[chunk]
@@ -67,7 +67,7 @@ def _pull_rows(start, stop, points, g, sums):
                 total[r, 3] += h
 
 
-@kernel
+@loop
 def _pull_points(start, stop, rows, g, g_points):
     for n in range(start, stop):
         for i in range(3):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 
 LARGEST = 1e38
 """What is larger is no number of single precision: fields that are flat to the last digit move nothing."""
@@ -43,7 +43,7 @@ def _slope(values, band, cell, base, at, shape, low, step, caps, out):
         out[i] = 0.0 if caps >> i & 1 else out[i] / step[i]
 
 
-@kernel
+@loop
 def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near, points, params, least):
     """Fill what samples `start` to `stop` carry.
 
@@ -101,7 +101,7 @@ def fill(start, stop, values, isovalue, sign, band, shape, low, step, ids, near,
         params[n, 15] = level
 
 
-@kernel
+@loop
 def hand_on(start, stop, faces, ends, cells, caps, ids):
     """Fill what triangles hand on to samples, (T, 8): the ends of three edges, the cell, and where it is capped."""
     for t in range(start, stop):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 
 
-@kernel
+@loop
 def move(start, stop, values, params, rows, isovalue, sign, out):
     """Fill the places (N, 3) of samples `start` to `stop`."""
     for n in range(start, stop):
@@ -18,7 +18,7 @@ def move(start, stop, values, params, rows, isovalue, sign, out):
             out[n, i] = params[n, 9 + i] - sign * level * params[n, 12 + i]
 
 
-@kernel
+@loop
 def push(start, stop, tangents, params, rows, sign, out):
     """Fill the derivatives (N, 3) along tangents (M,) of the values."""
     for n in range(start, stop):
@@ -29,7 +29,7 @@ def push(start, stop, tangents, params, rows, sign, out):
             out[n, i] = -sign * level * params[n, 12 + i]
 
 
-@kernel
+@loop
 def pull(g, params, rows, sign, results):
     """Add the gradients (M,) of the values, of those (N, 3) of the places."""
     for n in range(len(rows)):
@@ -60,7 +60,7 @@ def _edge(n, k, values, params, rows, numbers, isovalue, shape, step):
     return axis, length, along, apart
 
 
-@kernel
+@loop
 def cross(start, stop, values, params, rows, numbers, isovalue, shape, low, step, out):
     """Fill the places (N, 3) of samples `start` to `stop` whose corners slide along edges."""
     for n in range(start, stop):
@@ -74,7 +74,7 @@ def cross(start, stop, values, params, rows, numbers, isovalue, shape, low, step
         out[n, 0], out[n, 1], out[n, 2] = x, y, z
 
 
-@kernel
+@loop
 def push_crossings(start, stop, values, tangents, params, rows, numbers, isovalue, shape, low, step, out):
     """Fill the derivatives (N, 3) along tangents (M,) of the values."""
     for n in range(start, stop):
@@ -86,7 +86,7 @@ def push_crossings(start, stop, values, tangents, params, rows, numbers, isovalu
                 out[n, axis] -= params[n, k] * length * change / apart
 
 
-@kernel
+@loop
 def pull_crossings(values, g, params, rows, numbers, isovalue, shape, low, step, results):
     """Add the gradients (M,) of the values, of those (N, 3) of the places."""
     for n in range(len(rows)):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.compiling import compiled, loop
 
 
-@kernel
+@loop
 def mark(start, stop, row, settled, depth, firsts, beyond, margin, continued, marks):
     """Mark the cells of rows [start, stop) whose front ends towards a neighbour, or a neighbour's towards them.
 

@@ -1,16 +1,16 @@
 """Where rays meet bicubic patches, on the host, compiled: Newton's method, across the edges of patches.
 
-Patches are in the form of powers, see `rts_surfaces.bicubic_kernels`. It imports numba.
+Patches are in the form of powers, see `rts_surfaces.bicubic_loops`. It imports numba.
 """
 
 from __future__ import annotations
 
 import math
 
-from rts_surfaces.bicubic_kernels import compiled, first, kernel
+from rts_surfaces.bicubic_loops import compiled, first, loop
 
 
-@kernel
+@loop
 def bounds(nets, out):
     """Fill `out` (n, 3): bounds of the lengths of second derivatives: in u, in u and v, in v."""
     for n in range(len(nets)):
@@ -59,7 +59,7 @@ def _crossed(across, flips, patch, u, v, inside):
     return to, inside, 1 - t
 
 
-@kernel
+@loop
 def meet(start, stop, powers, bounds, across, flips, ids, params, row, depth, origins, directions, spread, limits):
     """Newton's method: move params so that points lie on their rays; see `rts_surfaces.parametric`.
 

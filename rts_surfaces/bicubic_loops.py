@@ -14,7 +14,7 @@ import numpy as np
 from rts.plugin_api import loops
 
 compiled = partial(loops.compiled, fastmath={"contract"})
-kernel = partial(loops.kernel, fastmath={"contract"})
+loop = partial(loops.loop, fastmath={"contract"})
 
 BEZIER = np.array([[1.0, 0, 0, 0], [-3, 3, 0, 0], [3, -6, 3, 0], [-1, 3, -3, 1]])
 """Coefficients of 1, t, t², t³ (rows) from Bézier control points (columns)."""
@@ -53,7 +53,7 @@ def _second(p, u, v):
     return uu, uv, a + u * (b + u * (c + u * d))
 
 
-@kernel
+@loop
 def points(start, stop, powers, patch, params, out):
     """Fill `out` (N, 1, 3): points of patches (N,) at params (N, 2)."""
     for n in range(start, stop):
@@ -61,7 +61,7 @@ def points(start, stop, powers, patch, params, out):
             out[n, 0, c] = first(powers[patch[n], c], params[n, 0], params[n, 1])[0]
 
 
-@kernel
+@loop
 def expansions(start, stop, powers, patch, params, out):
     """Fill `out` (N, 6, 3): points of patches (N,) at params (N, 2), and derivatives in u, v, uu, uv, vv."""
     for n in range(start, stop):
@@ -85,7 +85,7 @@ def _bernstein(t, value, slope):
     slope[2], slope[3] = three * t * (two * s - t), three * t * t
 
 
-@kernel
+@loop
 def gather(start, stop, rows, table, out):
     """Fill `out` (n, 16, C) with the rows (V, C) of each patch."""
     for n in range(start, stop):
@@ -94,7 +94,7 @@ def gather(start, stop, rows, table, out):
                 out[n, k, c] = rows[table[n, k], c]
 
 
-@kernel
+@loop
 def scatter(table, found, out):
     """Add to `out` (V, C) what patches have in all shares of `found` (S, n, 16, C)."""
     for n in range(len(table)):
@@ -104,7 +104,7 @@ def scatter(table, found, out):
                     out[table[n, k], c] += found[share, n, k, c]
 
 
-@kernel
+@loop
 def values(start, stop, nets, patch, params, out):
     """Fill `out` (N, C) with sums of control points (n, 16, C) of patches (N,) at params (N, 2)."""
     a, b, none = np.empty(4, nets.dtype), np.empty(4, nets.dtype), np.empty(4, nets.dtype)
@@ -120,7 +120,7 @@ def values(start, stop, nets, patch, params, out):
             out[n, c] = total
 
 
-@kernel
+@loop
 def pull_values(start, stop, patch, params, g, found):
     """Add to `found` (S, n, 16, C), for each of S shares of the samples, what g (N, C) pulls back to control points."""
     for share in range(start, stop):
@@ -201,7 +201,7 @@ def _unit_product(work, normal):
     return length
 
 
-@kernel
+@loop
 def normals(start, stop, nets, patch, params, collapsed, out):
     """Fill `out` (N, 3) with unit normals; `collapsed` says which tangents are none, relative to the other."""
     work = np.zeros((7, 4), nets.dtype)
@@ -210,7 +210,7 @@ def normals(start, stop, nets, patch, params, collapsed, out):
         _unit_product(work, out[n])
 
 
-@kernel
+@loop
 def push_normals(start, stop, nets, tangents, patch, params, collapsed, out):
     """Fill `out` (N, 3) with the derivatives of unit normals along tangents (n, 16, 3) of control points."""
     work, moved, normal = np.zeros((7, 4), nets.dtype), np.zeros((7, 4), nets.dtype), np.empty(3, nets.dtype)
@@ -235,7 +235,7 @@ def push_normals(start, stop, nets, tangents, patch, params, collapsed, out):
             out[n, c] -= along * normal[c]
 
 
-@kernel
+@loop
 def pull_normals(start, stop, nets, patch, params, collapsed, g, found):
     """Add to `found` (S, n, 16, 3), for each of S shares of the samples, what g (N, 3) pulls back to control points."""
     for share in range(start, stop):

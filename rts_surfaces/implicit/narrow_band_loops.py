@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 
 SHIFT = 2
 MASK = (1 << SHIFT) - 1
@@ -34,7 +34,7 @@ def _copy(source, s, target, t):
         target[t, i] = source[s, i]
 
 
-@kernel
+@loop
 def halved(blocks, counts):
     """Halve blocks (B, 3) along each axis: the blocks of half the side, (C, 3), without those beyond the end.
 
@@ -59,7 +59,7 @@ def halved(blocks, counts):
     return children
 
 
-@kernel
+@loop
 def centres(start, stop, blocks, side, shape, low, step, places):
     """Fill places (B, 3) float64, the centres of blocks."""
     for b in range(start, stop):
@@ -68,7 +68,7 @@ def centres(start, stop, blocks, side, shape, low, step, places):
             places[b, a] = low[a] + step[a] * (0.5 * (first + min(first + side, shape[a] - 1)))
 
 
-@kernel
+@loop
 def centre_numbers(blocks, side, shape):
     """The numbers (B,) int64 in the lattice of the centres of blocks of an even side; −1 where a block is cropped."""
     numbers = np.empty(len(blocks), np.int64)
@@ -82,7 +82,7 @@ def centre_numbers(blocks, side, shape):
     return numbers
 
 
-@kernel
+@loop
 def near(blocks, values, side, shape, step, lipschitz, slack, closed):
     """Choose the blocks which the surface may pass through, as far as the levels at their centres tell.
 
@@ -112,7 +112,7 @@ def near(blocks, values, side, shape, step, lipschitz, slack, closed):
     return kept
 
 
-@kernel
+@loop
 def widened(blocks, margin, counts):
     """Add all blocks that are so many blocks away, or fewer, along each axis: (K, 3), in the order of the grid."""
     marked = np.zeros(counts, np.bool_)
@@ -149,7 +149,7 @@ def _brick(x, y, z, counts):
     return place, (((x & MASK) << SHIFT | y & MASK) << SHIFT) | z & MASK
 
 
-@kernel
+@loop
 def numbered(blocks, side, shape, counts, directory, bricks, used, numbers, count):
     """Give rows to the corners of blocks.
 
@@ -191,7 +191,7 @@ def numbered(blocks, side, shape, counts, directory, bricks, used, numbers, coun
     return rows, bricks, used, numbers, count
 
 
-@kernel
+@loop
 def given_rows(known, side, shape, counts, directory, bricks, used, numbers, count):
     """Give rows to points of the lattice (M,) by number, all different and without rows; else like `numbered`."""
     for m in range(len(known)):
@@ -215,7 +215,7 @@ def given_rows(known, side, shape, counts, directory, bricks, used, numbers, cou
     return bricks, used, numbers, count
 
 
-@kernel
+@loop
 def places_of(start, stop, numbers, shape, low, step, places):
     """Fill places (M, 3) float64 of points of the lattice by number."""
     for m in range(start, stop):
@@ -257,7 +257,7 @@ def _border(blocks, b, counts):
     return border
 
 
-@kernel
+@loop
 def uncertain(blocks, centre_numbers, centre_values, rows, values, counts, step, lipschitz, slack, closed):
     """Halve blocks of two cells a side; choose the cells whose corners may differ in sign, as far as levels tell.
 
@@ -307,7 +307,7 @@ def uncertain(blocks, centre_numbers, centre_values, rows, values, counts, step,
     return kept[:count].copy()
 
 
-@kernel
+@loop
 def crossed(blocks, rows, values, counts, closed):
     """Choose the blocks whose corners differ in sign; where closed, too, those with a corner inside on the boundary.
 
@@ -345,7 +345,7 @@ def _mark(x, y, z, counts, directory, bricks, used):
     return new, used
 
 
-@kernel
+@loop
 def marked(blocks, counts, directory, bricks, used):
     """Mark blocks (B, 3), by ones in bricks of bytes (·, 64); returns `bricks` and `used` as they are now."""
     for b in range(len(blocks)):
@@ -355,7 +355,7 @@ def marked(blocks, counts, directory, bricks, used):
     return bricks, used
 
 
-@kernel
+@loop
 def beyond(blocks, rows, values, counts, closed, directory, bricks, used):
     """Find the unmarked blocks across sides of blocks that the surface crosses: those it goes on in. They are marked.
 
@@ -393,7 +393,7 @@ def beyond(blocks, rows, values, counts, closed, directory, bricks, used):
     return found[:count].copy(), bricks, used
 
 
-@kernel
+@loop
 def compact(rows, numbers, values):
     """Drop the points that no cell has; rows (C, 8) are changed to those of the points that stay.
 

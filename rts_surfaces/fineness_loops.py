@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 
 COLLAPSED = 1e-6
 """Derivatives that are parallel but for this share have no normal."""
@@ -50,7 +50,7 @@ def _normal(slopes, out):
     return there
 
 
-@kernel
+@loop
 def shapes(start, stop, found, frames, normals, places, bends):
     """Fill what is asked of the shape of tiles.
 
@@ -83,7 +83,7 @@ def shapes(start, stop, found, frames, normals, places, bends):
                 bends[n, m] = max(bends[n, m], abs(straight) if there else math.sqrt(size))
 
 
-@kernel
+@loop
 def curves(start, stop, found, frames, along, out):
     """Fill out (E,), the largest second derivatives of edges across themselves.
 
@@ -113,7 +113,7 @@ def curves(start, stop, found, frames, along, out):
 # ----------------------------------------------------------------------------------------------- how fine
 
 
-@kernel
+@loop
 def outlines(
     start, stop, places, normals, bends, eye, toward, parallel, aside, depth, spread, cone, wanted, chord, edge, facing
 ):
@@ -187,7 +187,7 @@ def outlines(
         chord[t] = edge[t] if facing[t] == 0 else max(width * wanted[1], 1e-4 * radius)
 
 
-@kernel
+@loop
 def rates(bends, curves, chord, edge, facing, sides, least, most, inner, edges):
     """Fill how often tiles and their sides are cut: inner (n, 2) along s and t, edges (E,).
 

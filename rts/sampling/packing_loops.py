@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.compiling import kernel
+from rts.compiling import loop
 from rts.contracts.records import Fragments
 from rts.threads import parallel
 
@@ -90,7 +90,7 @@ def count_in_views(kept: np.ndarray, views: tuple[int, int]) -> np.ndarray:
     return counts.reshape(layers, views[0], -1, views[1]).sum(axis=(0, 2)).reshape(-1)
 
 
-@kernel
+@loop
 def _count(start, stop, kept, counts):
     for y in range(start, stop):
         count = 0
@@ -99,7 +99,7 @@ def _count(start, stop, kept, counts):
         counts[y] = count
 
 
-@kernel
+@loop
 def _pack(start, stop, kept, triangle_ids, barycentrics, depths, table, corners, offsets, ids, params, row, depth):
     for y in range(start, stop):
         n = offsets[y]

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from rts.compiling import kernel
+from rts.compiling import loop
 
 
-@kernel
+@loop
 def put(start, stop, rows, index, shift, out, bad):
     """Fill rows [start, stop) of out (M, C) with those of (V, C) that (M,) integers name, plus a shift if it has rows.
 
@@ -21,7 +21,7 @@ def put(start, stop, rows, index, shift, out, bad):
             out[m, c] = rows[i, c] + shift[m, c] if len(shift) > 0 else rows[i, c]
 
 
-@kernel
+@loop
 def add(values, index, total):
     """Add the rows of (M, C) to those of (V, C) that (M,) integers name, in their order; indices of no row are left."""
     for m in range(len(index)):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from rts.compiling import kernel
+from rts.compiling import loop
 
 SMALL = 1e-2
 """Squared angles below which series are used, which are right to 3e-14 there."""
@@ -19,7 +19,7 @@ def rigid(pose: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return matrix, jacobian
 
 
-@kernel
+@loop
 def _rigid(pose, center, matrix, jacobian):
     r = pose[:3]
     s = r[0] * r[0] + r[1] * r[1] + r[2] * r[2]

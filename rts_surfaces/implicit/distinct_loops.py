@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.plugin_api.loops import kernel
+from rts.plugin_api.loops import loop
 
 FIRST, SECOND = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 """Factors of splitmix64, which spreads neighbouring numbers evenly."""
 
 
-@kernel
+@loop
 def distinct(keys):
     """Find the different numbers among many, by open addressing.
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from rts.compiling import compiled, kernel
+from rts.compiling import compiled, loop
 
 
-@kernel
+@loop
 def settle_lines(start, stop, row, depth, limits, out_row, out_depth):
     """See `rts.sampling.settling.settle`; for lines `start` to `stop` of the image.
 
@@ -57,7 +57,7 @@ def _ray(x, y, p, inverse, origin, direction):
         direction[k] = inverse[k, 0] * toward_x + inverse[k, 1] * toward_y - inverse[k, 2]
 
 
-@kernel
+@loop
 def rays_of(start, stop, row, size, projection, inverse, origins, directions):
     """Fill the rays of samples as `rts.Camera.rays` gives them; for lines `start` to `stop` of all layers.
 
@@ -80,7 +80,7 @@ def rays_of(start, stop, row, size, projection, inverse, origins, directions):
                 _ray((i + 0.5) * 2 / width - 1, y, projection, inverse, origins[n], directions[n])
 
 
-@kernel
+@loop
 def rays_of_cells(row, lines, columns, size, projection, inverse, origins, directions):
     """Fill the rays of samples in some cells: row (K, M), in lines (M,) and columns (M,)."""
     height, width = size

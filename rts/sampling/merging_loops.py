@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.compiling import compiled, loop
 from rts.threads import parallel, read_only
 
 
@@ -44,7 +44,7 @@ def interleave(
     return before if facing else before[:3]
 
 
-@kernel
+@loop
 def _merge(
     start,
     stop,

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.plugin_api.loops import compiled, kernel
+from rts.plugin_api.loops import compiled, loop
 
 
 @compiled(inline="always")
@@ -52,7 +52,7 @@ def _is_real(x, y, z, shape, closed):
     return closed or (x < shape[0] - 1 and y < shape[1] - 1 and z < shape[2] - 1)
 
 
-@kernel
+@loop
 def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
     """Count mixed cells, vertices and triangles of layers `start` to `stop` into `tally` (layers, 3)."""
     shape = values.shape
@@ -85,7 +85,7 @@ def count(start, stop, values, isovalue, sign, closed, triangles_of, tally):
         tally[x, 0], tally[x, 1], tally[x, 2] = mixed, crossed, triangles
 
 
-@kernel
+@loop
 def vertices(
     start, stop, values, isovalue, sign, closed, origin, step, offsets, cells, codes_of, first_of, ends, places, apart
 ):
@@ -164,7 +164,7 @@ def _bit_count(x):
     return (x & 1) + (x >> 1 & 1) + (x >> 2 & 1)
 
 
-@kernel
+@loop
 def faces(
     start, stop, shape, closed, offsets, cells, codes_of, first_of, triangles_of, edges_of, edges, out, owners, caps
 ):
@@ -195,7 +195,7 @@ def faces(
                 t += 1
 
 
-@kernel
+@loop
 def edges_of_cells(corners, virtual, codes, triangles_of, edges_of, edges, keys, pairs):
     """Fill the edges that corners of triangles lie on, for mixed cells in any order.
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, kernel
+from rts.compiling import compiled, loop
 
 
-@kernel
+@loop
 def put(start, stop, image, color, row, settled, fine, pixel, side, out):
     """Fill rows [start, stop) of out (H, W, C); see `rts.operations.inset`.
 
@@ -53,7 +53,7 @@ def _paint(out, c, value, there):
         out[x, c] = value if there[x] else nothing
 
 
-@kernel
+@loop
 def pull(start, stop, g, pixel, row, settled, side, image, sums, fine):
     """Gradients of both images, zeros to be filled, from rows [start, stop) of the result's; none without rows.
 
