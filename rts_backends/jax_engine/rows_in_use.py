@@ -20,9 +20,11 @@ from jax.core import ShapedArray, Tracer, eval_jaxpr
 from jax.extend.core import Jaxpr, Primitive
 from jax.interpreters import ad, batching, mlir
 
-from rts_backends.jax_engine import host
 from rts_backends.jax_engine.columns import summed_by_columns, variables
-from rts_backends.jax_engine.host import PIECE
+
+PIECE = 1 << 11
+"""Rows that are taken at a time: so many that calls of XLA's are worth it, and so few that intermediate arrays stay in
+caches, and that XLA does not wake its other threads for each."""
 
 LEAST = 1 << 15
 """Rows, below which all are computed: a loop would take as long as it saves."""
@@ -99,7 +101,7 @@ class _Pieces:
     def zeros(self) -> jax.Array:
         """Zeros in the shape of the value."""
         out: Any = self._jaxpr.outvars[0].aval
-        return host.zeros((self._total, *out.shape[1:]), out.dtype)
+        return jnp.zeros((self._total, *out.shape[1:]), out.dtype)
 
     def repeat(self, step: Callable[[Any, Any, Any], Any], state: Any) -> Any:
         """Do `state = step(start, first, state)` for each piece: rows from `start`, new ones from `first` on."""
@@ -187,7 +189,7 @@ def _pulled(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, wanted: tuple[bool,
         return sums
 
     varied = [x for x, wish in zip(operands, wanted, strict=True) if wish]
-    return pieces.repeat(step, [host.zeros(x.shape, x.dtype, number) for number, x in enumerate(varied)])
+    return pieces.repeat(step, [jnp.zeros_like(x) for x in varied])
 
 
 # --------------------------------------------------------------------------------------------------- as primitives
