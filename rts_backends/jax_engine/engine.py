@@ -136,7 +136,7 @@ class JaxEngine(Engine):
         whole, given = self._with_first(operation, operands)
         used = self._origins.used([given[i] for i in whole.packed])
         result = operations.apply(whole, given, params, used)
-        origin = Origin(used if operation.packed_result and self.traced(used) else None)
+        origin = Origin(used if operation.packed_result and isinstance(used, Tracer) else None)
         if operation.cheap and not params and self.traced(result) and self.known(result) is None:
             origin = Origin(origin.used, operation, operands)
         self._origins.note(result, origin)

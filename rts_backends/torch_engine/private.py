@@ -27,17 +27,17 @@ except ImportError:
         """Stands for some transform."""
         return 0
 
-    def is_wrapped(x: Tensor) -> bool:
+    def is_wrapped(tensor: Tensor) -> bool:
         """Stands for a tensor that no transform has wrapped."""
         return False
 
-    def is_legacy_batchedtensor(x: Tensor) -> bool:
+    def is_legacy_batchedtensor(tensor: Tensor) -> bool:
         """Stands for a tensor that is no batch of gradients."""
         return False
 
-    def get_unwrapped(x: Tensor) -> Tensor:
+    def get_unwrapped(tensor: Tensor) -> Tensor:
         """The tensor as it is."""
-        return x
+        return tensor
 
     unwrap_if_dead = get_unwrapped
 
