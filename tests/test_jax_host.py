@@ -1,6 +1,8 @@
 """Host functions inside jax programs."""
 
 import gc
+import os
+import subprocess
 import sys
 import weakref
 
@@ -12,14 +14,20 @@ pytestmark = pytest.mark.engines
 jax = pytest.importorskip("jax")
 jax_host = pytest.importorskip("rts_backends.jax_engine.host")
 jnp = jax.numpy
+mlir = pytest.importorskip("jax.interpreters.mlir")
 
 
-@pytest.fixture(params=["in place", "copying"], autouse=True)
-def way(request, monkeypatch):
-    """Both ways of calling."""
-    assert jax_host._available()
-    if request.param == "copying":
-        monkeypatch.setattr(jax_host, "_available", lambda: False)
+@pytest.fixture(params=["_in_place", "_copying"], autouse=True)
+def way(request):
+    """Both ways of calling; the second is that of other devices."""
+
+    def use(name):
+        rule = mlir.lower_fun(getattr(jax_host, name), multiple_results=True)
+        mlir.register_lowering(jax_host._call, rule, platform="cpu")
+
+    use(request.param)
+    yield
+    use("_in_place")
 
 
 def shape(*size, dtype=np.float32):
@@ -60,22 +68,14 @@ def test_errors_carry_their_message():
         call(jnp.zeros(3)).block_until_ready()
 
 
-def test_a_call_that_is_left_before_it_begins_fails_the_program(monkeypatch):
-    # An interrupt is raised at the next line of Python, which may be the first of what XLA calls.
-    def left(*given):
+def test_a_call_that_is_interrupted_fails_the_program():
+    def left(x):
         raise KeyboardInterrupt
 
-    ignored = []
-    monkeypatch.setattr(sys, "unraisablehook", lambda event: ignored.append(event.exc_type))
-    call = jax.jit(lambda x: jax_host.call(lambda x: [x + 1], (shape(3),), x)[0])
-    call = call.lower(jnp.zeros(3)).compile()
-    if not jax_host._available():
-        return  # jax's own interface sees to it.
-    with monkeypatch.context() as patch:
-        patch.setattr(jax_host._handle, "__code__", left.__code__)
-        with pytest.raises(jax.errors.JaxRuntimeError, match="left before its results were complete"):
-            call(jnp.zeros(3)).block_until_ready()
-    assert ignored == [KeyboardInterrupt]
+    functions = [left, lambda x: [x + 1]]
+    call = jax.jit(lambda x: jax_host.call(lambda x: functions.pop(0)(x), (shape(3),), x)[0])
+    with pytest.raises(jax.errors.JaxRuntimeError, match="KeyboardInterrupt"):
+        call(jnp.zeros(3)).block_until_ready()
     np.testing.assert_array_equal(call(jnp.zeros(3)), 1)
 
 
@@ -121,3 +121,23 @@ def test_functions_live_as_long_as_their_programs():
     jax.clear_caches()
     gc.collect()
     assert life() is None
+
+
+def test_many_programs_at_once_end_on_a_single_core():
+    code = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import jax, jax.numpy as jnp
+from rts_backends.jax_engine import host
+
+@jax.jit
+def program(x):
+    for _ in range(3):
+        (x,) = host.call(lambda x: [x + 1], [jax.ShapeDtypeStruct(x.shape, x.dtype)], jnp.sin(x))
+    return x
+
+x = jnp.ones((1000, 1000))
+for _ in range(5):
+    jax.block_until_ready([program(x + i) for i in range(8)])
+"""
+    subprocess.run([sys.executable, "-c", code], env=os.environ | {"JAX_PLATFORMS": "cpu"}, check=True, timeout=100)

@@ -1,5 +1,6 @@
 """Compiled projection and interpolation in torch: the same as in plain torch, in every transform."""
 
+import importlib
 import os
 import subprocess
 import sys
@@ -7,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import icosphere
 
 torch = pytest.importorskip("torch")
 
@@ -143,6 +145,32 @@ def test_points_without_an_image_are_finite_with_finite_gradients():
     out = projective_map(rows, points)
     out.sum().backward()
     assert out.isfinite().all() and rows.grad.isfinite().all() and points.grad.isfinite().all()
+
+
+def test_without_private_names_values_and_gradients_are_the_same(monkeypatch):
+    private = pytest.importorskip("rts_backends.torch_engine.private")
+    vertices, faces = icosphere(1)
+
+    def found():
+        pose = torch.full((6,), 0.1, requires_grad=True)
+        part = rts.Part(
+            rts.plugin("surfaces", "mesh")(faces),
+            {"vertices": vertices.astype(np.float32)},
+            transform=rts.rigid(pose),
+        )
+        image = rts.render(part, rts.Camera.look_at((1, 2, 3), (0, 0, 0), fov_y=50), (12, 12))
+        (image**2).sum().backward()
+        return image.detach().numpy(), pose.grad.numpy()
+
+    expected = found()
+    with monkeypatch.context() as patch:
+        patch.delattr(torch._C._functorch, "unwrap_if_dead")
+        importlib.reload(private)
+        assert private.unwrap_if_dead is private.get_unwrapped and private.transforms_active()
+        less = found()
+    importlib.reload(private)
+    for x, y in zip(less, expected, strict=True):
+        np.testing.assert_array_equal(x, y)
 
 
 def test_samples_of_another_mesh_are_one_clear_error():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,6 +16,7 @@ from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
 from rts_backends.jax_engine import host, operations, rows_in_use
 from rts_backends.jax_engine.chained import chained, may_chain
+from rts_backends.jax_engine.origins import Origin, Origins
 
 for _cls, _split, _join in Engine.records():
     jax.tree_util.register_pytree_node(_cls, _split, lambda static, arrays, join=_join: join(arrays, static))
@@ -46,8 +46,7 @@ class JaxEngine(Engine):
     _error: RtsError | None = None
 
     def __init__(self):
-        self._used: dict[int, tuple[weakref.ref, jax.Array]] = {}
-        self._made: dict[int, tuple[weakref.ref, Operation, Sequence[jax.Array]]] = {}
+        self._origins = Origins()
 
     def owns(self, x: Any) -> bool:
         """Whether `x` is a jax array or a tracer."""
@@ -86,23 +85,8 @@ class JaxEngine(Engine):
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
         *results, used = host.call(noticed, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args)
         for i in packed:
-            self._note(results[i], used)
+            self._origins.note(results[i], Origin(used))
         return tuple(results)
-
-    def _note(self, x: jax.Array, used: jax.Array | np.int32) -> jax.Array:
-        """Remember of a tracer how many of its rows are used; the others are zero."""
-        if isinstance(used, Tracer):
-            key = id(x)
-            self._used[key] = weakref.ref(x, lambda _: self._used.pop(key, None)), used
-        return x
-
-    def _used_of(self, packed: Sequence[jax.Array]) -> jax.Array | np.int32:
-        """How many rows are used of arrays (N, ·) that belong together, as far as that is known of any of them."""
-        for x in packed:
-            known = self._used.get(id(x))
-            if known is not None and known[0]() is x:
-                return known[1]
-        return np.int32(packed[0].shape[0] if packed else 0)
 
     def traced(self, x: jax.Array) -> bool:
         """Whether `x` is a tracer."""
@@ -147,22 +131,23 @@ class JaxEngine(Engine):
         if not operations.fits(operation, operands):
             return operation.specification(*operands, **params)
         whole, given = self._with_first(operation, operands)
-        used = self._used_of([given[i] for i in whole.packed])
+        used = self._origins.used([given[i] for i in whole.packed])
         result = operations.apply(whole, given, params, used)
+        origin = Origin(used if operation.packed_result and isinstance(used, Tracer) else None)
         if operation.cheap and not params and self.traced(result) and self.known(result) is None:
-            key = id(result)
-            self._made[key] = weakref.ref(result, lambda _: self._made.pop(key, None)), operation, operands
-        return self._note(result, used) if operation.packed_result else result
+            origin = Origin(origin.used, operation, operands)
+        self._origins.note(result, origin)
+        return result
 
     def _with_first(self, operation: Operation, operands: Sequence[jax.Array]) -> tuple[Operation, Sequence[jax.Array]]:
         """An operation with the cheap one that gives its first operand in a program, and the operands of both.
 
         Where nothing else reads it, that operand is then no array of the program, nor is its gradient.
         """
-        known = self._made.get(id(operands[0]))
-        if known is None or known[0]() is not operands[0] or not may_chain(known[1], operation):
+        first = self._origins.of(operands[0])
+        if first.operation is None or not may_chain(first.operation, operation):
             return operation, operands
-        return chained(known[1], operation), (*known[2], *operands[1:])
+        return chained(first.operation, operation), (*first.operands, *operands[1:])
 
     def padded(self, x: jax.Array) -> bool:
         """True: packed arrays may be padded to a bucket, or to the capacity."""

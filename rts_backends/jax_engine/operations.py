@@ -29,7 +29,6 @@ from jax.interpreters import ad
 
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
-from rts_backends.jax_engine.host import PIECE, clear
 from rts_backends.jax_engine.primitives import HostPrimitive
 
 Wanted = tuple[bool, ...]
@@ -179,7 +178,7 @@ class _Differentiable:
         out = results[0]
         if self.operation.packed_result:
             out = out[:used]
-            clear(results[0][used:], PIECE)
+            results[0][used:] = 0
         kept = self.operation.forward_on_host(operands, out, params)
         if self.operation.keeps:
             results[1][...] = -1 if kept is None else _kept.add(kept)
@@ -195,8 +194,7 @@ class _Differentiable:
         out = results[0]
         if self.operation.packed_result:
             out = out[:, :used]
-            for result in results[0]:
-                clear(result[used:], PIECE)
+            results[0][:, used:] = 0
         self.operation.push_on_host(operands, tangents, out, kept, params)
 
     def _host_pull(
@@ -210,19 +208,16 @@ class _Differentiable:
             for i, x in enumerate(found):
                 if x is None:
                     continue
-                if i not in self.operation.packed:
-                    clear(x)
-                    continue
-                found[i] = x[:used]
                 if np.may_share_memory(x, given[i]):  # It is to take the place of what is still read.
                     apart[i], found[i] = x, np.zeros((used, *x.shape[1:]), x.dtype)
-                else:
-                    clear(x[used:], PIECE)
-                    x[:used] = 0
+                    continue
+                x[...] = 0
+                if i in self.operation.packed:
+                    found[i] = x[:used]
             self.operation.pull_on_host(operands, g[:used] if self.operation.packed_result else g, found, kept, params)
             for i, x in apart.items():
                 x[:used] = found[i]
-                clear(x[used:], PIECE)
+                x[used:] = 0
 
     # --------------------------------------------------------------------------------------------- by specification
 

@@ -123,8 +123,7 @@ class HostPrimitive:
         own = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) if i in alike else x for i, x in enumerate(shapes)]
 
         def call(*given: jax.Array) -> list[jax.Array]:
-            name = f"{self.name} {sorted(params.items())} {sorted(places)}"
-            found = host.call_named(name, filler, tuple(own), *given, in_place=places)
+            found = host.filled(filler, own, *given, in_place=places)
             return [x[None] if i in alike else x for i, x in enumerate(found)]
 
         def filler(operands: Sequence[np.ndarray], results: Sequence[np.ndarray]) -> None:

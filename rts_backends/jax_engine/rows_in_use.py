@@ -20,9 +20,11 @@ from jax.core import ShapedArray, Tracer, eval_jaxpr
 from jax.extend.core import Jaxpr, Primitive
 from jax.interpreters import ad, batching, mlir
 
-from rts_backends.jax_engine import host
 from rts_backends.jax_engine.columns import summed_by_columns, variables
-from rts_backends.jax_engine.host import PIECE
+
+PIECE = 1 << 11
+"""Rows that are taken at a time: so many that calls of XLA's are worth it, and so few that intermediate arrays stay in
+caches, and that XLA does not wake its other threads for each."""
 
 LEAST = 1 << 15
 """Rows, below which all are computed: a loop would take as long as it saves."""
@@ -49,15 +51,15 @@ def apply(f: Callable[..., jax.Array], used: jax.Array, rows: Sequence[jax.Array
     if traced.effects:
         return None
     jaxpr, closed = _of_rows_alone(traced.jaxpr, traced.consts)
-    if variables(jaxpr.eqns, jaxpr.outvars).keys().isdisjoint(jaxpr.invars):
+    if variables(jaxpr.eqns, jaxpr.outvars).keys().isdisjoint(jaxpr.invars[len(closed) :]):
         return None
     if sum(x.size for x in closed if isinstance(x, Tracer)) > CLOSED:
         return None
-    return _value.bind(used, used, *closed, *rows, jaxpr=jaxpr)[0]
+    return _value.bind(used, used, *closed, *rows, jaxpr=jaxpr, fixed=len(closed))[0]
 
 
 def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any]]:
-    """A function without what does not depend on its arguments, which is computed here, and what it now closes over."""
+    """A function without what does not depend on its arguments, and the results of that, which it takes before them."""
     varying, before, rest = set(jaxpr.invars), [], []
     for equation in jaxpr.eqns:
         # Numbers spread over the rows of a piece are no less to keep than to make.
@@ -71,7 +73,7 @@ def _of_rows_alone(jaxpr: Jaxpr, consts: Sequence[Any]) -> tuple[Jaxpr, list[Any
     known = [x for x in known if x in read]
     names = jaxpr.debug_info.with_unknown_names()
     found = eval_jaxpr(jaxpr.replace(invars=[], outvars=known, eqns=before, debug_info=names), consts)
-    return jaxpr.replace(constvars=known, eqns=rest), found
+    return jaxpr.replace(constvars=[], invars=[*known, *jaxpr.invars], eqns=rest, debug_info=names), found
 
 
 _SPREADING = {"broadcast_in_dim", "iota"}
@@ -83,23 +85,23 @@ class _Pieces:
     """How a function of rows is computed.
 
     Args:
-        jaxpr: arrays (n, ·) → (n, ·), the function of a piece.
-        operands: arrays that it closes over, and arrays (N, ·).
+        jaxpr: the function of a piece: arrays that are the same for all pieces, and arrays (n, ·) → (n, ·).
+        operands: its operands, the latter (N, ·).
+        fixed: how many are the same for all pieces.
         most: how many rows are in use, at most; None to go through all.
         used: how many rows are in use.
     """
 
-    def __init__(self, jaxpr: Jaxpr, operands: Sequence[Any], most: Any, used: Any):
-        self._jaxpr, self._most, self._used = jaxpr, most, used
-        self.fixed = len(operands) - len(jaxpr.invars)
-        self._closed, self._rows = operands[: self.fixed], operands[self.fixed :]
-        first: Any = jaxpr.invars[0].aval
+    def __init__(self, jaxpr: Jaxpr, operands: Sequence[Any], fixed: int, most: Any, used: Any):
+        self._jaxpr, self._most, self._used, self.fixed = jaxpr, most, used, fixed
+        self._closed, self._rows = operands[:fixed], operands[fixed:]
+        first: Any = jaxpr.invars[fixed].aval
         self._total, self._size = self._rows[0].shape[0], first.shape[0]
 
     def zeros(self) -> jax.Array:
         """Zeros in the shape of the value."""
         out: Any = self._jaxpr.outvars[0].aval
-        return host.zeros((self._total, *out.shape[1:]), out.dtype)
+        return jnp.zeros((self._total, *out.shape[1:]), out.dtype)
 
     def repeat(self, step: Callable[[Any, Any, Any], Any], state: Any) -> Any:
         """Do `state = step(start, first, state)` for each piece: rows from `start`, new ones from `first` on."""
@@ -140,13 +142,13 @@ class _Pieces:
                 # What is not in use may hold values at which there are no derivatives.
                 other = jnp.where(self._used > 0, jax.lax.stop_gradient(whole[:1]), jnp.ones((), x.dtype))
                 own.append(self.among(x, there, other))
-            return eval_jaxpr(self._jaxpr, given[: self.fixed], *own)[0]
+            return eval_jaxpr(self._jaxpr, [], *given[: self.fixed], *own)[0]
 
         return function, [x for x, wish in zip(operands, wanted, strict=True) if wish]
 
 
-def _computed(most: Any, used: Any, *operands: Any, jaxpr: Jaxpr) -> list[jax.Array]:
-    pieces = _Pieces(jaxpr, operands, most, used)
+def _computed(most: Any, used: Any, *operands: Any, jaxpr: Jaxpr, fixed: int) -> list[jax.Array]:
+    pieces = _Pieces(jaxpr, operands, fixed, most, used)
 
     def step(start: Any, first: Any, out: jax.Array) -> jax.Array:
         function, _ = pieces.varying(start, [False] * len(operands))
@@ -155,39 +157,39 @@ def _computed(most: Any, used: Any, *operands: Any, jaxpr: Jaxpr) -> list[jax.Ar
     return [pieces.repeat(step, pieces.zeros())]
 
 
-def _pushed(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, wanted: tuple[bool, ...]) -> list[jax.Array]:
+def _pushed(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
     """The derivative along tangents of those operands that are wanted, which follow the operands."""
     operands, tangents = given[: len(wanted)], given[len(wanted) :]
-    pieces = _Pieces(jaxpr, operands, most, used)
-    fixed = sum(wanted[: pieces.fixed])
+    pieces = _Pieces(jaxpr, operands, fixed, most, used)
+    same = sum(wanted[:fixed])
 
     def step(start: Any, first: Any, out: jax.Array) -> jax.Array:
         function, varied = pieces.varying(start, wanted)
-        along = *tangents[:fixed], *(pieces.cut(t, start) for t in tangents[fixed:])
+        along = *tangents[:same], *(pieces.cut(t, start) for t in tangents[same:])
         push = summed_by_columns(lambda *along: jax.jvp(function, tuple(varied), along)[1])
         return jax.lax.dynamic_update_slice_in_dim(out, push(*along), start, 0)
 
     return [pieces.repeat(step, pieces.zeros())]
 
 
-def _pulled(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, wanted: tuple[bool, ...]) -> list[jax.Array]:
+def _pulled(most: Any, used: Any, *given: Any, jaxpr: Jaxpr, fixed: int, wanted: tuple[bool, ...]) -> list[jax.Array]:
     """The gradients of those operands that are wanted; that of the value follows the operands."""
     *operands, g = given
-    pieces = _Pieces(jaxpr, operands, most, used)
-    fixed = sum(wanted[: pieces.fixed])
+    pieces = _Pieces(jaxpr, operands, fixed, most, used)
+    same = sum(wanted[:fixed])
 
     def step(start: Any, first: Any, found: list[jax.Array]) -> list[jax.Array]:
         function, varied = pieces.varying(start, wanted)
         # The last piece may begin with rows of the one before.
         own = pieces.among(pieces.cut(g, start), pieces.index(start) >= first, 0)
         gradients = summed_by_columns(lambda g: jax.vjp(function, *varied)[1](g))(own)
-        sums = [a + b for a, b in zip(found[:fixed], gradients[:fixed], strict=True)]
-        for whole, x in zip(found[fixed:], gradients[fixed:], strict=True):
+        sums = [a + b for a, b in zip(found[:same], gradients[:same], strict=True)]
+        for whole, x in zip(found[same:], gradients[same:], strict=True):
             sums.append(jax.lax.dynamic_update_slice_in_dim(whole, pieces.cut(whole, start) + x, start, 0))
         return sums
 
     varied = [x for x, wish in zip(operands, wanted, strict=True) if wish]
-    return pieces.repeat(step, [host.zeros(x.shape, x.dtype, number) for number, x in enumerate(varied)])
+    return pieces.repeat(step, [jnp.zeros_like(x) for x in varied])
 
 
 # --------------------------------------------------------------------------------------------------- as primitives
@@ -234,8 +236,8 @@ def _present(tangents: Sequence[Any]) -> tuple[bool, ...]:
     return tuple(type(t) is not ad.Zero and t.dtype != jax.dtypes.float0 for t in tangents)
 
 
-def _like_value(*avals: Any, jaxpr: Jaxpr, **_: Any) -> list[ShapedArray]:
-    rows, out = avals[len(jaxpr.constvars)], cast(Any, jaxpr.outvars[0].aval)
+def _like_value(*avals: Any, jaxpr: Jaxpr, fixed: int, **_: Any) -> list[ShapedArray]:
+    rows, out = avals[fixed], cast(Any, jaxpr.outvars[0].aval)
     return [ShapedArray((rows.shape[0], *out.shape[1:]), out.dtype)]
 
 

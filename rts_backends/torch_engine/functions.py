@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch._C._functorch import is_legacy_batchedtensor, maybe_current_level, unwrap_if_dead
 from torch.autograd import forward_ad
 from torch.utils import _pytree
+
+from rts_backends.torch_engine import private
 
 
 def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
@@ -19,19 +20,19 @@ def applied(function: type[torch.autograd.Function], *args: Any) -> Any:
 
     Outside of transforms it spares torch's search for defaults, which takes longer than a small kernel.
     """
-    if torch._C._are_functorch_transforms_active():
+    if private.transforms_active():
         return function.apply(*args)
     # What torch does with all arguments, in one loop.
-    given = [unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
+    given = [private.unwrap_if_dead(a) if isinstance(a, Tensor) else a for a in args]
     # Torch's stubs leave out the class above `Function`.
     return super(torch.autograd.Function, function).apply(*given)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def transformed() -> bool:
     """Whether a transform of torch, forward mode or a compilation looks at what is computed now."""
-    if torch.compiler.is_compiling() or forward_ad._current_level >= 0:
+    if torch.compiler.is_compiling() or private.forward_level() >= 0:
         return True
-    return maybe_current_level() is not None
+    return private.maybe_current_level() is not None
 
 
 _loaded: list[bool] = []
@@ -49,7 +50,7 @@ def quiet_forward_mode() -> None:
 def foreign(*tensors: Tensor | None) -> bool:
     """Whether any is a batch of `torch.autograd.grad(..., is_grads_batched=True)`, which no function can look into."""
     for t in tensors:
-        if t is not None and is_legacy_batchedtensor(t):
+        if t is not None and private.is_legacy_batchedtensor(t):
             return True
     return False
 
@@ -73,7 +74,7 @@ def on_host(x: Tensor) -> np.ndarray:
     """The value of a tensor in the memory of the host, without a copy."""
     x = x.detach()
     # Zeros that torch's forward mode makes up have no memory.
-    return np.zeros(tuple(x.shape), _NUMPY[x.dtype]) if x._is_zerotensor() else x.numpy()
+    return np.zeros(tuple(x.shape), _NUMPY[x.dtype]) if private.is_zero(x) else x.numpy()
 
 
 _NUMPY = {torch.float32: np.float32, torch.float64: np.float64}

@@ -1,0 +1,51 @@
+"""Private names of torch, where it has no public ones, and what stands in for them in a torch without them.
+
+Then all goes as if a transform looked on: more slowly, through public names alone. Values inside of `torch.func`
+transforms are not known then.
+"""
+
+from __future__ import annotations
+
+import contextlib
+
+from torch import Tensor
+from torch.autograd import forward_ad
+
+try:
+    from torch._C import _are_functorch_transforms_active as transforms_active
+    from torch._C import _DisableFuncTorch as untransformed
+    from torch._C._functorch import get_unwrapped, is_legacy_batchedtensor, maybe_current_level, unwrap_if_dead
+    from torch._C._functorch import is_functorch_wrapped_tensor as is_wrapped
+except ImportError:
+    untransformed = contextlib.nullcontext
+
+    def transforms_active() -> bool:
+        """Stands for the public way of applying functions, which asks torch itself."""
+        return True
+
+    def maybe_current_level() -> int | None:
+        """Stands for some transform."""
+        return 0
+
+    def is_wrapped(tensor: Tensor) -> bool:
+        """Stands for a tensor that no transform has wrapped."""
+        return False
+
+    def is_legacy_batchedtensor(tensor: Tensor) -> bool:
+        """Stands for a tensor that is no batch of gradients."""
+        return False
+
+    def get_unwrapped(tensor: Tensor) -> Tensor:
+        """The tensor as it is."""
+        return tensor
+
+    unwrap_if_dead = get_unwrapped
+
+
+is_zero = getattr(Tensor, "_is_zerotensor", lambda x: False)
+"""Whether a tensor stands for zeros, without memory."""
+
+
+def forward_level() -> int:
+    """The level of forward mode, negative where it is off."""
+    return getattr(forward_ad, "_current_level", 0)
