@@ -37,6 +37,7 @@ from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
 from rts.gbuffer import GBuffer
+from rts.ndc import Ndc
 from rts.operations.rigid import rigid
 from rts.parts import Part
 from rts.radiance_fields import load_radiance_field
@@ -52,7 +53,6 @@ from rts.warming import warmup
 _MOVED = {
     "rts.errors": "AspectWarning EmptyImageWarning FileWarning InputWarning "
     "LayersWarning SamplerWarning ToleranceWarning",
-    "rts.ndc": "Ndc",
     "rts.plugin_api.operations": "Operation combine gradient",
     "rts.plugin_api.records": "ArraySpec Fragments Proxy RayHits Rays Samples Splats",
     "rts.radiance_fields": "volume_render",
@@ -95,6 +95,7 @@ __all__ = [
     "ImageResiduals",
     "InputError",
     "Loss",
+    "Ndc",
     "Part",
     "PluginError",
     "Rate",
@@ -134,6 +135,5 @@ __all__ = [
     "save_animation",
     "save_image",
     "tune",
-    "volume_render",
     "warmup",
 ]

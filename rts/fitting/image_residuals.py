@@ -27,7 +27,7 @@ from rts.checks import (
 from rts.contracts.plugin import overrides
 from rts.contracts.records import ArraySpec, Fine, Splats
 from rts.contracts.residuals import Residuals
-from rts.contracts.splatter import Splatter, SummingSplatter
+from rts.contracts.splatter import SummingSplatter
 from rts.engines import Engine, constants, context_of, engine_of, exemplar, namespace
 from rts.errors import InputError
 from rts.fitting.least_squares import flatten, normal_equations
@@ -287,7 +287,7 @@ class ImageResiduals(Residuals):
             found = self._swept(splatter, parameters, engine)
         return normal_equations(self, parameters, engine, self.loss) if found is None else found
 
-    def _swept(self, splatter: Splatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
+    def _swept(self, splatter: SummingSplatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
         """`normal_equations` by those of the splatter, in the bands that `render` takes; None where it gives none."""
         total: list[Array] = []
         for top, rows in self._settings.bands(self.size):
@@ -301,7 +301,7 @@ class ImageResiduals(Residuals):
         return value, matrix, gradient
 
     def _swept_band(
-        self, splatter: Splatter, parameters: Tree, engine: Engine, top: int, rows: int
+        self, splatter: SummingSplatter, parameters: Tree, engine: Engine, top: int, rows: int
     ) -> tuple[Array, Array, Array] | None:
         """`normal_equations` of some rows of the image alone."""
         vector, unflatten = flatten(parameters)

@@ -352,9 +352,10 @@ class _Search:
                 return known, *_nothing(grid), None, nowhere
             given = known.prepared, camera, view, layers
             if not exits:
-                cells = self.cells
-                drawn = sampler.rasterize(*given, self.cull) if cells is None else None
-                fragments = drawn or sampler.rasterize_cells(*given, self.cull, cells)
+                if self.cells is None:
+                    fragments = sampler.rasterize(*given, self.cull)
+                else:
+                    fragments = sampler.rasterize_cells(*given, self.cull, self.cells)
                 return known, fragments, check_fragments(fragments, grid, count, sampler), None, None
             seen: list[tuple[Fragments, np.ndarray, Decision]] = []
 

@@ -111,7 +111,11 @@ class Single(_Fused, specification.Single):
     """`rts.splatting.Single`, compiled."""
 
     kind = "single"
-    fills_interiors = specification.Single.fills_interiors
+
+    @property
+    def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
+        """See `rts.splatting`; promised of this image, too."""
+        return super().fills_interiors
 
 
 class Multi(_Fused, specification.Multi):
@@ -124,7 +128,11 @@ class Visible(_Fused, specification.Visible):
     """`rts.splatting.Visible`, compiled."""
 
     kind = "visible"
-    fills_interiors = specification.Visible.fills_interiors
+
+    @property
+    def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
+        """See `rts.splatting`; promised of this image, too."""
+        return super().fills_interiors
 
     @property
     def _motions(self) -> tuple[bool, ...]:
