@@ -349,3 +349,23 @@ program(*given)
 """
     variables = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}", "JAX_PLATFORMS": "cpu"}
     subprocess.run([sys.executable, "-c", code], env=os.environ | variables, check=True, timeout=60)
+
+
+def test_many_programs_at_once_end_on_a_single_core():
+    code = """
+import os
+os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import jax, jax.numpy as jnp
+from rts_backends.jax_engine import host
+
+@jax.jit
+def program(x):
+    for _ in range(3):
+        (x,) = host.call(lambda x: [x + 1], [jax.ShapeDtypeStruct(x.shape, x.dtype)], jnp.sin(x))
+    return x
+
+x = jnp.ones((1000, 1000))
+for _ in range(5):
+    jax.block_until_ready([program(x + i) for i in range(8)])
+"""
+    subprocess.run([sys.executable, "-c", code], env=os.environ | {"JAX_PLATFORMS": "cpu"}, check=True, timeout=100)

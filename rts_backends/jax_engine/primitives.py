@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
+from jax.extend.mlir.dialects import stablehlo as hlo
 from jax.interpreters import batching, mlir
-from jaxlib.mlir.dialects import stablehlo as hlo
 
 from rts_backends.jax_engine import host
 
