@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from rts.plugin_api.records import RayHits
-
 SIZE = (28, 36)
 POSE = (0.11, -0.07, 0.05, 0.02, -0.03, 0.04)
 """At which all is rendered: radians and units."""
@@ -46,7 +44,7 @@ class Ellipsoid:
         seen, outside = square > 0, near >= 0
         distance = xp.stack([xp.where(outside, near, far), far, *[far] * (layers - 2)][:layers])
         hit = xp.stack([seen & (far >= 0), seen & outside, *[seen & ~seen] * (layers - 2)][:layers])
-        return RayHits(hit, distance, _unit(xp, o[None] + distance[..., None] * d[None]))
+        return _ray_hits()(hit, distance, _unit(xp, o[None] + distance[..., None] * d[None]))
 
 
 def _unit(xp: Any, vectors: Any) -> Any:
@@ -123,3 +121,14 @@ def camera_of_scenes() -> Any:
     import rts
 
     return rts.Camera.look_at((0.4, 1.3, 2.6), (0, 0, 0), fov_y=45, aspect=SIZE[1] / SIZE[0])
+
+
+def _ray_hits() -> Any:
+    """The record, which has moved."""
+    import rts
+
+    if hasattr(rts, "RayHits"):
+        return rts.RayHits
+    from rts.plugin_api.records import RayHits
+
+    return RayHits

@@ -84,10 +84,6 @@ class Operation:
             then take a keyword `kept`: that object, or None if it is no longer known.
         sweeps: whether `push` takes tangents (T, ·) of T directions at once, and `out` (T, ·). If not, it is called
             for each direction.
-        cheap: whether a compiling engine may compute its value once more, inside of an operation that takes it, rather
-            than keep it.
-        takes_cheap: whether its `used` does without the first operand, so that a cheap operation that gives it may be
-            computed inside of this one. `used` finds another array of as many rows there.
     """
 
     name: str
@@ -104,8 +100,6 @@ class Operation:
     even: tuple[int, ...] = ()
     keeps: bool = False
     sweeps: bool = False
-    cheap: bool = False
-    takes_cheap: bool = False
 
     _seen: set[tuple] = field(default_factory=set, init=False, repr=False)
     """The dtype and the parameters' names of calls whose first value has been looked at."""
@@ -119,7 +113,7 @@ class Operation:
                 raise InputError(f"{name} of the operation {self.name} is {quoted(function)}; expected a function")
         for name in ("ranks", "packed", "even"):
             object.__setattr__(self, name, self._integers(name))
-        for name in ("packed_result", "keeps", "sweeps", "cheap", "takes_cheap"):
+        for name in ("packed_result", "keeps", "sweeps"):
             if type(getattr(self, name)) is not bool:
                 given = quoted(getattr(self, name))
                 raise InputError(f"{name} of the operation {self.name} is {given}; expected True or False")

@@ -95,7 +95,6 @@ PROJECTION = Operation(
     differentiable=2,
     packed=(1,),
     packed_result=True,
-    cheap=True,
 )
 
 

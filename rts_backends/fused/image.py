@@ -97,7 +97,7 @@ def rows_of(*cells: np.ndarray | None) -> int:
     return 1 + max(int(x.max(initial=0)) for x in cells if x is not None)
 
 
-_OPTIONS: dict[str, Any] = {"differentiable": 2, "packed": (0, 1), "used": used, "even": (1,), "takes_cheap": True}
+_OPTIONS: dict[str, Any] = {"differentiable": 2, "packed": (0, 1), "used": used, "even": (1,)}
 IMAGE = Operation(
     "rts.image",
     specification,

@@ -15,8 +15,7 @@ from rts.plugin_api.arrays import Tree
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
 from rts_backends.jax_engine import host, operations, rows_in_use
-from rts_backends.jax_engine.chained import chained, may_chain
-from rts_backends.jax_engine.origins import Origin, Origins
+from rts_backends.jax_engine.used_rows import UsedRows
 
 for _cls, _split, _join in Engine.records():
     jax.tree_util.register_pytree_node(_cls, _split, lambda static, arrays, join=_join: join(arrays, static))
@@ -46,7 +45,7 @@ class JaxEngine(Engine):
     _error: RtsError | None = None
 
     def __init__(self):
-        self._origins = Origins()
+        self._used = UsedRows()
 
     def owns(self, x: Any) -> bool:
         """Whether `x` is a jax array or a tracer."""
@@ -85,7 +84,7 @@ class JaxEngine(Engine):
         shapes = tuple(jax.ShapeDtypeStruct(spec.shape, spec.dtype) for spec in specs)
         *results, used = host.call(noticed, (*shapes, jax.ShapeDtypeStruct((), np.int32)), *args)
         for i in packed:
-            self._origins.note(results[i], Origin(used))
+            self._used.note(results[i], used)
         return tuple(results)
 
     def traced(self, x: jax.Array) -> bool:
@@ -130,24 +129,11 @@ class JaxEngine(Engine):
         """The result by compiled code on CPUs, if all floats are float32 or all float64; else by specification."""
         if not operations.fits(operation, operands):
             return operation.specification(*operands, **params)
-        whole, given = self._with_first(operation, operands)
-        used = self._origins.used([given[i] for i in whole.packed])
-        result = operations.apply(whole, given, params, used)
-        origin = Origin(used if operation.packed_result and isinstance(used, Tracer) else None)
-        if operation.cheap and not params and self.traced(result) and self.known(result) is None:
-            origin = Origin(origin.used, operation, operands)
-        self._origins.note(result, origin)
+        used = self._used.used([operands[i] for i in operation.packed])
+        result = operations.apply(operation, operands, params, used)
+        if operation.packed_result and isinstance(used, Tracer):
+            self._used.note(result, used)
         return result
-
-    def _with_first(self, operation: Operation, operands: Sequence[jax.Array]) -> tuple[Operation, Sequence[jax.Array]]:
-        """An operation with the cheap one that gives its first operand in a program, and the operands of both.
-
-        Where nothing else reads it, that operand is then no array of the program, nor is its gradient.
-        """
-        first = self._origins.of(operands[0])
-        if first.operation is None or not may_chain(first.operation, operation):
-            return operation, operands
-        return chained(first.operation, operation), (*first.operands, *operands[1:])
 
     def padded(self, x: jax.Array) -> bool:
         """True: packed arrays may be padded to a bucket, or to the capacity."""

@@ -1,0 +1,35 @@
+"""How many rows are in use of the packed arrays of a program that is being traced; the others are zero."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+
+class UsedRows:
+    """The record of the rows in use of tracers, each for as long as its tracer lives.
+
+    A tracer has no hash, and no equality but that of its entries. So the record goes by identity, and asks on each
+    look whether the tracer is still the one that was noted.
+    """
+
+    def __init__(self):
+        self._record: dict[int, tuple[weakref.ref, jax.Array | np.int32]] = {}
+
+    def note(self, x: jax.Array, used: jax.Array | np.int32) -> None:
+        """Record how many rows are in use of an array of a program, () int32; those of known values are not needed."""
+        if isinstance(x, Tracer):
+            key = id(x)
+            self._record[key] = weakref.ref(x, lambda _: self._record.pop(key, None)), used
+
+    def used(self, packed: Sequence[jax.Array]) -> jax.Array | np.int32:
+        """How many rows are in use of arrays (N, ·) that belong together, as far as that is known of any of them."""
+        for x in packed:
+            known = self._record.get(id(x))
+            if known is not None and known[0]() is x:
+                return known[1]
+        return np.int32(packed[0].shape[0] if packed else 0)
