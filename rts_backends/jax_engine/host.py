@@ -8,7 +8,10 @@ Shapes in a program are those of the worst case. What is not used of an array is
 
 from __future__ import annotations
 
+import ctypes
 import functools
+import mmap
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -122,8 +125,35 @@ def _write(out: np.ndarray, value: np.ndarray | np.generic) -> None:
         if value.ndim != out.ndim or any(n > size for n, size in zip(value.shape, out.shape, strict=True)):
             raise ValueError(f"a host function returned an array of shape {value.shape}, where {out.shape} was said")
         for axis, n in enumerate(value.shape):
-            out[(*map(slice, value.shape[:axis]), slice(n, None))] = 0
+            clear(out[(*map(slice, value.shape[:axis]), slice(n, None))])
     out[tuple(map(slice, value.shape))] = value
+
+
+def clear(out: np.ndarray) -> None:
+    """Fill with zeros. Pages of a large array are handed back: the system gives empty ones when they are touched.
+
+    Tangents in a program are mostly rows that nobody reads: to write them makes a step of Levenberg–Marquardt up to
+    half as long again.
+    """
+    if out.nbytes < _LEAST or not out.flags.c_contiguous or _advise is None:
+        out[...] = 0
+        return
+    data = out.reshape(-1).view(np.uint8)
+    start = -data.ctypes.data % mmap.PAGESIZE
+    stop = start + (len(data) - start) // mmap.PAGESIZE * mmap.PAGESIZE
+    # Shared memory would come back as it was; the mark at `start` tells.
+    data[:start], data[stop:], data[start] = 0, 0, 1
+    if _advise(data[start:].ctypes.data, stop - start, mmap.MADV_DONTNEED) or data[start]:
+        out[...] = 0
+
+
+_LEAST = 1 << 17
+"""Bytes, below which a call to the system is not worth it."""
+
+_advise: Callable[[int, int, int], int] | None = None
+if sys.platform == "linux":  # Elsewhere `MADV_DONTNEED` promises no zeros.
+    _advise = ctypes.CDLL(None).madvise
+    _advise.argtypes = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int
 
 
 batching.primitive_batchers[_call] = _batched

@@ -29,6 +29,7 @@ from jax.interpreters import ad
 
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.threads import read_only
+from rts_backends.jax_engine.host import clear
 from rts_backends.jax_engine.primitives import HostPrimitive
 
 Wanted = tuple[bool, ...]
@@ -178,7 +179,7 @@ class _Differentiable:
         out = results[0]
         if self.operation.packed_result:
             out = out[:used]
-            results[0][used:] = 0
+            clear(results[0][used:])
         kept = self.operation.forward_on_host(operands, out, params)
         if self.operation.keeps:
             results[1][...] = -1 if kept is None else _kept.add(kept)
@@ -194,7 +195,8 @@ class _Differentiable:
         out = results[0]
         if self.operation.packed_result:
             out = out[:, :used]
-            results[0][:, used:] = 0
+            for result in results[0]:
+                clear(result[used:])
         self.operation.push_on_host(operands, tangents, out, kept, params)
 
     def _host_pull(
@@ -211,13 +213,13 @@ class _Differentiable:
                 if np.may_share_memory(x, given[i]):  # It is to take the place of what is still read.
                     apart[i], found[i] = x, np.zeros((used, *x.shape[1:]), x.dtype)
                     continue
-                x[...] = 0
+                clear(x)
                 if i in self.operation.packed:
                     found[i] = x[:used]
             self.operation.pull_on_host(operands, g[:used] if self.operation.packed_result else g, found, kept, params)
             for i, x in apart.items():
                 x[:used] = found[i]
-                x[used:] = 0
+                clear(x[used:])
 
     # --------------------------------------------------------------------------------------------- by specification
 
