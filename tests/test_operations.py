@@ -116,7 +116,8 @@ def test_an_inset_is_the_mean_of_cells_where_there_is_one(target):
 def test_a_painted_inset_is_the_inset_of_an_image_of_one_color(target):
     color, fine = RNG.normal(size=2), RNG.normal(size=(4, 6, 2))
     pixel = np.array([[-1, 5, 0, -1], [-1, -1, 1, -1], [4, -1, -1, -1]], np.int32)
-    row, settled = RNG.integers(-3, 3, size=(5, 6), dtype=np.int32), RNG.integers(-2, 1, size=(5, 6), dtype=np.int8)
+    rng = np.random.default_rng(0)
+    row, settled = rng.integers(-3, 3, size=(5, 6), dtype=np.int32), rng.integers(-2, 1, size=(5, 6), dtype=np.int8)
     shown = ((row >= 0) | (settled >= 0))[1:-1, 1:-1]
     assert 0 < shown[pixel < 0].sum() < (pixel < 0).sum()
 

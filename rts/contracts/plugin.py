@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import abc
+import functools
 import inspect
-import weakref
 from collections.abc import Mapping
 from types import FunctionType
 from typing import Any
@@ -27,7 +27,11 @@ PROMISES: Mapping[str, tuple[str, ...]] = {
 
 def overrides(plugin: Any, method: str, base: type) -> bool:
     """Whether a plugin, or a class of plugins, has another method of this name than `base`, of which it is."""
-    kind = plugin if isinstance(plugin, type) else type(plugin)
+    return _overrides(plugin if isinstance(plugin, type) else type(plugin), method, base)
+
+
+@functools.lru_cache(maxsize=4096)
+def _overrides(kind: type, method: str, base: type) -> bool:
     return issubclass(kind, base) and getattr(kind, method, None) is not getattr(base, method, None)
 
 
@@ -37,18 +41,20 @@ def promised(plugin: Any, name: str) -> Any:
     It holds for the class that states it. Where a class below overrides a method that it speaks of, it is as the base
     has it; a promise of a class that has no such method yet is for those that will.
     """
-    kind = plugin if isinstance(plugin, type) else type(plugin)
+    holds, default = _holds(plugin if isinstance(plugin, type) else type(plugin), name)
+    return getattr(plugin, name) if holds or name in getattr(plugin, "__dict__", ()) else default
+
+
+@functools.lru_cache(maxsize=4096)
+def _holds(kind: type, name: str) -> tuple[bool, Any]:
+    """Whether a promise of a class holds, and the value that its base has."""
     stated = [c for c in kind.__mro__ if name in vars(c)]
     own, base = stated[0], stated[-1]
     there = {m for c in own.__mro__ if not issubclass(base, c) for m in PROMISES[name] if m in vars(c)}
-    if name in getattr(plugin, "__dict__", ()) or not any(overrides(kind, m, own) for m in there):
-        return getattr(plugin, name)
-    return vars(base)[name]
+    return not any(overrides(kind, m, own) for m in there), vars(base)[name]
 
 
-_checked: weakref.WeakSet[type] = weakref.WeakSet()
-
-
+@functools.lru_cache(maxsize=1024)
 def check_members(kind: type[Plugin]) -> None:
     """Refuse a class with a function whose name is one letter from an optional method that it lacks, or that is final.
 
@@ -57,8 +63,6 @@ def check_members(kind: type[Plugin]) -> None:
     Raises:
         PluginError: there is one; it is looked for once.
     """
-    if kind in _checked:
-        return
     bases = [c for c in kind.__mro__ if inspect.isabstract(c) and c.__module__.partition(".")[0] == "rts"]
     members = {n: f for c in reversed(bases) for n, f in vars(c).items() if isinstance(f, FunctionType) and n[0] != "_"}
     functions = [(c, n) for c in kind.__mro__ if c not in bases for n, f in vars(c).items() if type(f) is FunctionType]
@@ -76,7 +80,6 @@ def check_members(kind: type[Plugin]) -> None:
                 f"{where.__qualname__} has a function {name!r}, which rts never calls; did you mean {meant!r} of "
                 f"{bases[0].__name__}? Rename it to that, or to something less alike"
             )
-    _checked.add(kind)
 
 
 def _line(function: Any) -> str:

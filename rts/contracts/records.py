@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from operator import attrgetter
 from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
@@ -140,11 +141,11 @@ class _OnCells:
 
     cells: Cells
 
-    row = property(lambda self: self.cells.row, doc="See `Cells`.")
-    depth = property(lambda self: self.cells.depth, doc="See `Cells`.")
-    facing = property(lambda self: self.cells.facing, doc="See `Cells`.")
-    exit = property(lambda self: self.cells.exit, doc="See `Cells`.")
-    settled = property(lambda self: self.cells.settled, doc="See `Cells`.")
+    row = property(attrgetter("cells.row"), doc="See `Cells`.")
+    depth = property(attrgetter("cells.depth"), doc="See `Cells`.")
+    facing = property(attrgetter("cells.facing"), doc="See `Cells`.")
+    exit = property(attrgetter("cells.exit"), doc="See `Cells`.")
+    settled = property(attrgetter("cells.settled"), doc="See `Cells`.")
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed, those of `cells` among them."""
