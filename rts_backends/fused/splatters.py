@@ -5,30 +5,58 @@ What fits is float32 or float64 in the memory of the host. Second derivatives ar
 
 from __future__ import annotations
 
+import functools
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import numpy as np
 
 from rts import Loss, SummingSplatter, engine_of
-from rts.plugin_api import splats as specification
+from rts.plugin_api import splats as specified
 from rts.plugin_api.arrays import Array
 from rts.plugin_api.records import Splats
 from rts_backends.fused.cells import Settings
 from rts_backends.fused.image import IMAGE
 
 
+@dataclass(frozen=True)
 class _Fused(SummingSplatter):
-    """Base that makes `image` by compiled loops; it stands before a class of `rts.splatting`, which it extends."""
+    """Splatter by compiled loops, with the settings of one in array code.
+
+    Attributes:
+        sigma: see `rts.splatting`, as are the others.
+        epsilon: see `sigma`.
+        calibration: see `sigma`.
+    """
 
     kind: ClassVar[str]
-    sigma: float
-    epsilon: float
-    gamma: Any
+    specification: ClassVar[type]
+    sigma: float = specified.Single.sigma
+    epsilon: float = specified.Single.epsilon
+    calibration: float | None = specified.Single.calibration
+
+    def __post_init__(self):
+        _ = self.array_code  # It refuses settings that make no sense.
+
+    @functools.cached_property
+    def array_code(self) -> Any:
+        """The specification with these settings, to which what does not fit is left."""
+        return self.specification(**{field.name: getattr(self, field.name) for field in fields(self)})
+
+    @property
+    def reads(self) -> frozenset[str]:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
+        """See `rts.Splatter`."""
+        return self.array_code.reads
+
+    @property
+    def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
+        """See `rts.Splatter`."""
+        return self.array_code.fills_interiors
 
     def image(self, splats: Splats) -> Array:
-        """See `rts.splatting.Kernel`."""
+        """See `rts.Splatter`."""
         if splats.rgba.shape[0] == 0:
-            return super().image(splats)
+            return self.array_code.image(splats)
         return self._of(splats.replace(border=0))
 
     def cropped(self, splats: Splats) -> Array:
@@ -67,7 +95,7 @@ class _Fused(SummingSplatter):
         return self._own_image and type(self).cropped is _Fused.cropped
 
     def _settings(self, border: int, one_part: bool = False) -> Settings:
-        return Settings(self.kind, self.sigma, self.epsilon, self.gamma, border, one_part, *self._motions)
+        return Settings(self.kind, self.sigma, self.epsilon, self.array_code.gamma, border, one_part, *self._motions)
 
     def _settings_of(self, splats: Splats) -> Settings:
         # Parts that are told count, as they do in `Splats.parts`.
@@ -101,38 +129,49 @@ class _Fused(SummingSplatter):
     def needed(self, covered: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """See `rts.Splatter`."""
         if self.kind == "single" or depth.dtype not in (np.float32, np.float64):
-            return super().needed(covered, depth)
+            return self.array_code.needed(covered, depth)
         from rts_backends.fused import pruning
 
         return pruning.needed(covered, depth, self._settings(0))
 
 
-class Single(_Fused, specification.Single):
+@dataclass(frozen=True)
+class Single(_Fused):
     """`rts.splatting.Single`, compiled."""
 
     kind = "single"
-
-    @property
-    def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
-        """See `rts.splatting`; promised of this image, too."""
-        return super().fills_interiors
+    specification = specified.Single
+    layers = specified.Single.layers
 
 
-class Multi(_Fused, specification.Multi):
+@dataclass(frozen=True)
+class Multi(_Fused):
     """`rts.splatting.Multi`, compiled."""
 
     kind = "multi"
+    specification = specified.Multi
 
 
-class Visible(_Fused, specification.Visible):
-    """`rts.splatting.Visible`, compiled."""
+@dataclass(frozen=True)
+class Visible(_Fused):
+    """`rts.splatting.Visible`, compiled; see there for the settings.
+
+    Attributes:
+        rims: whether coverage moves as outlines do.
+        crossings: whether lines of crossing move as depths say.
+        facing: whether opposite sides of one sheet are kept from pairing.
+        exits: whether outlines of culled parts move as the middles of their chords.
+    """
 
     kind = "visible"
-
-    @property
-    def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
-        """See `rts.splatting`; promised of this image, too."""
-        return super().fills_interiors
+    specification = specified.Visible
+    reach = specified.Visible.reach
+    epsilon: float = specified.Visible.epsilon
+    calibration: float | None = specified.Visible.calibration
+    rims: bool = specified.Visible.rims
+    crossings: bool = specified.Visible.crossings
+    facing: bool = specified.Visible.facing
+    exits: bool = specified.Visible.exits
 
     @property
     def _motions(self) -> tuple[bool, ...]:
