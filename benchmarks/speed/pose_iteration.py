@@ -95,9 +95,9 @@ class Task:
 
 
 def torch_iteration(
-    task: Task, mode: str = "pose", sampler: str = "auto", swept: bool = False, prepared: bool = False
+    task: Task, mode: str = "pose", sampler: str = "auto", prepared: bool = False
 ) -> Callable[[], object]:
-    """One eager iteration a call; the loss of an image, or `swept`, also that of a `prepared` part at a pose."""
+    """One eager iteration a call, of a `prepared` part or of one that may change."""
     import torch
 
     pose = torch.tensor(START, requires_grad=True)
@@ -108,7 +108,7 @@ def torch_iteration(
     optimizer = torch.optim.Adam(groups)
     target = torch.from_numpy(task.target)
     scene = task.prepared() if prepared else lambda pose: task.posed(pose, vertices)
-    residuals = task.residuals(scene, target, sampler) if swept or prepared else None
+    residuals = task.residuals(scene, target, sampler) if prepared else None
 
     def step() -> float:
         pose.grad = None

@@ -45,8 +45,7 @@ def iterations(task: Task, args: argparse.Namespace) -> dict[str, Callable[[], o
         for engine, make in ENGINES.items():
             for sampler in ("auto", "embree") if mode == "pose" else ("auto",):
                 found[f"{NAMES[mode]}, {engine}, {sampler}"] = make(task, mode, sampler)
-    found["RtS-pose, torch, auto, one sweep"] = torch_iteration(task, swept=True)
-    found["RtS-pose, torch, prepared, one sweep"] = torch_iteration(task, prepared=True)
+    found[tables.PREPARED] = torch_iteration(task, prepared=True)
     if args.peers:
         from benchmarks.speed import other_renderers
 

@@ -9,7 +9,7 @@ from benchmarks.speed.stages import STAGES
 from benchmarks.timing import CONSECUTIVE
 
 OURS = "RtS-pose, torch, auto"
-PREPARED = "RtS-pose, torch, prepared, one sweep"
+PREPARED = "RtS-pose, torch, prepared"
 FULL = "full RtS, torch, auto"
 RATIOS = (
     (OURS, "DEODR"),
@@ -129,8 +129,7 @@ SECTIONS = {
         "Pose iteration",
         "One iteration: render, loss, gradient, step of Adam. Medians with quartiles, all methods in turn in one run, "
         f"{CONSECUTIVE} iterations after one that is not timed, by faces. *RtS-pose*: vertices constant. *Full RtS*: "
-        "gradient of pose and vertices, a step in the pose; *both*: a step in both. *One sweep*: the loss is made as "
-        "the image is (`rts.ImageResiduals.mean_loss`), elsewhere of an image; *prepared*: by `rts.prepare`. DEODR "
+        "gradient of pose and vertices, a step in the pose; *both*: a step in both; *prepared*: by `rts.prepare`. DEODR "
         "draws one channel of front faces on one thread, by its own classes, which always give the gradient of the "
         "vertices, or called at its compiled functions; the others use all cores.",
         pose,
