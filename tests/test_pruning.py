@@ -11,7 +11,7 @@ import rts
 from rts import splatting
 from rts.contracts.records import ArraySpec
 from rts.rendering.samples import sample
-from rts.sampling import pruning
+from rts.sampling import hidden
 from rts.sampling.extremes import extent, largest, named
 from rts.trees import map_leaves
 
@@ -259,7 +259,7 @@ def test_auto_says_what_is_beyond_its_limit(monkeypatch):
         sampled = rts.sample(parts, CAMERA, SIZE, splatter="visible", layers="auto")
     assert warned[0].filename == __file__
     assert sampled.row.shape[0] == 8 and int(sampled.overflow) > 0
-    monkeypatch.setattr(pruning, "LAYER_LIMIT", 16)
+    monkeypatch.setattr(hidden, "LAYER_LIMIT", 16)
     sampled = sample(parts, CAMERA, SIZE, splatter="visible", layers="auto")
     assert sampled.row.shape[0] == 12 and int(sampled.overflow) == 0
 

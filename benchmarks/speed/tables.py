@@ -130,8 +130,8 @@ SECTIONS = {
         "One iteration: render, loss, gradient, step of Adam. Medians with quartiles, all methods in turn in one run, "
         f"{CONSECUTIVE} iterations after one that is not timed, by faces. *RtS-pose*: vertices constant. *Full RtS*: "
         "gradient of pose and vertices, a step in the pose; *both*: a step in both; *prepared*: by `rts.prepare`. "
-        "DEODR draws one channel of front faces on one thread, by its own classes, which always give the gradient of the "
-        "vertices, or called at its compiled functions; the others use all cores.",
+        "DEODR draws one channel of front faces on one thread, by its own classes, which always give the gradient of "
+        "the vertices, or called at its compiled functions; the others use all cores.",
         pose,
     ),
     "stages": (

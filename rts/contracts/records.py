@@ -199,8 +199,8 @@ class Question(NamedTuple):
 
     Attributes:
         covered: (K, H, W) bool, where there are samples.
-        depth: (K, H, W) float, their depths.
-        size: of the largest coordinate that they were computed from; 0 where that is not known.
+        depth: (K, H, W) float, their depths; anything where nothing is covered.
+        size: the largest coordinate that depths were computed from, which bounds rounding; 0 where that is not known.
     """
 
     covered: np.ndarray
@@ -212,9 +212,9 @@ class Decision(NamedTuple):
     """The samples that can reach the image. Host arrays.
 
     Attributes:
-        kept: (K, H, W) bool, the samples to make.
+        kept: (K, H, W) bool, the samples to make: those of `needed` but for what only settled cells need.
         settled: (H, W) int8, `Cells.settled` of a scene of one part; None where that was not asked.
-        needed: (K, H, W) bool, the samples that were kept before those were left out that only settled cells need.
+        needed: (K, H, W) bool, the samples that the splatter needs.
     """
 
     kept: np.ndarray
@@ -227,7 +227,7 @@ class Hidden(Protocol):
 
     Attributes:
         settles: whether decisions tell which cells are settled.
-        size: of the largest number that surfaces read; 0 where that is not known.
+        size: the largest number that surfaces read, which bounds rounding; 0 where that is not known.
     """
 
     @property

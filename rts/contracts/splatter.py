@@ -20,7 +20,7 @@ class Splatter(Plugin):
 
     Attributes:
         layers: how many layers it looks at, from the front; None for all that there are.
-        reach: how many cells away from its own, along either axis, a sample may have an effect.
+        reach: how many cells away from its own, along either axis, a sample may have an effect; at least 1.
         reads: which of "facing" and "exit" of `Cells` it reads; these are found only then.
         fills_interiors: a promise on samples of one opaque colour, on cells' centres. A cell shows this colour where
             all nine samples around it are fronts and no hidden one beside them is `needed`, and nothing where none of
@@ -68,7 +68,7 @@ class Splatter(Plugin):
 
         Args:
             covered: (K, H, W) bool.
-            depth: (K, H, W) float.
+            depth: (K, H, W) float; 0 where nothing is covered.
 
         Returns:
             (K, H, W) bool; by default all that are covered.

@@ -90,13 +90,13 @@ class Visible(Kernel):
             s, off = layers.pairing(*n)
             shift[n] = xp.where((row[0] < 0) | layers.continues(*n, CONTINUED * off), 0, s)
         shown = {n: (s < 0) & layers.covers(*n) for n, s in shift.items()}
-        none = row.shape[0]
-        m = xp.full_like(row[0], none)
+        count = row.shape[0]
+        m = xp.full_like(row[0], count)
         for n, s in shift.items():
             m = xp.where(shown[n] & (-s < m), -s, m)
         differentiates = engine_of(splats.positions).differentiates
         lines, crossed = None, None
-        if self.crossings and none > 1 and differentiates:
+        if self.crossings and count > 1 and differentiates:
             pairs = crossings.pairs_of(layers)
             lines, crossed = crossings.targets(layers, shift, pairs), functools.reduce(operator.or_, pairs.values())
         still = None if lines is None else lines.target
@@ -105,7 +105,7 @@ class Visible(Kernel):
         front, surface, behind = 0.0, 0.0, 0.0
         for n, s in shift.items():
             hidden = xp.where(s < 0, 0, nearest(layers.source(*n), revealed, s, xp))
-            hidden = xp.where(m < none, hidden, none)
+            hidden = xp.where(m < count, hidden, count)
             for k, given in enumerate(layers.splats(*n, still=still)):
                 if k == 0:
                     front = front + xp.where((s > 0)[..., None], given, 0.0)
