@@ -653,7 +653,7 @@ class Camera:
         return xp.minimum(*depths), xp.maximum(*depths)
 
     def rays(self, size: tuple[int, int]) -> Rays:
-        """Rays through pixel centres: `origins` and `directions` (H, W, 3), world space, and `spread`; differentiable."""
+        """Rays through cells: `origins` and `directions` (H, W, 3), world space, and `spread`; differentiable."""
         size = check_pixels(size)
         self = self.for_size(size)
         xp, (view, p) = promote(self.view, self.projection)
