@@ -76,7 +76,8 @@ def in_words(capabilities: Mapping[str, Any]) -> str:
         if value is True:
             words.append(shown)
         elif isinstance(value, (tuple, list, frozenset)):
-            words.append(f"{shown} {' '.join(sorted(map(str, value))) or 'nothing'}")
+            listed = sorted(value) if isinstance(value, frozenset) else value
+            words.append(f"{shown} {' '.join(map(str, listed)) or 'nothing'}")
         elif value is not False and value is not None:
             words.append(f"{shown} {value}")
     return ", ".join(words)

@@ -1,7 +1,5 @@
 """Surfaces that are not their triangles: Bézier patches, refined by Newton's method, and a torus, sphere-traced."""
 
-from dataclasses import replace
-
 import numpy as np
 
 import rts
@@ -162,8 +160,7 @@ class Crowded(Sheets):
     def refine(self, inputs, samples, rays):
         entry = np.arange(len(samples.ids), dtype=np.int32)[:, None]
         row = np.where(samples.row < self.room, samples.row, -1)
-        return replace(
-            samples,
+        return samples.replace(
             ids=np.concatenate([samples.ids, np.minimum(entry, self.room - 1)], axis=1),
             params=samples.params[:, :0],
             row=row,

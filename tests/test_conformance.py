@@ -9,6 +9,7 @@ from importlib.metadata import entry_points
 import numpy as np
 import pytest
 from analytic import Ellipsoid
+from helpers import splats_of
 
 import rts
 from rts import GBuffer, InputError, Part, PluginError
@@ -16,7 +17,7 @@ from rts.arrays import without_border
 from rts.contracts.records import Request
 from rts.engines import engine_of, namespace
 from rts.plugin_api.operations import Operation
-from rts.plugin_api.records import Fragments, RayHits, Splats
+from rts.plugin_api.records import Fragments, RayHits
 from rts.registry import instance
 from rts.row_cameras import RowCameras
 from rts.shading import Depth, Normals, Unlit
@@ -442,7 +443,7 @@ class Roomy(rts.Sampler):
         return RASTER.sample(part, camera, size, layers)
 
 
-class DropsTheFront:
+class DropsTheFront(rts.Sampler):
     def sample(self, part, camera, size, layers, request):
         whole = RASTER.sample(part, camera, size, layers)
         first = max(0, len(whole.ids) - (request.capacity or len(whole.ids)))
@@ -458,7 +459,7 @@ class Complains(rts.Sampler):
         raise self.error
 
 
-class AcceptsAnything:
+class AcceptsAnything(rts.Sampler):
     def sample(self, part, camera, size, layers, request):
         return RASTER.sample(scenes.ball(), camera, size, layers, Request(request.capacity))
 
@@ -809,7 +810,7 @@ class OddMulti(Multi):
 
     def image(self, splats):
         given = splats.positions, splats.rgba, splats.row
-        return self.made(super().image(Splats(*self.given(*given))), *given)
+        return self.made(super().image(splats_of(*self.given(*given))), *given)
 
 
 def from_centres(positions, rgba, row):

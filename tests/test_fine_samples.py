@@ -115,6 +115,6 @@ def test_memory_is_that_of_the_outlines():
     vertices, faces = icosphere(3)
     part = rts.Part(MESH(faces), {"vertices": vertices})
     sampled = rts.sample(part, CAMERA, (128, 128), supersample=Adaptive(8), splatter="visible")
-    grid = strips.Grid((128, 128), 8, sampled.fine.apron).fine
+    grid = strips.FineGrid((128, 128), 8, sampled.fine.apron).fine
     assert sampled.fine.row[0].size < 0.25 * grid[0] * grid[1]
     assert sum(len(s.ids) for s in sampled.fine.samples) < 0.1 * grid[0] * grid[1]

@@ -346,7 +346,7 @@ def test_sweeps_are_products_of_pushed_tangents(kind, channels, colored):
         image, rows = image[..., chosen], rows[..., chosen]
         goal = np.random.default_rng(1).random(image.shape)
         r, rows = (image - goal).ravel(), rows.reshape(3, -1)
-        found = fused_normal.normal_equations(splats, t_positions, t_rgba, goal, None, None)
+        found = fused_normal.normal_equations(splats, t_positions, t_rgba, goal, None, None, rts.Loss())
         for own, expected in zip(found, (r @ r, rows @ rows.T, rows @ r), strict=True):
             np.testing.assert_allclose(own, expected / len(r), rtol=1e-11, atol=1e-13)
 
@@ -358,7 +358,7 @@ def test_results_are_bitwise_the_same_on_any_number_of_threads(kind, monkeypatch
     results = []
     for threads in ("1", "2", "5"):
         monkeypatch.setenv("RTS_NUM_THREADS", threads)
-        results.append(fused_normal.normal_equations(splats, *tangents, goal, weights, goal))
+        results.append(fused_normal.normal_equations(splats, *tangents, goal, weights, goal, rts.Loss()))
     for one, other in itertools.pairwise(results):
         for a, b in zip(one, other, strict=True):
             np.testing.assert_array_equal(a, b)
@@ -376,7 +376,7 @@ def test_sweeps_of_means_are_products_of_pushed_means(kind):
         pushed = rows.reshape(3, size[0], fine, size[1], fine, 4).mean(axis=(2, 4)).reshape(3, -1)
         goal = np.random.default_rng(1).random(mean.shape)
         r = (mean - goal).ravel()
-        found = fused_normal.normal_equations(splats, t_positions, t_rgba, goal, None, None)
+        found = fused_normal.normal_equations(splats, t_positions, t_rgba, goal, None, None, rts.Loss())
         for own, expected in zip(found, (r @ r, pushed @ pushed.T, pushed @ r), strict=True):
             np.testing.assert_allclose(own, expected / len(r), rtol=1e-10, atol=1e-13)
 
@@ -386,10 +386,10 @@ def test_a_sweep_at_512_needs_little_memory():
     tangents = np.ones((12, len(splats.positions), 3), np.float32)
     goal = np.ones((512, 512, 4), np.float32)
     splats.choices  # noqa: B018  (made before, as the image has it)
-    fused_normal.normal_equations(splats, tangents, None, goal, None, None)
+    fused_normal.normal_equations(splats, tangents, None, goal, None, None, rts.Loss())
     tracemalloc.start()
     try:
-        fused_normal.normal_equations(splats, tangents, None, goal, None, None)
+        fused_normal.normal_equations(splats, tangents, None, goal, None, None, rts.Loss())
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

@@ -15,7 +15,6 @@ from rts import splatting
 from rts.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
-from rts_backends.fused import normal_equations as fused_normal
 from rts_backends.fused.losses import cost_and_weight, in_numbers
 
 pytestmark = pytest.mark.fitting
@@ -509,4 +508,3 @@ def test_losses_are_values():
     assert not rts.Loss().robust and rts.Loss() == rts.Loss("linear", 1)
     with pytest.raises(dataclasses.FrozenInstanceError):
         loss.f_scale = 1.0
-    assert fused_normal.SQUARE == rts.Loss()

@@ -62,7 +62,7 @@ class Refined(Ball):
         params = samples.params.copy()
         params[row[cells]] = (weights[:, :2] / weights.sum(axis=1, keepdims=True))[..., 0]
         row[cells] = np.where(left > 0, row[cells], -1)
-        return dataclasses.replace(samples, params=params, row=row, depth=depth.astype(np.float32))
+        return samples.replace(params=params, row=row, depth=depth.astype(np.float32))
 
 
 def closed_form(radius=RADIUS):
