@@ -1,0 +1,196 @@
+"""Bands of rows: the loops that Python calls. They fill the image, its tangents, and the gradients of samples."""
+
+from functools import partial
+
+import numpy as np
+
+from rts.plugin_api import loops
+
+from .rows import (
+    ONE,
+    PITCH,
+    RX,
+    RY,
+    SOURCE,
+    SUM,
+    TANGENT,
+    TILE,
+    add_row,
+    add_tangent_row,
+    compiled,
+    gather,
+    load,
+    load_tangent,
+    normalised,
+    slot,
+)
+
+loop = partial(loops.loop, fastmath={"contract"})
+
+
+@compiled
+def tile(width, t):
+    """First column and number of columns of tile t."""
+    count = (width + TILE - 1) // TILE
+    return width * t // count, width * (t + 1) // count - width * t // count
+
+
+@loop
+def forward(start, stop, positions, rgba, row, settled, scale, peak, gamma, border, image):
+    """Fill rows of the image (H, W, 4), which is the cells without `border`."""
+    width, zero = image.shape[1], image.dtype.type(0)
+    sources, total, filled = np.empty(3 * SOURCE, image.dtype), np.empty(SUM, image.dtype), np.empty(3, np.bool_)
+    for t in range((width + TILE - 1) // TILE):
+        left, count = tile(width, t)
+        for y in range(start + border - 1, stop + border + 1):
+            given = row, y, left + border - 1, count + 2, scale, peak, gamma
+            filled[(y + 3) % 3] = load(slot(sources, y, SOURCE), positions, rgba, *given)
+            if y <= start + border:
+                continue
+            own = image[y - 1 - border, left : left + count]
+            if filled.any():
+                normalised(total, sources, filled, y - 1, count)
+                for j in range(count):
+                    for c in range(4):
+                        own[j, c] = total[c * PITCH + j]
+            else:
+                own[:] = zero
+            if len(settled) > 0:
+                paint(own, rgba, settled[y - 1, left + border :])
+
+
+@compiled
+def paint(image, rgba, settled):
+    """Give settled targets of a row the colours of samples, zeros if there are none."""
+    for j in range(len(image)):
+        if settled[j] >= 0:
+            for c in range(4):
+                image[j, c] = rgba[settled[j], c] if len(rgba) > 0 else image.dtype.type(0)
+
+
+@loop
+def push(start, stop, positions, rgba, row, settled, scale, peak, gamma, border, t_positions, t_rgba, out):
+    """Fill rows of the tangents (T, H, W, 4). Tangents of zeros may be absent: (T, 0, ·)."""
+    many, _, width, _ = out.shape
+    sources, total, filled = np.empty(3 * SOURCE, out.dtype), np.empty(SUM, out.dtype), np.empty(3, np.bool_)
+    tangents, change = np.empty((many, 3 * TANGENT), out.dtype), np.empty(SUM, out.dtype)
+    zero, one, slope = out.dtype.type(0), out.dtype.type(1), out.dtype.type(2) * scale * gamma
+    for t in range((width + TILE - 1) // TILE):
+        left, count = tile(width, t)
+        for y in range(start + border - 1, stop + border + 1):
+            at, s = (row, y, left + border - 1, count + 2), slot(sources, y, SOURCE)
+            filled[(y + 3) % 3] = some = load(s, positions, rgba, *at, scale, peak, gamma)
+            for n in range(many if some else 0):
+                load_tangent(slot(tangents[n], y, TANGENT), s, t_positions[n], t_rgba[n], *at, slope)
+            if y <= start + border:
+                continue
+            if filled.any():
+                normalised(total, sources, filled, y - 1, count)
+            for n in range(many):
+                own = out[n, y - 1 - border, left : left + count]
+                change[:] = zero
+                for v in range(-1, 2):
+                    if filled[(y - 1 - v + 3) % 3]:
+                        d = slot(tangents[n], y - 1 - v, TANGENT)
+                        add_tangent_row(change, slot(sources, y - 1 - v, SOURCE), d, v, count)
+                for j in range(count if filled.any() else 0):
+                    weight = total[ONE + j]
+                    grows = zero if weight < one else change[ONE + j]
+                    for c in range(4):
+                        p = c * PITCH + j
+                        own[j, c] = (change[p] - grows * total[p]) / max(weight, one)
+                if not filled.any():
+                    own[:] = zero
+                if len(settled) > 0:
+                    paint(own, t_rgba[n], settled[y - 1, left + border :])
+
+
+@loop
+def pull(start, stop, positions, rgba, row, settled, scale, peak, gamma, border, g, g_positions, g_rgba):
+    """Add to the gradients of the samples of rows of cells; each collects from its nine targets."""
+    width, zero = row.shape[1], g.dtype.type(0)
+    sources, total, filled = np.empty(3 * SOURCE, g.dtype), np.empty(SUM, g.dtype), np.empty(3, np.bool_)
+    adjoints, given, found = np.empty(3 * SUM, g.dtype), np.empty(SUM, g.dtype), np.empty(8 * PITCH, g.dtype)
+    active, slope = np.zeros(3, np.bool_), g.dtype.type(2) * scale * gamma
+    for t in range((width + TILE - 1) // TILE):
+        left, count = tile(width, t)
+        for y in range(start - 1, stop + 1):
+            for v in range(y + 1 if y >= start else y - 1, y + 2):
+                at = row, v, left - 2, count + 4, scale, peak, gamma
+                filled[(v + 3) % 3] = load(slot(sources, v, SOURCE), positions, rgba, *at)
+            adjoint = slot(adjoints, y, SUM)
+            active[(y + 3) % 3] = filled.any() and load_gradient(given, g, settled, border, y, left - 1, count + 2)
+            if active[(y + 3) % 3]:
+                normalised(total, sources, filled, y, count + 2)
+                to_sums(adjoint, total, given, count + 2)
+            else:
+                adjoint[:] = zero
+            if y > start and active.any() and filled[(y + 2) % 3]:
+                s = slot(sources, y - 1, SOURCE)[2:]
+                gather(found, s, slot(adjoints, y - 2, SUM), slot(adjoints, y - 1, SUM), adjoint, count)
+                scatter(g_positions, g_rgba, row[y - 1, left:], found, s, slope, count)
+
+
+@compiled
+def load_gradient(to, g, settled, border, y, first, count):
+    """Fill planes with the gradient of a row, zero beyond the image and where settled; returns whether any is not."""
+    some, zero = False, to.dtype.type(0)
+    for j in range(count):
+        v, u = y - border, first + j - border
+        inside = 0 <= v < g.shape[0] and 0 <= u < g.shape[1]
+        free = inside and (len(settled) == 0 or settled[y, first + j] < 0)
+        for c in range(4):
+            to[c * PITCH + j] = g[v, u, c] if free else zero
+            some |= to[c * PITCH + j] != zero
+    return some
+
+
+@compiled
+def to_sums(to, total, g, count):
+    """Adjoints of the sums from those of the image; zero for the weight where it is below one."""
+    zero, one = to.dtype.type(0), to.dtype.type(1)
+    for j in range(count):
+        weight, dot = total[ONE + j], zero
+        over = one / max(weight, one)
+        for c in range(4):
+            dot += g[c * PITCH + j] * total[c * PITCH + j]
+            to[c * PITCH + j] = g[c * PITCH + j] * over
+        to[ONE + j] = zero if weight < one else -dot * over
+
+
+@compiled
+def scatter(g_positions, g_rgba, row, found, s, slope, count):
+    """Hand what a row of cells has gathered to their samples."""
+    for j in range(count):
+        i = row[j]
+        if i >= 0 and len(g_rgba) > 0:
+            for c in range(4):
+                g_rgba[i, c] += found[c * PITCH + j]
+        if i >= 0 and len(g_positions) > 0:
+            h = found[5 * PITCH + j]
+            g_positions[i, 0] += slope * (found[6 * PITCH + j] - s[RX + j] * h)
+            g_positions[i, 1] += slope * (found[7 * PITCH + j] - s[RY + j] * h)
+
+
+@loop
+def repeats(row, seen):
+    """Whether several cells name one sample; `seen` (N,) are zeros."""
+    for y in range(row.shape[0]):
+        for x in range(row.shape[1]):
+            i = row[y, x]
+            if i >= 0:
+                if seen[i]:
+                    return True
+                seen[i] = True
+    return False
+
+
+@loop
+def collect(settled, border, g, g_rgba):
+    """Add the gradient of settled targets to those of the samples that they show."""
+    for y in range(g.shape[0]):
+        for x in range(g.shape[1]):
+            i = settled[y + border, x + border]
+            if i >= 0:
+                for c in range(4):
+                    g_rgba[i, c] += g[y, x, c]
