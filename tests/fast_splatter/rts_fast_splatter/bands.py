@@ -18,6 +18,7 @@ from .rows import (
     add_row,
     add_tangent_row,
     compiled,
+    covered,
     gather,
     load,
     load_tangent,
@@ -43,20 +44,20 @@ def forward(start, stop, positions, rgba, row, settled, scale, peak, gamma, bord
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
         for y in range(start + border - 1, stop + border + 1):
-            given = row, y, left + border - 1, count + 2, scale, peak, gamma
-            filled[(y + 3) % 3] = load(slot(sources, y, SOURCE), positions, rgba, *given)
+            at = row, y, left + border - 1, count + 2
+            filled[(y + 3) % 3] = covered(*at)
+            if filled[(y + 3) % 3]:
+                load(slot(sources, y, SOURCE), positions, rgba, *at, scale, peak, gamma)
             if y <= start + border:
                 continue
-            own = image[y - 1 - border, left : left + count]
-            if filled.any():
+            some = filled[0] | filled[1] | filled[2]
+            if some:
                 normalised(total, sources, filled, y - 1, count)
-                for j in range(count):
-                    for c in range(4):
-                        own[j, c] = total[c * PITCH + j]
-            else:
-                own[:] = zero
+            for j in range(count):
+                for c in range(4):
+                    image[y - 1 - border, left + j, c] = total[c * PITCH + j] if some else zero
             if len(settled) > 0:
-                paint(own, rgba, settled[y - 1, left + border :])
+                paint(image[y - 1 - border, left : left + count], rgba, settled[y - 1, left + border :])
 
 
 @compiled
@@ -79,12 +80,15 @@ def push(start, stop, positions, rgba, row, settled, scale, peak, gamma, border,
         left, count = tile(width, t)
         for y in range(start + border - 1, stop + border + 1):
             at, s = (row, y, left + border - 1, count + 2), slot(sources, y, SOURCE)
-            filled[(y + 3) % 3] = some = load(s, positions, rgba, *at, scale, peak, gamma)
-            for n in range(many if some else 0):
-                load_tangent(slot(tangents[n], y, TANGENT), s, t_positions[n], t_rgba[n], *at, slope)
+            filled[(y + 3) % 3] = covered(*at)
+            if filled[(y + 3) % 3]:
+                load(s, positions, rgba, *at, scale, peak, gamma)
+                for n in range(many):
+                    load_tangent(slot(tangents[n], y, TANGENT), s, t_positions[n], t_rgba[n], *at, slope)
             if y <= start + border:
                 continue
-            if filled.any():
+            some = filled[0] | filled[1] | filled[2]
+            if some:
                 normalised(total, sources, filled, y - 1, count)
             for n in range(many):
                 own = out[n, y - 1 - border, left : left + count]
@@ -93,13 +97,13 @@ def push(start, stop, positions, rgba, row, settled, scale, peak, gamma, border,
                     if filled[(y - 1 - v + 3) % 3]:
                         d = slot(tangents[n], y - 1 - v, TANGENT)
                         add_tangent_row(change, slot(sources, y - 1 - v, SOURCE), d, v, count)
-                for j in range(count if filled.any() else 0):
+                for j in range(count if some else 0):
                     weight = total[ONE + j]
                     grows = zero if weight < one else change[ONE + j]
                     for c in range(4):
                         p = c * PITCH + j
                         own[j, c] = (change[p] - grows * total[p]) / max(weight, one)
-                if not filled.any():
+                if not some:
                     own[:] = zero
                 if len(settled) > 0:
                     paint(own, t_rgba[n], settled[y - 1, left + border :])
@@ -116,16 +120,21 @@ def pull(start, stop, positions, rgba, row, settled, scale, peak, gamma, border,
         left, count = tile(width, t)
         for y in range(start - 1, stop + 1):
             for v in range(y + 1 if y >= start else y - 1, y + 2):
-                at = row, v, left - 2, count + 4, scale, peak, gamma
-                filled[(v + 3) % 3] = load(slot(sources, v, SOURCE), positions, rgba, *at)
+                at = row, v, left - 2, count + 4
+                filled[(v + 3) % 3] = covered(*at)
+                if filled[(v + 3) % 3]:
+                    load(slot(sources, v, SOURCE), positions, rgba, *at, scale, peak, gamma)
+            active[(y + 3) % 3] = False
+            if not (filled[0] | filled[1] | filled[2]):
+                continue
             adjoint = slot(adjoints, y, SUM)
-            active[(y + 3) % 3] = filled.any() and load_gradient(given, g, settled, border, y, left - 1, count + 2)
-            if active[(y + 3) % 3]:
+            if load_gradient(given, g, settled, border, y, left - 1, count + 2):
+                active[(y + 3) % 3] = True
                 normalised(total, sources, filled, y, count + 2)
                 to_sums(adjoint, total, given, count + 2)
             else:
                 adjoint[:] = zero
-            if y > start and active.any() and filled[(y + 2) % 3]:
+            if y > start and filled[(y + 2) % 3] and (active[0] | active[1] | active[2]):
                 s = slot(sources, y - 1, SOURCE)[2:]
                 gather(found, s, slot(adjoints, y - 2, SUM), slot(adjoints, y - 1, SUM), adjoint, count)
                 scatter(g_positions, g_rgba, row[y - 1, left:], found, s, slope, count)
@@ -134,14 +143,23 @@ def pull(start, stop, positions, rgba, row, settled, scale, peak, gamma, border,
 @compiled
 def load_gradient(to, g, settled, border, y, first, count):
     """Fill planes with the gradient of a row, zero beyond the image and where settled; returns whether any is not."""
-    some, zero = False, to.dtype.type(0)
-    for j in range(count):
-        v, u = y - border, first + j - border
-        inside = 0 <= v < g.shape[0] and 0 <= u < g.shape[1]
-        free = inside and (len(settled) == 0 or settled[y, first + j] < 0)
+    some, zero, left = False, to.dtype.type(0), max(first - border, 0)
+    to[:ONE] = zero
+    if not 0 <= y - border < g.shape[0]:
+        return False
+    inner = g[y - border, left : max(first - border + count, left)]
+    planes = to[left + border - first :]
+    for j in range(len(inner)):
         for c in range(4):
-            to[c * PITCH + j] = g[v, u, c] if free else zero
-            some |= to[c * PITCH + j] != zero
+            planes[c * PITCH + j] = inner[j, c]
+    if len(settled) > 0:
+        amid = settled[y, left + border : left + border + len(inner)]
+        for j in range(len(inner)):
+            if amid[j] >= 0:
+                for c in range(4):
+                    planes[c * PITCH + j] = zero
+    for p in range(ONE):
+        some |= to[p] != zero
     return some
 
 

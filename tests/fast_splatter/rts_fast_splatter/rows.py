@@ -59,14 +59,19 @@ def slot(s, y, size):
 
 
 @compiled
+def covered(row, y, first, count):
+    """Whether there is any sample in cells first, … of a row."""
+    some, height, width = False, *row.shape
+    if 0 <= y < height:
+        for x in range(max(first, 0), min(first + count, width)):
+            some |= row[y, x] >= 0
+    return some
+
+
+@compiled
 def load(s, positions, rgba, row, y, first, count, scale, peak, gamma):
-    """Fill a slot with cells first, … of a row; returns whether there is any sample, without which nothing is done."""
-    height, width = row.shape
-    some = False
-    for x in range(max(first, 0), min(first + count, width) if 0 <= y < height else 0):
-        some |= row[y, x] >= 0
-    if not some:
-        return False
+    """Fill a slot with cells first, … of a row."""
+    width = row.shape[1]
     zero, half = s.dtype.type(0), s.dtype.type(0.5)
     for j in range(count):
         x = first + j
@@ -86,7 +91,6 @@ def load(s, positions, rgba, row, y, first, count, scale, peak, gamma):
             for j in range(count):
                 d = s.dtype.type(u - 1) - s[RX + axis * PITCH + j]
                 s[WX + (3 * axis + u) * PITCH + j] = peak * exp(-(d * d) * scale)
-    return True
 
 
 @compiled
