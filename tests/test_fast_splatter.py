@@ -1,8 +1,5 @@
 """A compiled splatter made outside of the library, of public names alone, against the library's own."""
 
-import ast
-from pathlib import Path
-
 import numpy as np
 import pytest
 from fast_splatter.rts_fast_splatter import IMAGE, FastSingle
@@ -43,9 +40,10 @@ class TestImage(OperationConformance):
 
 def scenes(dtype):
     """Splats: more than a tile, two layers, a border, settled cells, a sample in several cells, and nothing."""
-    wide, two, empty = (Splats(p, c, Cells(r)) for p, c, r in (
-        cells(1, (13, 75), dtype=dtype), cells(2, dtype=dtype), cells(1, (5, 40), dtype=dtype, holes=2)
-    ))
+    wide, two, empty = (
+        Splats(p, c, Cells(r))
+        for p, c, r in (cells(1, (13, 75), dtype=dtype), cells(2, dtype=dtype), cells(1, (5, 40), dtype=dtype, holes=2))
+    )
     settled = np.full(wide.row.shape[1:], -1, np.int32)
     settled[2:7, 20:50], settled[9:, :4] = 3, 0
     repeated = np.where(np.random.default_rng(0).random(two.row.shape) < 0.2, 1, two.row).astype(np.int32)
@@ -82,12 +80,22 @@ def test_it_is_single(scene, dtype, settings):
     np.testing.assert_array_equal(numpy, ours[0])
     for other in (splatting.Single(**settings), fused.Single(**settings)):
         for x, y in zip(ours, found(other), strict=True):
-            np.testing.assert_allclose(x, y, atol=TOLERANCE[dtype] * max(1, float(y.abs().max())), rtol=TOLERANCE[dtype])
+            np.testing.assert_allclose(
+                x, y, atol=TOLERANCE[dtype] * max(1, float(y.abs().max())), rtol=TOLERANCE[dtype]
+            )
 
 
-@pytest.mark.parametrize("engine", ["torch", "jax"])
-def test_a_render_is_that_of_single(engine):
-    """A sphere's image, and its gradient in the radius, by name of neither."""
-    pytest.importorskip(engine)
-    chosen = rts.engine_of(__import__(engine + ".numpy", fromlist="x").zeros(1) if engine == "jax" else __import__(engine).zeros(1))
-    part = rts.examples() if hasattr(rts, "examples") else None
+def test_a_compiled_program_of_jax_renders_with_it():
+    """The image of a box that turns, and its gradient in the pose, are those of the library's splatter."""
+    jax = pytest.importorskip("jax")
+    part = rts.plugin("surfaces", "mesh").example().replace(shader="silhouette")
+
+    def loss(pose, splatter):
+        turned = part.replace(transform=rts.rigid(pose))
+        image = rts.render(turned, rts.Camera.look_at((0, 1, 4), (0, 0, 0)), (20, 24), splatter=splatter)
+        return (image[..., 3] * jax.numpy.linspace(0, 1, 24)).sum()
+
+    pose = jax.numpy.asarray([0.3, 0.2, 0.1, 0.1, 0.0, 0.0])
+    ours, theirs = (jax.jit(jax.value_and_grad(lambda x, s=s: loss(x, s)))(pose) for s in (FastSingle(), "single"))
+    for x, y in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-4)

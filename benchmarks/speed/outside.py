@@ -36,7 +36,9 @@ def main(rounds: int) -> None:
     """Print a table."""
     vertices, faces = meshes.mesh("bunny")
     splatters = {"inside": rts.plugin("splatters", "single")(), "outside": FastSingle()}
-    print("| side | shader | inside: wall, cores (ms) | outside | ratio of wall | of cores |\n|---|---|---|---|---|---|")
+    print(
+        "| side | shader | inside: wall, cores (ms) | outside | ratio of wall | of cores |\n|---|---|---|---|---|---|"
+    )
     for side in (256, 512):
         for shader in ("silhouette", "lambert"):
             given = vertices.astype("float32"), faces.astype("int32"), side, shader, 1

@@ -36,22 +36,22 @@ def _arguments(operands, numbers, border, checked=None):
 
 
 def _forward(operands, out, *, numbers, border):
-    from .bands import forward
-
-    given = *_arguments(operands, numbers, border), out
-    if out.size:
-        parallel(forward, len(out), *given, work=WORK * out.size // 4)
+    none = (read_only(np.empty((0, 0, n), out.dtype)) for n in (3, 4))
+    _splat(_arguments(operands, numbers, border), none, out[None])
     return True  # Kept: the operands have been checked.
 
 
 def _push(operands, tangents, out, *, numbers, border, kept):
-    from .bands import push
-
-    given = _arguments(operands, numbers, border, kept)
     none = (np.empty((len(out), 0, n), out.dtype) for n in (3, 4))
-    along = (read_only(n if t is None else t) for n, t in zip(none, tangents, strict=True))
+    along = [read_only(n if t is None else t) for n, t in zip(none, tangents, strict=True)]
+    _splat(_arguments(operands, numbers, border, kept), along, out)
+
+
+def _splat(given, along, out):
+    from .bands import splat
+
     if out.size:
-        parallel(push, out.shape[1], *given, *along, out, work=WORK * out.size // 4)
+        parallel(splat, out.shape[1], *given, *along, out, work=WORK * out.size // 4)
 
 
 def _pull(operands, g, results, *, numbers, border, kept):

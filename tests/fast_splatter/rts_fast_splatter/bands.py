@@ -15,8 +15,6 @@ from .rows import (
     SUM,
     TANGENT,
     TILE,
-    add_row,
-    add_tangent_row,
     compiled,
     covered,
     gather,
@@ -24,6 +22,7 @@ from .rows import (
     load_tangent,
     normalised,
     slot,
+    tangent,
 )
 
 loop = partial(loops.loop, fastmath={"contract"})
@@ -37,27 +36,43 @@ def tile(width, t):
 
 
 @loop
-def forward(start, stop, positions, rgba, row, settled, scale, peak, gamma, border, image):
-    """Fill rows of the image (H, W, 4), which is the cells without `border`."""
-    width, zero = image.shape[1], image.dtype.type(0)
-    sources, total, filled = np.empty(3 * SOURCE, image.dtype), np.empty(SUM, image.dtype), np.empty(3, np.bool_)
+def splat(start, stop, positions, rgba, row, settled, scale, peak, gamma, border, t_positions, t_rgba, out):
+    """Fill rows of out (T, H, W, 4), the cells without `border`: tangents, or with none (0, ·) the image (1, H, W, 4).
+
+    Tangents of zeros may be absent: (T, 0, ·).
+    """
+    many, width, kind = len(t_positions), out.shape[2], out.dtype.type
+    sources, total, filled = np.empty(3 * SOURCE, out.dtype), np.empty(SUM, out.dtype), np.empty(3, np.bool_)
+    tangents, change, slope = (
+        np.empty((many, 3 * TANGENT), out.dtype),
+        np.empty(SUM, out.dtype),
+        kind(2) * scale * gamma,
+    )
     for t in range((width + TILE - 1) // TILE):
         left, count = tile(width, t)
         for y in range(start + border - 1, stop + border + 1):
             at = row, y, left + border - 1, count + 2
             filled[(y + 3) % 3] = covered(*at)
             if filled[(y + 3) % 3]:
-                load(slot(sources, y, SOURCE), positions, rgba, *at, scale, peak, gamma)
+                s = slot(sources, y, SOURCE)
+                load(s, positions, rgba, *at, scale, peak, gamma)
+                for n in range(many):
+                    load_tangent(slot(tangents[n], y, TANGENT), s, t_positions[n], t_rgba[n], *at, slope)
             if y <= start + border:
                 continue
             some = filled[0] | filled[1] | filled[2]
             if some:
                 normalised(total, sources, filled, y - 1, count)
-            for j in range(count):
-                for c in range(4):
-                    image[y - 1 - border, left + j, c] = total[c * PITCH + j] if some else zero
-            if len(settled) > 0:
-                paint(image[y - 1 - border, left : left + count], rgba, settled[y - 1, left + border :])
+            for n in range(len(out)):
+                if some and many > 0:
+                    tangent(change, total, sources, tangents[n], filled, y - 1, count)
+                planes = change if many > 0 else total
+                for j in range(count):
+                    for c in range(4):
+                        out[n, y - 1 - border, left + j, c] = planes[c * PITCH + j] if some else kind(0)
+                if len(settled) > 0:
+                    own = out[n, y - 1 - border, left : left + count]
+                    paint(own, t_rgba[n] if many > 0 else rgba, settled[y - 1, left + border :])
 
 
 @compiled
@@ -67,46 +82,6 @@ def paint(image, rgba, settled):
         if settled[j] >= 0:
             for c in range(4):
                 image[j, c] = rgba[settled[j], c] if len(rgba) > 0 else image.dtype.type(0)
-
-
-@loop
-def push(start, stop, positions, rgba, row, settled, scale, peak, gamma, border, t_positions, t_rgba, out):
-    """Fill rows of the tangents (T, H, W, 4). Tangents of zeros may be absent: (T, 0, ·)."""
-    many, _, width, _ = out.shape
-    sources, total, filled = np.empty(3 * SOURCE, out.dtype), np.empty(SUM, out.dtype), np.empty(3, np.bool_)
-    tangents, change = np.empty((many, 3 * TANGENT), out.dtype), np.empty(SUM, out.dtype)
-    zero, one, slope = out.dtype.type(0), out.dtype.type(1), out.dtype.type(2) * scale * gamma
-    for t in range((width + TILE - 1) // TILE):
-        left, count = tile(width, t)
-        for y in range(start + border - 1, stop + border + 1):
-            at, s = (row, y, left + border - 1, count + 2), slot(sources, y, SOURCE)
-            filled[(y + 3) % 3] = covered(*at)
-            if filled[(y + 3) % 3]:
-                load(s, positions, rgba, *at, scale, peak, gamma)
-                for n in range(many):
-                    load_tangent(slot(tangents[n], y, TANGENT), s, t_positions[n], t_rgba[n], *at, slope)
-            if y <= start + border:
-                continue
-            some = filled[0] | filled[1] | filled[2]
-            if some:
-                normalised(total, sources, filled, y - 1, count)
-            for n in range(many):
-                own = out[n, y - 1 - border, left : left + count]
-                change[:] = zero
-                for v in range(-1, 2):
-                    if filled[(y - 1 - v + 3) % 3]:
-                        d = slot(tangents[n], y - 1 - v, TANGENT)
-                        add_tangent_row(change, slot(sources, y - 1 - v, SOURCE), d, v, count)
-                for j in range(count if some else 0):
-                    weight = total[ONE + j]
-                    grows = zero if weight < one else change[ONE + j]
-                    for c in range(4):
-                        p = c * PITCH + j
-                        own[j, c] = (change[p] - grows * total[p]) / max(weight, one)
-                if not some:
-                    own[:] = zero
-                if len(settled) > 0:
-                    paint(own, t_rgba[n], settled[y - 1, left + border :])
 
 
 @loop

@@ -151,6 +151,21 @@ def add_tangent_row(to, s, d, v, count):
 
 
 @compiled
+def tangent(change, total, sources, tangents, filled, y, count):
+    """The tangent of `normalised`, of which `total` is the result."""
+    zero, one = change.dtype.type(0), change.dtype.type(1)
+    change[:] = zero
+    for v in range(-1, 2):
+        if filled[(y - v + 3) % 3]:
+            add_tangent_row(change, slot(sources, y - v, SOURCE), slot(tangents, y - v, TANGENT), v, count)
+    for j in range(count):
+        over, grows = one / max(total[ONE + j], one), zero if total[ONE + j] < one else change[ONE + j]
+        for c in range(4):
+            p = c * PITCH + j
+            change[p] = (change[p] - grows * total[p]) * over
+
+
+@compiled
 def gather(to, s, above, level, below, count):
     """Sums of w, w u and w v over nine targets' adjoints; source j lies under target j + 1."""
     zero = to.dtype.type(0)
