@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -61,7 +62,8 @@ def capabilities(group: str, plugin: Any) -> dict[str, Any]:
         for name, (base, method) in METHODS.get(group, {}).items()
     }
     # What depends on settings is that of the default ones.
-    by_settings = any(isinstance(getattr(kind, name), property) for name in VARIABLES.get(group, ()))
+    own = [getattr(kind, name) for name in VARIABLES.get(group, ())]
+    by_settings = any(isinstance(value, (property, functools.cached_property)) for value in own)
     told = kind() if by_settings and plugin is kind else plugin
     for name in VARIABLES.get(group, ()):
         found[name] = promised(told, name) if name in PROMISES else getattr(told, name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -36,17 +37,17 @@ class CheckedPart(Part):
     transform: Array | None = None
     cull: str = "none"
 
-    @property
+    @functools.cached_property
     def uniform(self) -> bool:
         """Whether its shader promises one colour."""
         return promised(self.shader, "uniform")
 
-    @property
+    @functools.cached_property
     def takes_views(self) -> bool:
         """Whether its shader promises to take samples of several views."""
         return promised(self.shader, "takes_views")
 
-    @property
+    @functools.cached_property
     def reads(self) -> tuple[str, ...] | None:
         """The entries that its shader promises to do with, of the G-buffer and of θ; None for all."""
         return promised(self.shader, "reads")

@@ -349,6 +349,8 @@ class Context(NamedTuple):
 
     def constants(self, tree: Tree) -> Tree:
         """A copy of a tree in which every NumPy array and number is a constant of the engine."""
+        if tree is None or type(tree) in OWNERS:  # As most are.
+            return tree
         return constants(tree, self.engine, self.like)
 
 

@@ -211,15 +211,14 @@ class TriangleSampler(Sampler):
         surface, camera = _of_triangles(part.surface), camera.for_size(size)
         listed, hidden, entry = request.cells, request.hidden, request.entry
         shape = Shape(layers, size if listed is None else tuple(listed.shape), request.capacity, size)
-        tables, moves = shape.tables(surface) if surface.refines else {}, surface.refines and surface.refine_moves
+        refines = surface.refines
+        tables, moves = shape.tables(surface) if refines else {}, refines and surface.refine_moves
         sides = request.facing and layers > 1 and part.cull == "none" and not moves
         sides = sides and overrides(surface, "pieces", TriangleSurface)
-        exits = request.exits and part.cull == "back" and listed is None and not surface.refines and surface.centered
+        exits = request.exits and part.cull == "back" and listed is None and not refines and surface.centered
         beside = {
             **({"facing": ArraySpec((layers, *shape.size), np.int16)} if sides else {}),
-            **(
-                {"settled": ArraySpec(shape.size, np.int8)} if hidden and hidden.settles and not surface.refines else {}
-            ),
+            **({"settled": ArraySpec(shape.size, np.int8)} if hidden and hidden.settles and not refines else {}),
             **({"exit": ArraySpec(size, np.int32)} if exits else {}),
             **({"ran_out": ArraySpec((), np.int32)} if moves else {}),
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,7 +54,7 @@ class Single(Kernel):
 
     layers = 1
 
-    @property
+    @functools.cached_property
     def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
         """See `rts.Splatter`: True where weights fill a cell."""
         return self.epsilon >= LEAST_EPSILON

@@ -24,14 +24,6 @@ CROSSINGS = crossings.LARGEST, crossings.DIRECT, crossings.FIT, crossings.SLACK,
 """Numbers of those modules, for compiled code."""
 
 
-_READS = {
-    (facing, exits): frozenset(name for name, read in (("facing", facing), ("exit", exits)) if read)
-    for facing in (False, True)
-    for exits in (False, True)
-}
-"""What is read of cells, by whether sides and exits are."""
-
-
 @dataclass(frozen=True)
 class Visible(Kernel):
     """`Multi` with a calibrated derivative, where opaque layers of one source hide each other.
@@ -70,12 +62,13 @@ class Visible(Kernel):
     CROSSINGS: ClassVar[tuple[float, ...]] = CROSSINGS
     reach = 3  # Depths three cells away may decide how an outline or a line of crossing moves.
 
-    @property
+    @functools.cached_property
     def reads(self) -> frozenset[str]:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
         """See `rts.Splatter`."""
-        return _READS[self.facing, self.rims and self.exits]
+        told = {"facing": self.facing, "exit": self.rims and self.exits}
+        return frozenset(name for name, read in told.items() if read)
 
-    @property
+    @functools.cached_property
     def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
         """See `rts.Splatter`: True where weights fill a cell."""
         return self.epsilon >= LEAST_EPSILON

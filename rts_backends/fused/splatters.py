@@ -43,12 +43,12 @@ class _Fused(SummingSplatter):
         """The specification with these settings, to which what does not fit is left."""
         return self.specification(**{field.name: getattr(self, field.name) for field in fields(self)})
 
-    @property
+    @functools.cached_property
     def reads(self) -> frozenset[str]:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
         """See `rts.Splatter`."""
         return self.array_code.reads
 
-    @property
+    @functools.cached_property
     def fills_interiors(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]  # Assigned nowhere.
         """See `rts.Splatter`."""
         return self.array_code.fills_interiors
