@@ -33,6 +33,8 @@ class Engine(Plugin):
     namespace: ClassVar[Any]
     differentiates: ClassVar[bool] = True
 
+    # ------------------------------------------------------------------------------------------- every framework writes
+
     @abc.abstractmethod
     def owns(self, x: Any) -> bool:
         """Whether this is an array of the framework, traced ones included."""
@@ -69,7 +71,58 @@ class Engine(Plugin):
         for cls in STATIC_FIELDS:
             yield cls, split_record, functools.partial(join_record, cls)
 
-    # ----------------------------------------------------------------------------- how arrays are computed with
+    # -------------------------------------------------------------------------------------- one with derivatives writes
+
+    def value_and_grad(self, f: Callable) -> Callable:
+        """Turn `f(tree) -> scalar` into `tree -> (value, gradient tree)`."""
+        raise self._no_derivatives()
+
+    def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[Array, Array]:
+        """The value of `f` and its derivative along `tangent`, differentiable in turn in what `f` closes over."""
+        raise self._no_derivatives()
+
+    def jacobian(self, f: Callable) -> Callable:
+        """Turn `f(vector) -> arrays` into `vector -> (values, derivatives)`, a row an unknown, by forward mode."""
+        raise self._no_derivatives()
+
+    def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
+        """A step function `(parameters, gradient) -> parameters` of "adam" or "sgd", with its own state."""
+        raise self._no_derivatives()
+
+    def traced(self, x: Array) -> bool:
+        """Whether an array has a shape but not yet a value."""
+        return False
+
+    def known(self, x: Array) -> np.ndarray | None:
+        """The value of an array on the host, where it can be had while Python runs; None for what is traced.
+
+        Under transforms of batches it may have more axes than the array.
+        """
+        return None if self.traced(x) else self.to_numpy(self.stop_gradient(x))
+
+    def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], Array], state: Tree, most: int) -> Tree:
+        """Do `state = body(state)` as long as `going(state)`, () bool, is true, at most `most` times.
+
+        The result has no derivative. In compiled programs it is a loop, too: unrolled, it would take minutes to
+        compile. What `body` closes over must have no derivatives by itself (`stop_gradient`); θ has none where rays are
+        intersected.
+
+        Args:
+            body: tree of arrays → the same tree of other values; shapes and dtypes stay.
+            going: tree → () bool, such as whether any ray is not done.
+            state: arrays of this engine.
+            most: the largest number of times.
+
+        Returns:
+            The last state.
+        """
+        for _ in range(most):
+            if not bool(going(state)):
+                break
+            state = body(state)
+        return state
+
+    # --------------------------------------------------------------------- what makes it faster, or serves its compiler
 
     def apply(self, operation: Any, operands: Sequence[Array], params: Mapping[str, Any]) -> Array:
         """The result of an operation. The default runs its specification; override it to run compiled code."""
@@ -90,10 +143,6 @@ class Engine(Plugin):
         """Whether matrix products of these arrays keep their precision: some devices' matrix units round float32."""
         return False
 
-    def traced(self, x: Array) -> bool:
-        """Whether an array has a shape but not yet a value."""
-        return False
-
     def plain(self, x: Array) -> bool:
         """Whether `admitted` would give the array itself; asked of every array that a user gives."""
         return False
@@ -109,13 +158,6 @@ class Engine(Plugin):
             InputError: it cannot be used, such as a sparse one.
         """
         return x
-
-    def known(self, x: Array) -> np.ndarray | None:
-        """The value of an array on the host, where it can be had while Python runs; None for what is traced.
-
-        Under transforms of batches it may have more axes than the array.
-        """
-        return None if self.traced(x) else self.to_numpy(self.stop_gradient(x))
 
     def padded(self, x: Array) -> bool:
         """Whether packed arrays like this one may have rows that no cell refers to."""
@@ -160,28 +202,6 @@ class Engine(Plugin):
         ends = np.cumsum(sizes)
         return [x[end - size : end, ...] for size, end in zip(sizes, ends.tolist(), strict=True)]
 
-    def repeat(self, body: Callable[[Tree], Tree], going: Callable[[Tree], Array], state: Tree, most: int) -> Tree:
-        """Do `state = body(state)` as long as `going(state)`, () bool, is true, at most `most` times.
-
-        The result has no derivative. In compiled programs it is a loop, too: unrolled, it would take minutes to
-        compile. What `body` closes over must have no derivatives by itself (`stop_gradient`); θ has none where rays are
-        intersected.
-
-        Args:
-            body: tree of arrays → the same tree of other values; shapes and dtypes stay.
-            going: tree → () bool, such as whether any ray is not done.
-            state: arrays of this engine.
-            most: the largest number of times.
-
-        Returns:
-            The last state.
-        """
-        for _ in range(most):
-            if not bool(going(state)):
-                break
-            state = body(state)
-        return state
-
     def map_rows(self, f: Callable[[Array], Array], rows: Array, size: int) -> Array:
         """The values `f(rows)` of a function that treats each row by itself, so many rows at a time.
 
@@ -195,22 +215,12 @@ class Engine(Plugin):
         parts = [f(rows[i : i + size]) for i in range(0, rows.shape[0], size)]
         return parts[0] if len(parts) == 1 else self.namespace.concat(parts)
 
-    # ---------------------------------------------------------------------------------------------- derivatives
-
     def checkpoint(self, make: Callable[[], Tree], f: Callable[[Tree], Array]) -> Array:
         """The result of `f(make())`, computed once more for its gradient instead of keeping intermediate arrays.
 
         `make` has no derivative. An engine may keep what it gave instead of calling it again.
         """
         return f(make())
-
-    def value_and_grad(self, f: Callable) -> Callable:
-        """Turn `f(tree) -> scalar` into `tree -> (value, gradient tree)`."""
-        raise self._no_derivatives()
-
-    def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[Array, Array]:
-        """The value of `f` and its derivative along `tangent`, differentiable in turn in what `f` closes over."""
-        raise self._no_derivatives()
 
     def gradient_of_rows(self, f: Callable[[Array], Array], rows: Array) -> Array:
         """The gradient (N, C) of a function of rows (N, C), each value (N,) of which depends on its own row alone.
@@ -223,14 +233,6 @@ class Engine(Plugin):
             columns.append(self.jvp(f, rows, along)[1])
         return xp.stack(columns, axis=-1)
 
-    def jacobian(self, f: Callable) -> Callable:
-        """Turn `f(vector) -> arrays` into `vector -> (values, derivatives)`, a row an unknown, by forward mode."""
-        raise self._no_derivatives()
-
-    def optimizer(self, name: str, learning_rate: float, parameters: Tree) -> Callable[[Tree, Tree], Tree]:
-        """A step function `(parameters, gradient) -> parameters` of "adam" or "sgd", with its own state."""
-        raise self._no_derivatives()
-
     def _no_derivatives(self) -> EngineError:
         if not self.differentiates:
             return EngineError(
@@ -238,8 +240,6 @@ class Engine(Plugin):
                 f"what is to be differentiated"
             )
         return EngineError(f"the engine {self.name} lacks this function, though it says that it differentiates")
-
-    # ---------------------------------------------------------------------------------------------- compilation
 
     def jit(self, f: Callable) -> Callable:
         """Compile `f` if the framework can, else return it."""
