@@ -40,7 +40,8 @@ class Proxy(NamedTuple):
     Attributes:
         vertices: (V, 3) float32, local space.
         faces: (T, 3) int32.
-        ids: (T, I) int32, handed on to the samples of the triangle; None means `faces`, or none where I = 0.
+        ids: (T, I) int32, handed on to the samples of the triangle; None means `faces`, or none where I = 0 and
+            the surface has no `refine`.
         corner_params: (T, 3, P) float32, interpolated with the barycentrics; None means the barycentrics themselves.
     """
 

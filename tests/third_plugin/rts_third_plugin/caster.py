@@ -5,13 +5,16 @@ import numpy as np
 import rts
 from rts.plugin_api.records import Fragments
 
+TURN = np.array([0.5377, 0.3186, 0.7806])  # Where rays are turned to; no edge of a model is likely to lie along it.
+
 
 class Caster(rts.TriangleSampler):
     """Casts the rays of cells at triangles, one triangle after the other, at the cells that its projection may cover.
 
     A ray along d from o passes through a triangle if it passes all three edges on one side. The side of the edge from
     p to q is the sign of d · ((p − o) × (q − o)), which is exactly opposite from q to p, so that no ray slips through
-    between neighbours.
+    between neighbours. A ray through an edge is on the side that it would be on if it were turned a little, every ray
+    in the same way, so that of the triangles about an edge or a corner one is met.
     """
 
     concurrent = True
@@ -27,9 +30,11 @@ class Caster(rts.TriangleSampler):
             top, bottom, left, right = boxes[triangle]
             o, d = origins[top:bottom, left:right], directions[top:bottom, left:right]
             a, b, c = (vertices[corner] - o for corner in faces[triangle])
-            sides = np.stack([(d * np.cross(p, q)).sum(-1) for p, q in ((b, c), (c, a), (a, b))], axis=-1)
+            edges = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-2)
+            sides = (edges * d[..., None, :]).sum(axis=-1)
+            left_of = np.where(sides == 0, edges @ TURN, sides) > 0
             total = sides.sum(axis=-1)  # d · normal: negative where the front is seen.
-            hit = ((sides >= 0).all(-1) | (sides <= 0).all(-1)) & (total != 0)
+            hit = (left_of.all(axis=-1) | ~left_of.any(axis=-1)) & (total != 0)
             if cull != "none":
                 hit &= total < 0 if cull == "back" else total > 0
             y, x = np.nonzero(hit)
