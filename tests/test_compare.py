@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 import rts
 from rts import registry
+from rts.arrays.engines import engine_named
 from rts.cli.comparison import summary
 from rts.diagnostics import compare
 from rts.diagnostics.comparison import measure, truth, turns
@@ -25,7 +26,6 @@ from rts.diagnostics.comparison.scores import loss_weights, scores
 from rts.diagnostics.comparison.search import Search
 from rts.diagnostics.comparison.settings import Setting, _no_worse, engines, limited, worth_timing
 from rts.diagnostics.tune import tune
-from rts.engines import engine_named
 from rts.errors import InputError, PluginError, ToleranceWarning
 from rts.registry import plugin
 from rts.sampling.adaptive import as_text, finest

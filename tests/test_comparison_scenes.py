@@ -5,10 +5,10 @@ import pytest
 from helpers import derivative
 
 import rts
+from rts.arrays.engines import engine_named
 from rts.diagnostics.comparison import shapes
 from rts.diagnostics.comparison.builtin import BUILTIN, builtin, names
 from rts.diagnostics.comparison.scene import MODES, check_directions, moving
-from rts.engines import engine_named
 from rts.errors import InputError, PluginError
 
 pytestmark = pytest.mark.rendering

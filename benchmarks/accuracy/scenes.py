@@ -16,9 +16,9 @@ import numpy as np
 import rts
 from benchmarks.camera import DISTANCE, camera
 from benchmarks.meshes import DATA, mesh, rotation_xy
+from rts.arrays.engines import constants, engine_of, exemplar
 from rts.diagnostics.comparison import shapes
 from rts.diagnostics.comparison.shapes import CARD_DEPTH, QUAD, box, grid, icosphere, on_screen, pixel, rectangle, unlit
-from rts.engines import constants, engine_of, exemplar
 
 SIZE = 256
 

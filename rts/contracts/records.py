@@ -1,7 +1,7 @@
 """The records that pass from one stage of rendering to the next.
 
 Shapes use these letters: N packed samples, K layers front to back, H × W pixels (row 0 on top), V vertices,
-T triangles, I integers and P reals a sample, C channels. Conventions of space are in `rts.camera`.
+T triangles, I integers and P reals a sample, C channels. Conventions of space are in `rts.scene.camera`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 
-from rts.engines import namespace
-from rts.trees import Array, record
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array, record
 
 
 class ArraySpec(NamedTuple):
@@ -63,21 +63,6 @@ class Fragments(NamedTuple):
     triangle_ids: np.ndarray
     barycentrics: np.ndarray
     depth: np.ndarray
-
-
-class Rays(NamedTuple):
-    """Rays through pixel centres: the point at camera depth z is `origins + z * directions`.
-
-    Attributes:
-        origins: (..., 3), on the plane of the camera's centre.
-        directions: (..., 3), scaled to advance one unit of depth.
-        spread: (2,), a pixel at camera depth z is `spread[0] + spread[1] * z` wide, in the units of the origins: the
-            side of a square of its area.
-    """
-
-    origins: Array
-    directions: Array
-    spread: Array
 
 
 class RayHits(NamedTuple):

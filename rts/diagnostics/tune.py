@@ -8,8 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rts.arguments import check_positive, quoted
-from rts.checks import is_count, is_real
+from rts.arrays.argument_checks import check_positive, quoted
+from rts.arrays.engines import stopped
+from rts.arrays.trees import Tree
+from rts.contracts.checks import is_count, is_real
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.measure import TOGETHER, Measurements
 from rts.diagnostics.comparison.progress import Phase, phases
@@ -18,11 +20,9 @@ from rts.diagnostics.comparison.search import SUPERSAMPLE, Search
 from rts.diagnostics.comparison.settings import usable
 from rts.diagnostics.comparison.sources import engines_for, scene_of, some_modes
 from rts.diagnostics.comparison.truth import SAMPLES
-from rts.engines import stopped
 from rts.errors import InputError
 from rts.files.paths import output_folder
-from rts.parts import Part
-from rts.trees import Tree
+from rts.scene.parts import Part
 
 TRUTH_SAMPLES = (4, 8, SAMPLES)
 """Samples of truths, along each side of a pixel: more where the error of the truth itself is too large."""

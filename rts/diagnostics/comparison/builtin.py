@@ -15,15 +15,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array, Tree
 from rts.diagnostics.comparison import shapes
 from rts.diagnostics.comparison.scene import Scene, moving
 from rts.diagnostics.comparison.shapes import normalised, rotation_xy, turned
-from rts.engines import namespace
 from rts.errors import InputError
 from rts.files.models import load
-from rts.parts import Part
 from rts.registry import plugin
-from rts.trees import Array, Tree
+from rts.scene.parts import Part
 
 SIZE = (256, 256)
 VARIABLE, FOLDER = "RTS_DATA", Path("../shared/data")

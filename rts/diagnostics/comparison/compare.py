@@ -11,8 +11,10 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from rts.arguments import quoted
-from rts.checks import is_count
+from rts.arrays.argument_checks import quoted
+from rts.arrays.engines import Engine
+from rts.arrays.trees import Tree
+from rts.contracts.checks import is_count
 from rts.diagnostics.comparison.environment import environment
 from rts.diagnostics.comparison.front import Row, best_within, front, marked
 from rts.diagnostics.comparison.journal import Journal
@@ -25,12 +27,10 @@ from rts.diagnostics.comparison.settings import Setting, usable, worth_timing
 from rts.diagnostics.comparison.sources import engines_for, scene_of, some_modes
 from rts.diagnostics.comparison.truth import SAMPLES
 from rts.diagnostics.comparison.turns import ROUNDS, Calls, Turns
-from rts.engines import Engine
 from rts.errors import InputError, PluginError
 from rts.files.paths import output_folder, writing
-from rts.fitting.names import one_line
+from rts.fitting.parameter_names import one_line
 from rts.sampling.adaptive import Adaptive, as_text, finest
-from rts.trees import Tree
 
 LAYERS = (1, 2, 4, "auto")
 SUPERSAMPLE = (1, 2, 4, Adaptive(4))

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.camera import Camera
+from rts.arrays.trees import Tree
 from rts.contracts.surface import Rate
 from rts.diagnostics.comparison.scene import SceneFunction, parts_of
-from rts.parts import Part
-from rts.trees import Tree
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 
 class Form(NamedTuple):

@@ -11,15 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from rts import registry
-from rts.camera import Camera
-from rts.checks import check_scene
-from rts.engines import engine_of
-from rts.parts import Part
+from rts.arrays.engines import engine_of
+from rts.arrays.trees import leaves
+from rts.contracts.checks import check_scene
 from rts.rendering.image import render
 from rts.rendering.samples import sample
 from rts.sampling.cache import fingerprint
 from rts.sampling.hidden import LAYER_LIMIT
-from rts.trees import leaves
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 PACKAGES = ("rts", "rts_backends", "rts_surfaces")
 """The library's own."""

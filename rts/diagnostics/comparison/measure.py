@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.checks import check_scene, suited_sampler
+from rts.arrays.engines import Engine, is_constant, namespace
+from rts.arrays.trees import Array, Tree, collected, leaves, map_leaves
+from rts.contracts.checks import check_scene, suited_sampler
 from rts.diagnostics.comparison.forms import Form, forms_of
 from rts.diagnostics.comparison.identity import library_key, plugin_key, state_key
 from rts.diagnostics.comparison.journal import Journal
@@ -19,16 +20,15 @@ from rts.diagnostics.comparison.scores import loss_weights, low_pass, relative_l
 from rts.diagnostics.comparison.settings import Setting, TooSlow, limited
 from rts.diagnostics.comparison.truth import SAMPLES, STEP, Truth, truth, truth_key
 from rts.diagnostics.comparison.turns import LONGEST, Calls, Turns
+from rts.diagnostics.explain import explain
 from rts.diagnostics.steps import pixel_step
-from rts.engines import Engine, is_constant, namespace
 from rts.errors import InputError, RtsWarning
-from rts.explaining import explain
-from rts.fitting.names import one_line
-from rts.parts import Part
+from rts.fitting.parameter_names import one_line
 from rts.registry import instance
 from rts.rendering.image import render
 from rts.rendering.samples import sample
-from rts.trees import Array, Tree, collected, leaves, map_leaves
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 PATIENCE = 8.0
 """Seconds after which a sampler that has not answered is left out."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rts.arrays.engines import Engine
 from rts.diagnostics.comparison.deodr_peer import Deodr
 from rts.diagnostics.comparison.mitsuba_peer import Mitsuba, MitsubaScene
 from rts.diagnostics.comparison.scene import Scene
 from rts.diagnostics.comparison.seen import Peer, Seen, Unsuited, seen
-from rts.engines import Engine
-from rts.fitting.names import one_line
+from rts.fitting.parameter_names import one_line
 
 SPP = (1, 4, 16)
 """Samples a pixel of Mitsuba."""

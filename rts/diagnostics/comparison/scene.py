@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.camera import Camera
-from rts.checks import check_shader
-from rts.contracts.plugin import promised
+from rts.arrays.argument_checks import quoted
+from rts.arrays.engines import Engine, constants, engine_of, exemplar, is_constant
+from rts.arrays.trees import Array, Tree, collected, leaves, map_leaves
+from rts.contracts.checks import check_shader
 from rts.contracts.surface import TriangleSurface
-from rts.engines import Engine, constants, engine_of, exemplar, is_constant
 from rts.errors import InputError
-from rts.parts import Part
-from rts.shading import Unlit
-from rts.trees import Array, Tree, collected, leaves, map_leaves
+from rts.plugin_base import promised
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
+from rts.shading.shaders import Unlit
 
 SceneFunction = Callable[[Tree], tuple[Part | Sequence[Part], Camera]]
 
@@ -100,7 +100,7 @@ def moving(
     - rotation: about the upright axis of the camera, through the middle of what moves;
     - shape: the points that the surface is made of swell, unevenly, about their middle; what it reads and is no points,
       such as radii or values on a lattice, changes by one number;
-    - color: the base colour of the parts, which `rts.shading` describes, changes, each channel in another way;
+    - color: the base colour of the parts, which `rts.shading.shaders` describes, changes, each channel in another way;
     - camera: it moves ahead.
 
     Args:

@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import registry
-from rts.camera import Camera
-from rts.checks import CheckedPart, check_scene
+from rts.arrays.engines import Engine, engine_of
+from rts.arrays.trees import map_leaves
+from rts.contracts.checks import CheckedPart, check_scene
 from rts.diagnostics.comparison.scene import Scene
-from rts.engines import Engine, engine_of
 from rts.errors import InputError
-from rts.parts import Part
-from rts.shading import Silhouette, Unlit
-from rts.trees import map_leaves
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
+from rts.shading.shaders import Silhouette, Unlit
 
 EDGE = 4.0
 """Pixels that edges of triangles are to be shorter than, where a surface is cut into triangles."""

@@ -10,9 +10,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rts import registry
-from rts.arguments import quoted
+from rts.arrays.argument_checks import quoted
+from rts.arrays.engines import Engine, engine_named
 from rts.diagnostics.comparison.front import LEVELS
-from rts.engines import Engine, engine_named
 from rts.errors import InputError, PluginError
 from rts.sampling.adaptive import Adaptive, of_text
 

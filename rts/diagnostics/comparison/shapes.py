@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from rts.camera import Camera
 from rts.files.images import load_image
 from rts.files.models import load
-from rts.parts import Part
 from rts.registry import plugin
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 FOV, DISTANCE = 40.0, 3.2
 """The camera's vertical field of view, degrees, and its distance from the origin."""

@@ -14,19 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.arrays import kind_of
-from rts.camera import Camera
-from rts.checks import check_colors, check_scene, check_size
+from rts.arrays.argument_checks import quoted
+from rts.arrays.array_functions import kind_of
+from rts.arrays.engines import Engine, engine_of, is_constant, namespace
+from rts.arrays.trees import Tree, leaves, map_leaves
+from rts.contracts.checks import check_colors, check_scene, check_size
 from rts.diagnostics.comparison import builtin
 from rts.diagnostics.comparison.scene import Scene, check_directions, moving, parts_of
 from rts.diagnostics.comparison.settings import engines
-from rts.engines import Engine, engine_of, is_constant, namespace
 from rts.errors import InputError, RtsError
 from rts.files.paths import as_path
-from rts.fitting.names import named_leaves, one_line
-from rts.parts import Part
-from rts.trees import Tree, leaves, map_leaves
+from rts.fitting.parameter_names import named_leaves, one_line
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 SIZE = (256, 256)
 FEW = 6
@@ -118,7 +118,7 @@ def _named(
 
 def of_model(path: Path, surface: str, size: tuple[int, int]) -> Scene:
     """The scene of a model, seen as `rts render` sees it, whose parts all move."""
-    from rts.cli.views import bounds_of, orbit
+    from rts.cli.default_camera import bounds_of, orbit
     from rts.files.models import load
 
     parts = load(path, surface=surface)

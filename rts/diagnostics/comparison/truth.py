@@ -16,15 +16,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.camera import Camera
+from rts.arrays.engines import Engine, engine_of
 from rts.diagnostics.comparison.identity import layers_of, state_key
 from rts.diagnostics.comparison.scene import Scene, parts_of
 from rts.diagnostics.comparison.scores import low_pass, relative_l2
-from rts.engines import Engine, engine_of
 from rts.errors import InputError
 from rts.files.paths import cache_folder, output_folder, own_folder, writing
-from rts.parts import Part
 from rts.rendering.batched import render_views
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 SAMPLES = 16
 """Points a pixel, along x and along y."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.settings import limited
-from rts.fitting.names import one_line
+from rts.fitting.parameter_names import one_line
 
 ROUNDS, CONSECUTIVE = 3, 2
 """Turns that each function has, and calls timed in a turn."""

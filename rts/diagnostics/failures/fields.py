@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from rts.camera import Camera
+from rts.arrays.engines import engine_named
+from rts.arrays.trees import Array
 from rts.diagnostics.comparison.scene import parts_of
 from rts.diagnostics.comparison.scores import low_pass, relative_l2
 from rts.diagnostics.comparison.truth import area_image, lattice
@@ -15,14 +16,13 @@ from rts.diagnostics.failures.measures import own
 from rts.diagnostics.failures.methods import Method
 from rts.diagnostics.failures.outcome import Context, Outcome, cannot, graded
 from rts.diagnostics.failures.renderers import Own, Unable, quiet
-from rts.engines import engine_named
 from rts.errors import InputError
 from rts.fitting.fit import fit
-from rts.operations.rigid import rigid
-from rts.parts import Part
 from rts.registry import plugin
 from rts.rendering.image import render
-from rts.trees import Array
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
+from rts.scene.rigid import rigid
 
 COUNT, BOUNDS = 16, ((-1.0,) * 3, (1.0,) * 3)
 COLOR = np.array([0.9, 0.6, 0.3], np.float32)

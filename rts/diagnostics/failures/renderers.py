@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
+from rts.arrays.engines import Engine, engine_named, engine_of
+from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.diagnostics.comparison.peers import Deodr, Mitsuba, MitsubaScene
 from rts.diagnostics.comparison.scene import Scene, parts_of
 from rts.diagnostics.comparison.scores import loss_weights
 from rts.diagnostics.comparison.seen import Peer, Unsuited, seen
 from rts.diagnostics.failures.methods import Method
-from rts.engines import Engine, engine_named, engine_of
 from rts.errors import RtsWarning
-from rts.fitting.names import one_line
+from rts.fitting.parameter_names import one_line
 from rts.rendering.image import render
-from rts.trees import Array, Tree, leaves, map_leaves
 
 Weigh = Callable[[np.ndarray], np.ndarray]
 """An image (H, W, 3) → the derivative of a loss with respect to it."""

@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.camera import Camera
+from rts.arrays.engines import engine_of
+from rts.arrays.trees import Tree
 from rts.diagnostics.comparison import shapes
 from rts.diagnostics.comparison.builtin import data_file, read_mesh
 from rts.diagnostics.comparison.scene import Scene, parts_of
 from rts.diagnostics.comparison.shapes import CARD_DEPTH, DISTANCE, QUAD, on_screen, pixel, rectangle, unlit
-from rts.engines import engine_of
-from rts.operations.rigid import rigid
-from rts.parts import Part
-from rts.trees import Tree
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
+from rts.scene.rigid import rigid
 
 SIZE = (96, 96)
 SMALL = (64, 64)

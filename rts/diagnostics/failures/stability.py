@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.checks import is_count
+from rts.arrays.argument_checks import quoted
+from rts.contracts.checks import is_count
 from rts.diagnostics.comparison.environment import environment
 from rts.diagnostics.comparison.journal import Journal
 from rts.diagnostics.comparison.progress import phases
