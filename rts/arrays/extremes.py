@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.threads import parallel, read_only
+from rts.compiling.threads import parallel, read_only
 
 
 def largest(x: np.ndarray) -> float:

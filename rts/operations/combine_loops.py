@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, loop
+from rts.compiling.loops import compiled, loop
+from rts.compiling.threads import parallel, read_only
 from rts.errors import InputError
-from rts.threads import parallel, read_only
 
 
 def check(rows: np.ndarray, ids: np.ndarray, column: int, count: int) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 
 from rts.arrays.engines import namespace
 from rts.arrays.trees import Array
+from rts.compiling.threads import parallel, read_only
 from rts.operations.operation import Arrays, Operation, Some
-from rts.threads import parallel, read_only
 
 
 def with_inset(image: Array, fine: Array, pixel: Array, side: int) -> Array:

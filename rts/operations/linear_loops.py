@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import loop
+from rts.compiling.loops import loop
+from rts.compiling.threads import parallel, read_only
 from rts.operations.projection_loops import CHUNK
-from rts.threads import parallel, read_only
 
 
 def affine(rows: np.ndarray, points: np.ndarray, out: np.ndarray) -> None:

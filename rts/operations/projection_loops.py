@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import loop
-from rts.threads import parallel, read_only
+from rts.compiling.loops import loop
+from rts.compiling.threads import parallel, read_only
 
 CHUNK = 4096
 """Points whose sums are taken together; fixed, so that results do not depend on the number of threads."""

@@ -9,9 +9,9 @@ import numpy as np
 
 from rts.arrays.engines import engine_of, namespace
 from rts.arrays.trees import Array
+from rts.compiling.threads import parallel, read_only
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some, known_value
-from rts.threads import parallel, read_only
 
 
 def take(rows: Array, index: Array) -> Array:

@@ -7,8 +7,8 @@ import math
 import numba
 import numpy as np
 
-from rts.compiling import loop
-from rts.threads import parallel, read_only
+from rts.compiling.loops import loop
+from rts.compiling.threads import parallel, read_only
 
 SWEEPS = 12
 """More than it takes: each squares what is left to do."""

@@ -11,6 +11,7 @@ import numpy as np
 from rts.arrays.array_functions import described, shape_of
 from rts.arrays.engines import Context, context_of_scene, is_constant, namespace, uncompiled
 from rts.arrays.trees import Array
+from rts.compiling.threads import each
 from rts.contracts.checks import check_background, check_cameras
 from rts.contracts.records import Sampled
 from rts.errors import InputError
@@ -28,7 +29,6 @@ from rts.scene.camera import Camera
 from rts.scene.parts import Part
 from rts.splatting.channels import cropped_image
 from rts.splatting.side_by_side import Picture, at_once
-from rts.threads import each
 
 _T = TypeVar("_T")
 

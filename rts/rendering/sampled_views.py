@@ -16,6 +16,7 @@ import numpy as np
 from rts.arrays.engines import engine_of, is_traced, namespace, stopped, value_of
 from rts.arrays.extremes import largest
 from rts.arrays.trees import Array
+from rts.compiling.threads import each
 from rts.contracts.checks import CheckedPart, check_memory
 from rts.contracts.records import ArraySpec, Cells, Decision, Fragments, Question, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
@@ -32,7 +33,6 @@ from rts.sampling.sample_checks import check_fragments, checked_pieces
 from rts.sampling.triangle_sampler import TriangleSampler
 from rts.scene.camera import Camera
 from rts.splatting.side_by_side import Picture, depth_scales
-from rts.threads import each
 
 
 class Views(NamedTuple):

@@ -10,6 +10,7 @@ import numpy as np
 
 from rts.arrays.engines import Context, context_of, engine_of, namespace
 from rts.arrays.trees import Array, Tree
+from rts.compiling.threads import each
 from rts.contracts.checks import CheckedPart, check_splats
 from rts.contracts.records import ON_RAYS, Fine, Sampled, Samples, Splats
 from rts.errors import InputError
@@ -20,7 +21,6 @@ from rts.rendering.scene import Grid
 from rts.rendering.shade import add_footprint, apart, evaluate, shade, shaded_at_once, theta_of
 from rts.scene.camera import Camera
 from rts.scene.row_cameras import RowCameras
-from rts.threads import each
 
 
 def to_splats(

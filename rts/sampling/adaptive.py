@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from rts.arrays.argument_checks import quoted
+from rts.compiling.threads import parallel, read_only
 from rts.contracts.checks import CheckedPart, is_count, is_real
 from rts.errors import InputError
-from rts.threads import parallel, read_only
 
 MOST = 64
 """The most samples along each side of an active pixel. All fine samples are in memory at once."""

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rts.compiling.threads import read_only
 from rts.contracts.records import Fragments
-from rts.threads import read_only
 
 
 class Exits(NamedTuple):

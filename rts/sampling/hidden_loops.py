@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import loop
-from rts.threads import parallel, read_only
+from rts.compiling.loops import loop
+from rts.compiling.threads import parallel, read_only
 
 
 class Numbering:

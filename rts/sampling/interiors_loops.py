@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from rts.arrays.extremes import places
-from rts.compiling import compiled, loop
+from rts.compiling.loops import compiled, loop
+from rts.compiling.threads import parallel
 from rts.sampling.windows_loops import add, unite
-from rts.threads import parallel
 
 LONG = 2
 """Nanoseconds that a cell of a layer takes."""

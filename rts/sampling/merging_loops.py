@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.compiling import compiled, loop
-from rts.threads import parallel, read_only
+from rts.compiling.loops import compiled, loop
+from rts.compiling.threads import parallel, read_only
 
 
 def interleave(

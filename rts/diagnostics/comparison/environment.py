@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-from rts.threads import thread_count
+from rts.compiling.threads import thread_count
 
 
 def environment(packages: Iterable[str]) -> dict[str, Any]:
