@@ -220,11 +220,20 @@ def plugins(
             "(for triangles; else finite and not empty), and its gradient is finite and not zero.",
         ),
     ] = False,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(help="With --matrix: a surface, sampler or engine to try; may be repeated.", show_default=False),
+    ] = None,
 ) -> None:
     """List every plugin: engines, surfaces, samplers, shaders and splatters, and whether each one loads."""
-    from rts.cli.plugin_tables import matrix_table, plugin_table
+    from rts.cli.plugin_tables import plugin_table, print_matrix
 
-    Console().print(matrix_table() if matrix else plugin_table())
+    if matrix:
+        print_matrix(Console(), only or ())
+    elif only:
+        raise typer.BadParameter("goes with --matrix", param_hint="--only")
+    else:
+        Console().print(plugin_table())
 
 
 @app.command(epilog="Example: rts render bunny.obj -o bunny.png --size 480x640 --camera 30,20 --cull back")
@@ -492,16 +501,19 @@ def _interrupted(what: str) -> Iterator[None]:
 
 @app.command(epilog="Example: rts new surface blob && pip install -e 'rts-blob[test]' && pytest rts-blob")
 def new(
-    kind: Annotated[str, typer.Argument(help="surface", show_default=False)],
+    kind: Annotated[str, typer.Argument(help="surface, sampler, shader or splatter", show_default=False)],
     name: Annotated[str, typer.Argument(help="The plugin's name.", show_default=False)],
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Folder to make; rts-NAME by default.", show_default=False)
     ] = None,
+    triangles: Annotated[
+        bool, typer.Option("--triangles", help="A surface that is sampled by triangles; else by rays.")
+    ] = False,
 ) -> None:
     """Write a distribution that adds a plugin: its entry point, its class, and a test that passes as it is."""
     from rts.cli.new_plugin import write_plugin
 
-    files = write_plugin(kind, name, output)
+    files = write_plugin(kind, name, output, triangles)
     _say("wrote")
     _say_written(files)
 
