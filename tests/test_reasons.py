@@ -10,7 +10,7 @@ from helpers import arrays, box, icosphere, quad
 import rts
 from rts.arrays.engines import engine_of
 from rts.arrays.trees import leaves
-from rts.diagnostics.explanation import disagreeing, turns
+from rts.diagnostics.explanation import disagreeing, shared_budget
 from rts.diagnostics.explanation.reasons import KINDS
 from rts.diagnostics.explanation.subject import Subject
 
@@ -391,7 +391,7 @@ def test_a_minimum_is_not_flat():
 def test_what_a_spent_budget_leaves_out_of_a_number_is_told(monkeypatch):
     clock = iter([True] * 3)
     scene, start, _ = outlines(False)
-    monkeypatch.setattr(turns.Clock, "going", lambda self, share=1.0: share < 1 or next(clock, False))
+    monkeypatch.setattr(shared_budget.Clock, "going", lambda self, share=1.0: share < 1 or next(clock, False))
     monkeypatch.setattr(disagreeing, "EXPERIMENTS", disagreeing.EXPERIMENTS[:1] * 9)
     found = rts.check_gradient(scene, arrays("torch-cpu", start), SIZE, splatter="none", samples=3)
     assert not found.reasons and "or not all, in 2 of them" in found.note
@@ -408,7 +408,7 @@ def costly(monkeypatch):
             drawn.append((samples, tuple(np.concatenate([np.ravel(x) for x in leaves(direction)]))))
         return hard(subject, direction, by, samples, change)
 
-    monkeypatch.setattr(turns, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(shared_budget, "perf_counter", lambda: now[0])
     monkeypatch.setattr(Subject, "hard", slow)
     return now, drawn
 
@@ -435,7 +435,7 @@ def test_reasons_are_looked_for_in_every_number_before_any_is_tried_twice(monkey
         tried.append(case.number.slope.name)
 
     scene, start, _ = outlines(False)
-    monkeypatch.setattr(turns, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(shared_budget, "perf_counter", lambda: now[0])
     monkeypatch.setattr(disagreeing, "EXPERIMENTS", (slow,) * 4)
     found = rts.check_gradient(scene, arrays("torch-cpu", start), SIZE, splatter="none", samples=3, budget_s=20)
     first, second = (s.name for s in found.slopes)

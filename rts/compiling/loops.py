@@ -27,6 +27,13 @@ except ImportError:  # Windows.
 TOLD_AFTER = 1.0
 """Seconds of compilation after which a terminal is told of it."""
 
+LOOP = {"nogil": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
+"""numba's options of loops. It makes two wrappers beside a function's code, one for Python and one for C.
+
+Divisions by zero are not looked for. All loops have these options, since numba compiles its own functions, such as
+`min` and `np.empty`, once for each set of options.
+"""
+
 PACKAGES = ("rts", "rts_backends", "rts_surfaces")
 
 saving = threading.RLock()
@@ -35,7 +42,7 @@ saving = threading.RLock()
 
 def loop(function: Callable | None = None, **options: Any) -> Any:
     """Compile a loop that Python calls, without the interpreter lock, and keep it on disk; `options` are numba's."""
-    options = {"nogil": True, "no_cfunc_wrapper": True} | options
+    options = LOOP | options
 
     def decorate(function: Callable) -> Any:
         made = cast(Any, numba.njit(**options)(function))
@@ -48,7 +55,7 @@ def loop(function: Callable | None = None, **options: Any) -> Any:
 
 def compiled(function: Callable | None = None, **options: Any) -> Any:
     """Compile a helper, which only compiled loops call, not Python, nor itself. `options` are numba's."""
-    options = {"nogil": True, "no_cfunc_wrapper": True, "no_cpython_wrapper": True} | options
+    options = LOOP | {"no_cpython_wrapper": True} | options
     decorate = numba.njit(**options)
     return decorate if function is None else decorate(function)
 

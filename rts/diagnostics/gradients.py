@@ -19,9 +19,9 @@ from rts.contracts.checks import check_size, is_count, is_real
 from rts.diagnostics.comparison.progress import phases
 from rts.diagnostics.explanation.reasons import Reason, legend, marked
 from rts.diagnostics.explanation.selection import explained
+from rts.diagnostics.explanation.shared_budget import Clock, looked_at
 from rts.diagnostics.explanation.slopes import Slope
 from rts.diagnostics.explanation.subject import Scene, Subject
-from rts.diagnostics.explanation.shared_budget import Clock, looked_at
 from rts.errors import EmptyImageWarning, InputError, LayersWarning
 from rts.files.srgb import decode_srgb
 from rts.fitting.dependence import differentiable
