@@ -1,6 +1,6 @@
 """Where each method breaks: a table of ways to fail against methods, each cell an outcome with its figure.
 
-The rows are those of `rts.diagnostics.stability`, and the hand of the data folder (`benchmarks.paper.hand`). Written to
+The rows are those of `rts_compare.stability`, and the hand of the data folder (`benchmarks.paper.hand`). Written to
 the output are stability.md, stability.json and stability.png, and copies to benchmarks/results. A run that is
 interrupted goes on; rows can be run alone:
 
@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks.paper import hand
-from rts.diagnostics import Stability, stability
-from rts.diagnostics.comparison.journal import Journal
-from rts.diagnostics.failures.methods import METHODS, Method
-from rts.diagnostics.failures.outcome import Context, Outcome, Row, cannot
-from rts.diagnostics.failures.rows import ROWS
+from rts_compare import Stability, stability
+from rts_compare.failures.table_cells import Context, Outcome, Row, cannot
+from rts_compare.failures.table_columns import METHODS, Method
+from rts_compare.failures.table_rows import ROWS
+from rts_compare.kept_measurements import Journal
 
 RESULTS = Path(__file__).parent / "results"
 COLORS = {"ok": "#CDE9D6", "degraded": "#FBE7A8", "failed": "#F4B6AB", "cannot": "#ECECEC"}

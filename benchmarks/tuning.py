@@ -17,14 +17,14 @@ from pathlib import Path
 
 import rts
 from benchmarks.report import table
-from rts.diagnostics.comparison.builtin import builtin
-from rts.diagnostics.comparison.compare import file_name
-from rts.diagnostics.comparison.environment import environment
-from rts.diagnostics.comparison.journal import Journal
-from rts.diagnostics.comparison.measure import TOGETHER, Measurements
-from rts.diagnostics.comparison.search import LAYERS, SUPERSAMPLE
-from rts.diagnostics.comparison.settings import Setting, engines, usable
-from rts.diagnostics.comparison.turns import Calls
+from rts_compare.builtin_scenes import builtin
+from rts_compare.compared_settings import Setting, engines, usable
+from rts_compare.comparison import file_name
+from rts_compare.environment import environment
+from rts_compare.interleaved_timing import Calls
+from rts_compare.kept_measurements import Journal
+from rts_compare.measurements import TOGETHER, Measurements
+from rts_compare.settings_search import LAYERS, SUPERSAMPLE
 
 CASES = {
     "bunny over black": (("translation", "rotation"), 0.25),

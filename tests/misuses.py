@@ -9,9 +9,9 @@ from test_radiance_field import FIELD
 
 import rts
 from rts import Camera, regularizers
-from rts.diagnostics import compare, stability
 from rts.plugin_api.operations import Operation, gradient
 from rts.plugin_api.records import Fragments, Proxy, RayHits
+from rts_compare import compare, stability
 
 SIZE = (12, 16)
 CAMERA = Camera.look_at((0.4, 0.5, 4), (0, 0, 0))

@@ -21,7 +21,7 @@ from benchmarks.accuracy.figures import CONTRAST_LOW, show, signed
 from benchmarks.accuracy.scores import scores
 from benchmarks.accuracy.truth import truth
 from benchmarks.report import table
-from rts.diagnostics.comparison.scores import low_pass
+from rts.diagnostics.smoothing import low_pass
 
 FAILURES = "thin plate", "planes at two degrees", "three planes", "bar through card"
 SHOWN = slice(40, 216)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.accuracy.methods import CASES, name_of
-from rts.diagnostics.comparison.scores import low_pass
+from rts.diagnostics.smoothing import low_pass
 
 COLUMNS = {
     "single, K = 1": "single, K = 1",

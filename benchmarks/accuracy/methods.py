@@ -15,8 +15,8 @@ import torch
 
 import rts
 from benchmarks.accuracy import scenes
-from rts.diagnostics.comparison.peers import Peer, peers
-from rts.diagnostics.comparison.scene import Scene
+from rts_compare.moving_scenes import Scene
+from rts_compare.other_renderers.installed_renderers import Peer, peers
 
 CASES = ("A", "B", "C")
 """The scenes that peers render too, and that times are taken of."""
@@ -104,7 +104,7 @@ def splatters(scene: scenes.Scene) -> list[Method]:
 def others(scene: scenes.Scene, spp: list[int]) -> tuple[list[Method], list[str]]:
     """DEODR and Mitsuba with each number of samples a pixel, and why they are left out where they are.
 
-    See `rts.diagnostics.comparison.peers`.
+    See `rts_compare.other_renderers.installed_renderers`.
     """
     t = {"t": np.zeros(())}
     given = Scene(scene.name, lambda t: (scene.at(t["t"]), scene.camera), t, {MOTION: {"t": np.ones(())}}, scene.size)

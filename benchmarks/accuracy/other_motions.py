@@ -23,8 +23,8 @@ from benchmarks.camera import camera, supersampled
 from benchmarks.meshes import mesh, rotation_xy
 from benchmarks.outline_fits import TILT, around_axis, vase
 from benchmarks.report import table
-from rts.diagnostics.comparison.scores import low_pass
-from rts.diagnostics.comparison.shapes import icosphere
+from rts.diagnostics.shapes import icosphere
+from rts.diagnostics.smoothing import low_pass
 
 SIZE, POINTS = 256, 8
 """Pixels, and points of a pixel along x and y in each of the truth's two grids."""

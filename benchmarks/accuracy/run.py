@@ -27,8 +27,8 @@ from benchmarks.accuracy.closed_forms import closed_form
 from benchmarks.accuracy.methods import CASES, Method
 from benchmarks.accuracy.scores import scores
 from benchmarks.accuracy.truth import Truth, truth
-from rts.diagnostics.comparison.environment import environment
-from rts.diagnostics.comparison.scores import loss_weights
+from rts_compare.derivative_scores import loss_weights
+from rts_compare.environment import environment
 
 SPP = (1, 4, 16, 64, 256)
 QUICK = ("A", "half-plane")

@@ -16,9 +16,10 @@ import numpy as np
 import rts
 from benchmarks.camera import DISTANCE, camera
 from benchmarks.meshes import DATA, mesh, rotation_xy
-from rts.diagnostics.comparison import shapes
-from rts.diagnostics.comparison.shapes import CARD_DEPTH, QUAD, box, grid, icosphere, on_screen, pixel, rectangle, unlit
+from rts.diagnostics.shapes import QUAD, box, icosphere, unlit
 from rts.engines import constants, engine_of, exemplar
+from rts_compare import scene_shapes
+from rts_compare.scene_shapes import CARD_DEPTH, grid, on_screen, pixel, rectangle
 
 SIZE = 256
 
@@ -77,7 +78,7 @@ def turn(size: int, pixels: float = 1.0) -> np.ndarray:
 
 @cache
 def _bunny_and_square() -> tuple[rts.Part, rts.Part]:
-    return shapes.bunny_and_square(*mesh("bunny"))
+    return scene_shapes.bunny_and_square(*mesh("bunny"))
 
 
 def bunny_over_black(size: int, cull: str = "back") -> Scene:
@@ -145,7 +146,7 @@ def turned_box(size: int) -> Scene:
     return Scene(
         "turned box",
         (size, size),
-        shapes.turned_box(),
+        scene_shapes.turned_box(),
         (motion(DISTANCE, size), None),
         (2, 4),
         "a closed, unculled box with a colour a face moves before a card with a pattern",
@@ -154,7 +155,7 @@ def turned_box(size: int) -> Scene:
 
 def cards(size: int, count: int, alternating: bool = False) -> Scene:
     """Open cards: one in the middle moves, or neighbours in depth in opposite directions."""
-    parts, depths = shapes.cards(count)
+    parts, depths = scene_shapes.cards(count)
     if alternating:
         directions = [motion(depth, size, (-1) ** i) for i, depth in enumerate(depths)]
     else:
@@ -197,7 +198,7 @@ def wires(size: int, width: float) -> Scene:
     return Scene(
         f"wires {width:g} px",
         (size, size),
-        (shapes.wires(size, [width] * 7),),
+        (scene_shapes.wires(size, [width] * 7),),
         (motion(DISTANCE, size),),
         (1, 2),
         f"seven slanted wires, {width:g} pixels wide, move over black",
@@ -208,7 +209,7 @@ def spheres(size: int) -> Scene:
     return Scene(
         "spheres",
         (size, size),
-        shapes.crossing_spheres(),
+        scene_shapes.crossing_spheres(),
         (None, motion(DISTANCE - 0.1, size)),
         (2, 4),
         "two spheres that pass through one another, unculled; the nearer moves",
@@ -217,7 +218,7 @@ def spheres(size: int) -> Scene:
 
 @cache
 def _spot() -> rts.Part:
-    return shapes.textured_spot(DATA / "meshes" / "spot")
+    return scene_shapes.textured_spot(DATA / "meshes" / "spot")
 
 
 def spot(size: int, turns: bool = False) -> Scene:
@@ -250,7 +251,7 @@ def teapot_turns(size: int) -> Scene:
     return Scene(
         "teapot turns",
         (size, size),
-        (shapes.bunny_and_square(vertices, faces)[0],),
+        (scene_shapes.bunny_and_square(vertices, faces)[0],),
         (turn(size),),
         (2, 4),
         "the teapot, unculled, turns about +y, a pixel at distance 1 from the axis",

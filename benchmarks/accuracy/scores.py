@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import binary_dilation
 
-from rts.diagnostics.comparison.scores import loss_weights, low_pass, relative_l2
+from rts.diagnostics.smoothing import low_pass
+from rts_compare.derivative_scores import loss_weights, relative_l2
 
 
 def scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:

@@ -15,8 +15,9 @@ import numpy as np
 
 from benchmarks.accuracy import scenes
 from benchmarks.camera import regular_grid, supersampled
-from rts.diagnostics.comparison.scores import low_pass, relative_l2
-from rts.diagnostics.comparison.truth import lattice
+from rts.diagnostics.smoothing import low_pass
+from rts_compare.derivative_scores import relative_l2
+from rts_compare.true_derivatives import lattice
 
 SAMPLES = 16
 """Points a pixel, along x and along y."""

@@ -26,10 +26,10 @@ import rts
 from benchmarks.camera import regular_grid
 from benchmarks.meshes import DATA
 from benchmarks.report import table
-from rts.diagnostics.comparison.journal import Journal
-from rts.diagnostics.comparison.shapes import QUAD
-from rts.diagnostics.failures import methods as failures
+from rts.diagnostics.shapes import QUAD
 from rts.files.srgb import encode_srgb
+from rts_compare.failures import table_columns as failures
+from rts_compare.kept_measurements import Journal
 
 PHOTOGRAPHS = ("IMG-1842.jpg", "IMG-1843.jpg", "IMG-1844.jpg")
 METHODS = {m.name: dict(m.options) for m in failures.METHODS if m.name in ("single", "multi, K = 2", "visible")}
@@ -290,7 +290,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from rts.diagnostics.comparison.style import PEER_COLORS, SPLATTER_COLORS
+    from rts_compare.chart_style import PEER_COLORS, SPLATTER_COLORS
 
     fits, seeds = found["fits"], range(len(found["start"]))
     colors = {m: SPLATTER_COLORS[m.split(",")[0]] for m in fits}

@@ -15,11 +15,11 @@ import numpy as np
 from rts.arguments import quoted
 from rts.arrays import from_numbers, kind_of
 from rts.checks import check_size, is_count, is_real
-from rts.diagnostics.comparison.progress import Phase, phases
 from rts.diagnostics.explanation.explaining import explained
 from rts.diagnostics.explanation.reasons import Reason, legend, marked
 from rts.diagnostics.explanation.slopes import Number, Slope, chosen, measured, unit
 from rts.diagnostics.explanation.subject import Scene, Subject
+from rts.diagnostics.progress import Phase, phases
 from rts.engines import Engine, engine_of, is_constant, namespace
 from rts.errors import EmptyImageWarning, InputError, LayersWarning
 from rts.files.srgb import decode_srgb

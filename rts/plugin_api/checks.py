@@ -1,7 +1,7 @@
 """Checks of what users give, each refused in one line, and facts of tables of triangles."""
 
 from rts.arguments import check_numbers, check_positive, quoted
-from rts.checks import is_count
+from rts.checks import check_scene, is_count
 from rts.sampling.cache import fingerprint
 from rts.sampling.validation import check_camera
 from rts.topology import index_table, pieces
@@ -10,6 +10,7 @@ __all__ = [
     "check_camera",
     "check_numbers",
     "check_positive",
+    "check_scene",
     "fingerprint",
     "index_table",
     "is_count",

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.camera import Camera
-from rts.diagnostics.comparison.scores import low_pass
 from rts.diagnostics.explanation.subject import DEEP, Subject
+from rts.diagnostics.smoothing import low_pass
 from rts.engines import Engine, namespace
 from rts.parts import Part
 from rts.trees import Array, Tree, leaves, map_leaves
