@@ -74,7 +74,7 @@ def compare(
         found = measured(
             scene, size=shape, peers=peers, quick=quick, surface=surface, output=output, fresh=fresh, **options
         )
-    _print_summary(found)
+    Console().print(summary(found))
     for line in found.left_out:
         _say(escape(f"left out: {line}"))
     for file in found.files(output):
@@ -129,8 +129,8 @@ def _print_scenes() -> None:
     Console().print(table)
 
 
-def _print_summary(comparison: Comparison) -> None:
-    """Print, for each mode, the fastest setting within some errors."""
+def summary(comparison: Comparison) -> Table:
+    """For each mode the fastest setting within some errors."""
     from rts_compare.chart_style import label, time_label
     from rts_compare.pareto_front import LEVELS
 
@@ -142,7 +142,7 @@ def _print_summary(comparison: Comparison) -> None:
             row = comparison.best(mode, error)
             cells.append("none" if row is None else f"{label(row)}\n{time_label(row['ms']['median'])}")
         table.add_row(mode, *cells)
-    Console().print(table)
+    return table
 
 
 def _missing_charts() -> str | None:

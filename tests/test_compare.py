@@ -18,7 +18,7 @@ from rts import registry
 from rts.engines import engine_named
 from rts.errors import InputError, PluginError, ToleranceWarning
 from rts.registry import plugin
-from rts_compare import compare, interleaved_timing, measurements, true_derivatives
+from rts_compare import compare, compared_settings, interleaved_timing, measurements, true_derivatives
 from rts_compare.commands import summary
 from rts_compare.compared_settings import Setting, _no_worse, as_text, engines, finest, worth_timing
 from rts_compare.comparison import Comparison
@@ -674,7 +674,7 @@ class TestMisuse:
             tune("thin wires", tolerance=tolerance)
 
     def test_no_engine(self, monkeypatch):
-        monkeypatch.setattr(registry, "plugins", lambda group: ["numpy"] if group == "rts.engines" else [])
+        monkeypatch.setattr(compared_settings, "plugins", lambda group: ["numpy"] if group == "rts.engines" else [])
         with pytest.raises(PluginError, match="no engine with derivatives is installed"):
             compare("thin wires", progress=False)
 
@@ -743,7 +743,7 @@ class TestCommandLine:
         def interrupted(*args, **options):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("rts_compare.compare", interrupted)
+        monkeypatch.setattr("rts_compare.comparison.compare", interrupted)
         for missing, said in (
             (["matplotlib"], "no PNG, which needs matplotlib"),
             (["plotly"], "no HTML, which needs plotly"),
@@ -785,7 +785,7 @@ class TestCommandLine:
             (["compare", "missing.obj"], "missing.obj does not exist; expected a model"),
             (["compare", "thin wires", "--mode", "sideways"], "expected some of translation"),
             (["compare", "thin wires", "--sampler", "blender"], "no sampler named 'blender'"),
-            (["tune", "thin wires", "--tolerance", "-1"], "tolerance is -1.0; expected a share"),
+            (["tune", "thin wires", "--tolerance", "-1"], "tolerance is -1.0; expected a positive number"),
         ],
     )
     def test_misuse(self, arguments, message):
