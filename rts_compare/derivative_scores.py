@@ -38,10 +38,40 @@ def scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
             short.
         loss_error: over the random losses, RMS of the error of dL/dt relative to the RMS of dL/dt.
     """
-    low, low_true = low_pass(x), low_pass(true)
-    slopes, true_slopes = (np.tensordot(loss_weights(*true.shape[:2]), i, axes=3) for i in (x, true))
+    low = _compared(low_pass(x), low_pass(true))
+    return {"error": low["relative_l2"], "gain": low["gain"], "loss_error": _loss_error(x, true)}
+
+
+def all_scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    """How near a derivative image (H, W, 3) is to the true one, in more ways.
+
+    Returns:
+        relative_l2, cosine, gain: raw.
+        low_relative_l2, low_cosine, low_gain: the same through the low-pass.
+        spurious: share of the derivative's energy farther than 3 pixels from where the truth is not zero.
+        loss_error: as of `scores`.
+    """
+    from scipy.ndimage import binary_dilation
+
+    near = binary_dilation(np.abs(true).max(axis=-1) > 1e-6, iterations=3)
     return {
-        "error": relative_l2(low, low_true, low_true),
-        "gain": float((low * low_true).sum() / max(float((low_true**2).sum()), 1e-30)),
-        "loss_error": relative_l2(slopes, true_slopes, true_slopes),
+        **_compared(x, true),
+        **{f"low_{name}": value for name, value in _compared(low_pass(x), low_pass(true)).items()},
+        "spurious": float((x[~near] ** 2).sum() / max((x**2).sum(), 1e-30)),
+        "loss_error": _loss_error(x, true),
     }
+
+
+def _compared(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    product = float((x * true).sum())
+    return {
+        "relative_l2": relative_l2(x, true, true),
+        "cosine": product / max(float(np.linalg.norm(x) * np.linalg.norm(true)), 1e-30),
+        "gain": product / max(float((true**2).sum()), 1e-30),
+    }
+
+
+def _loss_error(x: np.ndarray, true: np.ndarray) -> float:
+    """Over the random losses, RMS of the error of dL/dt relative to the RMS of dL/dt."""
+    slopes, true_slopes = (np.tensordot(loss_weights(*true.shape[:2]), i, axes=3) for i in (x, true))
+    return relative_l2(slopes, true_slopes, true_slopes)

@@ -1,6 +1,6 @@
 """The true derivative of an image, by differences of area-sampled renders that know nothing of splatting.
 
-The differences are central, over a quarter of a pixel, on two lattices of points in the pixel that have nothing in
+The differences are central, over a quarter of a pixel, on two grids of points in the pixel that have nothing in
 common: what they disagree on tells their error. They are kept on disk by a key of the scene.
 """
 
@@ -19,6 +19,7 @@ import numpy as np
 from rts import Camera, Engine, Part, engine_of, render_views
 from rts.diagnostics.smoothing import low_pass
 from rts.errors import InputError
+from rts.plugin_api.checks import fingerprint
 from rts.plugin_api.files import cache_folder, output_folder, writing
 from rts_compare.derivative_scores import relative_l2
 from rts_compare.measurement_keys import layers_of, state_key
@@ -31,18 +32,28 @@ STEP = 0.25
 AT_ONCE = 8
 """Points of all pixels that are rendered by one call."""
 
+Grids = Callable[[int], tuple[np.ndarray, np.ndarray]]
+"""The square root of the number of points a pixel → two grids of points (S, 2)."""
+
 
 class Truth(NamedTuple):
     """How an image changes along one mode.
 
     Attributes:
-        derivative: (H, W, 3) a pixel of motion, the mean of the two lattices'.
-        error: half of what the lattices disagree on, relative L2 through the low-pass of `scores`: how far the mean of
+        derivative: (H, W, 3) a pixel of motion, the mean of the two grids'.
+        error: half of what the grids disagree on, relative L2 through the low-pass of `scores`: how far the mean of
             two that err alike, and independently, is off.
+        grids: (2, H, W, 3) the derivative on each of the grids.
     """
 
     derivative: np.ndarray
     error: float
+    grids: np.ndarray
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Relative L2 of what the grids disagree on: raw, and through the low-pass."""
+        return {"relative_l2": relative_l2(*self.grids, self.derivative), "low_relative_l2": 2 * self.error}
 
 
 def lattice(samples: int) -> np.ndarray:
@@ -52,6 +63,12 @@ def lattice(samples: int) -> np.ndarray:
     """
     count = samples**2
     return np.column_stack([(np.arange(count) + 0.5) / count, (np.arange(count) * (5**0.5 - 1) / 2 + 0.25) % 1]) - 0.5
+
+
+def lattices(samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """The lattice, and the same with x and y exchanged."""
+    points = lattice(samples)
+    return points, points[:, ::-1]
 
 
 def area_image(
@@ -88,10 +105,13 @@ def area_image(
     return total / len(points)
 
 
-def truth_key(scene: Scene, mode: str, step: float, samples: int, engine: Engine | None) -> str:
-    """A hash of all that the truth depends on: the exact scene at the ends of the difference."""
+def truth_key(
+    scene: Scene, mode: str, step: float, samples: int, engine: Engine | None, grids: Grids = lattices
+) -> str:
+    """A hash of all that the truth depends on: the exact scene at the ends of the difference, and the grids."""
     states = [state_key(*shown(scene, mode, by, engine), scene.size) for by in (-step / 2, step / 2)]
-    return hashlib.sha256(repr((samples, states)).encode()).hexdigest()[:20]
+    points = () if grids is lattices else (fingerprint(grids(samples)),)
+    return hashlib.sha256(repr((samples, states, *points)).encode()).hexdigest()[:20]
 
 
 def shown(scene: Scene, mode: str, by: float, engine: Engine | None) -> tuple[list[Part], Camera]:
@@ -113,6 +133,8 @@ def truth(
     pixel: float,
     *,
     samples: int = SAMPLES,
+    step: float = STEP,
+    grids: Grids = lattices,
     engine: Engine | None = None,
     folder: Path | None = None,
     done: Callable[[], None] = lambda: None,
@@ -124,28 +146,29 @@ def truth(
         mode: of it.
         pixel: how far along the mode's direction one pixel of motion is.
         samples: the square root of the number of points a pixel.
+        step: length of the difference, pixels.
+        grids: `samples` → two grids of points (S, 2) of a pixel.
         engine: as in `shown`.
         folder: where truths are kept; None for the folder of caches.
         done: called `samples`² times four, or as if, where it is known.
     """
-    step = STEP * pixel
+    length = step * pixel
     folder = (kept_folder() if folder is None else folder) / "truths"
-    key = truth_key(scene, mode, step, samples, engine)
+    key = truth_key(scene, mode, length, samples, engine, grids)
     path = folder / f"{key}.npy"
     kept = _read(path)
     if kept is not None:
         for _ in range(4 * samples**2):
             done()
         return _of(kept)
-    points = lattice(samples)
     images = [
         [
             _kept_image(partial(shown, scene, mode, by, engine), scene.size, grid, folder / f"{key}-{i}{j}.npy", done)
-            for j, by in enumerate((-step / 2, step / 2))
+            for j, by in enumerate((-length / 2, length / 2))
         ]
-        for i, grid in enumerate((points, points[:, ::-1]))
+        for i, grid in enumerate(grids(samples))
     ]
-    derivatives = np.stack([(after - before) / STEP for before, after in images]).astype(np.float32)
+    derivatives = np.stack([(after - before) / step for before, after in images]).astype(np.float32)
     _write(path, derivatives)
     for image in folder.glob(f"{key}-*.npy"):
         image.unlink(missing_ok=True)
@@ -204,4 +227,4 @@ def _write(path: Path, array: np.ndarray) -> None:
 def _of(derivatives: np.ndarray) -> Truth:
     first, second = derivatives.astype(np.float64)
     mean = (first + second) / 2
-    return Truth(mean, relative_l2(low_pass(first), low_pass(second), low_pass(mean)) / 2)
+    return Truth(mean, relative_l2(low_pass(first), low_pass(second), low_pass(mean)) / 2, np.stack([first, second]))

@@ -9,19 +9,28 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import rts
-from benchmarks.camera import DISTANCE, camera
+from benchmarks.camera import DISTANCE, camera, regular_grid
 from benchmarks.meshes import DATA, mesh, rotation_xy
 from rts.diagnostics.shapes import QUAD, box, icosphere, unlit
-from rts.engines import constants, engine_of, exemplar
-from rts_compare import scene_shapes
+from rts.plugin_api.arrays import constants, exemplar
+from rts_compare import moving_scenes, scene_shapes
 from rts_compare.scene_shapes import CARD_DEPTH, grid, on_screen, pixel, rectangle
+from rts_compare.true_derivatives import SAMPLES, Truth, area_image, lattice, truth
 
 SIZE = 256
+MOTION = "motion"
+"""The only mode of a scene here."""
+
+
+def grids(samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two grids of points of a pixel that have nothing in common: a regular one, and a lattice."""
+    return regular_grid(samples), lattice(samples)
 
 
 @dataclass(frozen=True)
@@ -50,9 +59,25 @@ class Scene:
     def camera(self) -> rts.Camera:
         return camera()
 
+    @property
+    def moving(self) -> moving_scenes.Scene:
+        """The scene as it is measured, with `MOTION` for its only mode."""
+        still, unit = {"t": np.zeros(())}, {"t": np.ones(())}
+        return moving_scenes.Scene(
+            self.name, lambda p: (self.at(p["t"]), self.camera), still, {MOTION: unit}, self.size, self.note
+        )
+
+    def truth(self, folder: Path, step: float = 1.0) -> Truth:
+        """How the image truly changes with t, by differences over a step; kept in a folder."""
+        return truth(self.moving, MOTION, 1.0, samples=SAMPLES, step=step, grids=grids, folder=folder)
+
+    def image(self) -> np.ndarray:
+        """The image (H, W, 3) at rest, area-sampled."""
+        return area_image(self.at(0.0), self.camera, self.size, regular_grid(SAMPLES))[..., :3]
+
     def at(self, t: Any) -> list[rts.Part]:
         """The parts at t: a number, or a scalar of torch or jax, in which they are then differentiable."""
-        engine, like = engine_of(t), exemplar(t)
+        engine, like = rts.engine_of(t), exemplar(t)
         parts = []
         for part, direction in zip(self.rest, self.directions, strict=True):
             if direction is not None:
