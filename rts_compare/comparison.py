@@ -20,8 +20,8 @@ from rts.plugin_api.files import output_folder, writing
 from rts_compare.compared_settings import Setting, as_text, finest, usable, worth_timing
 from rts_compare.derivative_scores import scores
 from rts_compare.environment import environment
-from rts_compare.interleaved_timing import ROUNDS, Calls, Turns
-from rts_compare.kept_measurements import Journal
+from rts_compare.interleaved_timing import ROUNDS, Calls, InterleavedTiming
+from rts_compare.kept_measurements import KeptMeasurements
 from rts_compare.left_out import one_line
 from rts_compare.measurements import Measurements
 from rts_compare.moving_scenes import Scene
@@ -193,9 +193,9 @@ def compare(
     names, without = usable("rts.splatters", splatters)
     possible, missing = usable("rts.samplers", samplers)
     used, failing = engines_for(found, engines)
-    journal = _journal(folder, found, fresh)
+    earlier = _earlier(folder, found, fresh)
     used = used[:1] if quick and engines is None else used
-    measured = Measurements(found, journal, used, truths=kept, samples=int(truth_samples))
+    measured = Measurements(found, earlier, used, truths=kept, samples=int(truth_samples))
     measured.left_out += [*failing, *without, *missing, *_unthinned()]
     measured.leave_out_what_rests()
     suited = measured.samplers(possible)
@@ -235,14 +235,14 @@ def _unthinned() -> list[str]:
     return []
 
 
-def _journal(folder: Path | None, scene: Scene, fresh: bool) -> Journal:
+def _earlier(folder: Path | None, scene: Scene, fresh: bool) -> KeptMeasurements:
     """What earlier runs have measured of scenes of this name."""
     if folder is None:
-        return Journal()
+        return KeptMeasurements()
     path = folder / f".{file_name(scene.name)}.jsonl"
     if fresh:
         path.unlink(missing_ok=True)
-    return Journal(path)
+    return KeptMeasurements(path)
 
 
 def _peers(measured: Measurements, wanted: bool) -> tuple[list[Peer], list[str]]:
@@ -279,7 +279,7 @@ def _compared(measured: Measurements, plan: Plan, phase: Phase) -> Comparison:
     found = marked({"rows": rows})
     return Comparison(
         {"name": scene.name, "note": scene.note, "size": list(scene.size)},
-        {**environment(PACKAGES), "date": measured.journal.since},
+        {**environment(PACKAGES), "date": measured.kept.since},
         {mode: {"truth_error": measured.truth(mode).error} for mode in modes},
         found["rows"],
         measured.left_out,
@@ -341,9 +341,9 @@ def _timed(
 def _taken(
     measured: Measurements, group: str, settings: Sequence[Setting], phase: Phase, what: str
 ) -> dict[Setting, dict[str, float]]:
-    turns = measured.turns(group, {s: lambda s=s: measured.call(group, s) for s in settings})
-    found = turns.run(done=phase(what, ROUNDS * len(settings)))
-    measured.left_out += [f"{', '.join(str(v) for v in s if v != '')}: {why}" for s, why in turns.failed.items()]
+    timing = measured.timing(group, {s: lambda s=s: measured.call(group, s) for s in settings})
+    found = timing.run(done=phase(what, ROUNDS * len(settings)))
+    measured.left_out += [f"{', '.join(str(v) for v in s if v != '')}: {why}" for s, why in timing.failed.items()]
     return {Setting(*s): ms for s, ms in found.items()}
 
 
@@ -353,11 +353,11 @@ def _peer_key(peer: Peer) -> tuple:
 
 def _peer_scores(measured: Measurements, mode: str, peer: Peer) -> dict[str, float] | None:
     key = "peer", mode, *_peer_key(peer), *measured.state(mode)
-    kept: Any = measured.journal.get(*key)
+    kept: Any = measured.kept.get(*key)
     if kept is None:
         try:
             derivative = peer.derivative(mode) * measured.pixel(mode)
-            kept = measured.journal.put(scores(derivative, measured.truth(mode).derivative), *key)
+            kept = measured.kept.put(scores(derivative, measured.truth(mode).derivative), *key)
         except Exception as error:
             why = one_line(f"{type(error).__name__}: {error}")
             measured.left_out.append(f"{' '.join(_peer_key(peer))}, {mode}: {why}")
@@ -371,8 +371,8 @@ def _peer_times(
     if not peers:
         return {}
     calls: Calls = {_peer_key(p): lambda p=p: p.gradient(mode) for p in peers}
-    turns = Turns(measured.journal, calls, lambda name: ("peer", mode, *name, *measured.state(mode)))
-    return turns.run(PEER_ROUNDS, phase(f"times of peers, {mode}", PEER_ROUNDS * len(peers)))
+    timing = InterleavedTiming(measured.kept, calls, lambda name: ("peer", mode, *name, *measured.state(mode)))
+    return timing.run(PEER_ROUNDS, phase(f"times of peers, {mode}", PEER_ROUNDS * len(peers)))
 
 
 def _rows(

@@ -53,11 +53,11 @@ def all_scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
     """
     from scipy.ndimage import binary_dilation
 
-    near = binary_dilation(np.abs(true).max(axis=-1) > 1e-6, iterations=3)
+    far = np.logical_not(binary_dilation(np.abs(true).max(axis=-1) > 1e-6, iterations=3))
     return {
         **_compared(x, true),
         **{f"low_{name}": value for name, value in _compared(low_pass(x), low_pass(true)).items()},
-        "spurious": float((x[~near] ** 2).sum() / max((x**2).sum(), 1e-30)),
+        "spurious": float((x[far] ** 2).sum() / max((x**2).sum(), 1e-30)),
         "loss_error": _loss_error(x, true),
     }
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rts_compare.kept_measurements import Journal
+from rts_compare.kept_measurements import KeptMeasurements
 from rts_compare.left_out import limited, one_line
 
 ROUNDS, CONSECUTIVE = 3, 2
@@ -27,11 +27,11 @@ Calls = Mapping[tuple, Callable[[], Callable[[], Any]]]
 """What to keep a time under → a function that makes the function to be timed."""
 
 
-class Turns:
+class InterleavedTiming:
     """Functions whose times are taken.
 
     Args:
-        journal: where times are kept.
+        kept: where times are kept.
         calls: the functions.
         key: what to keep each time under, of a key of `calls`.
 
@@ -39,8 +39,8 @@ class Turns:
         failed: key → why it could not be timed, a line.
     """
 
-    def __init__(self, journal: Journal, calls: Calls, key: Callable[[tuple], tuple]):
-        self.journal, self.calls, self.key = journal, calls, key
+    def __init__(self, kept: KeptMeasurements, calls: Calls, key: Callable[[tuple], tuple]):
+        self.kept, self.calls, self.key = kept, calls, key
         self.failed: dict[tuple, str] = {}
         self._times: dict[tuple, list[float]] = {name: [] for name in calls}
         self._made: dict[tuple, Callable[[], Any]] = {}
@@ -78,10 +78,10 @@ class Turns:
         times, key = self._times[name], ("time", *self.key(name), number)
         if name in self.failed or (len(times) >= 2 and sum(times) > SLOW):
             return
-        kept = self.journal.get(*key)
+        kept = self.kept.get(*key)
         if kept is None:
             try:
-                kept = self.journal.put(self.timed(name), *key)
+                kept = self.kept.put(self.timed(name), *key)
             except Exception as error:
                 self.failed[name] = one_line(f"{type(error).__name__}: {error}")
                 return

@@ -11,7 +11,7 @@ from rts.errors import InputError
 from rts.plugin_api.files import writing
 
 
-class Journal:
+class KeptMeasurements:
     """A table of measurements, each written to a file as soon as it is made.
 
     Args:

@@ -16,12 +16,12 @@ from rts.errors import InputError, RtsWarning
 from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
 from rts_compare.compared_settings import Setting
 from rts_compare.derivative_scores import loss_weights, relative_l2, scores
-from rts_compare.interleaved_timing import LONGEST, Calls, Turns
-from rts_compare.kept_measurements import Journal
+from rts_compare.interleaved_timing import LONGEST, Calls, InterleavedTiming
+from rts_compare.kept_measurements import KeptMeasurements
 from rts_compare.left_out import TooSlow, limited, one_line
 from rts_compare.measurement_keys import library_key, plugin_key, state_key
 from rts_compare.moving_scenes import Scene, is_constant, parts_of
-from rts_compare.surface_rates import Form, forms_of
+from rts_compare.surface_rates import SceneAtRate, scenes_at_rates
 from rts_compare.true_derivatives import SAMPLES, STEP, Truth, truth, truth_key
 
 PATIENCE = 8.0
@@ -42,7 +42,7 @@ class Measurements:
 
     Args:
         scene: the scene.
-        journal: where measurements are kept.
+        kept: where measurements are kept.
         engines: those that have derivatives; errors are measured with the first.
         truths: the folder of truths; None for that of caches.
         samples: of the truth, the square root of their number a pixel, where `refine_truths` takes no others.
@@ -58,7 +58,7 @@ class Measurements:
     def __init__(
         self,
         scene: Scene,
-        journal: Journal,
+        kept: KeptMeasurements,
         engines: Sequence[Engine],
         *,
         truths: Path | None = None,
@@ -67,12 +67,12 @@ class Measurements:
         count_at: int | None = None,
         slowest: float = SLOWEST,
     ):
-        self.scene, self.journal, self.engines, self.folder, self.samples = scene, journal, engines, truths, samples
+        self.scene, self.kept, self.engines, self.folder, self.samples = scene, kept, engines, truths, samples
         self.engine, self.count_at, self.slowest = engines[0], count_at, slowest
         self.left_out: list[str] = []
         self._truths: dict[str, Truth] = {}
         self._truth_samples: dict[str, int] = {}
-        self._forms: dict[str, dict[str, Form]] = {}
+        self._at_rates: dict[str, dict[str, SceneAtRate]] = {}
         self._pixels: dict[str, float] = {}
         self._states: dict[str, tuple[str, ...]] = {}
         self._failed: dict[tuple, str] = {}
@@ -198,11 +198,11 @@ class Measurements:
             self._states[mode] = (*own, true, library_key())
         return self._states[mode]
 
-    def forms(self, group: str) -> dict[str, Form]:
+    def at_rates(self, group: str) -> dict[str, SceneAtRate]:
         """The scene at the rates that its surfaces offer; "" as it is given."""
-        if group not in self._forms:
-            self._forms[group] = forms_of(self.scene.at, parts_of(self.scene.at(self.start(group))))
-        return self._forms[group]
+        if group not in self._at_rates:
+            self._at_rates[group] = scenes_at_rates(self.scene.at, parts_of(self.scene.at(self.start(group))))
+        return self._at_rates[group]
 
     # -------------------------------------------------------------------------------------------------- samplers
 
@@ -214,11 +214,11 @@ class Measurements:
         suited = ["auto"] if len(auto) > 1 else []
         for name in names:
             key = "sampler", name, plugin_key("rts.samplers", name), *self.state(next(iter(self.scene.directions)))
-            kept = self.journal.get(*key)
+            kept = self.kept.get(*key)
             if kept is None:
                 kept = self._tried(name, parts, found[1])
                 if kept["suits"]:
-                    self.journal.put(kept, *key)
+                    self.kept.put(kept, *key)
             if kept["suits"]:
                 suited.append(name)
             else:
@@ -231,9 +231,9 @@ class Measurements:
         found = {}
         for name in samplers:
             key = "kind", name, plugin_key("rts.samplers", name), samplers[0], *self.state(self.modes(group)[0])
-            kept = self.journal.get(*key)
+            kept = self.kept.get(*key)
             if kept is None:
-                kept = self.journal.put(name == samplers[0] or self._agrees(name, samplers[0], group), *key)
+                kept = self.kept.put(name == samplers[0] or self._agrees(name, samplers[0], group), *key)
             found[name] = "" if kept else name
         return found
 
@@ -293,7 +293,7 @@ class Measurements:
         all_of = (
             Setting(splatter, count, supersample, rate, kind)
             for kind in kinds
-            for rate in (self.forms(group) if rates else [""])
+            for rate in (self.at_rates(group) if rates else [""])
             for supersample in samples
             for splatter in splatters
             for count in layers
@@ -315,13 +315,13 @@ class Measurements:
         key = "layers", group, *setting, *self._identity(self.modes(group)[0], setting)
         if key in self._failed:
             return None
-        kept = self.journal.get(*key)
+        kept = self.kept.get(*key)
         if kept is None:
-            parts, camera = self.forms(group)[setting.rate].at(self.start(group))
+            parts, camera = self.at_rates(group)[setting.rate].at(self.start(group))
             try:
                 with limited(LONGEST):
                     found = _quietly(lambda: sample(parts, camera, self.scene.size, **setting.options))
-                kept = self.journal.put(int(found.row.shape[0]), *key)
+                kept = self.kept.put(int(found.row.shape[0]), *key)
             except Exception as error:
                 self._failed[key] = one_line(f"{type(error).__name__}: {error}")
                 self._leave_out(f'splatter {setting.splatter!r}, layers="auto": {self._failed[key]}')
@@ -341,10 +341,10 @@ class Measurements:
         key = "error", mode, *same, *self._identity(mode, same)
         if key in self._failed:
             return None
-        kept = self.journal.get(*key)
+        kept = self.kept.get(*key)
         if kept is None:
             try:
-                kept = self.journal.put(self._measured(mode, same), *key)
+                kept = self.kept.put(self._measured(mode, same), *key)
             except Exception as error:
                 self._failed[key] = one_line(f"{type(error).__name__}: {error}")
                 self._leave_out(f"splatter {same.splatter!r}, {mode}: {self._failed[key]}")
@@ -363,7 +363,7 @@ class Measurements:
 
     def _derivative(self, mode: str, setting: Setting) -> np.ndarray:
         """The derivative image (H, W, 3) along a mode, a pixel of motion."""
-        at, pixel = self.forms(self.group(mode))[setting.rate].at, self.pixel(mode)
+        at, pixel = self.at_rates(self.group(mode))[setting.rate].at, self.pixel(mode)
 
         def image(t: Array) -> Array:
             return render(*at(self.scene.moved(mode, t, self.engine)), self.scene.size, **setting.options)[..., :3]
@@ -380,13 +380,13 @@ class Measurements:
         return (
             layers + (0.5 if setting.layers == "auto" else 0.0),
             setting.side,
-            self.forms(group)[setting.rate].work,
+            self.at_rates(group)[setting.rate].work,
         )
 
     def call(self, group: str, setting: Setting) -> Callable[[], Any]:
         """A function that renders the scene and takes the gradient of a loss in the parameters of a group's modes."""
         engine = next(e for e in self.engines if e.name == setting.engine)
-        at, size = self.forms(group)[setting.rate].at, self.scene.size
+        at, size = self.at_rates(group)[setting.rate].at, self.scene.size
         live, rebuilt = self._live(group, engine)
         weights = engine.constant(np.asarray(loss_weights(*size, 1)[0], np.float32), live[0])
 
@@ -418,12 +418,12 @@ class Measurements:
 
         return live, rebuilt
 
-    def turns(self, group: str, calls: Calls) -> Turns:
+    def timing(self, group: str, calls: Calls) -> InterleavedTiming:
         """Functions that are to be timed, such as those of `call`, and where their times are kept.
 
         Args:
             group: of modes, whose parameters they differentiate.
-            calls: what to keep times under, a `Setting` or what a peer is called, → see `Turns`.
+            calls: what to keep times under, a `Setting` or what a peer is called, → see `InterleavedTiming`.
         """
         modes = self.modes(group)
         states = [state for mode in modes for state in self.state(mode)]
@@ -432,7 +432,7 @@ class Measurements:
             own = self._identity(modes[0], name) if isinstance(name, Setting) else ()
             return group, *name, *own, *states
 
-        return Turns(self.journal, calls, key)
+        return InterleavedTiming(self.kept, calls, key)
 
 
 def _quietly(f: Callable[[], Any]) -> Any:

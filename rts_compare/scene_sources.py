@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rts.plugin_api.commands import default_camera
 
 from rts import Camera, Engine, Part, engine_of, namespace
 from rts.errors import InputError, RtsError
 from rts.plugin_api.arrays import Tree, leaves, map_leaves
 from rts.plugin_api.checks import check_scene, is_count, quoted
+from rts.plugin_api.commands import default_camera
 from rts_compare import builtin_scenes
 from rts_compare.compared_settings import engines
 from rts_compare.left_out import one_line

@@ -259,7 +259,7 @@ class Search:
     def _timed(self, settings: Sequence[Setting], turns: int = 1) -> dict[Setting, float]:
         """Seconds of settings, those that fail or come too late left out."""
         calls: Calls = {s: lambda s=s: self.measured.call(TOGETHER, s) for s in settings}
-        found = self.measured.turns(TOGETHER, calls).run(turns, late=self._over, hopeless=SLOWER)
+        found = self.measured.timing(TOGETHER, calls).run(turns, late=self._over, hopeless=SLOWER)
         return {Setting(*s): ms["median"] / 1e3 for s, ms in found.items()}
 
     def _fastest(self, settings: Sequence[Setting]) -> Setting:
@@ -283,7 +283,7 @@ class Search:
         options: dict[str, list] = {
             "layers": list(dict.fromkeys(s.layers for s in cells)),
             "supersample": list(SUPERSAMPLE),
-            "rate": list(self.measured.forms(TOGETHER)),
+            "rate": list(self.measured.at_rates(TOGETHER)),
             "splatter": list(splatters),
             "sampler": list(self.samplers),
         }

@@ -12,7 +12,7 @@ from rts.plugin_api.arrays import Tree
 from rts_compare.moving_scenes import SceneFunction, parts_of
 
 
-class Form(NamedTuple):
+class SceneAtRate(NamedTuple):
     """A scene at some rates.
 
     Attributes:
@@ -24,8 +24,8 @@ class Form(NamedTuple):
     work: float
 
 
-def forms_of(at: SceneFunction, parts: Sequence[Part]) -> dict[str, Form]:
-    """The forms of a scene by what differs, such as "tolerance=0.4"; "" is the scene as it is given.
+def scenes_at_rates(at: SceneFunction, parts: Sequence[Part]) -> dict[str, SceneAtRate]:
+    """The scene at several rates by what differs, such as "tolerance=0.4"; "" is the scene as it is given.
 
     Surfaces of one kind are changed together, each to the first rate that it offers, to its second, and so on.
 
@@ -38,10 +38,12 @@ def forms_of(at: SceneFunction, parts: Sequence[Part]) -> dict[str, Form]:
         surface = part.surface
         for number, rate in enumerate(surface.rates(part.theta)):
             offered.setdefault((type(surface), number), {})[index] = rate
-    found = {"": Form(at, 1.0)}
+    found = {"": SceneAtRate(at, 1.0)}
     for rates in offered.values():
         work = np.mean([rates[i].work if i in rates else 1.0 for i in range(len(parts))])
-        found[" ".join(dict.fromkeys(r.setting for r in rates.values()))] = Form(_changed(at, rates), float(work))
+        found[" ".join(dict.fromkeys(r.setting for r in rates.values()))] = SceneAtRate(
+            _changed(at, rates), float(work)
+        )
     return found
 
 

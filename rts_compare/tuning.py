@@ -15,7 +15,7 @@ from rts.plugin_api.arrays import Tree, map_leaves
 from rts.plugin_api.checks import check_positive, is_count, quoted
 from rts.plugin_api.files import output_folder
 from rts_compare.compared_settings import usable
-from rts_compare.kept_measurements import Journal
+from rts_compare.kept_measurements import KeptMeasurements
 from rts_compare.measurements import TOGETHER, Measurements
 from rts_compare.moving_scenes import SceneFunction, parts_of
 from rts_compare.scene_sources import engines_for, scene_of, some_modes
@@ -116,7 +116,7 @@ def tune(
     used, _ = engines_for(found, None if engine is None else [engine])
     measured = Measurements(
         found,
-        Journal(),
+        KeptMeasurements(),
         used[:1],
         truths=kept,
         samples=truth_samples or TRUTH_SAMPLES[0],
@@ -134,7 +134,7 @@ def tune(
         search = Search(measured, measured.kinds(suited), tolerance, deadline, phase)
         chosen, reasons, error, seconds = search.run(named)
     reasons += _told_of_truths(measured, tolerance)
-    at = measured.forms(TOGETHER)[chosen.rate].at
+    at = measured.at_rates(TOGETHER)[chosen.rate].at
     own = None if measured.scene.separate else measured.engine
     parts = parts_of(at(measured.scene.moved(next(iter(measured.scene.directions)), 0.0, own)))
     parts = map_leaves(lambda x: engine_of(x).stop_gradient(x), parts)

@@ -23,7 +23,7 @@ from rts_compare.commands import summary
 from rts_compare.compared_settings import Setting, _no_worse, as_text, engines, finest, worth_timing
 from rts_compare.comparison import Comparison
 from rts_compare.derivative_scores import loss_weights, scores
-from rts_compare.kept_measurements import Journal
+from rts_compare.kept_measurements import KeptMeasurements
 from rts_compare.left_out import limited
 from rts_compare.moving_scenes import moving
 from rts_compare.settings_search import Search
@@ -181,12 +181,12 @@ class TestLimited:
 # -------------------------------------------------------------------------------------------------------- journal
 
 
-class TestJournal:
+class TestKeptMeasurements:
     def test_kept(self, tmp_path):
         path = tmp_path / "deep" / "journal"
-        Journal(path).put({"error": 0.1}, "error", "translation", 1)
-        assert Journal(path).get("error", "translation", 1) == {"error": 0.1}
-        assert Journal(path).get("error", "translation", 2) is None
+        KeptMeasurements(path).put({"error": 0.1}, "error", "translation", 1)
+        assert KeptMeasurements(path).get("error", "translation", 1) == {"error": 0.1}
+        assert KeptMeasurements(path).get("error", "translation", 2) is None
 
     @given(st.integers(0, 200))
     def test_cut_off_anywhere(self, at):
@@ -195,22 +195,22 @@ class TestJournal:
 
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "journal"
-            journal = Journal(path)
+            journal = KeptMeasurements(path)
             for n in range(8):
                 journal.put(n, "key", n)
             text = path.read_bytes()
             path.write_bytes(text[:at])
             whole = text[:at].count(b"\n")
-            again = Journal(path)
+            again = KeptMeasurements(path)
             assert [again.get("key", n) for n in range(8)] == [n if n < whole else None for n in range(8)]
             again.put("new", "key", "new")
-            assert Journal(path).get("key", "new") == "new"
+            assert KeptMeasurements(path).get("key", "new") == "new"
 
     def test_damaged(self, tmp_path):
         path = tmp_path / "journal"
         path.write_text("not a measurement\n")
         with pytest.raises(InputError, match="line 1 of .* is no measurement; remove the file"):
-            Journal(path)
+            KeptMeasurements(path)
 
 
 # -------------------------------------------------------------------------------------------------------- compare
@@ -259,7 +259,7 @@ class TestCompare:
         torch = pytest.importorskip("torch")
         comparison, _ = found
         cards = scene("translation")
-        measured = measurements.Measurements(cards, Journal(), [engine_named("torch")], truths=kept, samples=6)
+        measured = measurements.Measurements(cards, KeptMeasurements(), [engine_named("torch")], truths=kept, samples=6)
         pixel = measured.pixel("translation")
         # The nearer card moves by a pixel at its own depth; each of its samples, at its own.
         assert pixel == pytest.approx(2 * 3 * np.tan(np.radians(20)) / SIDE, rel=1e-3)
@@ -283,7 +283,7 @@ class TestCompare:
     def test_another_run_measures_nothing(self, found, kept, monkeypatch):
         comparison, output = found
         monkeypatch.setattr(measurements.Measurements, "_measured", None)
-        monkeypatch.setattr(interleaved_timing.Turns, "timed", None)
+        monkeypatch.setattr(interleaved_timing.InterleavedTiming, "timed", None)
         again = compare(scene("translation", "shape"), output=output, truths=kept, **SMALL)
         assert again.data == comparison.data
 
@@ -306,7 +306,7 @@ class TestCompare:
             monkeypatch.setattr(of, name, part)
 
         interrupted(measurements.Measurements, "_measured")
-        interrupted(interleaved_timing.Turns, "timed")
+        interrupted(interleaved_timing.InterleavedTiming, "timed")
         interruptions = 0
         while True:
             try:
@@ -478,7 +478,7 @@ def modelled(monkeypatch):
         assert callable(self.calls[name]())
         return [1e-3 * cost(Setting(*name))] * 2
 
-    monkeypatch.setattr(interleaved_timing.Turns, "timed", timed)
+    monkeypatch.setattr(interleaved_timing.InterleavedTiming, "timed", timed)
     return cost
 
 

@@ -20,7 +20,7 @@ from rts_compare.failures.table_columns import Method
 from rts_compare.left_out import one_line
 from rts_compare.moving_scenes import Scene, parts_of
 from rts_compare.other_renderers.installed_renderers import Deodr, Mitsuba, MitsubaScene
-from rts_compare.other_renderers.renderer_input import Peer, Unsuited, seen
+from rts_compare.other_renderers.renderer_input import Peer, Unsuited, renderer_input
 
 Weigh = Callable[[np.ndarray], np.ndarray]
 """An image (H, W, 3) → the derivative of a loss with respect to it."""
@@ -161,7 +161,7 @@ class Other(Renderer):
 
     def _peer(self, scene: Scene) -> Peer:
         try:
-            given = seen(scene)
+            given = renderer_input(scene)
             if self.method.peer == "DEODR":
                 return Deodr(given)
             return Mitsuba(MitsubaScene(given), self.method.options["spp"])

@@ -13,7 +13,7 @@ from rts_compare.failures.method_renderers import Unable, quiet, renderer, shift
 from rts_compare.failures.table_cells import Context, Outcome, cannot, graded
 from rts_compare.failures.table_columns import Method
 from rts_compare.moving_scenes import Scene, parts_of
-from rts_compare.other_renderers.renderer_input import seen
+from rts_compare.other_renderers.renderer_input import renderer_input
 from rts_compare.true_derivatives import area_image, lattice, truth
 
 ERRORS = 0.2, 0.5
@@ -30,7 +30,7 @@ SEEDS_OF_MITSUBA = 5
 
 def pixel_of(scene: Scene, mode: str) -> float:
     """How far along a mode what moves fastest moves by a pixel."""
-    return 1.0 / (seen(scene).fastest(mode) or 1.0)
+    return 1.0 / (renderer_input(scene).fastest(mode) or 1.0)
 
 
 class Derivative(NamedTuple):
@@ -79,7 +79,7 @@ class Derivative(NamedTuple):
         other = scene if self.reference is None else self.reference()
         step = pixel if self.reference is None else pixel_of(other, mode)
         with quiet():
-            true, noise = truth(other, mode, step, samples=context.samples, folder=context.folder)
+            true, noise, _ = truth(other, mode, step, samples=context.samples, folder=context.folder)
         low = low_pass(true)
         return {
             "error": relative_l2(low_pass(found), low, low),

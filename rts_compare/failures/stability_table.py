@@ -18,7 +18,7 @@ from rts_compare.environment import environment
 from rts_compare.failures.table_cells import Context, Outcome, Row, cannot
 from rts_compare.failures.table_columns import METHODS, Method
 from rts_compare.failures.table_rows import ROWS
-from rts_compare.kept_measurements import Journal
+from rts_compare.kept_measurements import KeptMeasurements
 
 MARKS = {"ok": "", "degraded": "~ ", "failed": "✗ ", "cannot": "–"}
 PACKAGES = ("rasterize-then-splat", "numpy", "torch", "deodr", "mitsuba")
@@ -123,18 +123,18 @@ def stability(
     kept = None if folder is None else folder / ".stability.jsonl"
     if fresh and kept is not None:
         kept.unlink(missing_ok=True)
-    journal = Journal(kept)
+    measured = KeptMeasurements(kept)
     context = Context(seeds, truth_samples, folder, steps)
     found: list[tuple[Row, list[Outcome]]] = []
     with phases(progress) as phase:
         for row in taken:
             done, cells = phase(row.name, len(columns)), []
             for method in columns:
-                cells.append(_measured(row, method, context, journal))
+                cells.append(_measured(row, method, context, measured))
                 done()
             found.append((row, cells))
     table = Stability(
-        [m.name for m in columns], found, {**environment(PACKAGES), "date": journal.since, "seeds": seeds}
+        [m.name for m in columns], found, {**environment(PACKAGES), "date": measured.since, "seeds": seeds}
     )
     if folder is not None:
         table.write(folder)
@@ -158,10 +158,10 @@ def _named(what: str, wanted: Sequence[str] | None, known: Mapping[str, Any]) ->
     return [known[name] for name in wanted]
 
 
-def _measured(row: Row, method: Method, context: Context, journal: Journal) -> Outcome:
+def _measured(row: Row, method: Method, context: Context, measured: KeptMeasurements) -> Outcome:
     """A cell, measured once."""
     key = (row.name, method.name, context.seeds, context.steps, context.samples)
-    kept = journal.get(*key)
+    kept = measured.get(*key)
     if kept is None:
         try:
             cell = row.measure(method, context)
@@ -169,7 +169,7 @@ def _measured(row: Row, method: Method, context: Context, journal: Journal) -> O
             if "is missing" not in str(error):
                 raise
             cell = cannot(str(error))
-        kept = journal.put(_plain(cell._asdict()), *key)
+        kept = measured.put(_plain(cell._asdict()), *key)
     return Outcome(**kept)
 
 

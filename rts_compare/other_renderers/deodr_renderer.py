@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rts_compare.derivative_scores import loss_weights
-from rts_compare.other_renderers.renderer_input import Peer, Seen, Unsuited
+from rts_compare.other_renderers.renderer_input import Peer, RendererInput, Unsuited
 
 STEP = 1e-6
 """Length of a difference, pixels."""
@@ -26,7 +26,7 @@ class Deodr(Peer):
     """A scene in DEODR: all parts as one mesh.
 
     Args:
-        seen: the scene.
+        given: the scene.
 
     Raises:
         ImportError: DEODR is not installed.
@@ -35,24 +35,24 @@ class Deodr(Peer):
 
     name = "DEODR"
 
-    def __init__(self, seen: Seen):
+    def __init__(self, given: RendererInput):
         import deodr
         from deodr.differentiable_renderer import Camera, Scene3D
 
-        if any((-p.vertices[:, 2] < seen.planes[0]).any() for p in seen.parts):
+        if any((-p.vertices[:, 2] < given.planes[0]).any() for p in given.parts):
             raise Unsuited("it clips no triangles, and some reach before the near plane")
-        self.seen, self.settings = seen, {}
-        self.vertices = np.concatenate([p.vertices for p in seen.parts])
-        self.colors = np.concatenate([p.colors for p in seen.parts])
+        self.given, self.settings = given, {}
+        self.vertices = np.concatenate([p.vertices for p in given.parts])
+        self.colors = np.concatenate([p.colors for p in given.parts])
         # Gradients are refused with perspective-correct interpolation, and where back faces are drawn.
         self.scene: Any = Scene3D(sigma=1.0, perspective_correct=False, integer_pixel_centers=False)
-        first = np.cumsum([0, *(len(p.vertices) for p in seen.parts)])
-        faces = np.concatenate([p.faces + f for p, f in zip(seen.parts, first, strict=False)])
+        first = np.cumsum([0, *(len(p.vertices) for p in given.parts)])
+        faces = np.concatenate([p.faces + f for p, f in zip(given.parts, first, strict=False)])
         self.scene.set_mesh(deodr.ColoredTriMesh(faces.astype(np.int32), self.vertices, colors=self.colors))
         self.scene.set_light(None, 1.0)
         self.scene.set_background_color(np.zeros(3))
-        height, width = seen.size
-        intrinsic = np.array([[seen.focal, 0, width / 2], [0, seen.focal, height / 2], [0, 0, 1]])
+        height, width = given.size
+        intrinsic = np.array([[given.focal, 0, width / 2], [0, given.focal, height / 2], [0, 0, 1]])
         view = np.array([[1.0, TURN, 0, 0], [TURN, -1, 0, 0], [0, 0, -1, 0]])
         self.camera = Camera(view, intrinsic, height, width)
 
@@ -71,7 +71,7 @@ class Deodr(Peer):
     def derivative(self, mode: str, seed: int = 0) -> np.ndarray:
         """See `Peer`."""
         move, change = self._velocity(mode)
-        step = STEP / (self.seen.fastest(mode) or 1.0)
+        step = STEP / (self.given.fastest(mode) or 1.0)
         rest = self._render(self.vertices, self.colors)
         ahead = self._render(self.vertices + step * move, self.colors + step * change) - rest
         behind = rest - self._render(self.vertices - step * move, self.colors - step * change)
@@ -81,7 +81,7 @@ class Deodr(Peer):
     def gradient(self, mode: str, weights: np.ndarray | None = None) -> Callable[[], float]:
         """See `Peer`. DEODR computes the gradients of vertices and of colours in any mode."""
         move, change = self._velocity(mode)
-        weights = np.array(loss_weights(*self.seen.size)[0] if weights is None else weights, np.float64)
+        weights = np.array(loss_weights(*self.given.size)[0] if weights is None else weights, np.float64)
 
         def slope() -> float:
             self._render(self.vertices, self.colors)
@@ -94,7 +94,7 @@ class Deodr(Peer):
 
     def _velocity(self, mode: str) -> tuple[np.ndarray, np.ndarray]:
         """Those of vertices and of colours, (V, 3) each."""
-        pairs = list(zip(self.seen.parts, self.seen.velocity(mode), strict=True))
+        pairs = list(zip(self.given.parts, self.given.velocity(mode), strict=True))
         moves = [np.zeros_like(p.vertices) if v.vertices is None else v.vertices for p, v in pairs]
         changes = [np.zeros_like(p.colors) if v.colors is None else v.colors for p, v in pairs]
         return np.concatenate(moves), np.concatenate(changes)

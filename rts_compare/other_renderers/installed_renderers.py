@@ -9,7 +9,7 @@ from rts_compare.left_out import one_line
 from rts_compare.moving_scenes import Scene
 from rts_compare.other_renderers.deodr_renderer import Deodr
 from rts_compare.other_renderers.mitsuba_renderer import Mitsuba, MitsubaScene
-from rts_compare.other_renderers.renderer_input import Peer, Seen, Unsuited, seen
+from rts_compare.other_renderers.renderer_input import Peer, RendererInput, Unsuited, renderer_input
 
 SPP = (1, 4, 16)
 """Samples a pixel of Mitsuba."""
@@ -27,7 +27,7 @@ def peers(scene: Scene, spp: Sequence[int] = SPP, engine: Engine | None = None) 
         The renderers, and a line for each that is left out.
     """
     try:
-        given = seen(scene, engine)
+        given = renderer_input(scene, engine)
     except Exception as error:
         reason = str(error) if isinstance(error, Unsuited) else f"{type(error).__name__}: {error}"
         return [], [f"DEODR and Mitsuba: {one_line(reason)}"]
@@ -43,10 +43,10 @@ def peers(scene: Scene, spp: Sequence[int] = SPP, engine: Engine | None = None) 
     return found, left_out
 
 
-def _deodr(given: Seen, spp: Sequence[int]) -> list[Peer]:
+def _deodr(given: RendererInput, spp: Sequence[int]) -> list[Peer]:
     return [Deodr(given)]
 
 
-def _mitsuba(given: Seen, spp: Sequence[int]) -> list[Peer]:
+def _mitsuba(given: RendererInput, spp: Sequence[int]) -> list[Peer]:
     scene = MitsubaScene(given)
     return [Mitsuba(scene, n) for n in spp]

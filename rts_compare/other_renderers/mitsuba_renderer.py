@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from rts_compare.derivative_scores import loss_weights
-from rts_compare.other_renderers.renderer_input import Peer, Seen
+from rts_compare.other_renderers.renderer_input import Peer, RendererInput
 
 
 @cache
@@ -104,27 +104,29 @@ class MitsubaScene:
     """A scene in Mitsuba, for any number of samples: each part a mesh that emits its colours.
 
     Args:
-        seen: the scene.
+        given: the scene.
 
     Raises:
         ImportError: see `mitsuba`.
     """
 
-    def __init__(self, seen: Seen):
+    def __init__(self, given: RendererInput):
         mi = mitsuba()
         with tempfile.TemporaryDirectory() as folder:
             meshes = {
                 f"part{i}": emitter(p.vertices, p.faces, f"{folder}/{i}.ply", p.colors)
-                for i, p in enumerate(seen.parts)
+                for i, p in enumerate(given.parts)
             }
-            self.scene = mi.load_dict({"type": "scene", "sensor": sensor(seen.size, seen.fov, seen.planes), **meshes})
-        self.seen, self.integrator, self.parameters = seen, integrator(), mi.traverse(self.scene)
+            self.scene = mi.load_dict(
+                {"type": "scene", "sensor": sensor(given.size, given.fov, given.planes), **meshes}
+            )
+        self.given, self.integrator, self.parameters = given, integrator(), mi.traverse(self.scene)
         self.moved: dict[str, Any] = {}
 
     def moving(self, mode: str) -> dict[str, tuple[Any, Any]]:
         """Name of a parameter that a mode changes → its value at rest, and its velocity."""
         found = {}
-        for index, velocity in enumerate(self.seen.velocity(mode)):
+        for index, velocity in enumerate(self.given.velocity(mode)):
             for entry, change in (("vertex_positions", velocity.vertices), ("vertex_color", velocity.colors)):
                 if change is not None:
                     key = f"part{index}.{entry}"
@@ -166,7 +168,7 @@ class Mitsuba(Peer):
         dr = import_module("drjit")
         moving = self.scene.moving(mode)
         if not moving:
-            return np.zeros((*self.scene.seen.size, 3))
+            return np.zeros((*self.scene.given.size, 3))
         t = dr.opaque(mitsuba().Float, 0.0)  # A literal would take the length of what it is multiplied with.
         dr.enable_grad(t)
         values = {key: value + t * change for key, (value, change) in moving.items()}
@@ -199,7 +201,7 @@ class Mitsuba(Peer):
         moving = self.scene.moving(mode)
         rest = {key: value for key, (value, _) in moving.items()}
         changes = {key: np.array(change) for key, (_, change) in moving.items()}
-        weights = loss_weights(*self.scene.seen.size)[0] if weights is None else weights
+        weights = loss_weights(*self.scene.given.size)[0] if weights is None else weights
         w = mitsuba().TensorXf(np.asarray(weights, np.float32))
 
         def slope() -> float:

@@ -61,7 +61,7 @@ class Velocity(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Seen:
+class RendererInput:
     """What other renderers are given.
 
     Attributes:
@@ -131,7 +131,7 @@ class Peer(abc.ABC):
         """
 
 
-def seen(scene: Scene, engine: Engine | None = None) -> Seen:
+def renderer_input(scene: Scene, engine: Engine | None = None) -> RendererInput:
     """A scene at rest, and its velocities in every mode.
 
     Velocities are central differences over a pixel: exact up to rounding where vertices move along straight lines.
@@ -159,13 +159,13 @@ def seen(scene: Scene, engine: Engine | None = None) -> Seen:
     for index, part in enumerate(rest):
         _check_joined(index, part)
     wound = tuple(_turned(a) if b.cull == "none" else a for a, b in zip(rest, parts, strict=True))
-    return Seen(scene.size, focal, (near, far), wound, velocities)
+    return RendererInput(scene.size, focal, (near, far), wound, velocities)
 
 
 # --------------------------------------------------------------------------------------------------------------- parts
 
 
-def _on_host(scene: Scene, mode: str, t: float, engine: Engine | None) -> tuple[list[Part], Camera]:
+def _on_host(scene: Scene, mode: str, t: float, engine: Engine | None) -> tuple[Sequence[Part], Camera]:
     """The parts and the camera at t, their arrays in NumPy."""
     parts, camera = scene.at(scene.moved(mode, t, engine))
     host = map_leaves(lambda x: engine_of(x).to_numpy(engine_of(x).stop_gradient(x)), (parts, camera))
@@ -339,7 +339,7 @@ def _slope(ahead: np.ndarray, behind: np.ndarray, step: float) -> np.ndarray | N
 
 
 def _fastest(parts: Sequence[Colored], velocities: Sequence[Velocity], focal: float, near: float) -> float:
-    """See `Seen.fastest`; what lies before the near plane does not count."""
+    """See `RendererInput.fastest`; what lies before the near plane does not count."""
     speed = 0.0
     for part, velocity in zip(parts, velocities, strict=True):
         if velocity.colors is not None:
