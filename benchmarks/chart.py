@@ -1,7 +1,8 @@
 """Speed against accuracy on all built-in scenes: what `rts compare` measures, as files to keep.
 
-Writes to benchmarks/results a PNG and a JSON a scene, chart.html for all of them, and summary.md: what to take for
-10 %, 3 % and 1 % of error. What is measured is kept in a folder of its own, and a run that is interrupted goes on:
+Writes to benchmarks/results a PNG and a JSON a scene, and summary.md: what to take for 10 %, 3 % and 1 % of error; and
+chart.html, a page of all of them, which is not kept: `--draw` makes it of the JSON files. What is measured is kept in a
+folder of its own, and a run that is interrupted goes on:
 
     python -m benchmarks.chart                                 # most of two hours on two cores
     python -m benchmarks.chart --scenes "thin wires" -o /tmp/wires

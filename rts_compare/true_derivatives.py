@@ -53,7 +53,10 @@ class Truth(NamedTuple):
     @property
     def noise(self) -> dict[str, float]:
         """Relative L2 of what the grids disagree on: raw, and through the low-pass."""
-        return {"relative_l2": relative_l2(self.grids[0], self.grids[1], self.derivative), "low_relative_l2": 2 * self.error}
+        return {
+            "relative_l2": relative_l2(self.grids[0], self.grids[1], self.derivative),
+            "low_relative_l2": 2 * self.error,
+        }
 
 
 def lattice(samples: int) -> np.ndarray:

@@ -12,7 +12,6 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-import torch
 
 import rts
 from benchmarks.accuracy import methods, scenes
@@ -21,6 +20,7 @@ from benchmarks.accuracy.figures import CONTRAST_LOW, show, signed
 from benchmarks.report import table
 from rts.diagnostics.smoothing import low_pass
 from rts_compare.derivative_scores import all_scores
+from rts_compare.failures.method_renderers import Own
 
 FAILURES = "thin plate", "planes at two degrees", "three planes", "bar through card"
 SHOWN = slice(40, 216)
@@ -50,12 +50,8 @@ def scene(name: str) -> scenes.Scene:
 
 def derivative(chosen: scenes.Scene, layers: int, fine: int, crossings: bool) -> np.ndarray:
     """(H, W, 3) by forward mode."""
-
-    def image(t: torch.Tensor) -> torch.Tensor:
-        options = {"splatter": VISIBLE(crossings=crossings), "layers": layers, "supersample": fine}
-        return rts.render(chosen.at(t), chosen.camera, chosen.size, **options)[..., :3]
-
-    return torch.func.jvp(image, (torch.zeros(()),), (torch.ones(()),))[1].numpy()
+    options = {"splatter": VISIBLE(crossings=crossings), "layers": layers, "supersample": fine}
+    return Own(chosen.moving, options).derivative(scenes.MOTION)
 
 
 def cell(found: np.ndarray, true: np.ndarray) -> str:
