@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import rts
-import rts_compare
 import rts.diagnostics
+import rts_compare
 from rts import Camera
 from rts.plugin_api.operations import combine, gradient
 from rts_surfaces.implicit.narrow_band import NarrowBand
