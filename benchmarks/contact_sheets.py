@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 
 import rts
 from benchmarks.meshes import DATA
-from rts.cli.views import bounds_of, orbit
+from rts.cli.default_camera import bounds_of, orbit
 from rts.errors import InputError
 
 MODELS = {

@@ -21,7 +21,7 @@ import numpy as np
 import rts
 from benchmarks.camera import DISTANCE, camera, supersampled
 from benchmarks.meshes import mesh
-from rts.engines import namespace
+from rts.arrays.engines import namespace
 
 SIZE = (128, 128)
 MESHES = ("teapot", "bunny", "nefertiti")

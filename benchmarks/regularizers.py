@@ -25,7 +25,7 @@ from benchmarks.meshes import MESHES, kept_mesh
 from benchmarks.report import environment, table
 from benchmarks.speed.memory import growth
 from benchmarks.timing import in_turn
-from rts.engines import engine_named
+from rts.arrays.engines import engine_named
 from rts.regularizers import ARAP, EdgeLength, Laplacian, NormalConsistency, Regularizer
 from rts.threads import thread_count
 

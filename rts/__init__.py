@@ -13,14 +13,15 @@ The surfaces that come with it are attributes, too, loaded when they are first u
 from typing import TYPE_CHECKING, Any
 
 from rts import errors, registry, regularizers
-from rts.camera import Camera
+from rts.arrays.engines import Engine, engine_of, namespace
+from rts.contracts.gbuffer import GBuffer
 from rts.contracts.residuals import Residuals
 from rts.contracts.sampler import Sampler
 from rts.contracts.shader import Shader
 from rts.contracts.splatter import Splatter, SummingSplatter
 from rts.contracts.surface import Rate, RaySurface, Surface, TriangleSurface
+from rts.diagnostics.explain import explain
 from rts.diagnostics.gradients import check_gradient, gradient_image
-from rts.engines import Engine, engine_of, namespace
 from rts.errors import (
     EngineError,
     InputError,
@@ -28,18 +29,14 @@ from rts.errors import (
     RtsError,
     RtsWarning,
 )
-from rts.explaining import explain
 from rts.files.images import load_image, save_animation, save_image
 from rts.files.models import load
-from rts.files.views import load_views
+from rts.files.posed_images import load_views
 from rts.fitting.fit import fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.losses import Loss
 from rts.fitting.schedule import Stage, pyramid
-from rts.gbuffer import GBuffer
 from rts.ndc import Ndc
-from rts.operations.rigid import rigid
-from rts.parts import Part
 from rts.radiance_fields import load_radiance_field
 from rts.registry import plugin, plugins
 from rts.rendering.batched import render_views
@@ -48,6 +45,9 @@ from rts.rendering.renderer import prepare
 from rts.rendering.samples import sample
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.triangle_sampler import TriangleSampler
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
+from rts.scene.rigid import rigid
 from rts.warming import warmup
 
 _MOVED = {

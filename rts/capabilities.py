@@ -6,8 +6,8 @@ import functools
 from collections.abc import Mapping
 from typing import Any
 
-from rts.contracts.plugin import PROMISES, overrides, promised
 from rts.errors import PluginError
+from rts.plugin_base import PROMISES, overrides, promised
 
 BASES = {
     "rts.surfaces": "Surface",

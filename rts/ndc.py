@@ -9,11 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from rts.arguments import check_pixels, check_positive
-from rts.arrays import described, from_numbers, shape_of
-from rts.engines import constants, context_of, namespace
+from rts.arrays.argument_checks import check_pixels, check_positive
+from rts.arrays.array_functions import described, from_numbers, shape_of
+from rts.arrays.engines import constants, context_of, namespace
+from rts.arrays.trees import Array
 from rts.errors import InputError
-from rts.trees import Array
 
 NEAREST, FARTHEST = 1e-6, 1e6
 """Depths, over that of the near plane, to which points behind the camera and at infinity are brought."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from rts import registry
-from rts.arguments import check_pixels, check_planes, quoted
-from rts.camera import Camera
+from rts.arrays.argument_checks import check_pixels, check_planes, quoted
 from rts.errors import InputError
 from rts.files.paths import as_path
-from rts.files.views import colour_named
+from rts.files.posed_images import colour_named
 from rts.ndc import Ndc
+from rts.scene.camera import Camera
 
 
 def load_radiance_field(path: Any) -> Any:

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rts import companion, registry
-from rts.camera import Camera
-from rts.checks import check_splatter
-from rts.engines import engine_named
+from rts.arrays.engines import engine_named
+from rts.contracts.checks import check_splatter
 from rts.operations.operation import Operation
-from rts.operations.rigid import rigid
-from rts.parts import Part
 from rts.rendering.image import render
 from rts.rendering.samples import sample
 from rts.rendering.scene import Scene
 from rts.rendering.splats import to_splats
 from rts.sampling.adaptive import Adaptive
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
+from rts.scene.rigid import rigid
 from rts.threads import read_only
 
 if TYPE_CHECKING:

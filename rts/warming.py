@@ -14,7 +14,7 @@ from contextlib import ExitStack
 import numpy as np
 
 from rts import companion
-from rts.arguments import quoted
+from rts.arrays.argument_checks import quoted
 from rts.errors import InputError, RtsError
 from rts.threads import thread_count
 

@@ -99,7 +99,7 @@ def moving(
     - rotation: about the upright axis of the camera, through the middle of what moves;
     - shape: the points that the surface is made of swell, unevenly, about their middle; what it reads and is no points,
       such as radii or values on a lattice, changes by one number;
-    - color: the base colour of the parts, which `rts.shading` describes, changes, each channel in another way;
+    - color: the base colour of the parts, which `rts.shading.shaders` describes, changes, each channel in another way;
     - camera: it moves ahead.
 
     Args:

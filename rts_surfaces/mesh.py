@@ -15,7 +15,7 @@ from rts.plugin_api.checks import fingerprint, index_table, pieces, quoted
 from rts.plugin_api.operations import interpolate, take
 from rts.plugin_api.records import Proxy, Samples
 from rts.plugin_api.threads import read_only
-from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows
+from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
 
 VERTEX_ATTRIBUTES = ("normals", "colors", "uv")
 

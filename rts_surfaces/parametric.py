@@ -17,7 +17,7 @@ from rts.plugin_api.arrays import Array, Tree
 from rts.plugin_api.checks import check_positive, is_count
 from rts.plugin_api.records import Proxy, Rays, Samples
 from rts_surfaces.tiles import MOST, Allowed, Shapes, Tiles, allowed_in, by_error, shapes, split, triangles, uniform
-from rts_surfaces.views import view_key, view_of
+from rts_surfaces.view_cells import view_key, view_of
 
 TOLERANCE = 0.1
 """Pixels that a triangle may be off the surface where there may be an outline."""

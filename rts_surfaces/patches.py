@@ -13,7 +13,7 @@ from rts.plugin_api.arrays import Array, Tree, constants
 from rts.plugin_api.records import Rays, Samples
 from rts.plugin_api.threads import parallel, read_only
 from rts_surfaces.bicubic import normals, values
-from rts_surfaces.entries import G_BUFFER_NAMES, WIDTHS, check_entry
+from rts_surfaces.parameter_checks import G_BUFFER_NAMES, WIDTHS, check_entry
 from rts_surfaces.parametric import LIMITS, Geometry, Parametric
 from rts_surfaces.tiles import Tiles
 

@@ -15,7 +15,7 @@ import numpy as np
 from rts import InputError
 from rts.plugin_api.records import Proxy
 from rts.plugin_api.threads import parallel, read_only
-from rts_surfaces.views import View
+from rts_surfaces.view_cells import View
 
 MOST = 256
 """The largest number of cuts along a side of a tile."""
@@ -152,7 +152,7 @@ def shapes(tiles: Tiles, points: Points, beside: float = 0.0) -> Shapes:
         points: the surface.
         beside: how far from the border of a tile, and from the ends of an edge, its grid begins, a share of its size.
     """
-    from rts_surfaces import fineness_loops
+    from rts_surfaces import tile_rates_loops
 
     (count, width), edges = tiles.corners.shape, len(tiles.edge_tiles)
     grid = GRID[width]
@@ -165,14 +165,14 @@ def shapes(tiles: Tiles, points: Points, beside: float = 0.0) -> Shapes:
         found = _expanded(tiles, points, np.arange(count)[some], local[None])
         part = out.normals[some], out.places[some], out.bends[some]
         work = 100 * len(local) * len(found)
-        parallel(fineness_loops.shapes, len(found), found, tiles.frames[some], *part, work=work)
+        parallel(tile_rates_loops.shapes, len(found), found, tiles.frames[some], *part, work=work)
     corners = _CORNERS[width]
     along = np.roll(corners, -1, axis=0) - corners
     for some in _slices(edges):
         tile, side = tiles.edge_tiles[some].T
         found = _expanded(tiles, points, tile, corners[side][:, None] + steps[:, None] * along[side][:, None])
         given = found, tiles.frames[tile], along[side], out.curves[some]
-        parallel(fineness_loops.curves, len(found), *given, work=100 * grid * len(found))
+        parallel(tile_rates_loops.curves, len(found), *given, work=100 * grid * len(found))
     return out
 
 
@@ -216,23 +216,23 @@ def allowed_in(view: View, found: Shapes, fine: float, coarse: float) -> Allowed
         fine: pixels, where a tile or an edge may have an outline.
         coarse: pixels elsewhere.
     """
-    from rts_surfaces import fineness_loops
+    from rts_surfaces import tile_rates_loops
 
     count, angle = len(found.bends), min(view.angle, math.pi / 2)
     allowed = Allowed(np.empty(count), np.empty(count), np.empty(count, np.int8))
     cone = np.array([*view.axis, math.sin(angle), math.cos(angle)])
     seen = view.eye, view.toward, view.parallel, view.aside, view.along, view.spread, cone, np.array([fine, coarse])
     given = found.places, found.normals, found.bends, *seen
-    parallel(fineness_loops.outlines, count, *given, *allowed, work=500 * count)
+    parallel(tile_rates_loops.outlines, count, *given, *allowed, work=500 * count)
     return allowed
 
 
 def by_error(tiles: Tiles, found: Shapes, allowed: Allowed) -> tuple[np.ndarray, np.ndarray]:
     """Rates of edges (E,) and of tiles (n, 2), int32, so that triangles are off by no more than is allowed."""
-    from rts_surfaces import fineness_loops
+    from rts_surfaces import tile_rates_loops
 
     inner, edges = np.empty((len(tiles.patch), 2), np.int32), np.empty(len(tiles.edge_tiles), np.int32)
-    fineness_loops.rates(
+    tile_rates_loops.rates(
         found.bends, found.curves, *allowed, tiles.sides, LEAST[tiles.sides.shape[1]], MOST, inner, edges
     )
     return edges, inner

@@ -4,7 +4,6 @@ import numpy as np
 from helpers import icosphere, quad, to_numpy
 
 import rts
-from rts.sampling import fine
 
 MESH = rts.plugin("rts.surfaces", "mesh")
 CAMERA = rts.Camera.look_at((0.4, 0.5, 3.2), (0, 0, 0))

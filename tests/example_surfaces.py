@@ -3,7 +3,7 @@
 import numpy as np
 
 import rts
-from rts.arrays import described, unit
+from rts.arrays.array_functions import described, unit
 from rts.plugin_api.operations import combine
 from rts.plugin_api.records import ArraySpec, Proxy, RayHits
 

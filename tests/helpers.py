@@ -7,9 +7,9 @@ import pytest
 
 import rts
 from rts import Camera, Part
+from rts.arrays.engines import is_constant
+from rts.arrays.trees import map_leaves
 from rts.contracts.records import Cells, Splats
-from rts.engines import is_constant
-from rts.trees import map_leaves
 
 
 def _torch_targets():

@@ -7,7 +7,7 @@ import numpy as np
 from helpers import rotation
 
 from rts import Camera
-from rts.camera import orthographic, perspective
+from rts.scene.camera import orthographic, perspective
 from rts_backends.triangles import facing, pixel_matrix
 
 DOUBLE, SINGLE = np.finfo(np.float64).eps, np.finfo(np.float32).eps

@@ -153,8 +153,8 @@ def test_what_cannot_be_is_refused(wrong, told):
 
 
 def test_more_fine_samples_than_memory_are_refused_before_they_are_laid_out(monkeypatch):
-    monkeypatch.setattr(rts.checks, "MEMORY", 8000 * SIZE[0] * SIZE[1])
-    monkeypatch.setattr(rts.sampling.fine, "lay_out", lambda *_: pytest.fail("laid out"))
+    monkeypatch.setattr(rts.contracts.checks, "MEMORY", 8000 * SIZE[0] * SIZE[1])
+    monkeypatch.setattr(rts.sampling.fine_samples, "lay_out", lambda *_: pytest.fail("laid out"))
     with pytest.raises(rts.InputError, match=r"1 x \d+ pixels .* or fewer samples a pixel"):
         render(scene(), Adaptive(64))
 

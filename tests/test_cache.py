@@ -11,8 +11,8 @@ from helpers import arrays, icosphere, soup, to_numpy
 
 import rts
 from rts import Camera, GBuffer, InputError, Part, PluginError, TriangleSampler, registry
-from rts.contracts.plugin import overrides
 from rts.plugin_api.records import Proxy
+from rts.plugin_base import overrides
 from rts.sampling import cache
 from rts.sampling.cache import KEPT, fingerprint
 

@@ -21,7 +21,7 @@ from helpers import (
 
 import rts
 from rts import Camera, InputError
-from rts.camera import look_at, orthographic, perspective
+from rts.scene.camera import look_at, orthographic, perspective
 
 pytestmark = pytest.mark.rendering
 

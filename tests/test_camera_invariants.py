@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from strategies import PROPERTIES, affine_maps, cameras, reals, rotations, sizes, vectors, views
 
 from rts import Camera
-from rts.camera import look_at
+from rts.scene.camera import look_at
 
 pytestmark = pytest.mark.rendering
 

@@ -15,7 +15,7 @@ import rts
 from rts.cli import demo
 from rts.cli import main as cli
 from rts.cli import pose_fit as pose
-from rts.cli.views import Bounds, bounds_of, orbit
+from rts.cli.default_camera import Bounds, bounds_of, orbit
 from rts.errors import InputError, PluginError
 
 pytestmark = pytest.mark.files

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import rts
 from rts import registry
-from rts.engines import engine_named
+from rts.arrays.engines import engine_named
 from rts.errors import InputError, PluginError, ToleranceWarning
 from rts.registry import plugin
 from rts_compare import compare, compared_settings, interleaved_timing, measurements, true_derivatives

@@ -142,7 +142,7 @@ def test_modes_do_not_disturb_one_another(peer_of):
 def test_they_agree_with_ours(peer_of, mode):
     torch = pytest.importorskip("torch")
     scene = two_parts()
-    engine = rts.engines.engine_of(torch.zeros(()))
+    engine = rts.engine_of(torch.zeros(()))
 
     def image(t):
         parts, camera = scene.at(scene.moved(mode, t, engine))
@@ -205,7 +205,7 @@ LEFT_OUT = {
         "not those of vertices",
     ),
     "alpha": (
-        SQUARE.replace(theta={**SQUARE.theta, "color": np.ones(4)}, shader=rts.shading.Unlit(opaque=False)),
+        SQUARE.replace(theta={**SQUARE.theta, "color": np.ones(4)}, shader=rts.shading.shaders.Unlit(opaque=False)),
         CAMERA,
         "part 0 is translucent",
     ),

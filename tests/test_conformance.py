@@ -13,14 +13,14 @@ from helpers import splats_of
 
 import rts
 from rts import GBuffer, InputError, Part, PluginError
-from rts.arrays import without_border
+from rts.arrays.array_functions import without_border
+from rts.arrays.engines import engine_of, namespace
 from rts.contracts.records import Request
-from rts.engines import engine_of, namespace
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import Fragments, RayHits
 from rts.registry import instance
-from rts.row_cameras import RowCameras
-from rts.shading import Depth, Normals, Unlit
+from rts.scene.row_cameras import RowCameras
+from rts.shading.shaders import Depth, Normals, Unlit
 from rts.splatting import Multi, Plain
 from rts.testing import (
     EngineConformance,
@@ -959,7 +959,7 @@ ODD_ENGINES = {
             value_and_grad=lambda self, f: (
                 lambda tree: (
                     (found := super(type(self), self).value_and_grad(f)(tree))[0],
-                    rts.trees.map_leaves(lambda x: 2 * x, found[1]),
+                    rts.arrays.trees.map_leaves(lambda x: 2 * x, found[1]),
                 )
             )
         )

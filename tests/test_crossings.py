@@ -7,7 +7,7 @@ import pytest
 from helpers import DIFFERENTIABLE, arrays, derivative, gradient, icosphere, low_passed, mesh_part, quad, splats_of
 
 import rts
-from rts.engines import constants, engine_of
+from rts.arrays.engines import constants, engine_of
 from rts.rendering import settings
 from rts.splatting import Visible, crossings
 from rts_backends.fused import splatters as fused

@@ -20,7 +20,7 @@ from helpers import (
 
 import rts
 from rts import Camera, Part
-from rts.trees import leaves, map_leaves
+from rts.arrays.trees import leaves, map_leaves
 
 pytestmark = pytest.mark.engines
 

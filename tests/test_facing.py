@@ -11,7 +11,7 @@ import rts
 from rts import splatting
 from rts.contracts.records import Cells
 from rts.sampling.facing import eye
-from rts.topology import pieces
+from rts.scene.topology import pieces
 from rts_backends.fused.splatters import Visible
 
 pytestmark = pytest.mark.splatting

@@ -12,7 +12,7 @@ import trimesh
 from PIL import Image
 
 import rts
-from rts.cli.views import bounds_of, orbit
+from rts.cli.default_camera import bounds_of, orbit
 from rts.errors import InputError, PluginError
 from rts.files.srgb import decode_srgb, encode_srgb
 

@@ -313,8 +313,8 @@ def test_a_derivative_that_is_not_finite_later_stops(target, method):
 
 def host(target, fn, x):
     """A host function of the library in a trace or out of it, as samplers are."""
+    from rts.arrays.engines import engine_of
     from rts.contracts.records import ArraySpec
-    from rts.engines import engine_of
 
     return engine_of(x).call_host(fn, (ArraySpec((1,), np.float32),), x)[0]
 

@@ -12,10 +12,10 @@ from helpers import DIFFERENTIABLE, arrays, gradient, splats_of, to_numpy
 
 import rts
 from rts import splatting
-from rts.arrays import without_border
+from rts.arrays.array_functions import without_border
 from rts_backends.fused import splatters as fused
 from rts_backends.fused.cells import Cells, Settings, _reach
-from rts_backends.fused.survey import BUSY, EMPTY, FLAT
+from rts_backends.fused.uniform_cells import BUSY, EMPTY, FLAT
 
 pytestmark = pytest.mark.splatting
 

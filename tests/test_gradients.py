@@ -24,7 +24,7 @@ def card(parameters):
 
 
 def arrays_like(x, value):
-    return rts.engines.engine_of(x).constant(value, x)
+    return rts.engine_of(x).constant(value, x)
 
 
 def parameters_of(target):
@@ -130,7 +130,7 @@ def test_a_direction_that_does_not_fit_is_refused():
 @pytest.mark.parametrize(
     "change, said",
     [
-        ({"scene": lambda p: card(p)[0]}, r"scene gave a rts.parts.Part; expected \(parts, camera\)"),
+        ({"scene": lambda p: card(p)[0]}, r"scene gave a rts.scene.parts.Part; expected \(parts, camera\)"),
         ({"scene": lambda p: None}, "scene gave None"),
         ({"loss": lambda image: image}, "loss gave .*; expected a .* scalar"),
         ({"loss": lambda image: 1.0}, "loss gave a float"),

@@ -12,7 +12,7 @@ from helpers import DIFFERENTIABLE, arrays, box, icosphere, quad, soup, to_numpy
 import rts
 import rts.fitting.least_squares
 from rts import splatting
-from rts.engines import engine_of
+from rts.arrays.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
 from rts.rendering import settings
@@ -599,7 +599,7 @@ def test_targets_of_an_engine_must_be_finite_too(target):
     [
         (lambda: None, "scene gave None; expected an rts.Part or several, or a tuple"),
         (lambda: (1, 2, 3), "scene gave a int, a int, a int"),
-        (lambda: (mesh(*box(0.5)), "front"), "scene gave a rts.parts.Part, a str"),
+        (lambda: (mesh(*box(0.5)), "front"), "scene gave a rts.scene.parts.Part, a str"),
         (lambda: np.zeros((26, 31, 4)), r"scene gave a numpy.ndarray of shape \(26, 31, 4\)"),
         (lambda: [], "scene gave nothing"),
     ],

@@ -12,12 +12,12 @@ from rts import splatting
 from rts.operations.combine import COMBINE, combine, interpolate
 from rts.operations.linear import AFFINE
 from rts.operations.projection import PROJECTION
-from rts.operations.rigid import RIGID
 from rts.operations.take import take
 from rts.plugin_api.records import Fragments, Proxy
 from rts.rendering.samples import sample
 from rts.sampling.merging import merge
 from rts.sampling.packing import lift
+from rts.scene.rigid import RIGID
 from rts_backends.fused import splatters as fused
 from rts_backends.fused.cells import Settings
 

@@ -11,10 +11,10 @@ from helpers import CAMERA, DIFFERENTIABLE, FRONT, SIZE, arrays, gradient, icosp
 
 import rts
 from rts import splatting
-from rts.checks import check_shader
-from rts.contracts.plugin import overrides, promised
+from rts.contracts.checks import check_shader
 from rts.contracts.records import Cells
 from rts.plugin_api.records import Proxy, Samples
+from rts.plugin_base import overrides, promised
 from rts.testing import SplatterConformance
 
 pytestmark = pytest.mark.core

@@ -10,7 +10,7 @@ from lattices import BALL, BOUNDS, TORUS, ball, on_lattice, torus
 
 import rts
 from rts import Camera, InputError, Part
-from rts.trees import map_leaves
+from rts.arrays.trees import map_leaves
 from rts_surfaces.implicit.narrow_band import NarrowBand
 
 pytestmark = pytest.mark.sampling

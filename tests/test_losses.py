@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 import rts
 from rts import splatting
-from rts.engines import engine_of
+from rts.arrays.engines import engine_of
 from rts.errors import InputError
 from rts.fitting.least_squares import normal_equations
 from rts_backends.fused.losses import cost_and_weight, in_numbers

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import rts
-from rts.engines import constants, engine_named
+from rts.arrays.engines import constants, engine_named
+from rts.arrays.trees import leaves, map_leaves
 from rts.errors import EmptyImageWarning, RtsError
 from rts.testing.compatibility import CAMERA, SIZE, example, single
-from rts.trees import leaves, map_leaves
 
 pytestmark = pytest.mark.core
 

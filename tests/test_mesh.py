@@ -92,7 +92,7 @@ def test_attributes_of_corners_are_read_through_their_own_indices(target):
 
 
 def heat_in_blue(theta, gbuffer, camera):
-    xp = rts.engines.namespace(gbuffer["position"])
+    xp = rts.namespace(gbuffer["position"])
     color = gbuffer["color"]
     one = xp.ones_like(color[:, :1])
     return xp.concat([color[:, :2], gbuffer["heat"], one], axis=1)
@@ -144,7 +144,7 @@ def test_a_deferred_attribute_is_computed_once_when_first_read():
 @pytest.mark.parametrize("target", DIFFERENTIABLE)
 def test_a_function_is_a_shader_and_its_theta_is_differentiable(target):
     def tinted(theta, gbuffer, camera):
-        xp = rts.engines.namespace(gbuffer["position"])
+        xp = rts.namespace(gbuffer["position"])
         one = xp.ones_like(gbuffer["position"])
         return xp.concat([one * theta["tint"] ** 2, one[:, :1]], axis=1)
 

@@ -21,10 +21,10 @@ import rts
 from rts import Camera, GBuffer
 from rts.contracts.records import Cells
 from rts.errors import InputError
-from rts.footprints import uv_footprint
 from rts.plugin_api.records import Samples
-from rts.shading import Textured
-from rts.textures import level_of, mip_levels, sample_texture
+from rts.shading.shaders import Textured
+from rts.shading.textures import level_of, mip_levels, sample_texture
+from rts.shading.uv_footprints import uv_footprint
 
 pytestmark = pytest.mark.rendering
 

@@ -12,9 +12,9 @@ from rts.operations.combine import COMBINE, combine, interpolate
 from rts.operations.inset import INSET, PAINTED, painted_inset, with_inset
 from rts.operations.linear import affine_map, affine_map_of_views, matmul
 from rts.operations.projection import projective_map, projective_map_of_views
-from rts.operations.rigid import RIGID
 from rts.operations.take import SHIFTED, TAKE, take
 from rts.plugin_api.operations import Operation
+from rts.scene.rigid import RIGID
 from rts.testing import OperationConformance
 from rts.testing.splatters import scattered
 from rts_backends.fused.image import IMAGE

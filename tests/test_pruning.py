@@ -9,11 +9,11 @@ from helpers import ALL, DIFFERENTIABLE, arrays, box, derivative, gradient, icos
 
 import rts
 from rts import splatting
+from rts.arrays.extremes import extent, largest, named
+from rts.arrays.trees import map_leaves
 from rts.contracts.records import ArraySpec
 from rts.rendering.samples import sample
 from rts.sampling import hidden
-from rts.sampling.extremes import extent, largest, named
-from rts.trees import map_leaves
 
 pytestmark = pytest.mark.sampling
 

@@ -6,9 +6,9 @@ from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, gradient, icosphere, mes
 
 import rts
 from rts import Camera, InputError, Ndc
-from rts.arrays import unit
+from rts.arrays.array_functions import unit
+from rts.arrays.trees import map_leaves, placed_leaves
 from rts.testing import ShaderConformance, SurfaceConformance
-from rts.trees import map_leaves, placed_leaves
 from rts_surfaces.radiance_field import lattice as lattices
 from rts_surfaces.radiance_field.chunks import in_chunks
 from rts_surfaces.radiance_field.field import RadianceField, load_radiance_field

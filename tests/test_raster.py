@@ -6,8 +6,8 @@ from helpers import box, icosphere, quad, rotation, soup
 
 import rts
 from rts import Camera
-from rts.camera import orthographic, perspective
 from rts.plugin_api.records import Proxy
+from rts.scene.camera import orthographic, perspective
 
 pytestmark = pytest.mark.sampling
 

@@ -8,9 +8,9 @@ import pytest
 from helpers import arrays, box, icosphere, quad
 
 import rts
+from rts.arrays.engines import engine_of
 from rts.diagnostics import gradients
 from rts.diagnostics.explanation.reasons import KINDS
-from rts.engines import engine_of
 
 pytestmark = pytest.mark.rendering
 

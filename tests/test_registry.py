@@ -232,7 +232,10 @@ def test_surfaces_and_entry_points_are_left_alone_until_an_attribute_asks_for_th
     loaded = modules_after("import rts\nassert not rts.registry._found\nassert not hasattr(rts, 'regulrizers')")
     assert not {m for m in loaded if m.startswith("rts_surfaces")}
     loaded = modules_after("import rts\nassert rts.registry._found == {}\nrts.Mesh")
-    assert {m for m in loaded if m.startswith("rts_surfaces.")} == {"rts_surfaces.entries", "rts_surfaces.mesh"}
+    assert {m for m in loaded if m.startswith("rts_surfaces.")} == {
+        "rts_surfaces.parameter_checks",
+        "rts_surfaces.mesh",
+    }
 
 
 # ------------------------------------------------------------------------------------------ what is loaded
@@ -249,7 +252,7 @@ def test_only_the_plugin_asked_for_is_imported():
     assert {"rts_backends.reference", "rts_surfaces.mesh"} <= loaded
     assert {m for m in loaded if m.startswith(("rts_backends.", "rts_surfaces."))} == {
         "rts_backends.reference",
-        "rts_surfaces.entries",
+        "rts_surfaces.parameter_checks",
         "rts_surfaces.mesh",
     }
     assert not loaded & set(HEAVY)

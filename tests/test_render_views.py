@@ -9,8 +9,8 @@ from helpers import ALL, DIFFERENTIABLE, TORCH, arrays, box, gradient, icosphere
 import rts
 from rts import Camera
 from rts.errors import EmptyImageWarning, InputError
-from rts.row_cameras import RowCameras
-from rts.shading import Lambert
+from rts.scene.row_cameras import RowCameras
+from rts.shading.shaders import Lambert
 from rts.splatting import side_by_side
 from rts.splatting.side_by_side import Picture
 
@@ -319,7 +319,7 @@ def test_shaded_views_move_with_cameras_and_lights_as_in_a_loop(shader):
 def test_compiled_views_are_shaded_together_in_pieces_of_rows_in_use(capacity, monkeypatch):
     jax = pytest.importorskip("jax")
     torch = pytest.importorskip("torch")
-    rows_in_use = pytest.importorskip("rts_backends.jax_engine.rows_in_use")
+    rows_in_use = pytest.importorskip("rts_backends.jax_engine.row_blocks")
     monkeypatch.setattr(rows_in_use, "LEAST", 1)
     monkeypatch.setattr(rows_in_use, "PIECE", 128)
     calls, part = [], mesh_part(icosphere(1))

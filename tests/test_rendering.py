@@ -26,7 +26,7 @@ from helpers import (
 
 import rts
 from rts import Camera, Part
-from rts.shading import Lambert, Textured
+from rts.shading.shaders import Lambert, Textured
 from rts.testing.compatibility import APRON
 
 pytestmark = pytest.mark.rendering

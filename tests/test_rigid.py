@@ -8,8 +8,8 @@ from helpers import ALL, arrays
 
 import rts
 from rts.operations.projection import projective_map
-from rts.operations.rigid import RIGID
 from rts.operations.take import take
+from rts.scene.rigid import RIGID
 
 pytestmark = pytest.mark.engines
 

@@ -9,7 +9,7 @@ pytestmark = pytest.mark.engines
 
 jax = pytest.importorskip("jax")
 columns = pytest.importorskip("rts_backends.jax_engine.columns")
-rows_in_use = pytest.importorskip("rts_backends.jax_engine.rows_in_use")
+rows_in_use = pytest.importorskip("rts_backends.jax_engine.row_blocks")
 jnp = jax.numpy
 
 ALL, PIECE = 21, 4

@@ -10,8 +10,8 @@ from test_raster import CAMERAS, KINDS, PIXELS, cast, grid, triangles
 
 import rts
 from rts import Camera
-from rts.camera import perspective
 from rts.plugin_api.records import Proxy
+from rts.scene.camera import perspective
 
 pytestmark = pytest.mark.sampling
 

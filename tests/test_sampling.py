@@ -6,8 +6,8 @@ from helpers import DIFFERENTIABLE, arrays, icosphere, to_numpy
 
 import rts
 from rts import Camera, GBuffer, Part
+from rts.arrays.engines import engine_of, namespace
 from rts.contracts.records import ArraySpec, Cells
-from rts.engines import engine_of, namespace
 from rts.plugin_api.records import Fragments, Proxy, Samples
 from rts.sampling.merging import merge
 from rts.sampling.packing import lift

@@ -10,9 +10,9 @@ from helpers import DIFFERENTIABLE, arrays, box, derivative, gradient, icosphere
 
 import rts
 from rts import splatting
-from rts.contracts.plugin import promised
 from rts.contracts.records import Cells
 from rts.plugin_api.records import Splats
+from rts.plugin_base import promised
 from rts.rendering.samples import sample
 from rts.sampling.interiors_loops import settle
 from rts.splatting.layers import dilated

@@ -7,7 +7,7 @@ import pytest
 from helpers import ALL, DIFFERENTIABLE, FRONT, TORCH, arrays, gradient, mesh_part, moved, quad, rigid, show, to_numpy
 
 from rts import Camera, GBuffer, InputError
-from rts.shading import BlinnPhong, Depth, Lambert, Normals, Silhouette, Unlit, sample_texture
+from rts.shading.shaders import BlinnPhong, Depth, Lambert, Normals, Silhouette, Unlit, sample_texture
 
 pytestmark = pytest.mark.rendering
 

@@ -8,7 +8,7 @@ from helpers import arrays, relative_error, to_numpy
 
 import rts
 from benchmarks.paper import snerf, snerf_scenes
-from rts.trees import leaves
+from rts.arrays.trees import leaves
 
 pytestmark = pytest.mark.rendering
 

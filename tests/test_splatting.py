@@ -180,7 +180,7 @@ def test_gradients_are_the_finite_differences_of_the_loop(name, target):
     z, cells, w = arrays(target, (positions[:, 2:], row, weights))
 
     def f(tree):
-        concat = rts.engines.namespace(z).concat
+        concat = rts.namespace(z).concat
         return (KERNELS[name]().splat(concat([tree["xy"], z], axis=1), tree["rgba"], cells) * w).sum()
 
     found, expected = gradient(target, f, arrays(target, given)), finite_difference(by_loops, given)

@@ -118,8 +118,10 @@ def test_measuring_imports_public_names_alone():
 
 def test_a_private_import_is_found(tmp_path):
     path = tmp_path / "plugin.py"
-    path.write_text("import rts\nimport rts.compiling\nfrom rts import Part, compiling\nfrom rts.trees import Array\n")
-    expected = {"rts.compiling", "rts.trees.Array"}
+    path.write_text(
+        "import rts\nimport rts.compiling\nfrom rts import Part, compiling\nfrom rts.arrays.trees import Array\n"
+    )
+    expected = {"rts.compiling", "rts.arrays.trees.Array"}
     assert private(path, {"rts": rts.__all__}) == expected
     path.write_text("import rts\nrts.render(rts.threads)\n")
     assert private(path, {"rts": rts.__all__}) == {"rts.threads"}

@@ -9,7 +9,7 @@ from helpers import ALL, DIFFERENTIABLE, arrays, to_numpy
 
 import rts
 from rts import Camera, InputError, Part
-from rts.arrays import is_finite
+from rts.arrays.array_functions import is_finite
 from rts.plugin_api.records import Proxy
 
 pytestmark = pytest.mark.rendering

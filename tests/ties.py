@@ -6,7 +6,7 @@ import numpy as np
 from helpers import rotation
 
 from rts import Camera
-from rts.camera import orthographic, perspective
+from rts.scene.camera import orthographic, perspective
 
 
 class Ties(NamedTuple):

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 import rts
-from rts.engines import engine_named
+from rts.arrays.engines import engine_named
 from rts.fitting.fit import Fit
 
 PIECE = np.array([0.80, 0.85, 0.30, 0.26, 0.22, 0.62, 0.55, 0.02])

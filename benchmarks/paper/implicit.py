@@ -24,7 +24,7 @@ import numpy as np
 
 import rts
 from benchmarks.report import table
-from rts.engines import engine_named
+from rts.arrays.engines import engine_named
 from rts_surfaces.implicit.fields import spheres, swept_sphere
 from rts_surfaces.implicit.narrow_band import NarrowBand
 

@@ -38,7 +38,7 @@ from scipy.ndimage import gaussian_filter
 
 import rts
 from benchmarks.paper.snerf_scenes import SHOWN, Scene, Shot, fern, lego, real
-from rts.trees import leaves, map_leaves
+from rts.arrays.trees import leaves, map_leaves
 
 HIGHEST = 8.0
 """The grid lies between 0, no density, and this: log(1 + density) of 3,000, near the greatest of these fields."""

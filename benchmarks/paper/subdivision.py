@@ -20,7 +20,7 @@ import numpy as np
 
 import rts
 from benchmarks.meshes import DATA
-from rts.engines import engine_named
+from rts.arrays.engines import engine_named
 
 AZIMUTHS, HELD_BACK, ELEVATION = (0.0, 120.0, 240.0), 90.0, 15.0
 """Degrees. A view and the one from behind have almost the same outline: as lines, these three are 60° apart, and the

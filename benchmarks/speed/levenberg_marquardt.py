@@ -10,7 +10,7 @@ import numpy as np
 import rts
 from benchmarks.speed.pose_iteration import Task
 from benchmarks.timing import START, in_turn
-from rts.engines import engine_of, namespace
+from rts.arrays.engines import engine_of, namespace
 from rts.fitting.least_squares import normal_equations
 
 UNKNOWNS = (6, 12)

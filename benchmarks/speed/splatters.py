@@ -11,7 +11,7 @@ import rts
 from benchmarks.speed.pose_iteration import Task
 from benchmarks.timing import START, in_turn
 from rts import splatting
-from rts.engines import namespace
+from rts.arrays.engines import namespace
 from rts.plugin_api.records import Splats
 
 SPLATTERS = {"single": splatting.Single, "multi": splatting.Multi, "visible": splatting.Visible}

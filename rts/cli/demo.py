@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 
 from rts import registry
+from rts.cli.default_camera import bounds_of, orbit
 from rts.cli.pose_file import posed
 from rts.cli.pose_fit import PoseFit, fit_pose, shrunk, silhouette_of
 from rts.cli.pose_report import write_report
 from rts.cli.pose_verdict import judged
-from rts.cli.views import bounds_of, orbit
 from rts.files.paths import writing
-from rts.operations.rigid import rigid
-from rts.parts import Part
 from rts.rendering.image import render
+from rts.scene.parts import Part
+from rts.scene.rigid import rigid
 
 SIZE = (320, 320)
 TRUE_ROTATION = (0.22, -0.38, 0.16)

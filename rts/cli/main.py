@@ -17,9 +17,9 @@ from rich.markup import escape
 from typer.core import TyperGroup
 
 from rts import __version__, registry
+from rts.arrays.trees import map_leaves
 from rts.errors import PluginError, RtsError
-from rts.parts import Part
-from rts.trees import map_leaves
+from rts.scene.parts import Part
 
 EXAMPLES = """
 Examples:
@@ -294,8 +294,8 @@ def render(
 ) -> None:
     """Render a model to a picture."""
     import rts
+    from rts.cli.default_camera import bounds_of, orbit
     from rts.cli.pose_file import posed, read_pose
-    from rts.cli.views import bounds_of, orbit
     from rts.files.paths import output_file
 
     shape, view, color = _size(size), _view(camera), _background(background)
@@ -377,11 +377,11 @@ def fit_pose(
     `rts render MODEL --pose pose.json` draws the model so.
     """
     import rts
+    from rts.cli.default_camera import bounds_of, orbit
     from rts.cli.pose_fit import fit_pose as fit
     from rts.cli.pose_fit import silhouette_of
     from rts.cli.pose_report import write_report
     from rts.cli.pose_verdict import judged
-    from rts.cli.views import bounds_of, orbit
     from rts.files.paths import output_folder
 
     if f_scale is not None and loss == "linear":
@@ -423,8 +423,8 @@ def export(
 ) -> None:
     """Make a mesh of a model's surface, its positions and triangles, and write it."""
     import rts
+    from rts.cli.default_camera import bounds_of
     from rts.cli.mesh_export import FORMATS, write_mesh
-    from rts.cli.views import bounds_of
     from rts.files.paths import output_file
 
     output_file(output, "mesh", FORMATS)

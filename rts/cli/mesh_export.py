@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rts.errors import InputError
-from rts.parts import Part
+from rts.scene.parts import Part
 
 FORMATS = (".obj", ".ply", ".stl", ".glb", ".off")
 

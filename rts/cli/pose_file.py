@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arguments import check_numbers, check_pixels, is_invertible
-from rts.camera import Camera
+from rts.arrays.argument_checks import check_numbers, check_pixels, is_invertible
+from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.files.paths import as_path
 from rts.operations.linear import matmul
-from rts.parts import Part
-from rts.trees import Array
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 
 class Pose(NamedTuple):

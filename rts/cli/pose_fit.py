@@ -9,17 +9,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import registry
-from rts.camera import Camera
+from rts.arrays.engines import Engine, engine_named, engine_of, namespace
+from rts.arrays.trees import Array
+from rts.cli.default_camera import Bounds
 from rts.cli.pose_file import Pose, posed
-from rts.cli.views import Bounds
-from rts.engines import Engine, engine_named, engine_of, namespace
 from rts.errors import InputError, PluginError
 from rts.fitting.fit import Fit, fit
 from rts.fitting.image_residuals import ImageResiduals
 from rts.fitting.schedule import Stage, box_filtered, pyramid
-from rts.operations.rigid import rigid
-from rts.parts import Part
-from rts.trees import Array
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
+from rts.scene.rigid import rigid
 
 LARGEST_SIDE = 256
 """Pixels of the longer side of the image that is fitted."""

@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from rts.camera import Camera
 from rts.cli.pose_file import Pose, posed
 from rts.cli.pose_fit import LARGEST_SIDE, PoseFit, shrunk
 from rts.cli.pose_verdict import Verdict
 from rts.files.images import save_animation, save_image
 from rts.files.paths import writing
-from rts.parts import Part
 from rts.rendering.image import render
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 PICTURE_SIDE, FRAMES = 512, 48
 PAPER, MARKED = (0.86, 0.87, 0.9), (0.95, 0.32, 0.05)

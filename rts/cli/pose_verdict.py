@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts.cli.pose_file import Pose, posed
-from rts.parts import Part
 from rts.rendering.image import render
+from rts.scene.parts import Part
 
 GOOD = 0.9
 """Intersection over union from which on a fit is called good."""

@@ -1,7 +1,7 @@
 """The records that pass from one stage of rendering to the next.
 
 Shapes use these letters: N packed samples, K layers front to back, H × W pixels (row 0 on top), V vertices,
-T triangles, I integers and P reals a sample, C channels. Conventions of space are in `rts.camera`.
+T triangles, I integers and P reals a sample, C channels. Conventions of space are in `rts.scene.camera`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 
-from rts.engines import namespace
-from rts.trees import Array, record
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array, record
 
 
 class ArraySpec(NamedTuple):

@@ -6,8 +6,8 @@ import abc
 from collections.abc import Callable
 from typing import Any
 
-from rts.contracts.plugin import Plugin
-from rts.trees import Array, Tree
+from rts.arrays.trees import Array, Tree
+from rts.plugin_base import Plugin
 
 
 class Residuals(Plugin):
@@ -32,7 +32,7 @@ class Residuals(Plugin):
         """Mean loss () of the n residuals r, JᵀSJ / n (U, U) and JᵀWr / n (U,) for their Jacobian J.
 
         W and S are diagonals of `self.loss.weights(r)`, ones for the mean square.
-        U counts the numbers in the parameters, in the order of `rts.trees.leaves`. All are arrays of the parameters'
+        U counts the numbers in the parameters, in the order of `rts.arrays.trees.leaves`. All are arrays of the parameters'
         engine, which may be traced. With it, Levenberg–Marquardt makes no Jacobian of its own.
         """
         raise NotImplementedError

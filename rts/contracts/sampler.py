@@ -5,10 +5,10 @@ from __future__ import annotations
 import abc
 from typing import Any
 
-from rts.camera import Camera
-from rts.contracts.plugin import Plugin
 from rts.contracts.records import Request, Samples
-from rts.parts import Part
+from rts.plugin_base import Plugin
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 
 class Sampler(Plugin):

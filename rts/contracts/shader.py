@@ -5,11 +5,11 @@ from __future__ import annotations
 import abc
 from collections.abc import Callable, Mapping
 
-from rts.arguments import quoted
-from rts.camera import Camera
-from rts.contracts.plugin import Plugin
-from rts.gbuffer import GBuffer
-from rts.trees import Array, Tree
+from rts.arrays.argument_checks import quoted
+from rts.arrays.trees import Array, Tree
+from rts.contracts.gbuffer import GBuffer
+from rts.plugin_base import Plugin
+from rts.scene.camera import Camera
 
 
 class Shader(Plugin):

@@ -7,12 +7,12 @@ from typing import Any, final
 
 import numpy as np
 
-from rts.arrays import from_numbers, shape_of, without_border
-from rts.contracts.plugin import Plugin
+from rts.arrays.array_functions import from_numbers, shape_of, without_border
+from rts.arrays.engines import constants, engine_of, exemplar, namespace
+from rts.arrays.trees import Array
 from rts.contracts.records import Cells, Splats
-from rts.engines import constants, engine_of, exemplar, namespace
 from rts.errors import InputError
-from rts.trees import Array
+from rts.plugin_base import Plugin
 
 
 class Splatter(Plugin):

@@ -12,22 +12,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.arrays import from_numbers, kind_of
-from rts.checks import check_size, is_count, is_real
-from rts.diagnostics.explanation.explaining import explained
+from rts.arrays.argument_checks import quoted
+from rts.arrays.array_functions import from_numbers, kind_of
+from rts.arrays.engines import Engine, engine_of, is_constant, namespace
+from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.contracts.checks import check_size, is_count, is_real
 from rts.diagnostics.explanation.reasons import Reason, legend, marked
+from rts.diagnostics.explanation.selection import explained
 from rts.diagnostics.explanation.slopes import Number, Slope, chosen, measured, unit
 from rts.diagnostics.explanation.subject import Scene, Subject
 from rts.diagnostics.progress import Phase, phases
-from rts.engines import Engine, engine_of, is_constant, namespace
 from rts.errors import EmptyImageWarning, InputError, LayersWarning
 from rts.files.srgb import decode_srgb
 from rts.fitting.dependence import differentiable
-from rts.fitting.names import named_leaves
+from rts.fitting.parameter_names import named_leaves
 from rts.fitting.run import untraceable
 from rts.rendering.image import render
-from rts.trees import Array, Tree, leaves, map_leaves
 
 NEGLIGIBLE = 0.01
 """What does not matter, as a share of the largest effect of a step."""

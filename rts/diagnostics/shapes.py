@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rts.parts import Part
 from rts.registry import plugin
+from rts.scene.parts import Part
 
 QUAD = ((0, 1, 2), (0, 2, 3))
 """Two triangles of four corners that go around counter-clockwise."""

@@ -7,10 +7,10 @@ from functools import partial
 
 import numpy as np
 
+from rts.arrays.engines import Engine, constants, namespace
+from rts.arrays.trees import Array, Tree
 from rts.contracts.records import Splats
 from rts.contracts.splatter import Splatter
-from rts.engines import Engine, constants, namespace
-from rts.trees import Array, Tree
 
 STEP_PIXELS = 1.0
 """How far a step moves what moves fastest in the image."""

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.checks import MEMORY, is_real
-from rts.engines import engine_of
+from rts.arrays.argument_checks import quoted
+from rts.arrays.engines import engine_of
+from rts.arrays.trees import Array
+from rts.contracts.checks import MEMORY, is_real
 from rts.errors import EngineError, FileWarning, InputError, PluginError, warn
 from rts.files.damage import gathered
 from rts.files.paths import as_path, output_file, writing
 from rts.files.srgb import decode_srgb, encode_srgb
-from rts.trees import Array
 
 
 def save_image(path: Any, image: Array) -> None:

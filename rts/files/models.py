@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rts import registry
-from rts.arguments import quoted
+from rts.arrays.argument_checks import quoted
 from rts.errors import FileWarning, InputError, warn
 from rts.files.damage import gathered
 from rts.files.obj_reader import read_obj
@@ -20,8 +20,8 @@ from rts.files.paths import as_path
 from rts.files.pieces import Piece, check_piece
 from rts.files.srgb import decode_srgb
 from rts.files.trimesh_reader import read_with_trimesh
-from rts.parts import Part
-from rts.shading import Lambert, Textured
+from rts.scene.parts import Part
+from rts.shading.shaders import Lambert, Textured
 
 
 def load(path: Any, *, merge: bool = False, weld: bool = True, surface: str = "mesh") -> list[Part]:

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import kind_of
-from rts.engines import Engine, engine_of, is_constant
+from rts.arrays.array_functions import kind_of
+from rts.arrays.engines import Engine, engine_of, is_constant
+from rts.arrays.trees import Array, Tree, leaves
 from rts.errors import EngineError, InputError
-from rts.fitting.names import listed
-from rts.trees import Array, Tree, leaves
+from rts.fitting.parameter_names import listed
 
 UNSEEN = 0.02
 """Numbers below this share of a direction's largest are left out where it is told."""

@@ -10,21 +10,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arguments import check_flag, quoted
-from rts.arrays import kind_of
-from rts.checks import checked_plugin, is_count, is_real
-from rts.contracts.plugin import overrides
+from rts.arrays.argument_checks import check_flag, quoted
+from rts.arrays.array_functions import kind_of
+from rts.arrays.engines import Engine
+from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.contracts.checks import checked_plugin, is_count, is_real
 from rts.contracts.residuals import Residuals
-from rts.engines import Engine
 from rts.errors import InputError
 from rts.fitting.dependence import differentiable, refuse_independent
 from rts.fitting.least_squares import levenberg_marquardt
 from rts.fitting.losses import SQUARE, Loss
-from rts.fitting.names import listed, named_leaves, one_line
+from rts.fitting.parameter_names import listed, named_leaves, one_line
 from rts.fitting.run import LONGEST_REASON, NO_GRADIENT, Astray, Report, Run, progress_bar, require
 from rts.fitting.schedule import Stage, checked_schedule
+from rts.plugin_base import overrides
 from rts.sampling.adaptive import finest
-from rts.trees import Array, Tree, leaves, map_leaves
 
 STEPS = {"adam": 200, "sgd": 200, "lm": 50}
 LEARNING_RATES = {"adam": 1e-2, "sgd": 1e-1}

@@ -11,10 +11,11 @@ from typing import Any, Literal, NamedTuple, TypeGuard
 import numpy as np
 
 from rts import companion
-from rts.arguments import quoted
-from rts.arrays import described, from_numbers, is_finite, kind_of, shape_of
-from rts.camera import Camera
-from rts.checks import (
+from rts.arrays.argument_checks import quoted
+from rts.arrays.array_functions import described, from_numbers, is_finite, kind_of, shape_of
+from rts.arrays.engines import Engine, constants, context_of, engine_of, exemplar, namespace
+from rts.arrays.trees import Array, Tree
+from rts.contracts.checks import (
     CheckedPart,
     check_background,
     check_cameras,
@@ -24,18 +25,16 @@ from rts.checks import (
     check_scene,
     is_count,
 )
-from rts.contracts.plugin import overrides
 from rts.contracts.records import ArraySpec, Fine, Splats
 from rts.contracts.residuals import Residuals
 from rts.contracts.splatter import SummingSplatter
-from rts.engines import Engine, constants, context_of, engine_of, exemplar, namespace
 from rts.errors import InputError
 from rts.fitting.least_squares import flatten, normal_equations
 from rts.fitting.losses import Loss
-from rts.fitting.names import one_line
+from rts.fitting.parameter_names import one_line
 from rts.fitting.schedule import Stage, blurred, box_filtered
 from rts.fitting.targets import check_range, largest, refuse_zero, warn_of_gradients
-from rts.parts import Part
+from rts.plugin_base import overrides
 from rts.rendering.batched import render_views
 from rts.rendering.image import render
 from rts.rendering.samples import sample
@@ -43,7 +42,8 @@ from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_fine_splats, to_splats
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.prepared import Prepared
-from rts.trees import Array, Tree
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 Parts = Part | Sequence[Part] | Prepared
 Cameras = Camera | Sequence[Camera]

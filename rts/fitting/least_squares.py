@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.engines import Engine, namespace
+from rts.arrays.engines import Engine, namespace
+from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.errors import InputError
 from rts.fitting.dependence import directions_in_words, refuse_independent
 from rts.fitting.losses import SQUARE, Loss
-from rts.fitting.names import named_leaves
+from rts.fitting.parameter_names import named_leaves
 from rts.fitting.run import NO_GRADIENT, Run, require
-from rts.trees import Array, Tree, leaves, map_leaves
 
 FIRST_DAMPING = 1e-3
 LARGEST_DAMPING = 1e12

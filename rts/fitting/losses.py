@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
-from rts.arguments import quoted
-from rts.arrays import described, from_numbers, shape_of
-from rts.checks import check_floating, is_real
-from rts.engines import namespace
+from rts.arrays.argument_checks import quoted
+from rts.arrays.array_functions import described, from_numbers, shape_of
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array
+from rts.contracts.checks import check_floating, is_real
 from rts.errors import InputError
-from rts.trees import Array
 
 
 class _Form(NamedTuple):

@@ -9,11 +9,11 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from rts.engines import Engine
+from rts.arrays.engines import Engine
+from rts.arrays.trees import Tree
 from rts.errors import EngineError, InputError, RtsError
 from rts.fitting.interrupts import interrupts_held_back
-from rts.fitting.names import listed, one_line
-from rts.trees import Tree
+from rts.fitting.parameter_names import listed, one_line
 
 Report = Callable[[int, Tree, float], Any]
 

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import check_pixels, quoted
-from rts.checks import is_count, is_real
-from rts.engines import constants, engine_of, namespace
+from rts.arrays.argument_checks import check_pixels, quoted
+from rts.arrays.engines import constants, engine_of, namespace
+from rts.arrays.trees import Array
+from rts.contracts.checks import is_count, is_real
 from rts.errors import InputError
 from rts.sampling.adaptive import Adaptive, finest
-from rts.trees import Array
 
 COARSEST, BLUR = 16, 1 / 16
 """A pyramid's first stage has at least so many pixels along the longer side, and this share of them as σ."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rts.engines import namespace, value_of
+from rts.arrays.engines import namespace, value_of
+from rts.arrays.trees import Array
 from rts.errors import InputError, InputWarning, warn
-from rts.trees import Array
 
 LARGEST = 2.0
 """Numbers of pictures from 0 to 1 that were filtered or interpolated are not above this."""

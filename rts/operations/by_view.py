@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rts.engines import namespace
-from rts.trees import Array
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array
 
 
 def ranges_of_views(view: np.ndarray, count: int) -> Iterator[tuple[int, slice]]:

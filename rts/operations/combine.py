@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.arrays import described, from_numbers, shape_of
-from rts.engines import constants, engine_of, exemplar, namespace
+from rts.arrays.array_functions import described, from_numbers, shape_of
+from rts.arrays.engines import constants, engine_of, exemplar, namespace
+from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
 from rts.operations.take import take
-from rts.trees import Array
 
 
 def combine(rows: Array, ids: Array, weights: Array) -> Array:

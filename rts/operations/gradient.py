@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.arrays import from_numbers, kind_of, shape_of
-from rts.engines import engine_of, namespace
+from rts.arrays.argument_checks import quoted
+from rts.arrays.array_functions import from_numbers, kind_of, shape_of
+from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import Array
 from rts.errors import InputError
-from rts.trees import Array
 
 STEP = 6e-6
 """The step of central differences in float64, as a share of the largest coordinate: the cube root of its precision."""

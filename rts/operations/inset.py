@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.engines import namespace
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array
 from rts.operations.operation import Arrays, Operation, Some
 from rts.threads import parallel, read_only
-from rts.trees import Array
 
 
 def with_inset(image: Array, fine: Array, pixel: Array, side: int) -> Array:

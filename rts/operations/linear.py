@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from rts.engines import constants, engine_of, exemplar, namespace
+from rts.arrays.engines import constants, engine_of, exemplar, namespace
+from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.operations.by_view import index_of_views, of_view, ranges_of_views, rows_in_views
 from rts.operations.operation import Arrays, Operation, Some
-from rts.trees import Array
 
 
 def matmul(a: Array, b: Array) -> Array:

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import one_line, quoted
-from rts.arrays import from_numbers, kind_of
-from rts.engines import OWNERS, constants, context_of, engine_of, value_of
+from rts.arrays.argument_checks import one_line, quoted
+from rts.arrays.array_functions import from_numbers, kind_of
+from rts.arrays.engines import OWNERS, constants, context_of, engine_of, value_of
+from rts.arrays.trees import Array
 from rts.errors import InputError, RtsError
-from rts.trees import Array
 
 _SHAPED = ("shape",)
 """Stands among what was looked at for the first shape of a result."""

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from rts.engines import namespace
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.operations.by_view import index_of_views, of_view, ranges_of_views, rows_in_views
 from rts.operations.linear import is_plain_product, specified_affine_map
 from rts.operations.operation import Arrays, Operation, Some
-from rts.trees import Array
 
 
 def projective_map(rows: Array, points: Array) -> Array:

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from rts.engines import engine_of, namespace
+from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some, known_value
 from rts.threads import parallel, read_only
-from rts.trees import Array
 
 
 def take(rows: Array, index: Array) -> Array:

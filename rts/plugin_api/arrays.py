@@ -1,8 +1,8 @@
 """Arrays of any engine, and trees of them."""
 
-from rts.arrays import from_numbers, shape_of, unit
-from rts.engines import constants, engine_named, exemplar
-from rts.trees import Array, Tree, leaves, map_leaves
+from rts.arrays.array_functions import from_numbers, shape_of, unit
+from rts.arrays.engines import constants, engine_named, exemplar
+from rts.arrays.trees import Array, Tree, leaves, map_leaves
 
 __all__ = [
     "Array",

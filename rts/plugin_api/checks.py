@@ -1,10 +1,10 @@
 """Checks of what users give, each refused in one line, and facts of tables of triangles."""
 
-from rts.arguments import check_numbers, check_positive, quoted
-from rts.checks import check_scene, is_count
+from rts.arrays.argument_checks import check_numbers, check_positive, quoted
+from rts.contracts.checks import check_scene, is_count
 from rts.sampling.cache import fingerprint
-from rts.sampling.validation import check_camera
-from rts.topology import index_table, pieces
+from rts.sampling.sample_checks import check_camera
+from rts.scene.topology import index_table, pieces
 
 __all__ = [
     "check_camera",

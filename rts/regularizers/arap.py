@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from rts.arrays.engines import engine_of
+from rts.arrays.trees import Array
 from rts.contracts.records import ArraySpec
-from rts.engines import engine_of
 from rts.regularizers.connectivity import both_ways, edge_weights
 from rts.regularizers.regularizer import OfRestShape, combined
-from rts.trees import Array
 
 
 class ARAP(OfRestShape):

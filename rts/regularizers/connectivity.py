@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import quoted
+from rts.arrays.argument_checks import quoted
 from rts.errors import InputError
 
 LARGEST_COTANGENT = 1e3

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.checks import is_real
-from rts.engines import engine_of, namespace
+from rts.arrays.argument_checks import quoted
+from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import Array
+from rts.contracts.checks import is_real
 from rts.errors import InputError
 from rts.regularizers.connectivity import edges_of
 from rts.regularizers.regularizer import OfRestShape, combined
-from rts.trees import Array
 
 NAMED = ("rest", "mean")
 

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.engines import engine_of
+from rts.arrays.argument_checks import quoted
+from rts.arrays.engines import engine_of
+from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.regularizers.connectivity import both_ways, edge_weights
 from rts.regularizers.regularizer import OfRestShape, combined
-from rts.trees import Array
 
 WIDTH = 8
 """Neighbours in a row of a table of vertices; most have no more."""

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from rts.engines import engine_of, namespace
+from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.regularizers.connectivity import pairs_of
 from rts.regularizers.regularizer import Regularizer, check_count, combined, known_vertices
-from rts.topology import index_table
-from rts.trees import Array
+from rts.scene.topology import index_table
 
 FLAT = 8.0
 """As many roundings of its longest side as the height of a triangle must be, at least, to have a normal."""

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import check_numbers, quoted
-from rts.arrays import described, from_numbers, shape_of
-from rts.engines import engine_of, namespace, uncompiled
+from rts.arrays.argument_checks import check_numbers, quoted
+from rts.arrays.array_functions import described, from_numbers, shape_of
+from rts.arrays.engines import engine_of, namespace, uncompiled
+from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.operations.combine import COMBINE
-from rts.topology import index_table
-from rts.trees import Array
+from rts.scene.topology import index_table
 
 
 class Regularizer(abc.ABC):

@@ -8,16 +8,15 @@ from typing import Any, Literal, TypeVar
 
 import numpy as np
 
-from rts.arrays import described, shape_of
-from rts.camera import Camera
-from rts.channels import cropped_image
-from rts.checks import check_background, check_cameras
+from rts.arrays.array_functions import described, shape_of
+from rts.arrays.engines import Context, context_of_scene, is_constant, namespace, uncompiled
+from rts.arrays.trees import Array
+from rts.contracts.checks import check_background, check_cameras
 from rts.contracts.records import Sampled
-from rts.engines import Context, context_of_scene, is_constant, namespace, uncompiled
 from rts.errors import InputError
 from rts.operations.inset import averaged
-from rts.parts import Part
 from rts.rendering.image import image_of, over_background, seen, splatted
+from rts.rendering.sampled_views import Sampling, Views, laid_side_by_side, sampled_as_one
 from rts.rendering.samples import sampled_scene
 from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
@@ -25,10 +24,11 @@ from rts.rendering.shade import shaded_at_once
 from rts.rendering.splats import views_to_splats
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.prepared import Prepared
-from rts.sampling.several import Sampling, Views, laid_side_by_side, sampled_as_one
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
+from rts.splatting.channels import cropped_image
 from rts.splatting.side_by_side import Picture, at_once
 from rts.threads import each
-from rts.trees import Array
 
 _T = TypeVar("_T")
 

@@ -7,25 +7,25 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Literal
 
-from rts.arguments import quoted
-from rts.camera import Camera
-from rts.channels import cropped_image
-from rts.checks import check_background, check_splatter
-from rts.contracts.plugin import promised
+from rts.arrays.argument_checks import quoted
+from rts.arrays.engines import Context, constants, context_of, engine_of, is_constant, namespace, uncompiled, value_of
+from rts.arrays.trees import Array
+from rts.contracts.checks import check_background, check_splatter
 from rts.contracts.records import Sampled, Splats
 from rts.contracts.splatter import Splatter
-from rts.engines import Context, constants, context_of, engine_of, is_constant, namespace, uncompiled, value_of
 from rts.errors import EmptyImageWarning, InputError, InputWarning, warn
 from rts.operations.inset import averaged, painted_inset, with_inset
-from rts.parts import Part
+from rts.plugin_base import promised
 from rts.rendering.samples import coarse_scene, sampled_scene, with_fine
 from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
 from rts.rendering.splats import to_fine_splats, to_splats
 from rts.sampling.adaptive import Adaptive
-from rts.sampling.emptiness import why_empty
+from rts.sampling.empty_images import why_empty
 from rts.sampling.prepared import Prepared
-from rts.trees import Array
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
+from rts.splatting.channels import cropped_image
 
 
 @uncompiled

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Literal
 
-from rts.camera import Camera
-from rts.checks import changed_part, check_background, check_changes, check_channels
-from rts.engines import context_of_scene, uncompiled
-from rts.parts import Part
+from rts.arrays.engines import context_of_scene, uncompiled
+from rts.arrays.trees import Array
+from rts.contracts.checks import changed_part, check_background, check_changes, check_channels
 from rts.rendering.image import image_over
 from rts.rendering.scene import Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.prepared import Prepared
-from rts.trees import Array
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 
 class PreparedParts(Prepared):

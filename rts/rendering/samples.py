@@ -9,24 +9,24 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rts.arguments import check_flag
-from rts.camera import Camera
-from rts.checks import check_memory
-from rts.contracts.plugin import promised
+from rts.arrays.argument_checks import check_flag
+from rts.arrays.engines import is_traced, uncompiled
+from rts.arrays.trees import Array
+from rts.contracts.checks import check_memory
 from rts.contracts.records import Hidden, Request, Sampled
-from rts.engines import is_traced, uncompiled
 from rts.errors import InputError
-from rts.parts import Part
+from rts.plugin_base import promised
 from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.adaptive import Adaptive
-from rts.sampling.fine import Where, fine_samples
+from rts.sampling.fine_samples import Where, fine_samples
 from rts.sampling.hidden import HiddenBySplatter, with_layers_that_count, without_hidden
 from rts.sampling.merging import merge
 from rts.sampling.prepared import Prepared
+from rts.sampling.sample_checks import check_samples
 from rts.sampling.strips import FineGrid, at_cells
-from rts.sampling.validation import check_samples
-from rts.trees import Array
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 
 @uncompiled

@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from rts.camera import Camera
-from rts.checks import CheckedPart, check_ratio, check_sampler, check_scene, suited_sampler
+from rts.arrays.engines import Context, context_of_scene
+from rts.arrays.trees import Tree
+from rts.contracts.checks import CheckedPart, check_ratio, check_sampler, check_scene, suited_sampler
 from rts.contracts.sampler import Sampler
 from rts.contracts.splatter import Splatter
-from rts.engines import Context, context_of_scene
-from rts.parts import Part
 from rts.sampling.hidden import HiddenBySplatter, hidden_by
 from rts.sampling.prepared import Prepared
 from rts.sampling.winding import warn_of_winding
-from rts.trees import Tree
-from rts.unread import warn_of_unread
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
+from rts.shading.unused_entries import warn_of_unread
 
 
 class Scene(NamedTuple):

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from rts.checks import check_size, check_splatter
+from rts.contracts.checks import check_size, check_splatter
 from rts.contracts.splatter import Splatter
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.hidden import planned

@@ -9,17 +9,17 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
-from rts.arrays import described, kind_of, shape_of
-from rts.camera import Camera
-from rts.checks import CheckedPart, check_shaded
+from rts.arrays.array_functions import described, kind_of, shape_of
+from rts.arrays.engines import Context, Engine, is_constant, namespace
+from rts.arrays.trees import Array, Tree
+from rts.contracts.checks import CheckedPart, check_shaded
+from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Samples
-from rts.engines import Context, Engine, is_constant, namespace
 from rts.errors import InputError
-from rts.footprints import FOOTPRINT, uv_footprint
-from rts.gbuffer import GBuffer
 from rts.operations.linear import affine_map
-from rts.row_cameras import RowCameras
-from rts.trees import Array, Tree
+from rts.scene.camera import Camera
+from rts.scene.row_cameras import RowCameras
+from rts.shading.uv_footprints import FOOTPRINT, uv_footprint
 
 
 def evaluate(part: CheckedPart, samples: Samples, context: Context) -> GBuffer:

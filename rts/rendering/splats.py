@@ -8,19 +8,19 @@ from typing import Any
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.checks import CheckedPart, check_splats
+from rts.arrays.engines import Context, context_of, engine_of, namespace
+from rts.arrays.trees import Array, Tree
+from rts.contracts.checks import CheckedPart, check_splats
 from rts.contracts.records import ON_RAYS, Fine, Sampled, Samples, Splats
-from rts.engines import Context, context_of, engine_of, namespace
 from rts.errors import InputError
 from rts.operations.projection import projective_map_of_views
 from rts.operations.take import take, take_shifted
+from rts.rendering.sampled_views import Views, in_one_table
 from rts.rendering.scene import Grid
 from rts.rendering.shade import add_footprint, apart, evaluate, shade, shaded_at_once, theta_of
-from rts.row_cameras import RowCameras
-from rts.sampling.several import Views, in_one_table
+from rts.scene.camera import Camera
+from rts.scene.row_cameras import RowCameras
 from rts.threads import each
-from rts.trees import Array, Tree
 
 
 def to_splats(

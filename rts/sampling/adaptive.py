@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.checks import CheckedPart, is_count, is_real
+from rts.arrays.argument_checks import quoted
+from rts.contracts.checks import CheckedPart, is_count, is_real
 from rts.errors import InputError
 from rts.threads import parallel, read_only
 

@@ -6,14 +6,14 @@ import logging
 from typing import NamedTuple
 
 from rts import registry
-from rts.camera import Camera
-from rts.checks import check_sampler
+from rts.arrays.engines import engine_of, is_constant
+from rts.contracts.checks import check_sampler
 from rts.contracts.records import Request, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
-from rts.engines import engine_of, is_constant
 from rts.errors import PluginError
-from rts.parts import Part
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 STATIC_FACES = 4_000_000
 """From so many triangles on, rays at a kept structure are faster than drawing all (benchmarks/speed/samplers.py)."""

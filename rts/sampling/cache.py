@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import xxhash
 
+from rts.arrays.trees import Tree, leaves
 from rts.contracts.records import Proxy
-from rts.trees import Tree, leaves
 
 KEPT = 2
 """Entries a surface and sampler: the newest, and the one before it, which is moved when a third is asked for."""

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rts.camera import Camera
 from rts.contracts.records import Cells, Fragments, Proxy
+from rts.scene.camera import Camera
 from rts.threads import parallel, read_only
 
 OTHER_COLUMNS = np.array([[j for j in range(4) if j != i] for i in range(4)])

@@ -11,18 +11,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rts.checks import CheckedPart
-from rts.contracts.plugin import overrides, promised
+from rts.arrays.engines import engine_of, is_constant, namespace, value_of
+from rts.arrays.extremes import largest
+from rts.arrays.trees import leaves
+from rts.contracts.checks import CheckedPart
 from rts.contracts.records import ArraySpec, Decision, Hidden, Question, Sampled, Samples
 from rts.contracts.splatter import Splatter
 from rts.contracts.surface import TriangleSurface
-from rts.engines import engine_of, is_constant, namespace, value_of
 from rts.errors import InputError, LayersWarning, warn
 from rts.operations.operation import known_value
+from rts.plugin_base import overrides, promised
 from rts.sampling.exits import beside_outlines
-from rts.sampling.extremes import largest
 from rts.sampling.packing import too_far
-from rts.trees import leaves
 
 LAYER_LIMIT = 8
 """The largest number of layers that `layers="auto"` takes."""

@@ -8,16 +8,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.checks import CheckedPart
+from rts.arrays.engines import context_of, floating_bits, is_constant, stopped
+from rts.arrays.trees import Array, leaves, map_leaves
+from rts.contracts.checks import CheckedPart
 from rts.contracts.records import ON_RAYS, ArraySpec, Cells, Samples
 from rts.contracts.surface import TriangleSurface
-from rts.engines import context_of, floating_bits, is_constant, stopped
-from rts.parts import Part
 from rts.sampling.cache import Entry
+from rts.sampling.sample_checks import check_camera
 from rts.sampling.settling import rays_of
-from rts.sampling.validation import check_camera
-from rts.trees import Array, leaves, map_leaves
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 Find = Callable[..., tuple[Samples, Mapping[str, np.ndarray]]]
 """(cameras, inputs of the proxy, further arrays), all on the host → samples, and further results by name."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from rts.arrays.extremes import places
 from rts.compiling import compiled, loop
-from rts.sampling.extremes import places
 from rts.sampling.windows_loops import add, unite
 from rts.threads import parallel
 

@@ -7,10 +7,10 @@ from functools import partial
 
 import numpy as np
 
+from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import Array
 from rts.contracts.records import ArraySpec, Cells, Sampled, Samples
-from rts.engines import engine_of, namespace
 from rts.errors import InputError
-from rts.trees import Array
 
 
 def merge(samples: Sequence[Samples], layers: int) -> Sampled:

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from rts.arrays.extremes import largest, named
 from rts.contracts.records import Cells, Fragments, Proxy, Samples
 from rts.errors import InputError
 from rts.sampling.exits import Exits
-from rts.sampling.extremes import largest, named
 
 FAR = 20
 """How many times larger than the farthest depth coordinates may be, so that depths, computed of them in float32, differ

@@ -7,14 +7,14 @@ from typing import Any, Self
 
 import numpy as np
 
-from rts.arguments import check_pixels
-from rts.camera import Camera
-from rts.checks import check_changes, check_sampler, check_scene, suited_sampler
-from rts.engines import value_of
-from rts.parts import Part
+from rts.arrays.argument_checks import check_pixels
+from rts.arrays.engines import value_of
+from rts.arrays.extremes import largest
+from rts.arrays.trees import leaves
+from rts.contracts.checks import check_changes, check_sampler, check_scene, suited_sampler
 from rts.sampling.cache import Entry
-from rts.sampling.extremes import largest
-from rts.trees import leaves
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 
 class Prepared:

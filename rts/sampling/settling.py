@@ -9,13 +9,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from rts.camera import Camera
+from rts.arrays.trees import Tree
 from rts.contracts.records import ArraySpec, Fragments, Proxy, Rays, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.packing import lift
-from rts.sampling.validation import checked_refined
+from rts.sampling.sample_checks import checked_refined
+from rts.scene.camera import Camera
 from rts.threads import parallel, read_only
-from rts.trees import Tree
 
 SAME_ROOT_PIXELS, SAME_ROOT = 1e-2, 1e-6
 """Layers whose depths differ by less, in widths of a pixel and relative to the depth, are one root found twice."""

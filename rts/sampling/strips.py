@@ -16,11 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rts.arrays.engines import Engine, constants, engine_of, namespace
+from rts.arrays.trees import Array
 from rts.contracts.records import ArraySpec, Cells, Decision, Fine, Question, Sampled, Samples
-from rts.engines import Engine, constants, engine_of, namespace
 from rts.sampling.hidden import HiddenBySplatter, numbers_of
 from rts.threads import parallel, read_only
-from rts.trees import Array
 
 STRIP = 16
 """Lines of fine cells in a strip without its apron, about: with fewer there are more of aprons, with more, more of

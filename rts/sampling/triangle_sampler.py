@@ -9,24 +9,24 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from rts.arrays import shape_of
-from rts.camera import Camera
-from rts.contracts.plugin import overrides
+from rts.arrays.array_functions import shape_of
+from rts.arrays.engines import stopped, value_of
+from rts.arrays.extremes import largest
+from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.records import ArraySpec, Decision, Fragments, Hidden, Proxy, Question, Request, Samples
 from rts.contracts.sampler import Sampler
 from rts.contracts.surface import TriangleSurface
-from rts.engines import stopped, value_of
 from rts.errors import InputError, PluginError
-from rts.parts import Part
+from rts.plugin_base import overrides
 from rts.sampling.cache import Entry, Keeper, fingerprint, same_faces
 from rts.sampling.exits import Exits, beside_outlines
-from rts.sampling.extremes import largest
 from rts.sampling.facing import facing as facing_of
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.packing import lift, repack
+from rts.sampling.sample_checks import check_faces, check_fragments, checked_pieces, checked_proxy
 from rts.sampling.settling import on_surface, refined
-from rts.sampling.validation import check_faces, check_fragments, checked_pieces, checked_proxy
-from rts.trees import Array, Tree, leaves, map_leaves
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 _T = TypeVar("_T")
 

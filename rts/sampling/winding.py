@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.checks import CheckedPart
+from rts.arrays.engines import stopped
+from rts.contracts.checks import CheckedPart
 from rts.contracts.surface import TriangleSurface
-from rts.engines import stopped
 from rts.errors import InputWarning, warn
-from rts.sampling.emptiness import known_tree
+from rts.sampling.empty_images import known_tree
+from rts.scene.camera import Camera
 
 FLAT = 1e-6
 """A mesh whose volume is below this share of that of a cube of its area has no inside."""

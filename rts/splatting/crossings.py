@@ -36,10 +36,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.engines import namespace, stopped
+from rts.arrays.engines import namespace, stopped
+from rts.arrays.trees import Array
 from rts.splatting.kernel import TIE, Kernel
 from rts.splatting.layers import AROUND, NEIGHBOURS, Layers, Steps, opposite
-from rts.trees import Array
 
 LARGEST = 0.5
 """R in terms of h(q) + h(p), below which the sheets are straight enough."""

@@ -20,14 +20,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.checks import is_count, is_real
+from rts.arrays.argument_checks import quoted
+from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import Array
+from rts.contracts.checks import is_count, is_real
 from rts.contracts.records import Splats
 from rts.contracts.splatter import Splatter
-from rts.engines import engine_of, namespace
 from rts.errors import InputError
 from rts.splatting.layers import NEIGHBOURS, OFFSETS, Depths, bordered, check_rows, check_settled, nothing, unpack
-from rts.trees import Array
 
 SIGMA, EPSILON = 0.5, 0.05
 LEAST_SIGMA, LARGEST_SIGMA = 0.1, 1e3

@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from rts.arrays.engines import namespace, stopped
+from rts.arrays.extremes import extent
+from rts.arrays.trees import Array
 from rts.contracts.records import Cells, Splats
-from rts.engines import namespace, stopped
 from rts.errors import InputError
 from rts.operations.operation import known_value
-from rts.sampling.extremes import extent
-from rts.trees import Array
 
 OFFSETS = (-1, 0, 1)
 NEIGHBOURS = [(u, v) for v in OFFSETS for u in OFFSETS]

@@ -26,10 +26,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.engines import namespace, stopped
+from rts.arrays.engines import namespace, stopped
+from rts.arrays.trees import Array
 from rts.splatting.kernel import Kernel
 from rts.splatting.layers import AROUND, Layers, Steps, bordered, dilated, opposite
-from rts.trees import Array
 
 LEAST, LARGEST = 1.23, 2.5
 """The ratio r from which depths are those of a smooth rim, 1.5 pixels away; and the bound of β."""

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.engines import namespace
-from rts.trees import Array
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array
 
 SIDE = 1024
 """Cells along each side of a picture, at most: float32 places samples there to 1/16000 of a cell."""

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array
 from rts.contracts.records import Splats
 from rts.contracts.splatter import Splatter
-from rts.engines import namespace
 from rts.splatting.kernel import LEAST_EPSILON, Kernel
 from rts.splatting.layers import (
     NEIGHBOURS,
@@ -23,7 +24,6 @@ from rts.splatting.layers import (
     over,
     unpack,
 )
-from rts.trees import Array
 
 
 class Plain(Splatter):

@@ -9,12 +9,12 @@ from typing import ClassVar
 
 import numpy as np
 
+from rts.arrays.engines import engine_of
+from rts.arrays.trees import Array
 from rts.contracts.records import Splats
-from rts.engines import engine_of
 from rts.splatting import crossings, rims
 from rts.splatting.kernel import LEAST_EPSILON, Kernel
 from rts.splatting.layers import NEIGHBOURS, Depths, Layers, all_of, nearest, normalised, over
-from rts.trees import Array
 
 CONTINUED = 0.8
 """Share of the error of plain pairing below which `Visible` takes the line of a front layer for its continuation."""

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.engines import Engine
-from rts.parts import Part
+from rts.arrays.engines import Engine
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 from rts.testing import derivatives, scenes
 from rts.testing.claims import claim, claim_finite, no_error
 from rts.testing.derivatives import joined, split

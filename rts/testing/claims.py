@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from rts.arrays.trees import leaves
 from rts.errors import RtsError
-from rts.trees import leaves
 
 
 def claim(holds: Any, message: str) -> None:

@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rts import registry
-from rts.camera import Camera
-from rts.checks import check_sampler, check_scene
+from rts.arrays.engines import Engine, constants, engine_named, is_constant
+from rts.arrays.trees import leaves, map_leaves
+from rts.contracts.checks import check_sampler, check_scene
 from rts.contracts.surface import RaySurface, TriangleSurface
-from rts.engines import Engine, constants, engine_named, is_constant
 from rts.errors import EmptyImageWarning, RtsError
-from rts.parts import Part
 from rts.rendering.image import render
 from rts.rendering.settings import RenderSettings
 from rts.sampling.triangle_sampler import TriangleSampler
-from rts.trees import leaves, map_leaves
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 SIZE = (14, 18)
 CAMERA = Camera.look_at((0.9, 1.6, 3.2), (0, 0, 0), aspect=SIZE[1] / SIZE[0], principal_point=(0.1, -0.05))

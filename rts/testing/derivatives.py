@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from rts import registry
-from rts.engines import Engine, constants, engine_named
+from rts.arrays.engines import Engine, constants, engine_named
+from rts.arrays.trees import Tree, map_leaves
 from rts.errors import PluginError
 from rts.testing.claims import claim, claim_close, claim_finite, no_error
 from rts.testing.compatibility import single
-from rts.trees import Tree, map_leaves
 
 ENGINES = registry.plugins("rts.engines")
 DIFFERENTIABLE = [name for name in ENGINES if name != "numpy"]

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from rts.engines import engine_of
+from rts.arrays.engines import engine_of
 from rts.operations.combine import combine, interpolate
 from rts.operations.linear import affine_map, matmul
 from rts.operations.projection import projective_map
-from rts.operations.rigid import rigid
 from rts.operations.take import take
+from rts.scene.rigid import rigid
 
 N = 6
 

@@ -10,15 +10,15 @@ from unittest import mock
 import numpy as np
 import pytest
 
+from rts.arrays.engines import OWNERS, Engine, engine_named
+from rts.arrays.trees import leaves, map_leaves
 from rts.contracts.records import ArraySpec, Cells, Samples
-from rts.engines import OWNERS, Engine, engine_named
 from rts.errors import EngineError
-from rts.operations.rigid import rigid
+from rts.scene.rigid import rigid
 from rts.testing import derivatives, scenes
 from rts.testing.claims import claim, claim_close, no_error
 from rts.testing.conformance import Conformance
 from rts.testing.engine_examples import IDS, NAMESPACE, OPERATIONS, N, numbers
-from rts.trees import leaves, map_leaves
 
 TOLERANCE = 1e-5
 

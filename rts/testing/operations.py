@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rts.engines import Engine, floating_bits
+from rts.arrays.engines import Engine, floating_bits
 from rts.operations.operation import Operation
 from rts.testing import derivatives
 from rts.testing.claims import claim, claim_finite, no_error

@@ -5,17 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from rts import registry
-from rts.camera import Camera
+from rts.arrays.trees import Tree, map_leaves
 from rts.contracts.surface import RaySurface, TriangleSurface
 from rts.errors import InputError
-from rts.parts import Part
 from rts.sampling.packing import lift
 from rts.sampling.settling import refined
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 from rts.testing import derivatives
 from rts.testing.claims import claim, claim_finite
 from rts.testing.sample_claims import FEW, REPROJECTION, RESIDUAL
 from rts.testing.scenes import GRID, LAYERS
-from rts.trees import Tree, map_leaves
 
 DEEP = 5
 """Layers of rays that are shot in both directions."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from rts.camera import Camera
 from rts.contracts.records import Sampled
-from rts.parts import Part
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 from rts.testing.claims import claim
 from rts.testing.compatibility import APRON
 from rts.testing.scenes import GRID, SIZE

@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 
 from rts import registry
-from rts.camera import Camera
-from rts.checks import check_sampler
+from rts.arrays.trees import leaves
+from rts.contracts.checks import check_sampler
+from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Decision, Question, Request, Sampled
 from rts.contracts.surface import Surface, TriangleSurface
 from rts.errors import InputError
-from rts.gbuffer import GBuffer
-from rts.parts import Part
 from rts.rendering.renderer import prepare
 from rts.rendering.samples import sample
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 from rts.testing import derivatives, scenes
 from rts.testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing
 from rts.testing.claims import claim, claim_close, no_error, refusal
@@ -25,7 +26,6 @@ from rts.testing.compatibility import APRON
 from rts.testing.conformance import Conformance
 from rts.testing.derivatives import DIFFERENTIABLE, ENGINES, differentiating, engine_or_skip, joined, split
 from rts.testing.sample_claims import claim_empty_where_empty, claim_ordered, claim_reprojected
-from rts.trees import leaves
 
 DEEPER = 4
 """Layers of the reference beyond those compared, which tell where a silhouette is."""

@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 
 from rts import registry
-from rts.camera import Camera
-from rts.checks import check_scene
+from rts.arrays.trees import Array
+from rts.contracts.checks import check_scene
 from rts.contracts.records import Sampled
-from rts.parts import Part
 from rts.rendering.image import render, render_samples
 from rts.rendering.samples import sample
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 from rts.testing import compatibility
 from rts.testing.claims import claim
 from rts.testing.compatibility import APRON, CAPACITY, LAYERS, SIZE
 from rts.testing.derivatives import single
-from rts.trees import Array
 
 GRID = SIZE[0] + 2 * APRON, SIZE[1] + 2 * APRON
 

@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rts.checks import check_shader
-from rts.contracts.plugin import promised
+from rts.arrays.engines import Engine, constants, engine_of
+from rts.arrays.trees import Tree, map_leaves
+from rts.contracts.checks import check_shader
+from rts.contracts.gbuffer import GBuffer
 from rts.contracts.shader import Shader
-from rts.engines import Engine, constants, engine_of
-from rts.gbuffer import GBuffer
-from rts.row_cameras import RowCameras
+from rts.plugin_base import promised
+from rts.scene.row_cameras import RowCameras
 from rts.testing import derivatives, scenes
 from rts.testing.claims import claim, claim_close, claim_finite, no_error, refusal
 from rts.testing.conformance import Conformance
 from rts.testing.derivatives import DIFFERENTIABLE, differentiating, names, split
-from rts.trees import Tree, map_leaves
 
 ROWS = 64
 STEP = 1e-6

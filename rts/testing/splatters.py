@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rts.checks import check_splatter
-from rts.contracts.plugin import overrides, promised
+from rts.contracts.checks import check_splatter
 from rts.contracts.records import Cells, Splats
 from rts.contracts.splatter import Splatter
+from rts.plugin_base import overrides, promised
 from rts.testing import derivatives
 from rts.testing.claims import claim, claim_close, no_error
 from rts.testing.conformance import Conformance

@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rts.camera import Camera
+from rts.arrays.engines import engine_of
+from rts.arrays.trees import Tree, map_leaves
+from rts.contracts.gbuffer import GBuffer
 from rts.contracts.records import Cells, Proxy, Samples
 from rts.contracts.surface import RaySurface, TriangleSurface
-from rts.engines import engine_of
-from rts.gbuffer import GBuffer
-from rts.parts import Part
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 from rts.testing import derivatives, scenes
 from rts.testing.awkward_views import claim_awkward_views_are_finite, claim_unseen_is_nothing
 from rts.testing.claims import claim, claim_close, claim_finite, no_error, refusal
@@ -20,7 +21,6 @@ from rts.testing.conformance import Conformance
 from rts.testing.derivatives import DIFFERENTIABLE, claim_slope, differentiating, installed, joined, split
 from rts.testing.refine_claims import claim_found_again, claim_found_from_behind, claim_refined
 from rts.testing.sample_claims import claim_ordered, claim_reprojected
-from rts.trees import Tree, map_leaves
 
 STEP = 1e-5
 

@@ -16,7 +16,7 @@ from rts import Camera
 from rts.plugin_api.loops import loop
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel
-from rts_backends.neighbours import corner_lists, look, places
+from rts_backends.exact_hits import corner_lists, look, places
 from rts_backends.triangles import facing, pixel_matrix
 
 STEP = 1e-6

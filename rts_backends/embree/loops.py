@@ -18,7 +18,7 @@ from numba import carray, types  # pyright: ignore[reportPrivateImportUsage]  # 
 from numba.extending import intrinsic
 
 from rts.plugin_api.loops import compiled, loop
-from rts_backends.embree.covers import NEVER
+from rts_backends.embree.enlarged_triangles import NEVER
 from rts_backends.triangles import clipped, depth_of, determinant, edge_values, to_corner
 
 TILE = 8

@@ -14,7 +14,7 @@ from rts import Camera, TriangleSampler
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel
 from rts_backends.embree import embreex_fallback, library
-from rts_backends.embree.covers import Covers
+from rts_backends.embree.enlarged_triangles import Covers
 from rts_backends.embree.loops import TILE, cast, keep_nearest_address
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix
 

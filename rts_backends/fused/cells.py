@@ -2,7 +2,7 @@
 
 Every target collects from its nine sources, and in the reverse direction every source from its nine targets, each in
 one fixed order: results do not depend on the number of threads. Most targets are plain (`stencil.py`); what is
-decided for the others, the mixed ones (`mixed.py`), is decided once and kept in `Cells`.
+decided for the others, the mixed ones (`mixed_targets.py`), is decided once and kept in `Cells`.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ import numpy as np
 from rts import InputError
 from rts.plugin_api.splats import Visible
 from rts.plugin_api.threads import parallel, read_only
-from rts_backends.fused import choices as listing
-from rts_backends.fused import crossing_pairs, crossings, mixed, outlines, stencil
+from rts_backends.fused import crossing_pairs, crossings, mixed_targets, outlines, stencil
+from rts_backends.fused import layer_pairing as listing
 from rts_backends.fused.crossings import Crossings
 from rts_backends.fused.outlines import Outlines
 from rts_backends.fused.pairs import BLOCK
-from rts_backends.fused.survey import EMPTY, collect, note, paint, survey
+from rts_backends.fused.uniform_cells import EMPTY, collect, note, paint, survey
 
 MANY = 256
 """Samples whose colours settled targets show, beyond which gradients are added one by one."""
@@ -286,7 +286,9 @@ class Cells:
             given = *self.plain_arguments, self.choices.states, self.border
             parallel(stencil.forward, len(out), *given, out, work=self._plain_work)
             if len(self.choices.columns):
-                parallel(mixed.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10)
+                parallel(
+                    mixed_targets.forward, len(out), *self._mixed_sums, self.border, out, work=self._mixed_work // 10
+                )
             if self._shows_several:  # What has no sample of its own shows that of row 0 so far.
                 self._paint(self.rgba[None], out[None])
 
@@ -340,15 +342,15 @@ class Cells:
         if not (count and (len(g_positions) or len(g_rgba))):
             return
         adjoints, work = np.empty((count, 3, 5), g.dtype), self._mixed_work
-        parallel(mixed.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=work // 5)
+        parallel(mixed_targets.adjoint, height, *self._mixed_sums, self.border, g, adjoints, work=work // 5)
         given = height, *self.mixed_arguments, adjoints
         if self._crossed:
             # Lines of crossing take the place of what samples would give to positions, but not to colours.
             if len(g_rgba):
-                parallel(mixed.pull, *given, g_positions[:0], g_rgba, work=work)
+                parallel(mixed_targets.pull, *given, g_positions[:0], g_rgba, work=work)
             adjoints[self.crossings.among_mixed()], g_rgba = 0, g_rgba[:0]
         if len(g_positions) or len(g_rgba):
-            parallel(mixed.pull, *given, g_positions, g_rgba, work=work)
+            parallel(mixed_targets.pull, *given, g_positions, g_rgba, work=work)
 
     def jvp(self, t_positions: np.ndarray | None, t_rgba: np.ndarray | None, out: np.ndarray) -> None:
         """Fill tangents (T, H, W, 4) of the image along those of positions (T, N, 3) and rgba (T, N, 4), or None."""
@@ -361,7 +363,7 @@ class Cells:
         parallel(stencil.push, out.shape[1], *self.plain_arguments, *tangents, self.choices.states, self.border, out)
         if len(self.choices.columns):
             given = *self.mixed_arguments, self.choices.sums, tangents, self.border
-            parallel(mixed.push, out.shape[1], *given, out, work=self._mixed_work * len(out))
+            parallel(mixed_targets.push, out.shape[1], *given, out, work=self._mixed_work * len(out))
         if self.rims and t_positions is not None:
             given = self.row, self.outlines, tangents[0], self.border
             parallel(outlines.push, out.shape[1], *given, out, work=80 * len(self.outlines.columns) * len(out))

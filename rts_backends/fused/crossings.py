@@ -13,8 +13,8 @@ import numpy as np
 from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.threads import parallel
 from rts_backends.fused.crossing_pairs import BORDER, Rules, gather, has_two, steps
-from rts_backends.fused.mixed import splat, tint_of
-from rts_backends.fused.survey import BUSY, SETTLED
+from rts_backends.fused.mixed_targets import splat, tint_of
+from rts_backends.fused.uniform_cells import BUSY, SETTLED
 
 NEITHER, SHEET_A, SHEET_B = 2, 0, 1
 """What a source is: of neither sheet, or of one."""

@@ -23,7 +23,7 @@ from rts_backends.fused.cells import Cells, Settings
 from rts_backends.fused.crossings import change_of
 from rts_backends.fused.image import rows_of
 from rts_backends.fused.losses import LINEAR, cost_and_weight, curvature, in_numbers
-from rts_backends.fused.mixed import changes_of, composited
+from rts_backends.fused.mixed_targets import changes_of, composited
 from rts_backends.fused.outlines import gain
 from rts_backends.fused.rows import (
     PITCH,
@@ -40,7 +40,7 @@ from rts_backends.fused.rows import (
     slot,
 )
 from rts_backends.fused.stencil import ALPHA, COLORS, TANGENT, add_tangent_row, load_around, load_tangent, tangent_row
-from rts_backends.fused.survey import BUSY, FLAT
+from rts_backends.fused.uniform_cells import BUSY, FLAT
 
 BAND = 16
 """Rows of the image whose products are added up together."""

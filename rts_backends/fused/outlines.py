@@ -17,7 +17,7 @@ from rts.plugin_api.threads import parallel
 from rts_backends.fused.crossing_pairs import steps
 from rts_backends.fused.pairs import BLOCK
 from rts_backends.fused.rows import exp
-from rts_backends.fused.survey import LISTED
+from rts_backends.fused.uniform_cells import LISTED
 
 BAND = 16
 """Rows whose gradients are added up by one thread, more than samples of which one target knows are apart."""

@@ -22,7 +22,7 @@ from numba import types
 from numba.extending import overload
 
 from rts.plugin_api import loops
-from rts_backends.fused.survey import FLAT
+from rts_backends.fused.uniform_cells import FLAT
 
 TILE = 32
 PITCH = TILE + 8

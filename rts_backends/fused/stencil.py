@@ -25,7 +25,7 @@ from rts_backends.fused.rows import (
     store,
     tile,
 )
-from rts_backends.fused.survey import BUSY, FLAT, SETTLED
+from rts_backends.fused.uniform_cells import BUSY, FLAT, SETTLED
 
 COLORS, ALPHA = (0,) * 5, (0,) * 2
 """The planes of a tangent that count, as tuples whose length compiled code knows: all five, or alpha and the weight."""

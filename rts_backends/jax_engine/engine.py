@@ -14,7 +14,7 @@ from rts import Engine, InputError, RtsError
 from rts.plugin_api.arrays import Tree
 from rts.plugin_api.operations import Operation
 from rts.plugin_api.records import ArraySpec
-from rts_backends.jax_engine import host, operations, rows_in_use
+from rts_backends.jax_engine import host, operations, row_blocks
 from rts_backends.jax_engine.used_rows import UsedRows
 
 for _cls, _split, _join in Engine.records():
@@ -158,7 +158,7 @@ class JaxEngine(Engine):
             with operations.by_specification():
                 return f(dict(zip(rows, own, strict=True)))
 
-        found = rows_in_use.apply(few, used, list(rows.values()))
+        found = row_blocks.apply(few, used, list(rows.values()))
         return whole if found is None else found
 
     def segment_sum(self, values: jax.Array, segments: np.ndarray, count: int) -> jax.Array:

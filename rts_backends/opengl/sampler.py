@@ -21,7 +21,7 @@ import numpy as np
 from rts import Camera, InputError, TriangleSampler, errors
 from rts.plugin_api.records import Fragments, Proxy
 from rts.plugin_api.threads import parallel
-from rts_backends.neighbours import corner_lists, places, settle
+from rts_backends.exact_hits import corner_lists, places, settle
 from rts_backends.opengl.worker import LESS, Worker
 from rts_backends.raster import Raster
 from rts_backends.triangles import bounding_sphere, facing, pixel_matrix

@@ -15,7 +15,7 @@ from rts.plugin_api.arrays import Array, Tree, exemplar, leaves, shape_of, unit
 from rts.plugin_api.checks import check_numbers, quoted
 from rts.plugin_api.operations import gradient
 from rts.plugin_api.records import Samples
-from rts_surfaces.entries import RESERVED
+from rts_surfaces.parameter_checks import RESERVED
 
 LARGEST = 1e38
 """What is larger is no number of single precision."""
@@ -225,7 +225,7 @@ def check_isovalue(isovalue: Any) -> float:
 
 
 def known_number(name: str, value: np.ndarray | None) -> float:
-    """A number that `rts.arguments` checked; refused where it is traced."""
+    """A number that `rts.arrays.argument_checks` checked; refused where it is traced."""
     if value is None:
         raise InputError(f"{name} is traced; expected a known number: surfaces do not change with theta")
     return float(value)

@@ -14,8 +14,8 @@ from rts import InputError, engine_of, namespace
 from rts.plugin_api.arrays import Array, Tree
 from rts.plugin_api.checks import check_positive
 from rts.plugin_api.operations import take
-from rts_surfaces.entries import check_entry
 from rts_surfaces.implicit.field import Function, check_function
+from rts_surfaces.parameter_checks import check_entry
 
 BLOCK = 2048
 """Points whose distances to all spheres are in memory at once."""

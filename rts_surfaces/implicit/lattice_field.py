@@ -9,11 +9,11 @@ from typing import Any
 from rts import namespace
 from rts.plugin_api.arrays import Array, Tree, shape_of
 from rts.plugin_api.records import ArraySpec, Samples
-from rts_surfaces.entries import check_entry
 from rts_surfaces.implicit.field import ScalarField
 from rts_surfaces.implicit.function_on_lattice import Looked, Resampled
 from rts_surfaces.implicit.interpolation import differences, interpolated
 from rts_surfaces.implicit.lattice import Lattice, check_shape
+from rts_surfaces.parameter_checks import check_entry
 
 
 class LatticeField(ScalarField):

@@ -19,7 +19,7 @@ from rts.plugin_api.checks import fingerprint, quoted
 from rts.plugin_api.operations import combine, take
 from rts.plugin_api.records import ArraySpec, Rays, Samples
 from rts.plugin_api.threads import read_only
-from rts_surfaces.entries import G_BUFFER_NAMES, check_names, check_rows
+from rts_surfaces.parameter_checks import G_BUFFER_NAMES, check_names, check_rows
 from rts_surfaces.parametric import BEYOND, CROSSINGS, LARGEST_STEP, RESIDUAL, STEPS, TOLERANCE, Geometry, Parametric
 from rts_surfaces.subdivision import library
 from rts_surfaces.subdivision.binding import BOUNDARIES, UV, UV_RULES, VERTEX, Limit, Points, Rules

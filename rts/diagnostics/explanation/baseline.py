@@ -9,14 +9,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.camera import Camera
+from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import Tree, leaves, map_leaves
 from rts.diagnostics.explanation import variants
 from rts.diagnostics.explanation.slopes import Number, measured
 from rts.diagnostics.explanation.subject import Subject
 from rts.diagnostics.shapes import box, icosphere, unlit
-from rts.engines import engine_of, namespace
-from rts.parts import Part
-from rts.trees import Tree, leaves, map_leaves
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 SUBDIVISIONS = 4
 """How often the sphere is subdivided."""

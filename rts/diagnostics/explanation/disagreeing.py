@@ -9,10 +9,10 @@ import numpy as np
 
 from rts.diagnostics.explanation import variants
 from rts.diagnostics.explanation.baseline import nearest
-from rts.diagnostics.explanation.fineness import on_host
 from rts.diagnostics.explanation.reasons import Finding
 from rts.diagnostics.explanation.slopes import Number
 from rts.diagnostics.explanation.subject import DEEP, Change, Subject, Touched
+from rts.diagnostics.explanation.thin_features import on_host
 from rts.diagnostics.explanation.vanishing import why_constant
 from rts.diagnostics.smoothing import low_pass
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rts.files.srgb import decode_srgb
-from rts.fitting.names import listed
+from rts.fitting.parameter_names import listed
 
 KINDS = {
     "constant": ("orange", (255, 150, 0)),

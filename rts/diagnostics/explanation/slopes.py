@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.camera import Camera
+from rts.arrays.engines import Engine, namespace
+from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.diagnostics.explanation.subject import DEEP, Subject
 from rts.diagnostics.smoothing import low_pass
-from rts.engines import Engine, namespace
-from rts.parts import Part
-from rts.trees import Array, Tree, leaves, map_leaves
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 STEP_UNSEEN = 1e-2
 """How far the finite differences change a number that nothing seems to depend on."""

@@ -10,21 +10,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arrays import kind_of
-from rts.camera import Camera
-from rts.checks import CheckedPart, check_colors, check_scene, check_splatter
+from rts.arrays.array_functions import kind_of
+from rts.arrays.engines import Engine, is_constant, namespace
+from rts.arrays.trees import Array, Tree, leaves, map_leaves
+from rts.contracts.checks import CheckedPart, check_colors, check_scene, check_splatter
 from rts.contracts.records import Sampled
-from rts.diagnostics.explanation.fineness import Fineness, fineness
+from rts.diagnostics.explanation.thin_features import Fineness, fineness
 from rts.diagnostics.steps import pixel_step
-from rts.engines import Engine, is_constant, namespace
 from rts.errors import InputError
-from rts.fitting.names import named_leaves
-from rts.parts import Part
+from rts.fitting.parameter_names import named_leaves
 from rts.rendering.image import render
 from rts.rendering.samples import sample
 from rts.sampling.adaptive import finest
 from rts.sampling.prepared import Prepared
-from rts.trees import Array, Tree, leaves, map_leaves
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 Scene = Callable[[Tree], tuple[Part | Sequence[Part] | Prepared, Camera]]
 Change = Callable[[list[Part], Camera], tuple[list[Part], Camera]]

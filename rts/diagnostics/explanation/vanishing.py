@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from rts.checks import check_scene
+from rts.arrays.trees import leaves, map_leaves
+from rts.contracts.checks import check_scene
 from rts.diagnostics.explanation import variants
 from rts.diagnostics.explanation.reasons import Finding
 from rts.diagnostics.explanation.slopes import Number
 from rts.diagnostics.explanation.subject import DEEP, Change, Subject, Touched, listed_parts
 from rts.fitting.dependence import directions_in_words
-from rts.sampling.emptiness import out_of_view
-from rts.trees import leaves, map_leaves
+from rts.sampling.empty_images import out_of_view
 
 QUIET = 1e-4
 """The largest change of a pixel by a step that counts as none."""

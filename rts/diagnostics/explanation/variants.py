@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from rts.camera import Camera
+from rts.arrays.engines import engine_of, namespace
+from rts.arrays.trees import Array, Tree
+from rts.contracts.gbuffer import GBuffer
 from rts.diagnostics.explanation.subject import Change
-from rts.engines import engine_of, namespace
-from rts.gbuffer import GBuffer
-from rts.parts import Part
 from rts.registry import instance
-from rts.trees import Array, Tree
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 CLEAR = 0.5
 """Alpha of what is made transparent, of that which it was."""

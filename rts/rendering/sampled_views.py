@@ -13,26 +13,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.checks import CheckedPart, check_memory
-from rts.contracts.plugin import overrides
+from rts.arrays.engines import engine_of, is_traced, namespace, stopped, value_of
+from rts.arrays.extremes import largest
+from rts.arrays.trees import Array
+from rts.contracts.checks import CheckedPart, check_memory
 from rts.contracts.records import ArraySpec, Cells, Decision, Fragments, Question, Sampled, Samples
 from rts.contracts.surface import TriangleSurface
-from rts.engines import engine_of, is_traced, namespace, stopped, value_of
+from rts.plugin_base import overrides
 from rts.rendering.scene import Grid, Scene
 from rts.rendering.settings import RenderSettings
 from rts.sampling.cache import Entry
-from rts.sampling.extremes import largest
 from rts.sampling.facing import facing_of_views
 from rts.sampling.hidden import HiddenBySplatter, without_hidden
 from rts.sampling.host_call import HostCall, Shape
 from rts.sampling.merging import merge
 from rts.sampling.packing import FAR, lift
+from rts.sampling.sample_checks import check_fragments, checked_pieces
 from rts.sampling.triangle_sampler import TriangleSampler
-from rts.sampling.validation import check_fragments, checked_pieces
+from rts.scene.camera import Camera
 from rts.splatting.side_by_side import Picture, depth_scales
 from rts.threads import each
-from rts.trees import Array
 
 
 class Views(NamedTuple):

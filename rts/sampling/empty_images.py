@@ -6,12 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.checks import CheckedPart
+from rts.arrays.engines import stopped, value_of
+from rts.arrays.trees import Tree, map_leaves
+from rts.contracts.checks import CheckedPart
 from rts.contracts.records import Proxy
 from rts.contracts.surface import TriangleSurface
-from rts.engines import stopped, value_of
-from rts.trees import Tree, map_leaves
+from rts.scene.camera import Camera
 
 
 def why_empty(parts: Sequence[CheckedPart], camera: Camera) -> str:

@@ -12,9 +12,9 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 import numpy as np
 
 from rts import registry
-from rts.contracts.plugin import Plugin, check_members
+from rts.arrays.trees import STATIC_FIELDS, Array, Tree, collected, join_record, map_leaves, split_record
 from rts.errors import EngineError, InputError, PluginError, RtsError
-from rts.trees import STATIC_FIELDS, Array, Tree, collected, join_record, map_leaves, split_record
+from rts.plugin_base import Plugin, check_members
 
 
 class Engine(Plugin):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from rts.camera import Camera, toward_rows, world_vectors
-from rts.engines import namespace
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array, record
 from rts.operations.by_view import index_of_views
 from rts.operations.linear import affine_map_of_views
 from rts.operations.take import take
-from rts.trees import Array, record
+from rts.scene.camera import Camera, toward_rows, world_vectors
 
 
 @record()

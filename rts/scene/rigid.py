@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import check_numbers
-from rts.arrays import is_finite, promote, shape_of
-from rts.engines import engine_of, is_constant, namespace
+from rts.arrays.argument_checks import check_numbers
+from rts.arrays.array_functions import is_finite, promote, shape_of
+from rts.arrays.engines import engine_of, is_constant, namespace
+from rts.arrays.trees import Array
 from rts.errors import InputError
 from rts.operations.operation import Arrays, Operation, Some
-from rts.transforms import affine_matrix
-from rts.trees import Array
+from rts.scene.transforms import affine_matrix
 
 ORIGIN = 0.0, 0.0, 0.0
 
@@ -73,7 +73,7 @@ def _shape(pose: tuple[int, ...], center: tuple[int, ...]) -> tuple[int, ...]:
 
 def _computed(operands: Arrays) -> tuple[np.ndarray, np.ndarray]:
     """The matrix, and its Jacobian (16, 9), float64."""
-    from rts.operations import rigid_loops
+    from rts.scene import rigid_loops
 
     pose, center = operands
     if pose.shape != (6,) or center.shape != (3,):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from rts.trees import Array, Tree, placed_leaves
+from rts.arrays.trees import Array, Tree, placed_leaves
 
 
 def named_leaves(tree: Tree) -> Iterator[tuple[str, Array]]:

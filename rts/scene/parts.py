@@ -7,9 +7,9 @@ from dataclasses import replace
 from typing import Any
 
 from rts import registry
-from rts.arguments import quoted
+from rts.arrays.argument_checks import quoted
+from rts.arrays.trees import Array, Tree, record
 from rts.errors import InputError
-from rts.trees import Array, Tree, record
 
 
 @record(static=("surface", "shader", "cull"))

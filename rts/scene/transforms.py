@@ -1,6 +1,6 @@
 """(4, 4) matrices, differentiable in their arguments: views and projections.
 
-Conventions of space are in `rts.camera`. Arguments may be torch or jax arrays, NumPy arrays or numbers.
+Conventions of space are in `rts.scene.camera`. Arguments may be torch or jax arrays, NumPy arrays or numbers.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import check_numbers, check_planes, check_positive, quoted
-from rts.arrays import promote, unit
-from rts.engines import namespace, value_of
+from rts.arrays.argument_checks import check_numbers, check_planes, check_positive, quoted
+from rts.arrays.array_functions import promote, unit
+from rts.arrays.engines import namespace, value_of
+from rts.arrays.trees import Array
 from rts.errors import InputError, InputWarning, warn
 from rts.operations.linear import matmul
-from rts.trees import Array
 
 
 def matrix_of(xp: Any, rows: list[list[Any]], like: Array) -> Array:

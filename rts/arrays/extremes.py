@@ -9,7 +9,7 @@ from rts.threads import parallel, read_only
 
 def largest(x: np.ndarray) -> float:
     """The largest size of a number in an array of floats; 0 for none, NaN where any is NaN."""
-    from rts.sampling import extremes_loops
+    from rts.arrays import extremes_loops
 
     if x.dtype != np.float32:
         return float(max(x.max(initial=0), -x.min(initial=0)))
@@ -40,7 +40,7 @@ def named(x: np.ndarray) -> tuple[np.ndarray, int, int]:
 
 def _ends(x: np.ndarray, there: np.ndarray) -> tuple[int, int]:
     """The least and the largest of int32; `there`, of their shape or empty, is filled with which are not negative."""
-    from rts.sampling import extremes_loops
+    from rts.arrays import extremes_loops
 
     numbers = read_only(x).reshape(-1)
     found = np.empty((-(-numbers.size // extremes_loops.CHUNK), 2), np.int32)
@@ -54,7 +54,7 @@ def places(x: np.ndarray, covered: np.ndarray) -> list[tuple[int, ...]]:
         sizes = np.where(covered, x, 0).reshape(1, -1)
         found, length = np.concatenate([-sizes, sizes]).max(axis=1, initial=0)[None], x.size
     else:
-        from rts.sampling.extremes_loops import CHUNK as length
+        from rts.arrays.extremes_loops import CHUNK as length
 
         found = _sizes(x, covered).view(np.float32)
     numbers, there = x.reshape(-1), covered.reshape(-1)
@@ -69,7 +69,7 @@ def places(x: np.ndarray, covered: np.ndarray) -> list[tuple[int, ...]]:
 
 def _sizes(x: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """How far numbers (float32) of each chunk are below and above zero at most, as bits (·, 2) int32."""
-    from rts.sampling import extremes_loops
+    from rts.arrays import extremes_loops
 
     bits = read_only(x).reshape(-1).view(np.int32)
     found = np.zeros((max(1, -(-bits.size // extremes_loops.CHUNK)), 2), np.int32)

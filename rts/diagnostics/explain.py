@@ -7,18 +7,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rts.camera import Camera
-from rts.checks import CheckedPart, check_scene
+from rts.arrays.engines import engine_of
+from rts.contracts.checks import CheckedPart, check_scene
 from rts.contracts.records import Samples
-from rts.engines import engine_of
-from rts.parts import Part
 from rts.rendering.image import render_samples
 from rts.rendering.samples import sample
 from rts.sampling.adaptive import Adaptive
 from rts.sampling.auto import Choice, choose, is_static
 from rts.sampling.prepared import Prepared
 from rts.sampling.winding import INSIDE_OUT, is_inside_out
-from rts.unread import Observed, likely_name, shaded_by, unread
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
+from rts.shading.unused_entries import Observed, likely_name, shaded_by, unread
 
 FEW = 32
 """Pixels along each side of the image that shows what shaders read."""

@@ -9,9 +9,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from rts.checks import check_memory
+from rts.arrays.engines import engine_of
+from rts.contracts.checks import check_memory
 from rts.contracts.records import Fine, Sampled
-from rts.engines import engine_of
 from rts.sampling.adaptive import Adaptive, contrasts, outlines
 from rts.sampling.hidden import HiddenBySplatter, planned, with_layers_that_count
 from rts.sampling.strips import FineGrid, HiddenInStrips, Layout, arranged, lay_out, of_engine, rounded

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from rts.camera import Camera
+from rts.arrays.engines import Engine, constants, namespace, stopped
+from rts.arrays.trees import Array, Tree
 from rts.contracts.records import Samples
 from rts.contracts.surface import Surface
-from rts.engines import Engine, constants, namespace, stopped
 from rts.errors import InputError
 from rts.operations.linear import affine_map
-from rts.trees import Array, Tree
+from rts.scene.camera import Camera
 
 FOOTPRINT = "uv_footprint"
 """The entry of the G-buffer."""

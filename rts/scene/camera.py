@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rts.arguments import (
+from rts.arrays.argument_checks import (
     check_numbers,
     check_pixels,
     check_planes,
@@ -27,13 +27,14 @@ from rts.arguments import (
     is_invertible,
     quoted,
 )
-from rts.arrays import described, from_numbers, promote, shape_of, unit
+from rts.arrays.array_functions import described, from_numbers, promote, shape_of, unit
+from rts.arrays.engines import constants, engine_of, is_constant, load_engines, namespace, value_of
+from rts.arrays.trees import Array, map_leaves, record
 from rts.contracts.records import Rays
-from rts.engines import constants, engine_of, is_constant, load_engines, namespace, value_of
 from rts.errors import InputError
 from rts.operations.linear import affine, matmul, specified_affine_map
 from rts.operations.projection import projective_map
-from rts.transforms import (
+from rts.scene.transforms import (
     ROUNDING,
     affine_matrix,
     check_product,
@@ -45,7 +46,6 @@ from rts.transforms import (
     scaled_rows,
     warn_of_radians,
 )
-from rts.trees import Array, map_leaves, record
 
 NEAR_OVER_DISTANCE = 1e-2
 FAR_OVER_DISTANCE = 1e2

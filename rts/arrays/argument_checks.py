@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import kind_of, shape_of
-from rts.engines import CONSTANT_TYPES, is_constant, namespace, value_of
+from rts.arrays.array_functions import kind_of, shape_of
+from rts.arrays.engines import CONSTANT_TYPES, is_constant, namespace, value_of
+from rts.arrays.trees import leaves
 from rts.errors import InputError
-from rts.trees import leaves
 
 Shape = tuple[int, ...]
 

@@ -7,18 +7,18 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import is_invertible, one_line
-from rts.arrays import shape_of
-from rts.camera import Camera
+from rts.arrays.argument_checks import is_invertible, one_line
+from rts.arrays.array_functions import shape_of
+from rts.arrays.engines import namespace
+from rts.arrays.extremes import largest
+from rts.arrays.trees import Tree
 from rts.contracts.records import Fragments, Proxy, Samples
 from rts.contracts.surface import TriangleSurface
-from rts.engines import namespace
 from rts.errors import InputError
-from rts.sampling.extremes import largest
 from rts.sampling.packing import covered_cells
+from rts.scene.camera import Camera
+from rts.scene.topology import table_extent
 from rts.splatting.layers import check_rows
-from rts.topology import table_extent
-from rts.trees import Tree
 
 
 def checked_proxy(surface: TriangleSurface, inputs: Tree, camera: Any, size: Any) -> Proxy:

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.arguments import ROTATION_TOLERANCE, check_numbers, quoted
-from rts.camera import Camera
-from rts.checks import is_count, is_real
+from rts.arrays.argument_checks import ROTATION_TOLERANCE, check_numbers, quoted
+from rts.contracts.checks import is_count, is_real
 from rts.errors import FileWarning, InputError, warn
 from rts.files.damage import contents, gathered
 from rts.files.images import load_image, read_image
 from rts.files.paths import as_path, inside
+from rts.scene.camera import Camera
 
 COLOURS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0)}
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".JPG", ".JPEG", ".PNG")

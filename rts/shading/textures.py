@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rts.arrays import described, shape_of
-from rts.engines import engine_of, namespace, stopped
+from rts.arrays.array_functions import described, shape_of
+from rts.arrays.engines import engine_of, namespace, stopped
+from rts.arrays.trees import Array
 from rts.errors import InputError
-from rts.trees import Array
 
 WRAPS = ("repeat", "mirror", "clamp")
 """How a texture goes on outside [0, 1]."""

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from rts.engines import CONSTANT_TYPES, OWNERS, engine_of, exemplar, is_constant, namespace, value_of
+from rts.arrays.engines import CONSTANT_TYPES, OWNERS, engine_of, exemplar, is_constant, namespace, value_of
+from rts.arrays.trees import STATIC_FIELDS, Array, Tree, is_named, leaves, map_leaves
 from rts.errors import EngineError, InputError
-from rts.trees import STATIC_FIELDS, Array, Tree, is_named, leaves, map_leaves
 
 
 def from_numbers(tree: Tree, name: str = "an array") -> Tree:
@@ -180,7 +180,7 @@ def _is_finite(x: Array) -> bool:
     known = engine.known(x)
     if known is None or not known.size:
         return True
-    from rts.sampling.extremes import largest
+    from rts.arrays.extremes import largest
 
     # What is repeated is looked at but once. Sums and products would take threads of their own, or overflow.
     return math.isfinite(largest(known[tuple([slice(None) if step else slice(1) for step in known.strides])]))

@@ -12,9 +12,9 @@ import numpy as np
 
 from rts.plugin_api.loops import compiled, loop
 from rts.plugin_api.records import Cells
-from rts_backends.fused.mixed import sums_of
+from rts_backends.fused.mixed_targets import sums_of
 from rts_backends.fused.pairs import BLOCK, mark
-from rts_backends.fused.survey import BUSY, EMPTY
+from rts_backends.fused.uniform_cells import BUSY, EMPTY
 
 MORE_BEHIND = Cells.MORE_BEHIND
 

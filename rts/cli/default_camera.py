@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rts.camera import Camera
 from rts.errors import InputError
-from rts.parts import Part
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 ROUGHLY = 16
 """Cuts along each side of a patch, to see how large a surface is."""

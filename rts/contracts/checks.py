@@ -12,24 +12,24 @@ from typing import Any
 import numpy as np
 
 from rts import registry
-from rts.arguments import check_pixels, quoted
-from rts.arrays import described, from_numbers, is_finite, shape_of
-from rts.camera import Camera
-from rts.contracts.plugin import check_members, promised
+from rts.arrays.argument_checks import check_pixels, quoted
+from rts.arrays.array_functions import described, from_numbers, is_finite, shape_of
+from rts.arrays.engines import floating_bits, value_of
+from rts.arrays.trees import Array, Tree, placed_leaves, record
+from rts.contracts.gbuffer import GBuffer
 from rts.contracts.sampler import Sampler
 from rts.contracts.shader import FunctionShader, Shader
 from rts.contracts.splatter import Splatter
 from rts.contracts.surface import RaySurface, Surface, TriangleSurface
-from rts.engines import floating_bits, value_of
 from rts.errors import AspectWarning, InputError, PluginError, warn
-from rts.gbuffer import GBuffer
-from rts.parts import Part
-from rts.trees import Array, Tree, placed_leaves, record
+from rts.plugin_base import check_members, promised
+from rts.scene.camera import Camera
+from rts.scene.parts import Part
 
 
 @record(static=("surface", "shader", "cull"))
 class CheckedPart(Part):
-    """A part whose surface and shader are of their bases, as `rts.checks` makes it."""
+    """A part whose surface and shader are of their bases, as `rts.contracts.checks` makes it."""
 
     surface: Surface
     theta: Mapping[str, Tree]

@@ -6,12 +6,12 @@ import difflib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
-from rts.checks import CheckedPart
+from rts.arrays.trees import Array, Tree
+from rts.contracts.checks import CheckedPart
+from rts.contracts.gbuffer import GBuffer
 from rts.contracts.shader import Shader
 from rts.errors import InputWarning, warn
-from rts.footprints import FOOTPRINT
-from rts.gbuffer import GBuffer
-from rts.trees import Array, Tree
+from rts.shading.uv_footprints import FOOTPRINT
 
 SURFACE_ENTRIES = ("vertices", "points", "normals", "colors", "uv")
 SHADER_ENTRIES = ("color", "texture", "light", "specular", "shininess", "depth_range", "weights")

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from rts.arguments import quoted
-from rts.arrays import shape_of
+from rts.arrays.argument_checks import quoted
+from rts.arrays.array_functions import shape_of
+from rts.arrays.engines import value_of
+from rts.arrays.extremes import extent
+from rts.arrays.trees import leaves
 from rts.contracts.records import Cells
-from rts.engines import value_of
 from rts.errors import EngineError, InputError
-from rts.sampling.extremes import extent
-from rts.trees import leaves
 
 
 def index_table(name: str, table: Any, width: int) -> np.ndarray:

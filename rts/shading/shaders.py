@@ -21,18 +21,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rts.arguments import quoted
-from rts.arrays import described, dot, is_finite, shape_of, unit
-from rts.camera import Camera
-from rts.contracts.plugin import promised
+from rts.arrays.argument_checks import quoted
+from rts.arrays.array_functions import described, dot, is_finite, shape_of, unit
+from rts.arrays.engines import engine_of, is_constant, namespace, value_of
+from rts.arrays.trees import Array, Tree, map_leaves
+from rts.contracts.gbuffer import GBuffer
 from rts.contracts.shader import Shader
-from rts.engines import engine_of, is_constant, namespace, value_of
 from rts.errors import InputError
-from rts.footprints import FOOTPRINT
-from rts.gbuffer import GBuffer
-from rts.row_cameras import RowCameras
-from rts.textures import WRAPS, sample_texture
-from rts.trees import Array, Tree, map_leaves
+from rts.plugin_base import promised
+from rts.scene.camera import Camera
+from rts.scene.row_cameras import RowCameras
+from rts.shading.textures import WRAPS, sample_texture
+from rts.shading.uv_footprints import FOOTPRINT
 
 DEFAULT_AMBIENT, DEFAULT_DIFFUSE = 0.2, 0.8
 LIGHT_ENTRIES = ("direction", "color", "ambient")

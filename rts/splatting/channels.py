@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from rts.arrays import described, shape_of
+from rts.arrays.array_functions import described, shape_of
+from rts.arrays.engines import namespace
+from rts.arrays.trees import Array
 from rts.contracts.records import Splats
 from rts.contracts.splatter import Splatter
-from rts.engines import namespace
 from rts.errors import InputError
-from rts.trees import Array
 
 GROUP = 3
 """Channels besides alpha that a splatter is given at once."""

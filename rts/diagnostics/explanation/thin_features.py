@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rts.arrays.engines import engine_of
 from rts.contracts.records import Sampled
-from rts.engines import engine_of
 
 FINE, CELLS = 8, 2**22
 """Cells along each side of a sample, to see what is thinner; fewer where there would be more than so many in all."""
