@@ -4,6 +4,7 @@ import numpy as np
 from helpers import icosphere, quad, to_numpy
 
 import rts
+from rts.sampling import fine_samples
 
 MESH = rts.plugin("rts.surfaces", "mesh")
 CAMERA = rts.Camera.look_at((0.4, 0.5, 3.2), (0, 0, 0))
@@ -26,7 +27,7 @@ def render(parts, supersample, **options):
 
 def activate(monkeypatch, mask):
     """Make a mask of pixels (H, W) the active ones."""
-    monkeypatch.setattr(fine, "active", lambda *_, **__: np.ascontiguousarray(mask))
+    monkeypatch.setattr(fine_samples, "active", lambda *_, **__: np.ascontiguousarray(mask))
 
 
 def random_mask(seed=0, share=0.3):

@@ -9,9 +9,9 @@ from helpers import DIFFERENTIABLE, arrays, box, icosphere, rotation, soup, spla
 
 import rts
 from rts import splatting
+from rts.contracts.pieces import pieces
 from rts.contracts.records import Cells
 from rts.sampling.facing import eye
-from rts.scene.topology import pieces
 from rts_backends.fused.splatters import Visible
 
 pytestmark = pytest.mark.splatting

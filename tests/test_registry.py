@@ -232,10 +232,8 @@ def test_surfaces_and_entry_points_are_left_alone_until_an_attribute_asks_for_th
     loaded = modules_after("import rts\nassert not rts.registry._found\nassert not hasattr(rts, 'regulrizers')")
     assert not {m for m in loaded if m.startswith("rts_surfaces")}
     loaded = modules_after("import rts\nassert rts.registry._found == {}\nrts.Mesh")
-    assert {m for m in loaded if m.startswith("rts_surfaces.")} == {
-        "rts_surfaces.parameter_checks",
-        "rts_surfaces.mesh",
-    }
+    expected = {"rts_surfaces.parameter_checks", "rts_surfaces.mesh"}
+    assert {m for m in loaded if m.startswith("rts_surfaces.")} == expected
 
 
 # ------------------------------------------------------------------------------------------ what is loaded

@@ -32,7 +32,7 @@ class Residuals(Plugin):
         """Mean loss () of the n residuals r, JᵀSJ / n (U, U) and JᵀWr / n (U,) for their Jacobian J.
 
         W and S are diagonals of `self.loss.weights(r)`, ones for the mean square.
-        U counts the numbers in the parameters, in the order of `rts.arrays.trees.leaves`. All are arrays of the parameters'
-        engine, which may be traced. With it, Levenberg–Marquardt makes no Jacobian of its own.
+        U counts the numbers in the parameters, in the order of `rts.arrays.trees.leaves`. All are arrays of the
+        parameters' engine, which may be traced. With it, Levenberg–Marquardt makes no Jacobian of its own.
         """
         raise NotImplementedError

@@ -1,4 +1,7 @@
-"""The bases of surfaces. Letters of shapes are in `rts.contracts.records`, conventions of space in `rts.scene.camera`."""
+"""The bases of surfaces.
+
+Letters of shapes are in `rts.contracts.records`, conventions of space in `rts.scene.camera`.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +16,12 @@ from rts.arrays.array_functions import from_numbers
 from rts.arrays.engines import engine_of, stopped
 from rts.arrays.trees import Array, Tree, map_leaves
 from rts.contracts.gbuffer import GBuffer
-from rts.contracts.records import ArraySpec, Proxy, RayHits, Rays, Samples
+from rts.contracts.records import ArraySpec, Proxy, RayHits, Samples
 from rts.errors import InputError
 from rts.plugin_base import Plugin, overrides
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
+from rts.scene.rays import Rays
 
 
 class Rate(NamedTuple):
@@ -171,7 +175,8 @@ class TriangleSurface(Surface):
     def pieces(self, proxy: Proxy) -> np.ndarray:
         """Which triangles are wound alike, so that what shows its front does not go on in what shows its back.
 
-        Not asked where `refine` moves samples. `rts.scene.topology.pieces` finds them by the edges that triangles share.
+        Not asked where `refine` moves samples. `rts.plugin_api.checks.pieces` finds them by the edges
+        that triangles share.
 
         Args:
             proxy: what `proxy` gave.

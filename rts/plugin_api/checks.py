@@ -2,9 +2,10 @@
 
 from rts.arrays.argument_checks import check_numbers, check_positive, quoted
 from rts.contracts.checks import check_scene, is_count
+from rts.contracts.pieces import pieces
 from rts.sampling.cache import fingerprint
 from rts.sampling.sample_checks import check_camera
-from rts.scene.topology import index_table, pieces
+from rts.scene.topology import index_table
 
 __all__ = [
     "check_camera",

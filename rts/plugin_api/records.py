@@ -1,5 +1,6 @@
 """Records that pass between the library and plugins."""
 
-from rts.contracts.records import ArraySpec, Cells, Fragments, Proxy, RayHits, Rays, Request, Samples, Splats
+from rts.contracts.records import ArraySpec, Cells, Fragments, Proxy, RayHits, Request, Samples, Splats
+from rts.scene.rays import Rays
 
 __all__ = ["ArraySpec", "Cells", "Fragments", "Proxy", "RayHits", "Rays", "Request", "Samples", "Splats"]

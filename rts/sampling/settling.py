@@ -10,11 +10,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from rts.arrays.trees import Tree
-from rts.contracts.records import ArraySpec, Fragments, Proxy, Rays, Samples
+from rts.contracts.records import ArraySpec, Fragments, Proxy, Samples
 from rts.contracts.surface import TriangleSurface
 from rts.sampling.packing import lift
 from rts.sampling.sample_checks import checked_refined
 from rts.scene.camera import Camera
+from rts.scene.rays import Rays
 from rts.threads import parallel, read_only
 
 SAME_ROOT_PIXELS, SAME_ROOT = 1e-2, 1e-6

@@ -30,10 +30,10 @@ from rts.arrays.argument_checks import (
 from rts.arrays.array_functions import described, from_numbers, promote, shape_of, unit
 from rts.arrays.engines import constants, engine_of, is_constant, load_engines, namespace, value_of
 from rts.arrays.trees import Array, map_leaves, record
-from rts.contracts.records import Rays
 from rts.errors import InputError
 from rts.operations.linear import affine, matmul, specified_affine_map
 from rts.operations.projection import projective_map
+from rts.scene.rays import Rays
 from rts.scene.transforms import (
     ROUNDING,
     affine_matrix,

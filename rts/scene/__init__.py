@@ -1,0 +1,1 @@
+"""What a scene is made of: parts, cameras, poses, and tables of triangles."""

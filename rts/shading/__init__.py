@@ -1,0 +1,1 @@
+"""The built-in shaders, textures, and what shaders read of samples."""
