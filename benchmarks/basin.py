@@ -32,8 +32,8 @@ from benchmarks.camera import camera, supersampled
 from benchmarks.meshes import mesh
 from benchmarks.pose_recovery import DIAMETER, VIEWS, Views, arrays, eye
 from benchmarks.report import table
-from rts.diagnostics.comparison.style import PEER_COLORS
 from rts.fitting.schedule import Stage
+from rts_compare.chart_style import PEER_COLORS
 
 RESULTS = Path(__file__).parent / "results"
 SIZE = (64, 64)

@@ -1,7 +1,8 @@
 """Speed against accuracy on all built-in scenes: what `rts compare` measures, as files to keep.
 
-Writes to benchmarks/results a PNG and a JSON a scene, chart.html for all of them, and summary.md: what to take for
-10 %, 3 % and 1 % of error. What is measured is kept in a folder of its own, and a run that is interrupted goes on:
+Writes to benchmarks/results a PNG and a JSON a scene, and summary.md: what to take for 10 %, 3 % and 1 % of error; and
+chart.html, a page of all of them, which is not kept: `--draw` makes it of the JSON files. What is measured is kept in a
+folder of its own, and a run that is interrupted goes on:
 
     python -m benchmarks.chart                                 # most of two hours on two cores
     python -m benchmarks.chart --scenes "thin wires" -o /tmp/wires
@@ -18,14 +19,14 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import table
-from rts.diagnostics import compare
-from rts.diagnostics.comparison.builtin import BUILTIN
-from rts.diagnostics.comparison.chart import draw
-from rts.diagnostics.comparison.compare import file_name
-from rts.diagnostics.comparison.front import LEVELS, best_within, timed
-from rts.diagnostics.comparison.page import write_page
-from rts.diagnostics.comparison.scene import MODES
-from rts.diagnostics.comparison.style import label, samples_label, side_length
+from rts_compare import compare
+from rts_compare.builtin_scenes import BUILTIN
+from rts_compare.chart_style import label, samples_label, side_length
+from rts_compare.comparison import file_name
+from rts_compare.html_page import write_page
+from rts_compare.moving_scenes import MODES
+from rts_compare.pareto_front import LEVELS, best_within, timed
+from rts_compare.png_chart import draw
 
 RESULTS = Path(__file__).parent / "results"
 

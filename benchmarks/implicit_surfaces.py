@@ -29,7 +29,7 @@ from benchmarks.meshes import DATA, normalised
 from benchmarks.report import table
 from benchmarks.speed.memory import growth
 from benchmarks.timing import in_turn
-from rts.diagnostics.comparison.environment import environment
+from rts_compare.environment import environment
 from rts_surfaces.implicit.fields import smooth_union, swept_sphere
 from rts_surfaces.implicit.narrow_band import NarrowBand
 

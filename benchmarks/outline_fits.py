@@ -30,7 +30,7 @@ from benchmarks.camera import camera, supersampled
 from benchmarks.meshes import mesh, rotation_xy
 from benchmarks.pose_recovery import DIAMETER, MESHES, VIEWS, Task, eye, line
 from benchmarks.report import table
-from rts.diagnostics.comparison.builtin import VASE_HEIGHTS, VASE_RADII
+from rts_compare.builtin_scenes import VASE_HEIGHTS, VASE_RADII
 
 MOTIONS: dict[str, dict] = {"samples": {"rims": False}, "fronts": {"exits": False}, "visible": {}}
 """Options of the splatter."""

@@ -30,8 +30,8 @@ from benchmarks.meshes import DATA, normalised, rotation_xy
 from benchmarks.report import table
 from benchmarks.speed.memory import growth
 from benchmarks.timing import in_turn
-from rts.diagnostics.comparison.environment import environment
 from rts.plugin_api.records import Proxy
+from rts_compare.environment import environment
 
 SHADERS = ("silhouette", "lambert")
 TOLERANCES = (0.8, 0.4, 0.2, 0.1, 0.05)

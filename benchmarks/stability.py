@@ -1,6 +1,6 @@
 """Where each method breaks: a table of ways to fail against methods, each cell an outcome with its figure.
 
-The rows are those of `rts.diagnostics.stability`, and the hand of the data folder (`benchmarks.paper.hand`). Written to
+The rows are those of `rts_compare.stability`, and the hand of the data folder (`benchmarks.paper.hand`). Written to
 the output are stability.md, stability.json and stability.png, and copies to benchmarks/results. A run that is
 interrupted goes on; rows can be run alone:
 
@@ -19,18 +19,18 @@ from typing import Any
 import numpy as np
 
 from benchmarks.paper import hand
-from rts.diagnostics import Stability, stability
-from rts.diagnostics.comparison.journal import Journal
-from rts.diagnostics.failures.methods import METHODS, Method
-from rts.diagnostics.failures.outcome import Context, Outcome, Row, cannot
-from rts.diagnostics.failures.rows import ROWS
+from rts_compare import Stability, stability
+from rts_compare.failures.table_cells import Context, Outcome, Row, cannot
+from rts_compare.failures.table_columns import METHODS, Method
+from rts_compare.failures.table_rows import ROWS
+from rts_compare.kept_measurements import KeptMeasurements
 
 RESULTS = Path(__file__).parent / "results"
 COLORS = {"ok": "#CDE9D6", "degraded": "#FBE7A8", "failed": "#F4B6AB", "cannot": "#ECECEC"}
 HAND = "hand, over learning rates"
 
 
-def hand_row(kept: Journal) -> Row:
+def hand_row(kept: KeptMeasurements) -> Row:
     """The row of the hand."""
     note = (
         "Three photographs, as rigid as possible, rates ×0.1 to ×30, 3 seeds. Figure: the median RMS error (sRGB) at "
@@ -41,7 +41,7 @@ def hand_row(kept: Journal) -> Row:
     return Row(HAND, note, partial(_hand, kept), why)
 
 
-def _hand(kept: Journal, method: Method, context: Context) -> Outcome:
+def _hand(kept: KeptMeasurements, method: Method, context: Context) -> Outcome:
     """One cell of it; DEODR's is its own fitter's."""
     if method.peer == "Mitsuba":
         return cannot("a fit of 1,800 images of it takes an hour")
@@ -111,7 +111,7 @@ def options() -> argparse.Namespace:
 def main() -> None:
     args = options()
     args.output.mkdir(parents=True, exist_ok=True)
-    kept = Journal(args.output / ".hand.jsonl")
+    kept = KeptMeasurements(args.output / ".hand.jsonl")
     more = [hand_row(kept)] if args.rows is None or HAND in args.rows else []
     rows = None if args.rows is None else [name for name in args.rows if name != HAND]
     table = stability(rows, args.methods, seeds=args.seeds, output=args.output, fresh=args.fresh, more=more)

@@ -17,14 +17,14 @@ from pathlib import Path
 
 import rts
 from benchmarks.report import table
-from rts.diagnostics.comparison.builtin import builtin
-from rts.diagnostics.comparison.compare import file_name
-from rts.diagnostics.comparison.environment import environment
-from rts.diagnostics.comparison.journal import Journal
-from rts.diagnostics.comparison.measure import TOGETHER, Measurements
-from rts.diagnostics.comparison.search import LAYERS, SUPERSAMPLE
-from rts.diagnostics.comparison.settings import Setting, engines, usable
-from rts.diagnostics.comparison.turns import Calls
+from rts_compare.builtin_scenes import builtin
+from rts_compare.compared_settings import Setting, engines, usable
+from rts_compare.comparison import file_name
+from rts_compare.environment import environment
+from rts_compare.interleaved_timing import Calls
+from rts_compare.kept_measurements import KeptMeasurements
+from rts_compare.measurements import TOGETHER, Measurements
+from rts_compare.settings_search import LAYERS, SUPERSAMPLE
 
 CASES = {
     "bunny over black": (("translation", "rotation"), 0.25),
@@ -64,15 +64,15 @@ def case(name: str, modes: tuple[str, ...], tolerance: float, folder: Path) -> d
         start = time.perf_counter()
         tuned = rts.tune(scene, modes=modes, tolerance=tolerance, size=SIZE, truths=folder, progress=False)
         times.append(time.perf_counter() - start)
-    journal = Journal(folder / f"{file_name(name)}.jsonl")
+    kept = KeptMeasurements(folder / f"{file_name(name)}.jsonl")
     scene = replace(scene.with_modes(modes), size=SIZE)
-    measured = Measurements(scene, journal, engines()[0][:1], truths=folder, together=True, count_at=SUPERSAMPLE[-1])
+    measured = Measurements(scene, kept, engines()[0][:1], truths=folder, together=True, count_at=SUPERSAMPLE[-1])
     admissible = within(measured, tolerance)
     found = medians(measured, admissible, 2)
     best = min(found, key=lambda s: found[s])
     chosen = Setting(**tuned.settings, rate=tuned.rate, engine=measured.engine.name)
     last = Measurements(
-        measured.scene, Journal(), [measured.engine], truths=folder, together=True, count_at=SUPERSAMPLE[-1]
+        measured.scene, KeptMeasurements(), [measured.engine], truths=folder, together=True, count_at=SUPERSAMPLE[-1]
     )
     again = medians(last, list({chosen: None, best: None}), TURNS)
     return {
@@ -92,7 +92,7 @@ def case(name: str, modes: tuple[str, ...], tolerance: float, folder: Path) -> d
 def medians(measured: Measurements, settings: list[Setting], turns: int) -> dict[Setting, float]:
     """Milliseconds of settings, in turns."""
     calls: Calls = {s: lambda s=s: measured.call(TOGETHER, s) for s in settings}
-    return {Setting(*s): ms["median"] for s, ms in measured.turns(TOGETHER, calls).run(turns).items()}
+    return {Setting(*s): ms["median"] for s, ms in measured.timing(TOGETHER, calls).run(turns).items()}
 
 
 def _told(setting: Setting) -> str:

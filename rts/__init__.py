@@ -6,7 +6,8 @@ differentiate only that.
 Plugins import from `rts.plugin_api` what is not here. The kinds of warnings are in `rts.errors`.
 
 The surfaces that come with it are attributes, too, loaded when they are first used: `rts.Mesh`, `rts.Bezier`,
-`rts.BSpline`, `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`.
+`rts.BSpline`, `rts.Revolution`, `rts.Subdivision`, `rts.Isosurface` and `rts.Sdf`. So is `rts.tune`, of the package
+`rts_compare`.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -22,7 +23,6 @@ from rts.contracts.splatter import Splatter, SummingSplatter
 from rts.contracts.surface import Rate, RaySurface, Surface, TriangleSurface
 from rts.diagnostics.explain import explain
 from rts.diagnostics.gradients import check_gradient, gradient_image
-from rts.diagnostics.tune import tune
 from rts.errors import (
     EngineError,
     InputError,
@@ -69,10 +69,11 @@ if TYPE_CHECKING:
     Revolution: Any
     Sdf: Any
     Subdivision: Any
+    tune: Any
 else:
 
     def __getattr__(name: str):
-        """A built-in surface, found through entry points when it is first asked for."""
+        """A built-in surface or function, found through entry points when it is first asked for."""
         for place, names in _MOVED.items():
             if name in names.split():
                 raise AttributeError(f"rts.{name} is {place}.{name} now")
@@ -81,7 +82,7 @@ else:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *registry.built_in_surfaces()})
+    return sorted({*globals(), *registry.built_in_attributes()})
 
 
 __version__ = "0.1.0"

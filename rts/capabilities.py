@@ -51,6 +51,8 @@ def capabilities(group: str, plugin: Any) -> dict[str, Any]:
     Raises:
         PluginError: it is not of the group's base.
     """
+    if group not in BASES:
+        return {}
     kind = plugin if isinstance(plugin, type) else type(plugin)
     bases = {c.__name__: c for c in kind.__mro__ if c.__module__.partition(".")[0] == "rts"}
     if BASES[group] not in bases:

@@ -66,4 +66,4 @@ def warn(message: str, category: type[RtsWarning]) -> None:
     warnings.warn(message, category, stacklevel=level)
 
 
-OWN_PACKAGES = ("rts", "rts_backends", "rts_surfaces")
+OWN_PACKAGES = ("rts", "rts_backends", "rts_compare", "rts_surfaces")

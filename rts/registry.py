@@ -1,6 +1,7 @@
 """Plugins by (group, name), found through the entry points of installed distributions.
 
-Groups: rts.surfaces, rts.samplers, rts.shaders, rts.splatters, rts.engines. The library's own plugins are
+Groups: rts.surfaces, rts.samplers, rts.shaders, rts.splatters, rts.engines; rts.commands, what `rts` does; and
+rts.functions, which those of the library itself are attributes of `rts`. The library's own plugins are
 registered in its `pyproject.toml` in the same way as anyone's. Only the plugin asked for is imported.
 """
 
@@ -15,7 +16,15 @@ from typing import Any, Literal, NamedTuple, overload
 from rts.capabilities import capabilities
 from rts.errors import InputError, PluginError
 
-GROUPS = ("rts.surfaces", "rts.samplers", "rts.shaders", "rts.splatters", "rts.engines")
+GROUPS = (
+    "rts.surfaces",
+    "rts.samplers",
+    "rts.shaders",
+    "rts.splatters",
+    "rts.engines",
+    "rts.commands",
+    "rts.functions",
+)
 
 
 class PluginInfo(NamedTuple):
@@ -166,33 +175,38 @@ def plugin(group: str, name: str) -> Any:
         ) from error
 
 
-def built_in_surfaces() -> dict[str, str]:
-    """Class → name of the surfaces that the library's own distribution registers, such as "Mesh" → "mesh"."""
+def built_in_attributes() -> dict[str, tuple[str, str]]:
+    """Attribute of `rts` → group and name of the surface or function of the library's own distribution it stands for.
+
+    Such as "Mesh" → ("rts.surfaces", "mesh"), and "tune" → ("rts.functions", "tune").
+    """
     numpy = _entries("rts.engines").get("numpy")  # Missing where the sources alone are in the path.
     own = numpy[0].dist if numpy else None
     return {
-        entry.attr: name
-        for name, entries in _entries("rts.surfaces").items()
+        entry.attr: (group, name)
+        for group in ("rts.surfaces", "rts.functions")
+        for name, entries in _entries(group).items()
         for entry in entries
         if own is not None and entry.dist is not None and entry.dist.name == own.name
     }
 
 
 def attribute(name: str, known: Iterable[str]) -> Any:
-    """What `rts.Mesh` and its like are: a built-in surface by the name of its class, loaded now.
+    """The built-in surface of a class's name, such as `rts.Mesh`, or the function of a name, such as `rts.tune`.
 
     Args:
         name: of the attribute.
         known: names that there are besides, for a hint.
 
     Raises:
-        AttributeError: there is no such surface, or it cannot be imported.
+        AttributeError: there is no such thing, or it cannot be imported.
     """
-    surfaces = built_in_surfaces() if name[:1].isupper() else {}  # Only classes are worth a look at entry points.
-    if name not in surfaces:
-        raise AttributeError(f"module 'rts' has no attribute {name!r}{_suggest(name, [*known, *surfaces])}")
+    # Modules that are imported are looked for here, too: they are not worth a look at entry points.
+    found = built_in_attributes() if name[:1].isupper() or name in known else {}
+    if name not in found:
+        raise AttributeError(f"module 'rts' has no attribute {name!r}{_suggest(name, [*known, *found])}")
     try:
-        return plugin("rts.surfaces", surfaces[name])
+        return plugin(*found[name])
     except PluginError as error:
         raise AttributeError(f"rts.{name} cannot be loaded: {error}") from error
 

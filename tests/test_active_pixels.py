@@ -18,7 +18,7 @@ from loops import STEPS, Pairing
 
 import rts
 from rts import Adaptive
-from rts.sampling.adaptive import as_text, of_text, outlines
+from rts.sampling.adaptive import outlines
 from rts.splatting.layers import dilated
 
 pytestmark = pytest.mark.sampling
@@ -173,7 +173,7 @@ def test_it_is_a_static_value():
     ],
 )
 def test_texts_stand_for_it(given, text):
-    assert as_text(given) == text and of_text(text) == of_text(text.upper()) == given
+    assert Adaptive.of_text(text) == Adaptive.of_text(text.upper()) == given
 
 
 @pytest.mark.parametrize(
@@ -190,4 +190,4 @@ def test_texts_stand_for_it(given, text):
 )
 def test_texts_that_stand_for_nothing_are_refused(text, told):
     with pytest.raises(rts.InputError, match=told):
-        of_text(text)
+        Adaptive.of_text(text)

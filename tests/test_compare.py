@@ -1,4 +1,4 @@
-"""`rts.diagnostics.compare` and `rts.tune`: truth, errors, times, what is kept of them, and the command line."""
+"""`rts_compare.compare` and `rts.tune`: truth, errors, times, what is kept of them, and the command line."""
 
 import json
 import math
@@ -16,19 +16,18 @@ from hypothesis import strategies as st
 import rts
 from rts import registry
 from rts.arrays.engines import engine_named
-from rts.cli.comparison import summary
-from rts.diagnostics import compare
-from rts.diagnostics.comparison import measure, truth, turns
-from rts.diagnostics.comparison.compare import Comparison
-from rts.diagnostics.comparison.journal import Journal
-from rts.diagnostics.comparison.scene import moving
-from rts.diagnostics.comparison.scores import loss_weights, scores
-from rts.diagnostics.comparison.search import Search
-from rts.diagnostics.comparison.settings import Setting, _no_worse, engines, limited, worth_timing
-from rts.diagnostics.tune import tune
 from rts.errors import InputError, PluginError, ToleranceWarning
 from rts.registry import plugin
-from rts.sampling.adaptive import as_text, finest
+from rts_compare import compare, compared_settings, interleaved_timing, measurements, true_derivatives
+from rts_compare.commands import summary
+from rts_compare.compared_settings import Setting, _no_worse, as_text, engines, finest, worth_timing
+from rts_compare.comparison import Comparison
+from rts_compare.derivative_scores import loss_weights, scores
+from rts_compare.kept_measurements import KeptMeasurements
+from rts_compare.left_out import limited
+from rts_compare.moving_scenes import moving
+from rts_compare.settings_search import Search
+from rts_compare.tuning import tune
 
 pytestmark = pytest.mark.rendering
 pytest.importorskip("torch")
@@ -80,7 +79,7 @@ class TestScores:
 
 class TestTruth:
     def test_lattice(self):
-        points = truth.lattice(8)
+        points = true_derivatives.lattice(8)
         assert points.shape == (64, 2) and np.abs(points).max() <= 0.5
         assert len(np.unique(points[:, 0])) == len(np.unique(points[:, 1])) == 64
         np.testing.assert_allclose(points.mean(axis=0), 0, atol=0.01)
@@ -88,7 +87,9 @@ class TestTruth:
     def test_closed_form(self, tmp_path):
         """What a convex card covers does not change as it moves, and its edges pass by as long as they are upright."""
         moved = moving("card", card(), CAMERA, (SIDE, SIDE), modes=["translation"])
-        found = truth.truth(moved, "translation", 2 * 3 * np.tan(np.radians(20)) / SIDE, samples=8, folder=tmp_path)
+        found = true_derivatives.truth(
+            moved, "translation", 2 * 3 * np.tan(np.radians(20)) / SIDE, samples=8, folder=tmp_path
+        )
         image = found.derivative
         assert np.abs(image.sum(axis=(0, 1))).max() < 1e-2 * np.abs(image).sum()
         # The first moment grows by the area, for each pixel of motion.
@@ -98,22 +99,22 @@ class TestTruth:
         assert 0 < found.error < 0.1
 
     def test_kept(self, tmp_path, monkeypatch):
-        first = truth.truth(scene(), "translation", 0.03, samples=2, folder=tmp_path)
+        first = true_derivatives.truth(scene(), "translation", 0.03, samples=2, folder=tmp_path)
         (path,) = (tmp_path / "truths").iterdir()
-        made = truth.area_image
-        monkeypatch.setattr(truth, "area_image", None)
-        again = truth.truth(scene(), "translation", 0.03, samples=2, folder=tmp_path)
+        made = true_derivatives.area_image
+        monkeypatch.setattr(true_derivatives, "area_image", None)
+        again = true_derivatives.truth(scene(), "translation", 0.03, samples=2, folder=tmp_path)
         np.testing.assert_array_equal(again.derivative, first.derivative)
         # A file that was cut off is made anew.
         path.write_bytes(path.read_bytes()[:100])
-        monkeypatch.setattr(truth, "area_image", made)
-        anew = truth.truth(scene(), "translation", 0.03, samples=2, folder=tmp_path)
+        monkeypatch.setattr(true_derivatives, "area_image", made)
+        anew = true_derivatives.truth(scene(), "translation", 0.03, samples=2, folder=tmp_path)
         np.testing.assert_array_equal(anew.derivative, first.derivative)
 
     @pytest.mark.parametrize("change", ["color", "camera", "pixel", "cull", "samples"])
     def test_another_scene_has_another_key(self, change):
         def key(scene, step=0.1, samples=4):
-            return truth.truth_key(scene, "translation", step, samples, None)
+            return true_derivatives.truth_key(scene, "translation", step, samples, None)
 
         parts, camera = two_cards()
         others = {
@@ -180,12 +181,12 @@ class TestLimited:
 # -------------------------------------------------------------------------------------------------------- journal
 
 
-class TestJournal:
+class TestKeptMeasurements:
     def test_kept(self, tmp_path):
         path = tmp_path / "deep" / "journal"
-        Journal(path).put({"error": 0.1}, "error", "translation", 1)
-        assert Journal(path).get("error", "translation", 1) == {"error": 0.1}
-        assert Journal(path).get("error", "translation", 2) is None
+        KeptMeasurements(path).put({"error": 0.1}, "error", "translation", 1)
+        assert KeptMeasurements(path).get("error", "translation", 1) == {"error": 0.1}
+        assert KeptMeasurements(path).get("error", "translation", 2) is None
 
     @given(st.integers(0, 200))
     def test_cut_off_anywhere(self, at):
@@ -194,22 +195,22 @@ class TestJournal:
 
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "journal"
-            journal = Journal(path)
+            journal = KeptMeasurements(path)
             for n in range(8):
                 journal.put(n, "key", n)
             text = path.read_bytes()
             path.write_bytes(text[:at])
             whole = text[:at].count(b"\n")
-            again = Journal(path)
+            again = KeptMeasurements(path)
             assert [again.get("key", n) for n in range(8)] == [n if n < whole else None for n in range(8)]
             again.put("new", "key", "new")
-            assert Journal(path).get("key", "new") == "new"
+            assert KeptMeasurements(path).get("key", "new") == "new"
 
     def test_damaged(self, tmp_path):
         path = tmp_path / "journal"
         path.write_text("not a measurement\n")
         with pytest.raises(InputError, match="line 1 of .* is no measurement; remove the file"):
-            Journal(path)
+            KeptMeasurements(path)
 
 
 # -------------------------------------------------------------------------------------------------------- compare
@@ -258,7 +259,7 @@ class TestCompare:
         torch = pytest.importorskip("torch")
         comparison, _ = found
         cards = scene("translation")
-        measured = measure.Measurements(cards, Journal(), [engine_named("torch")], truths=kept, samples=6)
+        measured = measurements.Measurements(cards, KeptMeasurements(), [engine_named("torch")], truths=kept, samples=6)
         pixel = measured.pixel("translation")
         # The nearer card moves by a pixel at its own depth; each of its samples, at its own.
         assert pixel == pytest.approx(2 * 3 * np.tan(np.radians(20)) / SIDE, rel=1e-3)
@@ -281,8 +282,8 @@ class TestCompare:
 
     def test_another_run_measures_nothing(self, found, kept, monkeypatch):
         comparison, output = found
-        monkeypatch.setattr(measure.Measurements, "_measured", None)
-        monkeypatch.setattr(turns.Turns, "timed", None)
+        monkeypatch.setattr(measurements.Measurements, "_measured", None)
+        monkeypatch.setattr(interleaved_timing.InterleavedTiming, "timed", None)
         again = compare(scene("translation", "shape"), output=output, truths=kept, **SMALL)
         assert again.data == comparison.data
 
@@ -304,8 +305,8 @@ class TestCompare:
 
             monkeypatch.setattr(of, name, part)
 
-        interrupted(measure.Measurements, "_measured")
-        interrupted(turns.Turns, "timed")
+        interrupted(measurements.Measurements, "_measured")
+        interrupted(interleaved_timing.InterleavedTiming, "timed")
         interruptions = 0
         while True:
             try:
@@ -317,7 +318,7 @@ class TestCompare:
         errors = [key for name, key in finished if name == "_measured"]
         assert len(errors) == len(set(errors))
         taken = [key for name, key in finished if name == "timed"]
-        assert {taken.count(key) for key in taken} == {turns.ROUNDS}
+        assert {taken.count(key) for key in taken} == {interleaved_timing.ROUNDS}
         want = [(r["settings"], r["error"]) for r in found[0].rows if r["mode"] == "translation"]
         timed = {json.dumps(r["settings"]) for r in again.rows if r["ms"]}
         assert {json.dumps(s) for s, _ in want if s["sampler"]} == timed
@@ -453,7 +454,7 @@ class TestStrangers:
                 while True:
                     pass
 
-        monkeypatch.setattr(measure, "PATIENCE", 0.1)
+        monkeypatch.setattr(measurements, "PATIENCE", 0.1)
         monkeypatch.setitem(registry._defaults, ("rts.samplers", "reference"), Slow())
         options = {**SMALL, "samplers": ["raster", "reference"], "supersample": [1], "splatters": ["visible"]}
         comparison = compare(scene("translation"), truths=kept, **options)
@@ -477,7 +478,7 @@ def modelled(monkeypatch):
         assert callable(self.calls[name]())
         return [1e-3 * cost(Setting(*name))] * 2
 
-    monkeypatch.setattr(turns.Turns, "timed", timed)
+    monkeypatch.setattr(interleaved_timing.InterleavedTiming, "timed", timed)
     return cost
 
 
@@ -519,7 +520,7 @@ class TestTune:
         def scores(self, mode, setting):
             return {"error": told[setting.splatter][mode == "shape"]}
 
-        monkeypatch.setattr(measure.Measurements, "scores", scores)
+        monkeypatch.setattr(measurements.Measurements, "scores", scores)
         with pytest.warns(ToleranceWarning, match="the least error that was found is 30 %"):
             tuned = tune(scene("translation", "shape"), tolerance=0.1, samplers=["raster"], truths=kept, **TRUTH)
         assert tuned.settings["splatter"] == "visible" and tuned.error == 0.3
@@ -581,9 +582,9 @@ class TestTune:
         """It takes as many samples as it needs to be much more accurate than the tolerance; what is left is told."""
         monkeypatch.setattr(sys.modules[tune.__module__], "TRUTH_SAMPLES", (4, 8))
         made = []
-        true = measure.truth
+        true = measurements.truth
         monkeypatch.setattr(
-            measure, "truth", lambda *given, **options: made.append(options["samples"]) or true(*given, **options)
+            measurements, "truth", lambda *given, **options: made.append(options["samples"]) or true(*given, **options)
         )
         options = dict(splatters=["single"], samplers=["raster"], truths=tmp_path, progress=False)
         with warnings.catch_warnings():
@@ -673,7 +674,7 @@ class TestMisuse:
             tune("thin wires", tolerance=tolerance)
 
     def test_no_engine(self, monkeypatch):
-        monkeypatch.setattr(registry, "plugins", lambda group: ["numpy"] if group == "rts.engines" else [])
+        monkeypatch.setattr(compared_settings, "plugins", lambda group: ["numpy"] if group == "rts.engines" else [])
         with pytest.raises(PluginError, match="no engine with derivatives is installed"):
             compare("thin wires", progress=False)
 
@@ -742,7 +743,7 @@ class TestCommandLine:
         def interrupted(*args, **options):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("rts.diagnostics.compare", interrupted)
+        monkeypatch.setattr("rts_compare.comparison.compare", interrupted)
         for missing, said in (
             (["matplotlib"], "no PNG, which needs matplotlib"),
             (["plotly"], "no HTML, which needs plotly"),
@@ -772,7 +773,7 @@ class TestCommandLine:
         def interrupted(*args, **options):
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(measure.Measurements, "truths", interrupted)
+        monkeypatch.setattr(measurements.Measurements, "truths", interrupted)
         code, told = run("compare", model, "--quick", "-o", tmp_path / "out")
         assert (
             code == 130 and told == "rts: interrupted; what was measured is kept: the same command goes on from there"
@@ -784,7 +785,7 @@ class TestCommandLine:
             (["compare", "missing.obj"], "missing.obj does not exist; expected a model"),
             (["compare", "thin wires", "--mode", "sideways"], "expected some of translation"),
             (["compare", "thin wires", "--sampler", "blender"], "no sampler named 'blender'"),
-            (["tune", "thin wires", "--tolerance", "-1"], "tolerance is -1.0; expected a share"),
+            (["tune", "thin wires", "--tolerance", "-1"], "tolerance is -1.0; expected a positive number"),
         ],
     )
     def test_misuse(self, arguments, message):

@@ -18,10 +18,10 @@ from strategies import PROPERTIES
 
 import rts
 from rts import InputError, PluginError
-from rts.diagnostics.comparison import style
-from rts.diagnostics.comparison.chart import draw
-from rts.diagnostics.comparison.front import best_within, front, marked
-from rts.diagnostics.comparison.page import write_page
+from rts_compare import chart_style
+from rts_compare.html_page import write_page
+from rts_compare.pareto_front import best_within, front, marked
+from rts_compare.png_chart import draw
 
 pytestmark = pytest.mark.files
 
@@ -135,24 +135,24 @@ def test_marking_leaves_the_comparison_as_it_was():
 
 def test_settings_are_named_in_short_and_as_arguments():
     ours = row("a", 1, 1.0, layers="auto", supersample=2, rate="tolerance=0.4")
-    assert style.label(ours) == "visible K=auto 2×2 raster torch tolerance=0.4"
-    text = style.arguments(ours)
+    assert chart_style.label(ours) == "visible K=auto 2×2 raster torch tolerance=0.4"
+    text = chart_style.arguments(ours)
     assert text == 'sampler="raster", splatter="visible", layers="auto", supersample=2  # torch, tolerance=0.4'
     assert eval(f"dict({text}\n)") == {"sampler": "raster", "splatter": "visible", "layers": "auto", "supersample": 2}
     adaptive = row("a", 1, 1.0, supersample="adaptive:8:dilated=False")
-    assert style.label(adaptive) == "visible K=2 adaptive 8×8 dilated=False raster torch"
-    assert eval(f"dict({style.arguments(adaptive)}\n)")["supersample"] == rts.Adaptive(8, dilated=False)
+    assert chart_style.label(adaptive) == "visible K=2 adaptive 8×8 dilated=False raster torch"
+    assert eval(f"dict({chart_style.arguments(adaptive)}\n)")["supersample"] == rts.Adaptive(8, dilated=False)
     peer = row("a", 1, 1.0, peer="Mitsuba", spp=16)
-    assert (style.label(peer), style.arguments(peer)) == ("Mitsuba spp=16", "# Mitsuba, spp=16")
+    assert (chart_style.label(peer), chart_style.arguments(peer)) == ("Mitsuba spp=16", "# Mitsuba, spp=16")
 
 
 def test_built_in_names_keep_their_looks_and_others_go_by_the_order_of_their_names():
     others = [f"toy{i}" for i in range(9)]
     rows = [row("a", 1, 1.0, splatter=s, sampler=s, engine=s) for s in ("visible", *reversed(others))]
-    looks = style.Looks.of([*rows, row("a", 1, 1.0, peer="DEODR"), row("a", 1, 1.0)])
-    assert looks.splatters["visible"] == style.SPLATTER_COLORS["visible"] and looks.samplers["raster"] == "circle"
-    assert [looks.splatters[name] for name in others] == [style.OTHER_COLORS[i % 4] for i in range(9)]
-    assert looks.engines["torch"] == "" and looks.peers == {"DEODR": style.PEER_COLORS["DEODR"]}
+    looks = chart_style.Looks.of([*rows, row("a", 1, 1.0, peer="DEODR"), row("a", 1, 1.0)])
+    assert looks.splatters["visible"] == chart_style.SPLATTER_COLORS["visible"] and looks.samplers["raster"] == "circle"
+    assert [looks.splatters[name] for name in others] == [chart_style.OTHER_COLORS[i % 4] for i in range(9)]
+    assert looks.engines["torch"] == "" and looks.peers == {"DEODR": chart_style.PEER_COLORS["DEODR"]}
 
 
 # ---------------------------------------------------------------------------------------------------- the picture
@@ -172,12 +172,16 @@ def test_the_picture_has_a_panel_a_mode_and_all_colours(tmp_path):
     pytest.importorskip("matplotlib")
     draw(comparison(), tmp_path / "two.png")
     two = pixels(tmp_path / "two.png")
-    for color in (style.SPLATTER_COLORS["visible"], style.SPLATTER_COLORS["none"], *style.PEER_COLORS.values()):
+    for color in (
+        chart_style.SPLATTER_COLORS["visible"],
+        chart_style.SPLATTER_COLORS["none"],
+        *chart_style.PEER_COLORS.values(),
+    ):
         assert shows(two, color)
-    assert not shows(two, style.SPLATTER_COLORS["multi"])
+    assert not shows(two, chart_style.SPLATTER_COLORS["multi"])
     draw(comparison(modes=("camera",), splatters=("multi",)), tmp_path / "one.png")
     one = pixels(tmp_path / "one.png")
-    assert one.shape[1] < 0.7 * two.shape[1] and shows(one, style.SPLATTER_COLORS["multi"])
+    assert one.shape[1] < 0.7 * two.shape[1] and shows(one, chart_style.SPLATTER_COLORS["multi"])
 
 
 def test_rows_without_time_are_not_drawn_and_others_are(tmp_path):
@@ -368,12 +372,12 @@ def test_the_page_shows_what_its_menus_say(browse):
         assert read[view]["legend"] == [*first, *shared, *others]
     agrees_with(read["byRate"], other, "shape")
     by_rate, by_splatter = (set(read[view]["marker"]["color"]) for view in ("byRate", "third"))
-    assert len(by_rate) == 2 and by_splatter == {style.SPLATTER_COLORS["multi"], style.OTHER_COLORS[0]}
+    assert len(by_rate) == 2 and by_splatter == {chart_style.SPLATTER_COLORS["multi"], chart_style.OTHER_COLORS[0]}
     assert not by_rate & by_splatter
     assert set(read["first"]["marker"]["symbol"]) == {"circle", "circle-open", "triangle-down", "triangle-down-open"}
     by_place = dict(zip(read["first"]["settings"]["x"], read["first"]["marker"]["size"], strict=True))
     large = [r for r in rows_of(ball, "translation") if r["settings"].get("supersample") == 2]
-    assert all(by_place[float(f"{r['ms']['median']:.5g}")] == style.side_length(2) for r in large) and large
+    assert all(by_place[float(f"{r['ms']['median']:.5g}")] == chart_style.side_length(2) for r in large) and large
     assert read["first"]["left"][1] == f"{NASTY}: too slow" and len(read["first"]["left"]) == 3
 
 
@@ -420,11 +424,11 @@ def test_the_page_names_the_fastest_settings_within_an_error(used):
             least_error = min(r["error"] for r in ours)
             assert time == "none" and text.startswith(f"the least error is {100 * least_error:.3g} %")
         else:
-            assert text == style.arguments(best)
+            assert text == chart_style.arguments(best)
             assert float(time) == pytest.approx(best["ms"]["median"], rel=1e-3)
             assert least == f"{100 * best['error']:.3g} %"
         if (peer := best_within(peers, error)) is not None:
-            assert next(lines)[3] == style.arguments(peer)
+            assert next(lines)[3] == chart_style.arguments(peer)
     assert next(lines, None) is None and any(line[1] == "none" for line in read["first"]["table"])
 
 
@@ -433,12 +437,12 @@ def test_points_are_hovered_over_clicked_on_and_hidden(used):
     assert read["first"]["mode"] == "color"
     rows = rows_of(given, "color")
     (hit,) = [r for r in rows if np.allclose([r["ms"]["median"], r["error"]], list(read["row"].values()), rtol=1e-4)]
-    assert read["chosen"] == style.arguments(hit)
+    assert read["chosen"] == chart_style.arguments(hit)
     assert read["ring"]["x"] == [read["row"]["x"]]
     hover = " ".join(read["hover"])
-    for part in (*style.arguments(hit).split("  "), f"error {100 * hit['error']:.3g} %", "quartiles", "10 calls"):
+    for part in (*chart_style.arguments(hit).split("  "), f"error {100 * hit['error']:.3g} %", "quartiles", "10 calls"):
         assert part in hover
-    assert read["fromTable"] == style.arguments(best_within([r for r in rows if "peer" not in r], 0.1))
+    assert read["fromTable"] == chart_style.arguments(best_within([r for r in rows if "peer" not in r], 0.1))
     left = [r for r in rows if r["settings"].get("engine") == "torch"]
     np.testing.assert_allclose(sorted_pairs(**read["hidden"]["settings"]), expected_pairs(left), rtol=1e-4)
     assert "jax" in read["hidden"]["legend"]

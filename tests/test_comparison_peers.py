@@ -9,10 +9,11 @@ from helpers import icosphere
 from scipy.ndimage import gaussian_filter
 
 import rts
-from rts.diagnostics.comparison.mitsuba_peer import mitsuba
-from rts.diagnostics.comparison.peers import peers
-from rts.diagnostics.comparison.scene import moving
-from rts.diagnostics.comparison.scores import loss_weights, low_pass
+from rts.diagnostics.smoothing import low_pass
+from rts_compare.derivative_scores import loss_weights
+from rts_compare.moving_scenes import moving
+from rts_compare.other_renderers.installed_renderers import peers
+from rts_compare.other_renderers.mitsuba_renderer import mitsuba
 
 pytestmark = pytest.mark.rendering
 

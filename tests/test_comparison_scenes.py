@@ -6,18 +6,17 @@ from helpers import derivative
 
 import rts
 from rts.arrays.engines import engine_named
-from rts.diagnostics.comparison import shapes
-from rts.diagnostics.comparison.builtin import BUILTIN, builtin, names
-from rts.diagnostics.comparison.scene import MODES, check_directions, moving
+from rts.diagnostics.shapes import QUAD, unlit
 from rts.errors import InputError, PluginError
+from rts_compare import scene_shapes
+from rts_compare.builtin_scenes import BUILTIN, builtin, names
+from rts_compare.moving_scenes import MODES, check_directions, moving
 
 pytestmark = pytest.mark.rendering
 
 FORMULAS = [name for name in names() if not BUILTIN[name].data]
 SMALL = (48, 48)
-CARD = shapes.unlit(
-    np.array([[-0.4, -0.3, 0.2], [0.5, -0.3, 0.2], [0.5, 0.6, 0.2], [-0.4, 0.6, 0.2]]), shapes.QUAD, 0.7
-)
+CARD = unlit(np.array([[-0.4, -0.3, 0.2], [0.5, -0.3, 0.2], [0.5, 0.6, 0.2], [-0.4, 0.6, 0.2]]), QUAD, 0.7)
 ASLANT = rts.Camera.look_at((1.0, 1.4, 2.6), (0.1, 0.0, 0.2), fov_y=35)
 
 
@@ -135,7 +134,7 @@ def test_the_data_is_beside_the_working_directory_by_default(tmp_path, monkeypat
 # ------------------------------------------------------------------------------------------------------- modes
 
 
-@pytest.mark.parametrize("camera", [shapes.camera(), ASLANT])
+@pytest.mark.parametrize("camera", [scene_shapes.camera(), ASLANT])
 def test_translations_move_to_the_right_of_the_image(camera):
     scene = moving("card", CARD, camera)
     before, after = seen(scene, "translation", 0.0), seen(scene, "translation", 0.1)
@@ -144,16 +143,16 @@ def test_translations_move_to_the_right_of_the_image(camera):
 
 
 def test_the_image_of_a_card_moves_as_the_card_does():
-    scene = moving("card", CARD, shapes.camera())
+    scene = moving("card", CARD, scene_shapes.camera())
     side = 128
     image, slope = jvp(scene, "translation", (side, side), splatter="visible", supersample=2)
     x = np.arange(side) + 0.5
     area, moment = image[..., 3].sum(), (slope[..., 3] * x).sum()
-    assert abs(moment / area * shapes.pixel(3.0, side) - 1) < 0.02
+    assert abs(moment / area * scene_shapes.pixel(3.0, side) - 1) < 0.02
     assert abs(slope[..., 3].sum()) < 0.01 * np.abs(slope[..., 3]).sum()
 
 
-@pytest.mark.parametrize("camera", [shapes.camera(), ASLANT])
+@pytest.mark.parametrize("camera", [scene_shapes.camera(), ASLANT])
 def test_rotations_leave_the_upright_axis_through_the_middle(camera):
     middle, up = np.array([0.05, 0.15, 0.2]), np.linalg.inv(camera.view)[:3, 1]
     scene = moving("card", CARD, camera)
@@ -165,7 +164,7 @@ def test_rotations_leave_the_upright_axis_through_the_middle(camera):
 
 
 def test_a_camera_that_moves_ahead_magnifies():
-    camera = shapes.camera()
+    camera = scene_shapes.camera()
     scene = moving("card", CARD, camera)
     before, after = seen(scene, "camera", 0.0), seen(scene, "camera", 0.5)
     np.testing.assert_allclose(after[:, :2] - 24, (before[:, :2] - 24) * 3.0 / 2.5, rtol=1e-12)
@@ -176,7 +175,7 @@ def test_a_camera_that_moves_ahead_magnifies():
 
 def test_only_what_moves_is_moved():
     other = CARD.replace(theta={**CARD.theta, "vertices": CARD.theta["vertices"] - [0, 0, 1]})
-    scene = moving("cards", [CARD, other], shapes.camera(), moves=[1])
+    scene = moving("cards", [CARD, other], scene_shapes.camera(), moves=[1])
     for mode in ("translation", "rotation", "shape"):
         moved = [np.abs(seen(scene, mode, 0.1, index=i) - seen(scene, mode, 0.0, index=i)).max() for i in (0, 1)]
         assert moved[0] == 0 and moved[1] > 0.1
@@ -186,8 +185,8 @@ def test_only_what_moves_is_moved():
 
 def test_a_shape_swells_about_its_middle_unevenly():
     vertices = np.array([[-1.0, 0, 0], [1, 0, 0], [0, 0.5, 0], [0, -0.5, 0], [0, 0, 0]]) + [3, 2, 1]
-    part = shapes.unlit(vertices, [(0, 3, 2), (3, 1, 2), (0, 1, 4)], 0.5)
-    scene = moving("kite", part, shapes.camera())
+    part = unlit(vertices, [(0, 3, 2), (3, 1, 2), (0, 1, 4)], 0.5)
+    scene = moving("kite", part, scene_shapes.camera())
     away = (scene.at(scene.moved("shape", 1.0))[0][0].theta["vertices"] - vertices) / (vertices - [3, 2, 1] + 1e-300)
     np.testing.assert_allclose(away[0, 0], 1 - 0.5 * np.sin(2))
     np.testing.assert_allclose(away[1, 0], 1 + 0.5 * np.sin(2))
@@ -198,7 +197,7 @@ def test_a_shape_swells_about_its_middle_unevenly():
 def test_the_middle_of_a_field_is_that_of_its_ball():
     center = np.array([0.3, -0.2, 0.1])
     surface = rts.plugin("surfaces", "sdf")(lambda theta, p: rts.namespace(p).sum(p * p, axis=1), center=center)
-    part = rts.Part(surface, {"radius": np.float64(0.5)}, "normals", shapes.turned(0.3, 0.4))
+    part = rts.Part(surface, {"radius": np.float64(0.5)}, "normals", scene_shapes.turned(0.3, 0.4))
     scene = moving("ball", part, ASLANT)
     np.testing.assert_allclose(
         seen(scene, "rotation", 0.3, center[None]), seen(scene, "rotation", 0.0, center[None]), atol=1e-9
@@ -243,8 +242,8 @@ QUAD_OF = {"vertices": CARD.theta["vertices"]}
     ],
 )
 def test_one_base_color_changes(theta, shader, entry):
-    mesh = rts.plugin("surfaces", "mesh")(shapes.QUAD)
-    scene = moving("card", rts.Part(mesh, QUAD_OF | theta, shader), shapes.camera())
+    mesh = rts.plugin("surfaces", "mesh")(scene_shapes.QUAD)
+    scene = moving("card", rts.Part(mesh, QUAD_OF | theta, shader), scene_shapes.camera())
     before, after = (scene.at(scene.moved("color", t))[0][0].theta for t in (0.0, 1e-3))
     changed = {name for name in after if name not in before or not np.array_equal(before[name], after[name])}
     assert changed == {entry}
@@ -258,12 +257,12 @@ def test_one_base_color_changes(theta, shader, entry):
 
 @pytest.mark.parametrize("shader", ["silhouette", "normals", "depth"])
 def test_shaders_without_colors_have_no_such_mode(shader):
-    scene = moving("card", CARD.replace(shader=shader), shapes.camera())
+    scene = moving("card", CARD.replace(shader=shader), scene_shapes.camera())
     assert list(scene.directions) == ["translation", "rotation", "shape", "camera"]
 
 
 def test_what_only_looks_like_points_or_colors_stays():
-    mesh = rts.plugin("surfaces", "mesh")(shapes.QUAD, indices={"tangents": None})
+    mesh = rts.plugin("surfaces", "mesh")(QUAD, indices={"tangents": None})
     light = {"direction": np.array([0.0, 0, 1]), "color": np.ones(3)}
     more = {
         "normals": np.ones((4, 3)),
@@ -278,7 +277,7 @@ def test_what_only_looks_like_points_or_colors_stays():
         (rts.Part(mesh, {**CARD.theta, **more}, "lambert"), {"shape": {"vertices"}, "color": {"colors"}}),
         (rts.Part(field, ball, "blinn_phong"), {"shape": {"level"}, "color": {"color"}}),
     ):
-        scene = moving("part", part, shapes.camera())
+        scene = moving("part", part, scene_shapes.camera())
         for mode in MODES:
             theta = scene.at(scene.moved(mode, 0.1))[0][0].theta
             found = {name for name in theta if theta[name] is not part.theta[name]}
@@ -291,7 +290,7 @@ def test_what_only_looks_like_points_or_colors_stays():
 def test_modes_that_exact_parts_lack_are_left_out():
     surface = rts.plugin("surfaces", "sdf")(lambda theta, p: p[:, 0], reads=())
     exact = rts.Part(surface, {"color": np.full(3, 0.7)}, "unlit")
-    scene = moving("card", CARD, shapes.camera(), exact=exact)
+    scene = moving("card", CARD, scene_shapes.camera(), exact=exact)
     assert list(scene.directions) == ["translation", "rotation", "camera"]
     parts, _ = scene.exact(scene.moved("translation", 0.5))
     np.testing.assert_allclose(parts[0].transform[:3, 3], [0.5, 0, 0])
@@ -308,4 +307,4 @@ def test_modes_that_exact_parts_lack_are_left_out():
 )
 def test_scenes_that_cannot_be_are_refused(options, message):
     with pytest.raises(InputError, match=message):
-        moving("card", CARD, shapes.camera(), **options)
+        moving("card", CARD, scene_shapes.camera(), **options)

@@ -8,10 +8,10 @@ from helpers import DIFFERENTIABLE, arrays, derivative, gradient, icosphere, low
 
 import rts
 from rts.arrays.engines import constants, engine_of
-from rts.diagnostics.comparison import shapes
 from rts.rendering import settings
 from rts.splatting import Visible, crossings
 from rts_backends.fused import splatters as fused
+from rts_compare import scene_shapes
 from rts_surfaces.implicit import fields
 
 pytestmark = pytest.mark.splatting
@@ -250,9 +250,11 @@ def test_sheets_that_hide_one_another_without_meeting_do_not_cross():
         assert not np.logical_or.reduce(list(Sheets((20, 20), *sheets).pairs().values())).any()
 
 
-@pytest.mark.parametrize("parts, alike", [(shapes.turned_box(), 200), (shapes.cards(6)[0], 0)], ids=["box", "cards"])
+@pytest.mark.parametrize(
+    "parts, alike", [(scene_shapes.turned_box(), 200), (scene_shapes.cards(6)[0], 0)], ids=["box", "cards"]
+)
 def test_faces_that_hide_one_another_do_not_cross(parts, alike, monkeypatch):
-    camera = rts.Camera.look_at((0, 0, shapes.DISTANCE), (0, 0, 0), fov_y=40)
+    camera = rts.Camera.look_at((0, 0, scene_shapes.DISTANCE), (0, 0, 0), fov_y=40)
     samples = rts.sample(list(parts), camera, (64, 64), layers=4)
     covered, depth = np.asarray(samples.row) >= 0, np.asarray(samples.depth)
     assert covered[1].sum() > 500

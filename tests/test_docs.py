@@ -141,7 +141,7 @@ def test_pages_for_users_of_others_show_one_task_and_its_gradient(model):
 
 
 def test_the_task_in_mitsuba_runs_and_agrees(model):
-    from rts.diagnostics.comparison.mitsuba_peer import mitsuba
+    from rts_compare.other_renderers.mitsuba_renderer import mitsuba
 
     try:
         mitsuba()

@@ -24,7 +24,7 @@ def test_an_example_runs_and_writes_its_picture(script, tmp_path, monkeypatch, c
     for package in FRAMEWORKS:
         if re.search(rf"^import {package}$", text, re.MULTILINE):
             pytest.importorskip(package)
-    for name in set(re.findall(r"\brts\.([A-Z]\w+)", text)) & set(rts.registry.built_in_surfaces()):
+    for name in set(re.findall(r"\brts\.([A-Z]\w+)", text)) & set(rts.registry.built_in_attributes()):
         if not hasattr(rts, name):  # Such as OpenSubdiv's headers.
             with pytest.raises(AttributeError) as error:
                 getattr(rts, name)

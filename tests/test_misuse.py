@@ -10,6 +10,7 @@ import pytest
 
 import rts
 import rts.diagnostics
+import rts_compare
 from rts import Camera
 from rts.plugin_api.operations import combine, gradient
 from rts_surfaces.implicit.narrow_band import NarrowBand
@@ -364,9 +365,9 @@ def test_a_wrong_value_is_one_line_or_works(call, tmp_path, monkeypatch):
 
 def public():
     """Names that users call."""
-    modules = (rts, rts.regularizers, rts.diagnostics)
+    modules = (rts, rts.regularizers, rts.diagnostics, rts_compare)
     names = {name: getattr(module, name) for module in modules for name in module.__all__}
-    names |= {name: getattr(rts, name) for name in rts.registry.built_in_surfaces()}
+    names |= {name: getattr(rts, name) for name in rts.registry.built_in_attributes()}
     names |= {
         name: getattr(import_module(place), name) for place, moved in rts._MOVED.items() for name in moved.split()
     }

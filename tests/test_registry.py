@@ -9,9 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import rts
 from rts import registry
+from rts.capabilities import BASES
+from rts.cli.main import app
 
 pytestmark = pytest.mark.core
 
@@ -190,16 +193,22 @@ def test_details_say_which_extra_is_missing(install, tmp_path):
 # ---------------------------------------------------------------------------------- surfaces as attributes
 
 
-def test_the_surfaces_of_the_library_are_attributes_of_it():
+def test_surfaces_and_functions_of_the_library_are_attributes_of_it():
     root = Path(__file__).resolve().parent.parent
-    entries = tomllib.loads((root / "pyproject.toml").read_text())["project"]["entry-points"]["rts.surfaces"]
-    assert registry.built_in_surfaces() == {path.partition(":")[2]: name for name, path in entries.items()}
-    assert set(registry.built_in_surfaces()) <= set(dir(rts)) and "render" in dir(rts)
+    entries = tomllib.loads((root / "pyproject.toml").read_text())["project"]["entry-points"]
+    expected = {
+        path.partition(":")[2]: (group, name)
+        for group in ("rts.surfaces", "rts.functions")
+        for name, path in entries[group].items()
+    }
+    assert registry.built_in_attributes() == expected
+    assert set(registry.built_in_attributes()) <= set(dir(rts)) and "render" in dir(rts)
     assert rts.Mesh is rts.plugin("surfaces", "mesh") and rts.Sdf is rts.plugin("surfaces", "sdf")
+    assert rts.tune is rts.plugin("functions", "tune")
     # Type checkers are told the names.
     [block] = [n for n in ast.parse((root / "rts/__init__.py").read_text()).body if isinstance(n, ast.If)]
     told = {ast.unparse(n.target) for n in block.body if isinstance(n, ast.AnnAssign)}
-    assert ast.unparse(block.test) == "TYPE_CHECKING" and told == set(registry.built_in_surfaces())
+    assert ast.unparse(block.test) == "TYPE_CHECKING" and told == set(registry.built_in_attributes())
 
 
 def test_an_attribute_that_is_not_there_is_an_attribute_error_with_a_hint(install):
@@ -232,7 +241,7 @@ def test_surfaces_and_entry_points_are_left_alone_until_an_attribute_asks_for_th
 
 def test_importing_the_library_loads_no_framework_and_no_plugin():
     loaded = modules_after("import rts")
-    assert not loaded & {*HEAVY, "rts_backends", "rts_surfaces"}
+    assert not loaded & {*HEAVY, "rts_backends", "rts_compare", "rts_surfaces"}
     assert "rts.rendering" in loaded
 
 
@@ -249,7 +258,16 @@ def test_only_the_plugin_asked_for_is_imported():
 
 def test_listing_names_imports_no_plugin():
     loaded = modules_after("import rts; [rts.plugins(g) for g in rts.registry.GROUPS]")
-    assert not {m for m in loaded if m.startswith(("rts_backends", "rts_surfaces"))}
+    assert not {m for m in loaded if m.startswith(("rts_backends", "rts_compare", "rts_surfaces"))}
+
+
+def test_help_lists_commands_without_what_they_need():
+    loaded = modules_after(
+        "from typer.testing import CliRunner\n"
+        "from rts.cli.main import app\n"
+        "assert 'compare' in CliRunner().invoke(app, ['--help']).output"
+    )
+    assert {m for m in loaded if m.startswith("rts_compare.")} == {"rts_compare.commands"}
 
 
 def test_rendering_numpy_arrays_loads_neither_torch_nor_jax():
@@ -396,7 +414,25 @@ def test_a_broken_plugin_does_not_break_the_others(install):
     assert rts.plugin("samplers", "reference").__name__ == "Reference"
 
 
-@pytest.mark.parametrize("group", registry.GROUPS)
+@pytest.mark.parametrize(
+    "source, why",
+    [
+        ("raise RuntimeError('no display')", "fails to import: RuntimeError: no display"),
+        ("import a_package_that_is_absent", "needs the module 'a_package_that_is_absent'"),
+        ("draw = 3", "is neither a function of options nor"),
+    ],
+)
+def test_a_command_that_cannot_be_used_says_why_in_a_line_and_the_others_work(install, source, why):
+    install("faulty", {"rts.commands": {"draw": "faulty_command:draw"}}, {"faulty_command": source})
+    runner = CliRunner()
+    listed = runner.invoke(app, ["--help"])
+    assert listed.exit_code == 0 and "draw" in listed.output and "compare" in listed.output
+    done = runner.invoke(app, ["draw", "picture.png", "--fast"])
+    assert done.exit_code == 1 and why in done.output and done.output.count("\n") == 1
+    assert runner.invoke(app, ["plugins"]).exit_code == 0
+
+
+@pytest.mark.parametrize("group", BASES)
 def test_what_the_library_registers_are_classes_of_which_one_object_serves_a_name(group):
     for name in rts.plugins(group):
         try:

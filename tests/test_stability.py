@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rts.diagnostics import stability
-from rts.diagnostics.failures import fields, scenes
-from rts.diagnostics.failures.measures import Derivative, Fitted, Vanishing, distance
-from rts.diagnostics.failures.methods import DEFAULT, METHODS
-from rts.diagnostics.failures.outcome import VERDICTS, Context, Outcome, Row, graded
-from rts.diagnostics.failures.renderers import renderer, shifted
-from rts.diagnostics.failures.rows import ROWS
 from rts.errors import InputError
+from rts_compare import stability
+from rts_compare.failures import failure_scenes, library_only_rows
+from rts_compare.failures.method_renderers import renderer, shifted
+from rts_compare.failures.row_measures import Derivative, Fitted, Vanishing, distance
+from rts_compare.failures.table_cells import VERDICTS, Context, Outcome, Row, graded
+from rts_compare.failures.table_columns import DEFAULT, METHODS
+from rts_compare.failures.table_rows import ROWS
 
 pytestmark = pytest.mark.fitting
 
@@ -22,16 +22,16 @@ QUICK = Context(seeds=2, samples=3, steps=40)
 METHOD = {method.name: method for method in METHODS}
 SPLATTING = [m.name for m in METHODS if not m.peer and m.name != "none"]
 PRONE = (
-    scenes.coplanar,
-    scenes.through_near,
-    scenes.past_camera,
-    scenes.with_slivers,
-    scenes.grazing,
-    lambda: scenes.scaled(1e-4),
-    lambda: scenes.scaled(1e4),
-    lambda: scenes.scaled(1.0, 1e5),
-    lambda: scenes.with_slivers("lambert"),
-    scenes.empty,
+    failure_scenes.coplanar,
+    failure_scenes.through_near,
+    failure_scenes.past_camera,
+    failure_scenes.with_slivers,
+    failure_scenes.grazing,
+    lambda: failure_scenes.scaled(1e-4),
+    lambda: failure_scenes.scaled(1e4),
+    lambda: failure_scenes.scaled(1.0, 1e5),
+    lambda: failure_scenes.with_slivers("lambert"),
+    failure_scenes.empty,
 )
 """Scenes in which something is divided by what may be zero, or too large."""
 
@@ -52,7 +52,7 @@ def test_derivatives_are_finite(scene):
     assert drawn.broken() == 0
 
 
-@pytest.mark.parametrize("measure", [fields.lattice_ties, fields.singular_crossings])
+@pytest.mark.parametrize("measure", [library_only_rows.lattice_ties, library_only_rows.singular_crossings])
 def test_isosurfaces_have_finite_gradients(measure):
     found = measure(METHOD[DEFAULT], QUICK)
     assert found.numbers["nan"] == 0
@@ -64,7 +64,7 @@ def test_an_empty_view_has_a_gradient_of_zero():
 
 
 def test_plain_rasterization_does_not_see_outlines():
-    scene = scenes.upright()
+    scene = failure_scenes.upright()
     assert not renderer(scene, METHOD["none"]).derivative("tx").any()
     assert renderer(scene, METHOD[DEFAULT]).derivative("tx").any()
     assert row("upright edges").measure(METHOD["none"], QUICK).verdict == "failed"
@@ -76,7 +76,7 @@ def test_one_layer_does_not_see_what_is_behind():
 
 
 def test_fits_converge_with_outlines_and_not_without():
-    fitted = Fitted(scenes.far_card, lambda rng: rng.uniform(-5, 5, 2))
+    fitted = Fitted(failure_scenes.far_card, lambda rng: rng.uniform(-5, 5, 2))
     assert fitted(METHOD[DEFAULT], QUICK).numbers["converged"] == 2
     found = fitted(METHOD["none"], QUICK)
     assert (found.verdict, found.numbers["converged"], found.numbers["largest"]) == ("failed", 0, 0.0)
@@ -90,7 +90,7 @@ def test_fits_from_far_off_need_blurred_images():
 
 
 def test_slopes_are_those_of_the_derivative_image():
-    scene = scenes.box_pose()
+    scene = failure_scenes.box_pose()
     weights = np.random.default_rng(0).normal(size=(*scene.size, 3))
     for name in SPLATTING:
         drawn = renderer(scene, METHOD[name])
@@ -101,7 +101,7 @@ def test_slopes_are_those_of_the_derivative_image():
 
 def test_other_renderers_give_slopes_of_the_same_loss():
     pytest.importorskip("deodr")
-    scene, rng = scenes.far_card(), np.random.default_rng(1)
+    scene, rng = failure_scenes.far_card(), np.random.default_rng(1)
     weights = rng.normal(size=(2, 3))[0] * np.linspace(0, 1, scene.size[1])[:, None] * np.ones((*scene.size, 3))
     ours, theirs = (
         renderer(scene, METHOD[name]).slopes(np.array([3.0, -2.0]), lambda image: weights)
@@ -111,7 +111,7 @@ def test_other_renderers_give_slopes_of_the_same_loss():
 
 
 def test_amounts_are_pixels():
-    scene = scenes.far_card()
+    scene = failure_scenes.far_card()
     assert distance(scene, np.array([3.0, 4.0])) == pytest.approx(5.0, rel=1e-6)
     assert shifted(scene, np.zeros(2))["pose"].tolist() == [0.0] * 6
 
@@ -187,12 +187,12 @@ def test_rows_say_why_a_method_cannot():
 
 
 def test_what_turns_and_does_not_change():
-    turning = Vanishing(scenes.turning_ball, (0.1, 0.3))
+    turning = Vanishing(failure_scenes.turning_ball, (0.1, 0.3))
     assert turning(METHOD["none"], QUICK).text == "no derivative at all"
     assert turning(METHOD[DEFAULT], QUICK).numbers["left"] < 0.5
 
 
 def test_scales_change_nothing():
-    plain, small = (Derivative(lambda s=s: scenes.scaled(s)).scene() for s in (1.0, 1e-4))
+    plain, small = (Derivative(lambda s=s: failure_scenes.scaled(s)).scene() for s in (1.0, 1e-4))
     found = [renderer(scene, METHOD[DEFAULT]).derivative("tx") for scene in (plain, small)]
     assert np.abs(found[0] - found[1]).max() < 0.02 * np.abs(found[0]).max()

@@ -1,11 +1,17 @@
 """The plugins of `third_plugin`, a distribution written from docs/plugins.md alone, by the conformance kit."""
 
+import re
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from typer.testing import CliRunner
 
+from rts import registry
+from rts.cli.main import app
 from rts.testing import SamplerConformance, ShaderConformance, SplatterConformance, SurfaceConformance
 
 sys.path.insert(0, str(Path(__file__).parent / "third_plugin"))  # Nothing installs it.
@@ -44,3 +50,18 @@ class TestWide(SplatterConformance):
     @pytest.fixture
     def splatter(self):
         return Wide()
+
+
+def test_its_command_is_listed_and_runs_beside_ours(tmp_path, monkeypatch):
+    entry = EntryPoint("turntable", "rts_third_plugin.turntable:turntable", "rts.commands")
+    monkeypatch.setitem(registry._found, "rts.commands", {**registry._entries("rts.commands"), "turntable": [entry]})
+    monkeypatch.chdir(tmp_path)
+    listed = CliRunner().invoke(app, ["--help"]).output
+    for told in ("render ", "compare ", r"turntable +Write an animation of a model"):
+        assert re.search(told, listed)
+    trimesh.creation.box().export("box.obj")
+    done = CliRunner().invoke(app, ["turntable", "box.obj", "--frames", "2", "--output", "box.gif"])
+    assert done.exit_code == 0, done.output
+    assert Path("box.gif").stat().st_size > 1000
+    wrong = CliRunner().invoke(app, ["turntable", "none.obj"])
+    assert wrong.exit_code == 1 and "none.obj" in wrong.output and "Traceback" not in wrong.output

@@ -12,8 +12,7 @@ from pathlib import Path
 
 from benchmarks.accuracy import scenes
 from benchmarks.accuracy.closed_forms import CLOSED_FORMS, closed_form
-from benchmarks.accuracy.scores import scores
-from benchmarks.accuracy.truth import truth
+from rts_compare.derivative_scores import all_scores
 
 STEPS = (1.0, 0.25)
 """Lengths of the central differences, pixels."""
@@ -33,12 +32,12 @@ def main() -> None:
         scene = scenes.scene(name)
         closed = closed_form(scene)
         for step in STEPS:
-            measured = truth(scene, args.output, step)
+            measured = scene.truth(args.output, step)
             line = f"{name:22} {step:4g}  {_pair(measured.noise)}"
             if closed:
                 exact = closed.truth(step)
-                line += f"  {_pair(scores(measured.derivative, exact.derivative))}"
-                line += f"  {_pair(scores(exact.derivative, closed.derivative))}"
+                line += f"  {_pair(all_scores(measured.derivative, exact.derivative))}"
+                line += f"  {_pair(all_scores(exact.derivative, closed.derivative))}"
             print(line, flush=True)
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.accuracy import scenes
-from benchmarks.accuracy.truth import Truth
 from benchmarks.camera import DISTANCE, FOV
+from rts_compare.true_derivatives import Truth
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ClosedForm:
     def truth(self, step: float = 0.0) -> Truth:
         """As a truth without noise: the derivative, or the difference over a step."""
         derivative = self.difference(step) if step else self.derivative
-        return Truth(self.image(0.0), derivative, np.stack([derivative] * 2), step)
+        return Truth(derivative, 0.0, np.stack([derivative] * 2))
 
 
 def closed_form(scene: scenes.Scene) -> ClosedForm | None:

@@ -10,8 +10,8 @@ import numpy as np
 import rts
 from benchmarks.accuracy.scenes import DISTANCE, Scene, motion, pixel, turn
 from benchmarks.meshes import rotation_xy
-from rts.diagnostics.comparison import shapes
-from rts.diagnostics.comparison.shapes import QUAD, box, unlit
+from rts.diagnostics.shapes import QUAD, box, unlit
+from rts_compare import scene_shapes
 
 PLANE_COLORS = (0.9, 0.5, 0.2), (0.2, 0.5, 0.9)
 
@@ -48,7 +48,7 @@ def spheres_in_depth(size: int) -> Scene:
     return Scene(
         "spheres in depth",
         (size, size),
-        shapes.crossing_spheres(),
+        scene_shapes.crossing_spheres(),
         (None, nearer(pixel(DISTANCE - 0.1, size))),
         (2, 4),
         "two spheres that pass through one another, unculled; one comes nearer",

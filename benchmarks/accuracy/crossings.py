@@ -12,16 +12,15 @@ import argparse
 from pathlib import Path
 
 import numpy as np
-import torch
 
 import rts
 from benchmarks.accuracy import methods, scenes
 from benchmarks.accuracy.crossing_scenes import CROSSING
 from benchmarks.accuracy.figures import CONTRAST_LOW, show, signed
-from benchmarks.accuracy.scores import scores
-from benchmarks.accuracy.truth import truth
 from benchmarks.report import table
-from rts.diagnostics.comparison.scores import low_pass
+from rts.diagnostics.smoothing import low_pass
+from rts_compare.derivative_scores import all_scores
+from rts_compare.failures.method_renderers import Own
 
 FAILURES = "thin plate", "planes at two degrees", "three planes", "bar through card"
 SHOWN = slice(40, 216)
@@ -51,16 +50,12 @@ def scene(name: str) -> scenes.Scene:
 
 def derivative(chosen: scenes.Scene, layers: int, fine: int, crossings: bool) -> np.ndarray:
     """(H, W, 3) by forward mode."""
-
-    def image(t: torch.Tensor) -> torch.Tensor:
-        options = {"splatter": VISIBLE(crossings=crossings), "layers": layers, "supersample": fine}
-        return rts.render(chosen.at(t), chosen.camera, chosen.size, **options)[..., :3]
-
-    return torch.func.jvp(image, (torch.zeros(()),), (torch.ones(()),))[1].numpy()
+    options = {"splatter": VISIBLE(crossings=crossings), "layers": layers, "supersample": fine}
+    return Own(chosen.moving, options).derivative(scenes.MOTION)
 
 
 def cell(found: np.ndarray, true: np.ndarray) -> str:
-    row = scores(found, true)
+    row = all_scores(found, true)
     return f"{row['low_relative_l2']:.3f} / {row['low_gain']:.3f} / {row['loss_error']:.3f}"
 
 
@@ -68,7 +63,7 @@ def crossing_lines(names: list[str], folder: Path, spp: int) -> list[list[str]]:
     lines = []
     for name in names:
         chosen = scene(name)
-        against = truth(chosen, folder, chosen.step)
+        against = chosen.truth(folder, chosen.step)
         noise = f"{against.noise['low_relative_l2']:.3f}"
         for layers, fine in SETTINGS:
             cells = [cell(derivative(chosen, layers, fine, on), against.derivative) for on in (False, True)]
@@ -88,10 +83,10 @@ def pictures(folder: Path, path: Path) -> None:
     figure = Figure(figsize=(2.9 * 5, 2.9 * len(FAILURES) + 0.4), layout="constrained")
     for n, (line, name) in enumerate(zip(figure.subplots(len(FAILURES), 5), FAILURES, strict=True)):
         chosen = scene(name)
-        against = truth(chosen, folder, chosen.step)
+        against = chosen.truth(folder, chosen.step)
         before, found = (derivative(chosen, chosen.layers[0], 1, on) for on in (False, True))
         difference = signed(low_pass(found - against.derivative), CONTRAST_LOW)
-        seen = against.image.clip(0, 1), *(signed(x) for x in (against.derivative, before, found)), difference
+        seen = chosen.image().clip(0, 1), *(signed(x) for x in (against.derivative, before, found)), difference
         for axes, picture, title in zip(line, seen, titles, strict=True):
             show(axes, picture[SHOWN, SHOWN], "" if n else title)
         line[0].set_ylabel(name, fontsize=13)

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.accuracy import scenes
 from benchmarks.accuracy.methods import CASES, name_of
-from rts.diagnostics.comparison.scores import low_pass
+from rts.diagnostics.smoothing import low_pass
 
 COLUMNS = {
     "single, K = 1": "single, K = 1",
@@ -52,15 +53,15 @@ def derivatives(images: dict, against: dict, path: Path) -> None:
     """Derivative images of A, B and C, like the paper's figure 4."""
     from matplotlib.figure import Figure
 
-    scenes = [c for c in CASES if c in against]
+    cases = [c for c in CASES if c in against]
     columns = {m: title for m, title in COLUMNS.items() if any((c, m) in images for c in scenes)}
-    if not scenes:
+    if not cases:
         return
     count = 2 + len(columns)
-    figure = Figure(figsize=(2.6 * count, 2.6 * len(scenes) + 0.8), layout="constrained")
-    for n, (line, scene) in enumerate(zip(figure.subplots(len(scenes), count, squeeze=False), scenes, strict=True)):
+    figure = Figure(figsize=(2.6 * count, 2.6 * len(cases) + 0.8), layout="constrained")
+    for n, (line, scene) in enumerate(zip(figure.subplots(len(cases), count, squeeze=False), cases, strict=True)):
         truth = against[scene].pixel
-        show(line[0], truth.image[SHOWN, SHOWN].clip(0, 1), "" if n else "image", scene)
+        show(line[0], scenes.scene(scene).image()[SHOWN, SHOWN].clip(0, 1), "" if n else "image", scene)
         pictures = {"truth": truth.derivative, **{title: images[scene, m] for m, title in columns.items()}}
         for axes, (title, picture) in zip(line[1:], pictures.items(), strict=True):
             show(axes, signed(picture[SHOWN, SHOWN], CONTRAST), "" if n else title)
@@ -73,11 +74,11 @@ def error_vs_time(results: dict, path: Path) -> None:
     from matplotlib.figure import Figure
 
     errors = {(r["scene"], r["method"]): r["exact"]["low_relative_l2"] for r in results["rows"]}
-    scenes = [c for c in CASES if any(r["scene"] == c for r in results["times"])]
-    if not scenes:
+    cases = [c for c in CASES if any(r["scene"] == c for r in results["times"])]
+    if not cases:
         return
-    figure = Figure(figsize=(4.6 * len(scenes), 5.2), layout="constrained")
-    for axes, scene in zip(figure.subplots(1, len(scenes), sharey=True, squeeze=False)[0], scenes, strict=True):
+    figure = Figure(figsize=(4.6 * len(cases), 5.2), layout="constrained")
+    for axes, scene in zip(figure.subplots(1, len(cases), sharey=True, squeeze=False)[0], cases, strict=True):
         for start, end, label, style in (
             ("visible", ("2", "4"), "visible, K = 2, s × s samples a pixel", {"color": "#c2410c", "marker": "o"}),
             *(
@@ -138,7 +139,7 @@ def failures(images: dict, against: dict, path: Path) -> None:
     ):
         found, reference = images[scene, name_of("visible", k)], against[scene].exact
         pictures = [
-            reference.image.clip(0, 1),
+            scenes.scene(scene).image().clip(0, 1),
             signed(reference.derivative),
             signed(found),
             signed(low_pass(found - reference.derivative), CONTRAST_LOW),

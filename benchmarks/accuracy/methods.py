@@ -11,12 +11,12 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 import rts
 from benchmarks.accuracy import scenes
-from rts.diagnostics.comparison.peers import Peer, peers
-from rts.diagnostics.comparison.scene import Scene
+from benchmarks.accuracy.scenes import MOTION
+from rts_compare.failures.method_renderers import Own
+from rts_compare.other_renderers.installed_renderers import Peer, peers
 
 CASES = ("A", "B", "C")
 """The scenes that peers render too, and that times are taken of."""
@@ -73,20 +73,12 @@ def ours(scene: scenes.Scene, splatter: str, layers: int, supersample: int | rts
         visible = rts.plugin("rts.splatters", "visible")()
         chosen = rts.plugin("rts.splatters", "multi")(epsilon=visible.epsilon, calibration=visible.calibration)
 
-    def image(t: torch.Tensor) -> torch.Tensor:
-        parts = scene.at(t)
-        options = {"splatter": chosen, "layers": layers, "supersample": supersample}
-        return rts.render(parts, scene.camera, scene.size, **options)[..., :3]
-
-    def derivative(seed: int) -> np.ndarray:
-        return torch.func.jvp(image, (torch.zeros(()),), (torch.ones(()),))[1].numpy()
+    drawn = Own(scene.moving, {"splatter": chosen, "layers": layers, "supersample": supersample})
 
     def gradient(weights: np.ndarray) -> float:
-        t = torch.zeros((), requires_grad=True)
-        (torch.as_tensor(weights, dtype=torch.float32) * image(t)).sum().backward()
-        return float(t.grad)
+        return float(drawn.slopes(np.zeros(1), lambda image: weights)[0])
 
-    return Method(name_of(splatter, layers, supersample), derivative, gradient)
+    return Method(name_of(splatter, layers, supersample), lambda seed: drawn.derivative(MOTION), gradient)
 
 
 def splatters(scene: scenes.Scene) -> list[Method]:
@@ -104,16 +96,10 @@ def splatters(scene: scenes.Scene) -> list[Method]:
 def others(scene: scenes.Scene, spp: list[int]) -> tuple[list[Method], list[str]]:
     """DEODR and Mitsuba with each number of samples a pixel, and why they are left out where they are.
 
-    See `rts.diagnostics.comparison.peers`.
+    See `rts_compare.other_renderers.installed_renderers`.
     """
-    t = {"t": np.zeros(())}
-    given = Scene(scene.name, lambda t: (scene.at(t["t"]), scene.camera), t, {MOTION: {"t": np.ones(())}}, scene.size)
-    found, left_out = peers(given, spp)
+    found, left_out = peers(scene.moving, spp)
     return [_method(peer) for peer in found], left_out
-
-
-MOTION = "motion"
-"""The only mode of a scene here."""
 
 
 def _method(peer: Peer) -> Method:

@@ -16,15 +16,14 @@ import numpy as np
 import torch
 
 import rts
-from benchmarks.accuracy.scenes import DISTANCE, pixel
-from benchmarks.accuracy.scores import scores
-from benchmarks.accuracy.truth import GRIDS
+from benchmarks.accuracy.scenes import DISTANCE, grids, pixel
 from benchmarks.camera import camera, supersampled
 from benchmarks.meshes import mesh, rotation_xy
 from benchmarks.outline_fits import TILT, around_axis, vase
 from benchmarks.report import table
-from rts.diagnostics.comparison.scores import low_pass
-from rts.diagnostics.comparison.shapes import icosphere
+from rts.diagnostics.shapes import icosphere
+from rts.diagnostics.smoothing import low_pass
+from rts_compare.derivative_scores import all_scores
 
 SIZE, POINTS = 256, 8
 """Pixels, and points of a pixel along x and y in each of the truth's two grids."""
@@ -80,8 +79,7 @@ class Body:
         """Difference of images (H, W, 3) half a unit of t before and after, the mean over two grids."""
         ends = [self.at((self.motion.vertices + t * velocity).astype(np.float32)) for t in (-0.5, 0.5)]
         images = [
-            [supersampled(end, camera(), (SIZE, SIZE), grid(POINTS))[..., :3] for end in ends]
-            for grid in GRIDS.values()
+            [supersampled(end, camera(), (SIZE, SIZE), points)[..., :3] for end in ends] for points in grids(POINTS)
         ]
         return np.mean([after - before for before, after in images], axis=0)
 
@@ -109,7 +107,7 @@ def cells(motion: Motion) -> list[str]:
         unit = np.linalg.norm(low_pass(whole))
         return [f"{np.linalg.norm(low_pass(x)) / unit:.3f} of a pixel" for x in found]
     true = body.truth(motion.velocity)
-    rows = [scores(x, true) for x in found]
+    rows = [all_scores(x, true) for x in found]
     return [f"{r['low_relative_l2']:.3f} / {r['low_gain']:.3f} / {r['loss_error']:.3f}" for r in rows]
 
 

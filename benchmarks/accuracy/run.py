@@ -1,7 +1,7 @@
 """How right derivatives of images are: splatters, layers and samples a pixel, over all scenes, beside other renderers.
 
-Derivative images by forward mode are scored against differences of area-sampled renders over one pixel, as
-`truth` defines, and after its low-pass against the derivative itself: a closed form, or a difference over a quarter of
+Derivative images by forward mode are scored against differences of area-sampled renders over one pixel
+(`Scene.truth`), and after its low-pass against the derivative itself: a closed form, or a difference over a quarter of
 a pixel, or over more where outlines hardly move. Writes tables (accuracy.md), all numbers (accuracy.json) and three
 figures:
 
@@ -25,10 +25,9 @@ from rich.progress import Progress
 from benchmarks.accuracy import figures, methods, scenes, tables
 from benchmarks.accuracy.closed_forms import closed_form
 from benchmarks.accuracy.methods import CASES, Method
-from benchmarks.accuracy.scores import scores
-from benchmarks.accuracy.truth import Truth, truth
-from rts.diagnostics.comparison.environment import environment
-from rts.diagnostics.comparison.scores import loss_weights
+from rts_compare.derivative_scores import all_scores, loss_weights
+from rts_compare.environment import environment
+from rts_compare.true_derivatives import Truth
 
 SPP = (1, 4, 16, 64, 256)
 QUICK = ("A", "half-plane")
@@ -46,7 +45,7 @@ class References(NamedTuple):
 
 def references(scene: scenes.Scene, folder: Path) -> References:
     closed = closed_form(scene)
-    return References(truth(scene, folder), closed.truth() if closed else truth(scene, folder, scene.step))
+    return References(scene.truth(folder), closed.truth() if closed else scene.truth(folder, scene.step))
 
 
 def score(scene: str, method: Method, against: References) -> tuple[dict, np.ndarray]:
@@ -54,9 +53,9 @@ def score(scene: str, method: Method, against: References) -> tuple[dict, np.nda
     images = [method.derivative(seed) for seed in range(method.seeds)]
     row: dict = {"scene": scene, "method": method.name}
     for name, reference in against._asdict().items():
-        found = [scores(image, reference.derivative) for image in images]
+        found = [all_scores(image, reference.derivative) for image in images]
         row[name] = {key: statistics.fmean(f[key] for f in found) for key in found[0]}
-    row["seeds"] = [scores(image, against.exact.derivative)["low_relative_l2"] for image in images]
+    row["seeds"] = [all_scores(image, against.exact.derivative)["low_relative_l2"] for image in images]
     return row, images[0]
 
 
@@ -147,9 +146,9 @@ def measure(plan: list[Plan], say: Callable[[str], None], done: Callable[[], Non
         noise = {name: reference.noise for name, reference in against._asdict().items()}
         results["scenes"][scene.name] = {
             "note": scene.note,
-            "closed_form": against.exact.step == 0,
+            "closed_form": against.exact.error == 0,
             "noise": noise,
-            "step": scores(against.pixel.derivative, against.exact.derivative)["low_relative_l2"],
+            "step": all_scores(against.pixel.derivative, against.exact.derivative)["low_relative_l2"],
         }
         for method in [*ours, *others]:
             say(f"{scene.name}: {method.name}")

@@ -9,18 +9,28 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import rts
-from benchmarks.camera import DISTANCE, camera
+from benchmarks.camera import DISTANCE, camera, regular_grid
 from benchmarks.meshes import DATA, mesh, rotation_xy
-from rts.arrays.engines import constants, engine_of, exemplar
-from rts.diagnostics.comparison import shapes
-from rts.diagnostics.comparison.shapes import CARD_DEPTH, QUAD, box, grid, icosphere, on_screen, pixel, rectangle, unlit
+from rts.diagnostics.shapes import QUAD, box, icosphere, unlit
+from rts.plugin_api.arrays import constants, exemplar
+from rts_compare import moving_scenes, scene_shapes
+from rts_compare.scene_shapes import CARD_DEPTH, grid, on_screen, pixel, rectangle
+from rts_compare.true_derivatives import SAMPLES, Truth, area_image, lattice, truth
 
 SIZE = 256
+MOTION = "motion"
+"""The only mode of a scene here."""
+
+
+def grids(samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two grids of points of a pixel that have nothing in common: a regular one, and a lattice."""
+    return regular_grid(samples), lattice(samples)
 
 
 @dataclass(frozen=True)
@@ -49,9 +59,25 @@ class Scene:
     def camera(self) -> rts.Camera:
         return camera()
 
+    @property
+    def moving(self) -> moving_scenes.Scene:
+        """The scene as it is measured, with `MOTION` for its only mode."""
+        still, unit = {"t": np.zeros(())}, {"t": np.ones(())}
+        return moving_scenes.Scene(
+            self.name, lambda p: (self.at(p["t"]), self.camera), still, {MOTION: unit}, self.size, self.note
+        )
+
+    def truth(self, folder: Path, step: float = 1.0) -> Truth:
+        """How the image truly changes with t, by differences over a step; kept in a folder."""
+        return truth(self.moving, MOTION, 1.0, samples=SAMPLES, step=step, grids=grids, folder=folder)
+
+    def image(self) -> np.ndarray:
+        """The image (H, W, 3) at rest, area-sampled."""
+        return area_image(self.at(0.0), self.camera, self.size, regular_grid(SAMPLES))[..., :3]
+
     def at(self, t: Any) -> list[rts.Part]:
         """The parts at t: a number, or a scalar of torch or jax, in which they are then differentiable."""
-        engine, like = engine_of(t), exemplar(t)
+        engine, like = rts.engine_of(t), exemplar(t)
         parts = []
         for part, direction in zip(self.rest, self.directions, strict=True):
             if direction is not None:
@@ -77,7 +103,7 @@ def turn(size: int, pixels: float = 1.0) -> np.ndarray:
 
 @cache
 def _bunny_and_square() -> tuple[rts.Part, rts.Part]:
-    return shapes.bunny_and_square(*mesh("bunny"))
+    return scene_shapes.bunny_and_square(*mesh("bunny"))
 
 
 def bunny_over_black(size: int, cull: str = "back") -> Scene:
@@ -145,7 +171,7 @@ def turned_box(size: int) -> Scene:
     return Scene(
         "turned box",
         (size, size),
-        shapes.turned_box(),
+        scene_shapes.turned_box(),
         (motion(DISTANCE, size), None),
         (2, 4),
         "a closed, unculled box with a colour a face moves before a card with a pattern",
@@ -154,7 +180,7 @@ def turned_box(size: int) -> Scene:
 
 def cards(size: int, count: int, alternating: bool = False) -> Scene:
     """Open cards: one in the middle moves, or neighbours in depth in opposite directions."""
-    parts, depths = shapes.cards(count)
+    parts, depths = scene_shapes.cards(count)
     if alternating:
         directions = [motion(depth, size, (-1) ** i) for i, depth in enumerate(depths)]
     else:
@@ -197,7 +223,7 @@ def wires(size: int, width: float) -> Scene:
     return Scene(
         f"wires {width:g} px",
         (size, size),
-        (shapes.wires(size, [width] * 7),),
+        (scene_shapes.wires(size, [width] * 7),),
         (motion(DISTANCE, size),),
         (1, 2),
         f"seven slanted wires, {width:g} pixels wide, move over black",
@@ -208,7 +234,7 @@ def spheres(size: int) -> Scene:
     return Scene(
         "spheres",
         (size, size),
-        shapes.crossing_spheres(),
+        scene_shapes.crossing_spheres(),
         (None, motion(DISTANCE - 0.1, size)),
         (2, 4),
         "two spheres that pass through one another, unculled; the nearer moves",
@@ -217,7 +243,7 @@ def spheres(size: int) -> Scene:
 
 @cache
 def _spot() -> rts.Part:
-    return shapes.textured_spot(DATA / "meshes" / "spot")
+    return scene_shapes.textured_spot(DATA / "meshes" / "spot")
 
 
 def spot(size: int, turns: bool = False) -> Scene:
@@ -250,7 +276,7 @@ def teapot_turns(size: int) -> Scene:
     return Scene(
         "teapot turns",
         (size, size),
-        (shapes.bunny_and_square(vertices, faces)[0],),
+        (scene_shapes.bunny_and_square(vertices, faces)[0],),
         (turn(size),),
         (2, 4),
         "the teapot, unculled, turns about +y, a pixel at distance 1 from the axis",

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.accuracy.methods import ADAPTIVE, CASES, CLOSED, name_of
-from benchmarks.accuracy.scores import scores
 from benchmarks.report import table
+from rts_compare.derivative_scores import all_scores
 
 UNCULLED = (
     (
@@ -90,7 +90,7 @@ def upright_floor() -> float:
     """
     line = np.zeros((64, 64, 3))
     line[:, 32] = 1
-    return scores((line + np.roll(line, 1, axis=1)) / 2, line)["low_relative_l2"]
+    return all_scores((line + np.roll(line, 1, axis=1)) / 2, line)["low_relative_l2"]
 
 
 def cases(rows: Rows) -> str:

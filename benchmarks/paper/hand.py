@@ -26,10 +26,10 @@ import rts
 from benchmarks.camera import regular_grid
 from benchmarks.meshes import DATA
 from benchmarks.report import table
-from rts.diagnostics.comparison.journal import Journal
-from rts.diagnostics.comparison.shapes import QUAD
-from rts.diagnostics.failures import methods as failures
+from rts.diagnostics.shapes import QUAD
 from rts.files.srgb import encode_srgb
+from rts_compare.failures import table_columns as failures
+from rts_compare.kept_measurements import KeptMeasurements
 
 PHOTOGRAPHS = ("IMG-1842.jpg", "IMG-1843.jpg", "IMG-1844.jpg")
 METHODS = {m.name: dict(m.options) for m in failures.METHODS if m.name in ("single", "multi, K = 2", "visible")}
@@ -246,8 +246,8 @@ def as_arrays(parameters: dict[str, Any]) -> dict[str, Any]:
     return {k: torch.tensor(v, dtype=torch.float32) for k, v in parameters.items()}
 
 
-def measured(kept: Journal, factors: tuple[float, ...], seeds: int, steps: int) -> dict[str, Any]:
-    """All fits, and DEODR's; what the journal holds is not run again."""
+def measured(kept: KeptMeasurements, factors: tuple[float, ...], seeds: int, steps: int) -> dict[str, Any]:
+    """All fits, and DEODR's; what is kept is not run again."""
     fits: dict[str, dict[str, list[dict]]] = {}
     for method in METHODS:
         for factor in factors:
@@ -290,7 +290,7 @@ def draw(found: dict[str, Any], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    from rts.diagnostics.comparison.style import PEER_COLORS, SPLATTER_COLORS
+    from rts_compare.chart_style import PEER_COLORS, SPLATTER_COLORS
 
     fits, seeds = found["fits"], range(len(found["start"]))
     colors = {m: SPLATTER_COLORS[m.split(",")[0]] for m in fits}
@@ -341,7 +341,7 @@ def main() -> None:
     args = parser.parse_args()
     args.output.mkdir(parents=True, exist_ok=True)
     factors, steps = (QUICK_FACTORS, QUICK_STEPS) if args.quick else (FACTORS, STEPS)
-    found = measured(Journal(args.output / ".hand.jsonl"), factors, 1 if args.quick else args.seeds, steps)
+    found = measured(KeptMeasurements(args.output / ".hand.jsonl"), factors, 1 if args.quick else args.seeds, steps)
     print(summary(found))
     draw(found, args.output / "hand.png")
     (args.output / "hand.json").write_text(json.dumps(found, separators=(",", ":")))

@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.camera import DISTANCE, FOV
 from benchmarks.speed.pose_iteration import Task
 from benchmarks.timing import RATE, START
-from rts.diagnostics.comparison.mitsuba_peer import emitter, integrator, mitsuba, sensor
+from rts_compare.other_renderers.mitsuba_renderer import emitter, integrator, mitsuba, sensor
 
 SIGMA = 1.0
 """Width of DEODR's anti-aliased edges, pixels."""

@@ -25,7 +25,7 @@ from benchmarks.speed import levenberg_marquardt, memory, second_layer, splatter
 from benchmarks.speed.charts import CHARTS
 from benchmarks.speed.pose_iteration import ENGINES, MODES, Task, torch_iteration
 from benchmarks.timing import ROUNDS, WARM_UP, in_turn
-from rts.diagnostics.comparison.environment import environment
+from rts_compare.environment import environment
 
 QUICK_MESHES, QUICK_SIZES, QUICK_ROUNDS = ("teapot", "bunny"), (256,), 3
 SPLATTED, PRUNED, STAGED = ("bunny",), ("bunny", "nefertiti"), ("teapot", "bunny", "nefertiti")

@@ -48,6 +48,16 @@ def bounds_of(parts: Sequence[Part]) -> Bounds:
     return Bounds(center, radius)
 
 
+def default_camera(parts: Sequence[Part], size: tuple[int, int]) -> Camera:
+    """The camera that commands have unless told otherwise: it sees all of the parts, from above and aside.
+
+    Args:
+        parts: of NumPy arrays, of whose surfaces a mesh can be made.
+        size: (height, width) of the image.
+    """
+    return orbit(bounds_of(parts), size, 30, 20)
+
+
 def orbit(
     bounds: Bounds,
     size: tuple[int, int],

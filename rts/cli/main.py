@@ -1,4 +1,4 @@
-"""The command line: `rts plugins`, `render`, `fit-pose`, `export`, `compare`, `tune`, `new`, `demo`, `warmup`."""
+"""The command line: `rts plugins`, `render`, `fit-pose`, `export`, `new`, `demo`, `warmup`, and installed commands."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typer.core import TyperGroup
 
 from rts import __version__, registry
 from rts.arrays.trees import map_leaves
-from rts.errors import RtsError
+from rts.errors import PluginError, RtsError
 from rts.scene.parts import Part
 
 EXAMPLES = """
@@ -37,7 +37,17 @@ UsageError: Any = typer.BadParameter.__base__
 
 
 class _Group(TyperGroup):
-    """Commands whose expected errors are one line on standard error, without a traceback."""
+    """Commands, those of installed distributions too, whose expected errors are one line on standard error."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        own = super().list_commands(ctx)
+        return [*own, *(name for name in registry.plugins("rts.commands") if name not in own)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        found = super().get_command(ctx, cmd_name)
+        if found is None and cmd_name in registry.plugins("rts.commands"):
+            return _installed_command(cmd_name)
+        return found
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Let --debug stand anywhere; without arguments, show the help."""
@@ -50,6 +60,36 @@ class _Group(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         with _one_line(ctx), _warnings_in_a_line():
             return super().invoke(ctx)
+
+
+def _installed_command(name: str) -> Any:
+    """The command of an entry point, imported now; where that fails, a command that says why."""
+    try:
+        return _as_command(name, registry.plugin("rts.commands", name))
+    except PluginError as error:
+        reason = error
+
+    def broken() -> None:
+        raise reason
+
+    broken.__doc__ = f"cannot be used: {_line(str(reason))}"
+    return _as_command(name, broken, {"ignore_unknown_options": True, "allow_extra_args": True})
+
+
+def _as_command(name: str, found: Any, settings: dict[str, Any] | None = None) -> Any:
+    """A function, or a `typer.Typer`, as a command of this name."""
+    try:
+        if not isinstance(found, typer.Typer):
+            alone = typer.Typer(rich_markup_mode="markdown", add_completion=False)
+            alone.command(name, context_settings=settings)(found)
+            found = alone
+        command = typer.main.get_command(found)
+    except Exception as error:
+        raise PluginError(
+            f"the command {name!r} is neither a function of options nor a typer.Typer: {error}"
+        ) from error
+    command.name = name
+    return command
 
 
 @contextlib.contextmanager
@@ -133,9 +173,9 @@ def _size(text: str) -> tuple[int, int]:
 
 def _supersample(text: str) -> Any:
     """The samples a pixel of "4", or of "adaptive:4"."""
-    from rts.sampling.adaptive import of_text
+    from rts.sampling.adaptive import Adaptive
 
-    return of_text(text)
+    return Adaptive.of_text(text)
 
 
 def _view(text: str) -> tuple[float, ...]:
@@ -402,101 +442,6 @@ def export(
     parts = rts.load(model, surface=surface)
     vertices, faces = write_mesh(output, parts, tolerance * bounds_of(parts).radius)
     _say(escape(f"{vertices} vertices and {faces} triangles; wrote {output}"))
-
-
-Scene = Annotated[
-    str,
-    typer.Argument(
-        help="A model, a Python file (FILE.py or FILE.py:FUNCTION), or a built-in scene: see `rts compare list`.",
-        show_default=False,
-    ),
-]
-Modes = Annotated[
-    list[str] | None,
-    typer.Option("--mode", help="translation, rotation, shape, color or camera; may be repeated. All by default."),
-]
-SceneSize = Annotated[str | None, typer.Option("--size", help="Pixels: 256, or HEIGHTxWIDTH; the scene's own.")]
-
-
-@app.command(epilog="Example: rts compare bunny.obj --quick -o out/bunny && open out/bunny/bunny.html")
-def compare(
-    scene: Scene,
-    output: Annotated[Path, typer.Option("--output", "-o", help="Folder for the results.")] = Path("comparison"),
-    quick: Annotated[
-        bool, typer.Option("--quick", help="One mode, one engine, one sampler, at most 40 settings.")
-    ] = False,
-    modes: Modes = None,
-    size: SceneSize = None,
-    surface: Surface = "mesh",
-    samplers: Annotated[list[str] | None, typer.Option("--sampler", help="May be repeated. All by default.")] = None,
-    splatters: Annotated[list[str] | None, typer.Option("--splatter", help="May be repeated. All by default.")] = None,
-    engines: Annotated[list[str] | None, typer.Option("--engine", help="May be repeated. All by default.")] = None,
-    supersample: Annotated[
-        list[str] | None, typer.Option(help="As in rts render. May be repeated. 1, 2, 4 and adaptive:4 by default.")
-    ] = None,
-    peers: Annotated[bool, typer.Option(help="DEODR and Mitsuba, where they are installed.")] = True,
-    fresh: Annotated[bool, typer.Option("--fresh", help="Forget what earlier runs have measured.")] = False,
-) -> None:
-    """Chart the error of derivatives against the time of a render and gradient, over all settings and plugins.
-
-    Writes SCENE.json, SCENE.png and SCENE.html, which is interactive. A run that is interrupted goes on where it was.
-    """
-    from rts.cli.comparison import missing_charts, scene_list, summary
-    from rts.diagnostics import compare as measured
-
-    if scene == "list":
-        Console().print(scene_list())
-        return
-    wanted: dict[str, Any] = dict(modes=modes, samplers=samplers, splatters=splatters, engines=engines)
-    options: dict[str, Any] = {name: value or None for name, value in wanted.items()}
-    options["supersample"] = [_supersample(text) for text in supersample or []] or None
-    shape = None if size is None else _size(size)
-    if (missing := missing_charts()) is not None:
-        _say(escape(missing))
-    with _interrupted("what was measured is kept: the same command goes on from there"):
-        found = measured(
-            scene, size=shape, peers=peers, quick=quick, surface=surface, output=output, fresh=fresh, **options
-        )
-    Console().print(summary(found))
-    for line in found.left_out:
-        _say(escape(f"left out: {line}"))
-    _say_written(found.files(output))
-
-
-@app.command(epilog="Example: rts tune bunny.obj --tolerance 0.05 --mode translation --mode rotation")
-def tune(
-    scene: Scene,
-    tolerance: Annotated[float, typer.Option(help="The largest error of derivatives, a share of them.")] = 0.05,
-    budget: Annotated[float, typer.Option(help="Seconds of measuring, after the truth.")] = 60.0,
-    modes: Modes = None,
-    size: SceneSize = None,
-    surface: Surface = "mesh",
-    engine: Annotated[str, typer.Option(help="torch or jax; auto is whichever is installed.")] = "auto",
-) -> None:
-    """Find the cheapest settings whose derivatives are accurate enough on a scene, and say why."""
-    import rts
-    from rts.diagnostics.comparison.style import time_label
-
-    shape, chosen = None if size is None else _size(size), None if engine == "auto" else engine
-    options: dict[str, Any] = dict(tolerance=tolerance, budget_s=budget, modes=modes or None)
-    with _interrupted("the truth is kept, other measurements are not"):
-        found = rts.tune(scene, size=shape, engine=chosen, surface=surface, **options)
-    _say(escape(f"rts.render(parts, camera, size, {', '.join(f'{k}={v!r}' for k, v in found.settings.items())})"))
-    _say(f"error {100 * found.error:.2g} %, {time_label(1e3 * found.seconds)} for a render and gradient")
-    if found.rate:
-        _say(escape(f"with surfaces of {found.rate}: rts.tune(...).parts and .scene have them"))
-    for reason in found.reasons:
-        _say(escape(f"  {reason}"))
-
-
-@contextlib.contextmanager
-def _interrupted(what: str) -> Iterator[None]:
-    """Say what is left after Ctrl-C."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        typer.echo(f"rts: interrupted; {what}", err=True)
-        raise typer.Exit(130) from None
 
 
 @app.command(epilog="Example: rts new surface blob && pip install -e 'rts-blob[test]' && pytest rts-blob")

@@ -81,7 +81,7 @@ class Surface(Plugin):
     def rates(self, theta: Mapping[str, Tree]) -> Sequence[Rate]:
         """Coarser and finer forms of the surface, for whoever looks for the cheapest that will do; none by default.
 
-        `rts.diagnostics.compare` and `rts.tune` try them. The surface as it is need not be among them.
+        `rts_compare.compare` and `rts.tune` try them. The surface as it is need not be among them.
 
         Args:
             theta: θ; NumPy arrays are constants, others may be of any engine.

@@ -16,12 +16,12 @@ from rts.arrays.array_functions import from_numbers, kind_of
 from rts.arrays.engines import Engine, engine_of, is_constant, namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
 from rts.contracts.checks import check_size, is_count, is_real
-from rts.diagnostics.comparison.progress import phases
 from rts.diagnostics.explanation.reasons import Reason, legend, marked
 from rts.diagnostics.explanation.selection import explained
 from rts.diagnostics.explanation.shared_budget import Clock, looked_at
 from rts.diagnostics.explanation.slopes import Slope
 from rts.diagnostics.explanation.subject import Scene, Subject
+from rts.diagnostics.progress import phases
 from rts.errors import EmptyImageWarning, InputError, LayersWarning
 from rts.files.srgb import decode_srgb
 from rts.fitting.dependence import differentiable

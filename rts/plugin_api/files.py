@@ -1,6 +1,6 @@
 """Files of polygons, and the folder of what is costly to make."""
 
 from rts.files.obj_reader import read_polygons
-from rts.files.paths import cache_folder
+from rts.files.paths import cache_folder, output_folder, writing
 
-__all__ = ["cache_folder", "read_polygons"]
+__all__ = ["cache_folder", "output_folder", "read_polygons", "writing"]

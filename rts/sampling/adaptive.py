@@ -63,36 +63,28 @@ class Adaptive:
             return self.contrast is not None or not all(part.uniform for part in parts)
         return self.dilated
 
+    @staticmethod
+    def of_text(text: str) -> int | Adaptive:
+        """The samples a pixel that a text stands for: "4", "adaptive:4", or "adaptive:8:dilated=False:contrast=0.2".
 
-def as_text(supersample: int | Adaptive) -> str:
-    """What `of_text` reads: "4", "adaptive:4", or with what else is given "adaptive:8:dilated=False:contrast=0.2"."""
-    if not isinstance(supersample, Adaptive):
-        return str(supersample)
-    given = {"dilated": supersample.dilated, "contrast": supersample.contrast}
-    return ":".join([f"adaptive:{supersample.samples}", *(f"{k}={v}" for k, v in given.items() if v is not None)])
-
-
-def of_text(text: str) -> int | Adaptive:
-    """The samples a pixel that a text stands for; see `as_text`.
-
-    Raises:
-        InputError: it stands for none.
-    """
-    kind, *rest = (word.strip().lower() for word in text.split(":"))
-    number, *further = rest if rest and kind == "adaptive" else [kind]
-    if not number.isdecimal() or (rest and kind != "adaptive"):
-        raise InputError(f"{text!r} is no supersample; expected a number such as 4, or adaptive:4")
-    values = {"dilated=true": ("dilated", True), "dilated=false": ("dilated", False)}
-    options: dict[str, Any] = {}
-    for word in further:
-        name, _, value = word.partition("=")
-        if word in values:
-            options.update([values[word]])
-        elif name == "contrast" and (least := _number(value)) is not None:
-            options[name] = least
-        else:
-            raise InputError(f"{word!r} of {text!r} is none of dilated=True, dilated=False and contrast=0.2")
-    return Adaptive(int(number), **options) if rest else int(number)
+        Raises:
+            InputError: it stands for none.
+        """
+        kind, *rest = (word.strip().lower() for word in text.split(":"))
+        number, *further = rest if rest and kind == "adaptive" else [kind]
+        if not number.isdecimal() or (rest and kind != "adaptive"):
+            raise InputError(f"{text!r} is no supersample; expected a number such as 4, or adaptive:4")
+        values = {"dilated=true": ("dilated", True), "dilated=false": ("dilated", False)}
+        options: dict[str, Any] = {}
+        for word in further:
+            name, _, value = word.partition("=")
+            if word in values:
+                options.update([values[word]])
+            elif name == "contrast" and (least := _number(value)) is not None:
+                options[name] = least
+            else:
+                raise InputError(f"{word!r} of {text!r} is none of dilated=True, dilated=False and contrast=0.2")
+        return Adaptive(int(number), **options) if rest else int(number)
 
 
 def _number(text: str) -> float | None:

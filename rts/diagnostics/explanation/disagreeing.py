@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rts.diagnostics.comparison.scores import low_pass
 from rts.diagnostics.explanation import variants
 from rts.diagnostics.explanation.baseline import nearest
 from rts.diagnostics.explanation.reasons import Finding
@@ -15,6 +14,7 @@ from rts.diagnostics.explanation.slopes import Number
 from rts.diagnostics.explanation.subject import DEEP, Change, Subject, Touched
 from rts.diagnostics.explanation.thin_features import on_host
 from rts.diagnostics.explanation.vanishing import why_constant
+from rts.diagnostics.smoothing import low_pass
 
 HALVED = 0.5
 """An experiment names a reason if it leaves less than this share of the error."""

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from rts.diagnostics.comparison.progress import Phase
 from rts.diagnostics.explanation.disagreeing import why_off
 from rts.diagnostics.explanation.reasons import Finding, Reason, merged
 from rts.diagnostics.explanation.slopes import Number, Slope
@@ -19,6 +18,7 @@ from rts.diagnostics.explanation.vanishing import (
     why_not_finite,
     why_nothing,
 )
+from rts.diagnostics.progress import Phase
 
 
 def explained(

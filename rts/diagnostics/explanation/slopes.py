@@ -9,8 +9,8 @@ import numpy as np
 
 from rts.arrays.engines import Engine, namespace
 from rts.arrays.trees import Array, Tree, leaves, map_leaves
-from rts.diagnostics.comparison.scores import low_pass
 from rts.diagnostics.explanation.subject import DEEP, Subject
+from rts.diagnostics.smoothing import low_pass
 from rts.scene.camera import Camera
 from rts.scene.parts import Part
 

@@ -1,1 +1,0 @@
-"""Ways to fail, and which methods do: the table of `rts.diagnostics.stability`."""

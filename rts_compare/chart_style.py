@@ -1,0 +1,138 @@
+"""What the rows of a comparison look like in charts, and what they are called there.
+
+Colours are those of Okabe and Ito, which those who are colour blind tell apart, and others chosen to be far from these
+for them too. Symbols have the names that plotly.js gives them.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rts_compare.compared_settings import finest, in_python, samples_of
+from rts_compare.pareto_front import Row, milliseconds, timed
+
+SPLATTER_COLORS = {
+    "visible": "#D55E00",
+    "multi": "#0072B2",
+    "single": "#009E73",
+    "none": "#5C6068",
+    "auto": "#E69F00",
+}
+PEER_COLORS = {"DEODR": "#CC79A7", "Mitsuba": "#56B4E9"}
+OTHER_COLORS = ("#7A3FF2", "#B10027", "#A8A85A", "#276262")
+SAMPLER_SYMBOLS = {
+    "raster": "circle",
+    "reference": "square",
+    "embree": "diamond",
+    "opengl": "triangle-up",
+    "rays": "triangle-down",
+    "auto": "hexagon",
+}
+OTHER_SYMBOLS = ("pentagon", "star", "cross", "triangle-left", "triangle-right")
+PEER_SYMBOL = "x"
+ENGINE_FILLS = {"torch": "", "jax": "-open"}
+OTHER_FILLS = ("-open-dot", "-dot")
+"""What is added to a symbol: full, hollow, hollow with a dot, full with a dot."""
+
+
+def assigned(names: Iterable[str], fixed: Mapping[str, str], others: Sequence[str]) -> dict[str, str]:
+    """The look of each name: its own where it has one, else one of `others` by the order of the names.
+
+    Args:
+        names: any; some may occur often.
+        fixed: name → look.
+        others: looks, used again and again where there are more names.
+
+    Returns:
+        Name → look, the fixed ones first.
+    """
+    given = set(names)
+    foreign = sorted(given - fixed.keys())
+    return {name: look for name, look in fixed.items() if name in given} | {
+        name: others[index % len(others)] for index, name in enumerate(foreign)
+    }
+
+
+@dataclass(frozen=True)
+class Looks:
+    """Name → look, for all names in some comparisons.
+
+    Attributes:
+        splatters: name → colour.
+        samplers: name → symbol.
+        engines: name → what is added to the symbol.
+        peers: name → colour.
+    """
+
+    splatters: dict[str, str]
+    samplers: dict[str, str]
+    engines: dict[str, str]
+    peers: dict[str, str]
+
+    @classmethod
+    def of(cls, rows: Iterable[Row]) -> Looks:
+        """The looks of rows."""
+        rows = list(rows)
+        ours = [row["settings"] for row in rows if "peer" not in row]
+        return cls(
+            assigned((s["splatter"] for s in ours), SPLATTER_COLORS, OTHER_COLORS),
+            assigned((s["sampler"] for s in ours), SAMPLER_SYMBOLS, OTHER_SYMBOLS),
+            assigned((s["engine"] for s in ours), ENGINE_FILLS, OTHER_FILLS),
+            assigned((row["peer"] for row in rows if "peer" in row), PEER_COLORS, OTHER_COLORS),
+        )
+
+
+def drawn(row: Row) -> bool:
+    """Whether a row has a place on logarithmic axes."""
+    return timed(row) and milliseconds(row) > 0 and row["error"] > 0
+
+
+def time_label(milliseconds: float) -> str:
+    """A time in three digits: "0.25 ms", "47.5 ms", "4.75 s", "475 s"."""
+    if milliseconds < 999.5:
+        return f"{milliseconds:.3g} ms"
+    seconds = milliseconds / 1e3
+    return f"{seconds:.3g} s" if seconds < 999.5 else f"{seconds:.0f} s"
+
+
+def side_length(supersample: int | str) -> float:
+    """How large a row is drawn, by how many samples it takes along the side of a pixel; in pixels of a screen."""
+    return 5.0 + 2.5 * min(finest(samples_of(supersample)), 6)
+
+
+def samples_label(supersample: int | str) -> str:
+    """Samples a pixel in few words: "4×4", or "adaptive 4×4" where they are at outlines alone."""
+    side = finest(samples_of(supersample))
+    if not isinstance(supersample, str):
+        return f"{side}×{side}"
+    return " ".join([f"adaptive {side}×{side}", *supersample.split(":")[2:]])
+
+
+def label(row: Row) -> str:
+    """A row's settings in few words, such as "visible K=2 2×2 raster torch tolerance=0.4"."""
+    settings = row["settings"]
+    if "peer" in row:
+        return " ".join([row["peer"], *(f"{name}={value}" for name, value in settings.items())])
+    samples = settings["supersample"]
+    words = [settings["splatter"], f"K={settings['layers']}", samples_label(samples) if samples != 1 else ""]
+    return " ".join(filter(None, [*words, settings["sampler"], settings["engine"], settings["rate"]]))
+
+
+def arguments(row: Row) -> str:
+    """A row's settings as keyword arguments to copy, and in a comment what is set elsewhere: engine and rate."""
+    settings = row["settings"]
+    if "peer" in row:
+        return "# " + ", ".join([row["peer"], *(f"{name}={value}" for name, value in settings.items())])
+    names = ("sampler", "splatter", "layers")
+    given = ", ".join(f"{name}={json.dumps(settings[name], ensure_ascii=False)}" for name in names)
+    given += f", supersample={in_python(settings['supersample'])}"
+    return f"{given}  # " + ", ".join(filter(None, [settings["engine"], settings["rate"]]))
+
+
+def environment_line(environment: Mapping[str, Any]) -> str:
+    """Where and when a comparison was made, in one line."""
+    versions = ", ".join(f"{name} {version}" for name, version in environment.get("versions", {}).items() if version)
+    return "; ".join(filter(None, [environment.get("date"), environment.get("machine"), versions]))

@@ -1,0 +1,148 @@
+"""Settings that are compared: what there is to choose from, and which are worth a look."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from rts import Adaptive, Engine, plugin, plugins
+from rts.errors import InputError, PluginError
+from rts.plugin_api.arrays import engine_named
+from rts.plugin_api.checks import quoted
+from rts_compare.pareto_front import LEVELS
+
+FIRST = "torch"
+"""The engine that errors are measured with where it is installed, since all agree on them and it compiles nothing."""
+
+
+SHARE = 1.5
+"""Fine samples for each sample of the plain image and each along a pixel's side, about, where they are at outlines."""
+
+ALIKE = 1.1
+"""A setting that costs more has to have an error smaller than by this factor, or smaller than one of `LEVELS`."""
+
+
+class Setting(NamedTuple):
+    """One way to render a scene.
+
+    Attributes:
+        splatter: its name.
+        layers: K, or "auto".
+        supersample: samples along each side of a pixel; or, where outlines are, such as "adaptive:4" (`rts.Adaptive`).
+        rate: what differs of the surfaces, such as "tolerance=0.4"; "" for nothing.
+        sampler: its name; "" where only the error is meant.
+        engine: its name; "" likewise.
+    """
+
+    splatter: str
+    layers: int | str
+    supersample: int | str
+    rate: str = ""
+    sampler: str = ""
+    engine: str = ""
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Keyword arguments of `rts.render`."""
+        found = {"splatter": self.splatter, "layers": self.layers, "supersample": samples_of(self.supersample)}
+        return {"sampler": self.sampler, **found} if self.sampler else found
+
+    @property
+    def side(self) -> float:
+        """The square root of the samples a pixel; of those at outlines alone, about what they cost."""
+        found = samples_of(self.supersample)
+        return math.sqrt(SHARE * found.samples) if isinstance(found, Adaptive) else found
+
+
+def samples_of(supersample: int | str) -> int | Adaptive:
+    """What `rts.render` takes, of what settings hold: a number, or a text."""
+    return Adaptive.of_text(supersample) if isinstance(supersample, str) else int(supersample)
+
+
+def as_text(supersample: Adaptive) -> str:
+    """What settings hold of samples at outlines: "adaptive:4", or "adaptive:8:dilated=False:contrast=0.2"."""
+    given = {"dilated": supersample.dilated, "contrast": supersample.contrast}
+    return ":".join([f"adaptive:{supersample.samples}", *(f"{k}={v}" for k, v in given.items() if v is not None)])
+
+
+def finest(supersample: Any) -> Any:
+    """Samples along each side of a pixel, where there are most; what is neither is returned as it is."""
+    return supersample.samples if isinstance(supersample, Adaptive) else supersample
+
+
+def in_python(supersample: int | str) -> str:
+    """Samples a pixel as a user writes them."""
+    if not isinstance(supersample, str):
+        return str(supersample)
+    _, side, *options = supersample.split(":")
+    return f"rts.Adaptive({', '.join([side, *options])})"
+
+
+def usable(group: str, chosen: Sequence[str] | None = None) -> tuple[list[str], list[str]]:
+    """The plugins of a group that load, "auto" and further names of one class left out; and why others are not there.
+
+    Args:
+        group: such as "rts.splatters".
+        chosen: names; None for all.
+    """
+    found: dict[str, Any] = {}
+    left_out = []
+    if chosen is not None and (not isinstance(chosen, (list, tuple)) or not chosen):
+        raise InputError(f"{group.removeprefix('rts.')} is {quoted(chosen)}; expected a list of names, or None for all")
+    for name in plugins(group) if chosen is None else chosen:
+        if name == "auto" and chosen is None:
+            continue
+        try:
+            loaded = plugin(group, name)
+        except PluginError as error:
+            if chosen is not None:
+                raise
+            left_out.append(str(error))
+            continue
+        if not any(loaded is other for other in found.values()):
+            found[name] = loaded
+    return list(found), left_out
+
+
+def engines(chosen: Sequence[str] | None = None) -> tuple[list[Engine], list[str]]:
+    """The engines that have derivatives, the one that errors are measured with first; and why others are not there."""
+    names, left_out = usable("rts.engines", chosen)
+    loaded = [engine_named(name) for name in names]
+    found = [engine for engine in loaded if engine.differentiates]
+    if chosen is not None:
+        left_out += [f"engine {engine.name!r}: it has no derivatives" for engine in loaded if not engine.differentiates]
+    if not found and chosen is not None:
+        installed = ", ".join(engine.name for engine in engines()[0])
+        raise InputError(
+            f"engines is {quoted(chosen)}, without derivatives, which are compared; expected some of {installed}"
+        )
+    if not found:
+        raise PluginError(
+            "no engine with derivatives is installed, and derivatives are compared: pip install "
+            "'rasterize-then-splat[torch]', or [jax]"
+        )
+    return sorted(found, key=lambda e: e.name != FIRST if chosen is None else names.index(e.name)), left_out
+
+
+def worth_timing(errors: Mapping[Setting, float], work: Callable[[Setting], tuple[float, ...]]) -> list[Setting]:
+    """The settings that no cheaper one betters, nor an equal one before it: the front of errors, with work for time.
+
+    Args:
+        errors: setting → error.
+        work: setting → what it costs in several respects.
+    """
+    found: list[Setting] = []
+    for setting in sorted(errors, key=lambda s: (work(s), errors[s])):
+        mine = work(setting)
+        if not any(
+            _no_worse(errors[other], errors[setting]) and all(a <= b for a, b in zip(work(other), mine, strict=True))
+            for other in found
+        ):
+            found.append(setting)
+    return found
+
+
+def _no_worse(error: float, other: float) -> bool:
+    """Whether an error is not much larger than another one, and within all `LEVELS` that the other is within."""
+    return error <= ALIKE * other and not any(other <= level < error for level in LEVELS)

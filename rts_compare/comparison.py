@@ -1,0 +1,392 @@
+"""`rts_compare.compare`: speed against accuracy, on one chart, for anyone's scene and anyone's plugin."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rts import Adaptive, Engine
+from rts.diagnostics.progress import Phase, phases
+from rts.errors import InputError, PluginError
+from rts.plugin_api.arrays import Tree
+from rts.plugin_api.checks import is_count, quoted
+from rts.plugin_api.files import output_folder, writing
+from rts_compare.compared_settings import Setting, as_text, finest, usable, worth_timing
+from rts_compare.derivative_scores import scores
+from rts_compare.environment import environment
+from rts_compare.interleaved_timing import ROUNDS, Calls, InterleavedTiming
+from rts_compare.kept_measurements import KeptMeasurements
+from rts_compare.left_out import one_line
+from rts_compare.measurements import Measurements
+from rts_compare.moving_scenes import Scene
+from rts_compare.other_renderers.renderer_input import Peer
+from rts_compare.pareto_front import Row, best_within, front, marked
+from rts_compare.scene_sources import engines_for, scene_of, some_modes
+from rts_compare.true_derivatives import SAMPLES
+
+LAYERS = (1, 2, 4, "auto")
+SUPERSAMPLE = (1, 2, 4, Adaptive(4))
+QUICK_CELLS = 40
+"""The most settings that are looked at with `quick`."""
+PEER_ROUNDS = 2
+"""Turns of other renderers."""
+PACKAGES = ("rasterize-then-splat", "numpy", "numba", "torch", "jax", "embreex", "moderngl", "deodr", "mitsuba")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Settings on one scene, with the error of their derivatives and their time.
+
+    Attributes:
+        scene: "name", "note" and "size" (height, width).
+        environment: date, machine and versions.
+        modes: mode → {"truth_error": what the truth itself may be off}.
+        rows: one for each mode and setting: "mode", "settings", "error" (relative L2 through a Gaussian of 2 pixels),
+            "gain", "loss_error", "ms" (median, quartiles and number of calls, or None where only the error was
+            measured) and "front", whether nothing is both faster and more accurate. Rows of other renderers have
+            "peer", too.
+        left_out: what could not be measured, and why; a line each.
+    """
+
+    scene: Mapping[str, Any]
+    environment: Mapping[str, Any]
+    modes: Mapping[str, Mapping[str, float]]
+    rows: Sequence[Row]
+    left_out: Sequence[str]
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """All of it as dicts and lists, as it is written to JSON."""
+        return dict(vars(self))
+
+    def best(self, mode: str, error: float) -> Row | None:
+        """The fastest of the library's own rows of a mode whose error is at most `error`; None if there is none."""
+        return best_within([r for r in self.rows if r["mode"] == mode and "peer" not in r], error)
+
+    def write(self, folder: Path | str) -> list[Path]:
+        """Write NAME.json, and NAME.png and NAME.html where the packages of the extra `plots` are installed."""
+        from rts_compare.html_page import write_page
+        from rts_compare.png_chart import draw
+
+        output_folder(folder)
+        files = self._files(folder)
+        with writing(files[0]):
+            files[0].parent.mkdir(parents=True, exist_ok=True)
+            files[0].write_text(json.dumps(self.data, indent=1) + "\n", encoding="utf-8")
+        written = files[:1]
+        for file, write in ((files[1], lambda f: draw(self.data, f)), (files[2], lambda f: write_page([self.data], f))):
+            try:
+                write(file)
+                written.append(file)
+            except PluginError:  # What is missing is seen from what is not there.
+                continue
+        return written
+
+    def files(self, folder: Path | str) -> list[Path]:
+        """The files of the comparison that there are in a folder."""
+        return [file for file in self._files(folder) if file.exists()]
+
+    def _files(self, folder: Path | str) -> list[Path]:
+        name = file_name(self.scene["name"])
+        return [Path(folder) / f"{name}{suffix}" for suffix in (".json", ".png", ".html")]
+
+
+def file_name(scene: str) -> str:
+    """What the files of a scene are called."""
+    return re.sub(r"\W+", "_", scene).strip("_") or "scene"
+
+
+class Plan(NamedTuple):
+    """What is to be measured.
+
+    Attributes:
+        splatters: names.
+        samplers: names of those that suit the scene, the usual one first; each with the one whose errors it shares:
+            "" for the usual one.
+        engines: the one that errors are measured with first.
+        layers: K or "auto".
+        supersample: as `Setting.supersample`.
+        rates: whether the rates that surfaces offer are tried.
+        most: how many settings are looked at, at most; None for all.
+        peers: other renderers.
+    """
+
+    splatters: Sequence[str]
+    samplers: Mapping[str, str]
+    engines: Sequence[Engine]
+    layers: Sequence[int | str]
+    supersample: Sequence[int | str]
+    rates: bool
+    most: int | None
+    peers: Sequence[Peer]
+
+
+def compare(
+    scene: Any,
+    parameters: Tree = None,
+    *,
+    directions: Mapping[str, Tree] | None = None,
+    size: tuple[int, int] | None = None,
+    modes: Sequence[str] | None = None,
+    samplers: Sequence[str] | None = None,
+    splatters: Sequence[str] | None = None,
+    engines: Sequence[str] | None = None,
+    layers: Sequence[int | str] | None = None,
+    supersample: Sequence[int | Adaptive] | None = None,
+    peers: bool = True,
+    quick: bool = False,
+    surface: str = "mesh",
+    output: Path | str | None = None,
+    truths: Path | str | None = None,
+    truth_samples: int = SAMPLES,
+    fresh: bool = False,
+    progress: bool | None = None,
+) -> Comparison:
+    """Measure the error of derivatives, and the time of a render and gradient, of all settings on one scene.
+
+    The error of a setting is that of the derivative image along each of some directions (modes), against differences of
+    area-sampled renders. Settings that no cheaper one betters are timed, in turns: a render and the gradient of a loss
+    in what moves. Every registered sampler and splatter takes part, and DEODR and Mitsuba where the extra `bench` is
+    installed.
+
+    Args:
+        scene: the name of a built-in scene, the path of a model or of a Python file ("file.py:function"), or a
+            function: parameters → (parts, camera), or () → (parts, camera) in NumPy, whose parts then move in five
+            ways.
+        parameters: of the function: where derivatives are taken; an array, or nested dicts and lists.
+        directions: mode → direction of the parameters; None for one for each number of small arrays, and one at random
+            for each larger array.
+        size: (height, width); None for the scene's own.
+        modes: some of the modes; None for all.
+        samplers: names; None for all that suit the scene.
+        splatters: names; None for all.
+        engines: names; None for all. Errors are measured with the first.
+        layers: numbers of layers, or "auto"; None for 1, 2, 4 and "auto".
+        supersample: samples along each side of a pixel, or `rts.Adaptive`; None for 1, 2, 4 and `rts.Adaptive(4)`.
+        peers: whether other renderers take part.
+        quick: one mode, engine and sampler unless others are named, at most 40 settings, no peers.
+        surface: the kind of surface that reads a model.
+        output: a folder for the results, and for what a run that is interrupted goes on from; None to write nothing.
+        truths: the folder of truths; None for the folder of caches.
+        truth_samples: of the truth, along each side of a pixel; fewer are faster, and leave a larger error of its own.
+        fresh: whether to forget what earlier runs have measured.
+        progress: whether to show progress; None for where standard error is a terminal.
+
+    Raises:
+        InputError: there is no such scene, or an argument is wrong; before anything is measured.
+        PluginError: a plugin that was asked for cannot be loaded.
+    """
+    found = scene_of(scene, parameters, directions, size, surface=surface)
+    folder = None if output is None else output_folder(output)
+    kept = None if truths is None else output_folder(truths)
+    found = some_modes(found, list(found.directions)[:1] if quick and modes is None else modes)
+    layers = _counts("layers", layers, LAYERS[:2] if quick else LAYERS, ("auto",))
+    samples_a_pixel = _samples(supersample)
+    if not is_count(truth_samples):
+        raise InputError(f"truth_samples is {quoted(truth_samples)}; expected an integer of at least 1")
+    names, without = usable("rts.splatters", splatters)
+    possible, missing = usable("rts.samplers", samplers)
+    used, failing = engines_for(found, engines)
+    earlier = _earlier(folder, found, fresh)
+    used = used[:1] if quick and engines is None else used
+    measured = Measurements(found, earlier, used, truths=kept, samples=int(truth_samples))
+    measured.left_out += [*failing, *without, *missing, *_unthinned()]
+    measured.leave_out_what_rests()
+    suited = measured.samplers(possible)
+    if not suited:
+        raise InputError(f"none of the samplers {', '.join(possible)} suits {found.name!r}; {measured.left_out[-1]}")
+    others, unsuited = _peers(measured, peers and not quick)
+    measured.left_out += unsuited
+    most = QUICK_CELLS if quick else None
+    kinds = measured.kinds(suited[:1] if quick and samplers is None else suited)
+    plan = Plan(names, kinds, used, layers, samples_a_pixel, rates=not quick, most=most, peers=others)
+    with phases(progress) as phase:
+        comparison = _compared(measured, plan, phase)
+    if folder is not None:
+        comparison.write(folder)
+    return comparison
+
+
+def _counts(name: str, given: Any, usual: Sequence, others: tuple[str, ...] = ()) -> list:
+    found = list(usual) if given is None else list(given) if isinstance(given, (list, tuple)) else [given]
+    if not found or not all(is_count(n) or (isinstance(n, str) and n in others) for n in found):
+        expected = " or ".join(["integers of at least 1", *map(repr, others)])
+        raise InputError(f"{name} is {quoted(given)}; expected {expected}")
+    return [n if isinstance(n, str) else int(n) for n in found]
+
+
+def _samples(given: Any) -> list[int | str]:
+    """What `Setting.supersample` holds, of what a user gave."""
+    wanted = list(SUPERSAMPLE) if given is None else list(given) if isinstance(given, (list, tuple)) else [given]
+    if not wanted or not all(is_count(finest(s)) for s in wanted):
+        raise InputError(f"supersample is {quoted(given)}; expected integers of at least 1 or rts.Adaptive")
+    return [as_text(s) if isinstance(s, Adaptive) else int(s) for s in wanted]
+
+
+def _unthinned() -> list[str]:
+    if find_spec("fast_simplification") is None:
+        return ["meshes of fewer faces: pip install 'rasterize-then-splat[decimation]'"]
+    return []
+
+
+def _earlier(folder: Path | None, scene: Scene, fresh: bool) -> KeptMeasurements:
+    """What earlier runs have measured of scenes of this name."""
+    if folder is None:
+        return KeptMeasurements()
+    path = folder / f".{file_name(scene.name)}.jsonl"
+    if fresh:
+        path.unlink(missing_ok=True)
+    return KeptMeasurements(path)
+
+
+def _peers(measured: Measurements, wanted: bool) -> tuple[list[Peer], list[str]]:
+    if not wanted:
+        return [], []
+    from rts_compare.other_renderers.installed_renderers import peers
+
+    return peers(measured.scene, engine=None if measured.scene.separate else measured.engine)
+
+
+def _compared(measured: Measurements, plan: Plan, phase: Phase) -> Comparison:
+    done = phase("truth", 4 * measured.samples**2 * len(measured.scene.directions))
+    measured.truths(done)
+    scene, rows = measured.scene, []
+    modes = list(scene.directions)
+    cells = {g: _cells(measured, plan, g) for g in dict.fromkeys(map(measured.group, modes))}
+    done = phase("errors", sum(len(cells[measured.group(m)]) + len(plan.peers) for m in modes))
+    errors: dict[str, dict[Setting, dict[str, float]]] = {}
+    for mode in modes:
+        found = {s: _counted(measured.scores, mode, s, done=done) for s in cells[measured.group(mode)]}
+        errors[mode] = {setting: score for setting, score in found.items() if score is not None}
+    of_peers = {(m, p): _counted(_peer_scores, measured, m, p, done=done) for m in modes for p in plan.peers}
+    for group in cells:
+        of_group = {mode: errors[mode] for mode in measured.modes(group)}
+        times = _timed(measured, plan, group, of_group, phase)
+        for mode, found in of_group.items():
+            rows += _rows(mode, found, plan.samplers, times)
+            peer_times = _peer_times(measured, mode, plan.peers, phase)
+            for peer in plan.peers:
+                score, ms = of_peers[mode, peer], peer_times.get(_peer_key(peer))
+                if score is not None:
+                    rows.append({"mode": mode, "peer": peer.name, "settings": dict(peer.settings), **score, "ms": ms})
+    rows.sort(key=lambda row: modes.index(row["mode"]))
+    found = marked({"rows": rows})
+    return Comparison(
+        {"name": scene.name, "note": scene.note, "size": list(scene.size)},
+        {**environment(PACKAGES), "date": measured.kept.since},
+        {mode: {"truth_error": measured.truth(mode).error} for mode in modes},
+        found["rows"],
+        measured.left_out,
+    )
+
+
+def _counted(f: Callable, *args: Any, done: Callable[[], None]) -> Any:
+    """The result of a call, which counts as a step."""
+    found = f(*args)
+    done()
+    return found
+
+
+def _cells(measured: Measurements, plan: Plan, group: str) -> list[Setting]:
+    kinds = dict.fromkeys(plan.samplers.values())
+    found = measured.settings(group, plan.splatters, plan.layers, plan.supersample, kinds, plan.rates)
+    if plan.most is not None and len(found) > plan.most:
+        measured.left_out.append(f"{len(found) - plan.most} settings beyond the {plan.most} that are quick to measure")
+        found = found[: plan.most]
+    return found
+
+
+def _timed(
+    measured: Measurements, plan: Plan, group: str, errors: Mapping[str, Mapping[Setting, dict]], phase: Phase
+) -> dict[Setting, dict[str, float]]:
+    """Times of settings.
+
+    Of each splatter, and each sampler with errors of its own, the front of errors is timed, with one sampler and the
+    first engine; what is then on the front of errors and times, with all samplers that share these errors, and with all
+    other engines.
+    """
+    engine = plan.engines[0].name
+    usual = {kind: next(name for name, k in plan.samplers.items() if k == kind) for kind in plan.samplers.values()}
+    plain = {mode: {s: found["error"] for s, found in of_mode.items()} for mode, of_mode in errors.items()}
+    first: dict[Setting, Setting] = {}
+    for of_mode in plain.values():
+        for splatter, kind in product(plan.splatters, usual):
+            own = {s: error for s, error in of_mode.items() if (s.splatter, s.sampler) == (splatter, kind)}
+            for setting in worth_timing(own, lambda s: measured.work(group, s)):
+                first[setting] = setting._replace(sampler=usual[kind], engine=engine)
+    times = _taken(measured, group, list(first.values()), phase, f"times, {group}")
+    known = {s: times[timed]["median"] for s, timed in first.items() if timed in times}
+    best: dict[Setting, None] = {}
+    for mode, of_mode in plain.items():
+        tried = [s for s in of_mode if s in known]
+        on = front([{"mode": mode, "error": of_mode[s], "ms": {"median": known[s]}} for s in tried])
+        best.update(dict.fromkeys(s for s, wanted in zip(tried, on, strict=True) if wanted))
+    more = [
+        s._replace(sampler=name, engine=engine)
+        for s in best
+        for name, kind in plan.samplers.items()
+        if kind == s.sampler and name != usual[kind]
+    ]
+    # Compiled programs have to know how many layers there are.
+    more += [first[s]._replace(engine=e.name) for s in best for e in plan.engines[1:] if s.layers != "auto"]
+    return times | _taken(measured, group, more, phase, "times, other samplers and engines")
+
+
+def _taken(
+    measured: Measurements, group: str, settings: Sequence[Setting], phase: Phase, what: str
+) -> dict[Setting, dict[str, float]]:
+    timing = measured.timing(group, {s: lambda s=s: measured.call(group, s) for s in settings})
+    found = timing.run(done=phase(what, ROUNDS * len(settings)))
+    measured.left_out += [f"{', '.join(str(v) for v in s if v != '')}: {why}" for s, why in timing.failed.items()]
+    return {Setting(*s): ms for s, ms in found.items()}
+
+
+def _peer_key(peer: Peer) -> tuple:
+    return peer.name, *(f"{name}={value}" for name, value in peer.settings.items())
+
+
+def _peer_scores(measured: Measurements, mode: str, peer: Peer) -> dict[str, float] | None:
+    key = "peer", mode, *_peer_key(peer), *measured.state(mode)
+    kept: Any = measured.kept.get(*key)
+    if kept is None:
+        try:
+            derivative = peer.derivative(mode) * measured.pixel(mode)
+            kept = measured.kept.put(scores(derivative, measured.truth(mode).derivative), *key)
+        except Exception as error:
+            why = one_line(f"{type(error).__name__}: {error}")
+            measured.left_out.append(f"{' '.join(_peer_key(peer))}, {mode}: {why}")
+    return kept
+
+
+def _peer_times(
+    measured: Measurements, mode: str, peers: Sequence[Peer], phase: Phase
+) -> dict[tuple, dict[str, float]]:
+    """Times of peers in a mode: they have to be told anew where a mode changes other vertices or colours."""
+    if not peers:
+        return {}
+    calls: Calls = {_peer_key(p): lambda p=p: p.gradient(mode) for p in peers}
+    timing = InterleavedTiming(measured.kept, calls, lambda name: ("peer", mode, *name, *measured.state(mode)))
+    return timing.run(PEER_ROUNDS, phase(f"times of peers, {mode}", PEER_ROUNDS * len(peers)))
+
+
+def _rows(
+    mode: str,
+    errors: Mapping[Setting, dict],
+    samplers: Mapping[str, str],
+    times: Mapping[Setting, dict[str, float]],
+) -> list[dict]:
+    """A row for each setting that was timed, and one without time for each that was not."""
+    timed: dict[Setting, list[Setting]] = {}
+    for setting in times:
+        timed.setdefault(setting._replace(sampler=samplers[setting.sampler], engine=""), []).append(setting)
+    return [
+        {"mode": mode, "settings": s._asdict(), **found, "ms": times.get(s) if s.engine else None}
+        for setting, found in errors.items()
+        for s in timed.get(setting, [setting])
+    ]

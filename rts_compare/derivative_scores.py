@@ -1,0 +1,77 @@
+"""How near the derivative of an image is to the truth."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from rts.diagnostics.smoothing import low_pass
+
+LOSSES, LOSS_SCALE = 16, 8.0
+"""How many random losses, and the standard deviation of the Gaussian that smooths their weights, pixels."""
+
+
+def relative_l2(x: np.ndarray, y: np.ndarray, scale: np.ndarray) -> float:
+    """Norm of the difference over that of `scale`."""
+    return float(np.linalg.norm(x - y) / max(float(np.linalg.norm(scale)), 1e-30))
+
+
+@lru_cache(2)
+def loss_weights(height: int, width: int, count: int = LOSSES) -> np.ndarray:
+    """Weights (count, H, W, 3) float32 of random losses L = Σ w · image: smooth, of fixed seed and unit variance."""
+    from scipy.ndimage import gaussian_filter
+
+    noise = np.random.default_rng(0).normal(size=(count, height, width, 3))
+    smooth = gaussian_filter(noise, (0, LOSS_SCALE, LOSS_SCALE, 0), output=np.float32)
+    weights = smooth / smooth.std(axis=(1, 2, 3), keepdims=True)
+    weights.setflags(write=False)
+    return weights
+
+
+def scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    """How near a derivative image (H, W, 3) is to the true one.
+
+    Returns:
+        error: relative L2 of the two through the low-pass; what charts show.
+        gain: ⟨x, truth⟩ / ⟨truth, truth⟩, through the low-pass: 1 where the derivative is neither too long nor too
+            short.
+        loss_error: over the random losses, RMS of the error of dL/dt relative to the RMS of dL/dt.
+    """
+    low = _compared(low_pass(x), low_pass(true))
+    return {"error": low["relative_l2"], "gain": low["gain"], "loss_error": _loss_error(x, true)}
+
+
+def all_scores(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    """How near a derivative image (H, W, 3) is to the true one, in more ways.
+
+    Returns:
+        relative_l2, cosine, gain: raw.
+        low_relative_l2, low_cosine, low_gain: the same through the low-pass.
+        spurious: share of the derivative's energy farther than 3 pixels from where the truth is not zero.
+        loss_error: as of `scores`.
+    """
+    from scipy.ndimage import binary_dilation
+
+    far = np.logical_not(binary_dilation(np.abs(true).max(axis=-1) > 1e-6, iterations=3))
+    return {
+        **_compared(x, true),
+        **{f"low_{name}": value for name, value in _compared(low_pass(x), low_pass(true)).items()},
+        "spurious": float((x[far] ** 2).sum() / max((x**2).sum(), 1e-30)),
+        "loss_error": _loss_error(x, true),
+    }
+
+
+def _compared(x: np.ndarray, true: np.ndarray) -> dict[str, float]:
+    product = float((x * true).sum())
+    return {
+        "relative_l2": relative_l2(x, true, true),
+        "cosine": product / max(float(np.linalg.norm(x) * np.linalg.norm(true)), 1e-30),
+        "gain": product / max(float((true**2).sum()), 1e-30),
+    }
+
+
+def _loss_error(x: np.ndarray, true: np.ndarray) -> float:
+    """Over the random losses, RMS of the error of dL/dt relative to the RMS of dL/dt."""
+    slopes, true_slopes = (np.tensordot(loss_weights(*true.shape[:2]), i, axes=3) for i in (x, true))
+    return relative_l2(slopes, true_slopes, true_slopes)

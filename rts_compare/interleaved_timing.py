@@ -1,0 +1,117 @@
+"""Times of functions that take turns, each turn kept as it is made."""
+
+from __future__ import annotations
+
+import math
+import random
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from rts_compare.kept_measurements import KeptMeasurements
+from rts_compare.left_out import limited, one_line
+
+ROUNDS, CONSECUTIVE = 3, 2
+"""Turns that each function has, and calls timed in a turn."""
+SLOW = 1.5
+"""Seconds of timed calls after which a function has had its turns, two at least."""
+LONGEST = 120.0
+"""Seconds after which a function that is to be timed is left out."""
+
+WARM = 0.5
+"""Seconds that a first call may always take: it loads what the next ones find."""
+
+Calls = Mapping[tuple, Callable[[], Callable[[], Any]]]
+"""What to keep a time under → a function that makes the function to be timed."""
+
+
+class InterleavedTiming:
+    """Functions whose times are taken.
+
+    Args:
+        kept: where times are kept.
+        calls: the functions.
+        key: what to keep each time under, of a key of `calls`.
+
+    Attributes:
+        failed: key → why it could not be timed, a line.
+    """
+
+    def __init__(self, kept: KeptMeasurements, calls: Calls, key: Callable[[tuple], tuple]):
+        self.kept, self.calls, self.key = kept, calls, key
+        self.failed: dict[tuple, str] = {}
+        self._times: dict[tuple, list[float]] = {name: [] for name in calls}
+        self._made: dict[tuple, Callable[[], Any]] = {}
+        self._hopeless = math.inf
+
+    def run(
+        self,
+        rounds: int = ROUNDS,
+        done: Callable[[], None] = lambda: None,
+        late: Callable[[], bool] = lambda: False,
+        hopeless: float = math.inf,
+    ) -> dict[tuple, dict[str, float]]:
+        """Let them take turns in shuffled order, each after a call to warm up.
+
+        Args:
+            rounds: turns of each; those of earlier runs count.
+            done: called for each turn.
+            late: whether to end, once something is known.
+            hopeless: what takes so many times as long as the fastest is called once.
+
+        Returns:
+            Milliseconds under each name that could be timed: "median", quartiles "low" and "high", number of "calls".
+        """
+        self._hopeless = hopeless
+        order, shuffle = list(self.calls), random.Random(0).shuffle
+        for number in range(rounds):
+            shuffle(order)
+            for name in order:
+                done()
+                if not (late() and any(self._times.values())):
+                    self._turn(name, number)
+        return {name: _milliseconds(found) for name, found in self._times.items() if found}
+
+    def _turn(self, name: tuple, number: int) -> None:
+        times, key = self._times[name], ("time", *self.key(name), number)
+        if name in self.failed or (len(times) >= 2 and sum(times) > SLOW):
+            return
+        kept = self.kept.get(*key)
+        if kept is None:
+            try:
+                kept = self.kept.put(self.timed(name), *key)
+            except Exception as error:
+                self.failed[name] = one_line(f"{type(error).__name__}: {error}")
+                return
+        times.extend(kept)
+
+    def timed(self, name: tuple) -> list[float]:
+        """Seconds of a few consecutive calls, after one that is not timed where calls are quick."""
+        with limited(LONGEST):
+            if name not in self._made:
+                self._made[name] = self.calls[name]()
+                first = _seconds(self._made[name])
+                if first > self._most():
+                    return [first]
+            found = [_seconds(self._made[name])]
+            if found[0] < SLOW / 2:
+                found = [_seconds(self._made[name]) for _ in range(CONSECUTIVE)]
+        return found
+
+    def _most(self) -> float:
+        """Seconds of a first call after which there is no other."""
+        known = [float(np.median(times)) for times in self._times.values() if times]
+        return max(WARM, self._hopeless * min(known)) if known else math.inf
+
+
+def _seconds(f: Callable[[], Any]) -> float:
+    start = time.perf_counter()
+    f()
+    return time.perf_counter() - start
+
+
+def _milliseconds(times: list[float]) -> dict[str, float]:
+    low, median, high = 1e3 * np.percentile(times, [25, 50, 75])
+    return {"median": float(median), "low": float(low), "high": float(high), "calls": len(times)}

@@ -1,0 +1,442 @@
+"""What is measured of a scene, each once: errors of derivatives, and seconds of a render with its gradient."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rts import Camera, Engine, Part, explain, namespace, render, sample
+from rts.diagnostics.smoothing import low_pass
+from rts.diagnostics.steps import pixel_step
+from rts.errors import InputError, RtsWarning
+from rts.plugin_api.arrays import Array, Tree, leaves, map_leaves
+from rts_compare.compared_settings import Setting
+from rts_compare.derivative_scores import loss_weights, relative_l2, scores
+from rts_compare.interleaved_timing import LONGEST, Calls, InterleavedTiming
+from rts_compare.kept_measurements import KeptMeasurements
+from rts_compare.left_out import TooSlow, limited, one_line
+from rts_compare.measurement_keys import library_key, plugin_key, state_key
+from rts_compare.moving_scenes import Scene, is_constant, parts_of
+from rts_compare.surface_rates import SceneAtRate, scenes_at_rates
+from rts_compare.true_derivatives import SAMPLES, STEP, Truth, truth, truth_key
+
+PATIENCE = 8.0
+"""Seconds after which a sampler that has not answered is left out."""
+PROBE, SLOWEST = 8, 3.0
+"""Side of the first image that samplers are tried on, pixels; the most seconds that one of the scene's size takes."""
+ALIKE = 0.002
+"""Samplers whose derivatives differ by less, relative L2, share their errors."""
+
+TOGETHER = "all"
+"""The group of all modes, where they are differentiated at once."""
+
+Done = Callable[[], None]
+
+
+class Measurements:
+    """A scene, and what has been measured of it.
+
+    Args:
+        scene: the scene.
+        kept: where measurements are kept.
+        engines: those that have derivatives; errors are measured with the first.
+        truths: the folder of truths; None for that of caches.
+        samples: of the truth, the square root of their number a pixel, where `refine_truths` takes no others.
+        together: whether the parameters of all modes are differentiated at once.
+        count_at: samples along each side of a pixel with which layers are counted, once for all settings of a splatter;
+            None to count them with those of each setting.
+        slowest: the most seconds that a sampler may take for an image of the scene's size.
+
+    Attributes:
+        left_out: what could not be measured, a line each.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        kept: KeptMeasurements,
+        engines: Sequence[Engine],
+        *,
+        truths: Path | None = None,
+        samples: int = SAMPLES,
+        together: bool = False,
+        count_at: int | None = None,
+        slowest: float = SLOWEST,
+    ):
+        self.scene, self.kept, self.engines, self.folder, self.samples = scene, kept, engines, truths, samples
+        self.engine, self.count_at, self.slowest = engines[0], count_at, slowest
+        self.left_out: list[str] = []
+        self._truths: dict[str, Truth] = {}
+        self._truth_samples: dict[str, int] = {}
+        self._at_rates: dict[str, dict[str, SceneAtRate]] = {}
+        self._pixels: dict[str, float] = {}
+        self._states: dict[str, tuple[str, ...]] = {}
+        self._failed: dict[tuple, str] = {}
+        self._groups = {m: TOGETHER if together else self._group(m) for m in scene.directions}
+
+    # ------------------------------------------------------------------------------------------------- the scene
+
+    def _group(self, mode: str) -> str:
+        parts = parts_of(self.scene.at(self.scene.moved(mode, 0.0, self.engine)))
+        read = [part.theta[name] for part in parts for name in part.surface.reads(part.theta)]
+        return "surfaces rest" if is_constant(read) else "surfaces change"
+
+    def group(self, mode: str) -> str:
+        """The modes that are timed together: those that leave surfaces alone, and those that change them."""
+        return self._groups[mode]
+
+    def modes(self, group: str) -> list[str]:
+        """The modes of a group."""
+        return [mode for mode in self.scene.directions if self.group(mode) == group]
+
+    def pixel(self, mode: str) -> float:
+        """How far along a mode what moves fastest moves by a pixel.
+
+        Raises:
+            InputError: nothing changes with it.
+        """
+        if mode not in self._pixels:
+            engine, scene = self.engine, self.scene
+
+            def image(t: Array, **options: Any) -> Array:
+                found = scene.at(scene.moved(mode, t, engine))
+                options = {"layers": 1, "sampler": "auto", **options}
+                return render(*found, scene.size, **options)
+
+            start = self._number(0.0)
+            step = _quietly(lambda: pixel_step(engine, image, start, namespace(start).ones_like(start)))
+            if step is None:
+                raise self._rests(mode)
+            self._pixels[mode] = step
+        return self._pixels[mode]
+
+    def leave_out_what_rests(self) -> None:
+        """Go on with those modes that change something.
+
+        Raises:
+            InputError: there are none.
+        """
+        self._keep(self.pixel)
+
+    def truths(self, done: Done) -> None:
+        """Make the truths, and go on with those modes in which the image changes.
+
+        Args:
+            done: see `truth`.
+
+        Raises:
+            InputError: there are none.
+        """
+
+        def changes(mode: str) -> None:
+            if not np.linalg.norm(self.truth(mode, done).derivative) > 0:
+                raise self._rests(mode)
+
+        self._keep(changes)
+
+    def rough(self, error: float) -> list[str]:
+        """The modes whose truth has an error of its own that is larger."""
+        return [mode for mode in self.scene.directions if self.truth(mode).error > error]
+
+    def refine_truths(self, modes: Sequence[str], samples: int, done: Done) -> None:
+        """Make the truths of some modes anew, of `samples`² a pixel."""
+        for mode in modes:
+            self._truth_samples[mode] = samples
+            self._truths.pop(mode, None)
+            self._states.pop(mode, None)
+            self.truth(mode, done)
+
+    def _keep(self, check: Callable[[str], Any]) -> None:
+        """Go on with the modes that a check does not refuse."""
+        kept, why = [], []
+        for mode in self.scene.directions:
+            try:
+                check(mode)
+                kept.append(mode)
+            except InputError as error:
+                why.append(error)
+                self._leave_out(str(error))
+        if not kept:
+            raise why[0]
+        self.scene = self.scene.with_modes(kept)
+
+    def _rests(self, mode: str) -> InputError:
+        return InputError(
+            f"nothing in the image of {self.scene.name!r} changes with {mode!r}; expected parameters that the scene "
+            f"depends on, and parts that are in view"
+        )
+
+    def _number(self, value: float) -> Array:
+        like = next((x for x in leaves(self.scene.parameters) if self.engine.owns(x)), None)
+        return self.engine.constant(np.asarray(value, np.float32), like)
+
+    def truth(self, mode: str, done: Done = lambda: None) -> Truth:
+        """How the image truly changes along a mode; see `truth`."""
+        if mode not in self._truths:
+            samples = self._truth_samples.get(mode, self.samples)
+            options: dict[str, Any] = dict(samples=samples, engine=self._still, folder=self.folder, done=done)
+            self._truths[mode] = truth(self.scene, mode, self.pixel(mode), **options)
+        return self._truths[mode]
+
+    @property
+    def _still(self) -> Engine | None:
+        """The engine of scenes without derivatives: None for NumPy, where the scene takes it."""
+        return None if self.scene.separate else self.engine
+
+    def state(self, mode: str) -> tuple[str, ...]:
+        """What measurements of a mode depend on: the scene where it begins and ends, its truth, and the library."""
+        if mode not in self._states:
+            step = STEP * self.pixel(mode)
+            moved = [self.scene.at(self.scene.moved(mode, by, self._still)) for by in (-step / 2, step / 2)]
+            own = [state_key(parts_of(found), found[1], self.scene.size) for found in moved]
+            samples = self._truth_samples.get(mode, self.samples)
+            true = truth_key(self.scene, mode, step, samples, self._still)
+            self._states[mode] = (*own, true, library_key())
+        return self._states[mode]
+
+    def at_rates(self, group: str) -> dict[str, SceneAtRate]:
+        """The scene at the rates that its surfaces offer; "" as it is given."""
+        if group not in self._at_rates:
+            self._at_rates[group] = scenes_at_rates(self.scene.at, parts_of(self.scene.at(self.start(group))))
+        return self._at_rates[group]
+
+    # -------------------------------------------------------------------------------------------------- samplers
+
+    def samplers(self, names: Iterable[str]) -> list[str]:
+        """Those that can sample all parts, the one that "auto" takes first; "auto" itself where it takes several."""
+        found = self.scene.at(self.start(self.group(next(iter(self.scene.directions)))))
+        parts = parts_of(found)
+        auto = {choice.sampler for choice in explain(parts, found[1])}
+        suited = ["auto"] if len(auto) > 1 else []
+        for name in names:
+            key = "sampler", name, plugin_key("rts.samplers", name), *self.state(next(iter(self.scene.directions)))
+            kept = self.kept.get(*key)
+            if kept is None:
+                kept = self._tried(name, parts, found[1])
+                if kept["suits"]:
+                    self.kept.put(kept, *key)
+            if kept["suits"]:
+                suited.append(name)
+            else:
+                self._leave_out(f"sampler {name!r}: {kept['why']}")
+        return sorted(suited, key=lambda name: (name not in auto, name != "auto"))
+
+    def kinds(self, samplers: Sequence[str]) -> dict[str, str]:
+        """Each sampler, with the one that its errors are shared with: "" for the usual one, itself where it differs."""
+        group = self.group(next(iter(self.scene.directions)))
+        found = {}
+        for name in samplers:
+            key = "kind", name, plugin_key("rts.samplers", name), samplers[0], *self.state(self.modes(group)[0])
+            kept = self.kept.get(*key)
+            if kept is None:
+                kept = self.kept.put(name == samplers[0] or self._agrees(name, samplers[0], group), *key)
+            found[name] = "" if kept else name
+        return found
+
+    def _agrees(self, name: str, usual: str, group: str) -> bool:
+        """Whether a sampler gives the derivatives that the usual one gives."""
+        for mode in self.modes(group):
+            setting = Setting("auto", 2, 1)
+            try:
+                a, b = (low_pass(self._derivative(mode, setting._replace(sampler=n))) for n in (usual, name))
+            except Exception:
+                return False
+            if not relative_l2(a, b, a) <= ALIKE:
+                return False
+        return True
+
+    def _tried(self, name: str, parts: list[Part], camera: Camera) -> dict[str, Any]:
+        """Whether a sampler suits the scene, and why not."""
+        side = PROBE
+        try:
+            for size, patience in (((PROBE, PROBE), PATIENCE), (self.scene.size, self.slowest)):
+                side = size[0]
+                with limited(patience):
+                    _quietly(lambda size=size: sample(parts, camera, size, sampler=name, layers=1))
+        except InputError as error:
+            return {"suits": False, "why": one_line(str(error))}
+        except TooSlow as error:
+            return {"suits": False, "why": f"{error} for an image {side} pixels high"}
+        except Exception as error:
+            return {"suits": False, "why": one_line(f"{type(error).__name__}: {error}")}
+        return {"suits": True, "why": ""}
+
+    def _leave_out(self, line: str) -> None:
+        if line not in self.left_out:
+            self.left_out.append(line)
+
+    # ---------------------------------------------------------------------------------------------------- errors
+
+    def settings(
+        self,
+        group: str,
+        splatters: Iterable[str],
+        layers: Iterable[int | str],
+        samples: Iterable[int | str],
+        kinds: Iterable[str] = ("",),
+        rates: bool = True,
+    ) -> list[Setting]:
+        """All that may differ in their error, those that can be had.
+
+        Args:
+            group: of modes.
+            splatters: names.
+            layers: numbers, or "auto".
+            samples: as `Setting.supersample`.
+            kinds: samplers that have errors of their own, and "" for all others.
+            rates: whether the rates that surfaces offer are among them.
+        """
+        all_of = (
+            Setting(splatter, count, supersample, rate, kind)
+            for kind in kinds
+            for rate in (self.at_rates(group) if rates else [""])
+            for supersample in samples
+            for splatter in splatters
+            for count in layers
+        )
+        return [setting for setting in all_of if self.counting(group, setting) is not None]
+
+    def counting(self, group: str, setting: Setting) -> int | None:
+        """How many layers count in a setting: beyond those that "auto" takes there are none. None where that fails."""
+        counted = setting._replace(layers="auto", engine="")
+        if self.count_at is not None:
+            counted = counted._replace(supersample=self.count_at, rate="")
+        most = self._layers(group, counted)
+        if most is None:
+            return None if setting.layers == "auto" else int(setting.layers)
+        return most if setting.layers == "auto" else min(int(setting.layers), most)
+
+    def _layers(self, group: str, setting: Setting) -> int | None:
+        """How many layers "auto" takes, None where it takes none."""
+        key = "layers", group, *setting, *self._identity(self.modes(group)[0], setting)
+        if key in self._failed:
+            return None
+        kept = self.kept.get(*key)
+        if kept is None:
+            parts, camera = self.at_rates(group)[setting.rate].at(self.start(group))
+            try:
+                with limited(LONGEST):
+                    found = _quietly(lambda: sample(parts, camera, self.scene.size, **setting.options))
+                kept = self.kept.put(int(found.row.shape[0]), *key)
+            except Exception as error:
+                self._failed[key] = one_line(f"{type(error).__name__}: {error}")
+                self._leave_out(f'splatter {setting.splatter!r}, layers="auto": {self._failed[key]}')
+        return kept
+
+    def scores(self, mode: str, setting: Setting) -> dict[str, float] | None:
+        """How far the derivative along a mode is off; see `rts_compare.derivative_scores`. None where it fails.
+
+        Args:
+            mode: of the scene.
+            setting: its `sampler` is one that has errors of its own, or "".
+        """
+        count = self.counting(self.group(mode), setting)
+        if count is None:
+            return None
+        same = setting._replace(layers=count, engine="")
+        key = "error", mode, *same, *self._identity(mode, same)
+        if key in self._failed:
+            return None
+        kept = self.kept.get(*key)
+        if kept is None:
+            try:
+                kept = self.kept.put(self._measured(mode, same), *key)
+            except Exception as error:
+                self._failed[key] = one_line(f"{type(error).__name__}: {error}")
+                self._leave_out(f"splatter {same.splatter!r}, {mode}: {self._failed[key]}")
+        return kept
+
+    def _identity(self, mode: str, setting: Setting) -> tuple[str, ...]:
+        """What a measurement of a setting depends on beside the setting."""
+        plugins = ("rts.splatters", setting.splatter), ("rts.samplers", setting.sampler)
+        return *(plugin_key(*p) for p in plugins), *self.state(mode)
+
+    def _measured(self, mode: str, setting: Setting) -> dict[str, float]:
+        derivative = self._derivative(mode, setting)
+        if not np.isfinite(derivative).all():
+            raise InputError("its derivative is not finite")
+        return scores(derivative, self.truth(mode).derivative)
+
+    def _derivative(self, mode: str, setting: Setting) -> np.ndarray:
+        """The derivative image (H, W, 3) along a mode, a pixel of motion."""
+        at, pixel = self.at_rates(self.group(mode))[setting.rate].at, self.pixel(mode)
+
+        def image(t: Array) -> Array:
+            return render(*at(self.scene.moved(mode, t, self.engine)), self.scene.size, **setting.options)[..., :3]
+
+        with limited(LONGEST):
+            found = _quietly(lambda: self.engine.jvp(image, self._number(0.0), self._number(pixel))[1])
+        return self.engine.to_numpy(found).astype(np.float64)
+
+    # ----------------------------------------------------------------------------------------------------- times
+
+    def work(self, group: str, setting: Setting) -> tuple[float, ...]:
+        """What a setting costs, in respects that are known beforehand: layers, samples, rate."""
+        layers = self.counting(group, setting) or 0
+        return (
+            layers + (0.5 if setting.layers == "auto" else 0.0),
+            setting.side,
+            self.at_rates(group)[setting.rate].work,
+        )
+
+    def call(self, group: str, setting: Setting) -> Callable[[], Any]:
+        """A function that renders the scene and takes the gradient of a loss in the parameters of a group's modes."""
+        engine = next(e for e in self.engines if e.name == setting.engine)
+        at, size = self.at_rates(group)[setting.rate].at, self.scene.size
+        live, rebuilt = self._live(group, engine)
+        weights = engine.constant(np.asarray(loss_weights(*size, 1)[0], np.float32), live[0])
+
+        def loss(values: list[Array]) -> Array:
+            image = render(*at(rebuilt(values)), size, **setting.options)
+            return namespace(image).sum(image[..., :3] * weights)
+
+        gradient = engine.jit(engine.value_and_grad(loss))
+        return lambda: _quietly(lambda: engine.block(gradient(live)))
+
+    def start(self, group: str) -> Tree:
+        """The parameters, those that a group's modes change in arrays of the first engine."""
+        live, rebuilt = self._live(group, self.engine)
+        return rebuilt(live)
+
+    def _live(self, group: str, engine: Engine) -> tuple[list[Array], Callable[[list[Array]], Tree]]:
+        """The parameters that a group's modes change, and the tree of all parameters with others in their place."""
+        scene = self.scene
+        changing = [
+            not scene.separate or any(np.any(np.asarray(d)) for d in of_modes)
+            for of_modes in zip(*(leaves(scene.directions[mode]) for mode in self.modes(group)), strict=True)
+        ]
+        given = list(leaves(scene.parameters))
+        live = [x if engine.owns(x) else engine.constant(x) for x, c in zip(given, changing, strict=True) if c]
+
+        def rebuilt(values: list[Array]) -> Tree:
+            which, new = iter(changing), iter(values)
+            return map_leaves(lambda x: next(new) if next(which) else x, scene.parameters)
+
+        return live, rebuilt
+
+    def timing(self, group: str, calls: Calls) -> InterleavedTiming:
+        """Functions that are to be timed, such as those of `call`, and where their times are kept.
+
+        Args:
+            group: of modes, whose parameters they differentiate.
+            calls: what to keep times under, a `Setting` or what a peer is called, → see `InterleavedTiming`.
+        """
+        modes = self.modes(group)
+        states = [state for mode in modes for state in self.state(mode)]
+
+        def key(name: tuple) -> tuple:
+            own = self._identity(modes[0], name) if isinstance(name, Setting) else ()
+            return group, *name, *own, *states
+
+        return InterleavedTiming(self.kept, calls, key)
+
+
+def _quietly(f: Callable[[], Any]) -> Any:
+    """The result of a call; what the library warns of is known from the first look at the scene."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RtsWarning)
+        return f()

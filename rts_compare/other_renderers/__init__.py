@@ -1,0 +1,1 @@
+"""DEODR and Mitsuba, which come with the extra `bench`, on scenes of ours."""

@@ -1,0 +1,331 @@
+"""A search for the cheapest settings within a tolerance: cheap ones first, then the fastest of what will do."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from rts.diagnostics.progress import Phase
+from rts.errors import InputError, ToleranceWarning, warn
+from rts_compare.compared_settings import Setting, in_python
+from rts_compare.interleaved_timing import Calls
+from rts_compare.measurements import TOGETHER, Measurements
+
+LAYERS = (1, 2, 4, 8)
+SUPERSAMPLE = (1, 2, "adaptive:4", 3, 4)
+HOPELESS = 2.0
+"""How many times the error of the best splatter another one may have, to be looked at further."""
+ALIKE = 0.9
+"""A setting is faster than another one if it takes less than this share of its time."""
+TURNS = 6
+"""Turns of the fastest settings; those that are told of beside the chosen one have a sixth."""
+MORE_WORK = 2.0
+"""What is so many times the work of what will do is not looked at: no splatter is worth it."""
+SLOWER = 3.0
+"""What takes so many times as long as the fastest has one call."""
+ENOUGH = 3
+"""Turns of the chosen one, at least."""
+NEARLY = 1.2
+"""A setting is passed over if the best of as many samples has so many times the tolerance."""
+FAR = 1.5
+"""A setting is passed over if by what fewer samples did its error will be so many times the tolerance."""
+
+
+class Found(NamedTuple):
+    """What a search has chosen.
+
+    Attributes:
+        setting: of the sampler, splatter, layers, samples and rate.
+        reasons: a line for each choice.
+        error: the largest along a mode.
+        seconds: median time of a render and gradient.
+    """
+
+    setting: Setting
+    reasons: list[str]
+    error: float
+    seconds: float
+
+
+class Search:
+    """A search for the cheapest settings within a tolerance.
+
+    Args:
+        measured: the scene, and what is known of it.
+        samplers: names, each with the one whose errors it shares; "" for the usual one.
+        tolerance: of the error.
+        deadline: when to stop measuring, on the clock of `time.perf_counter`.
+        phase: shows progress.
+    """
+
+    def __init__(
+        self,
+        measured: Measurements,
+        samplers: Mapping[str, str],
+        tolerance: float,
+        deadline: float,
+        phase: Phase,
+    ):
+        self.measured, self.samplers, self.phase = measured, samplers, phase
+        self.tolerance, self.deadline = tolerance, deadline
+        self.modes = list(measured.scene.directions)
+        self.bounds: dict[Setting, float] = {}
+        self.engine = measured.engine.name
+        self.late = False
+
+    def run(self, splatters: Sequence[str]) -> Found:
+        """The best of these splatters that is found in time."""
+        cells: list[Setting] = []
+        within: list[Setting] = []
+        for kind in dict.fromkeys(self.samplers.values()):
+            if not within:
+                cells = self._cells(self._promising(splatters, kind), kind)
+                within = self._within(cells)
+        within = [s for s in within if not self._needless(s, [other for other in within if other != s])]
+        chosen = self._fastest(self._sampled(within or [self._best(cells)]))
+        reasons, faster = self._reasons(chosen, cells, splatters)
+        if faster is not None:  # More work need not take longer.
+            chosen = faster
+            reasons, _ = self._reasons(chosen, cells, splatters)
+        error, seconds = self._error(chosen), self._timed([chosen], ENOUGH)[chosen]
+        if error > self.tolerance:
+            reasons.insert(0, self._told_of_failure(error))
+        if self.late:
+            reasons.append("the budget was spent before all settings were looked at")
+        return Found(chosen, reasons, error, seconds)
+
+    def _told_of_failure(self, error: float) -> str:
+        """What to say where nothing is within the tolerance; a warning, too."""
+        wanted = _percent(self.tolerance)
+        told = f"nothing within {wanted} was found in time" if self.late else f"nothing is within {wanted}"
+        told = f"{told}: the least error that was found is {_percent(error)}"
+        advice = "give a larger budget_s" if self.late else "give a larger tolerance, or look at more pixels"
+        warn(f"{told}; {advice}", ToleranceWarning)
+        return told
+
+    # -------------------------------------------------------------------------------------------------- accuracy
+
+    def _cells(
+        self,
+        splatters: Sequence[str],
+        kind: str,
+        layers: Sequence[int] = LAYERS,
+        supersample: Sequence[int | str] = SUPERSAMPLE,
+        rates: bool = True,
+    ) -> list[Setting]:
+        """All settings of a kind of sampler that may differ in their error, the cheapest first."""
+        found = self.measured.settings(TOGETHER, splatters, layers, supersample, [kind], rates)
+        return sorted(found, key=lambda s: math.prod(self._work(s)))
+
+    def _promising(self, splatters: Sequence[str], kind: str) -> list[str]:
+        """The splatters that are accurate enough, or nearly as accurate as the best, with two layers and one sample."""
+        known: dict[str, float] = {}
+        for setting in self._cells(splatters, kind, LAYERS[:2], SUPERSAMPLE[:1], rates=False):
+            if not self._over():
+                known[setting.splatter] = min(self._error(setting), known.get(setting.splatter, math.inf))
+        allowed = max(self.tolerance, HOPELESS * min(known.values(), default=math.inf))
+        return [name for name in splatters if known.get(name, 0.0) <= allowed]
+
+    def _sampled(self, settings: Sequence[Setting]) -> list[Setting]:
+        """Settings with each sampler: those that share their errors, and others that are accurate enough, too."""
+        found = []
+        for setting in settings:
+            for name, kind in self.samplers.items():
+                other = setting._replace(sampler=name, engine=self.engine)
+                if kind == setting.sampler or (not self._over() and self._bound(other) <= self.tolerance):
+                    found.append(other)
+        return found
+
+    def _cell(self, setting: Setting) -> Setting:
+        """What the error of a setting is kept under."""
+        return setting._replace(sampler=self.samplers.get(setting.sampler, setting.sampler), engine="")
+
+    def _work(self, setting: Setting) -> tuple[float, ...]:
+        layers, supersample, rate = self.measured.work(TOGETHER, self._cell(setting))
+        return layers, supersample**2, rate
+
+    def _within(self, cells: Sequence[Setting]) -> list[Setting]:
+        """The settings within the tolerance that no cheaper one of their splatter makes needless."""
+        done = self.phase("errors", len(cells))
+        found: list[Setting] = []
+        passed: list[Setting] = []
+        for setting in cells:
+            done()
+            if self._needless(setting, found):
+                continue
+            if self._far(setting) or self._in_vain(setting, cells, found):
+                passed.append(setting)
+            elif not self._looked_at(setting, found):
+                break
+        for setting in [] if found else passed:
+            if not self._needless(setting, found) and not self._looked_at(setting, found):
+                break
+        return found
+
+    def _looked_at(self, setting: Setting, found: list[Setting]) -> bool:
+        """Whether there was time to look at a setting, which joins those found if it is accurate enough."""
+        if self._over():
+            return False
+        if self._bound(setting) <= self.tolerance:
+            found.append(setting)
+        return True
+
+    def _needless(self, setting: Setting, found: Sequence[Setting]) -> bool:
+        """Whether something found costs far less, or is of its kind and costs no more in any respect."""
+        mine = self._work(setting)
+        if any(self._cost(setting) > MORE_WORK * self._cost(s) for s in found):
+            return True
+        return any(
+            (s.splatter, s.sampler) == (setting.splatter, setting.sampler)
+            and all(a <= b for a, b in zip(self._work(s), mine, strict=True))
+            for s in found
+        )
+
+    def _far(self, setting: Setting) -> bool:
+        """Whether the errors with fewer samples, as a power of their number, tell of one that is much too large."""
+        if isinstance(setting.supersample, str):
+            return False  # Of outlines it has the error of as many samples everywhere.
+        numbers = [n for n in SUPERSAMPLE if not isinstance(n, str) and n < setting.supersample]
+        fewer = {n: self._cell(setting._replace(supersample=n)) for n in numbers}
+        known = [(n, self.bounds[cell]) for n, cell in fewer.items() if cell in self.bounds]
+        if len(known) < 2:
+            return False
+        (coarse, larger), (fine, smaller) = known[-2:]
+        if not 0 < smaller < math.inf or not 0 < larger < math.inf:
+            return False
+        power = math.log(smaller / larger) / math.log(fine / coarse)
+        return smaller * (setting.supersample / fine) ** power > FAR * self.tolerance
+
+    def _cost(self, setting: Setting) -> float:
+        """About what a setting takes: hidden layers are few samples, and faces less than pixels."""
+        layers, samples, rate = self._work(setting)
+        return math.sqrt(layers * rate) * samples
+
+    def _in_vain(self, setting: Setting, cells: Sequence[Setting], found: list[Setting]) -> bool:
+        """Whether something like it failed, and neither more layers nor a finer surface would do with these samples."""
+        level = [s for s in cells if s._replace(layers=0, rate="") == setting._replace(layers=0, rate="")]
+        best = max(level, key=lambda s: (self._work(s)[2], self._work(s)[0]))
+        if setting == best or not any(self._cell(s) in self.bounds for s in level) or self._over():
+            return False
+        if self._cell(best) not in self.bounds:
+            self._looked_at(best, found)
+        return self.bounds.get(self._cell(best), 0.0) > NEARLY * self.tolerance
+
+    def _best(self, cells: Sequence[Setting]) -> Setting:
+        """The setting of the least error among those that were looked at; the first of all where none was."""
+        least, best = math.inf, cells[0] if cells else None
+        for setting in sorted(self.bounds, key=lambda s: self.bounds[s]):
+            if self.bounds[setting] >= least:
+                break
+            error = self._error(setting)
+            if error < least:
+                least, best = error, setting
+        if best is None:
+            raise InputError(f"nothing could be measured: {'; '.join(self.measured.left_out)}")
+        return best
+
+    def _bound(self, setting: Setting) -> float:
+        """The largest error along a mode, or that along the first mode where it is beyond the tolerance."""
+        worst = 0.0
+        for mode in self.modes:
+            error = self._along(mode, setting)
+            if error > self.tolerance:
+                # What was too much once is looked at first.
+                self.modes = [mode, *(m for m in self.modes if m != mode)]
+                worst = error
+                break
+            worst = max(worst, error)
+        self.bounds[self._cell(setting)] = worst
+        return worst
+
+    def _error(self, setting: Setting) -> float:
+        """The largest error along a mode."""
+        worst = max(self._along(mode, setting) for mode in self.modes)
+        self.bounds[self._cell(setting)] = worst
+        return worst
+
+    def _along(self, mode: str, setting: Setting) -> float:
+        found = self.measured.scores(mode, self._cell(setting))
+        return math.inf if found is None else found["error"]
+
+    # ------------------------------------------------------------------------------------------------------ time
+
+    def _over(self) -> bool:
+        self.late = self.late or time.perf_counter() > self.deadline
+        return self.late
+
+    def _timed(self, settings: Sequence[Setting], turns: int = 1) -> dict[Setting, float]:
+        """Seconds of settings, those that fail or come too late left out."""
+        calls: Calls = {s: lambda s=s: self.measured.call(TOGETHER, s) for s in settings}
+        found = self.measured.timing(TOGETHER, calls).run(turns, late=self._over, hopeless=SLOWER)
+        return {Setting(*s): ms["median"] / 1e3 for s, ms in found.items()}
+
+    def _fastest(self, settings: Sequence[Setting]) -> Setting:
+        """The fastest, by successive halving: all have a turn, the faster half another, and so on."""
+        turns, left = 1, list(settings)
+        while True:
+            times = self._timed(left, turns)
+            if not times:
+                raise InputError(f"nothing could be timed: {'; '.join(self.measured.left_out)}")
+            left = sorted(times, key=lambda s: times[s])[: max(1, (len(times) + 1) // 2)]
+            if len(times) <= 1 or turns >= TURNS or self._over():
+                return left[0]
+            turns += 1
+
+    # --------------------------------------------------------------------------------------------------- reasons
+
+    def _reasons(
+        self, chosen: Setting, cells: Sequence[Setting], splatters: Sequence[str]
+    ) -> tuple[list[str], Setting | None]:
+        """For each choice what the cheaper one lacks, and what the next one costs; and what is better after all."""
+        options: dict[str, list] = {
+            "layers": list(dict.fromkeys(s.layers for s in cells)),
+            "supersample": list(SUPERSAMPLE),
+            "rate": list(self.measured.at_rates(TOGETHER)),
+            "splatter": list(splatters),
+            "sampler": list(self.samplers),
+        }
+        others = {name: self._others(chosen, name, values) for name, values in options.items()}
+        told = dict.fromkeys(s for found in others.values() for s in found if s is not None)
+        times = self._timed([chosen, *told]) if not self._over() else {}
+        faster = [s for s in times if times[s] < ALIKE * times[chosen] and self._error(s) <= self.tolerance]
+        lines = [self._reason(chosen, name, *found, times) for name, found in others.items() if any(found)]
+        return lines, min(faster, key=lambda s: times[s], default=None)
+
+    def _others(self, chosen: Setting, name: str, values: Sequence) -> tuple[Setting | None, Setting | None]:
+        """The next cheaper and the next dearer setting in one respect; for names, one that is another."""
+        found = [chosen._replace(**{name: value}) for value in values if value != getattr(chosen, name)]
+        if name in ("splatter", "sampler"):
+            known = [s for s in found if self._cell(s) in self.bounds]
+            return None, min(known, key=lambda s: self.bounds[self._cell(s)], default=None)
+        mine = math.prod(self._work(chosen))
+        work = {s: math.prod(self._work(s)) for s in found}
+        below, above = [s for s in found if work[s] < mine], [s for s in found if work[s] > mine]
+        return max(below, key=lambda s: work[s], default=None), min(above, key=lambda s: work[s], default=None)
+
+    def _reason(
+        self, chosen: Setting, name: str, below: Setting | None, above: Setting | None, times: Mapping[Setting, float]
+    ) -> str:
+        """One line on one choice."""
+        parts = []
+        if below is not None and not self._over():
+            parts.append(f"{_value(below, name)} is off by {_percent(self._error(below))}")
+        if above is not None and chosen in times and above in times:
+            ratio = times[above] / times[chosen]
+            error = f", off by {_percent(self._error(above))}" if name != "sampler" else ""
+            parts.append(f"{_value(above, name)} takes {ratio:.2g} times as long{error}")
+        return f"{_value(chosen, name)}: {'; '.join(parts)}" if parts else f"{_value(chosen, name)}"
+
+
+def _value(setting: Setting, name: str) -> str:
+    """A choice as a user would write it."""
+    value = getattr(setting, name)
+    if name == "rate":
+        return value or "the surfaces as they are given"
+    return f"{name}={in_python(value) if name == 'supersample' else repr(value)}"
+
+
+def _percent(error: float) -> str:
+    return f"{100 * error:.3g} %"
