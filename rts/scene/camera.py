@@ -309,7 +309,8 @@ class Camera:
 
         A matrix that is transposed (for row vectors), or multiplied in the other order, is refused where it shows. It
         does not show in a view without rotation, or of rotation alone. Depths from 0 to 1, as in Direct3D and Vulkan,
-        are read as those of a near plane at half the depth or so; pictures are the same. Depths from 1 to 0 are refused.
+        are read as those of a near plane at about half its depth; pictures are the same. Depths from 1 to 0 are
+        refused.
 
         Args:
             matrix: (4, 4) OpenGL clip space from world space, acting on column vectors; `projection @ view`.
@@ -317,14 +318,14 @@ class Camera:
         Raises:
             InputError: the matrix is singular, transposed, in the other order, or has a plane behind the camera.
         """
-        known = check_numbers("matrix", matrix, (4, 4))
-        if known is not None and not is_invertible(known):
+        value = check_numbers("matrix", matrix, (4, 4))
+        if value is not None and not is_invertible(value):
             raise InputError("matrix is singular; expected an invertible product projection @ view")
-        if known is not None:
-            check_product(known)
+        if value is not None:
+            check_product(value)
         xp, (m,) = promote(matrix)
         x, y, z, w = (m[i, :3] for i in range(4))
-        parallel = known is not None and is_parallel_product(known)
+        parallel = value is not None and is_parallel_product(value)
         if parallel:  # Depth grows along the rays, from the near plane on.
             along = xp.linalg.cross(x, y)
             axis, start = unit(along * xp.sign(xp.sum(along * z))), m[2, :] + m[3, :]
