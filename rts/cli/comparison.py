@@ -1,4 +1,4 @@
-"""What `rts compare` prints."""
+"""Tables and lines that `rts compare` prints."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def scene_list() -> Table:
 
 
 def missing_charts() -> str | None:
-    """A line that names the charts that cannot be drawn for want of a package; None where all can."""
+    """A line that names the charts for which a package is missing; None if no package is."""
     kinds = {"matplotlib": "PNG", "plotly": "HTML"}
     missing = [package for package in kinds if find_spec(package) is None]
     if not missing:
@@ -33,7 +33,7 @@ def missing_charts() -> str | None:
 
 
 def summary(comparison: Comparison) -> Table:
-    """For each mode the fastest setting within some errors."""
+    """A table of the fastest setting of each mode, for several bounds of the error."""
     title = f"{comparison.scene['name']}: fastest settings by the error of derivatives"
     table = Table("mode", *(f"{error:.0%}" for error in LEVELS), title=title)
     for mode in comparison.modes:

@@ -32,7 +32,7 @@ Examples:
 """
 
 
-# The base of BadParameter is click's UsageError, under whatever name typer has click.
+# The base of BadParameter is click's UsageError, wherever typer keeps click.
 UsageError: Any = typer.BadParameter.__base__
 
 
@@ -61,7 +61,7 @@ def _one_line(ctx: Any) -> Iterator[None]:
         command = error.ctx.info_name if error.ctx is not None and error.ctx.parent else ctx.invoked_subcommand
         help_ = " ".join(filter(None, ("rts", command, "--help")))
         _fail(error, f"{error.format_message().rstrip('.')}; try '{help_}'", 2)
-    except BrokenPipeError:  # The reader of our output has gone; click knows what to do.
+    except BrokenPipeError:  # The reader of the output has closed it; click handles that.
         raise
     except (RtsError, OSError, MemoryError) as error:
         if ctx.params.get("debug"):
@@ -86,7 +86,7 @@ def _warnings_in_a_line() -> Iterator[None]:
 
 
 def _line(text: str) -> str:
-    """The text in one line, without what would command the terminal: it may quote a file from elsewhere."""
+    """The text in one line. Control characters, which a quoted file may contain, are escaped."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
 
 
@@ -106,7 +106,7 @@ app = typer.Typer(
 
 def main() -> None:
     """The entry point `rts`."""
-    # Idle threads of OpenMP, which torch and numba both use, would spin and take the processor from others.
+    # Idle OpenMP threads of torch and numba would spin, and take the processor from others.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     app(prog_name="rts")
 
@@ -132,14 +132,14 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _supersample(text: str) -> Any:
-    """The samples a pixel of "4", or of "adaptive:4"."""
+    """The value of supersample in a text such as "4" or "adaptive:4"."""
     from rts.sampling.adaptive import of_text
 
     return of_text(text)
 
 
 def _view(text: str) -> tuple[float, ...]:
-    """Azimuth, elevation and perhaps distance."""
+    """Azimuth, elevation and optional distance, from comma-separated numbers."""
     try:
         numbers = tuple(float(x) for x in text.split(","))
     except ValueError:
@@ -150,7 +150,7 @@ def _view(text: str) -> tuple[float, ...]:
 
 
 def _background(text: str) -> tuple[float, ...] | None:
-    """A linear colour, or None for transparent."""
+    """The linear colour of a colour's name; None for transparent."""
     from PIL import ImageColor
 
     from rts.files.srgb import decode_srgb
@@ -164,7 +164,7 @@ def _background(text: str) -> tuple[float, ...] | None:
 
 
 def _given(context: typer.Context, option: str) -> bool:
-    """Whether an option was given, and is not its default."""
+    """True if an option was given, and not left at its default."""
     source = context.get_parameter_source(option)
     return source is not None and source.name != "DEFAULT"
 
@@ -355,16 +355,16 @@ def fit_pose(
     seen = orbit(bounds, mask.shape, *view, fov=fov, up=up)
     chosen = None if engine == "auto" else engine
     options: dict[str, Any] = {"method": method, "steps": steps, "fit_fov": fit_fov, "loss": loss, "f_scale": f_scale}
-    found = fit(parts, mask, seen, bounds, engine=chosen, **options)
-    verdict = judged(found.pose, parts, mask, picture, robust=loss != "linear")
-    files = write_report(output, found, verdict, parts, mask)
+    result = fit(parts, mask, seen, bounds, engine=chosen, **options)
+    verdict = judged(result.pose, parts, mask, picture, robust=loss != "linear")
+    files = write_report(output, result, verdict, parts, mask)
     _say(
-        f"loss {found.first_loss:.3g} → {found.loss:.3g} in {len(found.history)} steps, {_sum(found.levels)} from "
-        f"coarse and blurred pixels to fine, {found.seconds:.1f} s (at the finest, {found.reason}); wrote"
+        f"loss {result.first_loss:.3g} → {result.loss:.3g} in {len(result.history)} steps, {_sum(result.levels)} from "
+        f"coarse and blurred pixels to fine, {result.seconds:.1f} s (at the finest, {result.reason}); wrote"
     )
     _say_written(files)
     _say_skipped_plot(files)
-    seen_by = f", field of view {found.pose.fov_y:.1f} degrees" if fit_fov else ""
+    seen_by = f", field of view {result.pose.fov_y:.1f} degrees" if fit_fov else ""
     _say(f"{verdict.word}: IoU {verdict.iou:.3f}{seen_by}")
     for note in verdict.notes:
         _say(escape(f"  {note}"))
@@ -438,20 +438,20 @@ def compare(
     if scene == "list":
         Console().print(scene_list())
         return
-    wanted: dict[str, Any] = dict(modes=modes, samplers=samplers, splatters=splatters, engines=engines)
-    options: dict[str, Any] = {name: value or None for name, value in wanted.items()}
+    filters: dict[str, Any] = dict(modes=modes, samplers=samplers, splatters=splatters, engines=engines)
+    options: dict[str, Any] = {name: value or None for name, value in filters.items()}
     options["supersample"] = [_supersample(text) for text in supersample or []] or None
     shape = None if size is None else _size(size)
     if (missing := missing_charts()) is not None:
         _say(escape(missing))
     with _interrupted("what was measured is kept: the same command goes on from there"):
-        found = measured(
+        comparison = measured(
             scene, size=shape, peers=peers, quick=quick, surface=surface, output=output, fresh=fresh, **options
         )
-    Console().print(summary(found))
-    for line in found.left_out:
+    Console().print(summary(comparison))
+    for line in comparison.left_out:
         _say(escape(f"left out: {line}"))
-    _say_written(found.files(output))
+    _say_written(comparison.files(output))
 
 
 @app.command(epilog="Example: rts tune bunny.obj --tolerance 0.05 --mode translation --mode rotation")
@@ -471,18 +471,18 @@ def tune(
     shape, chosen = None if size is None else _size(size), None if engine == "auto" else engine
     options: dict[str, Any] = dict(tolerance=tolerance, budget_s=budget, modes=modes or None)
     with _interrupted("the truth is kept, other measurements are not"):
-        found = rts.tune(scene, size=shape, engine=chosen, surface=surface, **options)
-    _say(escape(f"rts.render(parts, camera, size, {', '.join(f'{k}={v!r}' for k, v in found.settings.items())})"))
-    _say(f"error {100 * found.error:.2g} %, {time_label(1e3 * found.seconds)} for a render and gradient")
-    if found.rate:
-        _say(escape(f"with surfaces of {found.rate}: rts.tune(...).parts and .scene have them"))
-    for reason in found.reasons:
+        tuned = rts.tune(scene, size=shape, engine=chosen, surface=surface, **options)
+    _say(escape(f"rts.render(parts, camera, size, {', '.join(f'{k}={v!r}' for k, v in tuned.settings.items())})"))
+    _say(f"error {100 * tuned.error:.2g} %, {time_label(1e3 * tuned.seconds)} for a render and gradient")
+    if tuned.rate:
+        _say(escape(f"with surfaces of {tuned.rate}: rts.tune(...).parts and .scene have them"))
+    for reason in tuned.reasons:
         _say(escape(f"  {reason}"))
 
 
 @contextlib.contextmanager
 def _interrupted(what: str) -> Iterator[None]:
-    """Say what is left after Ctrl-C."""
+    """Turn Ctrl-C into a line that says what is kept, and exit code 130."""
     try:
         yield
     except KeyboardInterrupt:
@@ -516,8 +516,8 @@ def demo(
     from rts.files.paths import output_folder
 
     output_folder(output)
-    found, files = run(output, None if engine == "auto" else engine)
-    _say(f"pose found in {len(found.history)} steps, {found.seconds:.1f} s; wrote")
+    result, files = run(output, None if engine == "auto" else engine)
+    _say(f"pose found in {len(result.history)} steps, {result.seconds:.1f} s; wrote")
     _say_written(files)
     _say_skipped_plot(files)
 

@@ -14,7 +14,7 @@ from rts.errors import InputError
 from rts.files.paths import output_folder, writing
 
 KINDS = ("surface",)
-"""What there are templates of."""
+"""Kinds of plugins that have templates."""
 PLACES = {
     "pyproject.toml.in": "pyproject.toml",
     "README.md.in": "README.md",
@@ -22,7 +22,7 @@ PLACES = {
     "surface.py.in": "{package}/surface.py",
     "test_surface.py.in": "tests/test_{module}.py",
 }
-"""Template → the file that it becomes, within the new folder."""
+"""Template → file in the new folder."""
 
 
 def write_plugin(kind: str, name: str, folder: Any = None) -> list[Path]:
@@ -30,14 +30,14 @@ def write_plugin(kind: str, name: str, folder: Any = None) -> list[Path]:
 
     Args:
         kind: one of `KINDS`.
-        name: the plugin's, such as "height-field".
-        folder: where to; by default "rts-" and the name, in the current folder.
+        name: the name of the plugin, such as "height-field".
+        folder: the new folder; by default "rts-" and the name, in the current folder.
 
     Returns:
         The files written.
 
     Raises:
-        InputError: there is no such kind; the name is no good, or taken; the folder exists or cannot be written.
+        InputError: there is no such kind; the name is invalid or taken; the folder exists or cannot be written.
     """
     if kind not in KINDS:
         raise InputError(f"no template of {kind!r}; there is {', '.join(KINDS)}")
@@ -58,7 +58,7 @@ def write_plugin(kind: str, name: str, folder: Any = None) -> list[Path]:
 
 
 def _names(name: str) -> dict[str, str]:
-    """What the templates ask for, of a plugin's name."""
+    """Values of the templates' placeholders, from a plugin's name."""
     module = name.replace("-", "_")
     if not re.fullmatch(r"[a-z][a-z0-9]*([-_][a-z0-9]+)*", name) or keyword.iskeyword(module):
         raise InputError(
