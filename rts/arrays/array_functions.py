@@ -168,19 +168,19 @@ def without_border(image: Array, border: int) -> Array:
 
 
 def is_finite(*arrays: Array) -> bool:
-    """Whether all values are finite, as far as they are known; quick where they are."""
+    """True if all known values are finite; quick if they are."""
     return all(map(_is_finite, arrays))
 
 
 def _is_finite(x: Array) -> bool:
     engine = engine_of(x)
     if not engine.on_host(x):
-        known = value_of(engine.namespace.all(engine.namespace.isfinite(x)))
-        return known is None or bool(known.all())
-    known = engine.known(x)
-    if known is None or not known.size:
+        values = value_of(engine.namespace.all(engine.namespace.isfinite(x)))
+        return values is None or bool(values.all())
+    values = engine.known(x)
+    if values is None or not values.size:
         return True
     from rts.arrays.extremes import largest
 
-    # What is repeated is looked at but once. Sums and products would take threads of their own, or overflow.
-    return math.isfinite(largest(known[tuple([slice(None) if step else slice(1) for step in known.strides])]))
+    # Repeated values are checked once. Sums and products would start threads of their own, or overflow.
+    return math.isfinite(largest(values[tuple([slice(None) if step else slice(1) for step in values.strides])]))

@@ -78,7 +78,7 @@ class Engine(Plugin):
         raise self._no_derivatives()
 
     def jvp(self, f: Callable, primal: Tree, tangent: Tree) -> tuple[Array, Array]:
-        """The value of `f` and its derivative along `tangent`, differentiable in turn in what `f` closes over."""
+        """The value of `f` and its derivative along `tangent`, differentiable in arrays that `f` closes over."""
         raise self._no_derivatives()
 
     def jacobian(self, f: Callable) -> Callable:
@@ -225,7 +225,7 @@ class Engine(Plugin):
     def gradient_of_rows(self, f: Callable[[Array], Array], rows: Array) -> Array:
         """The gradient (N, C) of a function of rows (N, C) whose values (N,) depend on their own rows alone.
 
-        Differentiable in turn in the rows and in what `f` closes over. The default takes C derivatives in forward mode.
+        Differentiable in the rows and in arrays that `f` closes over. The default takes C derivatives in forward mode.
         """
         xp, zero, columns = self.namespace, self.namespace.zeros_like(rows), []
         for i in range(rows.shape[1]):

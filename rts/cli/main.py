@@ -482,7 +482,7 @@ def tune(
 
 @contextlib.contextmanager
 def _interrupted(what: str) -> Iterator[None]:
-    """Turn Ctrl-C into a line that says what is kept, and exit code 130."""
+    """Turn Ctrl-C into a line about the results that are kept, and exit code 130."""
     try:
         yield
     except KeyboardInterrupt:
@@ -526,7 +526,7 @@ def demo(
 def warmup(
     processes: Annotated[int, typer.Option(min=0, help="Processes at once; 0 is as many as there are cores.")] = 0,
 ) -> None:
-    """Compile ahead what ordinary renders and fits use, in several processes; else it is compiled when first used."""
+    """Compile ahead the loops of ordinary renders and fits, in several processes. Otherwise first use compiles them."""
     import rts
 
     _say("compiling what is not on disk yet, up to a minute")

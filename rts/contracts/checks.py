@@ -358,10 +358,10 @@ def check_splats(
 
     def wrong(x: Any) -> bool:
         """True if a value holds NaN or infinity; of an array with a row per sample, visible rows count."""
-        value = value_of(x)
-        if value is None or value.dtype.kind != "f":
+        array = value_of(x)
+        if array is None or array.dtype.kind != "f":
             return False
-        return not np.isfinite(value[..., used, :] if value.shape[-2:-1] == (count,) else value).all()
+        return not np.isfinite(array[..., used, :] if array.shape[-2:-1] == (count,) else array).all()
 
     if not (wrong(positions) or wrong(rgba)):  # Unused rows may hold anything.
         return

@@ -100,9 +100,9 @@ class Cells:
             no sides are recorded.
         exit: (H, W) int32, the sample where the ray leaves the closed part behind its front, or −1. Exits have rows of
             their own, which `row` does not name, in cells at outlines and beside them. None where none are recorded.
-        settled: (H, W) integers, for a cell whose colour cannot change the sample that has this colour; −1 elsewhere.
-            Such a cell may have no sample of its own, nor need cells around it that affect no others. Samples in it
-            and in the eight cells around it have its colour. None where no samples were left out on this ground.
+        settled: (H, W) integers, marks cells whose colour cannot change, however the scene moves: the sample that has
+            this colour, or −1. Such a cell may lack a sample of its own, and so may cells around it that affect no
+            others. Samples in it and in the eight cells around it have its colour. None if no cells are marked.
     """
 
     MORE_BEHIND: ClassVar[int] = 1 << 14
@@ -148,7 +148,7 @@ _OF_CELLS = {f.name for f in fields(Cells)}
 
 @record(static=("asked", "centered", "by_sample", "followed"))
 class Samples(_OnCells):
-    """Where the rays of one part meet its surface: the paper's U, packed.
+    """The points where rays meet the surface of one part: the paper's U, packed.
 
     Attributes:
         ids: (N, I) int32, such as the vertices of a triangle.
@@ -231,7 +231,7 @@ class Hidden(Protocol):
 
 @dataclass(frozen=True)
 class Request:
-    """Options of a call of a sampler. The sampler may ignore most of them, and records in `Samples` what it followed.
+    """Options of a call of a sampler. It may ignore most of them; `Samples.followed` names those that it followed.
 
     Attributes:
         capacity: number of packed rows to allot, or None for as many as there are. Every sampler follows it.
@@ -272,7 +272,7 @@ class Fine(_OnCells):
         supersample: s; each active pixel has s² cells.
         apron: cells around active pixels, and around the layout.
         flat: whether inactive pixels need no splatting. True if all samples have one colour and each inactive pixel
-            is empty or shows that colour, whatever moves.
+            is empty or shows that colour, however the scene moves.
     """
 
     samples: tuple[Samples, ...]

@@ -1,4 +1,4 @@
-"""As rigid as possible: bending a mesh costs nothing, stretching it does."""
+"""The energy `ARAP`, as rigid as possible: bending a mesh costs nothing, stretching it does."""
 
 from __future__ import annotations
 

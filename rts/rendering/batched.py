@@ -47,7 +47,7 @@ def render_views(
     capacity: int | None = None,
     engine: str | None = None,
 ) -> Array:
-    """Render several views of a scene. The images equal those of a loop of `render` up to rounding.
+    """Render several views of a scene. The images equal the results of a loop of `render` up to rounding.
 
     Gradients of hidden parts may differ more where layers are closer than float32 resolves at their distance. The
     threshold for equal depths is set by the farthest view, and is up to twice that of a single view.

@@ -235,8 +235,8 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
             for index in range(shift.shape[1]):
                 from_row, by = (engine.constant(x[:, index, None, None, None], rows) for x in (own_starts, shift))
                 stacked = xp.where(rows >= from_row if index else rows >= 0, rows + by, stacked)
-        grid = picture.laid_out(stacked, empty)
-        return grid if several else grid[0, ...]
+        whole = picture.laid_out(stacked, empty)
+        return whole if several else whole[0, ...]
 
     for index in range(len(first.samples)):
         own = [view.samples[index] for view in views]
@@ -258,7 +258,7 @@ def laid_side_by_side(views: Sequence[Sampled], picture: Picture) -> Views | Non
 
 
 def in_one_table(samples: Sequence[Samples]) -> Samples:
-    """Samples of one part in several views as one table, one after the other; grids are those of the first."""
+    """Samples of one part in several views as one table, one after the other, with the grids of the first."""
     if len(samples) == 1:
         return samples[0]
     first, xp = samples[0], namespace(samples[0].ids)

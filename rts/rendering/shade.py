@@ -114,7 +114,7 @@ NUMBER = "the numbers of views"
 
 
 def apart(samples: Samples, gbuffer: GBuffer, sizes: Sequence[int], engine: Engine) -> list[tuple[Samples, GBuffer]]:
-    """The samples and G-buffer of each view, cut from those of all views; `sizes` are numbers of rows."""
+    """The samples and G-buffer of each view, cut from the arrays of all views; `sizes` are numbers of rows."""
     pieces, lock = cache(lambda name: engine.split(gbuffer[name], sizes)), threading.Lock()
 
     def split(name: str) -> Sequence[Array]:

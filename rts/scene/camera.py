@@ -343,7 +343,7 @@ class Camera:
 
     @classmethod
     def from_opengl(cls, modelview: Any, projection: Any) -> Camera:
-        """A camera from OpenGL's matrices, whose conventions are those of this library.
+        """A camera from OpenGL's matrices, which have the conventions of this library.
 
         Args:
             modelview: (4, 4) camera-from-world.

@@ -17,7 +17,7 @@ from rts.scene.camera import Camera, toward_rows, world_vectors
 class RowCameras:
     """A camera for each of N samples, for shaders that promise `takes_views`.
 
-    The methods are those of a `Camera`, with a row for each sample. Arguments are points of the N samples.
+    The methods are named as in `Camera`, and return a row for each sample. Arguments are points of the N samples.
 
     Attributes:
         views: (B, 4, 4) camera-from-world, of each view.

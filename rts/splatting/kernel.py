@@ -1,7 +1,7 @@
 """The kernel of the splatters (paper §3.3): the target cells of a sample, and its weights there.
 
 A splat belongs to the cell (y, x) that its sample was cast through; its targets are that cell's 3 × 3 neighbours,
-whatever its computed position. With c = (x + 0.5, y + 0.5) the cell's centre, P the splat's differentiable position
+for any computed position. With c = (x + 0.5, y + 0.5) the cell's centre, P the splat's differentiable position
 and (u, v) ∈ {−1, 0, 1}², the weight is
 
     w(u, v) = (1 + ε) / W · exp(−‖c + (u, v) − P‖² / 2σ²),    W = Σ exp(−‖(u, v)‖² / 2σ²).
