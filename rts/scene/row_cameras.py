@@ -36,7 +36,7 @@ class RowCameras:
         return cls(stacked.view, stacked.projection, number)
 
     def of_rows(self, number: Array) -> RowCameras:
-        """The same views, for other samples."""
+        """Cameras of other samples, from these views."""
         return RowCameras(self.views, self.projections, number)
 
     def toward(self, points: Array) -> Array:
