@@ -5,8 +5,8 @@ which their depths change at a fixed pixel. The line then moves as
 
     v̂ = −ġ ∇g / |∇g|²,    ż = dP_z − ∇z · dP_xy.
 
-Beside the line the sheets are layers 0 and 1 of the cells, in opposite orders on its two sides. Let q be a cell, m one of
-the eight steps to its neighbours and p = q + m. Both have two layers z0 and z1, with gaps h = z1 − z0. Then
+Beside the line the sheets are layers 0 and 1 of the cells, in opposite orders on its two sides. Let q be a cell, m one
+of the eight steps to its neighbours and p = q + m. Both have two layers z0 and z1, with gaps h = z1 − z0. Then
 
     R = |z0(q − m) − 2 z0(q) + z1(p)| + |z1(q − m) − 2 z1(q) + z0(p)| + the two terms of p, from the other side,
     D = |z0(q − m) − 2 z0(q) + z0(p)| + |z1(q − m) − 2 z1(q) + z1(p)| + ...
