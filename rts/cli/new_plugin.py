@@ -24,7 +24,7 @@ PLACES = {
     "{template}/plugin.py.in": "{package}/{kind}.py",
     "{template}/test_plugin.py.in": "tests/test_{module}.py",
 }
-"""Template → the file that it becomes, within the new folder."""
+"""Template → file in the new folder."""
 
 
 def write_plugin(kind: str, name: str, folder: Any = None, triangles: bool = False) -> list[Path]:
@@ -40,7 +40,7 @@ def write_plugin(kind: str, name: str, folder: Any = None, triangles: bool = Fal
         The files written.
 
     Raises:
-        InputError: there is no such kind; the name is no good, or taken; the folder exists or cannot be written.
+        InputError: there is no such kind; the name is invalid or taken; the folder exists or cannot be written.
     """
     if kind not in KINDS:
         raise InputError(f"no template of {kind!r}; there is {', '.join(KINDS)}")

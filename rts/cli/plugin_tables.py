@@ -18,11 +18,11 @@ OK = (
     f"its pixels are more than {DIFFERING:g} off those of the sampler 'reference'; and its gradient in theta, "
     f"where the engine has derivatives, is finite and not zero"
 )
-"""What the matrix says of a pair that works, and all that it says."""
+"""Caption of the matrix: the exact meaning of "ok"."""
 
 
 def plugin_table() -> Table:
-    """Every plugin, whether it loads, and what it can do."""
+    """A table of all plugins, with their state and capabilities."""
     columns = (Column(name, no_wrap=True) for name in ("group", "name"))
     table = Table(*columns, "from", Column("state", overflow="fold"), Column("can", overflow="fold"))
     for info in registry.survey():

@@ -1,4 +1,4 @@
-"""Compiled loops on all cores, and arrays as they take them."""
+"""Compiled loops on all cores, and arrays in the form that loops take."""
 
 from rts.compiling.threads import parallel, read_only
 

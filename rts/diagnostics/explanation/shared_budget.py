@@ -11,9 +11,9 @@ import numpy as np
 from rts.arrays.argument_checks import quoted
 from rts.arrays.trees import Tree, leaves
 from rts.contracts.checks import is_real
-from rts.diagnostics.comparison.progress import Phase
 from rts.diagnostics.explanation.slopes import Number, chosen, differenced, measured, unit
 from rts.diagnostics.explanation.subject import Subject
+from rts.diagnostics.progress import Phase
 from rts.errors import InputError
 from rts.fitting.parameter_names import named_leaves
 
