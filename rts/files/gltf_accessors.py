@@ -92,26 +92,26 @@ def check_attributes(
     """Refuse attributes and indices that do not fit. Returns the accessors by what they are for, if they have data."""
     attributes = primitive["attributes"]
     used = {**attributes, **({"indices": primitive["indices"]} if "indices" in primitive else {})}
-    found = {kind: tree["accessors"][count_of(index)] for kind, index in used.items()}
-    sparse = [kind for kind, accessor in found.items() if "sparse" in accessor]
+    accessors = {kind: tree["accessors"][count_of(index)] for kind, index in used.items()}
+    sparse = [kind for kind, accessor in accessors.items() if "sparse" in accessor]
     if sparse:
         raise fail(f"{sparse[0]} of {name} is sparse, which is not read")
     quantized = QUANTIZATION in (*tree.get("extensionsUsed", []), *tree.get("extensionsRequired", []))
-    for kind, accessor in found.items():
+    for kind, accessor in accessors.items():
         if accessor["type"] not in ATTRIBUTES.get(kind, WIDTHS):
             raise fail(f"{kind} of {name} is of {accessor['type']}; expected {' or '.join(ATTRIBUTES[kind])}")
         _check_components(f"{kind} of {name}, accessor {used[kind]},", kind, accessor, quantized, fail)
-    count = found["POSITION"]["count"]
-    different = [kind for kind in attributes if found[kind]["count"] != count]
+    count = accessors["POSITION"]["count"]
+    different = [kind for kind in attributes if accessors[kind]["count"] != count]
     if different:
-        raise fail(f"{different[0]} of {name} has {found[different[0]]['count']} rows, and POSITION {count}")
-    if "bufferView" not in found["POSITION"] and not importlib.util.find_spec("DracoPy"):
+        raise fail(f"{different[0]} of {name} has {accessors[different[0]]['count']} rows, and POSITION {count}")
+    if "bufferView" not in accessors["POSITION"] and not importlib.util.find_spec("DracoPy"):
         extensions = ", ".join(primitive.get("extensions", {})) or "none is named"
         raise fail(f"{name} has no data of its own, and the extension that has them is not read: {extensions}")
-    read = {kind: used[kind] for kind, a in found.items() if kind in ATTRIBUTES and "bufferView" in a and count > 0}
+    read = {kind: used[kind] for kind, a in accessors.items() if kind in ATTRIBUTES and "bufferView" in a and count > 0}
     _check_overlap(name, {kind: index for kind, index in read.items() if kind != "indices"}, tree, fail)
     _check_bounds(path, name, read, tree, views)
-    if "bufferView" in found["POSITION"]:
+    if "bufferView" in accessors["POSITION"]:
         _check_corners(name, primitive, count, used.get("indices"), tree, views, fail)
     return read
 
@@ -154,16 +154,16 @@ def _check_bounds(path: Path, name: str, read: dict[str, int], tree: dict[str, A
         if "min" not in accessor or "max" not in accessor or not accessor["count"]:
             continue
         rows = rows_of(accessor, tree["bufferViews"], views).astype(np.float64)
-        found = np.stack([rows.min(axis=0), rows.max(axis=0)])
+        bounds = np.stack([rows.min(axis=0), rows.max(axis=0)])
         try:
-            told = np.array([accessor["min"], accessor["max"]], np.float64)
-            slack = BOUNDS_TOLERANCE * np.ptp(found, axis=0) + 1e-5 * np.abs(found).max()
-            wrong = told.shape != found.shape or not (np.abs(found - told) <= slack).all()
+            declared = np.array([accessor["min"], accessor["max"]], np.float64)
+            slack = BOUNDS_TOLERANCE * np.ptp(bounds, axis=0) + 1e-5 * np.abs(bounds).max()
+            wrong = declared.shape != bounds.shape or not (np.abs(bounds - declared) <= slack).all()
         except (TypeError, ValueError):
             wrong = True
         if wrong:
             warn(
-                f"{path}: {kind} of {name} go from {found[0].tolist()} to {found[1].tolist()}, but min and max of "
+                f"{path}: {kind} of {name} go from {bounds[0].tolist()} to {bounds[1].tolist()}, but min and max of "
                 f"accessor {read[kind]} are {accessor['min']} and {accessor['max']}; the file may be damaged"
             )
 

@@ -79,8 +79,8 @@ def sound_gltf(path: Path, data: bytes, file: Callable[[str], bytes]) -> tuple[s
     def fail(what: str) -> InputError:
         return unreadable(path, "GLTF", what)
 
-    found = _checked(path, data, None, file, fail)
-    return ("gltf", data) if found is None else ("glb", found)
+    rewritten = _checked(path, data, None, file, fail)
+    return ("gltf", data) if rewritten is None else ("glb", rewritten)
 
 
 def _checked(path: Path, text: bytes, binary: bytes | None, file: Callable[[str], bytes], fail: Any) -> bytes | None:
@@ -124,10 +124,10 @@ def _no_number(name: str) -> float:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
-        raise ValueError(f"one of {', '.join(found)[:60]} is there twice")
-    return found
+    members = dict(pairs)
+    if len(members) < len(pairs):
+        raise ValueError(f"one of {', '.join(members)[:60]} is there twice")
+    return members
 
 
 def _changed(tree: dict[str, Any], views: list[bytes], changes: dict[int, str]) -> bytes:
@@ -202,12 +202,12 @@ def _check_primitive(
     if "material" in primitive and count_of(primitive["material"]) >= len(tree.get("materials", [])):
         raise fail(f"{name} has material {primitive['material']}, which is not there")
     read = check_attributes(path, name, primitive, tree, views, fail)
-    found = {kind: tree["accessors"][index] for kind, index in read.items()}
-    colors = found.get("COLOR_0")
+    accessors = {kind: tree["accessors"][index] for kind, index in read.items()}
+    colors = accessors.get("COLOR_0")
     if colors is not None and colors["componentType"] == 5126:
         _check_colors(path, f"COLOR_0 of {name}", rows_of(colors, tree["bufferViews"], views), fail)
     changes = {}
-    for kind, accessor in found.items():
+    for kind, accessor in accessors.items():
         if kind == "COLOR_0":
             if accessor["componentType"] != 5121:
                 changes[read[kind]] = "u1"
@@ -232,14 +232,14 @@ def _check_names(path: Path, tree: dict[str, Any]) -> None:
     """Warn of properties that the format does not know, which may be others misspelt."""
     lists = {kind: tree.get(kind, []) for kind in PROPERTIES}
     lists["primitives"] = [p for mesh in lists["meshes"] for p in mesh["primitives"]]
-    found = []
+    unknown = []
     for kind, objects in lists.items():
         known = {*PROPERTIES[kind].split(), "name", "extensions", "extras"}
-        found += [f"{name!r} of {kind} {i}" for i, entry in enumerate(objects) for name in entry if name not in known]
+        unknown += [f"{name!r} of {kind} {i}" for i, entry in enumerate(objects) for name in entry if name not in known]
     for i, primitive in enumerate(lists["primitives"]):
-        found += [f"{name!r} of primitives {i}" for name in primitive["attributes"] if not ATTRIBUTE.fullmatch(name)]
-    if found:
-        warn(f"{path} has properties that glTF does not know, and that are left out: {', '.join(found[:5])}")
+        unknown += [f"{name!r} of primitives {i}" for name in primitive["attributes"] if not ATTRIBUTE.fullmatch(name)]
+    if unknown:
+        warn(f"{path} has properties that glTF does not know, and that are left out: {', '.join(unknown[:5])}")
 
 
 def _check_material(

@@ -223,8 +223,8 @@ def read_polygons(path: Path) -> Polygons:
     lines = _Lines(path).read()
     v, vt, vn = _rows(lines)
     used = {material for _, _, material in lines.faces}
-    found = [material for name, material in _materials(lines).items() if lines.materials.get(name) in used]
-    material = found[0] if len(used) == len(found) == 1 else Material()
+    materials = [material for name, material in _materials(lines).items() if lines.materials.get(name) in used]
+    material = materials[0] if len(used) == len(materials) == 1 else Material()
     corners, sizes = lines.polygons((len(v), len(vt), len(vn)))
     texture = None if material.texture is None else read_texture(material.texture, path)
     linear = (None if x is None else decode_srgb(x) for x in (_colors(v), material.color, texture))
@@ -280,12 +280,12 @@ def read_obj(path: Path) -> list[Piece]:
 
 def _materials(lines: _Lines) -> dict[str | None, Material]:
     """The materials of all libraries by name."""
-    found: dict[str | None, Material] = {}
+    materials: dict[str | None, Material] = {}
     complete = True
     for name in lines.libraries:
         library = inside(lines.path.parent, name, lines.path)
         if library.is_file():
-            found.update(read_mtl(library, lines.path.parent))
+            materials.update(read_mtl(library, lines.path.parent))
         else:
             warn(
                 f"{lines.path} names the material library {name!r}, but there is no file {library}; it is "
@@ -293,11 +293,11 @@ def _materials(lines: _Lines) -> dict[str | None, Material]:
             )
             complete = False
     used = {index for _, _, index in lines.faces}
-    missing = [name for name, index in lines.materials.items() if name and index in used and name not in found]
+    missing = [name for name, index in lines.materials.items() if name and index in used and name not in materials]
     if missing and complete and lines.libraries:
         names = ", ".join(map(repr, missing[:5]))
         warn(f"{lines.path} uses materials that its libraries lack: {names}; they are loaded as plain ones")
-    return found
+    return materials
 
 
 def _statements(lines: list[str]) -> Iterator[tuple[int, str]]:

@@ -86,23 +86,23 @@ def plain_off(path: Path, data: bytes) -> bytes:
 def _vertices(rows: list[tuple[int, str]], fail: Fail) -> np.ndarray:
     if not rows:
         raise fail("it promises no vertices")
-    found = numbers_of(rows, fail)
-    if isinstance(found, np.ndarray) and found.shape[1] >= 3:
-        return found
-    usual = max(len(row) for row in found)
-    number = next((n for (n, _), row in zip(rows, found, strict=True) if len(row) < max(usual, 3)), 0)
+    numbers = numbers_of(rows, fail)
+    if isinstance(numbers, np.ndarray) and numbers.shape[1] >= 3:
+        return numbers
+    usual = max(len(row) for row in numbers)
+    number = next((n for (n, _), row in zip(rows, numbers, strict=True) if len(row) < max(usual, 3)), 0)
     raise fail(f"line {number} ought to be a vertex, and has not as many numbers as others, or less than 3")
 
 
 def _polygons(path: Path, rows: list[tuple[int, str]], fail: Fail) -> tuple[np.ndarray, np.ndarray]:
     """How many corners each face has, and all corners, one face after the other."""
-    found = numbers_of(rows, fail) if rows else []
-    if isinstance(found, np.ndarray) and (found[:, 0] == found.shape[1] - 1).all() and found.shape[1] > 3:
-        faces = found[:, 1:]
+    numbers = numbers_of(rows, fail) if rows else []
+    if isinstance(numbers, np.ndarray) and (numbers[:, 0] == numbers.shape[1] - 1).all() and numbers.shape[1] > 3:
+        faces = numbers[:, 1:]
         if ((faces >= 0) & (faces < 2**31) & (faces == np.floor(faces))).all():
             return np.full(len(faces), faces.shape[1]), faces.astype(np.int64).ravel()
     sizes, corners, colored = [], [], 0
-    for (number, line), row in zip(rows, found, strict=True):
+    for (number, line), row in zip(rows, numbers, strict=True):
         size = int(row[0]) if 3 <= row[0] < len(row) else 0
         face = row[: size + 1]
         if size == 0 or not all(0 <= x < 2**31 and x == int(x) for x in face):
@@ -140,8 +140,8 @@ def sound_stl(path: Path, data: bytes) -> bytes:
     text_of(path, "STL", data)
     text = "\n".join([*lines_of(data), ""])
     solids, at = [], 0
-    while found := _SOLID.match(text, at):
-        at = begin = found.end()
+    while opening := _SOLID.match(text, at):
+        at = begin = opening.end()
         while facet := _FACET.match(text, at):
             at = facet.end()
         end = _END.match(text, at)

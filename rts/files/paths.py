@@ -23,18 +23,18 @@ from rts.errors import InputError
 def as_path(path: Any) -> Path:
     """A path from a string or path object; an InputError where no file can have that name."""
     try:
-        found = Path(os.fspath(path))
+        result = Path(os.fspath(path))
     except TypeError:
         raise InputError(f"the path is a {type(path).__name__}; expected a string or pathlib.Path") from None
     try:
-        found.lstat()
+        result.lstat()
     except ValueError:
         raise InputError(f"the path is {str(path)[:60]!r}, which no file can be called; choose another name") from None
     except OSError as error:
         if error.errno in (errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL):
             shown = str(path) if len(str(path)) <= 60 else f"{str(path)[:57]}..."
             raise InputError(f"the path {shown!r} is no good ({error.strerror}); choose another name") from None
-    return found
+    return result
 
 
 def output_file(path: Any, what: str, extensions: tuple[str, ...]) -> Path:

@@ -181,8 +181,8 @@ def _descend(
 
     def evaluate(p: Tree) -> tuple[Array, Tree, list[Array], list[Array]]:
         value, gradient = value_and_grad(p)
-        found = list(leaves(gradient))
-        return value, gradient, [xp.all(xp.isfinite(g)) for g in found], [xp.any(g != 0) for g in found]
+        gradients = list(leaves(gradient))
+        return value, gradient, [xp.all(xp.isfinite(g)) for g in gradients], [xp.any(g != 0) for g in gradients]
 
     evaluate = engine.jit(evaluate) if jit else evaluate
     step = engine.optimizer(method, rate, parameters)
@@ -253,8 +253,8 @@ class _Function(Residuals):
 def _residuals(given: Any, what: str) -> Residuals:
     """Residuals, of a function if they are one; `what` names them."""
     function = callable(given) and not isinstance(given, (Residuals, type))
-    found = _Function(given) if function else given
-    return checked_plugin(found, what, Residuals, "a function of the parameters, ")
+    residuals = _Function(given) if function else given
+    return checked_plugin(residuals, what, Residuals, "a function of the parameters, ")
 
 
 def _taken(stage: Residuals, whole: Residuals, given: Callable | None) -> tuple[Callable[[Array], Array], bool]:

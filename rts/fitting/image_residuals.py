@@ -237,12 +237,12 @@ class ImageResiduals(Residuals):
         return parts, cameras if self._views else cameras[0]
 
     def _scene_as_given(self, parameters: Tree) -> tuple[Any, Cameras]:
-        found = self._scene(parameters)
-        if isinstance(found, tuple) and len(found) == 2 and _are_cameras(given := found[1]):
-            return found[0], given
-        given = found if isinstance(found, (list, tuple)) else [found]
-        if not given or not all(isinstance(part, (Part, Prepared)) for part in given):
-            kinds = ", ".join(map(kind_of, given)) or "nothing"
+        scene = self._scene(parameters)
+        if isinstance(scene, tuple) and len(scene) == 2 and _are_cameras(parts := scene[1]):
+            return scene[0], parts
+        parts = scene if isinstance(scene, (list, tuple)) else [scene]
+        if not parts or not all(isinstance(part, (Part, Prepared)) for part in parts):
+            kinds = ", ".join(map(kind_of, parts)) or "nothing"
             raise InputError(
                 f"scene gave {one_line(kinds)}; expected an rts.Part or several, or a tuple (parts, camera)"
             )
@@ -250,7 +250,7 @@ class ImageResiduals(Residuals):
             raise InputError(
                 "camera is None, and scene gives none; expected an rts.Camera, or (parts, camera) of scene"
             )
-        return found, self._camera
+        return scene, self._camera
 
     @property
     def supersample(self) -> int | Adaptive:
@@ -269,11 +269,11 @@ class ImageResiduals(Residuals):
         """
         if self._views and self._ordinary:
             self.scene(parameters)  # Refused where there are not as many cameras.
-            found = [view.normal_equations(parameters) for view in self._views]
-            value, matrix, gradient = (sum(x[1:], x[0]) / len(x) for x in zip(*found, strict=True))
+            equations = [view.normal_equations(parameters) for view in self._views]
+            value, matrix, gradient = (sum(x[1:], x[0]) / len(x) for x in zip(*equations, strict=True))
             return value, matrix, gradient
         engine = engine_of(parameters)
-        splatter, found = self._settings.reader, None
+        splatter, equations = self._settings.reader, None
         if (
             self._ordinary
             and not self._sigma
@@ -284,18 +284,18 @@ class ImageResiduals(Residuals):
         ):
             mask = self._channels == 1
             companion.expect(companion.LEAST_SQUARES_OF_MASKS if mask else companion.LEAST_SQUARES)
-            found = self._swept(splatter, parameters, engine)
-        return normal_equations(self, parameters, engine, self.loss) if found is None else found
+            equations = self._swept(splatter, parameters, engine)
+        return normal_equations(self, parameters, engine, self.loss) if equations is None else equations
 
     def _swept(self, splatter: SummingSplatter, parameters: Tree, engine: Engine) -> tuple[Array, Array, Array] | None:
         """`normal_equations` by those of the splatter, in the bands that `render` takes; None where it gives none."""
         total: list[Array] = []
         for top, rows in self._settings.bands(self.size):
-            found = self._swept_band(splatter, parameters, engine, top, rows)
-            if found is None:
+            equations = self._swept_band(splatter, parameters, engine, top, rows)
+            if equations is None:
                 return None
             # Means over a band, made its part in means over the image.
-            shares = [x * (rows / self.size[0]) for x in found]
+            shares = [x * (rows / self.size[0]) for x in equations]
             total = shares if not total else [a + b for a, b in zip(total, shares, strict=True)]
         value, matrix, gradient = total
         return value, matrix, gradient
@@ -349,14 +349,14 @@ class ImageResiduals(Residuals):
         coarse, finer = _split(fields, constants(fine.pixel, engine, vector), fine)
         outside = replace(known, wanted=fine.coarse, border=sampled.apron)
         placed = Splats(None, None, fine.cells, fine.part, wanted=fine.wanted, border=sampled.apron)
-        found = (
+        sides = (
             swept(partial(to_splats, sampled), coarse, outside),
             swept(lambda parts, camera, _, own: to_fine_splats(fine, parts, camera, own), finer, placed),
         )
-        if found[0] is None or found[1] is None:
+        if sides[0] is None or sides[1] is None:
             return None
         share = finer.target.shape[0] * finer.target.shape[1] / (rows * self.size[1])
-        value, matrix, gradient = (a + share * b for a, b in zip(found[0], found[1], strict=True))
+        value, matrix, gradient = (a + share * b for a, b in zip(sides[0], sides[1], strict=True))
         return value, matrix, gradient
 
     def _beside_target(self, tree: Tree, parameters: Tree) -> Any:
@@ -395,10 +395,10 @@ def _split(fields: _Fields, pixel: Array, fine: Fine) -> tuple[_Fields, _Fields]
     height, width = ((n - 2 * fine.apron) // fine.supersample for n in fine.row.shape[1:])
 
     def host(pixel: np.ndarray) -> tuple[np.ndarray]:
-        found = np.full(height * width, -1, np.int32)
+        origin = np.full(height * width, -1, np.int32)
         active = np.flatnonzero(pixel >= 0)
-        found[pixel.reshape(-1)[active]] = active
-        return (found,)
+        origin[pixel.reshape(-1)[active]] = active
+        return (origin,)
 
     (origin,) = engine.call_host(host, (ArraySpec((height * width,), np.int32),), pixel)
     there = (origin >= 0)[:, None]

@@ -236,17 +236,17 @@ def _least_squares(
     return linearize, lambda v: float(run.attempt(engine, value_at, v))
 
 
-def _checked_equations(found: Any, count: int, engine: Engine) -> tuple[Array, Array, Array]:
+def _checked_equations(result: Any, count: int, engine: Engine) -> tuple[Array, Array, Array]:
     """The result of a user's `normal_equations`, refused where its form is another."""
     expected = (), (count, count), (count,)
-    given: Any = tuple(found) if isinstance(found, (tuple, list)) else (found,)
-    if not all(engine.owns(x) for x in given) or tuple(tuple(x.shape) for x in given) != expected:
-        shapes = ", ".join(str(tuple(x.shape)) if engine.owns(x) else f"a {type(x).__name__}" for x in given)
+    equations: Any = tuple(result) if isinstance(result, (tuple, list)) else (result,)
+    if not all(engine.owns(x) for x in equations) or tuple(tuple(x.shape) for x in equations) != expected:
+        shapes = ", ".join(str(tuple(x.shape)) if engine.owns(x) else f"a {type(x).__name__}" for x in equations)
         raise InputError(
             f"normal_equations gave {shapes}; expected {engine.name} arrays of shapes {', '.join(map(str, expected))}: "
             f"mean loss, JᵀSJ / n, JᵀWr / n"
         )
-    return given
+    return equations
 
 
 def flatten(parameters: Tree) -> tuple[Array, Callable[[Array], Tree]]:

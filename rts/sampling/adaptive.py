@@ -152,8 +152,8 @@ def contrasts(row: np.ndarray, rgba: np.ndarray, least: float) -> np.ndarray:
     def at(x: np.ndarray, v: int, u: int) -> np.ndarray:
         return x[1 + v : 1 + v + height, 1 + u : 1 + u + width]
 
-    found = np.zeros(row.shape, bool)
+    contrasting = np.zeros(row.shape, bool)
     for v, u in ((0, 1), (1, 0), (1, 1), (1, -1)):
         second = np.abs(at(color, v, u) - 2 * at(color, 0, 0) + at(color, -v, -u)).max(axis=-1)
-        found |= (second > least) & at(covered, v, u) & at(covered, -v, -u) & at(covered, 0, 0)
-    return found
+        contrasting |= (second > least) & at(covered, v, u) & at(covered, -v, -u) & at(covered, 0, 0)
+    return contrasting

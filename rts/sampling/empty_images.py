@@ -75,12 +75,12 @@ def _outside(proxy: Proxy, local: Camera) -> str | None:
 
 def known_tree(tree: Tree) -> Tree | None:
     """A tree with NumPy arrays, None if one of them is traced or of a batch."""
-    found = []
+    is_known = []
 
     def value(x: object) -> object:
-        known = value_of(x)
-        found.append(known is not None and known.shape == tuple(getattr(x, "shape", ())))
-        return known
+        array = value_of(x)
+        is_known.append(array is not None and array.shape == tuple(getattr(x, "shape", ())))
+        return array
 
     host = map_leaves(value, tree)
-    return host if all(found) else None
+    return host if all(is_known) else None

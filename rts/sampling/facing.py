@@ -48,13 +48,13 @@ def facing_of_views(
     behind = np.count_nonzero(kept[1:])
     if not behind:
         return np.zeros(kept.shape, np.int16)
-    found = np.empty(kept.shape, np.int16)
-    given = (np.ascontiguousarray(x) for x in (kept, fragments.triangle_ids))
+    sides = np.empty(kept.shape, np.int16)
+    marks = (np.ascontiguousarray(x) for x in (kept, fragments.triangle_ids))
     triangles = read_only(proxy.vertices), read_only(proxy.faces, np.int32), read_only(pieces, np.int16)
     eyes = np.stack([eye(camera) for camera in cameras])
-    arrays = *given, *triangles, eyes, *view, listed, Cells.MORE_BEHIND
-    parallel(facing_loops.fill, kept.shape[1], *arrays, found, work=kept[0].size + 100 * behind)
-    return found
+    arrays = *marks, *triangles, eyes, *view, listed, Cells.MORE_BEHIND
+    parallel(facing_loops.fill, kept.shape[1], *arrays, sides, work=kept[0].size + 100 * behind)
+    return sides
 
 
 def eye(camera: Camera) -> np.ndarray:
@@ -65,7 +65,7 @@ def eye(camera: Camera) -> np.ndarray:
     """
     rows = camera.projection[[0, 1, 3]] @ camera.view
     minors = rows[:, OTHER_COLUMNS].transpose(1, 0, 2)
-    *found, handedness = np.linalg.det(np.concatenate([minors, camera.view[None, :3, :3]]))
+    *point, handedness = np.linalg.det(np.concatenate([minors, camera.view[None, :3, :3]]))
     p = camera.projection
     winding = handedness * (p[0, 0] * p[1, 1] - p[0, 1] * p[1, 0])
-    return np.array(found) * ALTERNATING if winding > 0 else -np.array(found) * ALTERNATING
+    return np.array(point) * ALTERNATING if winding > 0 else -np.array(point) * ALTERNATING

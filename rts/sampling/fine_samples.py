@@ -42,11 +42,11 @@ def active(
     where: Where,
 ) -> np.ndarray:
     """Active pixels (H, W) bool of coarse samples (K, ·, ·) with an apron; see `outlines`."""
-    found = outlines(row, depth, sizes, settled)
+    pixels = outlines(row, depth, sizes, settled)
     if where.colors is not None and where.adaptive.contrast is not None:
-        found |= contrasts(row[0], where.colors, where.adaptive.contrast)
-    found = dilated(found) if where.dilates else found
-    return np.ascontiguousarray(found[apron:-apron, apron:-apron])
+        pixels |= contrasts(row[0], where.colors, where.adaptive.contrast)
+    pixels = dilated(pixels) if where.dilates else pixels
+    return np.ascontiguousarray(pixels[apron:-apron, apron:-apron])
 
 
 def fine_samples(

@@ -188,9 +188,9 @@ def without_hidden(sampled: Sampled, decide: Callable[[Question], Decision]) -> 
     rows = sampled.row, *(s.row for s in sampled.samples), *([] if sampled.exit is None else [sampled.exit])
     shapes = [ArraySpec(tuple(r.shape), np.int32) for r in rows]
     packed = [ArraySpec((n,), np.int32, packed=True) for n in sizes]
-    found = engine_of(sampled).call_host(host, (*shapes, *packed), rows[0], sampled.depth, *rows[1:])
-    row, own_rows, indices = found[0], found[1 : 1 + len(sizes)], found[len(rows) :]
-    exits = None if sampled.exit is None else found[1 + len(sizes)]
+    results = engine_of(sampled).call_host(host, (*shapes, *packed), rows[0], sampled.depth, *rows[1:])
+    row, own_rows, indices = results[0], results[1 : 1 + len(sizes)], results[len(rows) :]
+    exits = None if sampled.exit is None else results[1 + len(sizes)]
     samples = [_selected(*z) for z in zip(sampled.samples, own_rows, indices, strict=True)]
     xp = namespace(row)
     # Row numbers are within parts up to here, since an engine may have padded what comes before.

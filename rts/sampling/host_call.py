@@ -120,17 +120,17 @@ class HostCall:
             own = [Camera(np.asarray(next(it), np.float64), np.asarray(next(it), np.float64)) for _ in self._cameras]
             moved = [next(it) for _ in self._transform]
             cameras = [check_camera(camera, *moved) for camera in own]
-            others = [next(it) for _ in arrays]
+            further = [next(it) for _ in arrays]
             inputs = map_leaves(lambda _: next(it), self._inputs) if self._entry is None else self._entry.inputs
-            found, more = find(cameras, inputs, *others)
-            gbuffer = {} if self._theta is None else self._surface.evaluate(self._theta, found)
+            samples, more = find(cameras, inputs, *further)
+            gbuffer = {} if self._theta is None else self._surface.evaluate(self._theta, samples)
             if ON_RAYS in tables:
-                on_rays = _on_rays(found, cameras[0], self._shape.view, *others)
-                found = replace(found, tables={**found.tables, ON_RAYS: on_rays})
+                on_rays = _on_rays(samples, cameras[0], self._shape.view, *further)
+                samples = replace(samples, tables={**samples.tables, ON_RAYS: on_rays})
             return (
-                *(found.ids, found.params, found.row, found.depth, found.overflow),
+                *(samples.ids, samples.params, samples.row, samples.depth, samples.overflow),
                 *(more[name] for name in beside),
-                *(_allotted(found.tables[name], spec) for name, spec in tables.items()),
+                *(_allotted(samples.tables[name], spec) for name, spec in tables.items()),
                 *(np.asarray(gbuffer[name], spec.dtype) for name, spec in self._attributes.items()),
             )
 

@@ -60,12 +60,12 @@ def lift(
     corner_params = None if proxy.corner_params is None else np.ascontiguousarray(proxy.corner_params, np.float32)
     beside = () if exits is None else ((exits.fragments, exits.there),)
     packed = packing_loops.pack(fragments, kept, table, corner_params, capacity or 0, *beside, views=views)
-    found = None
+    exit_rows = None
     if exits is not None:
-        found = np.full(kept[0].shape, -1, np.int32)
-        found.reshape(-1)[exits.cells[0]] = packed[5][0, 0]
+        exit_rows = np.full(kept[0].shape, -1, np.int32)
+        exit_rows.reshape(-1)[exits.cells[0]] = packed[5][0, 0]
     ids, params, row, depth, total = packed[:5]
-    return Samples(ids, params, Cells(row, depth, exit=found), np.asarray(max(0, total - len(ids)), np.int32))
+    return Samples(ids, params, Cells(row, depth, exit=exit_rows), np.asarray(max(0, total - len(ids)), np.int32))
 
 
 def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
@@ -83,9 +83,9 @@ def repack(samples: Samples, kept: np.ndarray, capacity: int | None) -> Samples:
     index, overflow = index[:rows], np.asarray(samples.overflow + max(0, len(index) - rows), np.int32)
 
     def packed(x: np.ndarray) -> np.ndarray:
-        found = np.zeros((rows, *x.shape[1:]), x.dtype)
-        found[: len(index)] = x[index]
-        return found
+        rows_kept = np.zeros((rows, *x.shape[1:]), x.dtype)
+        rows_kept[: len(index)] = x[index]
+        return rows_kept
 
     return replace(
         samples,

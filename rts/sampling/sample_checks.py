@@ -233,17 +233,17 @@ def check_proxy(proxy: Proxy, surface: Any) -> None:
         )
 
 
-def checked_refined(found: Any, given: Samples, surface: TriangleSurface) -> Samples:
+def checked_refined(refined: Any, given: Samples, surface: TriangleSurface) -> Samples:
     """What `refine` of a surface gave, with arrays of the right dtypes; refused where it breaks its contract."""
     who = f"refine of {surface!r}"
-    if not isinstance(found, Samples):
-        raise InputError(f"{who} gave a {type(found).__name__}; expected Samples")
+    if not isinstance(refined, Samples):
+        raise InputError(f"{who} gave a {type(refined).__name__}; expected Samples")
     rows, grid, (i, p) = len(given.ids), given.row.shape, surface.sample_widths
-    ids = _array(f"{who} gave ids", found.ids, (rows, i), np.integer, np.int32)
-    params = _array(f"{who} gave params", found.params, (rows, p), np.floating, np.float32)
-    row = _array(f"{who} gave row", found.row, grid, np.integer, np.int32)
-    depth = _array(f"{who} gave depth", found.depth, grid, np.floating, np.float32)
-    overflow = _array(f"{who} gave overflow", found.overflow, (), np.integer, np.int32)
+    ids = _array(f"{who} gave ids", refined.ids, (rows, i), np.integer, np.int32)
+    params = _array(f"{who} gave params", refined.params, (rows, p), np.floating, np.float32)
+    row = _array(f"{who} gave row", refined.row, grid, np.integer, np.int32)
+    depth = _array(f"{who} gave depth", refined.depth, grid, np.floating, np.float32)
+    overflow = _array(f"{who} gave overflow", refined.overflow, (), np.integer, np.int32)
     if ((row != given.row) & (row != -1)).any():
         raise InputError(f"{who} gave another number to a row; expected what it was given, or −1 to drop a sample")
     if overflow < given.overflow:
@@ -255,7 +255,7 @@ def checked_refined(found: Any, given: Samples, surface: TriangleSurface) -> Sam
     if not np.isfinite(params).all() and not np.isfinite(used := params[row[covered]]).all():
         count = (~np.isfinite(used).all(axis=1)).sum()
         raise InputError(f"{who} gave {count} samples whose params are not finite; set their rows to −1")
-    tables = _checked_tables(found.tables, given, who)
+    tables = _checked_tables(refined.tables, given, who)
     return given.replace(ids=ids, params=params, row=row, depth=depth, overflow=overflow, tables=tables)
 
 
@@ -273,13 +273,13 @@ def _array(what: str, value: Any, shape: tuple[int, ...], kind: type, dtype: Any
         return np.ascontiguousarray(array, dtype) if array.ndim else array.astype(dtype)
 
 
-def _checked_tables(found: Any, given: Samples, who: str) -> dict[str, np.ndarray]:
+def _checked_tables(refined: Any, given: Samples, who: str) -> dict[str, np.ndarray]:
     """Tables that fit into those that were allotted."""
-    if set(found) != set(given.tables):
-        raise InputError(f"{who} gave the tables {sorted(found)}; table_specs declares {sorted(given.tables)}")
+    if set(refined) != set(given.tables):
+        raise InputError(f"{who} gave the tables {sorted(refined)}; table_specs declares {sorted(given.tables)}")
     tables = {}
     for name, allotted in given.tables.items():
-        table = np.asarray(found[name], allotted.dtype)
+        table = np.asarray(refined[name], allotted.dtype)
         if name in given.by_sample and len(table) != len(given.ids):
             raise InputError(
                 f"{who} gave a table {name!r} of {len(table)} rows; expected {len(given.ids)}, one a sample"

@@ -260,12 +260,12 @@ class HiddenInStrips:
         """
         from rts.sampling import strips_loops
 
-        found, place = np.zeros((len(among), among[0].size), bool), self.layout.place
-        given = marks, np.empty((0, 0), np.uint8) if kinds is None else kinds, place, found
+        marked, place = np.zeros((len(among), among[0].size), bool), self.layout.place
+        given = marks, np.empty((0, 0), np.uint8) if kinds is None else kinds, place, marked
         parallel(strips_loops.scatter, len(marks) * len(place), *given, work=marks.size)
-        found = found.reshape(among.shape)
-        found &= among
-        return found
+        marked = marked.reshape(among.shape)
+        marked &= among
+        return marked
 
 
 def arranged(sampled: Sampled, layout: Layout, grid: FineGrid) -> Fine:
@@ -287,8 +287,8 @@ def arranged(sampled: Sampled, layout: Layout, grid: FineGrid) -> Fine:
 
     def host(row: np.ndarray, place: np.ndarray, cells: np.ndarray, *known: np.ndarray) -> tuple[np.ndarray, ...]:
         sides = [np.where(place >= 0, x.reshape(layers, -1)[:, place], 0).astype(np.int16) for x in known[: len(told)]]
-        *found, settled = _arranged(row, place, cells, sizes, grid.fine[1], *known[len(told) :])
-        return *found, *sides, *([settled] if amid else [])
+        *placed, settled = _arranged(row, place, cells, sizes, grid.fine[1], *known[len(told) :])
+        return *placed, *sides, *([settled] if amid else [])
 
     given = sampled.row, layout.place, layout.cells, *told, *amid
     index, shift, row, part, *known = engine.call_host(host, tuple(specs), *given)

@@ -226,8 +226,8 @@ class TriangleSampler(Sampler):
         def find(cameras: Sequence[Camera], inputs: Tree, *cells: np.ndarray) -> tuple[Samples, dict[str, Any]]:
             own = np.asarray(cells[0], np.int32) if cells else None
             search = _Search(self, surface, part.cull, inputs, cameras[0], shape, tables, hidden, entry, own)
-            found = search.moved() if moves else search.in_place(sides, exits)
-            return found, {name: getattr(found, name) for name in beside}
+            samples = search.moved() if moves else search.in_place(sides, exits)
+            return samples, {name: getattr(samples, name) for name in beside}
 
         call = HostCall(part, surface, [camera], shape, entry)
         samples, more = call.samples(find, beside, tables, [] if listed is None else [listed])
@@ -254,10 +254,10 @@ class TriangleSampler(Sampler):
             work: may be called by several threads at once where several may draw.
         """
         with self._keeper.lock:
-            found = entry or self._entry(surface, inputs, camera, view)
+            known = entry or self._entry(surface, inputs, camera, view)
             if not self.draws_at_once:
-                return work(found)
-        return work(found)
+                return work(known)
+        return work(known)
 
     @property
     def draws_at_once(self) -> bool:
@@ -312,15 +312,15 @@ class _Search:
             lifted = lift(fragments, known.proxy, self.shape.capacity, kept, behind)
             return lifted.replace(facing=facing, settled=decision.settled)
         lifted = lift(fragments, known.proxy, None, kept)
-        found, _ = refined(self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.cells)
-        return repack(found, found.row >= 0, self.shape.capacity).replace(facing=facing)
+        samples, _ = refined(self.surface, self.inputs, lifted, self.camera, self.tables, self.shape.view, self.cells)
+        return repack(samples, samples.row >= 0, self.shape.capacity).replace(facing=facing)
 
     def moved(self) -> Samples:
         """The samples where a surface moves them, off its triangles."""
         layers = self.shape.layers
         # Of tables there is but one set, so that no samples can be added later.
         known, fragments, covered, *_ = self._drawn(layers if self.tables else max(layers + 1, LEAST_LAYERS), False)
-        found = on_surface(
+        samples = on_surface(
             self.surface,
             self.inputs,
             fragments,
@@ -331,11 +331,11 @@ class _Search:
             self.shape.view,
             self.cells,
         )
-        there = kept = found.row >= 0
+        covers = kept = samples.row >= 0
         if self.hidden is not None:  # It is asked only now, since it goes by the final depths.
-            kept = self.hidden.decide(Question(there, found.depth)).needed
-        ran_out = np.count_nonzero(covered[-1] & ~there[-1])
-        return repack(found, kept, self.shape.capacity).replace(ran_out=np.asarray(ran_out, np.int32))
+            kept = self.hidden.decide(Question(covers, samples.depth)).needed
+        ran_out = np.count_nonzero(covered[-1] & ~covers[-1])
+        return repack(samples, kept, self.shape.capacity).replace(ran_out=np.asarray(ran_out, np.int32))
 
     def _drawn(self, layers: int, exits: bool) -> tuple[Entry, Fragments, np.ndarray, Decision | None, Exits | None]:
         """What is prepared, the fragments (K, ·, ·), and where there are any; with `exits` what was decided for them.

@@ -26,10 +26,10 @@ def warn_of_winding(parts: Sequence[CheckedPart], camera: Camera) -> None:
     for index, part in enumerate(parts):
         if part.cull != "back" or _triangles_of(part) is None or not _is_new(part.surface):
             continue
-        found = is_inside_out(part, camera)
-        if found is None:
+        inside_out = is_inside_out(part, camera)
+        if inside_out is None:
             _looked_at.discard(part.surface)
-        if found:
+        if inside_out:
             warn(f"part {index} {INSIDE_OUT}; give it faces[:, ::-1]", InputWarning)
 
 
